@@ -1,0 +1,57 @@
+# `make` alone says what there is. Python >= 3.11 is all that has to be there; take another one with
+# `make PYTHON=python3.12 ...`. pip's own variables work as usual, for example to point at another index.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq -c constraints.txt
+TEST_EXTRAS := rl,peers,dev
+ARGS :=
+
+# Stamps: present only after a complete install, so a second run needs no network and an interrupted one starts over.
+MADE := $(VENV)/.made
+BASE := $(VENV)/.base
+TEST := $(VENV)/.test
+
+.PHONY: help demo test bench lint clean
+.NOTPARALLEL:
+
+help: ## this list
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1 - \2/p' Makefile
+
+demo: $(BASE) ## install what is needed (once) and run the main job from end to end
+	@$(BIN)/thruster demo $(ARGS)
+
+test: $(TEST) ## install what tests need (once) and run all tests; ARGS="-k name" picks some
+	@$(BIN)/python -m pytest $(ARGS)
+
+bench: $(TEST) ## time it against other packages, side by side
+	@$(BIN)/python -m benchmarks $(ARGS)
+
+lint: $(TEST) ## check style and formatting
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+
+clean: ## remove .venv, build products and caches; results in out/ stay
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(MADE):
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { echo "make: Python 3.11 or later is needed, and '$(PYTHON)' is not: name one with make PYTHON=..." >&2; exit 1; }
+	@$(PYTHON) -m venv --clear $(VENV)
+	@touch $@
+
+# The build tool comes first, pinned like the rest, so that pip does not fetch an unpinned one behind our back. The extras
+# are pinned by the same file, so neither install changes a version that the other one put there.
+$(BASE): pyproject.toml constraints.txt | $(MADE)
+	@echo "installing the base into $(VENV) (once, about a minute) ..."
+	@rm -f $(BASE) $(TEST)
+	@$(PIP) setuptools
+	@$(PIP) --no-build-isolation -e .
+	@touch $(BASE)
+
+$(TEST): pyproject.toml constraints.txt | $(MADE)
+	@echo "installing what tests need into $(VENV) (once, some minutes) ..."
+	@rm -f $(BASE) $(TEST)
+	@$(PIP) setuptools
+	@$(PIP) --no-build-isolation -e ".[$(TEST_EXTRAS)]"
+	@touch $(BASE) $(TEST)

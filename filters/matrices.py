@@ -1,0 +1,114 @@
+"""Small dense matrices as tuples of rows, with every operation written out for its size.
+
+Compiled, they stay in registers and cost nanoseconds where a library call costs hundreds. Meant for models of
+up to about ten states: the written-out source grows with the cube of the size.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+
+from thruster_env.components import matrix_of, tuple_of, written_out
+
+
+@cache
+def multiplier(rows: int, inner: int, columns: int) -> Callable:
+    """Return `multiply(a, b)`: a b for shapes (rows, inner) and (inner, columns)."""
+    return written_out(
+        "multiply",
+        "a, b",
+        matrix_of(rows, columns, lambda i, j: " + ".join(f"a[{i}][{k}] * b[{k}][{j}]" for k in range(inner))),
+    )
+
+
+@cache
+def transposed_multiplier(rows: int, inner: int, columns: int) -> Callable:
+    """Return `multiply(a, b)`: a b' for shapes (rows, inner) and (columns, inner)."""
+    return written_out(
+        "multiply",
+        "a, b",
+        matrix_of(rows, columns, lambda i, j: " + ".join(f"a[{i}][{k}] * b[{j}][{k}]" for k in range(inner))),
+    )
+
+
+@cache
+def vector_multiplier(rows: int, inner: int) -> Callable:
+    """Return `multiply(a, x)`: the tuple a x for shapes (rows, inner) and (inner,)."""
+    return written_out(
+        "multiply",
+        "a, x",
+        tuple_of(" + ".join(f"a[{i}][{k}] * x[{k}]" for k in range(inner)) for i in range(rows)),
+    )
+
+
+@cache
+def symmetric_sum(size: int) -> Callable:
+    """Return `add(a, b)`: the symmetric part of a + b, exactly symmetric."""
+    return written_out(
+        "add",
+        "a, b",
+        matrix_of(size, size, lambda i, j: f"0.5 * (a[{i}][{j}] + a[{j}][{i}] + b[{i}][{j}] + b[{j}][{i}])"),
+    )
+
+
+@cache
+def identity_less(size: int) -> Callable:
+    """Return `subtract(a)`: I - a."""
+    return written_out(
+        "subtract", "a", matrix_of(size, size, lambda i, j: f"{1.0 if i == j else 0.0} - a[{i}][{j}]")
+    )
+
+
+@cache
+def masked(size: int) -> Callable:
+    """Return `mask(r, z)`: the covariance r without its correlations to channels that are NaN in z."""
+
+    def entry(i, j):
+        here = f"r[{i}][{j}]"
+        return here if i == j else f"({here} if z[{i}] == z[{i}] and z[{j}] == z[{j}] else 0.0)"
+
+    return written_out("mask", "r, z", matrix_of(size, size, entry))
+
+
+@cache
+def cholesky_factor(size: int) -> Callable:
+    """Return `factor(a)`: the lower triangular L with L L' = a; NaN where a is not positive definite."""
+    lines = []
+    for i in range(size):
+        for j in range(i + 1):
+            rest = "".join(f" - l{i}_{k} * l{j}_{k}" for k in range(j))
+            if i == j:
+                lines.append(f"d{i} = a[{i}][{i}]{rest}")
+                lines.append(f"l{i}_{i} = (d{i} if d{i} > 0.0 else nan) ** 0.5")
+            else:
+                lines.append(f"l{i}_{j} = (a[{i}][{j}]{rest}) / l{j}_{j}")
+    result = matrix_of(size, size, lambda i, j: f"l{i}_{j}" if j <= i else "0.0")
+    return written_out("factor", "a", *lines, result, nan=math.nan)
+
+
+@cache
+def row_solver(rows: int, size: int) -> Callable:
+    """Return `solve(b, l)`: b (l l')^-1, for b of shape (rows, size) and l lower triangular."""
+    lines = []
+    for r in range(rows):
+        for i in range(size):
+            rest = "".join(f" - l[{i}][{k}] * y{r}_{k}" for k in range(i))
+            lines.append(f"y{r}_{i} = (b[{r}][{i}]{rest}) / l[{i}][{i}]")
+        for i in reversed(range(size)):
+            rest = "".join(f" - l[{k}][{i}] * x{r}_{k}" for k in range(i + 1, size))
+            lines.append(f"x{r}_{i} = (y{r}_{i}{rest}) / l[{i}][{i}]")
+    return written_out("solve", "b, l", *lines, matrix_of(rows, size, lambda r, i: f"x{r}_{i}"))
+
+
+@cache
+def innovation_likelihood(size: int) -> Callable:
+    """Return `log_likelihood(v, l, z)`: log N(v; 0, l l') over the channels that are not NaN in z."""
+    lines = ["total = 0.0"]
+    for i in range(size):
+        rest = "".join(f" - l[{i}][{k}] * y{k}" for k in range(i))
+        lines.append(f"y{i} = (v[{i}]{rest}) / l[{i}][{i}]")
+        lines.append(f"if z[{i}] == z[{i}]:")
+        lines.append(f"    total -= 0.5 * y{i} * y{i} + log(l[{i}][{i}]) + {0.5 * math.log(2.0 * math.pi)!r}")
+    return written_out("log_likelihood", "v, l, z", *lines, "total", log=math.log)

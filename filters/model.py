@@ -1,0 +1,96 @@
+"""`StateSpaceModel`: what a filter believes of a plant."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thruster_env.checks import at_least, covariance, covariance_root, vector
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StateSpaceModel:
+    """A discrete-time model with additive Gaussian noise, for n states, p inputs and m measurements.
+
+        x_{k+1} = f(x_k, u_k) + w,  w ~ N(0, Q);   z_k = h(x_k) + v,  v ~ N(0, R);   x_0 ~ N(mean, cov)
+
+    The functions take and return tuples of components and may use `constants` c, the model's numbers:
+    `transition(x, u, c)`, `observe(x, c)` and, if known, their Jacobians as tuples of rows
+    (n rows of n, m rows of n). Written with arithmetic and `math` or `numpy` scalar functions they compile;
+    others run as Python, slower, with the same results.
+
+    Attributes:
+        transition: f, or one of its `substeps` equal parts: the function is applied `substeps` times a step.
+        observe: h.
+        process_noise_cov: Q, (n, n) or n variances, per step.
+        measurement_noise_cov: R, (m, m) or m variances; positive definite.
+        prior_mean: mean of the initial state, (n,).
+        prior_cov: covariance of the initial state, (n, n) or n variances; zero allowed.
+        inputs: number p of inputs.
+        constants: a NamedTuple (or tuple) of floats that is passed to every function.
+        transition_jacobian: df/dx(x, u, c) of one application; central differences if None.
+        observe_jacobian: dh/dx(x, c); central differences if None.
+        substeps: how often `transition` is applied in one step.
+    """
+
+    transition: Callable
+    observe: Callable
+    process_noise_cov: Any
+    measurement_noise_cov: Any
+    prior_mean: Any
+    prior_cov: Any
+    inputs: int = 1
+    constants: tuple = ()
+    transition_jacobian: Callable | None = None
+    observe_jacobian: Callable | None = None
+    substeps: int = 1
+
+    def __post_init__(self):
+        """Check shapes and signs; raise ValueError that states the rule and the value."""
+        mean = np.atleast_1d(np.array(self.prior_mean, dtype=np.float64))
+        n = mean.size
+        r = np.atleast_1d(np.array(self.measurement_noise_cov, dtype=np.float64))
+        checked = {
+            "prior_mean": vector("prior_mean", mean, n),
+            "prior_cov": covariance("prior_cov", self.prior_cov, n),
+            "process_noise_cov": covariance("process_noise_cov", self.process_noise_cov, n),
+            "measurement_noise_cov": covariance("measurement_noise_cov", r, len(r), positive_definite=True),
+            "substeps": at_least("substeps", self.substeps, 1),
+            "inputs": at_least("inputs", self.inputs, 0),
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.prior_mean)
+
+    @property
+    def m(self) -> int:
+        """Number of measurements."""
+        return len(self.measurement_noise_cov)
+
+    def replace(self, **changes) -> StateSpaceModel:
+        """The same model with some fields changed."""
+        return dataclasses.replace(self, **changes)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """Constants, noise, prior and substeps as one float64 row, the form that compiled functions take."""
+        matrices = (
+            self.process_noise_cov,
+            covariance_root(self.process_noise_cov),
+            self.measurement_noise_cov,
+            covariance_root(self.measurement_noise_cov),
+            self.prior_mean,
+            self.prior_cov,
+            covariance_root(self.prior_cov),
+            [self.substeps],
+            list(self.constants),
+        )
+        return np.concatenate([np.ravel(np.asarray(a, dtype=np.float64)) for a in matrices])

@@ -1,0 +1,48 @@
+"""No test opens a window, and in CI no test is skipped for want of a package."""
+
+import os
+import re
+
+import pytest
+
+# Before anything imports matplotlib or pygame.
+os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+
+
+class MissingPackages:
+    """Fails the session when a test was skipped because a package is missing or too old.
+
+    Such a skip is right on a user's machine. CI installs everything, so there it would hide a broken install.
+    """
+
+    # What importorskip, a failed import and a hand-written skipif say.
+    reason = re.compile(r"could not import|No module named|not installed|required is:", re.IGNORECASE)
+
+    def __init__(self):
+        self.skipped = {}
+
+    def note(self, report):
+        # A skip carries (file, line, reason); an expected failure is reported as skipped too, and is none.
+        if report.skipped and not hasattr(report, "wasxfail"):
+            reason = str(report.longrepr[-1])
+            if self.reason.search(reason):
+                self.skipped[report.nodeid] = reason.removeprefix("Skipped: ")
+
+    pytest_runtest_logreport = note
+
+    def pytest_collectreport(self, report):  # a whole module skipped
+        self.note(report)
+
+    def pytest_sessionfinish(self, session, exitstatus):
+        if self.skipped and exitstatus in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED):
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+    def pytest_terminal_summary(self, terminalreporter):
+        for nodeid, reason in self.skipped.items():
+            terminalreporter.write_line(f"FAILED, a package is missing: {nodeid}: {reason}", red=True)
+
+
+def pytest_configure(config):
+    if os.environ.get("CI"):
+        config.pluginmanager.register(MissingPackages(), "missing-packages")

@@ -1,0 +1,85 @@
+"""Argument checks that state the rule, then the value."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+
+def finite(name: str, value) -> float:
+    """Return value as a float; raise ValueError unless it is a finite number."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"{name} must be a finite number, but got {value!r}")
+    return number
+
+
+def positive(name: str, value, *, zero_allowed: bool = False) -> float:
+    """Return value as a float; raise ValueError unless it is finite and positive (or zero, where allowed)."""
+    number = finite(name, value)
+    if number < 0 or (number == 0 and not zero_allowed):
+        rule = "zero or positive" if zero_allowed else "positive"
+        raise ValueError(f"{name} must be {rule}, but got {value!r}")
+    return number
+
+
+def at_least(name: str, value, least: int) -> int:
+    """Return value as an int; raise ValueError unless it is a whole number of at least `least`."""
+    number = finite(name, value)
+    if number != int(number) or number < least:
+        raise ValueError(f"{name} must be a whole number of at least {least}, but got {value!r}")
+    return int(number)
+
+
+def one_of(name: str, value, choices: Iterable[str]) -> str:
+    """Return value; raise ValueError unless it is one of the choices."""
+    if not isinstance(value, str) or value not in tuple(choices):
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, but got {value!r}")
+    return value
+
+
+def vector(name: str, value, size: int) -> np.ndarray:
+    """Return value as a float64 array of shape (size,); raise ValueError if shape or numbers are off."""
+    try:
+        array = np.atleast_1d(np.array(value, dtype=np.float64))
+    except (TypeError, ValueError):
+        array = np.full(0, np.nan)
+    if array.shape != (size,) or not np.isfinite(array).all():
+        raise ValueError(f"{name} must be {size} finite number{'s' if size > 1 else ''}, but got {value!r}")
+    return array
+
+
+def covariance(name: str, value, size: int, *, positive_definite: bool = False) -> np.ndarray:
+    """Return a covariance, shape (size, size), from a matrix, `size` variances or one variance if size is 1.
+
+    Raises ValueError unless it is symmetric and positive semidefinite (or definite, where that is asked).
+    """
+    rule = f"{name} must be {size} variances or a symmetric {size} x {size} matrix"
+    try:
+        array = np.atleast_1d(np.array(value, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise ValueError(f"{rule}, but got {value!r}") from None
+    if array.shape == (size,):
+        array = np.diag(array)
+    if array.shape != (size, size) or not np.isfinite(array).all() or not np.allclose(array, array.T):
+        raise ValueError(f"{rule} of finite numbers, but got {value!r}")
+    eigenvalues = np.linalg.eigvalsh(array)
+    if eigenvalues[0] < -1e-12 * max(1e-300, abs(eigenvalues[-1])):
+        raise ValueError(f"{name} must be positive semidefinite (no negative variance), but got {value!r}")
+    if positive_definite and eigenvalues[0] <= 0:
+        raise ValueError(f"{name} must be positive definite, but got {value!r}")
+    return (array + array.T) / 2
+
+
+def covariance_root(cov: np.ndarray) -> np.ndarray:
+    """A lower triangular L with L L' = cov for a positive semidefinite covariance, zero variances allowed."""
+    eigenvalues, vectors = np.linalg.eigh(cov)
+    root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
+    lower = np.linalg.qr(root.T, mode="r").T
+    signs = np.where(np.diag(lower) < 0, -1.0, 1.0)
+    return lower * signs
