@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from filters.affine import AffineModel, linearize
 from filters.extended import kernels_of
@@ -21,31 +21,26 @@ class KalmanFilter(Filter):
 
     On an affine model the extended filter does exactly this, so it does the work.
 
-    Attributes:
-        operating_state: x* (n,) about which a nonlinear model is approximated; not needed for affine ones.
-        operating_input: u* (p,).
+    The operating point is the model's `operating_state` and `operating_input`; offsets are kept.
 
     Source: Kalman (1960), "A new approach to linear filtering and prediction problems".
     """
 
     name: ClassVar[str] = "kf"
-    operating_state: Any = None
-    operating_input: Any = None
 
     def __post_init__(self):
         """Raise ValueError if a nonlinear model comes without an operating point."""
-        given = self.operating_state is not None and self.operating_input is not None
-        if not given and not isinstance(self.model, AffineModel):
+        point = self.model.operating_state, self.model.operating_input
+        if any(part is None for part in point) and not isinstance(self.model, AffineModel):
             raise ValueError(
-                "a Kalman filter must have an affine model or an operating state and input to approximate "
-                f"one, but got operating_state={self.operating_state!r}, operating_input="
-                f"{self.operating_input!r}"
+                "a Kalman filter must have an affine model, or one with an operating state and input, but got "
+                f"operating_state={point[0]!r}, operating_input={point[1]!r}"
             )
 
     @cached_property
     def kernel_model(self) -> AffineModel:
         """The affine model that the filter runs on."""
-        return linearize(self.model, self.operating_state, self.operating_input)
+        return linearize(self.model, self.model.operating_state, self.model.operating_input)
 
     def kernels(self) -> Kernels:
         """Kernels of the extended filter on the affine model."""

@@ -35,6 +35,8 @@ class StateSpaceModel:
         transition_jacobian: df/dx(x, u, c) of one application; central differences if None.
         observe_jacobian: dh/dx(x, c); central differences if None.
         substeps: how often `transition` is applied in one step.
+        operating_state: x* (n,) about which a Kalman filter approximates the model; None for affine models.
+        operating_input: u* (p,), the input that goes with it.
     """
 
     transition: Callable
@@ -48,6 +50,8 @@ class StateSpaceModel:
     transition_jacobian: Callable | None = None
     observe_jacobian: Callable | None = None
     substeps: int = 1
+    operating_state: Any = None
+    operating_input: Any = None
 
     def __post_init__(self):
         """Check shapes and signs; raise ValueError that states the rule and the value."""
@@ -62,6 +66,9 @@ class StateSpaceModel:
             "substeps": at_least("substeps", self.substeps, 1),
             "inputs": at_least("inputs", self.inputs, 0),
         }
+        for name, size in (("operating_state", n), ("operating_input", checked["inputs"])):
+            if getattr(self, name) is not None:
+                checked[name] = vector(name, getattr(self, name), size)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
 

@@ -1,17 +1,11 @@
-"""The bridge: the thruster as a `StateSpaceModel`, and filters for it by name. Nothing else here knows it."""
+"""The bridge: the thruster as a `StateSpaceModel`. No other file of this package knows the thruster."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numpy as np
-
-from filters.ensemble import EnsembleKalmanFilter
-from filters.extended import ExtendedKalmanFilter
-from filters.filter import Filter
-from filters.kalman import KalmanFilter
 from filters.model import StateSpaceModel
-from thruster_env.checks import finite, one_of
+from thruster_env.checks import covariance, finite, positive
 from thruster_env.compiled import compilable, inlined
 from thruster_env.dynamics import substep, substep_jacobian, thrust_and_torque, thrust_and_torque_tangent
 from thruster_env.linear import steady_state
@@ -40,9 +34,88 @@ def observe(x, c):
 @compilable
 def observe_jacobian(x, c):
     """Jacobian of `observe` by rows."""
-    return (
-        (
-            thrust_and_torque_tangent(x, (1.0, 0.0), c)[0],
-            thrust_and_torque_tangent(x, (0.0, 1.0), c)[0],
-        ),
+    by_speed, _ = thrust_and_torque_tangent(x, (1.0, 0.0), c)
+    by_flow, _ = thrust_and_torque_tangent(x, (0.0, 1.0), c)
+    return ((by_speed, by_flow),)
+
+
+def thruster_model(
+    *,
+    parameter_factors: Mapping[str, float] | None = None,
+    operating_voltage: float | None = None,
+    **plant_arguments,
+) -> StateSpaceModel:
+    """What a filter assumes of a thruster, from plain arguments that JSON can hold.
+
+    Args:
+        parameter_factors: factors on fields of `ThrusterParameters`, by which the assumed thruster differs.
+        operating_voltage: where a Kalman filter approximates the model [V]; half of max_voltage if None.
+        **plant_arguments: those of `thruster_env.plant.make_plant`; the noise covariances are the filter's.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
+    return model_of_plant(
+        make_plant(**plant_arguments),
+        parameter_factors=parameter_factors,
+        operating_voltage=operating_voltage,
     )
+
+
+def model_of_plant(
+    plant: Plant,
+    *,
+    parameter_factors: Mapping[str, float] | None = None,
+    operating_voltage: float | None = None,
+    process_noise_cov=None,
+    measurement_noise_cov=None,
+) -> StateSpaceModel:
+    """The model of a plant, exact unless told otherwise; see `thruster_model` for the arguments."""
+    plant = plant._replace(parameters=_scaled(plant.parameters, parameter_factors or {}))
+    if process_noise_cov is not None:
+        plant = plant._replace(process_noise_cov=covariance("process_noise_cov", process_noise_cov, 2))
+    if measurement_noise_cov is not None:
+        r = covariance("measurement_noise_cov", measurement_noise_cov, 1)
+        plant = plant._replace(measurement_noise_cov=r)
+    if operating_voltage is None:
+        operating_voltage = plant.max_voltage / 2
+    operating_voltage = finite("operating_voltage", operating_voltage)
+    return StateSpaceModel(
+        transition=transition,
+        observe=observe,
+        transition_jacobian=transition_jacobian,
+        observe_jacobian=observe_jacobian,
+        process_noise_cov=plant.process_noise_cov,
+        measurement_noise_cov=plant.measurement_noise_cov,
+        prior_mean=plant.initial_mean,
+        prior_cov=plant.initial_cov,
+        constants=plant.constants,
+        substeps=plant.substeps,
+        operating_state=steady_state(plant.parameters, operating_voltage, plant.ambient_velocity)[:2],
+        operating_input=[operating_voltage],
+    )
+
+
+def model_of_env(env, **changes) -> StateSpaceModel:
+    """The model of a `BowThruster` env; changes are those of `model_of_plant`.
+
+    Raises:
+        ValueError: if the env has no plant that this package knows.
+    """
+    plant = getattr(env.unwrapped, "plant", None)
+    if not isinstance(plant, Plant):
+        raise ValueError(f"an env other than a bow thruster must come with a model, but got {env}")
+    try:
+        return model_of_plant(plant, **changes)
+    except TypeError as error:
+        raise ValueError(f"an argument is not known: {error}") from None
+
+
+def _scaled(parameters: ThrusterParameters, factors: Mapping[str, float]) -> ThrusterParameters:
+    names = [name for name in ThrusterParameters._fields if name != "angles"]
+    unknown = sorted(set(factors) - set(names))
+    if unknown:
+        raise ValueError(f"parameter_factors must name fields of {', '.join(names)}, but got {unknown}")
+    scaled = {name: getattr(parameters, name) * positive(name, factor) for name, factor in factors.items()}
+    return checked(parameters._replace(**scaled))
+

@@ -161,3 +161,13 @@ def episode_keys(seeds) -> np.ndarray:
     from gymnasium.utils.seeding import np_random
 
     return np.array([draw_key(np_random(int(seed))[0]) for seed in seeds])
+
+
+def filter_generator(seed: int | None) -> np.random.Generator:
+    """Generator of the keys that a filter wrapper draws, one an episode, after `reset(seed=seed)`."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(FILTER_PRIOR,)))
+
+
+def filter_keys(seeds) -> np.ndarray:
+    """Keys, shape (len(seeds), 2), of a filter wrapper's first episode after `reset(seed=s)` for s in seeds."""
+    return np.array([draw_key(filter_generator(int(seed))) for seed in seeds])

@@ -1,0 +1,62 @@
+"""Filters by name, and the file format that carries a filter's numbers from one program to the next."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+from filters.ensemble import EnsembleKalmanFilter
+from filters.extended import ExtendedKalmanFilter
+from filters.filter import Filter
+from filters.kalman import KalmanFilter
+from filters.model import StateSpaceModel
+from thruster_env.checks import one_of
+
+FILTERS: dict[str, type[Filter]] = {
+    kind.name: kind for kind in (KalmanFilter, ExtendedKalmanFilter, EnsembleKalmanFilter)
+}
+FILE_FORMAT = "thruster-env tuned filter"
+FILE_VERSION = 1
+
+
+def filter_class(name: str) -> type[Filter]:
+    """The class of a filter by name; ValueError for an unknown one."""
+    return FILTERS[one_of("filter", name, tuple(FILTERS))]
+
+
+def tunable_numbers(name: str) -> tuple[str, ...]:
+    """Names of the numbers that a filter has beside its model."""
+    return tuple(field.name for field in dataclasses.fields(filter_class(name)) if field.name != "model")
+
+
+def make_filter(name: str, model: StateSpaceModel, **numbers) -> Filter:
+    """A filter by name, for a model, with its own numbers; ValueError for an unknown name or number."""
+    known = tunable_numbers(name)
+    for number in numbers:
+        one_of(f"a number of filter {name!r}", number, known)
+    return filter_class(name)(model=model, **numbers)
+
+
+def read_tuned_file(path: str | Path) -> dict[str, Any]:
+    """Content of a tuned file; its "filter" entry holds `name`, `numbers` and the `model` arguments.
+
+    Raises:
+        ValueError: if the file cannot be read, is damaged or was written by another version.
+    """
+    try:
+        content = json.loads(Path(path).read_text())
+    except OSError as error:
+        raise ValueError(f"a tuned file must be readable, but {path} is not: {error.strerror}") from None
+    except ValueError as error:
+        raise ValueError(f"a tuned file must be whole JSON, but {path} is not: {error}") from None
+    if not isinstance(content, dict) or content.get("format") != FILE_FORMAT:
+        raise ValueError(f"a tuned file must say format: {FILE_FORMAT!r}, but {path} does not")
+    if content.get("version") != FILE_VERSION:
+        raise ValueError(f"a tuned file must be of version {FILE_VERSION}, but got {content.get('version')!r}")
+    entry = content.get("filter")
+    if not isinstance(entry, dict) or set(entry) != {"name", "numbers", "model"}:
+        raise ValueError(f"a tuned file must have a filter with name, numbers and model, but {path} has not")
+    one_of("the filter of a tuned file", entry["name"], tuple(FILTERS))
+    return content

@@ -1,0 +1,148 @@
+"""`EstimateState`: a filter around any Gymnasium env, its estimate in the observation and in info."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+
+import gymnasium as gym
+import numpy as np
+
+from filters.engine import Session
+from filters.model import StateSpaceModel
+from filters.registry import make_filter, read_tuned_file, tunable_numbers
+from filters.thruster import model_of_env
+from thruster_env.checks import one_of
+from thruster_env.streams import draw_key, filter_generator
+
+OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
+
+
+class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
+    """Run a filter beside an env: predict with the action, update with the measurement.
+
+    The observation becomes, in float32,
+
+    - "estimate": the mean of the state, (n,);
+    - "measurement+estimate": the measurement, then the mean, (m + n,);
+    - "belief": the mean, then the standard deviations, (2 n,).
+
+    Info gains `estimate` (n,), `estimate_cov` (n, n), `innovation` (m,), `innovation_cov` (m, m) and
+    `estimate_divergences`, the restarts from the prior after an estimate that was not finite. The measurement
+    is `info["measurement"]` where the env reports it (NaN where `measurement_valid` is false), else the
+    observation. The action is clipped to the action space before the filter sees it. The filter's
+    randomness comes from the reset seed by a stream of its own; the env's generator is never touched.
+
+    Args:
+        env: any env with Box actions and observations.
+        filter: "kf", "ekf" or "enkf".
+        observation: one of the three forms above.
+        model: None for the model of a bow thruster env, "module:factory" of a function that returns a
+            `StateSpaceModel`, or a `StateSpaceModel` (which JSON cannot hold).
+        tuned: path of a tuned file; it gives filter, numbers and model arguments.
+        **numbers: the filter's own numbers (`ensemble_size`) and arguments of the model: for a bow thruster
+            `process_noise_cov`, `measurement_noise_cov`, `parameter_factors`, `operating_voltage`.
+
+    Raises:
+        ValueError: if an argument is unknown or off, or spaces and model do not fit.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        filter: str | None = None,
+        observation: str = "estimate",
+        model: str | StateSpaceModel | None = None,
+        tuned: str | None = None,
+        **numbers,
+    ):
+        """Build model and filter; see the class for the arguments."""
+        recorded = {"filter": filter, "observation": observation, "model": model, "tuned": tuned, **numbers}
+        gym.utils.RecordConstructorArgs.__init__(self, **recorded)
+        gym.Wrapper.__init__(self, env)
+        self._form = one_of("observation", observation, OBSERVATIONS)
+        if tuned is not None:
+            if filter is not None or numbers:
+                raise ValueError("tuned must come without filter and numbers, for its file holds them")
+            entry = read_tuned_file(tuned)["filter"]
+            filter, numbers = entry["name"], {**entry["numbers"], **entry["model"]}
+        filter = "ekf" if filter is None else filter
+        own = {name: numbers.pop(name) for name in tunable_numbers(filter) if name in numbers}
+        self.filter = make_filter(filter, _model_for(env, model, numbers), **own)
+        _check_spaces(env, self.filter.model)
+        n, m = self.filter.model.n, self.filter.model.m
+        length = {"estimate": n, "measurement+estimate": m + n, "belief": 2 * n}[observation]
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
+        self._session = Session(self.filter)
+        self._generator = filter_generator(None)
+        low, high = env.action_space.low.ravel(), env.action_space.high.ravel()
+        self._bounds = list(zip(low.tolist(), high.tolist(), strict=True))
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Reset env and filter; the belief is the prior, updated with the first measurement."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        if seed is not None:
+            self._generator = filter_generator(seed)
+        z = _measurement(observation, info)
+        self._session.start(draw_key(self._generator), z)
+        return self._observe(z, info), info
+
+    def step(self, action):
+        """Step the env, then predict with the clipped action and update with the measurement."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        values = np.asarray(action, dtype=np.float64).ravel().tolist()
+        u = [min(max(v, low), high) for v, (low, high) in zip(values, self._bounds, strict=True)]
+        z = _measurement(observation, info)
+        self._session.step(u, z)
+        return self._observe(z, info), reward, terminated, truncated, info
+
+    def _observe(self, z, info) -> np.ndarray:
+        session = self._session
+        mean, cov = session.mean.copy(), session.cov.copy()
+        info["estimate"] = mean
+        info["estimate_cov"] = cov
+        info["innovation"] = session.innovation.copy()
+        info["innovation_cov"] = session.innovation_cov.copy()
+        info["estimate_divergences"] = session.divergences
+        if self._form == "estimate":
+            return mean.astype(np.float32)
+        if self._form == "belief":
+            return np.concatenate([mean, np.sqrt(np.diag(cov))]).astype(np.float32)
+        return np.concatenate([np.nan_to_num(z), mean]).astype(np.float32)
+
+
+def _model_for(env: gym.Env, model, arguments: dict) -> StateSpaceModel:
+    if model is None:
+        return model_of_env(env, **arguments)
+    if isinstance(model, StateSpaceModel):
+        if arguments:
+            raise ValueError(f"a StateSpaceModel must come without arguments of its own, but got {arguments!r}")
+        return model
+    module, _, name = str(model).partition(":")
+    try:
+        factory: Callable = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError):
+        raise ValueError(
+            f"model must be 'module:factory' that can be imported, or a StateSpaceModel, but got {model!r}"
+        ) from None
+    try:
+        return factory(**arguments)
+    except TypeError as error:
+        raise ValueError(f"model {model!r} must take the given arguments: {error}") from None
+
+
+def _check_spaces(env: gym.Env, model: StateSpaceModel) -> None:
+    spaces = {"action": (env.action_space, model.inputs), "observation": (env.observation_space, model.m)}
+    for name, (space, size) in spaces.items():
+        if not isinstance(space, gym.spaces.Box):
+            raise ValueError(f"the {name} space must be a Box, but got {space}")
+        if name == "action" and int(np.prod(space.shape)) != size:
+            raise ValueError(f"the {name} space must have the model's {size} entries, but got {space}")
+
+
+def _measurement(observation, info) -> np.ndarray:
+    z = info.get("measurement")
+    if z is None:
+        return np.asarray(observation, dtype=np.float64).ravel()
+    valid = info.get("measurement_valid")
+    return z if valid is None else np.where(valid, z, np.nan)

@@ -1,0 +1,1 @@
+"""Published experiments, one `authorYEAR.py` each, with the published numbers in it."""
