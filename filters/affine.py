@@ -104,7 +104,6 @@ def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
     x, u, c = np.array(state, dtype=np.float64), np.array(control, dtype=np.float64), model.constants
     n, m, p = model.n, model.m, model.inputs
 
-
     def advance(u, x):
         for _ in range(model.substeps):
             x = model.transition(x, u, c)

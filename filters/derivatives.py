@@ -12,9 +12,7 @@ RELATIVE_STEP = 6e-6  # cube root of the float64 resolution balances truncation 
 
 
 @cache
-def jacobian(
-    function: Callable, analytic: Callable | None, rows: int, columns: int, arguments: str
-) -> Callable:
+def jacobian(function: Callable, analytic: Callable | None, rows: int, columns: int, arguments: str) -> Callable:
     """Return `jacobian(x, <arguments>)`: d function/dx as a tuple of rows.
 
     Args:

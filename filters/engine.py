@@ -215,9 +215,7 @@ class Session:
         members = self._table[: len(self.mean), : self._size].copy()
         if not self._size:
             members = np.empty((len(self.mean), 0))
-        return Belief(
-            self.mean.copy(), self.cov.copy(), members, key, int(row[places.step]), self.divergences
-        )
+        return Belief(self.mean.copy(), self.cov.copy(), members, key, int(row[places.step]), self.divergences)
 
     def innovation_copy(self) -> Innovation:
         """A copy of what the last update found."""
@@ -310,7 +308,12 @@ def run(filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.
         memory = new_memory(filter_)  # serves the part's trajectories one after the other
         batch(*memory, filter_.size, keys, inputs, z, numbers, tuple(out), first, last)
 
+    spread(part, count)
+    return out
+
+
+def spread(part: Callable[[int, int], None], count: int) -> None:
+    """Call part(first, last) on all cores until it has covered 0 ... count; part releases the lock."""
     part(0, 1)  # compile or load once, before threads race for it
     edges = np.unique(np.linspace(1, count, 1 + min(count - 1, 4 * _threads())).astype(int))
     list(_pool().map(part, edges[:-1], edges[1:]))
-    return out

@@ -57,9 +57,7 @@ def take_moments(row, mean, cov, table, first, count, size):
     for i in range(count):
         row[mean + i] = mean_of_row(table, first + i, size)
         for k in range(i + 1):
-            value = covariance_of_rows(
-                table, first + i, row[mean + i], first + k, row[mean + k], size
-            )
+            value = covariance_of_rows(table, first + i, row[mean + i], first + k, row[mean + k], size)
             row[cov + i * count + k] = value
             row[cov + k * count + i] = value
 

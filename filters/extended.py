@@ -80,9 +80,7 @@ def gaussian_correction(n: int, m: int) -> Callable:
     silent = written_out(
         "silent",
         "h, z",
-        tuple_of(
-            tuple_of(f"h[{i}][{j}] if z[{i}] == z[{i}] else 0.0" for j in range(n)) for i in range(m)
-        ),
+        tuple_of(tuple_of(f"h[{i}][{j}] if z[{i}] == z[{i}] else 0.0" for j in range(n)) for i in range(m)),
     )
     moved = written_out("moved", "x, d", tuple_of(f"x[{i}] + d[{i}]" for i in range(n)))
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from thruster_env.components import tuple_of, written_out
 
-LANES = 8  # float64 in the widest vector register; ensembles are padded to a multiple of this, so that vector loops have no remainder
+LANES = 8  # float64 in the widest vector register: ensembles are padded, so that loops have no remainder
 
 
 def padded(size, lanes):

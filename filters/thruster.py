@@ -118,4 +118,3 @@ def _scaled(parameters: ThrusterParameters, factors: Mapping[str, float]) -> Thr
         raise ValueError(f"parameter_factors must name fields of {', '.join(names)}, but got {unknown}")
     scaled = {name: getattr(parameters, name) * positive(name, factor) for name, factor in factors.items()}
     return checked(parameters._replace(**scaled))
-

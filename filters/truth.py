@@ -23,7 +23,7 @@ class Truth(NamedTuple):
 
 @compilable
 def add_correlated(out, numbers, root, count, draws):
-    """out += L draws, the lower triangular L (count, count) lying by rows at numbers[root]."""
+    """Out += L draws, the lower triangular L (count, count) lying by rows at numbers[root]."""
     for i in range(count):
         for k in range(i + 1):
             out[i] += numbers[root + i * count + k] * draws[k]

@@ -1,35 +1,41 @@
-"""What every command shares: options, tables on the terminal, JSON for programs, whole files or none."""
+"""What every command shares: options, tables on the terminal, JSON for programs."""
 
 from __future__ import annotations
 
 import json
-import os
 import sys
-import tempfile
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
+
+from thruster_env.compiled import tell_when_compiling
+from thruster_env.files import write_whole
 
 JsonOption = Annotated[
-    str | None, typer.Option("--json", metavar="FILE", help="Also write the result as JSON; - for standard output.")
+    str | None,
+    typer.Option("--json", metavar="FILE", help="Also write the result as JSON; - for standard output."),
 ]
-SeedOption = Annotated[int, typer.Option("--seed", min=0, help="Seed of all randomness; the same seed repeats all.")]
+SeedOption = Annotated[
+    int, typer.Option("--seed", min=0, help="Seed of all randomness; the same seed repeats all.")
+]
 
-console = Console()
-progress_console = Console(stderr=True)
+console = Console(markup=False, highlight=False)
+progress_console = Console(stderr=True, markup=False, highlight=False)
 
 
 def table(title: str, columns: list[str], rows: list[list[Any]], *, caption: str | None = None) -> Table:
     """A table for the terminal; the first column is left-aligned, the others to the right."""
-    out = Table(title=title, caption=caption, title_justify="left", caption_justify="left")
+    out = Table(title=title, caption=caption, title_justify="left", caption_justify="left", box=SIMPLE_HEAD)
+    out.padding, out.pad_edge = (0, 1, 0, 0), False  # five figures with their intervals fit into 80 columns
     for index, column in enumerate(columns):
-        out.add_column(column, justify="left" if index == 0 else "right")
+        out.add_column(Text(column), justify="left" if index == 0 else "right")
     for row in rows:
-        out.add_row(*[cell if isinstance(cell, str) else str(cell) for cell in row])
+        out.add_row(*[Text(str(cell)) for cell in row])  # Text: units in brackets are no markup
     return out
 
 
@@ -42,22 +48,14 @@ def emit(shown: list, data: dict, json_target: str | None) -> None:
     for part in shown:
         console.print(part)
     if json_target is not None:
-        write_whole(Path(json_target), json.dumps(data, indent=2, default=_plain) + "\n")
+        write_whole(json_target, json.dumps(data, indent=2, default=_plain) + "\n")
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a text file aside, then rename it into place: a reader sees the old file or the new one.
-
-    Raises:
-        ValueError: if the folder does not exist or cannot be written.
-    """
-    try:
-        descriptor, aside = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        with os.fdopen(descriptor, "w") as stream:
-            stream.write(text)
-        os.replace(aside, path)
-    except OSError as error:
-        raise ValueError(f"a file must be in a folder that can be written, but {path} is not: {error.strerror}") from None
+def announce_compilation() -> None:
+    """Say on standard error when this process has to compile; later ones find the result in a cache."""
+    tell_when_compiling(
+        lambda: progress_console.print("compiling numerical code: the first run only, some seconds a filter ...")
+    )
 
 
 def _plain(value):

@@ -76,6 +76,24 @@ def compiled(function: Callable) -> Callable:
     return numba.njit(cache=True, nogil=True, fastmath=set(FASTMATH), error_model="numpy")(function)
 
 
+def tell_when_compiling(tell: Callable[[], None]) -> None:
+    """Call `tell` at the first real compilation of this process; loading from the cache does not count."""
+    from numba.core import event
+
+    class Once(event.Listener):
+        waiting = True
+
+        def on_start(self, event):
+            if self.waiting:
+                Once.waiting = False
+                tell()
+
+        def on_end(self, event):
+            pass
+
+    event.register("numba:compile", Once())
+
+
 @functools.cache
 def source_fingerprint() -> str:
     """Hash of the sources that compiled functions may inline; numba's cache looks at the outermost only."""

@@ -1,0 +1,165 @@
+"""How good an estimate can be: the Riccati covariance and the posterior Cramer-Rao bound."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from filters.affine import AffineModel
+from filters.derivatives import jacobian
+from filters.model import StateSpaceModel
+from filters.rows import constants_form, constants_reader, number_places, padded
+from filters.truth import truth_steps_of
+from thruster_env.checks import at_least
+from thruster_env.compiled import compilable, compiled, function_fingerprint, is_interpreting
+from thruster_env.components import matrix_reader, vector_reader
+from thruster_env.streams import GROUP
+
+
+def riccati_covariances(model: AffineModel) -> tuple[np.ndarray, np.ndarray]:
+    """Steady-state covariances of the Kalman filter, predicted (before) and posterior (after the update).
+
+    P solves the discrete algebraic Riccati equation P = A P A' - A P C' (C P C' + R)^-1 C P A' + Q; the
+    posterior is P - P C' (C P C' + R)^-1 C P. Source: Anderson and Moore (1979), Optimal Filtering, ch. 4.
+    """
+    from scipy.linalg import solve_discrete_are
+
+    a, _, _, c, _ = model.matrices()
+    predicted = solve_discrete_are(a.T, c.T, model.process_noise_cov, model.measurement_noise_cov)
+    innovation_cov = c @ predicted @ c.T + model.measurement_noise_cov
+    gain = np.linalg.solve(innovation_cov, c @ predicted).T
+    posterior = predicted - gain @ innovation_cov @ gain.T
+    return (predicted + predicted.T) / 2, (posterior + posterior.T) / 2
+
+
+def posterior_bound(model: StateSpaceModel, inputs: np.ndarray, *, truths: int = 100, seed: int = 0) -> np.ndarray:
+    """Posterior Cramer-Rao bound on the covariance of any estimate, conditional on each input sequence.
+
+    With F = df/dx and H = dh/dx at truths drawn under the very input sequence, and P = J^-1,
+
+        J_0 = P_0^-1 + E[H' R^-1 H],  D11 = E[F' Q^-1 F],  D12 = -E[F'] Q^-1,
+        J_{k+1} = Q^-1 + E[H' R^-1 H] - D12' (J_k + D11)^-1 D12
+
+    written with P in place of J, so that P_0 may be singular. Expectations are over truths of one sequence;
+    Jacobians pooled over different inputs would give a bound that nothing attains and nothing obeys.
+
+    Args:
+        model: the model that draws the truth; Q must be positive definite.
+        inputs: (B, K, p), one sequence a row.
+        truths: truths drawn for each sequence.
+        seed: of the truths.
+
+    Returns:
+        Bound P_k for every sequence and step, (B, K + 1, n, n); index 0 is after the first measurement.
+
+    Raises:
+        ValueError: if Q is singular: then the recursion's Q^-1 does not exist.
+
+    Source: Tichavsky, Muravchik, Nehorai (1998), "Posterior Cramer-Rao bounds for discrete-time nonlinear
+    filtering", IEEE Trans. Signal Processing 46(5), eqs. 21 and 34-36.
+    """
+    truths = at_least("truths", truths, 2)
+    inputs = np.ascontiguousarray(inputs, dtype=np.float64)
+    if np.linalg.eigvalsh(model.process_noise_cov)[0] <= 0:
+        raise ValueError(f"the bound needs a positive definite Q, but got {model.process_noise_cov.tolist()}")
+    count, steps, _ = inputs.shape
+    n = model.n
+    q_inverse = np.linalg.inv(model.process_noise_cov)  # enters the recursion itself, as a weight
+    r_inverse = np.linalg.inv(model.measurement_noise_cov)
+    keys = np.random.default_rng(seed).integers(0, 2**32, size=(count, truths, 2)).astype(np.float64)
+    f_mean, d11, information = (np.zeros((count, steps + 1, n, n)) for _ in range(3))
+    gather = _gatherer(model, is_interpreting())
+    from filters.engine import spread
+
+    spread(
+        lambda first, last: gather(
+            keys, inputs, model.numbers, q_inverse, r_inverse, f_mean, d11, information, first, last
+        ),
+        count,
+    )
+    f_mean, d11, information = f_mean / truths, d11 / truths, information / truths
+
+    bound = np.empty((count, steps + 1, n, n))
+    prior = np.broadcast_to(model.prior_cov, (count, n, n))
+    bound[:, 0] = _less_information(prior, information[:, 0])
+    for k in range(steps):
+        d12 = -np.swapaxes(f_mean[:, k], -1, -2) @ q_inverse
+        kept = _less_information(bound[:, k], d11[:, k])  # (J_k + D11)^-1
+        j = q_inverse + information[:, k + 1] - np.swapaxes(d12, -1, -2) @ kept @ d12
+        bound[:, k + 1] = np.linalg.inv((j + np.swapaxes(j, -1, -2)) / 2)
+    return bound
+
+
+def _less_information(p: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """(P^-1 + information)^-1 for a P that may be singular: (I + P information)^-1 P."""
+    result = np.linalg.solve(np.eye(p.shape[-1]) + p @ information, p)
+    return (result + np.swapaxes(result, -1, -2)) / 2
+
+
+def _gatherer(model: StateSpaceModel, interpreting: bool):
+    for function in (model.transition, model.observe):
+        compilable(function)
+    return _build_gatherer(
+        truth_steps_of(model),
+        model.transition,
+        jacobian(model.transition, model.transition_jacobian, model.n, model.n, "u, c"),
+        jacobian(model.observe, model.observe_jacobian, model.m, model.n, "c"),
+        model.n,
+        model.m,
+        model.inputs,
+        constants_form(model.constants),
+        interpreting,
+    )
+
+
+@cache
+def _build_gatherer(steps, transition, transition_matrix, observation_matrix, n, m, inputs, form, interpreting):
+    begin, advance, _ = steps
+    state, control, constants = vector_reader(n), vector_reader(inputs), constants_reader(n, m, form)
+    substeps, room = number_places(n, m).substeps, padded(max(n, m), GROUP)
+    from filters.matrices import multiplier
+
+    times = multiplier(n, n, n)
+    identity = matrix_reader(n, n)
+    fingerprint = function_fingerprint(transition, transition_matrix, observation_matrix)
+
+    @compilable
+    def whole_step_matrix(x, u, numbers, c, eye):
+        f = identity(eye)
+        for _ in range(int(numbers[substeps])):
+            f = times(transition_matrix(x, u, c), f)
+            x = transition(x, u, c)
+        return f
+
+    @compilable
+    def add_weighted(out, a, weight, rows):
+        # out += a' weight a, for a tuple of rows a
+        for i in range(n):
+            for j in range(n):
+                for p in range(rows):
+                    for q in range(rows):
+                        out[i, j] += a[p][i] * weight[p, q] * a[q][j]
+
+    def gather(keys, inputs, numbers, q_inverse, r_inverse, f_mean, d11, information, first, last):
+        fingerprint  # noqa: B018 - part of the cache's key
+        x, u, draws, eye = np.zeros(n), np.zeros(inputs.shape[2]), np.zeros(room), np.eye(n).ravel()
+        c = constants(numbers)
+        for b in range(first, last):
+            for truth in range(keys.shape[1]):
+                key_0, key_1 = keys[b, truth, 0], keys[b, truth, 1]
+                begin(x, draws, key_0, key_1, numbers)
+                for k in range(f_mean.shape[1]):
+                    add_weighted(information[b, k], observation_matrix(state(x), c), r_inverse, m)
+                    if k == inputs.shape[1]:
+                        break
+                    for i in range(u.shape[0]):
+                        u[i] = inputs[b, k, i]
+                    f = whole_step_matrix(state(x), control(u), numbers, c, eye)
+                    add_weighted(d11[b, k], f, q_inverse, n)
+                    for i in range(n):
+                        for j in range(n):
+                            f_mean[b, k, i, j] += f[i][j]
+                    advance(x, u, draws, k + 1, key_0, key_1, numbers)
+
+    return compiled(gather)

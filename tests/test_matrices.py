@@ -1,0 +1,100 @@
+"""Written-out matrix functions against NumPy, for sizes 1 to 4."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from filters import matrices
+
+SIZES = [1, 2, 3, 4]
+
+
+def rows_of(matrix):
+    return tuple(tuple(row) for row in np.asarray(matrix).tolist())
+
+
+def random(*shape):
+    return np.random.default_rng(shape).normal(size=shape)
+
+
+def random_covariance(size):
+    root = random(size, size + 2)
+    return root @ root.T
+
+
+@pytest.mark.parametrize("rows", SIZES)
+@pytest.mark.parametrize("inner", SIZES)
+@pytest.mark.parametrize("columns", SIZES)
+def test_products_are_those_of_numpy(rows, inner, columns):
+    a, b = random(rows, inner), random(inner, columns) + 0.5
+    product = matrices.multiplier(rows, inner, columns)(rows_of(a), rows_of(b))
+    np.testing.assert_allclose(product, a @ b, rtol=1e-14, atol=1e-14)
+    transposed = matrices.transposed_multiplier(rows, inner, columns)(rows_of(a), rows_of(b.T))
+    np.testing.assert_allclose(transposed, a @ b, rtol=1e-14, atol=1e-14)
+    vector = matrices.vector_multiplier(rows, inner)(rows_of(a), tuple(b[:, 0]))
+    np.testing.assert_allclose(vector, a @ b[:, 0], rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_symmetric_sum_is_exactly_symmetric(size):
+    a, b = random(size, size), random(size, size) * 1e-7
+    total = np.array(matrices.symmetric_sum(size)(rows_of(a), rows_of(b)))
+    assert (total == total.T).all()
+    np.testing.assert_allclose(total, (a + b + (a + b).T) / 2, rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_identity_less_a_matrix(size):
+    a = random(size, size)
+    np.testing.assert_array_equal(matrices.identity_less(size)(rows_of(a)), np.eye(size) - a)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_a_mask_cuts_correlations_to_missing_channels_only(size):
+    r = random_covariance(size)
+    for missing in range(size):
+        z = np.zeros(size)
+        z[missing] = math.nan
+        expected = r.copy()
+        expected[missing, :] = expected[:, missing] = 0.0
+        expected[missing, missing] = r[missing, missing]
+        np.testing.assert_array_equal(matrices.masked(size)(rows_of(r), tuple(z)), expected)
+    np.testing.assert_array_equal(matrices.masked(size)(rows_of(r), (0.0,) * size), r)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_cholesky_factor_is_that_of_numpy(size):
+    a = random_covariance(size)
+    factor = matrices.cholesky_factor(size)(rows_of(a))
+    np.testing.assert_allclose(factor, np.linalg.cholesky(a), rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("eigenvalue", [0.0, -1.0, math.nan])
+def test_a_matrix_that_is_not_positive_definite_has_a_factor_with_nan(size, eigenvalue):
+    a = np.diag([1.0] * (size - 1) + [eigenvalue])
+    assert np.isnan(matrices.cholesky_factor(size)(rows_of(a))).any()
+
+
+@pytest.mark.parametrize("rows", SIZES)
+@pytest.mark.parametrize("size", SIZES)
+def test_the_row_solver_divides_by_the_factored_matrix_from_the_right(rows, size):
+    a, b = random_covariance(size), random(rows, size)
+    solved = matrices.row_solver(rows, size)(rows_of(b), rows_of(np.linalg.cholesky(a)))
+    np.testing.assert_allclose(solved, b @ np.linalg.inv(a), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_likelihood_is_that_of_scipy_over_the_channels_that_are_there(size):
+    cov, value = random_covariance(size), random(size)
+    for missing in [*range(size), None]:
+        z, v = np.zeros(size), value.copy()
+        here = np.array([i != missing for i in range(size)])
+        z[~here], v[~here] = math.nan, 0.0
+        s = np.array(matrices.masked(size)(rows_of(cov), tuple(z)))
+        found = matrices.innovation_likelihood(size)(tuple(v), rows_of(np.linalg.cholesky(s)), tuple(z))
+        part = cov[np.ix_(here, here)]
+        expected = multivariate_normal.logpdf(v[here], np.zeros(len(part)), part) if here.any() else 0.0
+        assert found == pytest.approx(expected, rel=1e-11, abs=1e-12)

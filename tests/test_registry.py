@@ -1,0 +1,99 @@
+"""Filters by name, their numbers, and the file that carries a tuned filter."""
+
+import json
+
+import pytest
+
+from filters import (
+    FILTERS,
+    EnsembleKalmanFilter,
+    ExtendedKalmanFilter,
+    KalmanFilter,
+    make_filter,
+    thruster_model,
+)
+from filters.registry import filter_class, read_tuned_file, tunable_numbers
+
+TUNED = {
+    "format": "thruster-env tuned filter",
+    "version": 1,
+    "filter": {
+        "name": "enkf",
+        "numbers": {"ensemble_size": 20},
+        "model": {"process_noise_cov": [1, 4e-4]},
+    },
+}
+
+
+def changed(**entries):
+    return {**TUNED, "filter": {**TUNED["filter"], **entries}}
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(content):
+        path = tmp_path / "tuned.json"
+        path.write_text(content if isinstance(content, str) else json.dumps(content))
+        return path
+
+    return write
+
+
+def test_filters_go_by_their_names():
+    known = {"kf": KalmanFilter, "ekf": ExtendedKalmanFilter, "enkf": EnsembleKalmanFilter}
+    assert known.items() <= FILTERS.items()
+    assert all(filter_class(name) is kind and kind.name == name for name, kind in FILTERS.items())
+
+
+def test_a_filter_is_made_by_name_with_its_own_numbers():
+    assert [tunable_numbers(name) for name in ("kf", "ekf", "enkf")] == [(), (), ("ensemble_size",)]
+    made = make_filter("enkf", thruster_model(), ensemble_size=7)
+    assert isinstance(made, EnsembleKalmanFilter)
+    assert made.ensemble_size == made.size == 7
+
+
+def test_an_unknown_filter_is_refused_with_the_known_names():
+    with pytest.raises(ValueError, match=r"filter must be one of kf, ekf, enkf.* but got 'no filter'"):
+        make_filter("no filter", thruster_model())
+
+
+@pytest.mark.parametrize(("name", "number"), [("enkf", "size"), ("ekf", "ensemble_size")])
+def test_an_unknown_number_is_refused(name, number):
+    with pytest.raises(ValueError, match=f"a number of filter '{name}' must be one of .*but got '{number}'"):
+        make_filter(name, thruster_model(), **{number: 3})
+
+
+def test_a_tuned_file_is_read_as_it_was_written(write):
+    assert read_tuned_file(write(TUNED)) == TUNED
+    assert read_tuned_file(str(write(TUNED))) == TUNED
+
+
+@pytest.mark.parametrize(
+    ("content", "rule"),
+    [
+        (json.dumps(TUNED)[:60], "whole JSON"),
+        ("", "whole JSON"),
+        ([TUNED], "format"),
+        ({**TUNED, "format": "something else"}, "format"),
+        ({**TUNED, "version": 2}, "version 1, but got 2"),
+        ({key: TUNED[key] for key in ("format", "filter")}, "version 1, but got None"),
+        ({key: TUNED[key] for key in ("format", "version")}, "name, numbers and model"),
+        ({**TUNED, "filter": {"name": "ekf"}}, "name, numbers and model"),
+        (changed(name="no filter"), "one of kf, ekf, enkf.* but got 'no filter'"),
+        (changed(name=["enkf"]), "one of kf, ekf, enkf.* but"),
+        (changed(numbers=3), "numbers"),
+        (changed(numbers=[20]), "numbers"),
+        (changed(model=None), "model"),
+    ],
+)
+def test_a_damaged_tuned_file_is_refused_in_one_line(write, content, rule):
+    with pytest.raises(ValueError, match=rule) as error:
+        read_tuned_file(write(content))
+    assert "\n" not in str(error.value)
+
+
+def test_a_tuned_file_that_is_not_there_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="must be readable.*nowhere.json"):
+        read_tuned_file(tmp_path / "nowhere.json")
+    with pytest.raises(ValueError, match="must be readable"):
+        read_tuned_file(tmp_path)

@@ -1,0 +1,48 @@
+"""`thruster evaluate`: a filter, tuned or not, on a scenario."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
+from thruster_cli.tune import Tuning, choice_table, comparison_table
+from tuning.scenarios import find_scenario
+from tuning.space import untuned_choice
+from tuning.study import HELD_OUT_SEEDS, prove
+from tuning.tuned import read_tuned, summary
+
+
+def command(
+    tuned: Annotated[Path | None, typer.Option(help="Tuned file; it names filter, numbers and scenario.")] = None,
+    filter_name: Annotated[
+        str | None, typer.Option("--filter", help="Without a tuned file: kf, ekf, enkf.")
+    ] = None,
+    scenario: Annotated[str | None, typer.Option(help="Another scenario than the tuned file's.")] = None,
+    seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,
+    seed: SeedOption = 0,
+    json: JsonOption = None,
+) -> None:
+    """Run a filter on held-out seeds of a scenario, beside the untuned filter and the one with the true Q, R."""
+    if (tuned is None) == (filter_name is None):
+        raise ValueError("give either --tuned FILE or --filter NAME")
+    if tuned is not None:
+        choice, default, _ = read_tuned(tuned)
+        chosen = default if scenario is None else find_scenario(scenario)
+    else:
+        chosen = find_scenario(scenario or "nominal")
+        choice = untuned_choice(filter_name, chosen)
+    announce_compilation()
+    with progress_console.status(f"{choice.name} on {seeds} seeds of {chosen.name} ..."):
+        proof = prove(choice, chosen, seed, seeds)
+    evaluated = Tuning("", chosen, None, proof, tuned)
+    data = {
+        "filter": choice._asdict(),
+        "scenario": chosen.name,
+        "seeds": [proof.seeds.start, proof.seeds.stop],
+        "bound": proof.bound,
+        **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
+    }
+    emit([choice_table(choice, chosen), comparison_table(evaluated)], data, json)

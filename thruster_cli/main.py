@@ -1,0 +1,43 @@
+"""The `thruster` command."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from thruster_cli import evaluate, inspect, reproduce, simulate, tune
+
+app = typer.Typer(
+    help="A ship's bow thruster, the filters that estimate its hidden state, and the tuning that makes them good.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+)
+app.command("inspect")(inspect.command)
+app.command("simulate")(simulate.command)
+app.command("tune")(tune.command)
+app.command("evaluate")(evaluate.command)
+app.command("reproduce")(reproduce.command)
+
+
+@app.callback()
+def _callback() -> None:
+    pass
+
+
+def main() -> None:
+    """Run the command line; a user's mistake is one line and exit code 2, never a traceback."""
+    try:
+        app()
+    except ValueError as error:
+        print(f"thruster: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("thruster: interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""`thruster simulate`: truth, inputs and measurements as a table in a file."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit
+from thruster_env.checks import at_least, finite, positive
+from thruster_env.files import write_whole
+from thruster_env.plant import (
+    DEFAULT_DT,
+    DEFAULT_MEASUREMENT_NOISE,
+    DEFAULT_PROCESS_NOISE,
+    make_plant,
+    simulate,
+)
+from thruster_env.streams import episode_keys
+from tuning.scenarios import held_levels
+
+COLUMNS = ("time_s", "voltage_V", "omega_m_rad_per_s", "U_a_m_per_s", "thrust_N", "measured_thrust_N")
+
+
+def command(
+    out: Annotated[Path, typer.Option(help="File to write: .csv with units in the header, or .npz.")],
+    preset: Annotated[
+        str, typer.Option(help="tunnel, tunnel_physical, open_bladed, open_bladed_corrected.")
+    ] = "tunnel",
+    steps: Annotated[int, typer.Option(help="Number of steps.")] = 500,
+    dt: Annotated[float, typer.Option(help="Sample time [s].")] = DEFAULT_DT,
+    voltage: Annotated[float | None, typer.Option(help="Constant voltage [V]; else random levels.")] = None,
+    amplitude: Annotated[float, typer.Option(help="Random levels lie within plus and minus this [V] ...")] = 12.0,
+    hold: Annotated[int, typer.Option(help="... and are held for so many steps.")] = 25,
+    process_noise: Annotated[
+        tuple[float, float], typer.Option(help="Variances a step of omega_m and U_a.")
+    ] = DEFAULT_PROCESS_NOISE,
+    measurement_noise: Annotated[
+        float, typer.Option(help="Variance of the thrust [N^2].")
+    ] = DEFAULT_MEASUREMENT_NOISE,
+    seed: SeedOption = 0,
+    json: JsonOption = None,
+) -> None:
+    """Simulate a thruster and write time, voltage, true state, true thrust and measured thrust to a file.
+
+    Row k holds the state at time k dt and the voltage that acts from then on; the last row has none. The
+    numbers are those of BowThruster-v0 after reset(seed=SEED) under the same voltages.
+    """
+    if out.suffix not in (".csv", ".npz"):
+        raise ValueError(f"--out must end in .csv or .npz, but got {str(out)!r}")
+    steps = at_least("steps", steps, 1)
+    plant = make_plant(preset, dt, process_noise_cov=process_noise, measurement_noise_cov=measurement_noise)
+    keys = episode_keys([seed])
+    if voltage is not None:
+        voltages = np.full((1, steps), np.clip(finite("voltage", voltage), -plant.max_voltage, plant.max_voltage))
+    else:
+        amplitude = positive("amplitude", amplitude, zero_allowed=True)
+        voltages = held_levels(keys, min(amplitude, plant.max_voltage), at_least("hold", hold, 1), steps)
+    announce_compilation()
+    run = simulate(plant, keys, voltages)
+    values = np.column_stack(
+        [
+            plant.dt * np.arange(steps + 1),
+            np.append(voltages[0], np.nan),
+            run.states[0],
+            run.thrusts[0],
+            run.measurements[0],
+        ]
+    )
+    if out.suffix == ".csv":
+        text = io.StringIO()
+        np.savetxt(text, values, delimiter=",", header=",".join(COLUMNS), comments="", fmt="%.10g")
+        write_whole(out, text.getvalue())
+    else:
+        columns = dict(zip(COLUMNS, values.T, strict=True))
+        write_whole(out, lambda stream: np.savez(stream, **columns))
+    data = {"file": str(out), "rows": steps + 1, "columns": list(COLUMNS), "seed": seed, "preset": preset}
+    emit([f"{steps + 1} rows of {', '.join(COLUMNS)} in {out}"], data, json)

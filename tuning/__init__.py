@@ -1,0 +1,1 @@
+"""Scenarios, evaluation and Optuna studies of a filter's free numbers, proved on data the study never saw."""

@@ -1,0 +1,108 @@
+"""Pictures of studies and estimates, each saved as one PNG file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from optuna.trial import FrozenTrial, TrialState
+
+from filters.engine import run
+from filters.filter import Filter
+from thruster_env.files import write_whole
+from tuning.scenarios import Data
+from tuning.study import Comparison
+
+STATES = (("motor speed $\\omega_m$", "rad/s"), ("flow velocity $U_a$", "m/s"))
+TRUTH, ESTIMATE, BOUND = "#222222", "#0b6fa4", "#b5541c"
+COLOURS = {"untuned": "#9aa5ad", "tuned": ESTIMATE, "true Q, R": "#5a8f3c"}
+
+
+def _new(rows: int, columns: int, size: tuple[float, float], **options):
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, layout="constrained", dpi=120)
+    axes = figure.subplots(rows, columns, squeeze=False, **options)
+    for axis in axes.flat:
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(alpha=0.25, linewidth=0.6)
+    return figure, axes
+
+
+def _save(figure, path: Path) -> Path:
+    write_whole(path, lambda stream: figure.savefig(stream, format="png"))
+    return path
+
+
+def estimates_figure(path: Path, filters: Mapping[str, Filter], data: Data, run_index: int, dt: float) -> Path:
+    """Truth and estimate of every state over time, and the error in its 95 % band; one column a filter."""
+    figure, axes = _new(4, len(filters), (5.4 * len(filters), 8.0), sharex=True, height_ratios=(2, 1.3, 2, 1.3))
+    one = slice(run_index, run_index + 1)
+    time = dt * np.arange(data.states.shape[1])
+    for column, (title, filter_) in enumerate(filters.items()):
+        estimates = run(filter_, data.filter_keys[one], data.inputs[one], data.measurements[one])
+        for i, (label, unit) in enumerate(STATES):
+            above, below = axes[2 * i, column], axes[2 * i + 1, column]
+            truth, mean = data.states[run_index, :, i], estimates.means[0, :, i]
+            band = 1.96 * np.sqrt(estimates.covs[0, :, i, i])
+            above.fill_between(time, mean - band, mean + band, color=ESTIMATE, alpha=0.3, linewidth=0)
+            above.plot(time, truth, color=TRUTH, linewidth=1.6, label="truth")
+            above.plot(time, mean, color=ESTIMATE, linewidth=1.0, label="estimate")
+            below.fill_between(
+                time, -band, band, color=ESTIMATE, alpha=0.3, linewidth=0, label="95 % band of the filter"
+            )
+            below.plot(time, mean - truth, color=BOUND, linewidth=0.9, label="error of the estimate")
+            if column == 0:
+                above.set_ylabel(f"{label}\n[{unit}]")
+                below.set_ylabel(f"error\n[{unit}]")
+        axes[-1, column].set_xlabel("time [s]")
+        axes[0, column].set_title(title, fontsize=11)
+    figure.align_ylabels(axes[:, 0])
+    handles, labels = (
+        sum(parts, []) for parts in zip(*(a.get_legend_handles_labels() for a in axes[:2, 0]), strict=True)
+    )
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    return _save(figure, path)
+
+
+def history_figure(path: Path, trials: list[FrozenTrial], title: str) -> Path:
+    """Score of every trial of a study and the best so far; the first trial is the untuned filter."""
+    figure, axes = _new(1, 1, (6.4, 4.0))
+    axis = axes[0, 0]
+    done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    numbers, values = [trial.number + 1 for trial in done], [trial.value for trial in done]
+    axis.plot(numbers[1:], values[1:], "o", color=COLOURS["untuned"], markersize=4, label="trial")
+    axis.plot(numbers[:1], values[:1], "s", color=BOUND, markersize=7, label="untuned (first trial)")
+    axis.step(numbers, np.minimum.accumulate(values), where="post", color=ESTIMATE, label="best so far")
+    low = min(values)
+    top = max(1.3 * low, 1.15 * values[0])
+    axis.set_ylim(0.9 * low, top)
+    beyond = sum(value > top for value in values)
+    axis.set_xlabel(f"trial ({beyond} of {len(values)} lie above the axis)" if beyond else "trial")
+    axis.set_ylabel("score: mean RMSE over bound [-]")
+    axis.set_title(title, fontsize=11)
+    axis.legend(frameon=False)
+    return _save(figure, path)
+
+
+def comparison_figure(path: Path, proof: Comparison, title: str) -> Path:
+    """RMSE of the untuned, tuned and true filter on held-out seeds with 95 % intervals, and the bound."""
+    figure, axes = _new(1, 2, (8.0, 4.0))
+    names = dict(zip(COLOURS, (proof.untuned, proof.tuned, proof.true), strict=True))
+    for column, (label, unit) in enumerate(STATES):
+        axis = axes[0, column]
+        for place, (name, evaluation) in enumerate(names.items()):
+            rmse = evaluation.rmse[column]
+            whiskers = [[rmse.value - rmse.low], [rmse.high - rmse.value]]
+            axis.bar(place, rmse.value, 0.62, yerr=whiskers, color=COLOURS[name], capsize=4)
+            axis.annotate(f"{rmse.value:.3g}", (place, rmse.high), (0, 4), textcoords="offset points", ha="center")
+        axis.axhline(proof.bound[column], color=BOUND, linestyle="--", label="posterior Cramér-Rao bound")
+        axis.set_xticks(range(len(names)), list(names))
+        axis.set_ylabel(f"RMSE of {label} [{unit}]")
+        axis.margins(y=0.15)
+        axis.grid(axis="x", visible=False)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", frameon=False)
+    figure.suptitle(title, fontsize=11)
+    return _save(figure, path)

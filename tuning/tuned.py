@@ -1,0 +1,84 @@
+"""The tuned file: one JSON file that carries a filter's numbers, where they come from and what they achieve."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+from pathlib import Path
+
+from filters.registry import FILE_FORMAT, FILE_VERSION, read_tuned_file
+from thruster_env.checks import at_least
+from thruster_env.files import write_whole
+from tuning.evaluate import Evaluation
+from tuning.scenarios import Scenario, find_scenario
+from tuning.space import Choice
+from tuning.study import Comparison, StudyResult
+
+PACKAGES = ("thruster-env", "optuna", "numpy", "numba", "gymnasium")
+
+
+def write_tuned(
+    path: str | Path, scenario: Scenario, seed: int, result: StudyResult, proof: Comparison, study_name: str
+) -> None:
+    """Write a tuned file whole or not at all.
+
+    Raises:
+        ValueError: if the folder cannot be written.
+    """
+    choice = result.choice
+    content = {
+        "format": FILE_FORMAT,
+        "version": FILE_VERSION,
+        "made_with": {name: _version(name) for name in PACKAGES},
+        "filter": {
+            "name": choice.name,
+            "numbers": choice.numbers,
+            "model": {**choice.model, "parameter_factors": dict(scenario.parameter_factors)},
+        },
+        "scenario": scenario.name,
+        "study": {
+            "name": study_name,
+            "seed": seed,
+            "trials": len(result.trials),
+            "best_training_score": result.best_value,
+        },
+        "held_out": {
+            "seeds": [proof.seeds.start, proof.seeds.stop],
+            "bound": proof.bound.tolist(),
+            **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
+        },
+    }
+    write_whole(Path(path), json.dumps(content, indent=2) + "\n")
+
+
+def read_tuned(path: str | Path) -> tuple[Choice, Scenario, int]:
+    """Choice, scenario and study seed of a tuned file; ValueError that says what is wrong with a bad one."""
+    content = read_tuned_file(path)
+    entry = content["filter"]
+    try:
+        scenario, seed = find_scenario(content["scenario"]), at_least("seed", content["study"]["seed"], 0)
+        model = {key: entry["model"][key] for key in ("process_noise_cov", "measurement_noise_cov")}
+        model["process_noise_cov"] = tuple(model["process_noise_cov"])
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"a tuned file must have all its entries, but {path} lacks or bends {error}") from None
+    return Choice(entry["name"], model, dict(entry["numbers"])), scenario, seed
+
+
+def summary(evaluation: Evaluation) -> dict:
+    """The figures of an evaluation as plain numbers for JSON."""
+    return {
+        "rmse": [list(value) for value in evaluation.rmse],
+        "start_up_rmse": evaluation.start_up_rmse.tolist(),
+        "score": list(evaluation.score),
+        "nees": list(evaluation.nees),
+        "nis": list(evaluation.nis),
+        "log_likelihood": evaluation.log_likelihood,
+        "divergences": evaluation.divergences,
+    }
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
