@@ -8,12 +8,14 @@ import numpy as np
 
 from filters.affine import AffineModel
 from filters.derivatives import jacobian
+from filters.engine import spread
+from filters.matrices import multiplier, quadratic_form
 from filters.model import StateSpaceModel
 from filters.rows import constants_form, constants_reader, number_places, padded
 from filters.truth import truth_steps_of
 from thruster_env.checks import at_least
 from thruster_env.compiled import compilable, compiled, function_fingerprint, is_interpreting
-from thruster_env.components import matrix_reader, vector_reader
+from thruster_env.components import matrix_reader, vector_reader, written_out
 from thruster_env.streams import GROUP
 
 
@@ -70,11 +72,18 @@ def posterior_bound(model: StateSpaceModel, inputs: np.ndarray, *, truths: int =
     keys = np.random.default_rng(seed).integers(0, 2**32, size=(count, truths, 2)).astype(np.float64)
     f_mean, d11, information = (np.zeros((count, steps + 1, n, n)) for _ in range(3))
     gather = _gatherer(model, is_interpreting())
-    from filters.engine import spread
-
     spread(
         lambda first, last: gather(
-            keys, inputs, model.numbers, q_inverse, r_inverse, f_mean, d11, information, first, last
+            keys,
+            inputs,
+            model.numbers,
+            q_inverse.ravel(),
+            r_inverse.ravel(),
+            f_mean,
+            d11,
+            information,
+            first,
+            last,
         ),
         count,
     )
@@ -118,10 +127,15 @@ def _build_gatherer(steps, transition, transition_matrix, observation_matrix, n,
     begin, advance, _ = steps
     state, control, constants = vector_reader(n), vector_reader(inputs), constants_reader(n, m, form)
     substeps, room = number_places(n, m).substeps, padded(max(n, m), GROUP)
-    from filters.matrices import multiplier
-
-    times = multiplier(n, n, n)
-    identity = matrix_reader(n, n)
+    times, identity = multiplier(n, n, n), matrix_reader(n, n)
+    read_weight_n, read_weight_m = matrix_reader(n, n), matrix_reader(m, m)
+    quadratic_n, quadratic_m = quadratic_form(n, n), quadratic_form(m, n)
+    accumulate = written_out(
+        "accumulate",
+        "out, b, k, a",
+        *(f"out[b, k, {i}, {j}] += a[{i}][{j}]" for i in range(n) for j in range(n)),
+        "None",
+    )
     fingerprint = function_fingerprint(transition, transition_matrix, observation_matrix)
 
     @compilable
@@ -132,34 +146,24 @@ def _build_gatherer(steps, transition, transition_matrix, observation_matrix, n,
             x = transition(x, u, c)
         return f
 
-    @compilable
-    def add_weighted(out, a, weight, rows):
-        # out += a' weight a, for a tuple of rows a
-        for i in range(n):
-            for j in range(n):
-                for p in range(rows):
-                    for q in range(rows):
-                        out[i, j] += a[p][i] * weight[p, q] * a[q][j]
-
     def gather(keys, inputs, numbers, q_inverse, r_inverse, f_mean, d11, information, first, last):
         fingerprint  # noqa: B018 - part of the cache's key
         x, u, draws, eye = np.zeros(n), np.zeros(inputs.shape[2]), np.zeros(room), np.eye(n).ravel()
         c = constants(numbers)
+        weight_q, weight_r = read_weight_n(q_inverse), read_weight_m(r_inverse)
         for b in range(first, last):
             for truth in range(keys.shape[1]):
                 key_0, key_1 = keys[b, truth, 0], keys[b, truth, 1]
                 begin(x, draws, key_0, key_1, numbers)
                 for k in range(f_mean.shape[1]):
-                    add_weighted(information[b, k], observation_matrix(state(x), c), r_inverse, m)
+                    accumulate(information, b, k, quadratic_m(observation_matrix(state(x), c), weight_r))
                     if k == inputs.shape[1]:
                         break
                     for i in range(u.shape[0]):
                         u[i] = inputs[b, k, i]
                     f = whole_step_matrix(state(x), control(u), numbers, c, eye)
-                    add_weighted(d11[b, k], f, q_inverse, n)
-                    for i in range(n):
-                        for j in range(n):
-                            f_mean[b, k, i, j] += f[i][j]
+                    accumulate(d11, b, k, quadratic_n(f, weight_q))
+                    accumulate(f_mean, b, k, f)
                     advance(x, u, draws, k + 1, key_0, key_1, numbers)
 
     return compiled(gather)

@@ -213,8 +213,6 @@ class Session:
         row, places = self._row, self._places
         key = int(row[places.key_0]), int(row[places.key_1])
         members = self._table[: len(self.mean), : self._size].copy()
-        if not self._size:
-            members = np.empty((len(self.mean), 0))
         return Belief(self.mean.copy(), self.cov.copy(), members, key, int(row[places.step]), self.divergences)
 
     def innovation_copy(self) -> Innovation:

@@ -137,7 +137,7 @@ def extended_kernels(transition, transition_jacobian, observe, observe_jacobian,
         mean, c = read_mean(row), constants(numbers)
         correct(row, measured(z), observe(mean, c), observation_matrix(mean, c), numbers)
 
-    return Kernels(n, m, 0, 0, gaussian_start(n, m), predict, update)
+    return Kernels(n, m, n, 0, gaussian_start(n, m), predict, update)
 
 
 def kernels_of(model: StateSpaceModel) -> Kernels:

@@ -38,13 +38,14 @@ class Innovation(NamedTuple):
 class Kernels(NamedTuple):
     """A kind of filter for one shape of model, as plain functions on its memory.
 
-    `row` and `numbers` are laid out by `filters.rows`; `table` is (table_rows, padded size), its first n rows
-    the members; `draws` is a vector with room for `draws_per_member` normals a member.
+    `row` and `numbers` are laid out by `filters.rows`; `table` is (table_rows, padded size), its first n rows the
+    members, without columns for filters without an ensemble; `draws` has room for `draws_per_member` normals a
+    member.
     """
 
     n: int
     m: int
-    table_rows: int  # 0 for filters without an ensemble
+    table_rows: int
     draws_per_member: int
     start: Callable  # start(memory, numbers, size): belief = prior; memory = (row, table, draws)
     predict: Callable  # predict(memory, u, numbers, size)

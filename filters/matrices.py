@@ -44,6 +44,16 @@ def vector_multiplier(rows: int, inner: int) -> Callable:
 
 
 @cache
+def quadratic_form(rows: int, columns: int) -> Callable:
+    """Return `form(a, w)`: a' w a for a of shape (rows, columns) and w of shape (rows, rows)."""
+
+    def entry(i, j):
+        return " + ".join(f"a[{p}][{i}] * w[{p}][{q}] * a[{q}][{j}]" for p in range(rows) for q in range(rows))
+
+    return written_out("form", "a, w", matrix_of(columns, columns, entry))
+
+
+@cache
 def symmetric_sum(size: int) -> Callable:
     """Return `add(a, b)`: the symmetric part of a + b, exactly symmetric."""
     return written_out(

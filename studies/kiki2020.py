@@ -1,8 +1,8 @@
-"""RMSE of Kalman filter and ensemble Kalman filter on the linear bow thruster, as printed by Kiki (2020).
+"""RMSE of KF and EnKF on the linear bow thruster, as printed by Kiki (2020).
 
-Source: M. Kiki (2020), final project KM184801, Department of Mathematics, Institut Teknologi Sepuluh Nopember,
-Surabaya (in Indonesian). One run of 100 steps of 0.01 s, it seems; x_0, P_0, V_s, U_0 and the ensemble size
-are not printed.
+Source: M. Kiki (2020), final project KM184801, Department of Mathematics, Institut Teknologi Sepuluh
+Nopember, Surabaya (in Indonesian). One run of 100 steps of 0.01 s, it seems; x_0, P_0, V_s, U_0 and the
+ensemble size are not printed.
 """
 
 from studies.published import PublishedRMSE, PublishedTable
@@ -31,7 +31,7 @@ TABLE = PublishedTable(
         ("open-bladed", 1.0): PublishedRMSE(5.7886, 0.9631),
     },
     remarks=(
-        "Equation 4.50 as printed starts every member again from the mean, so the ensemble forgets its spread.",
+        "Equation 4.50 as printed starts every member again from the mean: the ensemble forgets its spread.",
         "Section 4.6 prints R where R^-1 belongs.",
     ),
 )

@@ -1,9 +1,10 @@
-"""RMSE of Kalman filter and ensemble Kalman filter on the linear bow thruster, as printed by Nurhadi et al. (2022).
+"""RMSE of KF and EnKF on the linear bow thruster, as printed by Nurhadi et al. (2022).
 
 Source: H. Nurhadi, M. Kiki, D. Adzkiya, T. Herlambang (2022), "Estimation of water momentum and propeller
-velocity in bow thruster model of autonomous surface vehicle using modified Kalman filter", International Journal
-of Electrical and Computer Engineering 12(6), 5988-5997, doi:10.11591/ijece.v12i6.pp5988-5997. One run of 100
-steps of 0.01 s, it seems; x_0, P_0, V_s, U_0 and the ensemble size are not printed.
+velocity in bow thruster model of autonomous surface vehicle using modified Kalman filter", International
+Journal of Electrical and Computer Engineering (IJECE) 12(6), 5988-5997,
+doi:10.11591/ijece.v12i6.pp5988-5997. One run of 100 steps of 0.01 s, it seems; x_0, P_0, V_s, U_0 and the
+ensemble size are not printed.
 """
 
 from studies.published import PublishedRMSE, PublishedTable
@@ -33,7 +34,8 @@ TABLE = PublishedTable(
     },
     remarks=(
         "P_xz and P_z as printed use the perturbed measurements in place of the predicted ones.",
-        "The abstract's EnKF values 0.7920 and 0.1352 stand in the table of Kiki (2020), not in this paper's; its KF "
-        "values 1.9957 and 2.0609 are picked there from two different rows (q = 0.8 and q = 0.6): they are no run.",
+        "The abstract's EnKF values 0.7920 and 0.1352 stand in the table of Kiki (2020), not in this "
+        "paper's. Its KF values 1.9957 and 2.0609 come from there too, from two different rows (q = 0.8 and "
+        "q = 0.6): they are no run.",
     ),
 )

@@ -90,9 +90,7 @@ def test_thrust_and_torque_are_the_trigonometric_ones(p):
 
 
 @every_case
-@pytest.mark.parametrize(
-    "x", [(100.0, 0.0), (-100.0, 0.0), (0.0, 2.0), (0.0, -2.0), (100.0, -2.0), (-100.0, 2.0)]
-)
+@pytest.mark.parametrize("x", [(100.0, 0.0), (-100.0, 0.0), (0.0, 2.0), (0.0, -2.0), (100.0, -2.0), (-100.0, 2.0)])
 def test_forces_are_right_on_the_axes_and_against_the_flow(p, x):
     expected = textbook_thrust_and_torque(*x, p)
     scale = np.abs(expected).max()

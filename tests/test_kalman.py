@@ -1,4 +1,4 @@
-"""The Kalman filter against a textbook one, FilterPy, Riccati's equation and the operating point it is for."""
+"""The Kalman filter against a textbook one, FilterPy, Riccati's equation and its operating point."""
 
 import math
 
@@ -144,15 +144,15 @@ def test_its_steady_covariance_solves_riccati_s_equation():
 
 def test_its_errors_are_as_large_as_it_says():
     model, _ = random_affine(seed=4)
-    inputs = np.zeros((200, 30, 2))
-    drawn = truth.simulate(model, episode_keys(range(200)), inputs)
-    estimates = run(KalmanFilter(model=model), np.zeros((200, 2)), inputs, drawn.measurements)
+    inputs = np.zeros((100, 20, 2))
+    drawn = truth.simulate(model, episode_keys(range(100)), inputs)
+    estimates = run(KalmanFilter(model=model), np.zeros((100, 2)), inputs, drawn.measurements)
     errors = drawn.states[:, -1] - estimates.means[:, -1]
     nees = np.einsum("bi,bij,bj->b", errors, np.linalg.inv(estimates.covs[:, -1]), errors)
-    assert abs(nees.mean() - 3.0) < 3 * nees.std() / math.sqrt(200)  # 3 states, three standard errors
+    assert abs(nees.mean() - 3.0) < 3 * nees.std() / math.sqrt(100)  # 3 states, three standard errors
     v = estimates.innovations[:, -1]
     nis = np.einsum("bi,bij,bj->b", v, np.linalg.inv(estimates.innovation_covs[:, -1]), v)
-    assert abs(nis.mean() - 2.0) < 3 * nis.std() / math.sqrt(200)
+    assert abs(nis.mean() - 2.0) < 3 * nis.std() / math.sqrt(100)
 
 
 @pytest.mark.parametrize("voltage", [None, -6.0])

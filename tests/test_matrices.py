@@ -39,7 +39,7 @@ def test_products_are_those_of_numpy(rows, inner, columns):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_a_symmetric_sum_is_exactly_symmetric(size):
-    a, b = random(size, size), random(size, size) * 1e-7
+    a, b = random(size, size), random(size, size) + 0.1
     total = np.array(matrices.symmetric_sum(size)(rows_of(a), rows_of(b)))
     assert (total == total.T).all()
     np.testing.assert_allclose(total, (a + b + (a + b).T) / 2, rtol=1e-14, atol=1e-14)

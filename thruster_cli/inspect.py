@@ -56,7 +56,7 @@ def command(
         "voltage": voltage,
         "ambient_velocity": ambient_velocity,
         "dt": dt,
-        "steady_state": point,
+        "steady_state": dict(zip(("omega_m [rad/s]", "U_a [m/s]", "thrust [N]"), point, strict=True)),
         "range": spread,
         "A": a,
         "B": b,

@@ -1,0 +1,71 @@
+"""`python -m benchmarks`: speed beside other packages, in one table."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from typing import Annotated
+
+import typer
+
+from benchmarks.rows import COLUMNS, machine, machine_lines
+from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
+
+CAPTION = (
+    "A step's time counts env, filter and fresh info arrays; FilterPy's, one predict and update and no env. "
+    "evaluate: nanoseconds a member and step, 500 steps, on all cores. Times are the best of many rounds, "
+    "ratios the median over rounds that measure both in turn. Goals are upper limits; (in brackets) for later."
+)
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command()
+def command(
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Few rounds: shows that all runs; the times are rough.")
+    ] = False,
+    seed: SeedOption = 0,
+    json: JsonOption = None,
+) -> None:
+    """Measure the speed of env, filters and evaluation beside Gymnasium's and FilterPy's, in about a minute.
+
+    All is measured in this run, ours and the peer in turns, on an otherwise idle machine if the times are to
+    mean much. A goal that is missed prints "no" and fails nothing: times are the machine's as well.
+    """
+    if importlib.util.find_spec("filterpy") is None:
+        raise ValueError(
+            "FilterPy must be installed to compare with: `make bench` does it, or pip install -e '.[peers]'"
+        )
+    from benchmarks import batches, processes, steps  # after the check: they import FilterPy
+
+    announce_compilation()
+    rows = []
+    with progress_console.status("measuring ...") as status:
+        for part in (steps, batches, processes):
+            for row in part.rows(seed, quick):
+                rows.append(row)
+                status.update(f"measured: {row.what} ...")
+    facts = machine()
+    shown = table("Speed, side by side", COLUMNS, [row.cells() for row in rows], caption=CAPTION)
+    emit(
+        [shown, *machine_lines(facts)],
+        {"rows": [row.as_json() for row in rows], "machine": facts, "seed": seed, "quick": quick},
+        json,
+    )
+
+
+def main() -> None:
+    """Run the command; a user's mistake is one line and exit code 2, never a traceback."""
+    try:
+        app(prog_name="python -m benchmarks")
+    except ValueError as error:
+        print(f"benchmarks: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("benchmarks: interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

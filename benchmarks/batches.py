@@ -1,0 +1,116 @@
+"""Whole evaluations on all cores, per member and step, beside the arithmetic that nobody can do without."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cache
+from time import perf_counter
+
+import numpy as np
+
+from benchmarks.rows import Row
+from benchmarks.timing import Measure, alone, side_by_side
+from filters import engine
+from thruster_env.compiled import compiled, function_fingerprint
+from thruster_env.components import column_reader, column_writer, vector_reader
+from thruster_env.dynamics import Constants, substep
+from thruster_env.plant import Plant
+from thruster_env.streams import FILTER_PROCESS, fill_normals
+from tuning.evaluate import evaluate
+from tuning.scenarios import find_scenario, training_seeds
+from tuning.space import Choice, true_choice
+
+SEEDS, ENSEMBLE_SIZE = 64, 50
+NORMALS = 3  # a member and step: one for each state, one for the measurement
+WIDTH = 64  # members in one block of the floor: whole vector registers, and all in the fastest cache
+BLOCKS = SEEDS * ENSEMBLE_SIZE // WIDTH
+
+_read_constants = vector_reader(len(Constants._fields))
+_column, _store = column_reader(2), column_writer(2)
+
+
+def rows(seed: int, quick: bool) -> Iterator[Row]:
+    """Measure, one row after the other."""
+    rounds = 5 if quick else 60
+    scenario = find_scenario("nominal")
+    data = scenario.data(training_seeds(seed, SEEDS))
+    choice = true_choice("enkf", scenario).with_size(ENSEMBLE_SIZE)
+    count = SEEDS * scenario.steps * ENSEMBLE_SIZE
+
+    def judge():
+        evaluate(choice.filter(scenario), data, scenario.scale)
+
+    floor = floor_measures(scenario.plant, scenario.steps)
+    whole_floor = _sum(*floor.values())
+    workload = f"{SEEDS} seeds, N = {ENSEMBLE_SIZE}"
+    timing = side_by_side(_shared(judge, count), whole_floor, rounds)
+    yield Row(f"evaluate, {workload}", "floor", timing, time_goal=15e-9)
+    timing = side_by_side(_shared(lambda: _run(choice, scenario, data), count), whole_floor, rounds)
+    yield Row("the same without metrics", "floor", timing, time_goal=15e-9)
+    for name, measure in floor.items():
+        yield Row(f"floor: {name}", None, alone(measure, rounds))
+
+
+def _run(choice: Choice, scenario, data) -> None:
+    engine.run(choice.filter(scenario), data.filter_keys, data.inputs, data.measurements)
+
+
+def _shared(work: Callable[[], object], count: int) -> Measure:
+    """A measure of work that is shared by `count` members and steps."""
+
+    def measure() -> float:
+        begin = perf_counter()
+        work()
+        return (perf_counter() - begin) / count
+
+    return measure
+
+
+def _sum(*measures: Measure) -> Measure:
+    return lambda: sum(measure() for measure in measures)
+
+
+def floor_measures(plant: Plant, steps: int) -> dict[str, Measure]:
+    """Measures, by name, of what each member and step needs at least: its motion, and its noise.
+
+    As many members and steps as in the evaluation, spread over the cores in the same way, but with no
+    moments, no gain, nothing stored and no member that is only there to fill a register.
+    """
+    propagate, draw = _floor_functions()
+    numbers = plant.numbers
+
+    def motion(first: int, last: int) -> None:
+        table = np.zeros((2, WIDTH))
+        for _ in range(first, last):
+            propagate(table, steps, plant.substeps, numbers)
+
+    def noise(first: int, last: int) -> None:
+        draws = np.zeros(NORMALS * WIDTH)
+        for block in range(first, last):
+            draw(draws, steps, block)
+
+    count = BLOCKS * WIDTH * steps
+    return {
+        f"{plant.substeps} Runge-Kutta steps": _shared(lambda: engine.spread(motion, BLOCKS), count),
+        f"{NORMALS} normals": _shared(lambda: engine.spread(noise, BLOCKS), count),
+    }
+
+
+@cache
+def _floor_functions() -> tuple[Callable, Callable]:
+    fingerprint = function_fingerprint()
+
+    def propagate(table, steps, substeps, numbers):
+        fingerprint  # noqa: B018 - part of the cache's key
+        c = Constants(*_read_constants(numbers))
+        for _ in range(steps):
+            for _ in range(substeps):
+                for j in range(table.shape[1]):
+                    _store(table, j, substep(_column(table, j), (12.0, c.ambient_velocity), c))
+
+    def draw(draws, steps, key):
+        fingerprint  # noqa: B018 - part of the cache's key
+        for step in range(steps):
+            fill_normals(draws, draws.shape[0], step, FILTER_PROCESS, key, 0)
+
+    return compiled(propagate), compiled(draw)

@@ -1,0 +1,156 @@
+import csv
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from typing import NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import thruster_env  # noqa: F401 - registers the env
+from filters import EstimateState
+from thruster_cli.main import main
+
+
+class Done(NamedTuple):
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+@pytest.fixture
+def thruster(tmp_path, monkeypatch, capsys):
+    """Run the command in this process, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["thruster", *map(str, arguments)])
+        capsys.readouterr()
+        try:
+            main()
+            code = 0
+        except SystemExit as stop:
+            code = stop.code or 0
+        return Done(code, *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture
+def as_json(thruster):
+    def run(*arguments):
+        done = thruster(*arguments, "--json", "-")
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    return run
+
+
+def test_tune_resume_evaluate_and_wrap(thruster, as_json, tmp_path):
+    options = ("tune", "--filter", "ekf", "--scenario", "mismatch")
+    first = as_json(*options, "--trials", 12)
+    assert first["trials"] == 12 and not first["interrupted"]
+    again = thruster(*options, "--trials", 15, "--json", "again.json")
+    assert again.returncode == 0 and "goes on after 12 finished trials" in again.stderr
+    for word in ("untuned", "tuned", "true Q, R", "bound", "rad/s", "NEES", "held-out"):
+        assert word in again.stdout
+    second = json.loads((tmp_path / "again.json").read_text())
+    assert second["trials"] == 15
+    assert second["best_training_score"] <= first["best_training_score"]
+
+    evaluated = as_json("evaluate", "--tuned", second["file"])
+    assert evaluated["tuned"] == second["held_out"]["tuned"]
+
+    env = EstimateState(gym.make("BowThruster-v0"), tuned=str(tmp_path / second["file"]))
+    assert env.filter.name == "ekf"
+    np.testing.assert_allclose(
+        np.diag(env.filter.model.process_noise_cov), second["filter"]["model"]["process_noise_cov"]
+    )
+    assert env.filter.model.constants.half_lift == pytest.approx(
+        1.15 * env.unwrapped.plant.constants.half_lift, rel=1e-12
+    )
+
+
+def test_simulate_writes_what_the_env_does_with_units_in_the_header(thruster, tmp_path):
+    done = thruster("simulate", "--out", "run.csv", "--seed", 4, "--voltage", 9, "--steps", 20)
+    assert done.returncode == 0, done.stderr
+    with (tmp_path / "run.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 21
+    env = gym.make("BowThruster-v0")
+    _, info = env.reset(seed=4)
+    for row in rows:
+        assert float(row["omega_m_rad_per_s"]) == pytest.approx(info["state"][0], rel=1e-8)
+        assert float(row["U_a_m_per_s"]) == pytest.approx(info["state"][1], rel=1e-8)
+        assert float(row["measured_thrust_N"]) == pytest.approx(info["measurement"][0], rel=1e-8)
+        assert float(row["time_s"]) == pytest.approx(info["time"])
+        _, _, _, _, info = env.step(np.array([9.0], dtype=np.float32))
+    assert thruster("simulate", "--out", "run.npz", "--seed", 4, "--steps", 20).returncode == 0
+    columns = np.load(tmp_path / "run.npz")
+    assert set(columns) == set(rows[0]) and len(np.unique(columns["voltage_V"][:-1])) == 1
+
+
+def test_inspect_prints_units_and_the_number_of_substeps(thruster, as_json):
+    done = thruster("inspect", "--preset", "tunnel", "--voltage", 12)
+    assert done.returncode == 0 and "[rad/s]" in done.stdout
+    assert re.search(r"Runge-Kutta substeps a sample time +2", done.stdout)
+    data = as_json("inspect")
+    assert data["steady_state"]["omega_m [rad/s]"] == pytest.approx(193.803, abs=1e-3)
+
+
+@pytest.mark.parametrize("command", ["", "inspect", "simulate", "tune", "evaluate", "reproduce", "demo"])
+def test_help_teaches(command, thruster):
+    done = thruster(*filter(None, [command, "--help"]))
+    assert done.returncode == 0 and "Usage" in done.stdout
+
+
+BAD = [
+    (("tune", "--filter", "none"), "filter must be one of kf, ekf, enkf, but got 'none'"),
+    (("tune", "--scenario", "none"), "scenario must be one of"),
+    (("tune", "--trials", "0"), "trials must be a whole number of at least 1, but got 0"),
+    (("tune", "--storage", "sqlite:////no/such/folder/x.db"), "storage must be a database that can be reached"),
+    (("tune", "--storage", "text.txt"), "storage must be a journal file"),
+    (("tune", "--filter", "ekf", "--trials", "1", "--out", "text.txt/x.json"), "must be where it can be written"),
+    (("evaluate", "--tuned", "missing.json"), "a tuned file must be readable"),
+    (("evaluate", "--tuned", "text.txt"), "a tuned file must be whole JSON"),
+    (("evaluate", "--tuned", "old.json"), "a tuned file must be of version 1, but got 0"),
+    (("evaluate",), "give either --tuned FILE or --filter NAME"),
+    (("evaluate", "--filter", "ekf", "--seeds", "1"), "held-out seeds must be a whole number of at least 2"),
+    (("inspect", "--preset", "none"), "preset must be one of"),
+    (("inspect", "--dt", "-1"), "dt must be positive, but got -1.0"),
+    (("simulate", "--out", "run.txt"), "--out must end in .csv or .npz, but got 'run.txt'"),
+    (("simulate", "--out", "run.csv", "--measurement-noise", "-1"), "no negative variance"),
+    (("simulate", "--out", "run.csv", "--voltage", "nan"), "voltage must be a finite number, but got nan"),
+    (("reproduce", "none"), "none"),
+    (("nothing",), "nothing"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "line"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
+def test_a_users_mistake_is_one_clear_line_and_exit_code_2(arguments, line, thruster, tmp_path):
+    (tmp_path / "text.txt").write_text("hello\n")
+    (tmp_path / "old.json").write_text(json.dumps({"format": "thruster-env tuned filter", "version": 0}))
+    done = thruster(*arguments)
+    assert done.returncode == 2
+    assert line in done.stderr and "Traceback" not in done.stderr
+    left = {path.name for path in tmp_path.iterdir()} - {"text.txt", "old.json", "out"}
+    assert not left, "no half-written file"
+
+
+def test_the_installed_command_interrupted_keeps_its_trials_and_says_so(tmp_path):
+    command = [sys.executable, "-m", "thruster_cli.main", "tune", "--filter", "ekf", "--trials", "100000"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    journal = tmp_path / "out" / "studies.journal"
+    for _ in range(1200):
+        time.sleep(0.05)
+        if journal.exists() and journal.read_text().count('"op_code":6') > 20:
+            break
+    process.send_signal(signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130 and "Traceback" not in stderr
+    assert "Interrupted: this is on the trials that were finished" in stdout

@@ -1,0 +1,198 @@
+"""The ensemble Kalman filter against the Kalman filter and a naive analysis, and the noise it adds."""
+
+import math
+
+import numpy as np
+import pytest
+
+from filters import (
+    EnsembleKalmanFilter,
+    ExtendedKalmanFilter,
+    KalmanFilter,
+    StateSpaceModel,
+    affine_model,
+    run,
+    thruster_model,
+    truth,
+)
+from thruster_env.compiled import interpreted
+from thruster_env.streams import (
+    FILTER_MEASUREMENT,
+    FILTER_PRIOR,
+    FILTER_PROCESS,
+    episode_keys,
+    filter_keys,
+    normal_block,
+)
+
+KEY = (123456789, 4294967295)
+
+
+def plane_model(**changes):
+    """n = m = 2, p = 1, with offsets and correlated noise."""
+    arguments = {
+        "a": [[0.9, 0.3], [-0.2, 0.8]],
+        "b": [[1.0], [0.5]],
+        "c": [[1.0, 0.4], [-0.3, 1.5]],
+        "state_offset": [0.3, -0.2],
+        "measurement_offset": [0.7, -0.1],
+        "process_noise_cov": [[0.3, 0.12], [0.12, 0.2]],
+        "measurement_noise_cov": [[0.5, -0.25], [-0.25, 0.4]],
+        "prior_mean": [1.0, -1.0],
+        "prior_cov": [[1.0, 0.4], [0.4, 0.5]],
+    }
+    return affine_model(**{**arguments, **changes})
+
+
+def line_model():
+    """n = 2, p = m = 1."""
+    return plane_model(c=[[1.0, 0.4]], measurement_offset=[0.7], measurement_noise_cov=[0.5])
+
+
+def normals(stream, key, step, rows, size):
+    """The normals (rows, size) of a stream: channel i of member j is number i * width + j of one long draw."""
+    width = -(-size // 8) * 8  # ensembles are padded to a multiple of eight
+    index = np.arange(rows * width)
+    block = np.array(normal_block(index // 4, step, stream, *key))  # (4, rows * width)
+    return block[index % 4, index].reshape(rows, width)[:, :size]
+
+
+def test_one_cycle_is_the_naive_one_with_the_same_normals():
+    size, model = 11, plane_model()
+    a, b, offset, c, shift = model.matrices()
+    filter_ = EnsembleKalmanFilter(model=model, ensemble_size=size)
+    root_p, root_q, root_r = (
+        np.linalg.cholesky(cov) for cov in (model.prior_cov, model.process_noise_cov, model.measurement_noise_cov)
+    )
+    with interpreted():
+        belief = filter_.init(KEY)
+        x = model.prior_mean[:, None] + root_p @ normals(FILTER_PRIOR, KEY, 0, 2, size)
+        np.testing.assert_allclose(belief.members, x, rtol=1e-12, atol=1e-12)
+        for step, (u, z) in enumerate([(0.5, [2.0, -1.0]), (-1.0, [0.3, 0.9])], start=1):
+            belief = filter_.predict(belief, [u])
+            x = a @ x + b * u + offset[:, None] + root_q @ normals(FILTER_PROCESS, KEY, step, 2, size)
+            np.testing.assert_allclose(belief.members, x, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(belief.mean, x.mean(axis=1), rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(belief.cov, np.cov(x), rtol=1e-12, atol=1e-12)
+
+            belief, innovation = filter_.update(belief, z)
+            y = c @ x + shift[:, None]
+            joint = np.cov(x, y)  # divisor size - 1
+            s = joint[2:, 2:] + model.measurement_noise_cov
+            gain = joint[:2, 2:] @ np.linalg.inv(s)
+            v = root_r @ normals(FILTER_MEASUREMENT, KEY, step, 2, size)
+            x = x + gain @ (np.array(z)[:, None] - v - y)
+            np.testing.assert_allclose(belief.members, x, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(belief.mean, x.mean(axis=1), rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(belief.cov, np.cov(x), rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(innovation.value, z - y.mean(axis=1), rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(innovation.cov, s, rtol=1e-12, atol=1e-12)
+
+
+def assert_normal(sample, cov, mean=0.0):
+    """A sample (d, N) has the mean and covariance given, to four standard errors."""
+    size, spread = sample.shape[1], np.sqrt(np.diag(cov))
+    assert (np.abs(sample.mean(axis=1) - mean) < 4 * spread / math.sqrt(size)).all()
+    standard_error = np.sqrt((np.outer(spread**2, spread**2) + cov**2) / size)
+    assert (np.abs(np.cov(sample) - cov) < 4 * standard_error).all()
+
+
+def test_members_are_stirred_by_the_prior_the_process_noise_and_the_measurement_noise():
+    model, size = plane_model(), 2000
+    a, b, offset, c, shift = model.matrices()
+    filter_ = EnsembleKalmanFilter(model=model, ensemble_size=size)
+    z = np.array([1.0, 2.0])
+    with interpreted():
+        first = filter_.init(KEY)
+        second = filter_.predict(first, [0.5])
+        third = filter_.predict(second, [0.5])
+        updated, innovation = filter_.update(third, z)
+    drift = (offset + b[:, 0] * 0.5)[:, None]
+    w_1 = second.members - a @ first.members - drift
+    w_2 = third.members - a @ second.members - drift
+    # The analysis solved for the noise that each member took the measurement with.
+    gain = np.cov(third.members) @ c.T @ np.linalg.inv(innovation.cov)
+    expected = c @ third.members + shift[:, None]
+    v = z[:, None] - expected - np.linalg.inv(gain) @ (updated.members - third.members)
+    assert_normal(first.members, model.prior_cov, model.prior_mean)
+    assert_normal(w_1, model.process_noise_cov)
+    assert_normal(w_2, model.process_noise_cov)
+    assert_normal(v, model.measurement_noise_cov)
+    # Nothing that stirs the members is correlated with anything else.
+    together = np.corrcoef(np.vstack([first.members, w_1, w_2, v]))
+    for i in range(0, 8, 2):
+        together[i : i + 2, i : i + 2] = 0.0
+    assert np.abs(together).max() < 4 / math.sqrt(size)
+
+
+def test_it_converges_to_the_kalman_filter_like_one_over_root_n():
+    model = line_model()
+    inputs = np.random.default_rng(0).normal(size=(60, 30, 1))
+    drawn = truth.simulate(model, episode_keys(range(60)), inputs)
+    keys = filter_keys(range(60))
+    exact = run(KalmanFilter(model=model), keys, inputs, drawn.measurements)
+    spread = np.sqrt(np.einsum("bkii->bki", exact.covs))
+    scale = spread[..., :, None] * spread[..., None, :]
+    sizes, in_mean, in_cov = np.array([20, 80, 320, 1280]), [], []
+    for size in sizes:
+        found = run(EnsembleKalmanFilter(model=model, ensemble_size=size), keys, inputs, drawn.measurements)
+        in_mean.append(np.sqrt(np.mean(((found.means - exact.means) / spread) ** 2)))
+        in_cov.append(np.sqrt(np.mean(((found.covs - exact.covs) / scale) ** 2)))
+    for errors in (in_mean, in_cov):
+        slope = np.polyfit(np.log(sizes), np.log(errors), 1)[0]
+        assert -0.6 < slope < -0.4  # 60 independent runs give each error to about 6 %, the slope to 0.03
+    # Averaged over the runs nothing remains but the bias of order 1/N: four standard errors of 1/sqrt(60 N).
+    bias = ((found.means - exact.means) / spread)[:, -1].mean(axis=0)
+    assert (np.abs(bias) < 4 * in_mean[-1] / math.sqrt(60)).all()
+
+
+def test_on_the_thruster_a_hundred_members_are_as_good_as_the_extended_filter():
+    model = thruster_model(process_noise_cov=[1.0, 4e-4], measurement_noise_cov=0.25)
+    inputs = np.repeat(np.random.default_rng(20).uniform(-12.0, 12.0, size=(100, 20, 1)), 25, axis=1)
+    drawn = truth.simulate(model, episode_keys(range(100)), inputs)
+
+    def rmse(filter_):
+        estimates = run(filter_, filter_keys(range(100)), inputs, drawn.measurements)
+        assert (estimates.divergences == 0).all()
+        return np.sqrt(np.mean((estimates.means - drawn.states)[:, 50:] ** 2, axis=(0, 1)))
+
+    ensemble = rmse(EnsembleKalmanFilter(model=model, ensemble_size=100))
+    np.testing.assert_allclose(ensemble, rmse(ExtendedKalmanFilter(model=model)), rtol=0.05)
+
+
+@pytest.mark.parametrize("size", [1, 0, -3, 2.5, math.nan, "many", None])
+def test_fewer_than_two_members_or_no_whole_number_is_refused(size):
+    with pytest.raises(ValueError, match="ensemble_size must be a (whole|finite) number.* but got"):
+        EnsembleKalmanFilter(model=line_model(), ensemble_size=size)
+
+
+def test_two_members_are_enough_to_run():
+    filter_ = EnsembleKalmanFilter(model=line_model(), ensemble_size=2)
+    with interpreted():
+        estimates = run(filter_, np.array([KEY]), np.zeros((1, 20, 1)), np.zeros((1, 21, 1)))
+    assert np.isfinite(estimates.means).all()
+    assert estimates.divergences.tolist() == [0]
+
+
+def needs_positive(x, u, c):
+    return (math.log(x[0]) + 3.0,)
+
+
+def see(x, c):
+    return (x[0],)
+
+
+def test_only_real_members_are_put_through_the_model():
+    """What pads an ensemble to full vector registers must not fail where no member does."""
+    model = StateSpaceModel(
+        transition=needs_positive,
+        observe=see,
+        process_noise_cov=[0.01],
+        measurement_noise_cov=[0.1],
+        prior_mean=[5.0],
+        prior_cov=[0.01],
+    )
+    filter_ = EnsembleKalmanFilter(model=model, ensemble_size=5)
+    with interpreted():
+        belief = filter_.predict(filter_.init(KEY), [0.0])
+    assert belief.mean[0] == pytest.approx(math.log(5.0) + 3.0, abs=0.3)

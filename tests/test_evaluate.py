@@ -1,0 +1,113 @@
+import numpy as np
+import pytest
+
+from filters import affine_model
+from filters.bounds import posterior_bound, riccati_covariances
+from filters.consistency import normalized_squares
+from tuning.evaluate import evaluate, score_ratio
+from tuning.scenarios import find_scenario, held_out_seeds
+from tuning.space import choice_of, parameters_of, true_choice, untuned_choice
+
+
+@pytest.fixture(scope="module")
+def nominal():
+    return find_scenario("nominal")
+
+
+@pytest.fixture(scope="module")
+def data(nominal):
+    return nominal.data(held_out_seeds(5, 200))
+
+
+@pytest.fixture(scope="module")
+def ekf(nominal, data):
+    return evaluate(true_choice("ekf", nominal).filter(nominal), data, nominal.scale)
+
+
+@pytest.fixture(scope="module")
+def untuned_ekf(nominal, data):
+    return evaluate(untuned_choice("ekf", nominal).filter(nominal), data, nominal.scale)
+
+
+def test_rmse_is_pooled_over_runs_and_steps_from_50_on(nominal, data, ekf):
+    from filters import run
+
+    estimates = run(true_choice("ekf", nominal).filter(nominal), data.filter_keys, data.inputs, data.measurements)
+    errors = (estimates.means - data.states)[:, 50:]
+    np.testing.assert_allclose([r.value for r in ekf.rmse], np.sqrt((errors**2).mean((0, 1))), rtol=1e-12)
+    expected = np.mean([r.value / s for r, s in zip(ekf.rmse, nominal.scale, strict=True)])
+    assert ekf.score.value == pytest.approx(expected, rel=1e-12)
+
+
+def test_the_true_ekf_sits_on_the_bound_and_is_consistent(nominal, data, ekf):
+    bound = nominal.bound(data)
+    for rmse, limit in zip(ekf.rmse, bound, strict=True):
+        assert 0.98 * limit < rmse.value < 1.05 * limit
+    assert ekf.nees.low < 2.0 < ekf.nees.high
+    assert ekf.nis.low < 1.0 < ekf.nis.high
+    assert ekf.divergences == 0
+
+
+def test_the_untuned_ekf_is_worse_and_the_paired_interval_says_so(ekf, untuned_ekf):
+    ratio = score_ratio(untuned_ekf, ekf)
+    assert 1.0 < ratio.low < ratio.value < ratio.high
+    assert score_ratio(ekf, ekf) == (1.0, 1.0, 1.0)
+    # pairing makes the interval of the ratio narrower than the two intervals side by side
+    unpaired = untuned_ekf.score.high / ekf.score.low - untuned_ekf.score.low / ekf.score.high
+    assert ratio.high - ratio.low < unpaired
+
+
+def test_a_choice_survives_its_trial_parameters(nominal):
+    choice = untuned_choice("enkf", nominal).with_size(17)
+    again = choice_of("enkf", parameters_of(choice), nominal)
+    assert again == choice
+
+
+def test_bad_scales_and_unequal_seeds_are_refused(nominal, data, ekf):
+    with pytest.raises(ValueError, match="scale must be positive in every state, but got"):
+        evaluate(true_choice("ekf", nominal).filter(nominal), data, [1.0, 0.0])
+    with pytest.raises(ValueError, match="same seeds, but got 200 and 199"):
+        score_ratio(ekf, ekf._replace(mean_squares=ekf.mean_squares[1:]))
+
+
+def test_normalized_squares_against_inverses_and_skip_singular_covariances():
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(50, 3, 3))
+    covs = roots @ roots.transpose(0, 2, 1) + 1e-3 * np.eye(3)
+    errors = rng.normal(size=(50, 3))
+    expected = [e @ np.linalg.inv(p) @ e for e, p in zip(errors, covs, strict=True)]
+    np.testing.assert_allclose(normalized_squares(errors, covs), expected, rtol=1e-6)
+    covs[3] = 0.0
+    covs[4] = np.outer([1.0, 2.0, 3.0], [1.0, 2.0, 3.0])
+    assert np.isnan(normalized_squares(errors, covs)[[3, 4]]).all()
+
+
+LINEAR = dict(
+    a=[[0.9, 0.2], [-0.1, 0.7]],
+    b=[[1.0], [0.5]],
+    c=[[1.0, -0.5]],
+    process_noise_cov=[[0.5, 0.1], [0.1, 0.3]],
+    measurement_noise_cov=[0.4],
+    prior_mean=[0.0, 0.0],
+)
+
+
+def test_on_a_linear_model_the_bound_is_the_kalman_covariance_at_every_step():
+    model = affine_model(**LINEAR, prior_cov=[2.0, 0.0])
+    bound = posterior_bound(model, np.ones((1, 60, 1)), truths=2)[0]
+    a, _, _, c, _ = model.matrices()
+    p = model.prior_cov
+    for k in range(61):
+        if k:
+            p = a @ p @ a.T + model.process_noise_cov
+        p = p - p @ c.T @ np.linalg.inv(c @ p @ c.T + model.measurement_noise_cov) @ c @ p
+        np.testing.assert_allclose(bound[k], p, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(bound[-1], riccati_covariances(model)[1], rtol=1e-6)
+
+
+def test_the_bound_starts_from_a_prior_without_spread_and_refuses_a_singular_q():
+    model = affine_model(**LINEAR, prior_cov=[0.0, 0.0])
+    bound = posterior_bound(model, np.zeros((1, 3, 1)), truths=2)[0]
+    assert (bound[0] == 0).all() and np.linalg.eigvalsh(bound[1])[0] > 0
+    with pytest.raises(ValueError, match="positive definite Q, but got"):
+        posterior_bound(model.replace(process_noise_cov=[1.0, 0.0]), np.zeros((1, 3, 1)))

@@ -1,0 +1,109 @@
+"""Who may know whom, read from the imports of every file."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+ROOMS = ("thruster_env", "filters", "tuning", "studies", "thruster_cli")
+FILES = [path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
+every_file = pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
+every_room = pytest.mark.parametrize("room", ROOMS)
+
+FORBIDDEN = {
+    "thruster_env": {"filters", "tuning", "studies", "thruster_cli"},
+    "filters": {"tuning", "studies", "thruster_cli"},
+    "tuning": {"thruster_cli"},
+    "studies": {"thruster_cli"},
+    "thruster_cli": set(),
+}
+LEARNING = {"stable_baselines3", "sb3_contrib", "rl_zoo3", "torch"}
+SHARED_TOOLS = {f"thruster_env.{module}" for module in ("checks", "compiled", "components", "streams")}
+BRIDGE = ROOT / "filters" / "thruster.py"
+
+
+def imports_of(path, source=None):
+    """Modules that a file imports, anywhere in it, by full name: `from a import b` gives a and a.b."""
+    found = set()
+    package = path.relative_to(ROOT).parent.parts
+    for node in ast.walk(ast.parse(path.read_text() if source is None else source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            home = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join([*home, *([node.module] if node.module else [])])
+            found |= {module} | {f"{module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def packages_of(path):
+    return {name.partition(".")[0] for name in imports_of(path)}
+
+
+def modules_of(path, room):
+    """Modules of a room that a file imports; names imported from a module count as that module."""
+    return {
+        ".".join(name.split(".")[:2]) for name in imports_of(path) if name == room or name.startswith(f"{room}.")
+    }
+
+
+def test_imports_are_found_wherever_they_hide():
+    source = "import a.b\nfrom c import d\nfrom . import e\nfrom .f import g\ndef h():\n    import i as j\n"
+    found = imports_of(ROOT / "filters" / "some.py", source)
+    assert found == {"a.b", "c", "c.d", "filters", "filters.e", "filters.f", "filters.f.g", "i"}
+
+
+def test_there_is_something_to_read():
+    assert BRIDGE in FILES and len(FILES) > 20
+
+
+@every_file
+def test_a_room_knows_only_the_rooms_below(path):
+    room = path.relative_to(ROOT).parts[0]
+    assert not packages_of(path) & FORBIDDEN[room]
+
+
+@every_file
+def test_only_tuning_imports_optuna(path):
+    assert "optuna" not in packages_of(path) or path.relative_to(ROOT).parts[0] == "tuning"
+
+
+@every_file
+def test_no_package_that_learns_policies_is_needed(path):
+    room = path.relative_to(ROOT).parts[0]
+    if room in ("thruster_env", "filters", "tuning"):
+        assert not packages_of(path) & LEARNING
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "filters").rglob("*.py")), ids=lambda path: path.name)
+def test_filters_know_the_thruster_through_one_bridge(path):
+    if path != BRIDGE:
+        assert modules_of(path, "thruster_env") - {"thruster_env"} <= SHARED_TOOLS
+        assert "thruster_env" not in imported_as_a_whole(path)
+
+
+def imported_as_a_whole(path):
+    """Packages named by a bare `import package`."""
+    tree = ast.parse(path.read_text())
+    return {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+
+
+@every_file
+def test_a_file_is_at_most_300_lines_long(path):
+    assert len(path.read_text().splitlines()) <= 300
+
+
+@every_room
+def test_a_package_says_that_it_is_typed(room):
+    assert (ROOT / room / "__init__.py").is_file()
+    assert (ROOT / room / "py.typed").is_file()
+
+
+def test_importing_the_env_stays_light():
+    heavy = ["numba", "scipy", "matplotlib", "optuna", "torch", "filters", "tuning"]
+    code = f"import sys, thruster_env; print([name for name in {heavy} if name in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"

@@ -1,0 +1,24 @@
+import re
+from pathlib import Path
+
+import pytest
+
+README = (Path(__file__).parents[1] / "README.md").read_text()
+EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+
+
+@pytest.mark.parametrize("code", EXAMPLES, ids=["env", "values"])
+def test_readme_code_runs(code, capsys):
+    names = {}
+    exec(compile(code, "README.md", "exec"), names)
+    if "env" in names:
+        assert "estimate" in names["info"]
+        assert len(code.strip().splitlines()) <= 11
+        assert "nan" not in capsys.readouterr().out
+    else:
+        assert names["belief"].cov.shape == (2, 2)
+
+
+def test_every_picture_and_page_that_readme_names_is_there():
+    for target in re.findall(r"\]\((?!http)([^)#]+)\)", README):
+        assert (Path(__file__).parents[1] / target).exists(), target

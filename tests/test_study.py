@@ -1,0 +1,156 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import optuna
+import pytest
+from optuna.trial import TrialState
+
+from tuning.scenarios import find_scenario
+from tuning.space import parameters_of, untuned_choice
+from tuning.storage import PROCESS, RETRY_OF, open_storage
+from tuning.study import finished_trials, open_study, prove, run_study
+from tuning.tuned import read_tuned, write_tuned
+
+SCENARIO = find_scenario("mismatch")
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+
+
+def study_in(storage, name="s", seed=0):
+    return open_study(name, "ekf", SCENARIO, seed, storage)
+
+
+def test_a_study_starts_untuned_never_sees_the_truth_and_improves_on_held_out_seeds(tmp_path):
+    study = study_in(open_storage(str(tmp_path / "j")))
+    seen = []
+    result = run_study(study, "ekf", SCENARIO, 0, 25, lambda study, finished: seen.append(finished))
+    assert seen == list(range(1, 26))
+    first = result.trials[0].params
+    assert first == pytest.approx(dict(parameters_of(untuned_choice("ekf", SCENARIO))))
+    true = SCENARIO.true["process_noise_cov"]
+    assert all((t.params["Q11"], t.params["Q22"]) != true for t in result.trials)
+    proof = prove(result.choice, SCENARIO, 0, 100)
+    assert proof.tuned.score.high < proof.untuned.score.low
+    assert result.best_value < result.trials[0].value
+
+    path = tmp_path / "tuned.json"
+    write_tuned(path, SCENARIO, 0, result, proof, "s")
+    assert read_tuned(path) == (result.choice, SCENARIO, 0)
+    assert json.loads(path.read_text())["held_out"]["tuned"]["rmse"][0] == list(proof.tuned.rmse[0])
+
+
+def test_the_same_seed_gives_the_same_study_and_another_seed_another():
+    def values(seed):
+        study = study_in(optuna.storages.InMemoryStorage(), seed=seed)
+        return [t.params for t in run_study(study, "ekf", SCENARIO, seed, 12).trials]
+
+    assert values(0) == values(0)
+    assert values(0)[1:] != values(1)[1:]
+
+
+def test_a_resumed_study_counts_what_is_there_and_does_not_repeat_it(tmp_path):
+    path = str(tmp_path / "j")
+    run_study(study_in(open_storage(path)), "ekf", SCENARIO, 0, 5)
+    resumed = run_study(study_in(open_storage(path)), "ekf", SCENARIO, 0, 9)
+    assert len(resumed.trials) == 9
+    points = [tuple(t.params.values()) for t in resumed.trials]
+    assert len(set(points)) == 9
+
+
+def test_a_study_for_something_else_is_refused(tmp_path):
+    storage = open_storage(str(tmp_path / "j"))
+    study_in(storage)
+    with pytest.raises(ValueError, match="study 's' must be for .*'seed': 3.* but it was made for .*'seed': 0"):
+        study_in(storage, seed=3)
+
+
+def test_ctrl_c_keeps_finished_trials(tmp_path):
+    study = study_in(open_storage(str(tmp_path / "j")))
+
+    def interrupt(study, finished):
+        if finished == 4:
+            raise KeyboardInterrupt
+
+    result = run_study(study, "ekf", SCENARIO, 0, 50, interrupt)
+    assert result.interrupted and finished_trials(study) == 4
+    assert not [t for t in study.trials if t.state == TrialState.RUNNING]
+
+
+def test_a_trial_of_a_dead_process_is_failed_and_tried_once_more(tmp_path):
+    storage = open_storage(str(tmp_path / "j"))
+    study = study_in(storage)
+    trial = study.ask()
+    trial.suggest_float("Q11", 1.0, 1e4)
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    trial.set_user_attr(PROCESS, f"{os.uname().nodename}:{dead.pid}")
+    again = study_in(storage)
+    states = [t.state for t in again.trials]
+    assert states == [TrialState.FAIL, TrialState.WAITING]
+    assert again.trials[1].user_attrs[RETRY_OF] == 0
+    assert [t.state for t in study_in(storage).trials] == states  # once only
+
+
+def test_a_running_trial_of_a_living_process_is_left_alone(tmp_path):
+    storage = open_storage(str(tmp_path / "j"))
+    trial = study_in(storage).ask()
+    trial.set_user_attr(PROCESS, f"{os.uname().nodename}:{os.getpid()}")
+    assert study_in(storage).trials[0].state == TrialState.RUNNING
+
+
+def test_a_torn_last_line_is_cut_off_and_the_study_goes_on(tmp_path):
+    path = tmp_path / "j"
+    run_study(study_in(open_storage(str(path))), "ekf", SCENARIO, 0, 3)
+    with path.open("a") as stream:
+        stream.write('{"op_code": 5, "worker_id": "x", "tri')
+    with pytest.warns(UserWarning, match="cut off its last line"):
+        storage = open_storage(str(path))
+    assert len(run_study(study_in(storage), "ekf", SCENARIO, 0, 5).trials) == 5
+
+
+def test_a_killed_process_loses_its_running_trial_only(tmp_path):
+    path = tmp_path / "j"
+    program = (
+        "import optuna; optuna.logging.set_verbosity(optuna.logging.WARNING)\n"
+        "from tuning.scenarios import find_scenario\n"
+        "from tuning.storage import open_storage\n"
+        "from tuning.study import open_study, run_study\n"
+        f"s = find_scenario('mismatch'); storage = open_storage({str(path)!r})\n"
+        "study = open_study('s', 'ekf', s, 0, storage)\n"
+        "run_study(study, 'ekf', s, 0, 100000, lambda study, n: print(n, flush=True))\n"
+    )
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    for line in process.stdout:
+        if int(line) >= 4:
+            break
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    study = study_in(open_storage(str(path)))
+    done = finished_trials(study)
+    assert done >= 4
+    result = run_study(study, "ekf", SCENARIO, 0, done + 2)
+    assert finished_trials(study) == done + 2
+    assert not [t for t in result.trials if t.state == TrialState.RUNNING]
+
+
+@pytest.mark.parametrize(
+    ("content", "rule"),
+    [(b"hello\n", "journal"), (b"hello", "journal"), (b'{"op_code": 0}\nx\n{"op_code": 1}\n', "line 2")],
+)
+def test_a_file_that_is_no_journal_is_refused_and_left_as_it_is(tmp_path, content, rule):
+    path = tmp_path / "notes.txt"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=f"storage must be a journal file.*{rule}"):
+        open_storage(str(path))
+    assert path.read_bytes() == content
+
+
+def test_a_database_that_cannot_be_reached_is_one_clear_line():
+    with pytest.raises(ValueError, match="storage must be a database that can be reached, but got sqlite:"):
+        open_storage("sqlite:////no/such/folder/x.db")
