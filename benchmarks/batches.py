@@ -10,7 +10,8 @@ import numpy as np
 
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, alone, side_by_side
-from filters import engine
+from filters import run
+from filters.engine import spread
 from thruster_env.compiled import compiled, function_fingerprint
 from thruster_env.components import column_reader, column_writer, vector_reader
 from thruster_env.dynamics import Constants, substep
@@ -52,7 +53,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
 
 
 def _run(choice: Choice, scenario, data) -> None:
-    engine.run(choice.filter(scenario), data.filter_keys, data.inputs, data.measurements)
+    run(choice.filter(scenario), data.filter_keys, data.inputs, data.measurements)
 
 
 def _shared(work: Callable[[], object], count: int) -> Measure:
@@ -91,8 +92,8 @@ def floor_measures(plant: Plant, steps: int) -> dict[str, Measure]:
 
     count = BLOCKS * WIDTH * steps
     return {
-        f"{plant.substeps} Runge-Kutta steps": _shared(lambda: engine.spread(motion, BLOCKS), count),
-        f"{NORMALS} normals": _shared(lambda: engine.spread(noise, BLOCKS), count),
+        f"{plant.substeps} Runge-Kutta steps": _shared(lambda: spread(motion, BLOCKS), count),
+        f"{NORMALS} normals": _shared(lambda: spread(noise, BLOCKS), count),
     }
 
 

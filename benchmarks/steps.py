@@ -26,16 +26,16 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
 
     ours, peer = episode(gym.make("BowThruster-v0"), seed), episode(gym.make("Pendulum-v1"), seed)
     timing = side_by_side(ours, peer, 20 if quick else 600)
-    yield Row("step of the env", "Pendulum-v1", timing, ratio_goal=0.35)
+    yield Row("env step", "Pendulum-v1", timing, ratio_goal=0.35)
 
     for model, peer_name, goal in (
         (python_model, "FilterPy", 1 / 25),
-        (compiled_model, "FilterPy, compiled model", None),
+        (compiled_model, "FilterPy with numba", None),
     ):
         wrapped = EstimateState(gym.make("BowThruster-v0"), filter="enkf", ensemble_size=ENSEMBLE_SIZE)
         peer = peer_ensemble(plant, model, voltages, measurements, seed)
         timing = side_by_side(episode(wrapped, seed), peer, 4 if quick else 60)
-        yield Row(f"step with EnKF, N = {ENSEMBLE_SIZE}", peer_name, timing, ratio_goal=goal)
+        yield Row(f"EnKF step, N = {ENSEMBLE_SIZE}", peer_name, timing, ratio_goal=goal)
 
     for name in ("kf", "ekf"):
         wrapped = EstimateState(gym.make("BowThruster-v0"), filter=name)
@@ -43,7 +43,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
         inputs = np.column_stack([voltages, np.ones_like(voltages)])
         peer = seconds_a_call(step, zip(inputs, measurements, strict=True), step.reset)
         timing = side_by_side(episode(wrapped, seed), peer, 10 if quick else 200)
-        yield Row(f"step with {name.upper()}", "FilterPy's KF", timing, ratio_goal=1 / 3, later=True)
+        yield Row(f"{name.upper()} step", "FilterPy's KF", timing, ratio_goal=1 / 3, later=True)
 
 
 def recorded_episode(seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -39,8 +39,8 @@ def side_by_side(ours: Measure, peer: Measure, rounds: int, *, warm_up: bool = T
     if warm_up:
         ours(), peer()
     pairs = []
-    for number in range(rounds):
-        with _no_collection():
+    with _no_collection():
+        for number in range(rounds):
             if number % 2:
                 second = peer()
                 pairs.append((ours(), second))
@@ -53,7 +53,8 @@ def alone(ours: Measure, rounds: int, *, warm_up: bool = True) -> Timing:
     """Measure something that has no peer, after a first round that does not count."""
     if warm_up:
         ours()
-    return Timing(min(ours() for _ in range(rounds)), None, None)
+    with _no_collection():
+        return Timing(min(ours() for _ in range(rounds)), None, None)
 
 
 def seconds_a_call(function: Callable, arguments: Iterable[tuple], prepare: Callable = lambda: None) -> Measure:

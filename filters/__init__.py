@@ -1,10 +1,10 @@
 """Kalman-type filters: as values with `init`, `predict`, `update`, over batches, and as Gymnasium wrappers."""
 
 from filters.affine import affine_model, linearize
-from filters.engine import Estimates, run
+from filters.batch import Estimates, run
+from filters.belief import Belief, Innovation
 from filters.ensemble import EnsembleKalmanFilter
 from filters.extended import ExtendedKalmanFilter
-from filters.filter import Belief, Innovation
 from filters.kalman import KalmanFilter
 from filters.model import StateSpaceModel
 from filters.registry import FILTERS, make_filter

@@ -1,4 +1,4 @@
-"""Running filters: one step of one belief, or whole trajectories of many, from the same kernels."""
+"""From kernels to compiled code: steps of one belief, or whole trajectories of many."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
-from filters.filter import Belief, Filter, Innovation, Kernels
+from filters.belief import Kernels
 from filters.rows import LANES, memory_places, padded
 from thruster_env.compiled import compilable, compiled, function_fingerprint, is_interpreting
 from thruster_env.streams import GROUP
@@ -127,127 +126,27 @@ def _build_batch(kernels: Kernels) -> Callable:
     return batch
 
 
-@lru_cache(maxsize=128)
-def _operation(kernels: Kernels, interpreting: bool) -> _Runner:
-    return _Runner(_build_operation, kernels)
+def operation(kernels: Kernels) -> Callable:
+    """`operate(*memory, size, u, z, numbers, starting, predicting, updating)` on one belief."""
+    return _runner(_build_operation, kernels, is_interpreting())
+
+
+def batch(kernels: Kernels) -> Callable:
+    """`batch(*memory, size, keys, inputs, measurements, numbers, out, first, last)` on trajectories."""
+    return _runner(_build_batch, kernels, is_interpreting())
 
 
 @lru_cache(maxsize=128)
-def _batch(kernels: Kernels, interpreting: bool) -> _Runner:
-    return _Runner(_build_batch, kernels)
+def _runner(build: Callable, kernels: Kernels, interpreting: bool) -> _Runner:
+    return _Runner(build, kernels)
 
 
-class Session:
-    """One filter at work in place on its own memory: what a wrapper steps and `Filter.predict` borrows.
-
-    Attributes:
-        mean, cov, innovation, innovation_cov: views on the memory, (n,), (n, n), (m,), (m, m).
-    """
-
-    def __init__(self, filter_: Filter):
-        """Allocate the memory of a filter; `start` or `load` comes next."""
-        kernels, model = filter_.kernels(), filter_.kernel_model
-        n, m = kernels.n, kernels.m
-        places = memory_places(n, m)
-        self._operate = _operation(kernels, is_interpreting())
-        self._numbers, self._size, self._places = model.numbers, filter_.size, places
-        self._memory = new_memory(filter_)
-        self._row, self._table, _ = self._memory
-        self._u, self._z = np.zeros(model.inputs), np.full(m, np.nan)
-        self.mean = self._row[places.mean : places.mean + n]
-        self.cov = self._row[places.cov : places.cov + n * n].reshape(n, n)
-        self.innovation = self._row[places.innovation : places.innovation + m]
-        self.innovation_cov = self._row[places.innovation_cov : places.innovation_cov + m * m].reshape(m, m)
-
-    def _do(self, starting: bool, predicting: bool, updating: bool) -> None:
-        self._operate(
-            *self._memory,
-            self._size,
-            self._u,
-            self._z,
-            self._numbers,
-            starting,
-            predicting,
-            updating,
-        )
-
-    def set_key(self, key) -> None:
-        """Set the key (2,) on which the belief's randomness depends."""
-        self._row[self._places.key_0], self._row[self._places.key_1] = key
-
-    def start(self, key, z) -> None:
-        """Set the prior with a random key (2,) and update it with a first measurement z (m,)."""
-        self.set_key(key)
-        self._z[:] = z
-        self._do(True, False, True)
-
-    def step(self, u, z) -> None:
-        """Predict with input u (p,), then update with measurement z (m,); NaN marks a missing channel."""
-        self._u[:] = u
-        self._z[:] = z
-        self._do(False, True, True)
-
-    def run(self, operation: str, u=None, z=None) -> None:
-        """Do one of "start", "predict" or "update" alone, arguments checked."""
-        if u is not None:
-            self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
-        if z is not None:
-            self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
-        self._do(operation == "start", operation == "predict", operation == "update")
-
-    @property
-    def divergences(self) -> int:
-        """Restarts from the prior, so far, after an estimate that was not finite."""
-        return int(self._row[self._places.divergences])
-
-    def load(self, belief: Belief) -> None:
-        """Put a belief into the memory."""
-        self.mean[:], self.cov[:] = belief.mean, belief.cov
-        self._table[: len(belief.mean), : self._size] = belief.members
-        self.set_key(belief.key)
-        self._row[self._places.step] = belief.step
-        self._row[self._places.divergences] = belief.divergences
-
-    def belief(self) -> Belief:
-        """A copy of the belief in the memory."""
-        row, places = self._row, self._places
-        key = int(row[places.key_0]), int(row[places.key_1])
-        members = self._table[: len(self.mean), : self._size].copy()
-        return Belief(self.mean.copy(), self.cov.copy(), members, key, int(row[places.step]), self.divergences)
-
-    def innovation_copy(self) -> Innovation:
-        """A copy of what the last update found."""
-        log_likelihood = float(self._row[self._places.log_likelihood])
-        return Innovation(self.innovation.copy(), self.innovation_cov.copy(), log_likelihood)
-
-
-def new_memory(filter_: Filter) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Row, table and draws for one belief of a filter, zeros."""
-    kernels, width = filter_.kernels(), padded(filter_.size, LANES)
+def new_memory(kernels: Kernels, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Row, table and draws for one belief with `size` members, zeros."""
+    width = padded(size, LANES)
     length = memory_places(kernels.n, kernels.m).length
     draws = padded(kernels.draws_per_member * width, GROUP)
     return np.zeros(length), np.zeros((kernels.table_rows, width)), np.zeros(draws)
-
-
-def vector_like(name: str, value, like: np.ndarray, *, missing_allowed: bool) -> np.ndarray:
-    """Return value as float64 of the shape of `like`; raise ValueError for a wrong shape or infinite entries."""
-    array = np.atleast_1d(np.asarray(value, dtype=np.float64))
-    wrong = np.isinf(array) if missing_allowed else ~np.isfinite(array)
-    if array.shape != like.shape or wrong.any():
-        rule = "finite or NaN" if missing_allowed else "finite"
-        raise ValueError(f"{name} must be {like.size} numbers, each {rule}, but got {value!r}")
-    return array
-
-
-class Estimates(NamedTuple):
-    """A filter's output over a batch of B trajectories of K steps; index 0 is after the first measurement."""
-
-    means: np.ndarray  # (B, K + 1, n)
-    covs: np.ndarray  # (B, K + 1, n, n)
-    innovations: np.ndarray  # (B, K + 1, m)
-    innovation_covs: np.ndarray  # (B, K + 1, m, m)
-    log_likelihoods: np.ndarray  # (B, K + 1)
-    divergences: np.ndarray  # (B,), restarts after an estimate that was not finite
 
 
 @cache
@@ -257,57 +156,6 @@ def _pool() -> ThreadPoolExecutor:
 
 def _threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def run(filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray) -> Estimates:
-    """Filter many trajectories in one compiled call that uses all cores.
-
-    Args:
-        filter_: any filter.
-        keys: random keys, one a trajectory, (B, 2).
-        inputs: u, (B, K, p); the filter predicts with u[:, k] ...
-        measurements: ... and updates with z[:, k + 1]; (B, K + 1, m), NaN where missing.
-
-    Returns:
-        `Estimates`, the same whatever the number of cores.
-
-    Raises:
-        ValueError: if shapes do not fit or an input is not finite.
-    """
-    kernels, model = filter_.kernels(), filter_.kernel_model
-    keys = np.ascontiguousarray(keys, dtype=np.float64)
-    inputs = np.ascontiguousarray(inputs, dtype=np.float64)
-    z = np.ascontiguousarray(measurements, dtype=np.float64)
-    if z.ndim != 3 or inputs.ndim != 3 or keys.shape != (len(z), 2):
-        raise ValueError(
-            "keys, inputs, measurements must have shapes (B, 2), (B, K, p), (B, K + 1, m), "
-            f"but got {keys.shape}, {inputs.shape}, {z.shape}"
-        )
-    count, times, m = z.shape
-    if inputs.shape != (count, times - 1, model.inputs) or m != model.m:
-        raise ValueError(
-            f"inputs and measurements must have shapes {(count, times - 1, model.inputs)} and "
-            f"{(count, times, model.m)}, but got {inputs.shape} and {z.shape}"
-        )
-    if not np.isfinite(inputs).all() or np.isinf(z).any():
-        raise ValueError("inputs must be finite, and measurements finite or NaN, but some are not")
-    n = model.n
-    out = Estimates(
-        np.empty((count, times, n)),
-        np.empty((count, times, n, n)),
-        np.empty((count, times, m)),
-        np.empty((count, times, m, m)),
-        np.empty((count, times)),
-        np.empty(count),
-    )
-    batch, numbers = _batch(kernels, is_interpreting()), model.numbers
-
-    def part(first: int, last: int) -> None:
-        memory = new_memory(filter_)  # serves the part's trajectories one after the other
-        batch(*memory, filter_.size, keys, inputs, z, numbers, tuple(out), first, last)
-
-    spread(part, count)
-    return out
 
 
 def spread(part: Callable[[int, int], None], count: int) -> None:

@@ -7,7 +7,8 @@ from functools import lru_cache
 from typing import ClassVar
 
 from filters import matrices
-from filters.filter import Filter, Kernels
+from filters.belief import Kernels
+from filters.filter import Filter
 from filters.rows import constants_form, constants_reader, memory_places, number_places
 from thruster_env.checks import at_least
 from thruster_env.compiled import compilable, inlined

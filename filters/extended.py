@@ -8,8 +8,9 @@ from functools import lru_cache
 from typing import ClassVar
 
 from filters import matrices
+from filters.belief import Kernels
 from filters.derivatives import jacobian
-from filters.filter import Filter, Kernels
+from filters.filter import Filter
 from filters.model import StateSpaceModel
 from filters.rows import constants_form, constants_reader, memory_places, number_places
 from thruster_env.compiled import compilable

@@ -7,49 +7,12 @@ single steps and whole batches, compiled or not, is made from these in `filters.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
-import numpy as np
-
+from filters.belief import Belief, Innovation, Kernels
 from filters.model import StateSpaceModel
-
-
-class Belief(NamedTuple):
-    """What a filter believes of the state at one time."""
-
-    mean: np.ndarray  # (n,)
-    cov: np.ndarray  # (n, n)
-    members: np.ndarray  # (n, N) ensemble, one row a state component; N = 0 for Gaussian filters
-    key: tuple[int, int]  # what all its randomness depends on, together with ...
-    step: int  # ... the number of steps predicted so far
-    divergences: int  # restarts from the prior after an estimate that was not finite
-
-
-class Innovation(NamedTuple):
-    """What a measurement said beyond the prediction."""
-
-    value: np.ndarray  # (m,), z - E[z]; zero in missing channels
-    cov: np.ndarray  # (m, m), S
-    log_likelihood: float  # log N(value; 0, S) of the channels that were there
-
-
-class Kernels(NamedTuple):
-    """A kind of filter for one shape of model, as plain functions on its memory.
-
-    `row` and `numbers` are laid out by `filters.rows`; `table` is (table_rows, padded size), its first n rows the
-    members, without columns for filters without an ensemble; `draws` has room for `draws_per_member` normals a
-    member.
-    """
-
-    n: int
-    m: int
-    table_rows: int
-    draws_per_member: int
-    start: Callable  # start(memory, numbers, size): belief = prior; memory = (row, table, draws)
-    predict: Callable  # predict(memory, u, numbers, size)
-    update: Callable  # update(memory, z, numbers, size); a NaN in z is a missing channel
+from filters.session import Session
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,7 +61,5 @@ class Filter:
         session.run("update", z=z)
         return session.belief(), session.innovation_copy()
 
-    def _session(self):
-        from filters.engine import Session
-
-        return Session(self)
+    def _session(self) -> Session:
+        return Session(self.kernels(), self.kernel_model, self.size)

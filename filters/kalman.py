@@ -7,8 +7,9 @@ from functools import cached_property
 from typing import ClassVar
 
 from filters.affine import AffineModel, linearize
+from filters.belief import Kernels
 from filters.extended import kernels_of
-from filters.filter import Filter, Kernels
+from filters.filter import Filter
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import gymnasium as gym
 import numpy as np
 
-from filters.engine import Session
 from filters.model import StateSpaceModel
 from filters.registry import make_filter, read_tuned_file, tunable_numbers
+from filters.session import Session
 from filters.thruster import model_of_env
 from thruster_env.checks import one_of
 from thruster_env.streams import draw_key, filter_generator
@@ -73,7 +73,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         n, m = self.filter.model.n, self.filter.model.m
         length = {"estimate": n, "measurement+estimate": m + n, "belief": 2 * n}[observation]
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
-        self._session = Session(self.filter)
+        self._session = Session(self.filter.kernels(), self.filter.kernel_model, self.filter.size)
         self._generator = filter_generator(None)
         low, high = env.action_space.low.ravel(), env.action_space.high.ravel()
         self._bounds = list(zip(low.tolist(), high.tolist(), strict=True))

@@ -88,8 +88,8 @@ def general_statements(comparisons: list[Comparison]) -> list[str]:
         "Q = R = q I every error is proportional to sqrt(q): the four noise levels are one experiment, done "
         "here four times with other draws.",
         "The un-updated ensemble: the members run free, the gain comes from their covariance, only the mean "
-        "is corrected, and the measurements carry no noise, so that its U_a in the tunnel case can fall below "
-        "the optimum. On the unstable open-bladed system the members' covariance grows without bound, and the "
+        "is corrected, and the measurements carry no noise, so its U_a in the tunnel case can fall below "
+        "the optimum. On the unstable open-bladed system the members' covariance grows for ever, and the "
         "gain follows it.",
     ]
 

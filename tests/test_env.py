@@ -200,13 +200,11 @@ def test_a_state_that_is_not_finite_terminates(x):
     assert terminated is True and truncated is False
 
 
-@pytest.mark.xfail(raises=RuntimeWarning, reason="a thrust beyond float32 warns when it is cast")
 def test_a_thrust_beyond_float32_does_not_warn():
     env = BowThrusterEnv(initial_state=[1e25, 0.0])
     assert np.isinf(env.reset(seed=0)[0]).all()
 
 
-@pytest.mark.xfail(reason="the limits know the range without flow only")
 def test_a_slow_thruster_in_a_fast_flow_is_not_absurd():
     env = BowThrusterEnv("open_bladed", ambient_velocity=5.0)
     env.reset(seed=0)

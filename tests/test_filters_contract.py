@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from filters import FILTERS, StateSpaceModel, affine_model, make_filter, run, thruster_model, truth
-from filters.engine import Session
+from filters.session import Session
 from thruster_env.compiled import interpreted
 from thruster_env.streams import episode_keys, filter_keys
 
@@ -67,7 +67,7 @@ def stepped(filter_, key, inputs, measurements):
 
 def in_session(filter_, key, inputs, measurements):
     """Rows (mean, cov, innovation, its cov) of one trajectory, by a session."""
-    session = Session(filter_)
+    session = Session(filter_.kernels(), filter_.kernel_model, filter_.size)
     parts = session.mean, session.cov, session.innovation, session.innovation_cov
     session.start(key, measurements[0])
     rows = [[part.copy() for part in parts]]

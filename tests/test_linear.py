@@ -153,7 +153,6 @@ def test_nothing_turns_without_voltage_and_flow(p):
     assert steady_state(p, 0.0) == (0.0, 0.0, 0.0)
 
 
-@pytest.mark.xfail(reason="the Newton-type solution may end at a saddle or nowhere")
 @pytest.mark.parametrize("p", [OPEN_BLADED_CORRECTED], ids=["open_bladed_corrected"])
 @pytest.mark.parametrize(("voltage", "ambient"), [(-1.0, 0.5), (-12.0, 2.0), (-1.5, 1.0), (-12.0, 5.0)])
 def test_a_voltage_against_the_flow_settles_to_its_steady_state(p, voltage, ambient):

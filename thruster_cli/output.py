@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from functools import cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -51,6 +52,7 @@ def emit(shown: list, data: dict, json_target: str | None) -> None:
         write_whole(json_target, json.dumps(data, indent=2, default=_plain) + "\n")
 
 
+@cache
 def announce_compilation() -> None:
     """Say on standard error when this process has to compile; later ones find the result in a cache."""
     tell_when_compiling(

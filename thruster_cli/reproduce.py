@@ -10,6 +10,8 @@ from rich.table import Table
 from rich.text import Text
 
 from studies import STUDIES
+from studies.comparison import MEMBERS, RUNS, compare_all
+from studies.findings import findings, general_statements, study_statements
 from thruster_cli.output import (
     JsonOption,
     SeedOption,
@@ -28,8 +30,8 @@ def command(
     study: Annotated[str, typer.Argument(help=f"{', '.join(STUDIES)} or {ALL}.")],
     runs: Annotated[
         int, typer.Option(help="Independent runs of 100 steps, at least 2; below 200 the intervals are wide.")
-    ] = 200,
-    members: Annotated[int, typer.Option(help="Ensemble size N of the EnKF, at least 2.")] = 200,
+    ] = RUNS,
+    members: Annotated[int, typer.Option(help="Ensemble size N of the EnKF, at least 2.")] = MEMBERS,
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
@@ -49,9 +51,12 @@ def command(
     Example: thruster reproduce nurhadi2022 --json table.json
     """
     names = tuple(STUDIES) if one_of("study", study, (*STUDIES, ALL)) == ALL else (study,)
-    runs, members = at_least("runs", runs, 2), at_least("members", members, 2)
-    from studies.findings import findings, general_statements, study_statements
+    shown, data = reproduce(names, at_least("runs", runs, 2), at_least("members", members, 2), seed)
+    emit(shown, data, json)
 
+
+def reproduce(names: tuple[str, ...], runs: int = RUNS, members: int = MEMBERS, seed: int = 0):
+    """Run the published experiments of some studies; return what to show, a list, and it as plain data."""
     comparisons = _compare(runs, members, seed)
     blank = Text()
     shown, general = [], general_statements(comparisons)
@@ -75,12 +80,10 @@ def command(
             "rows": [_plain_finding(f) for f in found],
             "statements": statements,
         }
-    emit([*shown, Text("What the runs say"), _list(general)], data, json)
+    return [*shown, Text("What the runs say"), _list(general)], data
 
 
 def _compare(runs: int, members: int, seed: int):
-    from studies.comparison import compare_all
-
     announce_compilation()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=progress_console) as progress:

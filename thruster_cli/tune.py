@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-import optuna
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -19,7 +18,16 @@ from tuning.evaluate import Evaluation, Interval, score_ratio
 from tuning.scenarios import Scenario, find_scenario
 from tuning.space import Choice
 from tuning.storage import open_storage
-from tuning.study import SIZE_LADDER, Comparison, StudyResult, finished_trials, open_study, prove, run_study
+from tuning.study import (
+    SIZE_LADDER,
+    Comparison,
+    StudyResult,
+    finished_trials,
+    open_study,
+    prove,
+    quiet_optuna,
+    run_study,
+)
 from tuning.tuned import summary, write_tuned
 
 DEFAULT_STORAGE = "out/studies.journal"
@@ -73,7 +81,7 @@ def tune(
     scenario, trials = find_scenario(scenario_name), at_least("trials", trials, 1)
     name = study_name or f"{filter_name}-{scenario_name}-seed{seed}"
     file = out or Path("out") / f"{name}.json"
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    quiet_optuna()
     announce_compilation()
     study = open_study(name, filter_name, scenario, seed, open_storage(storage))
     already = finished_trials(study)
@@ -99,7 +107,7 @@ def _bar(title: str, total: int, done: int) -> Iterator:
     with Progress(*columns, console=progress_console) as progress:
         task = progress.add_task(title, total=total, completed=min(done, total), best="-")
 
-        def advance(study: optuna.Study, finished: int) -> None:
+        def advance(study, finished: int) -> None:
             progress.update(task, completed=finished, best=f"{study.best_value:.3f}")
 
         yield advance

@@ -12,7 +12,7 @@ def finite(name: str, value) -> float:
     """Return value as a float; raise ValueError unless it is a finite number."""
     try:
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
         raise ValueError(f"{name} must be a finite number, but got {value!r}")
@@ -47,7 +47,7 @@ def vector(name: str, value, size: int) -> np.ndarray:
     """Return value as a float64 array of shape (size,); raise ValueError if shape or numbers are off."""
     try:
         array = np.atleast_1d(np.array(value, dtype=np.float64))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.full(0, np.nan)
     if array.shape != (size,) or not np.isfinite(array).all():
         raise ValueError(f"{name} must be {size} finite number{'s' if size > 1 else ''}, but got {value!r}")
@@ -62,7 +62,7 @@ def covariance(name: str, value, size: int, *, positive_definite: bool = False) 
     rule = f"{name} must be {size} variances or a symmetric {size} x {size} matrix"
     try:
         array = np.atleast_1d(np.array(value, dtype=np.float64))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{rule}, but got {value!r}") from None
     if array.shape == (size,):
         array = np.diag(array)

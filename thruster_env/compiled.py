@@ -77,7 +77,7 @@ def compiled(function: Callable) -> Callable:
 
 
 def tell_when_compiling(tell: Callable[[], None]) -> None:
-    """Call `tell` at the first real compilation of this process; loading from the cache does not count."""
+    """Call `tell` once, at the first real compilation; loading from the cache does not count."""
     from numba.core import event
 
     class Once(event.Listener):
@@ -85,7 +85,7 @@ def tell_when_compiling(tell: Callable[[], None]) -> None:
 
         def on_start(self, event):
             if self.waiting:
-                Once.waiting = False
+                self.waiting = False
                 tell()
 
         def on_end(self, event):

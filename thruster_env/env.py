@@ -92,7 +92,9 @@ class BowThrusterEnv(gym.Env):
             self.reference = finite("reference", reference)
         self.action_space = gym.spaces.Box(-top, top, shape=(1,), dtype=np.float32)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(1,), dtype=np.float32)
-        self._limits = tuple(ABSURD * state_range(self.plant.parameters, top).astype(object))
+        flow = abs(self.plant.ambient_velocity)
+        turned_by_flow = np.array([flow / self.plant.constants.blade_speed, flow])
+        self._limits = (ABSURD * (state_range(self.plant.parameters, top) + turned_by_flow)).tolist()
         self._numbers = self.plant.numbers
         self._memory = np.zeros((MEMORY_ROWS, 1))
         self._step = single_step()
@@ -118,7 +120,7 @@ class BowThrusterEnv(gym.Env):
         self._memory[KEY_0 : KEY_1 + 1, 0] = draw_key(self.np_random)
         self._steps = 0
         omega, flow, thrust, measured, self._voltage = self._step(self._memory, 0.0, self._numbers, True)
-        return np.array((measured,), dtype=np.float32), self._info(omega, flow, thrust, measured)
+        return _as_observation(measured), self._info(omega, flow, thrust, measured)
 
     def step(self, action):
         """Apply a voltage for one sample time.
@@ -133,7 +135,7 @@ class BowThrusterEnv(gym.Env):
         rate = (self._voltage - previous) / self.plant.max_voltage
         reward = -error * error - VOLTAGE_RATE_COST * rate * rate
         terminated = not (abs(omega) < self._limits[0] and abs(flow) < self._limits[1])
-        observation = np.array((measured,), dtype=np.float32)
+        observation = _as_observation(measured)
         return observation, reward, terminated, False, self._info(omega, flow, thrust, measured)
 
     def _info(self, omega, flow, thrust, measured) -> dict:
@@ -148,10 +150,16 @@ class BowThrusterEnv(gym.Env):
 
 def _as_voltage(action) -> float:
     try:
-        voltage = action.item()
-    except (AttributeError, ValueError):
-        values = np.asarray(action, dtype=object).ravel()
-        voltage = values[0] if values.size == 1 else math.nan
-    if not isinstance(voltage, (int, float)) or voltage != voltage:
+        voltage = float(action.item() if hasattr(action, "item") else np.asarray(action, dtype=np.float64).item())
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: a torch tensor of several numbers
+        voltage = math.nan
+    if voltage != voltage:
         raise ValueError(f"an action must be one voltage [V] and not NaN, but got {action!r}")
     return voltage
+
+
+def _as_observation(measured: float) -> np.ndarray:
+    # float32 ends at 3.4e38; casting beyond it would warn on its way to infinity.
+    if not abs(measured) < 3e38:
+        measured = math.copysign(math.inf, measured)
+    return np.array((measured,), dtype=np.float32)

@@ -27,10 +27,12 @@ def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float 
 
     Thrust, torque and momentum drag are homogeneous of degree two, so at U_0 = 0 the ratio r = U_a/omega_m
     solves T(1, r) = K4 r |r| whatever the voltage, and omega_m is the root of a quadratic. That point is the
-    start for a Newton-type solution where U_0 is not zero.
+    start of a simulation where U_0 is not zero; a Newton-type solution then polishes where that settles. (Against
+    the flow there are saddles too, on which Newton's method alone may end.)
 
     Raises ValueError if no steady state is found.
     """
+    from scipy.integrate import solve_ivp
     from scipy.optimize import brentq, root
 
     c = derive_constants(p, ambient_velocity)
@@ -41,6 +43,10 @@ def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float 
         return thrust_and_torque((1.0, r), c)[0] * c.inverse_mass - c.flow_drag * r * abs(r)
 
     # U_a = -U_p turns the attack angle past zero lift for every preset, so the root lies between.
+    if not imbalance(0.0) * imbalance(20.0 * c.blade_speed) < 0:
+        raise ValueError(
+            f"blade_angle must be one with which the thruster has a steady state, but got {p.blade_angle}"
+        )
     ratio = brentq(imbalance, 0.0, 20.0 * c.blade_speed, xtol=1e-16)
     load = c.load_gain * thrust_and_torque((1.0, ratio), c)[1]
     drive = c.voltage_gain * abs(voltage)
@@ -49,9 +55,8 @@ def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float 
     x = np.array([omega, ratio * omega]) * np.sign(voltage)
     if ambient_velocity != 0:
         u = (voltage, ambient_velocity)
-        solution = root(
-            lambda y: rates(tuple(y), u, c), x + [0.0, ambient_velocity], jac=lambda y: _plant_matrix(y, u, c)
-        )
+        settled = solve_ivp(lambda t, y: rates(tuple(y), u, c), (0.0, 1e5), x, method="LSODA", rtol=1e-8)
+        solution = root(lambda y: rates(tuple(y), u, c), settled.y[:, -1], jac=lambda y: _plant_matrix(y, u, c))
         if not solution.success:
             raise ValueError(f"voltage {voltage} V at {ambient_velocity} m/s has no steady state that was found")
         x = solution.x
@@ -118,7 +123,8 @@ def required_substeps(p: ThrusterParameters, dt: float, max_voltage: float, ambi
     limit = ONE_STEP_ACCURACY * state_range(p, max_voltage)
     grid = np.linspace(-1.0, 1.0, 5)
     omega, flow, voltage = (g.ravel() for g in np.meshgrid(grid, grid, grid, indexing="ij"))
-    x, u = (omega * top.omega_m, flow * top.U_a), (voltage * max_voltage, ambient_velocity)
+    fastest_flow = top.U_a + abs(ambient_velocity)
+    x, u = (omega * top.omega_m, flow * fastest_flow), (voltage * max_voltage, ambient_velocity)
     with np.errstate(all="ignore"):
         exact = np.array(run_substeps(x, u, p, dt, 512))
         for count in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256):

@@ -8,14 +8,14 @@ seed gives the same numbers on every path.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from thruster_env.checks import covariance, covariance_root, finite, positive, vector
-from thruster_env.compiled import compilable, compiled, function_fingerprint
+from thruster_env.compiled import compilable, compiled, function_fingerprint, is_interpreting
 from thruster_env.components import column_reader, column_writer, vector_reader
 from thruster_env.dynamics import Constants, substep, thrust_and_torque
 from thruster_env.linear import required_substeps, steady_state
@@ -25,7 +25,7 @@ from thruster_env.streams import INITIAL, MEASUREMENT, PROCESS, normal_block
 DEFAULT_DT = 0.01  # [s], the sample time of the published experiments
 DEFAULT_MAX_VOLTAGE = 24.0  # [V]
 # Tunnel, signal to noise: w stirs motor and flow by 0.5 % of their values at 12 V each step (in stationarity
-# 1.1 rad/s and 0.06 m/s); v is 0.5 N, 4 % of the thrust at 12 V, 16 % at 6 V and 65 % at 3 V.
+# 1.15 rad/s and 0.035 m/s at 12 V); v is 0.5 N, 4 % of the thrust at 12 V, 16 % at 6 V and 65 % at 3 V.
 DEFAULT_PROCESS_NOISE = (1.0, 4e-4)  # variances a step, [(rad/s)^2, (m/s)^2]
 DEFAULT_MEASUREMENT_NOISE = 0.25  # variance, [N^2]
 DEFAULT_INITIAL_VARIANCES = (1.0, 0.01)  # about rest, [(rad/s)^2, (m/s)^2]
@@ -169,12 +169,16 @@ def advance_copies(memory, voltages, numbers):
     _measure(memory, numbers, c)
 
 
-@cache
-def single_step():
+def single_step() -> Callable:
     """Compiled `step(memory, voltage, numbers, begin)` of one thruster; memory is (8, 1), voltage in volts.
 
     It returns (omega_m, U_a, thrust, measurement, applied voltage) as floats.
     """
+    return _single_step(is_interpreting())
+
+
+@cache
+def _single_step(interpreting: bool) -> Callable:
     fingerprint = function_fingerprint()
 
     def step(memory, voltage, numbers, begin):
@@ -191,7 +195,7 @@ def single_step():
 
 
 @cache
-def _batch_simulation():
+def _batch_simulation(interpreting: bool) -> Callable:
     fingerprint = function_fingerprint()
 
     def simulate(keys, voltages, numbers, record):
@@ -221,9 +225,17 @@ def simulate(plant: Plant, keys: np.ndarray, voltages: np.ndarray) -> Simulation
     """Run a plant from its initial state for every key (B, 2) under voltages (B, K) [V].
 
     The same key and voltages give the same numbers as an env that is stepped through Gymnasium.
+
+    Raises:
+        ValueError: if shapes do not fit or a number is not finite.
     """
-    voltages = np.ascontiguousarray(np.asarray(voltages, dtype=np.float64).T)
-    record = np.empty((voltages.shape[0] + 1, 4, len(keys)))
-    _batch_simulation()(np.asarray(keys, dtype=np.float64), voltages, plant.numbers, record)
+    keys, voltages = (np.ascontiguousarray(a, dtype=np.float64) for a in (keys, voltages))
+    if keys.ndim != 2 or keys.shape[1] != 2 or not np.isfinite(keys).all():
+        raise ValueError(f"keys must be finite and of shape (B, 2), but got shape {keys.shape}")
+    if voltages.ndim != 2 or len(voltages) != len(keys) or np.isnan(voltages).any():
+        rule = f"without NaN and of shape ({len(keys)}, K), one row a key"
+        raise ValueError(f"voltages must be {rule}, but got shape {voltages.shape}")
+    record = np.empty((voltages.shape[1] + 1, 4, len(keys)))
+    _batch_simulation(is_interpreting())(keys, np.ascontiguousarray(voltages.T), plant.numbers, record)
     record = np.ascontiguousarray(record.transpose(2, 0, 1))
     return Simulation(record[..., :2], record[..., THRUST], record[..., MEASURED : MEASURED + 1])

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from filters.batch import run
 from filters.consistency import normalized_squares
-from filters.engine import run
 from filters.filter import Filter
 from tuning.scenarios import FIRST_SCORED_STEP, Data
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from optuna.trial import FrozenTrial, TrialState
 
-from filters.engine import run
+from filters.batch import run
 from filters.filter import Filter
 from thruster_env.files import write_whole
 from tuning.scenarios import Data

@@ -31,6 +31,11 @@ DIVERGENCE_PENALTY = 10.0  # added to the score for each run that had to restart
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 
 
+def quiet_optuna() -> None:
+    """Let Optuna report warnings only, for programs that show progress of their own."""
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+
+
 class Comparison(NamedTuple):
     """Three choices on the same held-out seeds, and the bound on these."""
 

@@ -1,0 +1,72 @@
+"""A filter over many trajectories in one compiled call that uses all cores."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.engine import batch, new_memory, spread
+from filters.filter import Filter
+
+
+class Estimates(NamedTuple):
+    """A filter's output over a batch of B trajectories of K steps; index 0 is after the first measurement."""
+
+    means: np.ndarray  # (B, K + 1, n)
+    covs: np.ndarray  # (B, K + 1, n, n)
+    innovations: np.ndarray  # (B, K + 1, m)
+    innovation_covs: np.ndarray  # (B, K + 1, m, m)
+    log_likelihoods: np.ndarray  # (B, K + 1)
+    divergences: np.ndarray  # (B,), restarts after an estimate that was not finite
+
+
+def run(filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray) -> Estimates:
+    """Filter many trajectories in one compiled call that uses all cores.
+
+    Args:
+        filter_: any filter.
+        keys: random keys, one a trajectory, (B, 2).
+        inputs: u, (B, K, p); the filter predicts with u[:, k] ...
+        measurements: ... and updates with z[:, k + 1]; (B, K + 1, m), NaN where missing.
+
+    Returns:
+        `Estimates`, the same whatever the number of cores.
+
+    Raises:
+        ValueError: if shapes do not fit or an input is not finite.
+    """
+    kernels, model = filter_.kernels(), filter_.kernel_model
+    keys = np.ascontiguousarray(keys, dtype=np.float64)
+    inputs = np.ascontiguousarray(inputs, dtype=np.float64)
+    z = np.ascontiguousarray(measurements, dtype=np.float64)
+    if z.ndim != 3 or inputs.ndim != 3 or keys.shape != (len(z), 2):
+        raise ValueError(
+            "keys, inputs, measurements must have shapes (B, 2), (B, K, p), (B, K + 1, m), "
+            f"but got {keys.shape}, {inputs.shape}, {z.shape}"
+        )
+    count, times, m = z.shape
+    if inputs.shape != (count, times - 1, model.inputs) or m != model.m:
+        raise ValueError(
+            f"inputs and measurements must have shapes {(count, times - 1, model.inputs)} and "
+            f"{(count, times, model.m)}, but got {inputs.shape} and {z.shape}"
+        )
+    if not np.isfinite(inputs).all() or np.isinf(z).any():
+        raise ValueError("inputs must be finite, and measurements finite or NaN, but some are not")
+    n = model.n
+    out = Estimates(
+        np.empty((count, times, n)),
+        np.empty((count, times, n, n)),
+        np.empty((count, times, m)),
+        np.empty((count, times, m, m)),
+        np.empty((count, times)),
+        np.empty(count),
+    )
+    run_part, numbers = batch(kernels), model.numbers
+
+    def part(first: int, last: int) -> None:
+        memory = new_memory(kernels, filter_.size)  # serves the part's trajectories one after the other
+        run_part(*memory, filter_.size, keys, inputs, z, numbers, tuple(out), first, last)
+
+    spread(part, count)
+    return out

@@ -1,0 +1,44 @@
+"""Beliefs, innovations, and the plain functions that a kind of filter is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Belief(NamedTuple):
+    """What a filter believes of the state at one time."""
+
+    mean: np.ndarray  # (n,)
+    cov: np.ndarray  # (n, n)
+    members: np.ndarray  # (n, N) ensemble, one row a state component; N = 0 for Gaussian filters
+    key: tuple[int, int]  # what all its randomness depends on, together with ...
+    step: int  # ... the number of steps predicted so far
+    divergences: int  # restarts from the prior after an estimate that was not finite
+
+
+class Innovation(NamedTuple):
+    """What a measurement said beyond the prediction."""
+
+    value: np.ndarray  # (m,), z - E[z]; zero in missing channels
+    cov: np.ndarray  # (m, m), S
+    log_likelihood: float  # log N(value; 0, S) of the channels that were there
+
+
+class Kernels(NamedTuple):
+    """A kind of filter for one shape of model, as plain functions on its memory.
+
+    `row` and `numbers` are laid out by `filters.rows`; `table` is (table_rows, padded size), its first n rows the
+    members, without columns for filters without an ensemble; `draws` has room for `draws_per_member` normals a
+    member.
+    """
+
+    n: int
+    m: int
+    table_rows: int
+    draws_per_member: int
+    start: Callable  # start(memory, numbers, size): belief = prior; memory = (row, table, draws)
+    predict: Callable  # predict(memory, u, numbers, size)
+    update: Callable  # update(memory, z, numbers, size); a NaN in z is a missing channel

@@ -1,0 +1,103 @@
+"""One belief at work in place: what a wrapper steps, and what a filter's pure functions borrow."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from filters.belief import Belief, Innovation, Kernels
+from filters.engine import new_memory, operation
+from filters.model import StateSpaceModel
+from filters.rows import memory_places
+
+
+class Session:
+    """One filter at work in place on its own memory: what a wrapper steps and `Filter.predict` borrows.
+
+    Attributes:
+        mean, cov, innovation, innovation_cov: views on the memory, (n,), (n, n), (m,), (m, m).
+    """
+
+    def __init__(self, kernels: Kernels, model: StateSpaceModel, size: int):
+        """Allocate the memory of a filter with `size` members; `start` or `load` comes next."""
+        n, m = kernels.n, kernels.m
+        places = memory_places(n, m)
+        self._operate = operation(kernels)
+        self._numbers, self._size, self._places = model.numbers, size, places
+        self._memory = new_memory(kernels, size)
+        self._row, self._table, _ = self._memory
+        self._u, self._z = np.zeros(model.inputs), np.full(m, np.nan)
+        self.mean = self._row[places.mean : places.mean + n]
+        self.cov = self._row[places.cov : places.cov + n * n].reshape(n, n)
+        self.innovation = self._row[places.innovation : places.innovation + m]
+        self.innovation_cov = self._row[places.innovation_cov : places.innovation_cov + m * m].reshape(m, m)
+
+    def _do(self, starting: bool, predicting: bool, updating: bool) -> None:
+        self._operate(
+            *self._memory,
+            self._size,
+            self._u,
+            self._z,
+            self._numbers,
+            starting,
+            predicting,
+            updating,
+        )
+
+    def set_key(self, key) -> None:
+        """Set the key (2,) on which the belief's randomness depends."""
+        self._row[self._places.key_0], self._row[self._places.key_1] = key
+
+    def start(self, key, z) -> None:
+        """Set the prior with a random key (2,) and update it with a first measurement z (m,)."""
+        self.set_key(key)
+        self._z[:] = z
+        self._do(True, False, True)
+
+    def step(self, u, z) -> None:
+        """Predict with input u (p,), then update with measurement z (m,); NaN marks a missing channel."""
+        self._u[:] = u
+        self._z[:] = z
+        self._do(False, True, True)
+
+    def run(self, operation: str, u=None, z=None) -> None:
+        """Do one of "start", "predict" or "update" alone, arguments checked."""
+        if u is not None:
+            self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
+        if z is not None:
+            self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
+        self._do(operation == "start", operation == "predict", operation == "update")
+
+    @property
+    def divergences(self) -> int:
+        """Restarts from the prior, so far, after an estimate that was not finite."""
+        return int(self._row[self._places.divergences])
+
+    def load(self, belief: Belief) -> None:
+        """Put a belief into the memory."""
+        self.mean[:], self.cov[:] = belief.mean, belief.cov
+        self._table[: len(belief.mean), : self._size] = belief.members
+        self.set_key(belief.key)
+        self._row[self._places.step] = belief.step
+        self._row[self._places.divergences] = belief.divergences
+
+    def belief(self) -> Belief:
+        """A copy of the belief in the memory."""
+        row, places = self._row, self._places
+        key = int(row[places.key_0]), int(row[places.key_1])
+        members = self._table[: len(self.mean), : self._size].copy()
+        return Belief(self.mean.copy(), self.cov.copy(), members, key, int(row[places.step]), self.divergences)
+
+    def innovation_copy(self) -> Innovation:
+        """A copy of what the last update found."""
+        log_likelihood = float(self._row[self._places.log_likelihood])
+        return Innovation(self.innovation.copy(), self.innovation_cov.copy(), log_likelihood)
+
+
+def vector_like(name: str, value, like: np.ndarray, *, missing_allowed: bool) -> np.ndarray:
+    """Return value as float64 of the shape of `like`; raise ValueError for a wrong shape or infinite entries."""
+    array = np.atleast_1d(np.asarray(value, dtype=np.float64))
+    wrong = np.isinf(array) if missing_allowed else ~np.isfinite(array)
+    if array.shape != like.shape or wrong.any():
+        rule = "finite or NaN" if missing_allowed else "finite"
+        raise ValueError(f"{name} must be {like.size} numbers, each {rule}, but got {value!r}")
+    return array
