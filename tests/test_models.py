@@ -259,11 +259,8 @@ OWN_MODEL = """
 import numpy as np
 from filters import ExtendedKalmanFilter, StateSpaceModel, run
 
-def factor(x):
-    return FACTOR * x
-
 def transition(x, u, c):
-    return (factor(x[0]),)
+    return (FACTOR * x[0],)
 
 def observe(x, c):
     return (x[0],)
@@ -284,7 +281,7 @@ def test_a_model_that_was_edited_is_never_served_from_the_old_cache(tmp_path):
     for factor in ("0.5", "0.25"):
         (tmp_path / "own_model.py").write_text(OWN_MODEL.replace("FACTOR", factor))
         found = subprocess.run(
-            [sys.executable, "-c", "import own_model; print(own_model.means()[0, 1, 0])"],
+            [sys.executable, "-W", "error", "-c", "import own_model; print(own_model.means()[0, 1, 0])"],
             cwd=root,
             env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(root)])},
             capture_output=True,

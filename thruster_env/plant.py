@@ -56,7 +56,7 @@ class Plant(NamedTuple):
 
     @property
     def numbers(self) -> np.ndarray:
-        """All that `step_copies` needs, as one float64 row."""
+        """All that compiled steps need, as one float64 row: the constants, then the places named below."""
         q_root, initial_root = covariance_root(self.process_noise_cov), covariance_root(self.initial_cov)
         noise = [*q_root[np.tril_indices(2)], float(self.measurement_noise_cov[0, 0]) ** 0.5]
         initial = [*self.initial_mean, *initial_root[np.tril_indices(2)]]
@@ -121,14 +121,17 @@ def _initial_distribution(initial_state, parameters, ambient_velocity) -> tuple[
     )
 
 
-_COUNT = len(Constants._fields)
-_read_constants = vector_reader(_COUNT)
+_CONSTANTS = len(Constants._fields)
+SUBSTEPS, TOP_VOLTAGE, Q_ROOT_00, Q_ROOT_10, Q_ROOT_11, R_ROOT = range(_CONSTANTS, _CONSTANTS + 6)
+MEAN_0, MEAN_1, PRIOR_ROOT_00, PRIOR_ROOT_10, PRIOR_ROOT_11 = range(_CONSTANTS + 6, _CONSTANTS + 11)
+
+_read_constants = vector_reader(_CONSTANTS)
 _column, _store = column_reader(2), column_writer(2)
 
 
 @compilable
 def _measure(memory, numbers, c):
-    sigma = numbers[_COUNT + 5]
+    sigma = numbers[R_ROOT]
     for j in range(memory.shape[1]):
         thrust, _ = thrust_and_torque(_column(memory, j), c)
         v, _, _, _ = normal_block(0, memory[STEP, j], MEASUREMENT, memory[KEY_0, j], memory[KEY_1, j])
@@ -140,7 +143,8 @@ def _measure(memory, numbers, c):
 def begin_copies(memory, numbers):
     """Draw the initial state of every copy from its key, and take the first measurement."""
     c = Constants(*_read_constants(numbers))
-    mean_0, mean_1, root_00, root_10, root_11 = numbers[_COUNT + 6 : _COUNT + 11]
+    mean_0, mean_1 = numbers[MEAN_0], numbers[MEAN_1]
+    root_00, root_10, root_11 = numbers[PRIOR_ROOT_00], numbers[PRIOR_ROOT_10], numbers[PRIOR_ROOT_11]
     for j in range(memory.shape[1]):
         w0, w1, _, _ = normal_block(0, 0, INITIAL, memory[KEY_0, j], memory[KEY_1, j])
         memory[0, j] = mean_0 + root_00 * w0
@@ -154,11 +158,11 @@ def begin_copies(memory, numbers):
 def advance_copies(memory, voltages, numbers):
     """Apply voltages (copies,) [V] for one sample time, add process noise, and measure."""
     c = Constants(*_read_constants(numbers))
-    top = numbers[_COUNT + 1]
-    root_00, root_10, root_11 = numbers[_COUNT + 2], numbers[_COUNT + 3], numbers[_COUNT + 4]
+    top = numbers[TOP_VOLTAGE]
+    root_00, root_10, root_11 = numbers[Q_ROOT_00], numbers[Q_ROOT_10], numbers[Q_ROOT_11]
     for j in range(memory.shape[1]):
         memory[VOLTAGE, j] = min(max(voltages[j], -top), top)
-    for _ in range(int(numbers[_COUNT])):
+    for _ in range(int(numbers[SUBSTEPS])):
         for j in range(memory.shape[1]):
             _store(memory, j, substep(_column(memory, j), (memory[VOLTAGE, j], c.ambient_velocity), c))
     for j in range(memory.shape[1]):
