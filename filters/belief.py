@@ -42,3 +42,4 @@ class Kernels(NamedTuple):
     start: Callable  # start(memory, numbers, size): belief = prior; memory = (row, table, draws)
     predict: Callable  # predict(memory, u, numbers, size)
     update: Callable  # update(memory, z, numbers, size); a NaN in z is a missing channel
+    summarise: Callable  # summarise(memory, size): mean and cov from the members; `update` does it itself

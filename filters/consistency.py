@@ -13,13 +13,15 @@ def normalized_squares(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     Estimation with Applications to Tracking and Navigation, section 5.4.
     """
     d = errors.shape[-1]
-    scale = np.sqrt(np.einsum("...ii->...i", covs))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        unit = covs / (scale[..., :, None] * scale[..., None, :])
-    regular = np.isfinite(unit).all(axis=(-1, -2))
-    unit = np.where(regular[..., None, None], unit, np.eye(d))
-    regular &= np.linalg.eigvalsh(unit)[..., 0] > 1e-12
-    unit = np.where(regular[..., None, None], unit, np.eye(d))
-    scaled = np.divide(errors, scale, out=np.zeros_like(errors), where=regular[..., None])
-    solved = np.linalg.solve(unit, scaled[..., None])[..., 0]
-    return np.where(regular, np.einsum("...i,...i->...", scaled, solved), np.nan)
+    root, solved = {}, []
+    total, regular = np.zeros(errors.shape[:-1]), np.ones(errors.shape[:-1], dtype=bool)
+    for i in range(d):  # Cholesky factor and forward substitution, each entry an array over all covariances
+        for j in range(i):
+            rest = sum(root[i, k] * root[j, k] for k in range(j))
+            root[i, j] = (covs[..., i, j] - rest) / root[j, j]
+        pivot = covs[..., i, i] - sum(root[i, k] ** 2 for k in range(i))
+        regular &= pivot > 1e-12 * covs[..., i, i]
+        root[i, i] = np.sqrt(np.where(regular, pivot, 1.0))
+        solved.append((errors[..., i] - sum(root[i, k] * solved[k] for k in range(i))) / root[i, i])
+        total += solved[i] ** 2
+    return np.where(regular, total, np.nan)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -23,8 +24,15 @@ class _Runner:
         self._python = build(kernels)
         self.run = compiled(self._python)
         self._proven = self.run is self._python
+        self._first = threading.Lock()  # one thread compiles, or finds out that numba refuses
 
     def __call__(self, *arguments):
+        if self._proven:
+            return self.run(*arguments)
+        with self._first:
+            return self._prove(*arguments)
+
+    def _prove(self, *arguments):
         if self._proven:
             return self.run(*arguments)
         from numba.core.errors import NumbaError
@@ -43,7 +51,7 @@ class _Runner:
 @cache
 def _restart_if_lost(kernels: Kernels) -> Callable:
     """Return a function that puts the prior in place of a belief that is not finite, and counts it."""
-    places, start = memory_places(kernels.n, kernels.m), kernels.start
+    places, start, summarise = memory_places(kernels.n, kernels.m), kernels.start, kernels.summarise
     last, divergences = places.cov + kernels.n**2, places.divergences
 
     @compilable
@@ -54,13 +62,14 @@ def _restart_if_lost(kernels: Kernels) -> Callable:
             total += abs(row[i])
         if not total < 1e300:
             start(memory, numbers, size)
+            summarise(memory, size)
             row[divergences] += 1.0
 
     return restart_if_lost
 
 
 def _build_operation(kernels: Kernels) -> Callable:
-    start, predict, update = kernels.start, kernels.predict, kernels.update
+    start, predict, update, summarise = kernels.start, kernels.predict, kernels.update, kernels.summarise
     places = memory_places(kernels.n, kernels.m)
     step, divergences = places.step, places.divergences
     restart_if_lost = _restart_if_lost(kernels)
@@ -77,13 +86,15 @@ def _build_operation(kernels: Kernels) -> Callable:
             predict(memory, u, numbers, size)
         if updating:
             update(memory, z, numbers, size)
+        else:
+            summarise(memory, size)
         restart_if_lost(memory, numbers, size)
 
     return operate
 
 
 def _build_batch(kernels: Kernels) -> Callable:
-    n, m, _, _, start, predict, update = kernels
+    n, m, start, predict, update = kernels.n, kernels.m, kernels.start, kernels.predict, kernels.update
     places = memory_places(n, m)
     mean, cov, innovation, s = places.mean, places.cov, places.innovation, places.innovation_cov
     key_0, key_1, step, divergences = places.key_0, places.key_1, places.step, places.divergences
@@ -164,6 +175,5 @@ def _threads() -> int:
 
 def spread(part: Callable[[int, int], None], count: int) -> None:
     """Call part(first, last) on all cores until it has covered 0 ... count; part releases the lock."""
-    part(0, 1)  # compile or load once, before threads race for it
-    edges = np.unique(np.linspace(1, count, 1 + min(count - 1, 4 * _threads())).astype(int))
+    edges = np.linspace(0, count, 1 + min(count, 4 * _threads())).astype(int)
     list(_pool().map(part, edges[:-1], edges[1:]))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import ClassVar
 
 from filters import matrices
@@ -15,9 +16,13 @@ from thruster_env.compiled import compilable, inlined
 from thruster_env.components import (
     column_reader,
     column_writer,
+    matrix_of,
     matrix_reader,
     matrix_writer,
+    tuple_of,
     vector_reader,
+    vector_writer,
+    written_out,
 )
 from thruster_env.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
 
@@ -34,33 +39,43 @@ def add_noise(table, first, count, draws, numbers, root):
                     table[first + i, j] += factor * draws[k * width + j]
 
 
-@compilable
-def mean_of_row(table, i, size):
-    """Mean of the first `size` entries of row i."""
-    total = 0.0
-    for j in range(size):
-        total += table[i, j]
-    return total / size
+@cache
+def row_means(rows: int) -> Callable:
+    """Return `means(table, size)`: means of the first `size` entries of rows 0 ... rows - 1, in one loop."""
+    places = range(rows)
+    return written_out(
+        "means",
+        "table, size",
+        *(f"s{i} = 0.0" for i in places),
+        "for j in range(size):",
+        *(f"    s{i} += table[{i}, j]" for i in places),
+        tuple_of(f"s{i} / size" for i in places),
+        mark=compilable,
+    )
 
 
-@compilable
-def covariance_of_rows(table, i, mean_i, k, mean_k, size):
-    """Sample covariance, divisor size - 1, of the first `size` entries of rows i and k."""
-    total = 0.0
-    for j in range(size):
-        total += (table[i, j] - mean_i) * (table[k, j] - mean_k)
-    return total / (size - 1)
+@cache
+def row_covariances(first: int, rows: int, second: int, columns: int) -> Callable:
+    """Return `covariances(table, size, means)`: sample covariances of two groups of rows, in one loop.
 
+    Entry (i, j) belongs to rows first + i and second + j; means are those of `row_means`, the divisor is size - 1.
+    """
+    pairs = [(i, j) for i in range(rows) for j in range(columns) if first != second or j <= i]
+    used = sorted({first + i for i, _ in pairs} | {second + j for _, j in pairs})
 
-@compilable
-def take_moments(row, mean, cov, table, first, count, size):
-    """Write mean and covariance of rows first ... first + count - 1 to row[mean] and row[cov]."""
-    for i in range(count):
-        row[mean + i] = mean_of_row(table, first + i, size)
-        for k in range(i + 1):
-            value = covariance_of_rows(table, first + i, row[mean + i], first + k, row[mean + k], size)
-            row[cov + i * count + k] = value
-            row[cov + k * count + i] = value
+    def entry(i, j):
+        return f"s{i}_{j}" if (i, j) in pairs else f"s{j}_{i}"
+
+    return written_out(
+        "covariances",
+        "table, size, means",
+        *(f"s{i}_{j} = 0.0" for i, j in pairs),
+        "for j in range(size):",
+        *(f"    d{k} = table[{k}, j] - means[{k}]" for k in used),
+        *(f"    s{i}_{j} += d{first + i} * d{second + j}" for i, j in pairs),
+        matrix_of(rows, columns, lambda i, j: f"{entry(i, j)} / (size - 1)"),
+        mark=compilable,
+    )
 
 
 @lru_cache(maxsize=64)
@@ -76,19 +91,32 @@ def ensemble_kernels(transition, observe, n, m, inputs, form) -> Kernels:
     prior_mean_place, prior_root_place = source.prior_mean, source.prior_root
     q_root_place, r_root_place = source.q_root, source.r_root
     predicted = n
+    means_of_members, means_of_all = row_means(n), row_means(n + m)
+    covariances_of_members = row_covariances(0, n, 0, n)
+    covariances_of_predicted = row_covariances(n, m, n, m)
+    cross_covariances = row_covariances(0, n, n, m)
+    store_mean, store_cov = vector_writer(n, mean_place), matrix_writer(n, n, cov_place)
+    store_innovation = vector_writer(m, innovation_place)
+    difference = matrices.innovation(m, n)
 
     constants, control = constants_reader(n, m, form), vector_reader(inputs)
     state, store_state, store_predicted = column_reader(n), column_writer(n), column_writer(m, n)
-    measured, read_innovation = vector_reader(m), vector_reader(m, innovation_place)
+    measured = vector_reader(m)
     read_r, mask = matrix_reader(m, m, source.r), matrices.masked(m)
-    read_s, store_s = matrix_reader(m, m, s_place), matrix_writer(m, m, s_place)
-    read_gain, store_gain = matrix_reader(n, m, gain_place), matrix_writer(n, m, gain_place)
+    store_s, store_gain = matrix_writer(m, m, s_place), matrix_writer(n, m, gain_place)
     factor, solve = matrices.cholesky_factor(m), matrices.row_solver(n, m)
     likelihood, add = matrices.innovation_likelihood(m), matrices.symmetric_sum(m)
 
     @compilable
     def draw(draws, count, row, stream):
         fill_normals(draws, count, row[step_place], stream, row[key_place], row[key_place + 1])
+
+    @inlined
+    def summarise(memory, size):
+        row, table, _ = memory
+        means = means_of_members(table, size)
+        store_mean(row, means)
+        store_cov(row, covariances_of_members(table, size, means))
 
     @inlined
     def start(memory, numbers, size):
@@ -98,7 +126,6 @@ def ensemble_kernels(transition, observe, n, m, inputs, form) -> Kernels:
             for j in range(table.shape[1]):
                 table[i, j] = numbers[prior_mean_place + i]
         add_noise(table, 0, n, draws, numbers, prior_root_place)
-        take_moments(row, mean_place, cov_place, table, 0, n, size)
 
     @inlined
     def predict(memory, u, numbers, size):
@@ -110,7 +137,6 @@ def ensemble_kernels(transition, observe, n, m, inputs, form) -> Kernels:
         row[step_place] += 1.0
         draw(draws, n * table.shape[1], row, FILTER_PROCESS)
         add_noise(table, 0, n, draws, numbers, q_root_place)
-        take_moments(row, mean_place, cov_place, table, 0, n, size)
 
     @inlined
     def update(memory, z, numbers, size):
@@ -122,20 +148,15 @@ def ensemble_kernels(transition, observe, n, m, inputs, form) -> Kernels:
             if z[i] != z[i]:  # a missing channel: constant predictions have no covariance with anything
                 for j in range(table.shape[1]):
                     table[predicted + i, j] = 0.0
-        take_moments(row, innovation_place, s_place, table, predicted, m, size)
-        for i in range(m):
-            centre = row[innovation_place + i]
-            for a in range(n):
-                row[gain_place + a * m + i] = covariance_of_rows(
-                    table, a, row[mean_place + a], predicted + i, centre, size
-                )
-            row[innovation_place + i] = z[i] - centre if z[i] == z[i] else 0.0
+        means = means_of_all(table, size)
         present = measured(z)
-        s = add(read_s(row), mask(read_r(numbers), present))
+        s = add(covariances_of_predicted(table, size, means), mask(read_r(numbers), present))
         root = factor(s)
+        innovation = difference(present, means)
+        store_innovation(row, innovation)
         store_s(row, s)
-        store_gain(row, solve(read_gain(row), root))
-        row[likelihood_place] = likelihood(read_innovation(row), root, present)
+        store_gain(row, solve(cross_covariances(table, size, means), root))
+        row[likelihood_place] = likelihood(innovation, root, present)
 
         draw(draws, m * table.shape[1], row, FILTER_MEASUREMENT)
         add_noise(table, predicted, m, draws, numbers, r_root_place)
@@ -144,9 +165,9 @@ def ensemble_kernels(transition, observe, n, m, inputs, form) -> Kernels:
                 for a in range(n):
                     for j in range(table.shape[1]):
                         table[a, j] += row[gain_place + a * m + i] * (z[i] - table[predicted + i, j])
-        take_moments(row, mean_place, cov_place, table, 0, n, size)
+        summarise(memory, size)
 
-    return Kernels(n, m, n + m, max(n, m), start, predict, update)
+    return Kernels(n, m, n + m, max(n, m), start, predict, update, summarise)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -40,6 +40,11 @@ def gaussian_start(n: int, m: int) -> Callable:
     return start
 
 
+@compilable
+def nothing_to_summarise(memory, size):
+    """Mean and covariance are the belief itself."""
+
+
 @lru_cache(maxsize=64)
 def gaussian_correction(n: int, m: int) -> Callable:
     """Return `correct(row, z, predicted, h, numbers)`: the Kalman update of the belief in a row.
@@ -75,9 +80,7 @@ def gaussian_correction(n: int, m: int) -> Callable:
         matrices.transposed_multiplier(n, m, n),
         matrices.vector_multiplier(n, m),
     )
-    present = written_out(
-        "present", "z, y", tuple_of(f"z[{i}] - y[{i}] if z[{i}] == z[{i}] else 0.0" for i in range(m))
-    )
+    present = matrices.innovation(m)
     silent = written_out(
         "silent",
         "h, z",
@@ -138,7 +141,7 @@ def extended_kernels(transition, transition_jacobian, observe, observe_jacobian,
         mean, c = read_mean(row), constants(numbers)
         correct(row, measured(z), observe(mean, c), observation_matrix(mean, c), numbers)
 
-    return Kernels(n, m, n, 0, gaussian_start(n, m), predict, update)
+    return Kernels(n, m, n, 0, gaussian_start(n, m), predict, update, nothing_to_summarise)
 
 
 def kernels_of(model: StateSpaceModel) -> Kernels:

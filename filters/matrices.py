@@ -72,6 +72,13 @@ def identity_less(size: int) -> Callable:
 
 
 @cache
+def innovation(size: int, first: int = 0) -> Callable:
+    """Return `subtract(z, y)`: z - y[first:], zero in channels that are NaN in z."""
+    entries = (f"z[{i}] - y[{first + i}] if z[{i}] == z[{i}] else 0.0" for i in range(size))
+    return written_out("subtract", "z, y", tuple_of(entries))
+
+
+@cache
 def masked(size: int) -> Callable:
     """Return `mask(r, z)`: the covariance r without its correlations to channels that are NaN in z."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -58,7 +59,7 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
     nis = np.nanmean(
         normalized_squares(estimates.innovations[:, late], estimates.innovation_covs[:, late]), axis=1
     )
-    resampled = np.sqrt(mean_squares[_resamples(len(mean_squares))].mean(axis=1))  # (resamples, n)
+    resampled = np.sqrt(_resampled_means(mean_squares))  # (resamples, n)
     rmse = np.sqrt(mean_squares.mean(axis=0))
     return Evaluation(
         rmse=tuple(interval(rmse[i], resampled[:, i]) for i in range(len(rmse))),
@@ -88,8 +89,7 @@ def score_ratio(a: Evaluation, b: Evaluation) -> Interval:
         raise ValueError(
             f"a paired comparison needs the same seeds, but got {len(a.mean_squares)} and {len(b.mean_squares)}"
         )
-    picks = _resamples(len(a.mean_squares))
-    scores = [(np.sqrt(e.mean_squares[picks].mean(axis=1)) / e.scale).mean(axis=1) for e in (a, b)]
+    scores = [(np.sqrt(_resampled_means(e.mean_squares)) / e.scale).mean(axis=1) for e in (a, b)]
     return interval(score(a.mean_squares, a.scale) / score(b.mean_squares, b.scale), scores[0] / scores[1])
 
 
@@ -101,9 +101,16 @@ def interval(value: float, resampled: np.ndarray) -> Interval:
 
 def mean_interval(values: np.ndarray) -> Interval:
     """Mean of one number a run, with its bootstrap interval over runs."""
-    return interval(values.mean(), values[_resamples(len(values))].mean(axis=1))
+    return interval(values.mean(), _resampled_means(values))
 
 
-def _resamples(count: int) -> np.ndarray:
-    # The same resamples in every call: paired quantities stay paired, and results repeat.
-    return np.random.default_rng(0).integers(0, count, size=(RESAMPLES, count))
+def _resampled_means(values: np.ndarray) -> np.ndarray:
+    return _bootstrap_weights(len(values)) @ values
+
+
+@lru_cache(maxsize=8)
+def _bootstrap_weights(count: int) -> np.ndarray:
+    # Row r holds how often resample r picks each run, over their number. The same in every call: paired
+    # quantities stay paired, and results repeat.
+    picks = np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), size=RESAMPLES)
+    return picks / count
