@@ -11,6 +11,7 @@ import numpy as np
 
 from filters.derivatives import jacobian
 from filters.model import StateSpaceModel
+from thruster_env.checks import covariance, vector
 from thruster_env.components import tuple_of, written_out
 
 
@@ -81,8 +82,10 @@ def affine_model(
         raise ValueError(
             f"a, b, c must have shapes (n, n), (n, p), (m, n), but got {a.shape}, {b.shape}, {c.shape}"
         )
-    offset = np.zeros(n) if state_offset is None else np.asarray(state_offset, dtype=np.float64)
-    shift = np.zeros(m) if measurement_offset is None else np.asarray(measurement_offset, dtype=np.float64)
+    offset = vector("state_offset", [0.0] * n if state_offset is None else state_offset, n)
+    shift = vector("measurement_offset", [0.0] * m if measurement_offset is None else measurement_offset, m)
+    prior_mean = vector("prior_mean", prior_mean, n)
+    measurement_noise_cov = covariance("measurement_noise_cov", measurement_noise_cov, m)
     return AffineModel(
         **_affine_functions(n, m, p),
         process_noise_cov=process_noise_cov,
@@ -110,12 +113,13 @@ def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
         return x
 
     a, point, v = np.eye(n), tuple(x), tuple(u)
+    scales, input_scales = tuple(model.scales), tuple(np.where(u == 0, 1.0, np.abs(u)))
     step = jacobian(model.transition, model.transition_jacobian, n, n, "u, c")
     for _ in range(model.substeps):
-        a = np.array(step(point, v, c)) @ a
+        a = np.array(step(point, scales, v, c)) @ a
         point = model.transition(point, v, c)
-    b = np.array(jacobian(advance, None, n, p, "state")(v, tuple(x)))
-    h = np.array(jacobian(model.observe, model.observe_jacobian, m, n, "c")(tuple(x), c))
+    b = np.array(jacobian(advance, None, n, p, "state")(v, input_scales, tuple(x)))
+    h = np.array(jacobian(model.observe, model.observe_jacobian, m, n, "c")(tuple(x), scales, c))
     return affine_model(
         a=a,
         b=b,

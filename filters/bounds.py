@@ -14,7 +14,7 @@ from filters.model import StateSpaceModel
 from filters.rows import constants_form, constants_reader, number_places, padded
 from filters.truth import truth_steps_of
 from thruster_env.checks import at_least
-from thruster_env.compiled import compilable, compiled, function_fingerprint, is_interpreting
+from thruster_env.compiled import CompiledOrPython, compilable, function_fingerprint, is_interpreting
 from thruster_env.components import matrix_reader, vector_reader, written_out
 from thruster_env.streams import GROUP
 
@@ -126,6 +126,7 @@ def _gatherer(model: StateSpaceModel, interpreting: bool):
 def _build_gatherer(steps, transition, transition_matrix, observation_matrix, n, m, inputs, form, interpreting):
     begin, advance, _ = steps
     state, control, constants = vector_reader(n), vector_reader(inputs), constants_reader(n, m, form)
+    scales = vector_reader(n, number_places(n, m).scales)
     substeps, room = number_places(n, m).substeps, padded(max(n, m), GROUP)
     times, identity = multiplier(n, n, n), matrix_reader(n, n)
     read_weight_n, read_weight_m = matrix_reader(n, n), matrix_reader(m, m)
@@ -142,7 +143,7 @@ def _build_gatherer(steps, transition, transition_matrix, observation_matrix, n,
     def whole_step_matrix(x, u, numbers, c, eye):
         f = identity(eye)
         for _ in range(int(numbers[substeps])):
-            f = times(transition_matrix(x, u, c), f)
+            f = times(transition_matrix(x, scales(numbers), u, c), f)
             x = transition(x, u, c)
         return f
 
@@ -156,7 +157,9 @@ def _build_gatherer(steps, transition, transition_matrix, observation_matrix, n,
                 key_0, key_1 = keys[b, truth, 0], keys[b, truth, 1]
                 begin(x, draws, key_0, key_1, numbers)
                 for k in range(f_mean.shape[1]):
-                    accumulate(information, b, k, quadratic_m(observation_matrix(state(x), c), weight_r))
+                    accumulate(
+                        information, b, k, quadratic_m(observation_matrix(state(x), scales(numbers), c), weight_r)
+                    )
                     if k == inputs.shape[1]:
                         break
                     for i in range(u.shape[0]):
@@ -166,4 +169,4 @@ def _build_gatherer(steps, transition, transition_matrix, observation_matrix, n,
                     accumulate(f_mean, b, k, f)
                     advance(x, u, draws, k + 1, key_0, key_1, numbers)
 
-    return compiled(gather)
+    return CompiledOrPython(gather)

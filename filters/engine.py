@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
-import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, lru_cache
@@ -12,47 +10,18 @@ from functools import cache, lru_cache
 import numpy as np
 
 from filters.belief import Kernels
-from filters.rows import LANES, memory_places, padded
-from thruster_env.compiled import compilable, compiled, function_fingerprint, is_interpreting
+from filters.rows import LANES, memory_places, number_places, padded
+from thruster_env.compiled import CompiledOrPython, compilable, function_fingerprint, is_interpreting
 from thruster_env.streams import GROUP
-
-
-class _Runner:
-    """A function made from kernels: compiled if numba can, else as Python with one warning."""
-
-    def __init__(self, build: Callable, kernels: Kernels):
-        self._python = build(kernels)
-        self.run = compiled(self._python)
-        self._proven = self.run is self._python
-        self._first = threading.Lock()  # one thread compiles, or finds out that numba refuses
-
-    def __call__(self, *arguments):
-        if self._proven:
-            return self.run(*arguments)
-        with self._first:
-            return self._prove(*arguments)
-
-    def _prove(self, *arguments):
-        if self._proven:
-            return self.run(*arguments)
-        from numba.core.errors import NumbaError
-
-        try:
-            result = self.run(*arguments)
-        except NumbaError as error:  # raised before anything has run
-            reason = str(error).strip().splitlines()[-1]
-            warnings.warn(f"the model runs as Python, slowly, for numba refuses it: {reason}", stacklevel=2)
-            self.run = self._python
-            result = self.run(*arguments)
-        self._proven = True
-        return result
 
 
 @cache
 def _restart_if_lost(kernels: Kernels) -> Callable:
     """Return a function that puts the prior in place of a belief that is not finite, and counts it."""
-    places, start, summarise = memory_places(kernels.n, kernels.m), kernels.start, kernels.summarise
-    last, divergences = places.cov + kernels.n**2, places.divergences
+    n, m, start, summarise = kernels.n, kernels.m, kernels.start, kernels.summarise
+    places, r_place = memory_places(n, m), number_places(n, m).r
+    last, divergences = places.gain, places.divergences
+    innovation, s_place, log_likelihood = places.innovation, places.innovation_cov, places.log_likelihood
 
     @compilable
     def restart_if_lost(memory, numbers, size):
@@ -64,6 +33,11 @@ def _restart_if_lost(kernels: Kernels) -> Callable:
             start(memory, numbers, size)
             summarise(memory, size)
             row[divergences] += 1.0
+            row[log_likelihood] = 0.0
+            for i in range(m):
+                row[innovation + i] = 0.0
+            for i in range(m * m):
+                row[s_place + i] = numbers[r_place + i]
 
     return restart_if_lost
 
@@ -86,9 +60,9 @@ def _build_operation(kernels: Kernels) -> Callable:
             predict(memory, u, numbers, size)
         if updating:
             update(memory, z, numbers, size)
+            restart_if_lost(memory, numbers, size)
         else:
             summarise(memory, size)
-        restart_if_lost(memory, numbers, size)
 
     return operate
 
@@ -148,8 +122,8 @@ def batch(kernels: Kernels) -> Callable:
 
 
 @lru_cache(maxsize=128)
-def _runner(build: Callable, kernels: Kernels, interpreting: bool) -> _Runner:
-    return _Runner(build, kernels)
+def _runner(build: Callable, kernels: Kernels, interpreting: bool) -> CompiledOrPython:
+    return CompiledOrPython(build(kernels))
 
 
 def new_memory(kernels: Kernels, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -116,7 +116,7 @@ def extended_kernels(transition, transition_jacobian, observe, observe_jacobian,
     read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
     store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
     read_q, constants = matrix_reader(n, n, source.q), constants_reader(n, m, form)
-    control, measured = vector_reader(inputs), vector_reader(m)
+    control, measured, read_scales = vector_reader(inputs), vector_reader(m), vector_reader(n, source.scales)
     transition_matrix = jacobian(transition, transition_jacobian, n, n, "u, c")
     observation_matrix = jacobian(observe, observe_jacobian, m, n, "c")
     times, times_transposed = matrices.multiplier(n, n, n), matrices.transposed_multiplier(n, n, n)
@@ -126,9 +126,9 @@ def extended_kernels(transition, transition_jacobian, observe, observe_jacobian,
     def predict(memory, u, numbers, size):
         row, _, _ = memory
         mean, p = read_mean(row), read_cov(row)
-        v, c = control(u), constants(numbers)
+        v, c, scales = control(u), constants(numbers), read_scales(numbers)
         for _ in range(int(numbers[substeps_place])):
-            f = transition_matrix(mean, v, c)
+            f = transition_matrix(mean, scales, v, c)
             mean = transition(mean, v, c)
             p = times_transposed(times(f, p), f)
         store_mean(row, mean)
@@ -139,7 +139,7 @@ def extended_kernels(transition, transition_jacobian, observe, observe_jacobian,
     def update(memory, z, numbers, size):
         row, _, _ = memory
         mean, c = read_mean(row), constants(numbers)
-        correct(row, measured(z), observe(mean, c), observation_matrix(mean, c), numbers)
+        correct(row, measured(z), observe(mean, c), observation_matrix(mean, read_scales(numbers), c), numbers)
 
     return Kernels(n, m, n, 0, gaussian_start(n, m), predict, update, nothing_to_summarise)
 

@@ -48,7 +48,10 @@ class Filter:
         return session.belief()
 
     def predict(self, belief: Belief, u) -> Belief:
-        """The belief one step later under input u (p,)."""
+        """The belief one step later under input u (p,).
+
+        If it is not finite, the next update restarts from the prior and counts that.
+        """
         session = self._session()
         session.load(belief)
         session.run("predict", u=u)

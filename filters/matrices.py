@@ -56,11 +56,9 @@ def quadratic_form(rows: int, columns: int) -> Callable:
 @cache
 def symmetric_sum(size: int) -> Callable:
     """Return `add(a, b)`: the symmetric part of a + b, exactly symmetric."""
-    return written_out(
-        "add",
-        "a, b",
-        matrix_of(size, size, lambda i, j: f"0.5 * (a[{i}][{j}] + a[{j}][{i}] + b[{i}][{j}] + b[{j}][{i}])"),
-    )
+    places = [(i, j) for i in range(size) for j in range(i + 1)]
+    lines = (f"s{i}_{j} = 0.5 * (a[{i}][{j}] + a[{j}][{i}] + b[{i}][{j}] + b[{j}][{i}])" for i, j in places)
+    return written_out("add", "a, b", *lines, matrix_of(size, size, lambda i, j: f"s{max(i, j)}_{min(i, j)}"))
 
 
 @cache

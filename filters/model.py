@@ -55,14 +55,14 @@ class StateSpaceModel:
 
     def __post_init__(self):
         """Check shapes and signs; raise ValueError that states the rule and the value."""
-        mean = np.atleast_1d(np.array(self.prior_mean, dtype=np.float64))
-        n = mean.size
-        r = np.atleast_1d(np.array(self.measurement_noise_cov, dtype=np.float64))
+        mean = vector("prior_mean", self.prior_mean)
+        n, r = len(mean), self.measurement_noise_cov
+        m = len(r) if isinstance(r, (list, tuple, np.ndarray)) and np.ndim(r) else 1
         checked = {
-            "prior_mean": vector("prior_mean", mean, n),
+            "prior_mean": mean,
             "prior_cov": covariance("prior_cov", self.prior_cov, n),
             "process_noise_cov": covariance("process_noise_cov", self.process_noise_cov, n),
-            "measurement_noise_cov": covariance("measurement_noise_cov", r, len(r), positive_definite=True),
+            "measurement_noise_cov": covariance("measurement_noise_cov", r, m, positive_definite=True),
             "substeps": at_least("substeps", self.substeps, 1),
             "inputs": at_least("inputs", self.inputs, 0),
         }
@@ -97,7 +97,17 @@ class StateSpaceModel:
             self.prior_mean,
             self.prior_cov,
             covariance_root(self.prior_cov),
+            self.scales,
             [self.substeps],
             list(self.constants),
         )
         return np.concatenate([np.ravel(np.asarray(a, dtype=np.float64)) for a in matrices])
+
+    @property
+    def scales(self) -> np.ndarray:
+        """What central differences measure a small step of each state in, (n,): its spread.
+
+        A change of units then changes nothing.
+        """
+        spread = np.sqrt(np.diag(self.prior_cov) + np.diag(self.process_noise_cov))
+        return np.where(spread > 0, spread, 1.0)

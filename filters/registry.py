@@ -12,7 +12,7 @@ from filters.extended import ExtendedKalmanFilter
 from filters.filter import Filter
 from filters.kalman import KalmanFilter
 from filters.model import StateSpaceModel
-from thruster_env.checks import one_of
+from thruster_env.checks import one_of, shown
 
 FILTERS: dict[str, type[Filter]] = {
     kind.name: kind for kind in (KalmanFilter, ExtendedKalmanFilter, EnsembleKalmanFilter)
@@ -58,5 +58,8 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
     entry = content.get("filter")
     if not isinstance(entry, dict) or set(entry) != {"name", "numbers", "model"}:
         raise ValueError(f"a tuned file must have a filter with name, numbers and model, but {path} has not")
+    for part in ("numbers", "model"):
+        if not isinstance(entry[part], dict):
+            raise ValueError(f"the {part} of a tuned file must be a mapping, but {path} has {shown(entry[part])}")
     one_of("the filter of a tuned file", entry["name"], tuple(FILTERS))
     return content

@@ -55,6 +55,7 @@ class NumberPlaces(NamedTuple):
     prior_mean: int  # (n,)
     prior_cov: int  # (n, n)
     prior_root: int  # (n, n)
+    scales: int  # (n,), what small steps of each state are measured in
     substeps: int
     constants: int  # the model's own constants
 
@@ -62,7 +63,7 @@ class NumberPlaces(NamedTuple):
 @cache
 def number_places(n: int, m: int) -> NumberPlaces:
     """Places in the row of a model's numbers; see `StateSpaceModel.numbers`."""
-    return NumberPlaces(*_starts(n * n, n * n, m * m, m * m, n, n * n, n * n, 1))
+    return NumberPlaces(*_starts(n * n, n * n, m * m, m * m, n, n * n, n * n, n, 1))
 
 
 def _starts(*lengths: int) -> list[int]:

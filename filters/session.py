@@ -75,7 +75,9 @@ class Session:
     def load(self, belief: Belief) -> None:
         """Put a belief into the memory."""
         self.mean[:], self.cov[:] = belief.mean, belief.cov
-        self._table[: len(belief.mean), : self._size] = belief.members
+        if self._size:
+            self._table[: len(belief.mean)] = belief.members[:, :1]  # the padding follows a real member
+            self._table[: len(belief.mean), : self._size] = belief.members
         self.set_key(belief.key)
         self._row[self._places.step] = belief.step
         self._row[self._places.divergences] = belief.divergences

@@ -9,7 +9,7 @@ import numpy as np
 
 from filters.model import StateSpaceModel
 from filters.rows import constants_form, constants_reader, number_places, padded
-from thruster_env.compiled import compilable, compiled, function_fingerprint, is_interpreting
+from thruster_env.compiled import CompiledOrPython, compilable, function_fingerprint, is_interpreting
 from thruster_env.components import vector_reader, vector_writer
 from thruster_env.streams import GROUP, INITIAL, MEASUREMENT, PROCESS, fill_normals
 
@@ -93,16 +93,24 @@ def _simulation(begin, advance, measure, n: int, m: int, interpreting: bool):
                 for i in range(m):
                     measurements[b, k, i] = z[i]
 
-    return compiled(simulate)
+    return CompiledOrPython(simulate)
 
 
 def simulate(model: StateSpaceModel, keys: np.ndarray, inputs: np.ndarray) -> Truth:
     """Draw truths from a model, one for every key (B, 2), under inputs (B, K, p).
 
     The numbers are those of the plant with the same key, where the model is exact.
+
+    Raises:
+        ValueError: if shapes do not fit.
     """
     inputs = np.ascontiguousarray(inputs, dtype=np.float64)
     keys = np.ascontiguousarray(keys, dtype=np.float64)
+    if inputs.ndim != 3 or inputs.shape[2] != model.inputs or keys.shape != (len(inputs), 2):
+        raise ValueError(
+            f"keys and inputs must have shapes (B, 2) and (B, K, {model.inputs}), "
+            f"but got {keys.shape} and {inputs.shape}"
+        )
     count, steps, _ = inputs.shape
     truth = Truth(np.empty((count, steps + 1, model.n)), np.empty((count, steps + 1, model.m)))
     run = _simulation(*truth_steps_of(model), model.n, model.m, is_interpreting())

@@ -12,7 +12,7 @@ from filters.model import StateSpaceModel
 from filters.registry import make_filter, read_tuned_file, tunable_numbers
 from filters.session import Session
 from filters.thruster import model_of_env
-from thruster_env.checks import one_of
+from thruster_env.checks import one_of, shown
 from thruster_env.streams import draw_key, filter_generator
 
 OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
@@ -57,7 +57,9 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         **numbers,
     ):
         """Build model and filter; see the class for the arguments."""
-        recorded = {"filter": filter, "observation": observation, "model": model, "tuned": tuned, **numbers}
+        model = model.content if isinstance(model, _ModelInSpec) else model
+        held = _ModelInSpec(model) if isinstance(model, StateSpaceModel) else model
+        recorded = {"filter": filter, "observation": observation, "model": held, "tuned": tuned, **numbers}
         gym.utils.RecordConstructorArgs.__init__(self, **recorded)
         gym.Wrapper.__init__(self, env)
         self._form = one_of("observation", observation, OBSERVATIONS)
@@ -84,6 +86,10 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         if seed is not None:
             self._generator = filter_generator(seed)
         z = _measurement(observation, info)
+        if np.shape(z) != (self.filter.model.m,):
+            raise ValueError(
+                f"a measurement must have the model's {self.filter.model.m} entries, but got {shown(z)}"
+            )
         self._session.start(draw_key(self._generator), z)
         return self._observe(z, info), info
 
@@ -126,9 +132,22 @@ def _model_for(env: gym.Env, model, arguments: dict) -> StateSpaceModel:
             f"model must be 'module:factory' that can be imported, or a StateSpaceModel, but got {model!r}"
         ) from None
     try:
-        return factory(**arguments)
+        made = factory(**arguments)
     except TypeError as error:
         raise ValueError(f"model {model!r} must take the given arguments: {error}") from None
+    if not isinstance(made, StateSpaceModel):
+        raise ValueError(f"model {model!r} must return a StateSpaceModel, but it returned {shown(made)}")
+    return made
+
+
+class _ModelInSpec:
+    """A model as an env's spec keeps it. JSON refuses it by its class's name, which says what to do."""
+
+    def __init__(self, content: StateSpaceModel):
+        self.content = content
+
+
+_ModelInSpec.__name__ = "StateSpaceModel (give model='module:factory' instead)"
 
 
 def _check_spaces(env: gym.Env, model: StateSpaceModel) -> None:

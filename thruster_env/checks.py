@@ -8,6 +8,12 @@ from collections.abc import Iterable
 import numpy as np
 
 
+def shown(value) -> str:
+    """A value for an error message, on one line and not too long."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 200 else text[:197] + "..."
+
+
 def finite(name: str, value) -> float:
     """Return value as a float; raise ValueError unless it is a finite number."""
     try:
@@ -15,7 +21,7 @@ def finite(name: str, value) -> float:
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise ValueError(f"{name} must be a finite number, but got {value!r}")
+        raise ValueError(f"{name} must be a finite number, but got {shown(value)}")
     return number
 
 
@@ -24,7 +30,7 @@ def positive(name: str, value, *, zero_allowed: bool = False) -> float:
     number = finite(name, value)
     if number < 0 or (number == 0 and not zero_allowed):
         rule = "zero or positive" if zero_allowed else "positive"
-        raise ValueError(f"{name} must be {rule}, but got {value!r}")
+        raise ValueError(f"{name} must be {rule}, but got {shown(value)}")
     return number
 
 
@@ -32,25 +38,28 @@ def at_least(name: str, value, least: int) -> int:
     """Return value as an int; raise ValueError unless it is a whole number of at least `least`."""
     number = finite(name, value)
     if number != int(number) or number < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, but got {value!r}")
+        raise ValueError(f"{name} must be a whole number of at least {least}, but got {shown(value)}")
     return int(number)
 
 
 def one_of(name: str, value, choices: Iterable[str]) -> str:
     """Return value; raise ValueError unless it is one of the choices."""
     if not isinstance(value, str) or value not in tuple(choices):
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, but got {value!r}")
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, but got {shown(value)}")
     return value
 
 
-def vector(name: str, value, size: int) -> np.ndarray:
-    """Return value as a float64 array of shape (size,); raise ValueError if shape or numbers are off."""
+def vector(name: str, value, size: int | None = None) -> np.ndarray:
+    """Return value as a float64 array of shape (size,), of any size if None; raise ValueError otherwise."""
     try:
         array = np.atleast_1d(np.array(value, dtype=np.float64))
     except (TypeError, ValueError, OverflowError):
         array = np.full(0, np.nan)
-    if array.shape != (size,) or not np.isfinite(array).all():
-        raise ValueError(f"{name} must be {size} finite number{'s' if size > 1 else ''}, but got {value!r}")
+    if array.ndim != 1 or not array.size or array.size != (size or array.size) or not np.isfinite(array).all():
+        count = size or array.size or "some"
+        raise ValueError(
+            f"{name} must be {count} finite number{'' if count == 1 else 's'}, but got {shown(value)}"
+        )
     return array
 
 
@@ -63,16 +72,16 @@ def covariance(name: str, value, size: int, *, positive_definite: bool = False) 
     try:
         array = np.atleast_1d(np.array(value, dtype=np.float64))
     except (TypeError, ValueError, OverflowError):
-        raise ValueError(f"{rule}, but got {value!r}") from None
+        raise ValueError(f"{rule}, but got {shown(value)}") from None
     if array.shape == (size,):
         array = np.diag(array)
     if array.shape != (size, size) or not np.isfinite(array).all() or not np.allclose(array, array.T):
-        raise ValueError(f"{rule} of finite numbers, but got {value!r}")
+        raise ValueError(f"{rule} of finite numbers, but got {shown(value)}")
     eigenvalues = np.linalg.eigvalsh(array)
     if eigenvalues[0] < -1e-12 * max(1e-300, abs(eigenvalues[-1])):
-        raise ValueError(f"{name} must be positive semidefinite (no negative variance), but got {value!r}")
+        raise ValueError(f"{name} must be positive semidefinite (no negative variance), but got {shown(value)}")
     if positive_definite and eigenvalues[0] <= 0:
-        raise ValueError(f"{name} must be positive definite, but got {value!r}")
+        raise ValueError(f"{name} must be positive definite, but got {shown(value)}")
     return (array + array.T) / 2
 
 

@@ -12,11 +12,18 @@ import functools
 import hashlib
 import importlib.util
 import inspect
+import threading
+import types
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 # No "nnan" and "ninf": with them isfinite and isnan are compiled away, and failures would pass unseen.
 FASTMATH = frozenset({"contract", "reassoc", "arcp", "nsz", "afn"})
+
+_PACKAGES = ("thruster_env", "filters")  # whose sources compiled functions may inline
 
 _waiting: list[tuple[Callable, bool]] = []
 _marked: set[Callable] = set()
@@ -98,7 +105,7 @@ def tell_when_compiling(tell: Callable[[], None]) -> None:
 def source_fingerprint() -> str:
     """Hash of the sources that compiled functions may inline; numba's cache looks at the outermost only."""
     digest = hashlib.sha256()
-    for package in ("thruster_env", "filters"):
+    for package in _PACKAGES:
         spec = importlib.util.find_spec(package)
         for folder in (spec.submodule_search_locations or []) if spec else []:
             for path in sorted(Path(folder).glob("*.py")):
@@ -107,15 +114,59 @@ def source_fingerprint() -> str:
 
 
 def function_fingerprint(*functions: Callable | None) -> str:
-    """Hash of what the given functions do: the text of their modules, else their byte code."""
+    """Hash of what functions do: their module's text and byte code, and those of all they call by name."""
     digest = hashlib.sha256(source_fingerprint().encode())
-    for function in functions:
-        if function is None:
+    seen: set[Callable] = set()
+    waiting = [function for function in functions if function is not None]
+    while waiting:
+        function = waiting.pop()
+        if function in seen:
             continue
-        code = function.__code__
-        digest.update(repr((code.co_name, code.co_code, code.co_consts, code.co_names)).encode())
-        try:
-            digest.update(Path(inspect.getsourcefile(function) or "").read_bytes())
-        except (OSError, TypeError):
-            pass  # defined in a notebook or a prompt: the byte code above tells changes apart
+        seen.add(function)
+        digest.update(_code_text(function.__code__).encode())
+        cells = [cell.cell_contents for cell in function.__closure__ or ()]
+        called = [function.__globals__.get(name) for name in function.__code__.co_names]
+        waiting += [part for part in (*cells, *called) if isinstance(part, types.FunctionType)]
+        if not function.__module__.startswith(_PACKAGES):
+            try:
+                digest.update(Path(inspect.getsourcefile(function) or "").read_bytes())
+            except (OSError, TypeError):
+                pass  # from a notebook or a prompt: the byte code tells changes apart
     return digest.hexdigest()
+
+
+def _code_text(code: types.CodeType) -> str:
+    constants = [_code_text(c) if isinstance(c, types.CodeType) else repr(c) for c in code.co_consts]
+    return " ".join([code.co_name, code.co_code.hex(), *constants, *code.co_names])
+
+
+class CompiledOrPython:
+    """A function compiled at its first call, or run as Python, with one warning, if numba refuses it."""
+
+    def __init__(self, function: Callable):
+        """Take a plain function; nothing is compiled yet."""
+        self._python, self._run = function, compiled(function)
+        self._proven = self._run is function
+        self._first = threading.Lock()  # one thread compiles, or finds out that numba refuses
+
+    def __call__(self, *arguments):
+        """Call the function."""
+        if not self._proven:
+            with self._first:
+                return self._call_first(*arguments)
+        if self._run is self._python:
+            with np.errstate(all="ignore"):  # compiled code does not warn of overflow either
+                return self._run(*arguments)
+        return self._run(*arguments)
+
+    def _call_first(self, *arguments):
+        if not self._proven:
+            try:
+                return self._run(*arguments)
+            except Exception as error:  # numba's, of many classes: compiled code itself raises nothing
+                reason = str(error).strip().splitlines()[-1]
+                warnings.warn(f"the model runs as Python, slowly, for numba refuses it: {reason}", stacklevel=3)
+                self._run = self._python
+            finally:
+                self._proven = True
+        return self(*arguments)
