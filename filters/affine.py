@@ -97,6 +97,11 @@ def affine_model(
     )
 
 
+@cache
+def _input_first(transition: Callable) -> Callable:
+    return lambda u, x, c: transition(x, u, c)
+
+
 def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
     """Affine approximation of a model about a state x* (n,) and an input u* (p,), offsets kept.
 
@@ -106,19 +111,14 @@ def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
         return model
     x, u, c = np.array(state, dtype=np.float64), np.array(control, dtype=np.float64), model.constants
     n, m, p = model.n, model.m, model.inputs
-
-    def advance(u, x):
-        for _ in range(model.substeps):
-            x = model.transition(x, u, c)
-        return x
-
-    a, point, v = np.eye(n), tuple(x), tuple(u)
+    a, b, point, v = np.eye(n), np.zeros((n, p)), tuple(x), tuple(u)
     scales, input_scales = tuple(model.scales), tuple(np.where(u == 0, 1.0, np.abs(u)))
     step = jacobian(model.transition, model.transition_jacobian, n, n, "u, c")
+    by_input = jacobian(_input_first(model.transition), None, n, p, "state, c")
     for _ in range(model.substeps):
-        a = np.array(step(point, scales, v, c)) @ a
+        f = np.array(step(point, scales, v, c))
+        a, b = f @ a, f @ b + np.array(by_input(v, input_scales, point, c)).reshape(n, p)
         point = model.transition(point, v, c)
-    b = np.array(jacobian(advance, None, n, p, "state")(v, input_scales, tuple(x)))
     h = np.array(jacobian(model.observe, model.observe_jacobian, m, n, "c")(tuple(x), scales, c))
     return affine_model(
         a=a,

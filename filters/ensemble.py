@@ -178,7 +178,8 @@ class EnsembleKalmanFilter(Filter):
         update:  y_j = h(x_j),  innovation = z - mean(y),  S = cov(y, y) + R,  K = cov(x, y) S^-1,
                  x_j += K (z - v_j - y_j),  v_j ~ N(0, R);  sample covariances with divisor N - 1
 
-    The belief's mean and covariance are those of the members.
+    The belief's mean and covariance are those of the members. The perturbations of an update depend on the key and
+    the step alone: of two updates within one step the second repeats the first one's.
 
     Attributes:
         ensemble_size: number N of members, at least 2.

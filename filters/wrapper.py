@@ -31,7 +31,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     `estimate_divergences`, the restarts from the prior after an estimate that was not finite. The measurement
     is `info["measurement"]` where the env reports it (NaN where `measurement_valid` is false), else the
     observation. The action is clipped to the action space before the filter sees it. The filter's
-    randomness comes from the reset seed by a stream of its own; the env's generator is never touched.
+    randomness comes from the reset seed by a stream of its own; the env's generator is never touched. Where a
+    measurement is missing, the observation repeats the last one that was there (0 at first).
 
     Args:
         env: any env with Box actions and observations.
@@ -86,10 +87,10 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         if seed is not None:
             self._generator = filter_generator(seed)
         z = _measurement(observation, info)
-        if np.shape(z) != (self.filter.model.m,):
-            raise ValueError(
-                f"a measurement must have the model's {self.filter.model.m} entries, but got {shown(z)}"
-            )
+        m = self.filter.model.m
+        if np.shape(z) != (m,):
+            raise ValueError(f"a measurement must have the model's {m} entries, but got {shown(z)}")
+        self._held = np.zeros(m)
         self._session.start(draw_key(self._generator), z)
         return self._observe(z, info), info
 
@@ -114,7 +115,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
             return mean.astype(np.float32)
         if self._form == "belief":
             return np.concatenate([mean, np.sqrt(np.diag(cov))]).astype(np.float32)
-        return np.concatenate([np.nan_to_num(z), mean]).astype(np.float32)
+        self._held = np.where(np.isnan(z), self._held, z)
+        return np.concatenate([self._held, mean]).astype(np.float32)
 
 
 def _model_for(env: gym.Env, model, arguments: dict) -> StateSpaceModel:

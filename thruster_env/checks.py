@@ -80,7 +80,7 @@ def covariance(name: str, value, size: int, *, positive_definite: bool = False) 
     eigenvalues = np.linalg.eigvalsh(array)
     if eigenvalues[0] < -1e-12 * max(1e-300, abs(eigenvalues[-1])):
         raise ValueError(f"{name} must be positive semidefinite (no negative variance), but got {shown(value)}")
-    if positive_definite and eigenvalues[0] <= 0:
+    if positive_definite and eigenvalues[0] <= 1e-14 * eigenvalues[-1]:
         raise ValueError(f"{name} must be positive definite, but got {shown(value)}")
     return (array + array.T) / 2
 

@@ -50,7 +50,18 @@ def _mark(function: Callable, *, inline: bool) -> Callable:
     if function not in _marked:
         _marked.add(function)
         _waiting.append((function, inline))
+        for callee in _callees(function):  # a user's model may call helpers of its own
+            _mark(callee, inline=inline)
     return function
+
+
+def _callees(function: Callable) -> list[Callable]:
+    """Plain functions that a function has in its closure or calls by a global name."""
+    if not isinstance(function, types.FunctionType):
+        return []
+    cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    called = [function.__globals__.get(name) for name in function.__code__.co_names]
+    return [part for part in (*cells, *called) if isinstance(part, types.FunctionType)]
 
 
 @contextlib.contextmanager
@@ -124,9 +135,7 @@ def function_fingerprint(*functions: Callable | None) -> str:
             continue
         seen.add(function)
         digest.update(_code_text(function.__code__).encode())
-        cells = [cell.cell_contents for cell in function.__closure__ or ()]
-        called = [function.__globals__.get(name) for name in function.__code__.co_names]
-        waiting += [part for part in (*cells, *called) if isinstance(part, types.FunctionType)]
+        waiting += _callees(function)
         if not function.__module__.startswith(_PACKAGES):
             try:
                 digest.update(Path(inspect.getsourcefile(function) or "").read_bytes())
@@ -164,9 +173,29 @@ class CompiledOrPython:
             try:
                 return self._run(*arguments)
             except Exception as error:  # numba's, of many classes: compiled code itself raises nothing
-                reason = str(error).strip().splitlines()[-1]
-                warnings.warn(f"the model runs as Python, slowly, for numba refuses it: {reason}", stacklevel=3)
+                warnings.warn(
+                    f"the model runs as Python, slowly, for numba refuses it: {_reason(error)}", stacklevel=3
+                )
                 self._run = self._python
             finally:
                 self._proven = True
         return self(*arguments)
+
+
+def _reason(error: Exception) -> str:
+    # numba frames its reason with lines on where it was; the first that is none of those says what is wrong.
+    frames = (
+        "Failed in",
+        "TypingError",
+        "During",
+        "There are",
+        "- Of which",
+        "Overload",
+        "With argument",
+        "Rejected",
+    )
+    lines = [line.strip() for line in str(error).splitlines()]
+    telling = [
+        line for line in lines if len(line) > 3 and not line.startswith((*frames, "File", ">>>", "No impl"))
+    ]
+    return telling[0] if telling else type(error).__name__
