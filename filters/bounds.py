@@ -14,7 +14,7 @@ from filters.model import StateSpaceModel
 from filters.rows import constants_form, constants_reader, number_places, padded
 from filters.truth import truth_steps_of
 from thruster_env.checks import at_least
-from thruster_env.compiled import CompiledOrPython, compilable, function_fingerprint, is_interpreting
+from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.components import matrix_reader, vector_reader, written_out
 from thruster_env.streams import GROUP
 
@@ -108,7 +108,7 @@ def _less_information(p: np.ndarray, information: np.ndarray) -> np.ndarray:
 
 def _gatherer(model: StateSpaceModel, interpreting: bool):
     for function in (model.transition, model.observe):
-        compilable(function)
+        inlined(function)
     return _build_gatherer(
         truth_steps_of(model),
         model.transition,
@@ -139,7 +139,7 @@ def _build_gatherer(steps, transition, transition_matrix, observation_matrix, n,
     )
     fingerprint = function_fingerprint(transition, transition_matrix, observation_matrix)
 
-    @compilable
+    @inlined
     def whole_step_matrix(x, u, numbers, c, eye):
         f = identity(eye)
         for _ in range(int(numbers[substeps])):

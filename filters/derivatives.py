@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
-from thruster_env.compiled import compilable
+from thruster_env.compiled import inlined
 from thruster_env.components import matrix_of, tuple_of, written_out
 
 RELATIVE_STEP = 6e-6  # cube root of the float64 resolution balances truncation and rounding
@@ -26,7 +26,7 @@ def jacobian(function: Callable, analytic: Callable | None, rows: int, columns: 
     """
     signature = f"x, scales, {arguments}"
     if analytic is not None:
-        return written_out("jacobian", signature, f"analytic(x, {arguments})", analytic=compilable(analytic))
+        return written_out("jacobian", signature, f"analytic(x, {arguments})", analytic=inlined(analytic))
     lines = []
     for j in range(columns):
         lines.append(f"h{j} = {RELATIVE_STEP} * (abs(x[{j}]) + scales[{j}])")
@@ -34,4 +34,4 @@ def jacobian(function: Callable, analytic: Callable | None, rows: int, columns: 
             point = tuple_of(f"x[{i}] {sign} h{j}" if i == j else f"x[{i}]" for i in range(columns))
             lines.append(f"{name}{j} = function({point}, {arguments})")
     source = matrix_of(rows, columns, lambda i, j: f"(above{j}[{i}] - below{j}[{i}]) / (2.0 * h{j})")
-    return written_out("jacobian", signature, *lines, source, function=compilable(function))
+    return written_out("jacobian", signature, *lines, source, function=inlined(function))

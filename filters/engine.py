@@ -11,7 +11,7 @@ import numpy as np
 
 from filters.belief import Kernels
 from filters.rows import LANES, memory_places, number_places, padded
-from thruster_env.compiled import CompiledOrPython, compilable, function_fingerprint, is_interpreting
+from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.streams import GROUP
 
 
@@ -23,7 +23,7 @@ def _restart_if_lost(kernels: Kernels) -> Callable:
     last, divergences = places.gain, places.divergences
     innovation, s_place, log_likelihood = places.innovation, places.innovation_cov, places.log_likelihood
 
-    @compilable
+    @inlined
     def restart_if_lost(memory, numbers, size):
         row, _, _ = memory
         total = 0.0

@@ -12,7 +12,7 @@ from filters.belief import Kernels
 from filters.filter import Filter
 from filters.rows import constants_form, constants_reader, memory_places, number_places
 from thruster_env.checks import at_least
-from thruster_env.compiled import compilable, inlined
+from thruster_env.compiled import inlined
 from thruster_env.components import (
     column_reader,
     column_writer,
@@ -27,7 +27,7 @@ from thruster_env.components import (
 from thruster_env.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
 
 
-@compilable
+@inlined
 def add_noise(table, first, count, draws, numbers, root):
     """Rows first ... += L W, where the lower triangular L lies at numbers[root] and W, by rows, in draws."""
     width = table.shape[1]
@@ -50,7 +50,6 @@ def row_means(rows: int) -> Callable:
         "for j in range(size):",
         *(f"    s{i} += table[{i}, j]" for i in places),
         tuple_of(f"s{i} / size" for i in places),
-        mark=compilable,
     )
 
 
@@ -74,7 +73,6 @@ def row_covariances(first: int, rows: int, second: int, columns: int) -> Callabl
         *(f"    d{k} = table[{k}, j] - means[{k}]" for k in used),
         *(f"    s{i}_{j} += d{first + i} * d{second + j}" for i, j in pairs),
         matrix_of(rows, columns, lambda i, j: f"{entry(i, j)} / (size - 1)"),
-        mark=compilable,
     )
 
 
@@ -107,7 +105,7 @@ def ensemble_kernels(transition, observe, n, m, inputs, form) -> Kernels:
     factor, solve = matrices.cholesky_factor(m), matrices.row_solver(n, m)
     likelihood, add = matrices.innovation_likelihood(m), matrices.symmetric_sum(m)
 
-    @compilable
+    @inlined
     def draw(draws, count, row, stream):
         fill_normals(draws, count, row[step_place], stream, row[key_place], row[key_place + 1])
 

@@ -13,7 +13,7 @@ from filters.derivatives import jacobian
 from filters.filter import Filter
 from filters.model import StateSpaceModel
 from filters.rows import constants_form, constants_reader, memory_places, number_places
-from thruster_env.compiled import compilable
+from thruster_env.compiled import inlined
 from thruster_env.components import (
     matrix_reader,
     matrix_writer,
@@ -31,7 +31,7 @@ def gaussian_start(n: int, m: int) -> Callable:
     read_mean, read_cov = vector_reader(n, source.prior_mean), matrix_reader(n, n, source.prior_cov)
     store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
 
-    @compilable
+    @inlined
     def start(memory, numbers, size):
         row, _, _ = memory
         store_mean(row, read_mean(numbers))
@@ -40,7 +40,7 @@ def gaussian_start(n: int, m: int) -> Callable:
     return start
 
 
-@compilable
+@inlined
 def nothing_to_summarise(memory, size):
     """Mean and covariance are the belief itself."""
 
@@ -88,7 +88,7 @@ def gaussian_correction(n: int, m: int) -> Callable:
     )
     moved = written_out("moved", "x, d", tuple_of(f"x[{i}] + d[{i}]" for i in range(n)))
 
-    @compilable
+    @inlined
     def correct(row, z, predicted, observation_matrix, numbers):
         p = read_cov(row)
         h = silent(observation_matrix, z)
@@ -122,7 +122,7 @@ def extended_kernels(transition, transition_jacobian, observe, observe_jacobian,
     times, times_transposed = matrices.multiplier(n, n, n), matrices.transposed_multiplier(n, n, n)
     add, correct = matrices.symmetric_sum(n), gaussian_correction(n, m)
 
-    @compilable
+    @inlined
     def predict(memory, u, numbers, size):
         row, _, _ = memory
         mean, p = read_mean(row), read_cov(row)
@@ -135,7 +135,7 @@ def extended_kernels(transition, transition_jacobian, observe, observe_jacobian,
         store_cov(row, add(p, read_q(numbers)))
         row[step_place] += 1.0
 
-    @compilable
+    @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
         mean, c = read_mean(row), constants(numbers)
@@ -147,9 +147,9 @@ def extended_kernels(transition, transition_jacobian, observe, observe_jacobian,
 def kernels_of(model: StateSpaceModel) -> Kernels:
     """Extended Kalman kernels for a model."""
     return extended_kernels(
-        compilable(model.transition),
+        inlined(model.transition),
         model.transition_jacobian,
-        compilable(model.observe),
+        inlined(model.observe),
         model.observe_jacobian,
         model.n,
         model.m,

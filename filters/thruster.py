@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from filters.model import StateSpaceModel
 from thruster_env.checks import covariance, finite, positive
-from thruster_env.compiled import compilable, inlined
+from thruster_env.compiled import inlined
 from thruster_env.dynamics import substep, substep_jacobian, thrust_and_torque, thrust_and_torque_tangent
 from thruster_env.linear import steady_state
 from thruster_env.parameters import ThrusterParameters, checked
@@ -19,7 +19,7 @@ def transition(x, u, c):
     return substep(x, (u[0], c.ambient_velocity), c)
 
 
-@compilable
+@inlined
 def transition_jacobian(x, u, c):
     """Jacobian of `transition` by rows."""
     return substep_jacobian(x, (u[0], c.ambient_velocity), c)
@@ -31,7 +31,7 @@ def observe(x, c):
     return (thrust_and_torque(x, c)[0],)
 
 
-@compilable
+@inlined
 def observe_jacobian(x, c):
     """Jacobian of `observe` by rows."""
     by_speed, _ = thrust_and_torque_tangent(x, (1.0, 0.0), c)

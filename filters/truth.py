@@ -9,7 +9,7 @@ import numpy as np
 
 from filters.model import StateSpaceModel
 from filters.rows import constants_form, constants_reader, number_places, padded
-from thruster_env.compiled import CompiledOrPython, compilable, function_fingerprint, is_interpreting
+from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.components import vector_reader, vector_writer
 from thruster_env.streams import GROUP, INITIAL, MEASUREMENT, PROCESS, fill_normals
 
@@ -21,7 +21,7 @@ class Truth(NamedTuple):
     measurements: np.ndarray  # (B, K + 1, m)
 
 
-@compilable
+@inlined
 def add_correlated(out, numbers, root, count, draws):
     """Out += L draws, the lower triangular L (count, count) lying by rows at numbers[root]."""
     for i in range(count):
@@ -41,14 +41,14 @@ def truth_steps(transition, observe, n: int, m: int, inputs: int, form):
     state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)
     control, constants = vector_reader(inputs), constants_reader(n, m, form)
 
-    @compilable
+    @inlined
     def begin(x, draws, key_0, key_1, numbers):
         fill_normals(draws, n, 0, INITIAL, key_0, key_1)
         for i in range(n):
             x[i] = numbers[prior_mean + i]
         add_correlated(x, numbers, prior_root, n, draws)
 
-    @compilable
+    @inlined
     def advance(x, u, draws, step, key_0, key_1, numbers):
         v, c = control(u), constants(numbers)
         for _ in range(int(numbers[substeps])):
@@ -56,7 +56,7 @@ def truth_steps(transition, observe, n: int, m: int, inputs: int, form):
         fill_normals(draws, n, step, PROCESS, key_0, key_1)
         add_correlated(x, numbers, q_root, n, draws)
 
-    @compilable
+    @inlined
     def measure(z, x, draws, step, key_0, key_1, numbers):
         store_measurement(z, observe(state(x), constants(numbers)))
         fill_normals(draws, m, step, MEASUREMENT, key_0, key_1)
@@ -67,7 +67,7 @@ def truth_steps(transition, observe, n: int, m: int, inputs: int, form):
 
 def truth_steps_of(model: StateSpaceModel):
     """`truth_steps` for a model."""
-    functions = compilable(model.transition), compilable(model.observe)
+    functions = inlined(model.transition), inlined(model.observe)
     return truth_steps(*functions, model.n, model.m, model.inputs, constants_form(model.constants))
 
 

@@ -25,7 +25,7 @@ FASTMATH = frozenset({"contract", "reassoc", "arcp", "nsz", "afn"})
 
 _PACKAGES = ("thruster_env", "filters")  # whose sources compiled functions may inline
 
-_waiting: list[tuple[Callable, bool]] = []
+_waiting: list[Callable] = []
 _marked: set[Callable] = set()
 _interpreting = False
 
@@ -33,25 +33,14 @@ _interpreting = False
 def inlined(function: Callable) -> Callable:
     """Mark a plain function so that compiled functions may call it; it is inlined into all of them.
 
-    Right for what stands in a loop over members or copies, which then becomes vector code.
+    So are functions that it calls by name. Inside a loop over members or copies this makes vector code, which
+    no call may interrupt.
     """
-    return _mark(function, inline=True)
-
-
-def compilable(function: Callable) -> Callable:
-    """Mark a plain function so that compiled functions may call it, inlined or not as the compiler likes.
-
-    Right for whatever does not stand in a loop over members: it compiles several times faster.
-    """
-    return _mark(function, inline=False)
-
-
-def _mark(function: Callable, *, inline: bool) -> Callable:
     if function not in _marked:
         _marked.add(function)
-        _waiting.append((function, inline))
+        _waiting.append(function)
         for callee in _callees(function):  # a user's model may call helpers of its own
-            _mark(callee, inline=inline)
+            inlined(callee)
     return function
 
 
@@ -88,9 +77,8 @@ def compiled(function: Callable) -> Callable:
     from numba.extending import register_jitable
 
     while _waiting:
-        waiting, inline = _waiting.pop()
-        # LLVM inlines small functions only, and vectorises no loop with a call left in it.
-        register_jitable(forceinline=inline)(waiting)
+        # By itself LLVM inlines small functions only.
+        register_jitable(forceinline=True)(_waiting.pop())
     return numba.njit(cache=True, nogil=True, fastmath=set(FASTMATH), error_model="numpy")(function)
 
 

@@ -23,15 +23,12 @@ def matrix_of(rows: int, columns: int, entry: Callable[[int, int], str]) -> str:
     return tuple_of(tuple_of(entry(i, j) for j in range(columns)) for i in range(rows))
 
 
-def written_out(name: str, arguments: str, *lines: str, mark: Callable = inlined, **names) -> Callable:
-    """Make a function from source lines, whose last is the expression it returns; `names` are its globals.
-
-    `mark` is `inlined` or `compilable`.
-    """
+def written_out(name: str, arguments: str, *lines: str, **names) -> Callable:
+    """Make a function from source lines, whose last is the expression it returns; `names` are its globals."""
     names["__name__"] = __name__  # without a module, pickling for numba's cache searches all of them
     body = "".join(f"    {line}\n" for line in (*lines[:-1], f"return {lines[-1]}"))
     exec(f"def {name}({arguments}):\n{body}", names)
-    return mark(names[name])
+    return inlined(names[name])
 
 
 @cache

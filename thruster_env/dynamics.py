@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from thruster_env.compiled import compilable, inlined
+from thruster_env.compiled import inlined
 from thruster_env.integration import runge_kutta
 
 # Keeps 1/V finite at rest, where every numerator vanishes faster.
@@ -74,7 +74,7 @@ def thrust_and_torque(x, c):
     return lift * cosine - drag * sine, c.torque_arm * (lift * sine + drag * cosine)
 
 
-@compilable
+@inlined
 def thrust_and_torque_tangent(x, dx, c):
     """Directional derivatives (dT, dQ) of `thrust_and_torque` at x along dx, by the product rule."""
     lift, drag, cosine, sine, blade, per_speed = lift_and_drag(x, c)
@@ -107,7 +107,7 @@ def rates(x, u, c):
     )
 
 
-@compilable
+@inlined
 def rates_tangent(x, dx, u, c):
     """Directional derivative of `rates` at x along dx: the Jacobian of the plant times dx."""
     d_thrust, d_torque = thrust_and_torque_tangent(x, dx, c)
@@ -118,7 +118,7 @@ def rates_tangent(x, dx, u, c):
     )
 
 
-@compilable
+@inlined
 def variational_rates(y, u, c):
     """Rates of the state and of a perturbation of it, y = (omega_m, U_a, d omega_m, d U_a)."""
     x = (y[0], y[1])
@@ -128,11 +128,11 @@ def variational_rates(y, u, c):
 substep = runge_kutta(rates, 2)
 """`substep(x, u, c)`: the state after c.substep seconds of constant input, by one Runge-Kutta step."""
 
-variational_substep = runge_kutta(variational_rates, 4, compilable)
+variational_substep = runge_kutta(variational_rates, 4)
 """`variational_substep(y, u, c)`: the same with a perturbation; exactly the derivative of `substep`."""
 
 
-@compilable
+@inlined
 def substep_jacobian(x, u, c):
     """Jacobian of `substep` by rows, ((d omega'/d omega, d omega'/d U), (d U'/d omega, d U'/d U))."""
     first = variational_substep((x[0], x[1], 1.0, 0.0), u, c)

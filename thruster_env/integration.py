@@ -8,15 +8,14 @@ from thruster_env.compiled import inlined
 from thruster_env.components import scaled_sum
 
 
-def runge_kutta(rates: Callable, count: int, mark: Callable = inlined) -> Callable:
+def runge_kutta(rates: Callable, count: int) -> Callable:
     """Return `step(x, u, c)`, one classical fourth-order Runge-Kutta step of length c.substep [s].
 
-    `rates(x, u, c)` takes and returns tuples of `count` components; u is held over the step. `mark` is
-    `inlined` or `compilable`.
+    `rates(x, u, c)` takes and returns tuples of `count` components; u is held over the step.
     """
     add = scaled_sum(count)
 
-    @mark
+    @inlined
     def step(x, u, c):
         h = c.substep
         k1 = rates(x, u, c)

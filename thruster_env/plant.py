@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thruster_env.checks import covariance, covariance_root, finite, positive, vector
-from thruster_env.compiled import compilable, compiled, function_fingerprint, is_interpreting
+from thruster_env.compiled import compiled, function_fingerprint, inlined, is_interpreting
 from thruster_env.components import column_reader, column_writer, vector_reader
 from thruster_env.dynamics import Constants, substep, thrust_and_torque
 from thruster_env.linear import required_substeps, steady_state
@@ -129,7 +129,7 @@ _read_constants = vector_reader(_CONSTANTS)
 _column, _store = column_reader(2), column_writer(2)
 
 
-@compilable
+@inlined
 def _measure(memory, numbers, c):
     sigma = numbers[R_ROOT]
     for j in range(memory.shape[1]):
@@ -139,7 +139,7 @@ def _measure(memory, numbers, c):
         memory[MEASURED, j] = thrust + sigma * v
 
 
-@compilable
+@inlined
 def begin_copies(memory, numbers):
     """Draw the initial state of every copy from its key, and take the first measurement."""
     c = Constants(*_read_constants(numbers))
@@ -154,7 +154,7 @@ def begin_copies(memory, numbers):
     _measure(memory, numbers, c)
 
 
-@compilable
+@inlined
 def advance_copies(memory, voltages, numbers):
     """Apply voltages (copies,) [V] for one sample time, add process noise, and measure."""
     c = Constants(*_read_constants(numbers))

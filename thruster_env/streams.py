@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from thruster_env.compiled import compilable, inlined
+from thruster_env.compiled import inlined
 
 # Streams: what a draw is for. Two streams of one key are independent.
 PROCESS, MEASUREMENT, INITIAL, EXCITATION, FILTER_PROCESS, FILTER_MEASUREMENT, FILTER_PRIOR = range(1, 8)
@@ -137,7 +137,7 @@ def normal_block(block, step, stream, key_0, key_1):
     return radius_0 * cosine_0, radius_0 * sine_0, radius_1 * cosine_1, radius_1 * sine_1
 
 
-@compilable
+@inlined
 def fill_normals(out, count, step, stream, key_0, key_1):
     """Fill a vector with the normals of channels 0, 1, 2, ..., at least `count` of them.
 
