@@ -9,9 +9,10 @@ from pathlib import Path
 
 import optuna
 from optuna.storages import BaseStorage, JournalStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import TrialState
 
+LOCK_SECONDS = 5  # after which a lock counts as left behind
 PROCESS, RETRY_OF = "process", "retry_of"  # trial attributes: who runs it, and what it repeats
 
 
@@ -31,12 +32,18 @@ def open_storage(storage: str) -> BaseStorage:
             raise ValueError(
                 f"storage must be a database that can be reached, but got {storage}: {reason}"
             ) from None
-    path = Path(storage)
+    path = Path(storage).absolute()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists():
-            _cut_unfinished_line(path)
-        return JournalStorage(JournalFileBackend(str(path)))
+        # A killed process may leave its lock behind; locks are held for milliseconds.
+        lock = JournalFileOpenLock(str(path), grace_period=LOCK_SECONDS)
+        lock.acquire()
+        try:
+            if path.exists():
+                _cut_unfinished_line(path)
+        finally:
+            lock.release()
+        return JournalStorage(JournalFileBackend(str(path), lock_obj=lock))
     except (OSError, ValueError, KeyError) as error:
         raise ValueError(
             f"storage must be a journal file that can be written, but got {storage}: {error}"
