@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
-from thruster_cli.tune import Tuning, choice_table, comparison_table
+from thruster_cli.tables import choice_table, comparison_table
 from tuning.scenarios import find_scenario
-from tuning.space import untuned_choice
+from tuning.space import true_choice, untuned_choice
 from tuning.study import HELD_OUT_SEEDS, prove
 from tuning.tuned import read_tuned, summary
 
@@ -37,12 +37,16 @@ def command(
     announce_compilation()
     with progress_console.status(f"{choice.name} on {seeds} seeds of {chosen.name} ..."):
         proof = prove(choice, chosen, seed, seeds)
-    evaluated = Tuning("", chosen, None, proof, tuned)
+    choices = {"untuned": untuned_choice(choice.name, chosen), "true": true_choice(choice.name, chosen)}
+    evaluations = {"untuned": proof.untuned, "true": proof.true}
+    if tuned is not None:
+        choices, evaluations = {"tuned": choice, **choices}, {"tuned": proof.tuned, **evaluations}
     data = {
         "filter": choice._asdict(),
         "scenario": chosen.name,
         "seeds": [proof.seeds.start, proof.seeds.stop],
         "bound": proof.bound,
-        **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
+        **{name: summary(evaluation) for name, evaluation in evaluations.items()},
     }
-    emit([choice_table(choice, chosen), comparison_table(evaluated)], data, json)
+    title = f"RMSE on held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
+    emit([choice_table(choices, chosen), comparison_table(evaluations, proof.bound, title)], data, json)

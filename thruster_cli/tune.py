@@ -12,11 +12,12 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from filters.registry import filter_class
-from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
+from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
+from thruster_cli.tables import choice_table, comparison_table, span
 from thruster_env.checks import at_least
 from tuning.evaluate import Evaluation, Interval, score_ratio
 from tuning.scenarios import Scenario, find_scenario
-from tuning.space import Choice
+from tuning.space import true_choice, untuned_choice
 from tuning.storage import open_storage
 from tuning.study import (
     SIZE_LADDER,
@@ -117,7 +118,14 @@ def report(tuning: Tuning) -> list:
     """Tables and sentences that say what a tuning found and what it is worth."""
     result, proof, scenario = tuning.result, tuning.proof, tuning.scenario
     choice = result.choice
-    shown = [choice_table(choice, scenario), comparison_table(tuning)]
+    choices = {
+        "untuned": untuned_choice(choice.name, scenario),
+        "tuned": choice,
+        "true": true_choice(choice.name, scenario),
+    }
+    evaluations = {"untuned": proof.untuned, "tuned": proof.tuned, "true Q, R": proof.true}
+    title = f"RMSE on held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {scenario.name}"
+    shown = [choice_table(choices, scenario), comparison_table(evaluations, proof.bound, title)]
     if result.sizes:
         kept = choice.numbers["ensemble_size"]
         ratios = ", ".join(f"{row.size}: {row.ratio:.3f}" for row in result.sizes if row.size in SIZE_LADDER)
@@ -127,7 +135,7 @@ def report(tuning: Tuning) -> list:
         )
     ratio = score_ratio(proof.tuned, proof.untuned)
     shown.append(
-        f"Tuned against untuned on {len(proof.seeds)} held-out seeds: score x {_span(ratio, 3)} "
+        f"Tuned against untuned on {len(proof.seeds)} held-out seeds: score x {span(ratio, 3)} "
         f"(paired 95 % interval). {_verdict(ratio)}"
     )
     shown.append(_consistency_sentence(proof.tuned, len(proof.bound)))
@@ -136,50 +144,6 @@ def report(tuning: Tuning) -> list:
     if result.interrupted:
         shown.append("Interrupted: this is on the trials that were finished; the same command goes on.")
     return shown
-
-
-def choice_table(choice: Choice, scenario: Scenario):
-    """The numbers of a choice beside the untuned and the plant's own ones."""
-    columns = [scenario.untuned, choice.model, scenario.true]
-    q_units = ["(rad/s)^2", "(m/s)^2"]
-    rows = [
-        [f"Q{i + 1}{i + 1} [{q_units[i]}]", *(f"{c['process_noise_cov'][i]:.4g}" for c in columns)]
-        for i in range(2)
-    ]
-    rows.append(["R [N^2]", *(f"{c['measurement_noise_cov']:.4g}" for c in columns)])
-    if choice.numbers:
-        rows.append(["N", "30", str(choice.numbers["ensemble_size"]), "30"])
-    return table(f"Numbers of the {choice.name} filter", ["", "untuned", "tuned", "true"], rows)
-
-
-def comparison_table(tuning: Tuning):
-    """RMSE, distance from the bound and consistency of the three filters on held-out seeds."""
-    proof = tuning.proof
-    rows = []
-    for name, evaluation in (("untuned", proof.untuned), ("tuned", proof.tuned), ("true Q, R", proof.true)):
-        above = [100.0 * (r.value / b - 1.0) for r, b in zip(evaluation.rmse, proof.bound, strict=True)]
-        rows.append(
-            [
-                name,
-                _about(evaluation.rmse[0], 3),
-                f"{above[0]:+.0f} %",
-                _about(evaluation.rmse[1], 4),
-                f"{above[1]:+.0f} %",
-                f"{evaluation.nees.value:.3g}",
-                f"{evaluation.nis.value:.3g}",
-            ]
-        )
-    rows.append(["bound", f"{proof.bound[0]:.3f}", "", f"{proof.bound[1]:.4f}", "", "2", "1"])
-    columns = ["filter", "omega_m [rad/s]", "above", "U_a [m/s]", "above", "NEES", "NIS"]
-    title = (
-        f"RMSE on held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {tuning.scenario.name}"
-    )
-    return table(
-        title,
-        columns,
-        rows,
-        caption="above: the bound. ±: half of the 95 % bootstrap interval. Honest: NEES 2, NIS 1.",
-    )
 
 
 def as_json(tuning: Tuning) -> dict:
@@ -201,14 +165,6 @@ def as_json(tuning: Tuning) -> dict:
         },
         "file": str(tuning.file),
     }
-
-
-def _span(value: Interval, digits: int) -> str:
-    return f"{value.value:.{digits}f} [{value.low:.{digits}f}, {value.high:.{digits}f}]"
-
-
-def _about(value: Interval, digits: int) -> str:
-    return f"{value.value:.{digits}f} ±{(value.high - value.low) / 2:.{digits}f}"
 
 
 def _verdict(ratio: Interval) -> str:
