@@ -26,6 +26,8 @@ from thruster_env.components import (
 )
 from thruster_env.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
 
+LARGEST_ENSEMBLE = 1_000_000
+
 
 @inlined
 def add_noise(table, first, count, draws, numbers, root):
@@ -189,8 +191,11 @@ class EnsembleKalmanFilter(Filter):
     ensemble_size: int = 100
 
     def __post_init__(self):
-        """Check the size; raise ValueError if it is not a whole number of at least 2."""
-        object.__setattr__(self, "ensemble_size", at_least("ensemble_size", self.ensemble_size, 2))
+        """Check the size; raise ValueError if it is not a whole number from 2 to a million."""
+        size = at_least("ensemble_size", self.ensemble_size, 2)
+        if size > LARGEST_ENSEMBLE:
+            raise ValueError(f"ensemble_size must be at most {LARGEST_ENSEMBLE}, but got {size}")
+        object.__setattr__(self, "ensemble_size", size)
 
     @property
     def size(self) -> int:

@@ -61,5 +61,8 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
     for part in ("numbers", "model"):
         if not isinstance(entry[part], dict):
             raise ValueError(f"the {part} of a tuned file must be a mapping, but {path} has {shown(entry[part])}")
+    for name in ("process_noise_cov", "measurement_noise_cov"):
+        if entry["model"].get(name) is None:
+            raise ValueError(f"the model of a tuned file must have a {name}, but {path} has none")
     one_of("the filter of a tuned file", entry["name"], tuple(FILTERS))
     return content

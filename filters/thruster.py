@@ -39,6 +39,9 @@ def observe_jacobian(x, c):
     return ((by_speed, by_flow),)
 
 
+MODEL_ARGUMENTS = ("process_noise_cov", "measurement_noise_cov", "parameter_factors", "operating_voltage")
+
+
 def thruster_model(
     *,
     parameter_factors: Mapping[str, float] | None = None,
@@ -105,10 +108,11 @@ def model_of_env(env, **changes) -> StateSpaceModel:
     plant = getattr(env.unwrapped, "plant", None)
     if not isinstance(plant, Plant):
         raise ValueError(f"an env other than a bow thruster must come with a model, but got {env}")
-    try:
-        return model_of_plant(plant, **changes)
-    except TypeError as error:
-        raise ValueError(f"an argument is not known: {error}") from None
+    unknown = sorted(set(changes) - set(MODEL_ARGUMENTS))
+    if unknown:
+        known = ", ".join(MODEL_ARGUMENTS)
+        raise ValueError(f"arguments must be numbers of the filter or {known}, but got {unknown}")
+    return model_of_plant(plant, **changes)
 
 
 def _scaled(parameters: ThrusterParameters, factors: Mapping[str, float]) -> ThrusterParameters:

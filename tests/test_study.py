@@ -130,7 +130,7 @@ def test_a_killed_process_loses_its_running_trial_only(tmp_path):
         if int(line) >= 4:
             break
     process.send_signal(signal.SIGKILL)
-    process.wait()
+    process.communicate()
     study = study_in(open_storage(str(path)))
     done = finished_trials(study)
     assert done >= 4
@@ -154,3 +154,36 @@ def test_a_file_that_is_no_journal_is_refused_and_left_as_it_is(tmp_path, conten
 def test_a_database_that_cannot_be_reached_is_one_clear_line():
     with pytest.raises(ValueError, match="storage must be a database that can be reached, but got sqlite:"):
         open_storage("sqlite:////no/such/folder/x.db")
+
+
+def test_the_first_ctrl_c_lets_the_running_trial_finish(tmp_path):
+    study = study_in(open_storage(str(tmp_path / "j")))
+    handler = signal.getsignal(signal.SIGINT)
+
+    def interrupt(study, finished):
+        if finished == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    result = run_study(study, "ekf", SCENARIO, 0, 50, interrupt)
+    assert result.interrupted and finished_trials(study) == 3
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+@pytest.mark.parametrize(
+    ("change", "rule"),
+    [
+        ({"parameter_factors": {"voltage_gain": 3.0}}, "must be that of its scenario"),
+        ({"preset": "rubbish"}, "must be that of its scenario"),
+        ({"measurement_noise_cov": None}, "must have a measurement_noise_cov"),
+        ({"process_noise_cov": [1.0]}, "process_noise_cov must be 2 finite numbers"),
+    ],
+)
+def test_a_tuned_file_edited_by_hand_is_refused(tmp_path, change, rule):
+    result = run_study(study_in(optuna.storages.InMemoryStorage()), "ekf", SCENARIO, 0, 2)
+    path = tmp_path / "tuned.json"
+    write_tuned(path, SCENARIO, 0, result, prove(result.choice, SCENARIO, 0, 2), "s")
+    content = json.loads(path.read_text())
+    content["filter"]["model"].update(change)
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=rule):
+        read_tuned(path)

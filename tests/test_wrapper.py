@@ -320,7 +320,7 @@ TUNED = {
     "filter": {
         "name": "enkf",
         "numbers": {"ensemble_size": 20},
-        "model": {"process_noise_cov": [1, 4e-4]},
+        "model": {"process_noise_cov": [1, 4e-4], "measurement_noise_cov": 0.25},
     },
 }
 

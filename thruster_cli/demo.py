@@ -29,7 +29,7 @@ def command(
 ) -> None:
     """Tune an ensemble Kalman filter, prove it on held-out seeds, and reproduce a published table."""
     started = time.perf_counter()
-    file = out / f"{FILTER}-{SCENARIO}.json"
+    file = out / f"{FILTER}-{SCENARIO}-seed{seed}.json"
     tuning = tune(FILTER, SCENARIO, trials, storage=str(out / "studies.journal"), out=file, seed=seed)
     with progress_console.status("drawing ..."):
         pictures = draw(tuning, out, seed)

@@ -8,6 +8,7 @@ import numpy as np
 import typer
 
 from thruster_cli.output import JsonOption, SeedOption, emit, table
+from thruster_env.checks import within
 from thruster_env.linear import jacobians, observability, state_range, steady_state, zero_order_hold
 from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, make_plant
 
@@ -30,6 +31,7 @@ def command(
     Nothing here is random; --seed is accepted, as by every command, and changes nothing.
     """
     plant = make_plant(preset, dt, max_voltage, ambient_velocity)
+    voltage = within("voltage", voltage, max_voltage)
     point = steady_state(plant.parameters, voltage, ambient_velocity)
     a, b, c = jacobians(plant.parameters, point[:2], voltage, ambient_velocity)
     a_d, _ = zero_order_hold(a, b, dt)

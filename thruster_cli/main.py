@@ -12,7 +12,7 @@ app = typer.Typer(
     help="A ship's bow thruster, the filters that estimate its hidden state, and the tuning that makes them good.",
     no_args_is_help=True,
     add_completion=False,
-    rich_markup_mode="rich",
+    rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
 )
 app.command("demo")(demo.command)
@@ -40,7 +40,7 @@ def main() -> None:
     except ValueError as error:
         print(f"thruster: {error}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):
         print("thruster: interrupted", file=sys.stderr)
         sys.exit(130)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from functools import cache
 from typing import Annotated, Any
@@ -43,13 +44,12 @@ def table(title: str, columns: list[str], rows: list[list[Any]], *, caption: str
 def emit(shown: list, data: dict, json_target: str | None) -> None:
     """Print tables and lines, unless JSON goes to standard output; write JSON where asked."""
     if json_target == "-":
-        json.dump(data, sys.stdout, indent=2, default=_plain)
-        sys.stdout.write("\n")
+        sys.stdout.write(as_text(data))
         return
     for part in shown:
         console.print(part)
     if json_target is not None:
-        write_whole(json_target, json.dumps(data, indent=2, default=_plain) + "\n")
+        write_whole(json_target, as_text(data))
 
 
 @cache
@@ -60,11 +60,18 @@ def announce_compilation() -> None:
     )
 
 
+def as_text(data) -> str:
+    """JSON of plain data, arrays and NamedTuples; numbers that are not finite become null."""
+    return json.dumps(_plain(data), indent=2, allow_nan=False) + "\n"
+
+
 def _plain(value):
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, np.generic):
-        return value.item()
-    if hasattr(value, "_asdict"):
-        return value._asdict()
-    raise TypeError(f"{type(value).__name__} has no JSON form")
+    if isinstance(value, dict):
+        return {str(key): _plain(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

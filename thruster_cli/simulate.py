@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit
-from thruster_env.checks import at_least, finite, positive
+from thruster_env.checks import at_least, positive, within
 from thruster_env.files import write_whole
 from thruster_env.plant import (
     DEFAULT_DT,
@@ -55,7 +55,7 @@ def command(
     plant = make_plant(preset, dt, process_noise_cov=process_noise, measurement_noise_cov=measurement_noise)
     keys = episode_keys([seed])
     if voltage is not None:
-        voltages = np.full((1, steps), np.clip(finite("voltage", voltage), -plant.max_voltage, plant.max_voltage))
+        voltages = np.full((1, steps), within("voltage", voltage, plant.max_voltage))
     else:
         amplitude = positive("amplitude", amplitude, zero_allowed=True)
         voltages = held_levels(keys, min(amplitude, plant.max_voltage), at_least("hold", hold, 1), steps)

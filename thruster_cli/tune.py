@@ -15,6 +15,7 @@ from filters.registry import filter_class
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
 from thruster_cli.tables import choice_table, comparison_table, span
 from thruster_env.checks import at_least
+from thruster_env.files import check_target
 from tuning.evaluate import Evaluation, Interval, score_ratio
 from tuning.scenarios import Scenario, find_scenario
 from tuning.space import true_choice, untuned_choice
@@ -81,14 +82,18 @@ def tune(
     filter_class(filter_name)
     scenario, trials = find_scenario(scenario_name), at_least("trials", trials, 1)
     name = study_name or f"{filter_name}-{scenario_name}-seed{seed}"
+    if "/" in name:
+        raise ValueError(f"study must be a name without slashes, but got {name!r}")
     file = out or Path("out") / f"{name}.json"
+    check_target(file)
     quiet_optuna()
     announce_compilation()
     study = open_study(name, filter_name, scenario, seed, open_storage(storage))
     already = finished_trials(study)
     if already:
         progress_console.print(f"study {name!r} goes on after {already} finished trials")
-    with _bar(f"tuning {filter_name} on {scenario_name}", trials, already) as advance:
+    best = f"{study.best_value:.3f}" if already else "-"
+    with _bar(f"tuning {filter_name} on {scenario_name}", trials, already, best) as advance:
         result = run_study(study, filter_name, scenario, seed, trials, advance)
     with progress_console.status("proving the choice on held-out seeds ..."):
         proof = prove(result.choice, scenario, seed)
@@ -97,7 +102,7 @@ def tune(
 
 
 @contextmanager
-def _bar(title: str, total: int, done: int) -> Iterator:
+def _bar(title: str, total: int, done: int, best: str) -> Iterator:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -106,7 +111,7 @@ def _bar(title: str, total: int, done: int) -> Iterator:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=progress_console) as progress:
-        task = progress.add_task(title, total=total, completed=min(done, total), best="-")
+        task = progress.add_task(title, total=total, completed=min(done, total), best=best)
 
         def advance(study, finished: int) -> None:
             progress.update(task, completed=finished, best=f"{study.best_value:.3f}")

@@ -34,6 +34,14 @@ def positive(name: str, value, *, zero_allowed: bool = False) -> float:
     return number
 
 
+def within(name: str, value, limit: float) -> float:
+    """Return value as a float; raise ValueError unless it is finite and within plus and minus limit."""
+    number = finite(name, value)
+    if abs(number) > limit:
+        raise ValueError(f"{name} must be within plus and minus {limit:g}, but got {shown(value)}")
+    return number
+
+
 def at_least(name: str, value, least: int) -> int:
     """Return value as an int; raise ValueError unless it is a whole number of at least `least`."""
     number = finite(name, value)

@@ -9,6 +9,19 @@ from pathlib import Path
 from typing import BinaryIO
 
 
+def check_target(path: str | Path) -> None:
+    """Raise ValueError if a file could not be written there, before long work is done for it."""
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"a file must be where it can be written, but {path} is a folder")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise ValueError(f"a file must be where it can be written, but {path} is not: {error.strerror}") from None
+
+
 def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], None]) -> None:
     """Write a file aside, then rename it into place: a reader sees the old file or the new one.
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -111,7 +114,7 @@ def run_study(
 ) -> StudyResult:
     """Run a study until it has `trials` finished trials, all on the same training seeds.
 
-    Ctrl-C ends it early and keeps what is finished.
+    Ctrl-C ends it after the running trial and keeps what is finished; a second one ends it at once.
 
     Args:
         study: from `open_study`.
@@ -122,25 +125,20 @@ def run_study(
         on_trial: called after each trial with the study and the number of finished trials.
 
     Raises:
-        ValueError: if the study is interrupted before any trial is finished.
+        KeyboardInterrupt: if it is interrupted before any trial is finished.
     """
     data = scenario.data(training_seeds(seed, TRAINING_SEEDS))
     started, interrupted = time.perf_counter(), False
     try:
-        while (done := finished_trials(study)) < trials:
-            trial = study.ask()
-            try:
-                trial.set_user_attr(PROCESS, this_process())
-                choice = suggest(trial, filter_name, scenario)
-                study.tell(trial, _training_score(choice, scenario, data))
-            except BaseException:
-                study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
-                raise
-            on_trial(study, done + 1)
+        with stop_on_interrupt() as stopped:
+            while not stopped() and (done := finished_trials(study)) < trials:
+                _run_trial(study, filter_name, scenario, data)
+                on_trial(study, done + 1)
+        interrupted = stopped()
     except KeyboardInterrupt:
         interrupted = True
-        if not finished_trials(study):
-            raise ValueError("the study was interrupted before its first trial was finished") from None
+    if not finished_trials(study):
+        raise KeyboardInterrupt
     best = study.best_trial
     choice = choice_of(filter_name, best.params, scenario)
     sizes = ensemble_sizes(choice, scenario, data) if has_ensemble(filter_name) else []
@@ -148,6 +146,41 @@ def run_study(
         choice = choice.with_size(next(row.size for row in sizes if row.ratio <= 1.0 + SIZE_TOLERANCE))
     seconds = time.perf_counter() - started
     return StudyResult(choice, best.value, study.get_trials(deepcopy=False), sizes, seconds, interrupted)
+
+
+def _run_trial(study: optuna.Study, filter_name: str, scenario: Scenario, data: Data) -> None:
+    trial = study.ask()
+    try:
+        trial.set_user_attr(PROCESS, this_process())
+        choice = suggest(trial, filter_name, scenario)
+        study.tell(trial, _training_score(choice, scenario, data))
+    except BaseException:
+        study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
+        raise
+
+
+@contextmanager
+def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
+    """Within this context the first Ctrl-C only makes the yielded function return True.
+
+    An exception in the midst of compiled code or a storage's lock could get lost or leave the lock behind.
+    Outside the main thread, where Python takes no signals, nothing changes.
+    """
+    caught = []
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def note(number, frame):
+        caught.append(number)
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: bool(caught)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _training_score(choice: Choice, scenario: Scenario, data: Data) -> float:

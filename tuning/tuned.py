@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from filters.registry import FILE_FORMAT, FILE_VERSION, read_tuned_file
-from thruster_env.checks import at_least
+from thruster_env.checks import at_least, positive, shown, vector
 from thruster_env.files import write_whole
 from tuning.evaluate import Evaluation
 from tuning.scenarios import Scenario, find_scenario
@@ -57,11 +57,20 @@ def read_tuned(path: str | Path) -> tuple[Choice, Scenario, int]:
     entry = content["filter"]
     try:
         scenario, seed = find_scenario(content["scenario"]), at_least("seed", content["study"]["seed"], 0)
-        model = {key: entry["model"][key] for key in ("process_noise_cov", "measurement_noise_cov")}
-        model["process_noise_cov"] = tuple(model["process_noise_cov"])
+        given = dict(entry["model"])
+        factors = given.pop("parameter_factors", {})
+        q = tuple(vector("process_noise_cov", given.pop("process_noise_cov"), 2).tolist())
+        r = positive("measurement_noise_cov", given.pop("measurement_noise_cov"))
     except (KeyError, TypeError) as error:
         raise ValueError(f"a tuned file must have all its entries, but {path} lacks or bends {error}") from None
-    return Choice(entry["name"], model, dict(entry["numbers"])), scenario, seed
+    if given or factors != dict(scenario.parameter_factors):
+        raise ValueError(
+            f"the model of a tuned file must be that of its scenario, {dict(scenario.parameter_factors)}, "
+            f"but {path} has {shown(entry['model'])}"
+        )
+    choice = Choice(entry["name"], {"process_noise_cov": q, "measurement_noise_cov": r}, dict(entry["numbers"]))
+    choice.filter(scenario)  # a clear error for numbers that the filter does not take
+    return choice, scenario, seed
 
 
 def summary(evaluation: Evaluation) -> dict:
