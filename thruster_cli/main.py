@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 
 import typer
@@ -30,19 +31,31 @@ def _callback() -> None:
 
 def main() -> None:
     """Run the command line; a user's mistake is one line and exit code 2, never a traceback."""
+    caught, before = [], signal.getsignal(signal.SIGINT)
+
+    def interrupt(number, frame):
+        caught.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, interrupt)
     try:
-        sys.exit(app(standalone_mode=False) or 0)
-    except typer.TyperException as error:
-        message = " ".join(error.format_message().split())
-        if message:  # without a command the help has been shown, and there is nothing to add
-            print(f"thruster: {message}", file=sys.stderr)
-        sys.exit(2)
-    except ValueError as error:
-        print(f"thruster: {error}", file=sys.stderr)
-        sys.exit(2)
+        code, message = app(standalone_mode=False) or 0, ""
     except (KeyboardInterrupt, typer.Abort):
-        print("thruster: interrupted", file=sys.stderr)
-        sys.exit(130)
+        code, message = 130, "interrupted"
+    except typer.TyperException as error:  # without a command its message is empty: the help has been shown
+        code, message = 2, " ".join(error.format_message().split())
+    except Exception as error:
+        if caught:  # a package that was interrupted while it loaded says so in ways of its own
+            code, message = 130, "interrupted"
+        elif isinstance(error, ValueError):
+            code, message = 2, str(error)
+        else:
+            raise
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if message:
+        print(f"thruster: {message}", file=sys.stderr)
+    sys.exit(code)
 
 
 if __name__ == "__main__":
