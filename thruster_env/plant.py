@@ -30,8 +30,7 @@ DEFAULT_PROCESS_NOISE = (1.0, 4e-4)  # variances a step, [(rad/s)^2, (m/s)^2]
 DEFAULT_MEASUREMENT_NOISE = 0.25  # variance, [N^2]
 DEFAULT_INITIAL_VARIANCES = (1.0, 0.01)  # about rest, [(rad/s)^2, (m/s)^2]
 
-# Rows of the memory (8, copies) of a batch of thrusters.
-STATE = slice(0, 2)  # omega_m [rad/s], U_a [m/s]
+# Rows of the memory (8, copies) of a batch of thrusters; rows 0 and 1 are omega_m [rad/s] and U_a [m/s].
 THRUST, MEASURED, KEY_0, KEY_1, STEP, VOLTAGE = range(2, 8)
 MEMORY_ROWS = 8
 
