@@ -14,6 +14,7 @@ import pytest
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
 from thruster_cli.main import main
+from thruster_env.parameters import TUNNEL, derive_constants
 
 
 class Done(NamedTuple):
@@ -71,9 +72,9 @@ def test_tune_resume_evaluate_and_wrap(thruster, as_json, tmp_path):
     np.testing.assert_allclose(
         np.diag(env.filter.model.process_noise_cov), second["filter"]["model"]["process_noise_cov"]
     )
-    assert env.filter.model.constants.half_lift == pytest.approx(
-        1.15 * env.unwrapped.plant.constants.half_lift, rel=1e-12
-    )
+    scaled = TUNNEL._replace(lift_coefficient=1.15 * 1.75, voltage_gain=0.95 * 1133.2)
+    expected = derive_constants(scaled, substep=env.unwrapped.plant.constants.substep)
+    np.testing.assert_allclose(env.filter.model.constants, expected, rtol=1e-12)
 
 
 def test_simulate_writes_what_the_env_does_with_units_in_the_header(thruster, tmp_path):

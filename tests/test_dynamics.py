@@ -21,6 +21,8 @@ from thruster_env.parameters import ANGLES, PRESETS, TUNNEL, TUNNEL_PHYSICAL, de
 CASES = {
     f"{name}, {angles}": preset._replace(angles=angles) for name, preset in PRESETS.items() for angles in ANGLES
 }
+SYMMETRIC = tuple(CASES)
+CASES["asymmetric"] = TUNNEL._replace(force_asymmetry=0.2)
 every_case = pytest.mark.parametrize("p", CASES.values(), ids=CASES.keys())
 every_preset = pytest.mark.parametrize("p", PRESETS.values(), ids=PRESETS.keys())
 
@@ -50,6 +52,7 @@ def textbook_thrust_and_torque(omega, flow, p):
     pressure = 0.5 * p.density * (blade**2 + flow**2) * p.area
     lift = pressure * p.lift_coefficient * math.sin(2 * attack)
     drag = pressure * p.drag_coefficient * (1 - math.cos(2 * attack))
+    lift, drag = (force * (1 + p.force_asymmetry * math.cos(inflow)) for force in (lift, drag))
     thrust = lift * math.cos(theta) - drag * math.sin(theta)
     torque = 0.7 * radius * (lift * math.sin(theta) + drag * math.cos(theta))
     return thrust, torque
@@ -127,7 +130,7 @@ def test_blades_that_turn_ahead_push_ahead_and_are_braked():
 numbers = st.floats(-1e6, 1e6)
 
 
-@given(st.sampled_from(sorted(CASES)), numbers, numbers, numbers, numbers)
+@given(st.sampled_from(SYMMETRIC), numbers, numbers, numbers, numbers)
 def test_everything_is_exactly_odd(case, omega, flow, voltage, ambient):
     c = derive_constants(CASES[case], substep=1e-3)
     x, u, minus_x, minus_u = (omega, flow), (voltage, ambient), (-omega, -flow), (-voltage, -ambient)
@@ -135,7 +138,14 @@ def test_everything_is_exactly_odd(case, omega, flow, voltage, ambient):
     assert rates(minus_x, minus_u, c) == tuple(-y for y in rates(x, u, c))
 
 
-@given(st.sampled_from(sorted(CASES)), st.floats(-300, 300), st.floats(-6, 6), st.floats(-24, 24))
+def test_asymmetric_forces_are_stronger_ahead_than_astern_by_one_plus_e_over_one_minus_e():
+    plain, uneven = derive_constants(TUNNEL), derive_constants(TUNNEL._replace(force_asymmetry=0.2))
+    for x, factor in (((90.0, 0.0), 1.2), ((-90.0, 0.0), 0.8), ((0.0, 2.0), 1.0)):
+        expected = [factor * force for force in thrust_and_torque(x, plain)]
+        np.testing.assert_allclose(thrust_and_torque(x, uneven), expected, rtol=1e-14)
+
+
+@given(st.sampled_from(SYMMETRIC), st.floats(-300, 300), st.floats(-6, 6), st.floats(-24, 24))
 def test_a_substep_is_exactly_odd(case, omega, flow, voltage):
     c = derive_constants(CASES[case], substep=1e-3)
     ahead = substep((omega, flow), (voltage, 0.5), c)

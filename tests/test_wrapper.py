@@ -13,6 +13,7 @@ import thruster_env  # noqa: F401 - registers the env
 from filters import FILTERS, EstimateState, StateSpaceModel, affine_model, make_filter, run, thruster_model
 from filters.thruster import model_of_env
 from thruster_env import plant
+from thruster_env.parameters import TUNNEL, derive_constants
 from thruster_env.streams import episode_keys, filter_keys
 
 # Both checkers would like a bare env with actions in [-1, 1]; volts and a wrapper are what is tested here.
@@ -341,8 +342,9 @@ class TestModels:
         factors = {"lift_coefficient": 1.15, "voltage_gain": 0.95}
         env = wrapped("ekf", parameter_factors=factors)
         assumed, true = env.filter.model.constants, thruster_model().constants
-        assert assumed.half_lift == pytest.approx(1.15 * true.half_lift)
-        assert assumed.voltage_gain == pytest.approx(0.95 * true.voltage_gain)
+        scaled = TUNNEL._replace(lift_coefficient=1.15 * 1.75, voltage_gain=0.95 * 1133.2)
+        expected = derive_constants(scaled, substep=true.substep)
+        np.testing.assert_allclose(assumed, expected, rtol=1e-12)
         assert assumed.motor_damping == true.motor_damping
         actions = np.full((300, 1), 10.0, dtype=np.float32)
         one, other = played(env, actions, 1)[2], played(wrapped("ekf"), actions, 1)[2]

@@ -17,12 +17,16 @@ from typing import NamedTuple
 from thruster_env.compiled import inlined
 from thruster_env.integration import runge_kutta
 
-# Keeps 1/V finite at rest, where every numerator vanishes faster.
+# Keeps 1/V finite at rest, where what it multiplies vanishes faster.
 _REST = 1e-200
 
 
 class Constants(NamedTuple):
-    """What the equations need of a preset; `parameters.derive_constants` makes it."""
+    """What the equations need of a preset; `parameters.derive_constants` makes it.
+
+    With V^2 = U_p^2 + U_a^2, lift and drag are quadratic in (omega_m, U_a), and cos(theta) and sin(theta) are
+    linear in them over V. So V T and V Q are cubic: `thrust_21` is the factor of omega_m^2 U_a in V T.
+    """
 
     motor_damping: float  # K1 [1/s]
     voltage_gain: float  # K2 [rad/(s^2 V)]
@@ -30,68 +34,67 @@ class Constants(NamedTuple):
     inverse_mass: float  # 1/K3 [1/kg]
     flow_drag: float  # K4/K3 [1/m]
     blade_speed: float  # U_p/omega_m = 0.7 R/N [m]
-    torque_arm: float  # 0.7 R [m]
-    half_lift: float  # rho A C_Lmax/2 [kg/m]
-    half_drag: float  # rho A C_Dmax/2 [kg/m]
-    attack_sine: float  # sin(2 alpha) at zero inflow
-    attack_cosine: float  # cos(2 alpha) at zero inflow
-    turn_sine: float  # sin(theta - phi)
-    turn_cosine: float  # cos(theta - phi)
+    asymmetry: float  # relative gain of the forces forward, and loss in reverse [-]
+    thrust_30: float  # V T's factor of omega_m^3
+    thrust_21: float  # ... of omega_m^2 U_a
+    thrust_12: float  # ... of omega_m U_a^2
+    thrust_03: float  # ... of U_a^3
+    torque_30: float  # V Q's factors in the same order
+    torque_21: float
+    torque_12: float
+    torque_03: float
     ambient_velocity: float  # U_0 [m/s] where it is constant
     substep: float  # time step of one integration step [s]
-
-
-@inlined
-def lift_and_drag(x, c):
-    """Lift and drag [N] at state x, with cos(theta), sin(theta), U_p [m/s] and 1/V [s/m].
-
-        U_p = 0.7 R omega_m/N, V^2 = U_p^2 + U_a^2, phi = arctan2(U_a, U_p)
-        Lift = 1/2 rho V^2 A C_Lmax sin(2 alpha),  Drag = 1/2 rho V^2 A C_Dmax (1 - cos(2 alpha))
-
-    With alpha = alpha_0 - phi and theta = phi + turn, V^2 sin(2 alpha) and V^2 cos(2 alpha) are quadratic in
-    (U_p, U_a): no trigonometric call is left. The four-quadrant phi makes the forces exactly odd.
-    """
-    omega, flow = x
-    blade = c.blade_speed * omega
-    speed_squared = blade * blade + flow * flow
-    cosine_part = blade * blade - flow * flow  # V^2 cos(2 phi)
-    sine_part = 2.0 * blade * flow  # V^2 sin(2 phi)
-    lift = c.half_lift * (c.attack_sine * cosine_part - c.attack_cosine * sine_part)
-    drag = c.half_drag * (speed_squared - c.attack_cosine * cosine_part - c.attack_sine * sine_part)
-    per_speed = 1.0 / (speed_squared + _REST) ** 0.5
-    cosine = (c.turn_cosine * blade - c.turn_sine * flow) * per_speed
-    sine = (c.turn_cosine * flow + c.turn_sine * blade) * per_speed
-    return lift, drag, cosine, sine, blade, per_speed
 
 
 @inlined
 def thrust_and_torque(x, c):
     """Thrust T [N] and propeller torque Q [N m] at state x.
 
-    T = Lift cos(theta) - Drag sin(theta),  Q = 0.7 R (Lift sin(theta) + Drag cos(theta))
+        U_p = 0.7 R omega_m/N, V^2 = U_p^2 + U_a^2, phi = arctan2(U_a, U_p)
+        Lift = 1/2 rho V^2 A C_Lmax sin(2 alpha),  Drag = 1/2 rho V^2 A C_Dmax (1 - cos(2 alpha))
+        T = (1 + e cos(phi)) (Lift cos(theta) - Drag sin(theta))
+        Q = (1 + e cos(phi)) 0.7 R (Lift sin(theta) + Drag cos(theta))
+
+    With alpha = alpha_0 - phi and theta = phi + turn, no trigonometric call is left: see `Constants`. The
+    four-quadrant phi makes the forces exactly odd where the asymmetry e is zero (as it is in print).
     """
-    lift, drag, cosine, sine, _, _ = lift_and_drag(x, c)
-    return lift * cosine - drag * sine, c.torque_arm * (lift * sine + drag * cosine)
+    omega, flow = x
+    blade = c.blade_speed * omega
+    omega_2, flow_2 = omega * omega, flow * flow
+    per_speed = 1.0 / (blade * blade + flow_2 + _REST) ** 0.5
+    scale = per_speed * (1.0 + c.asymmetry * blade * per_speed)
+    thrust = omega * (c.thrust_30 * omega_2 + c.thrust_12 * flow_2)
+    torque = omega * (c.torque_30 * omega_2 + c.torque_12 * flow_2)
+    thrust = thrust + flow * (c.thrust_21 * omega_2 + c.thrust_03 * flow_2)
+    torque = torque + flow * (c.torque_21 * omega_2 + c.torque_03 * flow_2)
+    return scale * thrust, scale * torque
 
 
 @inlined
 def thrust_and_torque_tangent(x, dx, c):
     """Directional derivatives (dT, dQ) of `thrust_and_torque` at x along dx, by the product rule."""
-    lift, drag, cosine, sine, blade, per_speed = lift_and_drag(x, c)
-    flow = x[1]
-    d_blade = c.blade_speed * dx[0]
-    d_flow = dx[1]
-    d_speed_squared = 2.0 * (blade * d_blade + flow * d_flow)
-    d_cosine_part = 2.0 * (blade * d_blade - flow * d_flow)
-    d_sine_part = 2.0 * (d_blade * flow + blade * d_flow)
-    d_lift = c.half_lift * (c.attack_sine * d_cosine_part - c.attack_cosine * d_sine_part)
-    d_drag = c.half_drag * (d_speed_squared - c.attack_cosine * d_cosine_part - c.attack_sine * d_sine_part)
-    d_log_speed = 0.5 * d_speed_squared * per_speed * per_speed
-    d_cosine = (c.turn_cosine * d_blade - c.turn_sine * d_flow) * per_speed - cosine * d_log_speed
-    d_sine = (c.turn_cosine * d_flow + c.turn_sine * d_blade) * per_speed - sine * d_log_speed
-    d_thrust = d_lift * cosine + lift * d_cosine - d_drag * sine - drag * d_sine
-    d_torque = c.torque_arm * (d_lift * sine + lift * d_sine + d_drag * cosine + drag * d_cosine)
-    return d_thrust, d_torque
+    omega, flow = x
+    d_omega, d_flow = dx
+    blade, d_blade = c.blade_speed * omega, c.blade_speed * d_omega
+    omega_2, flow_2, both = omega * omega, flow * flow, 2.0 * omega * flow
+    per_speed = 1.0 / (blade * blade + flow_2 + _REST) ** 0.5
+    d_log_speed = (blade * d_blade + flow * d_flow) * per_speed * per_speed
+    lean = c.asymmetry * blade * per_speed
+    d_lean = c.asymmetry * d_blade * per_speed - lean * d_log_speed
+    scale = per_speed * (1.0 + lean)
+    d_scale = per_speed * d_lean - scale * d_log_speed
+    thrust = omega * (c.thrust_30 * omega_2 + c.thrust_12 * flow_2)
+    torque = omega * (c.torque_30 * omega_2 + c.torque_12 * flow_2)
+    thrust = thrust + flow * (c.thrust_21 * omega_2 + c.thrust_03 * flow_2)
+    torque = torque + flow * (c.torque_21 * omega_2 + c.torque_03 * flow_2)
+    thrust_slope = 3.0 * c.thrust_30 * omega_2 + c.thrust_21 * both + c.thrust_12 * flow_2
+    torque_slope = 3.0 * c.torque_30 * omega_2 + c.torque_21 * both + c.torque_12 * flow_2
+    d_thrust = thrust_slope * d_omega
+    d_torque = torque_slope * d_omega
+    d_thrust = d_thrust + (c.thrust_21 * omega_2 + c.thrust_12 * both + 3.0 * c.thrust_03 * flow_2) * d_flow
+    d_torque = d_torque + (c.torque_21 * omega_2 + c.torque_12 * both + 3.0 * c.torque_03 * flow_2) * d_flow
+    return scale * d_thrust + d_scale * thrust, scale * d_torque + d_scale * torque
 
 
 @inlined

@@ -26,9 +26,9 @@ def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float 
     """Solve rates(x, (V_s, U_0)) = 0 for the state that a constant voltage [V] settles to.
 
     Thrust, torque and momentum drag are homogeneous of degree two, so at U_0 = 0 the ratio r = U_a/omega_m
-    solves T(1, r) = K4 r |r| whatever the voltage, and omega_m is the root of a quadratic. That point is the
-    start of a simulation where U_0 is not zero; a Newton-type solution then polishes where that settles. (Against
-    the flow there are saddles too, on which Newton's method alone may end.)
+    solves T(1, r) = K4 r |r| whatever the voltage (in reverse T(-1, -r) = -K4 r |r|), and omega_m is the root
+    of a quadratic. That point is the start of a simulation where U_0 is not zero; a Newton-type solution then
+    polishes where that settles. (Against the flow there are saddles too, on which Newton's method may end.)
 
     Raises ValueError if no steady state is found.
     """
@@ -39,8 +39,13 @@ def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float 
     if voltage == 0 and ambient_velocity == 0:
         return SteadyState(0.0, 0.0, 0.0)
 
+    sign = -1.0 if voltage < 0 else 1.0
+
+    def forces(r):
+        return [sign * force for force in thrust_and_torque((sign, sign * r), c)]
+
     def imbalance(r):
-        return thrust_and_torque((1.0, r), c)[0] * c.inverse_mass - c.flow_drag * r * abs(r)
+        return forces(r)[0] * c.inverse_mass - c.flow_drag * r * abs(r)
 
     # U_a = -U_p turns the attack angle past zero lift for every preset, so the root lies between.
     if not imbalance(0.0) * imbalance(20.0 * c.blade_speed) < 0:
@@ -48,11 +53,11 @@ def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float 
             f"blade_angle must be one with which the thruster has a steady state, but got {p.blade_angle}"
         )
     ratio = brentq(imbalance, 0.0, 20.0 * c.blade_speed, xtol=1e-16)
-    load = c.load_gain * thrust_and_torque((1.0, ratio), c)[1]
+    load = c.load_gain * forces(ratio)[1]
     drive = c.voltage_gain * abs(voltage)
     # load omega^2 + K1 omega - K2 |V| = 0, in the form that survives load -> 0
     omega = 2.0 * drive / (c.motor_damping + (c.motor_damping**2 + 4.0 * load * drive) ** 0.5)
-    x = np.array([omega, ratio * omega]) * np.sign(voltage)
+    x = np.array([omega, ratio * omega]) * (sign if voltage else 0.0)
     if ambient_velocity != 0:
         u = (voltage, ambient_velocity)
         settled = solve_ivp(lambda t, y: rates(tuple(y), u, c), (0.0, 1e5), x, method="LSODA", rtol=1e-8)
@@ -65,8 +70,8 @@ def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float 
 
 def state_range(p: ThrusterParameters, max_voltage: float) -> np.ndarray:
     """Range (2,) of (omega_m [rad/s], U_a [m/s]) over the voltages +-max_voltage [V]: largest minus smallest."""
-    top = steady_state(p, float(max_voltage))
-    return 2.0 * np.abs([top.omega_m, top.U_a])
+    ahead, astern = steady_state(p, float(max_voltage)), steady_state(p, -float(max_voltage))
+    return np.abs(np.array(ahead[:2]) - np.array(astern[:2]))
 
 
 def _plant_matrix(x, u, c) -> np.ndarray:
@@ -119,12 +124,13 @@ def required_substeps(p: ThrusterParameters, dt: float, max_voltage: float, ambi
 
     Raises ValueError if 256 substeps do not suffice: dt is then far too long for the plant.
     """
-    top = steady_state(p, max_voltage)
+    ahead, astern = steady_state(p, max_voltage), steady_state(p, -max_voltage)
     limit = ONE_STEP_ACCURACY * state_range(p, max_voltage)
     grid = np.linspace(-1.0, 1.0, 5)
     omega, flow, voltage = (g.ravel() for g in np.meshgrid(grid, grid, grid, indexing="ij"))
-    fastest_flow = top.U_a + abs(ambient_velocity)
-    x, u = (omega * top.omega_m, flow * fastest_flow), (voltage * max_voltage, ambient_velocity)
+    fastest = max(ahead.omega_m, -astern.omega_m)
+    fastest_flow = max(ahead.U_a, -astern.U_a) + abs(ambient_velocity)
+    x, u = (omega * fastest, flow * fastest_flow), (voltage * max_voltage, ambient_velocity)
     with np.errstate(all="ignore"):
         exact = np.array(run_substeps(x, u, p, dt, 512))
         for count in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256):

@@ -6,7 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from thruster_env.checks import finite, one_of, positive
+import numpy as np
+
+from thruster_env.checks import finite, one_of, positive, within
 from thruster_env.dynamics import Constants
 
 ANGLES = ("as-printed", "rotor-plane", "shaft-axis")
@@ -22,6 +24,9 @@ class ThrusterParameters(NamedTuple):
       are axial and tangential only for p = pi/4.
     - "rotor-plane": alpha = p - phi, theta = phi.
     - "shaft-axis": alpha = (pi/2 - p) - phi, theta = phi.
+
+    `force_asymmetry` e is ours: all forces are multiplied by 1 + e cos(phi), so by 1 + e forward and by 1 - e
+    in reverse. The papers' thruster is symmetric.
     """
 
     lift_coefficient: float  # C_Lmax [-]
@@ -37,6 +42,7 @@ class ThrusterParameters(NamedTuple):
     density: float  # rho [kg/m^3]
     blade_angle: float  # p [rad]
     angles: str = "as-printed"
+    force_asymmetry: float = 0.0  # e [-]
 
 
 def checked(parameters: ThrusterParameters) -> ThrusterParameters:
@@ -49,6 +55,8 @@ def checked(parameters: ThrusterParameters) -> ThrusterParameters:
             values[name] = positive(name, value, zero_allowed=True)
         elif name == "blade_angle":
             values[name] = finite(name, value)
+        elif name == "force_asymmetry":
+            values[name] = within(name, value, 0.9)
         else:
             values[name] = positive(name, value)
     return ThrusterParameters(**values)
@@ -121,23 +129,31 @@ def preset_parameters(preset: str | Mapping | ThrusterParameters) -> ThrusterPar
 
 def derive_constants(p: ThrusterParameters, ambient_velocity: float = 0.0, substep: float = 0.0) -> Constants:
     """Constants of the equations of motion for parameters, a flow U_0 [m/s] and a time step [s]."""
-    attack_at_zero_inflow = p.blade_angle if p.angles == "rotor-plane" else math.pi / 2 - p.blade_angle
-    turn = 2 * p.blade_angle - math.pi / 2 if p.angles == "as-printed" else 0.0
+    attack = p.blade_angle if p.angles == "rotor-plane" else math.pi / 2 - p.blade_angle  # at zero inflow
+    turn = 2 * p.blade_angle - math.pi / 2 if p.angles == "as-printed" else 0.0  # theta - phi
     arm = 0.7 * p.diameter / 2
+    pressure = 0.5 * p.density * p.area  # over V^2
+    # Polynomials in (U_p, U_a), as factors of U_p^2, U_p U_a, U_a^2 or of U_p, U_a.
+    sine = np.array([math.sin(2 * attack), -2 * math.cos(2 * attack), -math.sin(2 * attack)])  # V^2 sin(2 alpha)
+    cosine = np.array([math.cos(2 * attack), 2 * math.sin(2 * attack), -math.cos(2 * attack)])
+    lift = pressure * p.lift_coefficient * sine
+    drag = pressure * p.drag_coefficient * (np.array([1.0, 0.0, 1.0]) - cosine)
+    along = np.array([math.cos(turn), -math.sin(turn)])  # V cos(theta)
+    across = np.array([math.sin(turn), math.cos(turn)])  # V sin(theta)
+    blade_speed = arm / p.gear_ratio
+    powers = blade_speed ** np.array([3, 2, 1, 0])  # from U_p to omega_m
+    thrust = (np.convolve(lift, along) - np.convolve(drag, across)) * powers
+    torque = (np.convolve(lift, across) + np.convolve(drag, along)) * powers * arm
     return Constants(
-        motor_damping=p.motor_damping,
-        voltage_gain=p.voltage_gain,
-        load_gain=p.load_gain,
-        inverse_mass=1.0 / p.added_mass,
-        flow_drag=p.momentum_drag / p.added_mass,
-        blade_speed=arm / p.gear_ratio,
-        torque_arm=arm,
-        half_lift=0.5 * p.density * p.area * p.lift_coefficient,
-        half_drag=0.5 * p.density * p.area * p.drag_coefficient,
-        attack_sine=math.sin(2 * attack_at_zero_inflow),
-        attack_cosine=math.cos(2 * attack_at_zero_inflow),
-        turn_sine=math.sin(turn),
-        turn_cosine=math.cos(turn),
+        p.motor_damping,
+        p.voltage_gain,
+        p.load_gain,
+        1.0 / p.added_mass,
+        p.momentum_drag / p.added_mass,
+        blade_speed,
+        p.force_asymmetry,
+        *thrust.tolist(),
+        *torque.tolist(),
         ambient_velocity=float(ambient_velocity),
         substep=float(substep),
     )
