@@ -78,7 +78,7 @@ def floor_measures(plant: Plant, steps: int) -> dict[str, Measure]:
     moments, no gain, nothing stored and no member that is only there to fill a register.
     """
     propagate, draw = _floor_functions()
-    numbers = plant.numbers
+    numbers = np.array(plant.constants)
 
     def motion(first: int, last: int) -> None:
         table = np.zeros((2, WIDTH))

@@ -38,7 +38,7 @@ def python_model(plant: Plant) -> tuple[list[float], Callable, Callable]:
 
 def compiled_model(plant: Plant) -> tuple[list[float], Callable, Callable]:
     """The same compiled, a member a call: the most that a user of FilterPy can do without leaving it."""
-    u, numbers, substeps = [0.0, plant.ambient_velocity], plant.numbers, plant.substeps
+    u, numbers, substeps = [0.0, plant.ambient_velocity], np.array(plant.constants), plant.substeps
     advance, thrust = _compiled_functions()
 
     def fx(x, dt):

@@ -2,15 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cache
 
+import numpy as np
+
+from filters.affine import affine_model
 from filters.model import StateSpaceModel
 from thruster_env.checks import covariance, finite, positive
 from thruster_env.compiled import inlined
-from thruster_env.dynamics import substep, substep_jacobian, thrust_and_torque, thrust_and_torque_tangent
-from thruster_env.linear import steady_state
+from thruster_env.components import tuple_of, written_out
+from thruster_env.dynamics import (
+    Constants,
+    substep,
+    substep_jacobian,
+    thrust_and_torque,
+    thrust_and_torque_tangent,
+)
+from thruster_env.linear import steady_state, zero_order_hold
 from thruster_env.parameters import ThrusterParameters, checked
 from thruster_env.plant import Plant, make_plant
+from thruster_env.rendering import Overlay
 
 
 @inlined
@@ -27,7 +39,7 @@ def transition_jacobian(x, u, c):
 
 @inlined
 def observe(x, c):
-    """The measured quantity: thrust [N]."""
+    """The quantity that is measured by default: thrust [N]."""
     return (thrust_and_torque(x, c)[0],)
 
 
@@ -37,6 +49,29 @@ def observe_jacobian(x, c):
     by_speed, _ = thrust_and_torque_tangent(x, (1.0, 0.0), c)
     by_flow, _ = thrust_and_torque_tangent(x, (0.0, 1.0), c)
     return ((by_speed, by_flow),)
+
+
+@cache
+def _channel_functions(channels: tuple[str, ...]) -> tuple[Callable, Callable]:
+    """`observe` and its Jacobian for some measured quantities."""
+    if channels == ("thrust",):
+        return observe, observe_jacobian
+    readings = {"thrust": "thrust(x, c)[0]", "speed": "x[0]", "speed-magnitude": "abs(x[0])"}
+    slopes = {
+        "thrust": "thrust_slopes(x, c)[0]",
+        "speed": "(1.0, 0.0)",
+        "speed-magnitude": "(1.0 if x[0] >= 0.0 else -1.0, 0.0)",
+    }
+    unknown = sorted(set(channels) - set(readings))
+    if unknown:  # it depends on the voltage
+        known = ", ".join(readings)
+        raise ValueError(f"channels that a model of the state can predict must be {known}, but got {unknown}")
+    return (
+        written_out("observe", "x, c", tuple_of(readings[name] for name in channels), thrust=observe),
+        written_out(
+            "observe_jacobian", "x, c", tuple_of(slopes[name] for name in channels), thrust_slopes=observe_jacobian
+        ),
+    )
 
 
 MODEL_ARGUMENTS = ("process_noise_cov", "measurement_noise_cov", "parameter_factors", "operating_voltage")
@@ -74,20 +109,25 @@ def model_of_plant(
     measurement_noise_cov=None,
 ) -> StateSpaceModel:
     """The model of a plant, exact unless told otherwise; see `thruster_model` for the arguments."""
+    if plant.linear is not None and parameter_factors:
+        raise ValueError(f"parameter_factors must be none for a linear plant, but got {parameter_factors}")
     plant = plant._replace(parameters=_scaled(plant.parameters, parameter_factors or {}))
     if process_noise_cov is not None:
         plant = plant._replace(process_noise_cov=covariance("process_noise_cov", process_noise_cov, 2))
     if measurement_noise_cov is not None:
-        r = covariance("measurement_noise_cov", measurement_noise_cov, 1)
+        r = covariance("measurement_noise_cov", measurement_noise_cov, len(plant.channels))
         plant = plant._replace(measurement_noise_cov=r)
     if operating_voltage is None:
         operating_voltage = plant.max_voltage / 2
     operating_voltage = finite("operating_voltage", operating_voltage)
+    if plant.linear is not None:
+        return _linear_model(plant)
+    of_channels, of_channels_jacobian = _channel_functions(plant.channels)
     return StateSpaceModel(
         transition=transition,
-        observe=observe,
+        observe=of_channels,
         transition_jacobian=transition_jacobian,
-        observe_jacobian=observe_jacobian,
+        observe_jacobian=of_channels_jacobian,
         process_noise_cov=plant.process_noise_cov,
         measurement_noise_cov=plant.measurement_noise_cov,
         prior_mean=plant.initial_mean,
@@ -113,6 +153,36 @@ def model_of_env(env, **changes) -> StateSpaceModel:
         known = ", ".join(MODEL_ARGUMENTS)
         raise ValueError(f"arguments must be numbers of the filter or {known}, but got {unknown}")
     return model_of_plant(plant, **changes)
+
+
+def overlay_of(label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
+    """What a rendered thruster shows of a belief: the state and its thrust, each with a standard deviation."""
+    (omega, flow), (omega_std, flow_std) = mean.tolist(), np.sqrt(np.diag(cov)).tolist()
+    if not isinstance(model.constants, Constants):  # a linear plant's model
+        return Overlay(label, None, None, omega, omega_std, flow, flow_std)
+    thrust, _ = thrust_and_torque((omega, flow), model.constants)
+    slopes = np.array(observe_jacobian((omega, flow), model.constants)[0])
+    thrust_std = float(slopes @ cov @ slopes) ** 0.5
+    return Overlay(label, thrust, thrust_std, omega, omega_std, flow, flow_std)
+
+
+def _linear_model(plant: Plant) -> StateSpaceModel:
+    """The exact model of a plant that moves by a published linear system."""
+    a, b = zero_order_hold(plant.linear.a, plant.linear.b, plant.dt)
+    rows = {"thrust": plant.linear.c[0], "speed": [1.0, 0.0]}
+    unknown = sorted(set(plant.channels) - set(rows))
+    if unknown:
+        raise ValueError(f"channels of a linear model must be {', '.join(rows)}, but got {unknown}")
+    return affine_model(
+        a=a,
+        b=b[:, :1],
+        c=[rows[channel] for channel in plant.channels],
+        state_offset=b[:, 1] * plant.ambient_velocity,
+        process_noise_cov=plant.process_noise_cov,
+        measurement_noise_cov=plant.measurement_noise_cov,
+        prior_mean=plant.initial_mean,
+        prior_cov=plant.initial_cov,
+    )
 
 
 def _scaled(parameters: ThrusterParameters, factors: Mapping[str, float]) -> ThrusterParameters:

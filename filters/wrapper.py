@@ -11,11 +11,12 @@ import numpy as np
 from filters.model import StateSpaceModel
 from filters.registry import make_filter, read_tuned_file, tunable_numbers
 from filters.session import Session
-from filters.thruster import model_of_env
+from filters.thruster import model_of_env, overlay_of
 from thruster_env.checks import one_of, shown
 from thruster_env.streams import draw_key, filter_generator
 
 OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
+APPENDED = "appended_entries"  # attribute of an env: entries of its observation after the measurement
 
 
 class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
@@ -26,6 +27,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     - "estimate": the mean of the state, (n,);
     - "measurement+estimate": the measurement, then the mean, (m + n,);
     - "belief": the mean, then the standard deviations, (2 n,).
+
+    What the env appends to its measurement (validity flags, a reference) stays at the end of the observation.
 
     Info gains `estimate` (n,), `estimate_cov` (n, n), `innovation` (m,), `innovation_cov` (m, m) and
     `estimate_divergences`, the restarts from the prior after an estimate that was not finite. The measurement
@@ -74,10 +77,14 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self.filter = make_filter(filter, _model_for(env, model, numbers), **own)
         _check_spaces(env, self.filter.model)
         n, m = self.filter.model.n, self.filter.model.m
-        length = {"estimate": n, "measurement+estimate": m + n, "belief": 2 * n}[observation]
+        # What an env appends to its measurement, validity flags and the reference, stays in the observation.
+        self._appended = env.get_wrapper_attr(APPENDED) if env.has_wrapper_attr(APPENDED) else 0
+        length = {"estimate": n, "measurement+estimate": m + n, "belief": 2 * n}[observation] + self._appended
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
         self._session = Session(self.filter.kernels(), self.filter.kernel_model, self.filter.size)
         self._generator = filter_generator(None)
+        if hasattr(env.unwrapped, "render_overlay"):  # a bow thruster draws the estimate beside the truth
+            env.unwrapped.render_overlay = self._overlay
         low, high = env.action_space.low.ravel(), env.action_space.high.ravel()
         self._bounds = list(zip(low.tolist(), high.tolist(), strict=True))
 
@@ -92,7 +99,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
             raise ValueError(f"a measurement must have the model's {m} entries, but got {shown(z)}")
         self._held = np.zeros(m)
         self._session.start(draw_key(self._generator), z)
-        return self._observe(z, info), info
+        return self._observe(observation, z, info), info
 
     def step(self, action):
         """Step the env, then predict with the clipped action and update with the measurement."""
@@ -101,9 +108,12 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         u = [min(max(v, low), high) for v, (low, high) in zip(values, self._bounds, strict=True)]
         z = _measurement(observation, info)
         self._session.step(u, z)
-        return self._observe(z, info), reward, terminated, truncated, info
+        return self._observe(observation, z, info), reward, terminated, truncated, info
 
-    def _observe(self, z, info) -> np.ndarray:
+    def _overlay(self):
+        return overlay_of(self.filter.name, self.filter.model, self._session.mean, self._session.cov)
+
+    def _observe(self, observation, z, info) -> np.ndarray:
         session = self._session
         mean, cov = session.mean.copy(), session.cov.copy()
         info["estimate"] = mean
@@ -111,12 +121,17 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         info["innovation"] = session.innovation.copy()
         info["innovation_cov"] = session.innovation_cov.copy()
         info["estimate_divergences"] = session.divergences
-        if self._form == "estimate":
+        if self._form == "estimate" and not self._appended:
             return mean.astype(np.float32)
+        parts = [mean]
         if self._form == "belief":
-            return np.concatenate([mean, np.sqrt(np.diag(cov))]).astype(np.float32)
-        self._held = np.where(np.isnan(z), self._held, z)
-        return np.concatenate([self._held, mean]).astype(np.float32)
+            parts.append(np.sqrt(np.diag(cov)))
+        elif self._form == "measurement+estimate":
+            self._held = np.where(np.isnan(z), self._held, z)
+            parts.insert(0, self._held)
+        if self._appended:
+            parts.append(observation[-self._appended :])
+        return np.concatenate(parts).astype(np.float32)
 
 
 def _model_for(env: gym.Env, model, arguments: dict) -> StateSpaceModel:

@@ -23,10 +23,11 @@ from filters.affine import AffineModel
 from filters.bounds import riccati_covariances
 from filters.filter import Filter
 from filters.truth import Truth, simulate
-from studies.published import NOISE_LEVELS, SAMPLE_TIME, STEPS, SYSTEMS, H
+from studies.published import NOISE_LEVELS, STEPS, SYSTEMS, H
 from studies.unupdated_ensemble import unupdated_ensemble_means
 from thruster_env.checks import at_least, one_of, positive
 from thruster_env.linear import zero_order_hold
+from thruster_env.published import SAMPLE_TIME
 
 RUNS = 200
 MEMBERS = 200  # the RMSE is about 0.6 % above the Kalman filter's; with 100 members it is 1.2 %

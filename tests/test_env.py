@@ -17,7 +17,7 @@ from thruster_env.linear import run_substeps, state_range, steady_state
 from thruster_env.parameters import TUNNEL, TUNNEL_PHYSICAL
 
 every_preset = pytest.mark.parametrize("preset", PRESETS)
-INFO = {"state", "thrust", "measurement", "reference", "time"}
+INFO = {"state", "thrust", "measurement", "reference", "ambient_velocity", "time"}
 
 
 def actions(count=500, seed=3, top=24.0):
@@ -74,7 +74,9 @@ def test_spaces_are_one_voltage_in_and_one_thrust_out():
 def test_arguments_have_the_published_names():
     names = "preset dt max_voltage ambient_velocity process_noise_cov measurement_noise_cov reference"
     parameters = list(inspect.signature(BowThrusterEnv).parameters)
-    assert parameters == [*names.split(), "initial_state", "render_mode"]
+    names += " initial_state sensors flow amplifier uncertainty"
+    names += " tracking_weight energy_weight voltage_rate_weight render_mode"
+    assert parameters == names.split()
 
 
 def test_results_have_the_types_of_the_interface():
@@ -304,7 +306,7 @@ def test_a_voltage_beyond_the_maximum_is_the_maximum(action):
         ({"measurement_noise_cov": -1}, "measurement_noise_cov must be positive semidefinite .*, but got -1"),
         ({"reference": math.nan}, "reference must be a finite number, but got nan"),
         ({"reference": "full ahead"}, "reference must be a finite number, but got 'full ahead'"),
-        ({"render_mode": "human"}, "render_mode must be None, but got 'human'"),
+        ({"render_mode": "ansi"}, "render_mode must be None or 'human' or 'rgb_array', but got 'ansi'"),
     ],
 )
 def test_a_wrong_argument_is_refused(arguments, message):

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, StateSpaceModel, affine_model, make_filter, run, thruster_model, truth
-from thruster_env import plant
 from thruster_env.compiled import interpreted
+from thruster_env.plant import make_plant
+from thruster_env.simulation import simulate as simulate_plant
 from thruster_env.streams import episode_keys
 
 
@@ -158,7 +159,7 @@ class TestTruth:
         keys = episode_keys(range(5))
         inputs = np.random.default_rng(0).uniform(-24, 24, size=(5, 200, 1))
         of_model = truth.simulate(thruster_model(**arguments), keys, inputs)
-        of_plant = plant.simulate(plant.make_plant(**arguments), keys, inputs[..., 0])
+        of_plant = simulate_plant(make_plant(**arguments), keys, inputs[..., 0])
         close = {"rtol": 1e-12, "atol": 1e-12}
         np.testing.assert_allclose(of_model.states, of_plant.states, **close)
         np.testing.assert_allclose(of_model.measurements, of_plant.measurements, **close)

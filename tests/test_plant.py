@@ -6,24 +6,16 @@ import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the env
+from thruster_env.batch import Copies
 from thruster_env.checks import at_least, covariance, covariance_root, finite, one_of, positive, vector
 from thruster_env.compiled import interpreted
 from thruster_env.linear import run_substeps, steady_state
+from thruster_env.memory import COMMAND, FLOW, OMEGA, READINGS, THRUST, row
 from thruster_env.parameters import PRESETS, TUNNEL, checked
-from thruster_env.plant import (
-    KEY_0,
-    KEY_1,
-    MEASURED,
-    MEMORY_ROWS,
-    THRUST,
-    VOLTAGE,
-    advance_copies,
-    begin_copies,
-    make_plant,
-    simulate,
-    single_step,
-)
+from thruster_env.plant import make_plant
+from thruster_env.simulation import simulate
 from thruster_env.streams import draw_key, episode_keys
+from thruster_env.task import Task
 
 MAPPING = TUNNEL._asdict()
 Q, R = [[1.0, 0.012], [0.012, 4e-4]], 0.25
@@ -199,11 +191,10 @@ def test_voltages_are_clipped():
 
 
 def single_run(plant, key, voltages):
-    memory, numbers, step = np.zeros((MEMORY_ROWS, 1)), plant.numbers, single_step()
-    memory[KEY_0 : KEY_1 + 1, 0] = key
-    rows = [step(memory, 0.0, numbers, True)]
-    rows += [step(memory, float(voltage), numbers, False) for voltage in voltages]
-    return np.array(rows)
+    copies = Copies(plant, Task(), 1)
+    reports = [copies.begin(key[None])]
+    reports += [copies.step(voltages[k : k + 1]) for k in range(len(voltages))]
+    return np.array(reports)[:, [OMEGA, FLOW, THRUST, READINGS], 0]
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -216,7 +207,15 @@ def test_a_batch_is_a_loop_over_single_plants(preset):
         np.testing.assert_allclose(run.states[b], rows[:, :2], rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(run.thrusts[b], rows[:, 2], rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(run.measurements[b, :, 0], rows[:, 3], rtol=1e-12, atol=1e-12)
-        np.testing.assert_array_equal(np.clip(voltages[b], -24, 24), rows[1:, 4])
+
+
+@pytest.mark.parametrize("count", [1, 4, 128, 300, 1100])
+def test_a_voltage_beyond_the_range_is_clipped_in_every_copy(count):
+    copies = Copies(make_plant(), Task(), count)
+    copies.begin(np.zeros((count, 2)))
+    voltages = np.linspace(-40.0, 40.0, count)
+    copies.step(voltages)
+    np.testing.assert_array_equal(row(copies.memory, COMMAND, count), np.clip(voltages, -24, 24))
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -254,23 +253,16 @@ def test_python_and_machine_code_agree():
     plant = make_plant("tunnel_physical", process_noise_cov=Q, ambient_velocity=0.3)
     keys, voltages = episode_keys(range(4)), random_voltages(4, 60, top=30.0)
     run = simulate(plant, keys, voltages)
-    memory, numbers = np.zeros((MEMORY_ROWS, 4)), plant.numbers
-    memory[[KEY_0, KEY_1]] = keys.T
-    begin_copies(memory, numbers)
-    for k in range(61):
-        if k > 0:
-            advance_copies(memory, voltages[:, k - 1], numbers)
-            np.testing.assert_array_equal(memory[VOLTAGE], np.clip(voltages[:, k - 1], -24, 24))
-        np.testing.assert_allclose(run.states[:, k].T, memory[:2], rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(run.thrusts[:, k], memory[THRUST], rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(run.measurements[:, k, 0], memory[MEASURED], rtol=1e-12, atol=1e-12)
+    with interpreted():
+        of_python = simulate(plant, keys, voltages)
+    for a, b in zip(run, of_python, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
 def test_nothing_of_the_plant_is_compiled_within_interpreted():
-    single_step()
     with interpreted():
-        assert inspect.isfunction(single_step())
-    assert not inspect.isfunction(single_step())
+        assert inspect.isfunction(Copies(make_plant(), Task(), 1).advance)
+    assert not inspect.isfunction(Copies(make_plant(), Task(), 1).advance)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,8 @@ from scipy import stats
 import thruster_env  # noqa: F401 - registers the env
 from thruster_env import streams
 from thruster_env.compiled import compiled, function_fingerprint
-from thruster_env.plant import make_plant, simulate
+from thruster_env.plant import make_plant
+from thruster_env.simulation import simulate
 
 BLOCKS = 1_000_000  # four normals each
 KEY = (123456789.0, 987654321.0)

@@ -12,10 +12,11 @@ from filters.truth import simulate
 from studies import STUDIES
 from studies.comparison import compare, compare_all, discrete_model, optimum
 from studies.findings import findings
-from studies.published import NOISE_LEVELS, SAMPLE_TIME, STEPS, SYSTEMS, H
+from studies.published import NOISE_LEVELS, STEPS, SYSTEMS, H
 from studies.unupdated_ensemble import unupdated_ensemble_means
 from thruster_cli.main import main
 from thruster_env.linear import zero_order_hold
+from thruster_env.published import SAMPLE_TIME
 
 # The Riccati values and the errors of the un-updated ensemble, computed independently of this package.
 OPTIMUM = {

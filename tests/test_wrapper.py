@@ -12,8 +12,9 @@ from gymnasium.utils.env_checker import check_env
 import thruster_env  # noqa: F401 - registers the env
 from filters import FILTERS, EstimateState, StateSpaceModel, affine_model, make_filter, run, thruster_model
 from filters.thruster import model_of_env
-from thruster_env import plant
 from thruster_env.parameters import TUNNEL, derive_constants
+from thruster_env.plant import make_plant
+from thruster_env.simulation import simulate
 from thruster_env.streams import episode_keys, filter_keys
 
 # Both checkers would like a bare env with actions in [-1, 1]; volts and a wrapper are what is tested here.
@@ -171,7 +172,7 @@ class TestNumbers:
         seed, actions = 11, voltages(500)
         env = wrapped(filter)
         _, _, infos = played(env, actions, seed)
-        drawn = plant.simulate(plant.make_plant(), episode_keys([seed]), actions.T.astype(np.float64))
+        drawn = simulate(make_plant(), episode_keys([seed]), actions.T.astype(np.float64))
         np.testing.assert_allclose(infos_of("measurement", infos), drawn.measurements[0], rtol=1e-12, atol=1e-12)
         numbers = {"ensemble_size": 20} if filter == "enkf" else {}
         estimates = run(

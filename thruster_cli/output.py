@@ -17,11 +17,13 @@ from rich.text import Text
 
 from thruster_env.compiled import tell_when_compiling
 from thruster_env.files import write_whole
+from thruster_env.parameters import PRESETS
 
 JsonOption = Annotated[
     str | None,
     typer.Option("--json", metavar="FILE", help="Also write the result as JSON; - for standard output."),
 ]
+PresetOption = Annotated[str, typer.Option("--preset", help=f"{', '.join(PRESETS)}.")]
 SeedOption = Annotated[
     int, typer.Option("--seed", min=0, help="Seed of all randomness; the same seed repeats all.")
 ]

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit
+from thruster_cli.output import JsonOption, PresetOption, SeedOption, announce_compilation, emit
 from thruster_env.checks import at_least, positive, within
 from thruster_env.files import write_whole
 from thruster_env.plant import (
@@ -17,8 +17,8 @@ from thruster_env.plant import (
     DEFAULT_MEASUREMENT_NOISE,
     DEFAULT_PROCESS_NOISE,
     make_plant,
-    simulate,
 )
+from thruster_env.simulation import simulate
 from thruster_env.streams import episode_keys
 from tuning.scenarios import held_levels
 
@@ -27,9 +27,7 @@ COLUMNS = ("time_s", "voltage_V", "omega_m_rad_per_s", "U_a_m_per_s", "thrust_N"
 
 def command(
     out: Annotated[Path, typer.Option(help="File to write: .csv with units in the header, or .npz.")],
-    preset: Annotated[
-        str, typer.Option(help="tunnel, tunnel_physical, open_bladed, open_bladed_corrected.")
-    ] = "tunnel",
+    preset: PresetOption = "tunnel",
     steps: Annotated[int, typer.Option(help="Number of steps.")] = 500,
     dt: Annotated[float, typer.Option(help="Sample time [s].")] = DEFAULT_DT,
     voltage: Annotated[float | None, typer.Option(help="Constant voltage [V]; else random levels.")] = None,

@@ -34,7 +34,7 @@ class Constants(NamedTuple):
     inverse_mass: float  # 1/K3 [1/kg]
     flow_drag: float  # K4/K3 [1/m]
     blade_speed: float  # U_p/omega_m = 0.7 R/N [m]
-    asymmetry: float  # relative gain of the forces forward, and loss in reverse [-]
+    asymmetry: float  # relative gain of the thrust ahead, and loss astern [-]
     thrust_30: float  # V T's factor of omega_m^3
     thrust_21: float  # ... of omega_m^2 U_a
     thrust_12: float  # ... of omega_m U_a^2
@@ -54,7 +54,7 @@ def thrust_and_torque(x, c):
         U_p = 0.7 R omega_m/N, V^2 = U_p^2 + U_a^2, phi = arctan2(U_a, U_p)
         Lift = 1/2 rho V^2 A C_Lmax sin(2 alpha),  Drag = 1/2 rho V^2 A C_Dmax (1 - cos(2 alpha))
         T = (1 + e cos(phi)) (Lift cos(theta) - Drag sin(theta))
-        Q = (1 + e cos(phi)) 0.7 R (Lift sin(theta) + Drag cos(theta))
+        Q = 0.7 R (Lift sin(theta) + Drag cos(theta))
 
     With alpha = alpha_0 - phi and theta = phi + turn, no trigonometric call is left: see `Constants`. The
     four-quadrant phi makes the forces exactly odd where the asymmetry e is zero (as it is in print).
@@ -63,12 +63,12 @@ def thrust_and_torque(x, c):
     blade = c.blade_speed * omega
     omega_2, flow_2 = omega * omega, flow * flow
     per_speed = 1.0 / (blade * blade + flow_2 + _REST) ** 0.5
-    scale = per_speed * (1.0 + c.asymmetry * blade * per_speed)
+    lean = 1.0 + c.asymmetry * blade * per_speed
     thrust = omega * (c.thrust_30 * omega_2 + c.thrust_12 * flow_2)
     torque = omega * (c.torque_30 * omega_2 + c.torque_12 * flow_2)
     thrust = thrust + flow * (c.thrust_21 * omega_2 + c.thrust_03 * flow_2)
     torque = torque + flow * (c.torque_21 * omega_2 + c.torque_03 * flow_2)
-    return scale * thrust, scale * torque
+    return per_speed * lean * thrust, per_speed * torque
 
 
 @inlined
@@ -80,10 +80,8 @@ def thrust_and_torque_tangent(x, dx, c):
     omega_2, flow_2, both = omega * omega, flow * flow, 2.0 * omega * flow
     per_speed = 1.0 / (blade * blade + flow_2 + _REST) ** 0.5
     d_log_speed = (blade * d_blade + flow * d_flow) * per_speed * per_speed
-    lean = c.asymmetry * blade * per_speed
-    d_lean = c.asymmetry * d_blade * per_speed - lean * d_log_speed
-    scale = per_speed * (1.0 + lean)
-    d_scale = per_speed * d_lean - scale * d_log_speed
+    lean = 1.0 + c.asymmetry * blade * per_speed
+    d_lean = c.asymmetry * d_blade * per_speed - (lean - 1.0) * d_log_speed
     thrust = omega * (c.thrust_30 * omega_2 + c.thrust_12 * flow_2)
     torque = omega * (c.torque_30 * omega_2 + c.torque_12 * flow_2)
     thrust = thrust + flow * (c.thrust_21 * omega_2 + c.thrust_03 * flow_2)
@@ -94,7 +92,8 @@ def thrust_and_torque_tangent(x, dx, c):
     d_torque = torque_slope * d_omega
     d_thrust = d_thrust + (c.thrust_21 * omega_2 + c.thrust_12 * both + 3.0 * c.thrust_03 * flow_2) * d_flow
     d_torque = d_torque + (c.torque_21 * omega_2 + c.torque_12 * both + 3.0 * c.torque_03 * flow_2) * d_flow
-    return scale * d_thrust + d_scale * thrust, scale * d_torque + d_scale * torque
+    d_thrust = lean * (d_thrust - d_log_speed * thrust) + d_lean * thrust
+    return per_speed * d_thrust, per_speed * (d_torque - d_log_speed * torque)
 
 
 @inlined

@@ -3,31 +3,41 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.checks import finite
-from thruster_env.linear import state_range, steady_state
+from thruster_env.batch import Copies
+from thruster_env.checks import finite, vector
+from thruster_env.effects import Effect
+from thruster_env.memory import (
+    COMMAND,
+    KEY_0,
+    KEY_1,
+    NEXT_REFERENCE,
+    READINGS,
+    REPORTED,
+    REWARD,
+    TERMINATED,
+    VALID,
+)
 from thruster_env.parameters import ThrusterParameters
 from thruster_env.plant import (
     DEFAULT_DT,
     DEFAULT_MAX_VOLTAGE,
-    DEFAULT_MEASUREMENT_NOISE,
     DEFAULT_PROCESS_NOISE,
-    KEY_0,
-    KEY_1,
-    MEMORY_ROWS,
+    Plant,
     make_plant,
-    single_step,
 )
+from thruster_env.reference import Constant
+from thruster_env.rendering.env import RenderedEnv
 from thruster_env.streams import draw_key
+from thruster_env.task import DEFAULT_WEIGHTS, half_thrust, make_task, thrust_scale
+from thruster_env.uncertainty import drawn_parameters
 
-VOLTAGE_RATE_COST = 0.01  # reward lost for a jump of the voltage by max_voltage within one step
-ABSURD = 100.0  # a state this many times its range away from rest ends the episode
 
-
-class BowThrusterEnv(gym.Env):
+class BowThrusterEnv(RenderedEnv):
     """A ship's bow thruster: hold a thrust by the voltage of the motor, seeing the measured thrust only.
 
     ## Action space
@@ -40,6 +50,9 @@ class BowThrusterEnv(gym.Env):
     |---|---|---|---|---|
     | 0 | measured thrust T + v | -inf | inf | N |
 
+    With other `sensors`, one entry a channel in their order; then, for each channel that may drop out, 1 where the
+    measurement is valid and 0 where the last one is repeated.
+
     ## State (hidden; in `info["state"]`)
     | num | state | unit |
     |---|---|---|
@@ -47,23 +60,30 @@ class BowThrusterEnv(gym.Env):
     | 1 | section-average flow velocity U_a | m/s |
 
     ## Reward
-    -((T - reference)/T_max)^2 - 0.01 (change of voltage/max_voltage)^2, from the true thrust T after the step;
-    T_max is the steady thrust at max_voltage.
+    | term | weight | default |
+    |---|---|---|
+    | -((T - reference)/T_max)^2 | tracking_weight | 1 |
+    | -(V_s/max_voltage)^2 | energy_weight | 0 |
+    | -(change of V_s/max_voltage)^2 | voltage_rate_weight | 0.01 |
+
+    T is the true thrust after the step, whatever the sensors say; T_max is the steady thrust at max_voltage.
 
     ## Info
-    `state` (2,), `thrust` [N], `measurement` (1,) in float64 [N], `reference` [N], `time` [s].
+    `state` (2,), `thrust` [N], `measurement` (m,) in float64, `reference` [N] that the reward compares with,
+    `ambient_velocity` [m/s] during the step, `time` [s]; with dropout also `measurement_valid` (m,).
 
     ## Episode
-    Starts at N(0, diag(1, 0.01)) unless `initial_state` says otherwise; truncated after 500 steps (5 s);
-    terminated when the state is not finite or 100 times its range away from rest.
+    Starts at N(0, diag(1, 0.01)) unless `initial_state` says otherwise, or `reset(options={"state": [..]})`;
+    truncated after 500 steps (5 s); terminated when the state is not finite or 100 times its range away from rest.
 
     ## Arguments
-    `preset`, `dt`, `max_voltage`, `ambient_velocity`, `process_noise_cov`, `measurement_noise_cov` and
-    `initial_state` are those of `thruster_env.plant.make_plant`; `reference` is the thrust to hold [N], by
-    default the steady thrust at half of max_voltage. A wrong one raises a ValueError.
+    Those of `thruster_env.plant.make_plant` (`preset`, `dt`, `max_voltage`, `ambient_velocity`,
+    `process_noise_cov`, `measurement_noise_cov`, `initial_state`, `sensors`, `flow`, `amplifier`,
+    `uncertainty`), the weights above, and `reference` [N]: by default the steady thrust at half of max_voltage.
+    A wrong one raises a ValueError.
     """
 
-    metadata = {"render_modes": [], "render_fps": 100}
+    observes_reference = False
 
     def __init__(
         self,
@@ -72,80 +92,153 @@ class BowThrusterEnv(gym.Env):
         max_voltage: float = DEFAULT_MAX_VOLTAGE,
         ambient_velocity: float = 0.0,
         process_noise_cov=DEFAULT_PROCESS_NOISE,
-        measurement_noise_cov: float = DEFAULT_MEASUREMENT_NOISE,
-        reference: float | None = None,
+        measurement_noise_cov=None,
+        reference=None,
         initial_state=None,
+        sensors=None,
+        flow=None,
+        amplifier=None,
+        uncertainty=None,
+        tracking_weight: float = DEFAULT_WEIGHTS[0],
+        energy_weight: float = DEFAULT_WEIGHTS[1],
+        voltage_rate_weight: float = DEFAULT_WEIGHTS[2],
         render_mode: str | None = None,
     ):
         """Build the plant; see the class for the arguments."""
-        if render_mode is not None:
-            raise ValueError(f"render_mode must be None, but got {render_mode!r}")
-        self.render_mode = render_mode
-        self.plant = make_plant(
-            preset, dt, max_voltage, ambient_velocity, process_noise_cov, measurement_noise_cov, initial_state
+        plant = make_plant(
+            preset=preset,
+            dt=dt,
+            max_voltage=max_voltage,
+            ambient_velocity=ambient_velocity,
+            process_noise_cov=process_noise_cov,
+            measurement_noise_cov=measurement_noise_cov,
+            initial_state=initial_state,
+            sensors=sensors,
+            flow=flow,
+            amplifier=amplifier,
+            uncertainty=uncertainty,
         )
-        top = self.plant.max_voltage
-        self.thrust_scale = steady_state(self.plant.parameters, top).thrust
-        if reference is None:
-            self.reference = steady_state(self.plant.parameters, top / 2).thrust
-        else:
-            self.reference = finite("reference", reference)
+        self._build(plant, reference, (tracking_weight, energy_weight, voltage_rate_weight), render_mode)
+
+    def _build(self, plant: Plant, reference, weights, render_mode: str | None) -> None:
+        self.plant = plant
+        self._prepare_rendering(render_mode)
+        self.task = make_task(self._reference_signals(reference), *weights)
+        top, size = plant.max_voltage, len(plant.channels)
+        dropping = [VALID + i for i in plant.dropping_channels]
+        self._appended = [*dropping, *([NEXT_REFERENCE] if self.observes_reference else [])]
+        self._readings, self._valid = slice(READINGS, READINGS + size), slice(VALID, VALID + size)
+        self._drops = bool(dropping)
+        self._single = size == 1 and not self._appended  # the frequent case, which has to be quick
         self.action_space = gym.spaces.Box(-top, top, shape=(1,), dtype=np.float32)
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(1,), dtype=np.float32)
-        flow = abs(self.plant.ambient_velocity)
-        turned_by_flow = np.array([flow / self.plant.constants.blade_speed, flow])
-        self._limits = (ABSURD * (state_range(self.plant.parameters, top) + turned_by_flow)).tolist()
-        self._numbers = self.plant.numbers
-        self._memory = np.zeros((MEMORY_ROWS, 1))
-        self._step = single_step()
-        self._steps = 0
-        self._voltage = 0.0
+        self.observation_space = gym.spaces.Box(
+            -np.inf, np.inf, shape=(size + len(self._appended),), dtype=np.float32
+        )
+        self._copies = Copies(plant, self.task, 1)
+        self._memory, self._numbers = self._copies.memory, self._copies.numbers
+        self._out = np.zeros((REPORTED, 1))
+        self._report = self._out.reshape(-1)  # a view
+        self._advance = self._copies.advance
+
+    def _reference_signals(self, reference):
+        return [Constant(thrust=half_thrust(self.plant) if reference is None else finite("reference", reference))]
+
+    @property
+    def appended_entries(self) -> int:
+        """Entries of the observation after the measurement: validity flags and the reference."""
+        return len(self._appended)
+
+    @property
+    def observed_rows(self) -> list[int]:
+        """Rows of a report, see `memory`, that make the observation."""
+        return [*range(self._readings.start, self._readings.stop), *self._appended]
+
+    @property
+    def thrust_scale(self) -> float:
+        """Steady thrust at max_voltage, T_max [N]."""
+        return thrust_scale(self.plant)
+
+    @property
+    def parameters(self) -> ThrusterParameters:
+        """The parameters of this episode, which differ from the plant's where these are uncertain."""
+        keys = self._memory[:1, KEY_0 : KEY_1 + 1, 0]
+        drawn = drawn_parameters(self.plant.parameters, self.plant.uncertainty, keys)
+        return drawn._replace(**{name: float(getattr(drawn, name)[0]) for name in self.plant.uncertainty})
 
     @property
     def spec(self):
-        """The specification that made this env; parameters are kept in it as a mapping, which JSON can hold."""
+        """The specification that made this env; its objects are kept as mappings, which JSON can hold."""
         return self._spec
 
     @spec.setter
     def spec(self, spec) -> None:
-        if spec is not None and isinstance(spec.kwargs.get("preset"), ThrusterParameters):
-            spec.kwargs["preset"] = spec.kwargs["preset"]._asdict()
+        if spec is not None:
+            spec.kwargs.update({key: _as_json(value) for key, value in spec.kwargs.items()})
         self._spec = spec
 
     _spec = None
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Start an episode: a key from the env's generator, an initial state and a first measurement."""
+        """Start an episode: a key from the env's generator, an initial state and a first measurement.
+
+        `options={"state": [omega_m, U_a]}` fixes the initial state of this episode.
+        """
         super().reset(seed=seed)
-        self._memory[KEY_0 : KEY_1 + 1, 0] = draw_key(self.np_random)
-        self._steps = 0
-        omega, flow, thrust, measured, self._voltage = self._step(self._memory, 0.0, self._numbers, True)
-        return _as_observation(measured), self._info(omega, flow, thrust, measured)
+        numbers = None
+        if options is not None and "state" in options:
+            state = vector("the state of options", options["state"], 2)
+            plant = self.plant._replace(initial_mean=state, initial_cov=np.zeros((2, 2)))
+            numbers = Copies(plant, self.task, 1).numbers
+        report = self._copies.begin(draw_key(self.np_random)[None], numbers=numbers)[:, 0].tolist()
+        if self.render_mode is not None:
+            self._show(report, begin=True)
+        return self._observation(report), self._info(report)
 
     def step(self, action):
         """Apply a voltage for one sample time.
 
         Raises ValueError for an action that is not one number or is NaN.
         """
-        voltage = _as_voltage(action)
-        previous = self._voltage
-        omega, flow, thrust, measured, self._voltage = self._step(self._memory, voltage, self._numbers, False)
-        self._steps += 1
-        error = (thrust - self.reference) / self.thrust_scale
-        rate = (self._voltage - previous) / self.plant.max_voltage
-        reward = -error * error - VOLTAGE_RATE_COST * rate * rate
-        terminated = not (abs(omega) < self._limits[0] and abs(flow) < self._limits[1])
-        observation = _as_observation(measured)
-        return observation, reward, terminated, False, self._info(omega, flow, thrust, measured)
+        self._memory[0, COMMAND, 0] = _as_voltage(action)
+        self._advance(self._memory, self._numbers, self._out, False, 0, 1)
+        report = self._report.tolist()
+        if self.render_mode is not None:
+            self._show(report)
+        return self._observation(report), report[REWARD], report[TERMINATED] > 0.0, False, self._info(report)
 
-    def _info(self, omega, flow, thrust, measured) -> dict:
-        return {
+    def _observation(self, report: list[float]) -> np.ndarray:
+        if self._single and -3e38 < report[READINGS] < 3e38:
+            return np.array((report[READINGS],), dtype=np.float32)
+        values = report[self._readings] + [report[i] for i in self._appended]
+        # float32 ends at 3.4e38; casting beyond it would warn on its way to infinity.
+        values = [value if abs(value) < 3e38 else math.copysign(math.inf, value) for value in values]
+        return np.array(values, dtype=np.float32)
+
+    def _info(self, report: list[float]) -> dict:
+        omega, flow, thrust, ambient, reference, _, _, time = report[:8]
+        info = {
             "state": np.array((omega, flow)),
             "thrust": thrust,
-            "measurement": np.array((measured,)),
-            "reference": self.reference,
-            "time": self._steps * self.plant.dt,
+            "measurement": np.array(report[self._readings]),
+            "reference": reference,
+            "ambient_velocity": ambient,
+            "time": time,
         }
+        if self._drops:
+            info["measurement_valid"] = np.array(report[self._valid]) > 0.0
+        return info
+
+
+def _as_json(value):
+    if isinstance(value, ThrusterParameters):
+        return value._asdict()
+    if isinstance(value, Effect):
+        return value.as_mapping()
+    if isinstance(value, Mapping):
+        return {key: _as_json(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_as_json(entry) for entry in value]
+    return value
 
 
 def _as_voltage(action) -> float:
@@ -156,10 +249,3 @@ def _as_voltage(action) -> float:
     if voltage != voltage:
         raise ValueError(f"an action must be one voltage [V] and not NaN, but got {action!r}")
     return voltage
-
-
-def _as_observation(measured: float) -> np.ndarray:
-    # float32 ends at 3.4e38; casting beyond it would warn on its way to infinity.
-    if not abs(measured) < 3e38:
-        measured = math.copysign(math.inf, measured)
-    return np.array((measured,), dtype=np.float32)

@@ -25,8 +25,8 @@ class ThrusterParameters(NamedTuple):
     - "rotor-plane": alpha = p - phi, theta = phi.
     - "shaft-axis": alpha = (pi/2 - p) - phi, theta = phi.
 
-    `force_asymmetry` e is ours: all forces are multiplied by 1 + e cos(phi), so by 1 + e forward and by 1 - e
-    in reverse. The papers' thruster is symmetric.
+    `thrust_asymmetry` e is ours: the thrust is multiplied by 1 + e cos(phi), so at the bollard by 1 + e ahead and
+    by 1 - e astern, the torque by nothing. The papers' thruster is symmetric.
     """
 
     lift_coefficient: float  # C_Lmax [-]
@@ -42,7 +42,7 @@ class ThrusterParameters(NamedTuple):
     density: float  # rho [kg/m^3]
     blade_angle: float  # p [rad]
     angles: str = "as-printed"
-    force_asymmetry: float = 0.0  # e [-]
+    thrust_asymmetry: float = 0.0  # e [-]
 
 
 def checked(parameters: ThrusterParameters) -> ThrusterParameters:
@@ -55,7 +55,7 @@ def checked(parameters: ThrusterParameters) -> ThrusterParameters:
             values[name] = positive(name, value, zero_allowed=True)
         elif name == "blade_angle":
             values[name] = finite(name, value)
-        elif name == "force_asymmetry":
+        elif name == "thrust_asymmetry":
             values[name] = within(name, value, 0.9)
         else:
             values[name] = positive(name, value)
@@ -99,18 +99,80 @@ TUNNEL_PHYSICAL = TUNNEL._replace(
     area=math.pi * 0.0762**2 / 4,
     angles="rotor-plane",
 )
-"""The tunnel with K_h = 17 790 (the print's dot is a thousands separator), A = pi D^2/4 (which gives the
-printed K3 and K4) and the rotor-plane angles, the one pair whose bollard K_T (0.22) is a real thruster's."""
+"""The tunnel table with three corrections; everything else as printed.
+
+- K_h = 17 790. The print's 17.790 is most likely that number with a dot as thousands separator: J = 1/K_h is then
+  5.6e-5 kg m^2, the inertia of a small motor. With a thousand times more inertia, as printed, the motor would
+  hardly notice the propeller's torque.
+- A = pi D^2/4 = 0.00456 m^2. With this area rho A L gamma and rho A dbeta are the printed K3 and K4; with the
+  printed 0.00445 m^2 they are 0.931 kg and 0.888 kg/m.
+- Rotor-plane angles. Thrust and torque are the axial and tangential parts of the forces only if theta is the
+  inflow angle, which the printed pair gives for p = pi/4 alone. The bollard K_T = T/(rho n^2 D^4) is 1.55 with the
+  printed pair, 1.27 with the shaft-axis pair and 0.22 with this one; measured small thrusters have 0.18 to 0.46.
+"""
 
 OPEN_BLADED_CORRECTED = OPEN_BLADED._replace(voltage_gain=650.0, area=math.pi * 0.15**2 / 4)
-"""The open-bladed table with A = pi D^2/4 and K2 = 650 (an inference: V_s was in millivolts). Corrected, but
-not physical: its bollard K_T of 2.1 is about five times that of any measured thruster."""
+"""The open-bladed table with two corrections; everything else as printed.
+
+- A = pi D^2/4 = 0.01767 m^2. With this area rho A L gamma and rho A dbeta are the printed K3 and K4; with the
+  printed 0.00445 m^2 they are 1.00 kg and 7.55 kg/m.
+- K2 = 650. The papers used 0.65, with which a volt turns the motor at 0.06 rad/s. That their V_s is in millivolts
+  is an inference.
+
+The angles need no correction: for p = pi/4 the three pairs are one. Corrected, but not physical: the bollard K_T
+of 2.1 is about five times that of any measured thruster.
+"""
+
+T200 = ThrusterParameters(
+    lift_coefficient=0.3943,
+    drag_coefficient=0.2062,
+    motor_damping=47.68,
+    voltage_gain=2386.0,
+    load_gain=20000.0,
+    added_mass=0.4363,
+    momentum_drag=6.791,
+    area=math.pi * 0.076**2 / 4,
+    diameter=0.076,
+    gear_ratio=1.0,
+    density=998.0,
+    blade_angle=math.pi / 6,
+    angles="rotor-plane",
+    thrust_asymmetry=0.1603,
+)
+"""A Blue Robotics T200, identified from its static bollard table by `studies/t200_identification.py`.
+
+Source: Blue Robotics, "T200 Public Performance Data 10-20V September 2019"; 14 and 18 V held out.
+
+Identified: C_Lmax, C_Dmax, e, K1, K2. Inferred, because a static table cannot tell:
+
+- K_h = 1/J with J = 5e-5 kg m^2 for rotor, propeller and the water that turns along. The table fixes only ratios
+  of K1, K2 and K_h, so the motor's time constant goes with J.
+- K3 = rho A (L + 1.22 R) = 0.436 kg: the water in a nozzle of L = 0.05 m and at its two open ends. With these two
+  the poles are at -65 and -128 1/s at full throttle ahead from 10 V, and at -82 and -171 1/s from 20 V.
+- K4 = 1.5 rho A: between a duct that the jet leaves at full width (1) and an open propeller (2).
+- p = pi/6, as in the tunnel. C_Lmax, C_Dmax and e hold together with this p and this K4.
+- C_Dmax sets the torque, which is read off the current: a motor without friction, torque K1/K2 times current.
+
+Asymmetry: with e = 0.160 the bollard K_T is 0.424 ahead and 0.338 astern; the table's medians are 0.429 and 0.335,
+its ranges 0.40 to 0.46 and 0.31 to 0.37. The torque is not scaled by e, yet 5 % larger astern: less thrust draws
+less flow, which makes the attack angle larger. By the table's current it is 2 % smaller. At one |V_s| the model
+turns 1.4 % slower astern. With 13 V and an ambient flow above 3.4 m/s its jet takes more power than the shaft has.
+
+Errors above a quarter of full speed, medians of fitted / held-out voltages: thrust from measured speed 2.2 / 2.7 %
+ahead and 2.8 / 2.9 % astern; thrust from pulse width and supply 2.7 / 2.6 % ahead and 2.4 / 2.0 % astern; current
+from measured speed 3.3 / 2.7 % ahead and 4.3 / 3.9 % astern. Nine rows in ten are within 10 %. At 20 V and full
+throttle the model has too little thrust: 8 % ahead and 3 % astern, at the measured speed 8 and 10 %.
+
+V_s is what reaches the motor: 8.3 V at full throttle from 10 V, 13.3 V from 20 V (`studies.t200_identification`
+has the map from pulse width). `max_voltage` should thus be 13 V; the thrust of 140 N at 24 V is extrapolated.
+"""
 
 PRESETS: dict[str, ThrusterParameters] = {
     "tunnel": TUNNEL,
     "open_bladed": OPEN_BLADED,
     "tunnel_physical": TUNNEL_PHYSICAL,
     "open_bladed_corrected": OPEN_BLADED_CORRECTED,
+    "t200": T200,
 }
 
 
@@ -128,32 +190,45 @@ def preset_parameters(preset: str | Mapping | ThrusterParameters) -> ThrusterPar
 
 
 def derive_constants(p: ThrusterParameters, ambient_velocity: float = 0.0, substep: float = 0.0) -> Constants:
-    """Constants of the equations of motion for parameters, a flow U_0 [m/s] and a time step [s]."""
+    """Constants of the equations of motion for parameters, a flow U_0 [m/s] and a time step [s].
+
+    The parameters may be arrays of one shape, for many thrusters at once; so then are the constants.
+    """
     attack = p.blade_angle if p.angles == "rotor-plane" else math.pi / 2 - p.blade_angle  # at zero inflow
-    turn = 2 * p.blade_angle - math.pi / 2 if p.angles == "as-printed" else 0.0  # theta - phi
+    turn = 2 * p.blade_angle - math.pi / 2 if p.angles == "as-printed" else 0.0 * p.blade_angle  # theta - phi
     arm = 0.7 * p.diameter / 2
     pressure = 0.5 * p.density * p.area  # over V^2
     # Polynomials in (U_p, U_a), as factors of U_p^2, U_p U_a, U_a^2 or of U_p, U_a.
-    sine = np.array([math.sin(2 * attack), -2 * math.cos(2 * attack), -math.sin(2 * attack)])  # V^2 sin(2 alpha)
-    cosine = np.array([math.cos(2 * attack), 2 * math.sin(2 * attack), -math.cos(2 * attack)])
-    lift = pressure * p.lift_coefficient * sine
-    drag = pressure * p.drag_coefficient * (np.array([1.0, 0.0, 1.0]) - cosine)
-    along = np.array([math.cos(turn), -math.sin(turn)])  # V cos(theta)
-    across = np.array([math.sin(turn), math.cos(turn)])  # V sin(theta)
+    lift = _scaled(
+        pressure * p.lift_coefficient, (np.sin(2 * attack), -2 * np.cos(2 * attack), -np.sin(2 * attack))
+    )
+    drag = _scaled(
+        pressure * p.drag_coefficient, (1 - np.cos(2 * attack), -2 * np.sin(2 * attack), 1 + np.cos(2 * attack))
+    )
+    along, across = (np.cos(turn), -np.sin(turn)), (np.sin(turn), np.cos(turn))  # V cos(theta), V sin(theta)
     blade_speed = arm / p.gear_ratio
-    powers = blade_speed ** np.array([3, 2, 1, 0])  # from U_p to omega_m
-    thrust = (np.convolve(lift, along) - np.convolve(drag, across)) * powers
-    torque = (np.convolve(lift, across) + np.convolve(drag, along)) * powers * arm
-    return Constants(
+    thrust = zip(_product(lift, along), _product(drag, across), strict=True)
+    torque = zip(_product(lift, across), _product(drag, along), strict=True)
+    values = (
         p.motor_damping,
         p.voltage_gain,
         p.load_gain,
         1.0 / p.added_mass,
         p.momentum_drag / p.added_mass,
         blade_speed,
-        p.force_asymmetry,
-        *thrust.tolist(),
-        *torque.tolist(),
-        ambient_velocity=float(ambient_velocity),
-        substep=float(substep),
+        p.thrust_asymmetry,
+        *((a - b) * blade_speed**power for power, (a, b) in zip((3, 2, 1, 0), thrust, strict=True)),
+        *((a + b) * blade_speed**power * arm for power, (a, b) in zip((3, 2, 1, 0), torque, strict=True)),
+        ambient_velocity,
+        substep,
     )
+    return Constants(*(value if np.ndim(value) else float(value) for value in values))
+
+
+def _scaled(factor, polynomial) -> tuple:
+    return tuple(factor * a for a in polynomial)
+
+
+def _product(quadratic, linear) -> tuple:
+    (a, b, c), (d, e) = quadratic, linear
+    return a * d, a * e + b * d, b * e + c * d, c * e

@@ -14,6 +14,7 @@ from thruster_env.compiled import inlined
 
 # Streams: what a draw is for. Two streams of one key are independent.
 PROCESS, MEASUREMENT, INITIAL, EXCITATION, FILTER_PROCESS, FILTER_MEASUREMENT, FILTER_PRIOR = range(1, 8)
+DISTURBANCE, CHANCE, REFERENCE_SIGNAL, PARAMETERS = range(8, 12)
 
 GROUP = 32  # normals that one pass of vector code makes: four from each of eight blocks
 
@@ -154,6 +155,11 @@ def fill_normals(out, count, step, stream, key_0, key_1):
 def draw_key(generator: np.random.Generator) -> np.ndarray:
     """Draw an episode's key from a NumPy generator: two 32-bit words as float64, shape (2,)."""
     return generator.integers(0, 2**32, size=2).astype(np.float64)
+
+
+def draw_keys(generator: np.random.Generator, count: int) -> np.ndarray:
+    """Draw the keys (count, 2) that so many calls of `draw_key` would give."""
+    return generator.integers(0, 2**32, size=(count, 2)).astype(np.float64)
 
 
 def episode_keys(seeds) -> np.ndarray:

@@ -10,29 +10,19 @@ from optuna.trial import FrozenTrial, TrialState
 
 from filters.batch import run
 from filters.filter import Filter
-from thruster_env.files import write_whole
+from thruster_env.figures import BLUE, DARK, RUST, STATES, new_figure, save_figure, tidy
 from tuning.scenarios import Data
 from tuning.study import Comparison
 
-STATES = (("motor speed $\\omega_m$", "rad/s"), ("flow velocity $U_a$", "m/s"))
-TRUTH, ESTIMATE, BOUND = "#222222", "#0b6fa4", "#b5541c"
+TRUTH, ESTIMATE, BOUND = DARK, BLUE, RUST
 COLOURS = {"untuned": "#9aa5ad", "tuned": ESTIMATE, "true Q, R": "#5a8f3c"}
 
 
 def _new(rows: int, columns: int, size: tuple[float, float], **options):
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained", dpi=120)
+    figure = new_figure(size)
     axes = figure.subplots(rows, columns, squeeze=False, **options)
-    for axis in axes.flat:
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.grid(alpha=0.25, linewidth=0.6)
+    tidy(axes.flat)
     return figure, axes
-
-
-def _save(figure, path: Path) -> Path:
-    write_whole(path, lambda stream: figure.savefig(stream, format="png"))
-    return path
 
 
 def estimates_figure(path: Path, filters: Mapping[str, Filter], data: Data, run_index: int, dt: float) -> Path:
@@ -63,7 +53,7 @@ def estimates_figure(path: Path, filters: Mapping[str, Filter], data: Data, run_
         sum(parts, []) for parts in zip(*(a.get_legend_handles_labels() for a in axes[:2, 0]), strict=True)
     )
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
 def history_figure(path: Path, trials: list[FrozenTrial], title: str) -> Path:
@@ -83,7 +73,7 @@ def history_figure(path: Path, trials: list[FrozenTrial], title: str) -> Path:
     axis.set_ylabel("score: mean RMSE over bound [-]")
     axis.set_title(title, fontsize=11)
     axis.legend(frameon=False)
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
 def comparison_figure(path: Path, proof: Comparison, title: str) -> Path:
@@ -105,4 +95,4 @@ def comparison_figure(path: Path, proof: Comparison, title: str) -> Path:
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", frameon=False)
     figure.suptitle(title, fontsize=11)
-    return _save(figure, path)
+    return save_figure(figure, path)

@@ -15,7 +15,8 @@ from filters.model import StateSpaceModel
 from filters.thruster import model_of_plant
 from thruster_env.checks import at_least, one_of
 from thruster_env.linear import state_range
-from thruster_env.plant import DEFAULT_MEASUREMENT_NOISE, DEFAULT_PROCESS_NOISE, Plant, make_plant, simulate
+from thruster_env.plant import DEFAULT_MEASUREMENT_NOISE, DEFAULT_PROCESS_NOISE, Plant, make_plant
+from thruster_env.simulation import simulate
 from thruster_env.streams import EXCITATION, episode_keys, filter_keys, uniform_block
 
 FIRST_SCORED_STEP = 50  # RMSE counts steps 50 to 500; start-up is reported apart
@@ -31,7 +32,7 @@ class Data(NamedTuple):
     inputs: np.ndarray  # (B, K, 1) [V]
     states: np.ndarray  # (B, K + 1, 2)
     thrusts: np.ndarray  # (B, K + 1) [N]
-    measurements: np.ndarray  # (B, K + 1, 1) [N]
+    measurements: np.ndarray  # (B, K + 1, 1) [N], NaN where missing
     filter_keys: np.ndarray  # (B, 2)
 
 
@@ -109,7 +110,9 @@ def _data(scenario: Scenario, seeds: tuple[int, ...]) -> Data:
     keys = episode_keys(seeds)
     voltages = held_levels(keys, scenario.amplitude, scenario.hold, scenario.steps)
     simulation = simulate(scenario.plant, keys, voltages)
-    data = Data(seeds, voltages[..., None], *simulation, filter_keys(seeds))
+    measurements = np.where(simulation.valid, simulation.measurements, np.nan)  # as filters take missing ones
+    truth = simulation.states, simulation.thrusts
+    data = Data(seeds, voltages[..., None], *truth, measurements, filter_keys(seeds))
     for array in data[1:]:
         array.setflags(write=False)
     return data

@@ -1,0 +1,110 @@
+"""Many copies of a thruster at work in place: what envs step and what `simulate` records."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import numpy as np
+
+from thruster_env.copies import advance
+from thruster_env.encoding import encode, is_plain, known_effects
+from thruster_env.memory import (
+    COMMAND,
+    CONSTANT_COUNT,
+    FIXED_ROWS,
+    KEY_0,
+    KEY_1,
+    REPORTED,
+    gathered,
+    new_memory,
+    scatter,
+    set_row,
+)
+from thruster_env.parameters import derive_constants
+from thruster_env.plant import Plant
+from thruster_env.task import Task
+from thruster_env.uncertainty import drawn_parameters
+
+THREADED_BLOCKS = 8  # fewer blocks are done before a second thread has woken up
+
+
+class Copies:
+    """N copies of a plant with a task, each with its own key; reports are arrays (REPORTED, N), see `memory`."""
+
+    def __init__(self, plant: Plant, task: Task, count: int):
+        """Allocate the memory of `count` copies; `begin` comes next."""
+        self.plant, self.task, self.count = plant, task, count
+        self.numbers, self._extra_rows = encode(plant, task)
+        self.memory = new_memory(count, self._extra_rows)
+        self.advance = advance(known_effects(plant, task), is_plain(plant, task))
+
+    @property
+    def bytes_per_copy(self) -> int:
+        """Memory that one copy takes."""
+        return self.memory.nbytes // (self.memory.shape[0] * self.memory.shape[2])
+
+    def begin(self, keys: np.ndarray, which: np.ndarray | None = None, numbers=None) -> np.ndarray:
+        """Start episodes with keys (count, 2) for all copies, or for those named by `which`; return their report.
+
+        `numbers` may stand in for the plant's own, with another initial state.
+        """
+        numbers = self.numbers if numbers is None else numbers
+        memory = self.memory if which is None else gathered(self.memory, which)
+        set_row(memory, KEY_0, keys[:, 0])
+        set_row(memory, KEY_1, keys[:, 1])
+        if self.plant.uncertainty:
+            self._draw_constants(memory, keys)
+        out = self._run(memory, numbers, True)
+        if which is not None:
+            scatter(memory, self.memory, which)
+        return out[:, : len(keys)]
+
+    def step(self, voltages: np.ndarray) -> np.ndarray:
+        """Apply voltages (N,) [V] for one sample time; return the report."""
+        set_row(self.memory, COMMAND, voltages)
+        return self._run(self.memory, self.numbers, False)[:, : self.count]
+
+    def report(self) -> np.ndarray:
+        """What the last step reported, without a step."""
+        return np.ascontiguousarray(self.memory[:, :REPORTED].transpose(1, 0, 2)).reshape(REPORTED, -1)[
+            :, : self.count
+        ]
+
+    def _run(self, memory: np.ndarray, numbers: np.ndarray, begin: bool) -> np.ndarray:
+        blocks, _, width = memory.shape
+        out = np.empty((REPORTED, blocks * width))
+        if blocks < THREADED_BLOCKS or _threads() == 1:
+            self.advance(memory, numbers, out, begin, 0, blocks)
+            return out
+        # This thread takes its share; the others need some microseconds to wake up.
+        edges = np.linspace(0, blocks, _threads() + 1).astype(int)
+        parts = [(memory, numbers, out, begin, a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        others = [_pool().submit(self.advance, *part) for part in parts[1:]]
+        self.advance(*parts[0])
+        for other in others:
+            other.result()
+        return out
+
+    def _draw_constants(self, memory: np.ndarray, keys: np.ndarray) -> None:
+        plant = self.plant
+        parameters = drawn_parameters(plant.parameters, plant.uncertainty, keys)
+        constants = derive_constants(parameters, plant.ambient_velocity, plant.dt / plant.substeps)
+        first = FIXED_ROWS + self._extra_rows - CONSTANT_COUNT
+        for i, values in enumerate(constants):
+            set_row(memory, first + i, np.broadcast_to(values, len(keys)))
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max(1, _threads() - 1), thread_name_prefix="thrusters")
+
+
+if hasattr(os, "register_at_fork"):  # a forked child has none of the threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+@cache
+def _threads() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

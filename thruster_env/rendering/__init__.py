@@ -1,0 +1,18 @@
+"""Pictures of the thruster at work, 640 x 400 pixels: in a window (`human`) or as arrays (`rgb_array`).
+
+Above, the hull cut through at the thruster, with the propeller turning and arrows of the flow and of the push on
+the ship; below, strip charts of the last 500 steps and gauges of thrust and voltage, with truth and measurement.
+One step is one frame, so `render_fps = 1/dt` shows true speed.
+
+**Overlay hook.** The plant knows no filter. The env holds `render_overlay`, None or a function without arguments
+that returns an `Overlay` or None; a filter wrapper sets it: `env.unwrapped.render_overlay = ...`. A wrapper knows
+its estimate only after the env's step has ended. So the env asks for it when it draws and at the start of the next
+step, and hands it to `Renderer.amend`: each estimate is then drawn at the time that it is of.
+
+Needs pygame, which is imported when a `Renderer` is made: `pip install 'thruster-env[render]'`.
+"""
+
+from thruster_env.rendering.history import Moment, Overlay
+from thruster_env.rendering.renderer import Renderer
+
+__all__ = ["Moment", "Overlay", "Renderer"]

@@ -1,0 +1,57 @@
+"""What an env asks for: a reference thrust, and the weights of the reward's terms."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from thruster_env.checks import positive
+from thruster_env.effects import Effect
+from thruster_env.linear import state_range, steady_state
+from thruster_env.plant import Plant
+from thruster_env.reference import REFERENCE_SIGNALS
+
+DEFAULT_WEIGHTS = (1.0, 0.0, 0.01)  # tracking, energy, voltage rate
+ABSURD = 100.0  # a state this many times its range away from rest ends the episode
+
+
+class Task(NamedTuple):
+    """A reference, and a reward from the true thrust T after the step, whatever the sensors say.
+
+    -(tracking ((T - r)/T_max)^2 + energy (V_s/V_max)^2 + voltage_rate (change of V_s/V_max)^2)
+    """
+
+    reference: tuple[Effect, ...] = ()
+    weights: tuple[float, float, float] = DEFAULT_WEIGHTS
+
+
+def make_task(reference, tracking_weight: float, energy_weight: float, voltage_rate_weight: float) -> Task:
+    """Make a task from plain arguments; raises ValueError that states the rule and the value."""
+    weights = {"tracking": tracking_weight, "energy": energy_weight, "voltage_rate": voltage_rate_weight}
+    checked = (positive(f"{name}_weight", value, zero_allowed=True) for name, value in weights.items())
+    return Task(REFERENCE_SIGNALS.make(reference), tuple(checked))
+
+
+def thrust_scale(plant: Plant) -> float:
+    """Steady thrust at max_voltage, T_max [N]."""
+    if plant.linear is None:
+        return steady_state(plant.parameters, plant.max_voltage).thrust
+    return float(abs(plant.linear.steady_state((plant.max_voltage, 0.0))[2]))
+
+
+def half_thrust(plant: Plant) -> float:
+    """Steady thrust at half of max_voltage [N]: the reference where no other one is given."""
+    if plant.linear is None:
+        return steady_state(plant.parameters, plant.max_voltage / 2).thrust
+    return float(plant.linear.steady_state((plant.max_voltage / 2, 0.0))[2])
+
+
+def state_limits(plant: Plant) -> np.ndarray:
+    """Magnitudes (2,) of omega_m [rad/s] and U_a [m/s] at which an episode ends."""
+    if plant.linear is not None:
+        speed, flow, _ = plant.linear.steady_state((plant.max_voltage, plant.ambient_velocity))
+        return ABSURD * 2 * np.abs([speed, flow])
+    flow = abs(plant.ambient_velocity)
+    turned_by_flow = np.array([flow / plant.constants.blade_speed, flow])
+    return ABSURD * (state_range(plant.parameters, plant.max_voltage) + turned_by_flow)
