@@ -8,6 +8,8 @@ import numpy as np
 
 from filters.engine import batch, new_memory, spread
 from filters.filter import Filter
+from filters.rows import with_root
+from thruster_env.checks import covariance
 
 
 class Estimates(NamedTuple):
@@ -21,7 +23,15 @@ class Estimates(NamedTuple):
     divergences: np.ndarray  # (B,), restarts after an estimate that was not finite
 
 
-def run(filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray) -> Estimates:
+def run(
+    filter_: Filter,
+    keys: np.ndarray,
+    inputs: np.ndarray,
+    measurements: np.ndarray,
+    *,
+    process_noise_covs: np.ndarray | None = None,
+    measurement_noise_covs: np.ndarray | None = None,
+) -> Estimates:
     """Filter many trajectories in one compiled call that uses all cores.
 
     Args:
@@ -29,6 +39,8 @@ def run(filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.
         keys: random keys, one a trajectory, (B, 2).
         inputs: u, (B, K, p); the filter predicts with u[:, k] ...
         measurements: ... and updates with z[:, k + 1]; (B, K + 1, m), NaN where missing.
+        process_noise_covs: Q of every step, (K, n, n), in place of the model's.
+        measurement_noise_covs: R of every measurement, (K + 1, m, m), in place of the model's.
 
     Returns:
         `Estimates`, the same whatever the number of cores.
@@ -36,6 +48,8 @@ def run(filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.
     Raises:
         ValueError: if shapes do not fit or an input is not finite.
     """
+    filter_.check_noise(process_noise_covs)
+    filter_.check_noise(measurement_noise_covs)
     kernels, model = filter_.kernels(), filter_.kernel_model
     keys = np.ascontiguousarray(keys, dtype=np.float64)
     inputs = np.ascontiguousarray(inputs, dtype=np.float64)
@@ -62,11 +76,24 @@ def run(filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.
         np.empty((count, times)),
         np.empty(count),
     )
-    run_part, numbers = batch(kernels), model.numbers
+    noise = (
+        _noise_rows("process_noise_covs", process_noise_covs, times - 1, n),
+        _noise_rows("measurement_noise_covs", measurement_noise_covs, times, m),
+    )
+    run_part, numbers = batch(kernels), filter_.numbers
 
     def part(first: int, last: int) -> None:
         memory = new_memory(kernels, filter_.size)  # serves the part's trajectories one after the other
-        run_part(*memory, filter_.size, keys, inputs, z, numbers, tuple(out), first, last)
+        run_part(*memory, filter_.size, keys, inputs, z, numbers.copy(), noise, tuple(out), first, last)
 
     spread(part, count)
     return out
+
+
+def _noise_rows(name: str, given, count: int, size: int) -> np.ndarray:
+    if given is None:
+        return np.empty((0, 2 * size * size))
+    if np.shape(given) != (count, size, size):
+        raise ValueError(f"{name} must have shape {(count, size, size)}, but got {np.shape(given)}")
+    definite = name.startswith("measurement")
+    return np.array([with_root(covariance(name, cov, size, positive_definite=definite)) for cov in given])

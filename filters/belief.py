@@ -13,10 +13,12 @@ class Belief(NamedTuple):
 
     mean: np.ndarray  # (n,)
     cov: np.ndarray  # (n, n)
-    members: np.ndarray  # (n, N) ensemble, one row a state component; N = 0 for Gaussian filters
+    members: np.ndarray  # (n, N) ensemble, one row a state component; N = 0 for Gaussian filters. Particle
+    # filters add a row of log weights.
     key: tuple[int, int]  # what all its randomness depends on, together with ...
     step: int  # ... the number of steps predicted so far
     divergences: int  # restarts from the prior after an estimate that was not finite
+    extras: np.ndarray = np.empty(0)  # whatever else a kind of filter remembers, such as an estimate of R
 
 
 class Innovation(NamedTuple):
@@ -32,7 +34,8 @@ class Kernels(NamedTuple):
 
     `row` and `numbers` are laid out by `filters.rows`; `table` is (table_rows, padded size), its first n rows the
     members, without columns for filters without an ensemble; `draws` has room for `draws_per_member` normals a
-    member.
+    member. What a belief keeps beside mean and covariance are the first `kept_rows` rows of the table and
+    `extras` numbers of the row, from `memory_places(n, m).extras` on.
     """
 
     n: int
@@ -43,3 +46,10 @@ class Kernels(NamedTuple):
     predict: Callable  # predict(memory, u, numbers, size)
     update: Callable  # update(memory, z, numbers, size); a NaN in z is a missing channel
     summarise: Callable  # summarise(memory, size): mean and cov from the members; `update` does it itself
+    extras: int = 0
+    extra_kept_rows: int = 0  # rows of the table, after the n of members, that belong to the belief
+
+    @property
+    def kept_rows(self) -> int:
+        """Rows of the table that belong to the belief."""
+        return self.n + self.extra_kept_rows

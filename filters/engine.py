@@ -73,11 +73,13 @@ def _build_batch(kernels: Kernels) -> Callable:
     mean, cov, innovation, s = places.mean, places.cov, places.innovation, places.innovation_cov
     key_0, key_1, step, divergences = places.key_0, places.key_1, places.step, places.divergences
     log_likelihood = places.log_likelihood
+    q_place, r_place = number_places(n, m).q, number_places(n, m).r
     restart_if_lost = _restart_if_lost(kernels)
     fingerprint = function_fingerprint(start, predict, update)
 
-    def batch(row, table, draws, size, keys, inputs, measurements, numbers, out, first, last):
+    def batch(row, table, draws, size, keys, inputs, measurements, numbers, noise, out, first, last):
         fingerprint  # noqa: B018 - part of the cache's key
+        qs, rs = noise
         means, covs, innovations, innovation_covs, log_likelihoods, counts = out
         memory = (row, table, draws)
         u, z = np.zeros(inputs.shape[2]), np.zeros(m)
@@ -92,9 +94,15 @@ def _build_batch(kernels: Kernels) -> Callable:
                 if k > 0:
                     for i in range(u.shape[0]):
                         u[i] = inputs[b, k - 1, i]
+                    if qs.shape[0] > 0:
+                        for i in range(qs.shape[1]):
+                            numbers[q_place + i] = qs[k - 1, i]
                     predict(memory, u, numbers, size)
                 for i in range(m):
                     z[i] = measurements[b, k, i]
+                if rs.shape[0] > 0:
+                    for i in range(rs.shape[1]):
+                        numbers[r_place + i] = rs[k, i]
                 update(memory, z, numbers, size)
                 restart_if_lost(memory, numbers, size)
                 for i in range(n):
@@ -117,7 +125,11 @@ def operation(kernels: Kernels) -> Callable:
 
 
 def batch(kernels: Kernels) -> Callable:
-    """`batch(*memory, size, keys, inputs, measurements, numbers, out, first, last)` on trajectories."""
+    """`batch(*memory, size, keys, inputs, measurements, numbers, noise, out, first, last)` on trajectories.
+
+    noise = (qs, rs) has a row (Q, its root) for each step and a row (R, its root) for each measurement that stand
+    in for the model's, or no rows. Those are written into numbers, which threads must thus not share.
+    """
     return _runner(_build_batch, kernels, is_interpreting())
 
 
@@ -129,7 +141,7 @@ def _runner(build: Callable, kernels: Kernels, interpreting: bool) -> CompiledOr
 def new_memory(kernels: Kernels, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Row, table and draws for one belief with `size` members, zeros."""
     width = padded(size, LANES)
-    length = memory_places(kernels.n, kernels.m).length
+    length = memory_places(kernels.n, kernels.m).extras + kernels.extras
     draws = padded(kernels.draws_per_member * width, GROUP)
     return np.zeros(length), np.zeros((kernels.table_rows, width)), np.zeros(draws)
 

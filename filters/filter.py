@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
+
 from filters.belief import Belief, Innovation, Kernels
 from filters.model import StateSpaceModel
 from filters.session import Session
@@ -24,6 +26,7 @@ class Filter:
     """
 
     name: ClassVar[str]
+    varying_noise: ClassVar[bool] = True  # whether Q and R may differ from step to step
     model: StateSpaceModel
 
     def kernels(self) -> Kernels:
@@ -34,6 +37,16 @@ class Filter:
     def kernel_model(self) -> StateSpaceModel:
         """The model whose functions and numbers the kernels use: the given one, unless a filter replaces it."""
         return self.model
+
+    @property
+    def own_numbers(self) -> tuple[float, ...]:
+        """Numbers of the filter itself that its kernels read, behind the model's: from `rows.own_place` on."""
+        return ()
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """All that the kernels read, one float64 row: the model's numbers, then the filter's own."""
+        return np.append(self.kernel_model.numbers, self.own_numbers)
 
     @property
     def size(self) -> int:
@@ -47,22 +60,37 @@ class Filter:
         session.run("start")
         return session.belief()
 
-    def predict(self, belief: Belief, u) -> Belief:
+    def predict(self, belief: Belief, u, *, process_noise_cov=None) -> Belief:
         """The belief one step later under input u (p,).
 
-        If it is not finite, the next update restarts from the prior and counts that.
+        If it is not finite, the next update restarts from the prior and counts that. A `process_noise_cov`,
+        (n, n) or n variances, stands in for the model's Q in this step.
         """
         session = self._session()
         session.load(belief)
+        self.check_noise(process_noise_cov)
+        session.set_noise(process_noise_cov=process_noise_cov)
         session.run("predict", u=u)
         return session.belief()
 
-    def update(self, belief: Belief, z) -> tuple[Belief, Innovation]:
-        """The belief after measurement z (m,), and the innovation; a NaN in z leaves that channel out."""
+    def update(self, belief: Belief, z, *, measurement_noise_cov=None) -> tuple[Belief, Innovation]:
+        """The belief after measurement z (m,), and the innovation; a NaN in z leaves that channel out.
+
+        A `measurement_noise_cov`, (m, m) or m variances, stands in for the model's R in this update.
+        """
         session = self._session()
         session.load(belief)
+        self.check_noise(measurement_noise_cov)
+        session.set_noise(measurement_noise_cov=measurement_noise_cov)
         session.run("update", z=z)
         return session.belief(), session.innovation_copy()
 
+    def check_noise(self, given) -> None:
+        """Raise ValueError for a covariance of one step, if the filter cannot take one."""
+        if given is not None and not self.varying_noise:
+            raise ValueError(
+                f"Q and R of the filter {self.name!r} cannot vary from step to step, but got one that does"
+            )
+
     def _session(self) -> Session:
-        return Session(self.kernels(), self.kernel_model, self.size)
+        return Session(self)

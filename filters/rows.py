@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thruster_env.checks import covariance_root
 from thruster_env.components import tuple_of, written_out
 
 LANES = 8  # float64 in the widest vector register: ensembles are padded, so that loops have no remainder
@@ -36,7 +37,7 @@ class MemoryPlaces(NamedTuple):
     innovation_cov: int  # (m, m)
     log_likelihood: int
     gain: int  # (n, m), scratch
-    length: int
+    extras: int  # what a kind of filter keeps beside; the row ends with these
 
 
 @cache
@@ -57,13 +58,23 @@ class NumberPlaces(NamedTuple):
     prior_root: int  # (n, n)
     scales: int  # (n,), what small steps of each state are measured in
     substeps: int
-    constants: int  # the model's own constants
+    constants: int  # the model's own constants; a filter's own numbers follow
 
 
 @cache
 def number_places(n: int, m: int) -> NumberPlaces:
     """Places in the row of a model's numbers; see `StateSpaceModel.numbers`."""
     return NumberPlaces(*_starts(n * n, n * n, m * m, m * m, n, n * n, n * n, n, 1))
+
+
+def with_root(cov: np.ndarray) -> np.ndarray:
+    """A covariance (d, d) and its lower triangular root, as they lie one behind the other in a model's row."""
+    return np.concatenate([cov.ravel(), covariance_root(cov).ravel()])
+
+
+def own_place(n: int, m: int, form: type | int) -> int:
+    """First place of a filter's own numbers, behind those of its model; form is that of `constants_form`."""
+    return number_places(n, m).constants + (form if isinstance(form, int) else len(form._fields))
 
 
 def _starts(*lengths: int) -> list[int]:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from filters.belief import Belief, Innovation, Kernels
+from filters.belief import Belief, Innovation
 from filters.engine import new_memory, operation
-from filters.model import StateSpaceModel
-from filters.rows import memory_places
+from filters.rows import memory_places, number_places, with_root
+from thruster_env.checks import covariance
+
+if TYPE_CHECKING:
+    from filters.filter import Filter
 
 
 class Session:
@@ -17,14 +22,17 @@ class Session:
         mean, cov, innovation, innovation_cov: views on the memory, (n,), (n, n), (m,), (m, m).
     """
 
-    def __init__(self, kernels: Kernels, model: StateSpaceModel, size: int):
-        """Allocate the memory of a filter with `size` members; `start` or `load` comes next."""
+    def __init__(self, filter_: Filter):
+        """Allocate the memory of a filter; `start` or `load` comes next."""
+        kernels, model, size = filter_.kernels(), filter_.kernel_model, filter_.size
         n, m = kernels.n, kernels.m
         places = memory_places(n, m)
         self._operate = operation(kernels)
-        self._numbers, self._size, self._places = model.numbers, size, places
+        self._numbers, self._size, self._places = filter_.numbers, size, places
+        self._kept_rows, self._noise_places = kernels.kept_rows, number_places(n, m)
         self._memory = new_memory(kernels, size)
         self._row, self._table, _ = self._memory
+        self._extras = self._row[places.extras :]
         self._u, self._z = np.zeros(model.inputs), np.full(m, np.nan)
         self.mean = self._row[places.mean : places.mean + n]
         self.cov = self._row[places.cov : places.cov + n * n].reshape(n, n)
@@ -46,6 +54,16 @@ class Session:
     def set_key(self, key) -> None:
         """Set the key (2,) on which the belief's randomness depends."""
         self._row[self._places.key_0], self._row[self._places.key_1] = key
+
+    def set_noise(self, *, process_noise_cov=None, measurement_noise_cov=None) -> None:
+        """Put another Q or R, with its root, in place of the model's."""
+        n, m, at = len(self.mean), len(self.innovation), self._noise_places
+        if process_noise_cov is not None:
+            q = covariance("process_noise_cov", process_noise_cov, n)
+            self._numbers[at.q : at.q + 2 * n * n] = with_root(q)
+        if measurement_noise_cov is not None:
+            r = covariance("measurement_noise_cov", measurement_noise_cov, m, positive_definite=True)
+            self._numbers[at.r : at.r + 2 * m * m] = with_root(r)
 
     def start(self, key, z) -> None:
         """Set the prior with a random key (2,) and update it with a first measurement z (m,)."""
@@ -76,8 +94,9 @@ class Session:
         """Put a belief into the memory."""
         self.mean[:], self.cov[:] = belief.mean, belief.cov
         if self._size:
-            self._table[: len(belief.mean)] = belief.members[:, :1]  # the padding follows a real member
-            self._table[: len(belief.mean), : self._size] = belief.members
+            self._table[: self._kept_rows] = belief.members[:, :1]  # the padding follows a real member
+            self._table[: self._kept_rows, : self._size] = belief.members
+        self._extras[:] = belief.extras
         self.set_key(belief.key)
         self._row[self._places.step] = belief.step
         self._row[self._places.divergences] = belief.divergences
@@ -86,8 +105,9 @@ class Session:
         """A copy of the belief in the memory."""
         row, places = self._row, self._places
         key = int(row[places.key_0]), int(row[places.key_1])
-        members = self._table[: len(self.mean), : self._size].copy()
-        return Belief(self.mean.copy(), self.cov.copy(), members, key, int(row[places.step]), self.divergences)
+        members = self._table[: self._kept_rows, : self._size].copy()
+        step, extras = int(row[places.step]), self._extras.copy()
+        return Belief(self.mean.copy(), self.cov.copy(), members, key, step, self.divergences, extras)
 
     def innovation_copy(self) -> Innovation:
         """A copy of what the last update found."""

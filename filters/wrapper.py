@@ -81,7 +81,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self._appended = env.get_wrapper_attr(APPENDED) if env.has_wrapper_attr(APPENDED) else 0
         length = {"estimate": n, "measurement+estimate": m + n, "belief": 2 * n}[observation] + self._appended
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
-        self._session = Session(self.filter.kernels(), self.filter.kernel_model, self.filter.size)
+        self._session = Session(self.filter)
         self._generator = filter_generator(None)
         if hasattr(env.unwrapped, "render_overlay"):  # a bow thruster draws the estimate beside the truth
             env.unwrapped.render_overlay = self._overlay

@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from filters import FILTERS, StateSpaceModel, affine_model, make_filter, run, thruster_model, truth
+from filters.registry import tunable_numbers
 from filters.session import Session
 from thruster_env.compiled import interpreted
 from thruster_env.streams import episode_keys, filter_keys
@@ -45,7 +46,7 @@ MODELS = {"thruster": thruster_model, "wide affine": wide_affine, "no input": lo
 
 def small(name, model):
     """A filter by name; ensembles small, and of a size that fills no vector register."""
-    return make_filter(name, model, **({"ensemble_size": 10} if name == "enkf" else {}))
+    return make_filter(name, model, **({"ensemble_size": 10} if "ensemble_size" in tunable_numbers(name) else {}))
 
 
 def simulated(model, steps=20, count=1, level=3.0):
@@ -67,7 +68,7 @@ def stepped(filter_, key, inputs, measurements):
 
 def in_session(filter_, key, inputs, measurements):
     """Rows (mean, cov, innovation, its cov) of one trajectory, by a session."""
-    session = Session(filter_.kernels(), filter_.kernel_model, filter_.size)
+    session = Session(filter_)
     parts = session.mean, session.cov, session.innovation, session.innovation_cov
     session.start(key, measurements[0])
     rows = [[part.copy() for part in parts]]
@@ -432,3 +433,45 @@ def test_a_batch_of_no_trajectories_gives_no_estimates(name):
     estimates = run(small(name, thruster_model()), np.zeros((0, 2)), np.zeros((0, 5, 1)), np.zeros((0, 6, 1)))
     assert estimates.means.shape == (0, 6, 2)
     assert estimates.divergences.shape == (0,)
+
+
+class TestNoiseThatVaries:
+    def test_a_step_may_have_its_own_noise_as_if_the_model_had_it(self, name):
+        model = wide_affine()
+        inputs, measurements = simulated(model, 1)
+        q, r = 3.0 * model.process_noise_cov, 0.2 * model.measurement_noise_cov
+        with interpreted():
+            filter_ = small(name, model)
+            if not filter_.varying_noise:
+                with pytest.raises(ValueError, match="cannot vary"):
+                    filter_.predict(filter_.init(KEY), inputs[0, 0], process_noise_cov=q)
+                return
+            other = small(name, model.replace(process_noise_cov=q, measurement_noise_cov=r))
+            belief = filter_.init(KEY)
+            one, _ = filter_.update(
+                filter_.predict(belief, inputs[0, 0], process_noise_cov=q),
+                measurements[0, 1],
+                measurement_noise_cov=r,
+            )
+            two, _ = other.update(other.predict(belief, inputs[0, 0]), measurements[0, 1])
+        np.testing.assert_allclose(one.mean, two.mean, rtol=1e-12)
+        np.testing.assert_allclose(one.cov, two.cov, rtol=1e-10, atol=1e-14)
+
+    def test_a_batch_with_varying_noise_is_the_loop(self, name):
+        model = wide_affine()
+        inputs, measurements = simulated(model, 4, count=2)
+        qs = np.array([scale * model.process_noise_cov for scale in (1.0, 4.0, 0.5, 2.0)])
+        rs = np.array([scale * model.measurement_noise_cov for scale in (2.0, 0.5, 1.0, 3.0, 0.3)])
+        filter_ = small(name, model)
+        if not filter_.varying_noise:
+            return
+        keys = filter_keys(range(2))
+        found = run(filter_, keys, inputs, measurements, process_noise_covs=qs, measurement_noise_covs=rs)
+        for b in range(2):
+            belief = filter_.init(tuple(int(k) for k in keys[b]))
+            for k in range(5):
+                if k > 0:
+                    belief = filter_.predict(belief, inputs[b, k - 1], process_noise_cov=qs[k - 1])
+                belief, _ = filter_.update(belief, measurements[b, k], measurement_noise_cov=rs[k])
+                np.testing.assert_allclose(found.means[b, k], belief.mean, rtol=1e-9, atol=1e-12)
+                np.testing.assert_allclose(found.covs[b, k], belief.cov, rtol=1e-9, atol=1e-12)
