@@ -37,12 +37,12 @@ def command(
         raise ValueError(
             "FilterPy must be installed to compare with: `make bench` does it, or pip install -e '.[peers]'"
         )
-    from benchmarks import batches, processes, steps  # after the check: they import FilterPy
+    from benchmarks import batches, processes, steps, vectors  # after the check: they import FilterPy
 
     announce_compilation()
     rows = []
     with progress_console.status("measuring ...") as status:
-        for part in (steps, batches, processes):
+        for part in (steps, vectors, batches, processes):
             for row in part.rows(seed, quick):
                 rows.append(row)
                 status.update(f"measured: {row.what} ...")

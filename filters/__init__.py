@@ -4,11 +4,13 @@ from filters.affine import affine_model, linearize
 from filters.batch import Estimates, run
 from filters.belief import Belief, Innovation
 from filters.ensemble import EnsembleKalmanFilter
+from filters.envs import register_filtered_envs
 from filters.extended import ExtendedKalmanFilter
 from filters.kalman import KalmanFilter
 from filters.model import StateSpaceModel
 from filters.registry import FILTERS, make_filter
 from filters.thruster import thruster_model
+from filters.vector_wrapper import EstimateStates
 from filters.wrapper import EstimateState
 
 __all__ = [
@@ -16,6 +18,7 @@ __all__ = [
     "Belief",
     "EnsembleKalmanFilter",
     "EstimateState",
+    "EstimateStates",
     "Estimates",
     "ExtendedKalmanFilter",
     "Innovation",
@@ -27,3 +30,5 @@ __all__ = [
     "run",
     "thruster_model",
 ]
+
+register_filtered_envs()

@@ -42,7 +42,7 @@ def _restart_if_lost(kernels: Kernels) -> Callable:
     return restart_if_lost
 
 
-def _build_operation(kernels: Kernels) -> Callable:
+def build_operation(kernels: Kernels) -> Callable:
     start, predict, update, summarise = kernels.start, kernels.predict, kernels.update, kernels.summarise
     places = memory_places(kernels.n, kernels.m)
     step, divergences = places.step, places.divergences
@@ -121,7 +121,7 @@ def _build_batch(kernels: Kernels) -> Callable:
 
 def operation(kernels: Kernels) -> Callable:
     """`operate(*memory, size, u, z, numbers, starting, predicting, updating)` on one belief."""
-    return _runner(_build_operation, kernels, is_interpreting())
+    return _runner(build_operation, kernels, is_interpreting())
 
 
 def batch(kernels: Kernels) -> Callable:
@@ -159,7 +159,7 @@ def _threads() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def spread(part: Callable[[int, int], None], count: int) -> None:
+def spread(part: Callable[[int, int], None], count: int, *, parts_a_thread: int = 4) -> None:
     """Call part(first, last) on all cores until it has covered 0 ... count; part releases the lock."""
-    edges = np.linspace(0, count, 1 + min(count, 4 * _threads())).astype(int)
+    edges = np.linspace(0, count, 1 + min(count, parts_a_thread * _threads())).astype(int)
     list(_pool().map(part, edges[:-1], edges[1:]))

@@ -25,6 +25,9 @@ from thruster_env.plant import Plant, make_plant
 from thruster_env.rendering import Overlay
 
 
+ENV_IDS = tuple(f"BowThruster{task}-v0" for task in ("", "Tracking", "Reversal", "Linear"))
+
+
 @inlined
 def transition(x, u, c):
     """One Runge-Kutta step of the thruster under voltage u = (V_s,)."""

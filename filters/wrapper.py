@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable
-
 import gymnasium as gym
 import numpy as np
 
+from filters.arguments import APPENDED, OBSERVATIONS, ModelInSpec, check_spaces, filter_for
 from filters.model import StateSpaceModel
-from filters.registry import make_filter, read_tuned_file, tunable_numbers
 from filters.session import Session
-from filters.thruster import model_of_env, overlay_of
+from filters.thruster import overlay_of
 from thruster_env.checks import one_of, shown
 from thruster_env.streams import draw_key, filter_generator
-
-OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
-APPENDED = "appended_entries"  # attribute of an env: entries of its observation after the measurement
 
 
 class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
@@ -61,21 +55,14 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         **numbers,
     ):
         """Build model and filter; see the class for the arguments."""
-        model = model.content if isinstance(model, _ModelInSpec) else model
-        held = _ModelInSpec(model) if isinstance(model, StateSpaceModel) else model
+        model = model.content if isinstance(model, ModelInSpec) else model
+        held = ModelInSpec(model) if isinstance(model, StateSpaceModel) else model
         recorded = {"filter": filter, "observation": observation, "model": held, "tuned": tuned, **numbers}
         gym.utils.RecordConstructorArgs.__init__(self, **recorded)
         gym.Wrapper.__init__(self, env)
         self._form = one_of("observation", observation, OBSERVATIONS)
-        if tuned is not None:
-            if filter is not None or numbers:
-                raise ValueError("tuned must come without filter and numbers, for its file holds them")
-            entry = read_tuned_file(tuned)["filter"]
-            filter, numbers = entry["name"], {**entry["numbers"], **entry["model"]}
-        filter = "ekf" if filter is None else filter
-        own = {name: numbers.pop(name) for name in tunable_numbers(filter) if name in numbers}
-        self.filter = make_filter(filter, _model_for(env, model, numbers), **own)
-        _check_spaces(env, self.filter.model)
+        self.filter = filter_for(env, filter, model, tuned, numbers)
+        check_spaces(env.action_space, env.observation_space, self.filter.model)
         n, m = self.filter.model.n, self.filter.model.m
         # What an env appends to its measurement, validity flags and the reference, stays in the observation.
         self._appended = env.get_wrapper_attr(APPENDED) if env.has_wrapper_attr(APPENDED) else 0
@@ -132,48 +119,6 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         if self._appended:
             parts.append(observation[-self._appended :])
         return np.concatenate(parts).astype(np.float32)
-
-
-def _model_for(env: gym.Env, model, arguments: dict) -> StateSpaceModel:
-    if model is None:
-        return model_of_env(env, **arguments)
-    if isinstance(model, StateSpaceModel):
-        if arguments:
-            raise ValueError(f"a StateSpaceModel must come without arguments of its own, but got {arguments!r}")
-        return model
-    module, _, name = str(model).partition(":")
-    try:
-        factory: Callable = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError):
-        raise ValueError(
-            f"model must be 'module:factory' that can be imported, or a StateSpaceModel, but got {model!r}"
-        ) from None
-    try:
-        made = factory(**arguments)
-    except TypeError as error:
-        raise ValueError(f"model {model!r} must take the given arguments: {error}") from None
-    if not isinstance(made, StateSpaceModel):
-        raise ValueError(f"model {model!r} must return a StateSpaceModel, but it returned {shown(made)}")
-    return made
-
-
-class _ModelInSpec:
-    """A model as an env's spec keeps it. JSON refuses it by its class's name, which says what to do."""
-
-    def __init__(self, content: StateSpaceModel):
-        self.content = content
-
-
-_ModelInSpec.__name__ = "StateSpaceModel (give model='module:factory' instead)"
-
-
-def _check_spaces(env: gym.Env, model: StateSpaceModel) -> None:
-    spaces = {"action": (env.action_space, model.inputs), "observation": (env.observation_space, model.m)}
-    for name, (space, size) in spaces.items():
-        if not isinstance(space, gym.spaces.Box):
-            raise ValueError(f"the {name} space must be a Box, but got {space}")
-        if name == "action" and int(np.prod(space.shape)) != size:
-            raise ValueError(f"the {name} space must have the model's {size} entries, but got {space}")
 
 
 def _measurement(observation, info) -> np.ndarray:

@@ -68,16 +68,15 @@ class Copies:
 
     def report(self) -> np.ndarray:
         """What the last step reported, without a step."""
-        return np.ascontiguousarray(self.memory[:, :REPORTED].transpose(1, 0, 2)).reshape(REPORTED, -1)[
-            :, : self.count
-        ]
+        reported = self.memory[:, :REPORTED].transpose(1, 0, 2)
+        return reported.reshape(REPORTED, -1)[:, : self.count].copy()
 
     def _run(self, memory: np.ndarray, numbers: np.ndarray, begin: bool) -> np.ndarray:
         blocks, _, width = memory.shape
-        out = np.empty((REPORTED, blocks * width))
+        out = np.empty((REPORTED, blocks, width))
         if blocks < THREADED_BLOCKS or _threads() == 1:
             self.advance(memory, numbers, out, begin, 0, blocks)
-            return out
+            return out.reshape(REPORTED, -1)
         # This thread takes its share; the others need some microseconds to wake up.
         edges = np.linspace(0, blocks, _threads() + 1).astype(int)
         parts = [(memory, numbers, out, begin, a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
@@ -85,7 +84,7 @@ class Copies:
         self.advance(*parts[0])
         for other in others:
             other.result()
-        return out
+        return out.reshape(REPORTED, -1)
 
     def _draw_constants(self, memory: np.ndarray, keys: np.ndarray) -> None:
         plant = self.plant

@@ -152,7 +152,7 @@ def advance(known_effects, plain: bool) -> Callable:
 
     With `begin` it starts an episode of every copy from its key (rows KEY_0, KEY_1), and takes the first
     measurement; else it applies the voltages in row COMMAND for one sample time. The reported rows are copied to
-    out (REPORTED, blocks * width).
+    out (REPORTED, blocks, width).
 
     Args:
         known_effects: a tuple of effects for each registry, as `encoding.known_effects` gives them.
@@ -202,6 +202,6 @@ def _advance(known_effects, plain: bool, interpreting: bool) -> Callable:
             _tell_time_and_end(memory, b, numbers)
             for i in range(reported):
                 for j in range(width):
-                    out[i, b * width + j] = memory[b, i, j]
+                    out[i, b, j] = memory[b, i, j]
 
     return compiled(step)

@@ -136,7 +136,7 @@ class BowThrusterEnv(RenderedEnv):
         )
         self._copies = Copies(plant, self.task, 1)
         self._memory, self._numbers = self._copies.memory, self._copies.numbers
-        self._out = np.zeros((REPORTED, 1))
+        self._out = np.zeros((REPORTED, 1, 1))
         self._report = self._out.reshape(-1)  # a view
         self._advance = self._copies.advance
 

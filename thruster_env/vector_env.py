@@ -13,11 +13,9 @@ from gymnasium.vector.utils import batch_space
 from thruster_env.batch import Copies
 from thruster_env.checks import at_least, shown
 from thruster_env.env import BowThrusterEnv
+from thruster_env.keys import EpisodeKeys
 from thruster_env.memory import AMBIENT, READINGS, REFERENCE, REWARD, TERMINATED, THRUST, TIME, VALID
-from thruster_env.streams import draw_keys
 from thruster_env.tasks import BowThrusterLinearEnv, BowThrusterReversalEnv, BowThrusterTrackingEnv
-
-KEYS_AHEAD = 16  # episode keys that a copy draws at a time
 
 
 class BowThrusterVectorEnv(gym.vector.VectorEnv):
@@ -54,6 +52,7 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
         env = self.single_env(**arguments)
         self.metadata = {**env.metadata, "autoreset_mode": self._mode}
         self.plant, self.task, self._observed = env.plant, env.task, env.observed_rows
+        self.appended_entries = env.appended_entries  # of an observation, after the measurement
         self.single_action_space, self.single_observation_space = env.action_space, env.observation_space
         self.action_space = batch_space(env.action_space, self.num_envs)
         self.observation_space = batch_space(env.observation_space, self.num_envs)
@@ -116,11 +115,12 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
 
     def _voltages(self, actions) -> np.ndarray:
         try:
-            voltages = np.asarray(actions, dtype=np.float64).reshape(-1)
+            voltages = np.asarray(actions, dtype=np.float64)
         except (TypeError, ValueError):
             voltages = np.empty(0)
-        if len(voltages) != self.num_envs:
+        if voltages.shape not in ((self.num_envs,), (self.num_envs, 1)):
             raise ValueError(f"actions must be {self.num_envs} voltages [V], but got {shown(actions)}")
+        voltages = voltages.reshape(-1)
         if np.isnan(voltages.sum()):  # of infinities, too
             ignored = self._done if self._mode == AutoresetMode.NEXT_STEP else False
             wrong = np.flatnonzero(np.isnan(voltages) & ~np.asarray(ignored))
@@ -149,39 +149,6 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
             info["measurement_valid"] = report[VALID : VALID + m].T > 0.0
         there = np.ones(self.num_envs, dtype=bool) if mask is None else mask
         return info | {f"_{key}": there for key in info}
-
-
-class EpisodeKeys:
-    """The keys that each copy's own generator draws, one an episode."""
-
-    def __init__(self, count: int):
-        """Take the number of copies; they have no generators before `seed`."""
-        self._generators: list[np.random.Generator | None] = [None] * count
-        self._ahead = np.zeros((count, KEYS_AHEAD, 2))
-        self._used = np.full(count, KEYS_AHEAD)
-
-    def seed(self, seed: int | list[int | None] | None, mask: np.ndarray) -> None:
-        """Give copy i of those in the mask a generator from seed + i, or seed[i]; None keeps the one it has."""
-        count = len(self._generators)
-        if seed is None or isinstance(seed, (int, np.integer)):
-            seeds = [None if seed is None else int(seed) + i for i in range(count)]
-        elif len(seed) == count:
-            seeds = list(seed)
-        else:
-            raise ValueError(f"seed must be None, a number or {count} of these, but got {shown(seed)}")
-        for i in np.flatnonzero(mask):
-            if seeds[i] is not None or self._generators[i] is None:
-                self._generators[i] = np_random(seeds[i])[0]
-                self._used[i] = KEYS_AHEAD
-
-    def draw(self, which: np.ndarray) -> np.ndarray:
-        """The next key (len(which), 2) of some copies."""
-        for i in which[self._used[which] == KEYS_AHEAD]:
-            self._ahead[i] = draw_keys(self._generators[i], KEYS_AHEAD)
-            self._used[i] = 0
-        keys = self._ahead[which, self._used[which]]
-        self._used[which] += 1
-        return keys
 
 
 class BowThrusterTrackingVectorEnv(BowThrusterVectorEnv):

@@ -1,0 +1,101 @@
+"""Many beliefs at work in place, one a copy of a vector env, advanced by one compiled call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+
+from filters.belief import Kernels
+from filters.engine import build_operation, new_memory, spread
+from filters.filter import Filter
+from filters.rows import memory_places
+from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+
+THREADED_COPIES = 256  # fewer are done before a second thread has woken up
+IDLE, STEP, START = 0, 1, 2  # what a copy's belief does in a call
+
+
+class Beliefs:
+    """One filter on N copies, each with its own belief."""
+
+    def __init__(self, filter_: Filter, count: int):
+        """Allocate the memory of `count` beliefs; `start` comes next."""
+        self._kernels, self._size, self._numbers = filter_.kernels(), filter_.size, filter_.numbers
+        self._places = memory_places(self._kernels.n, self._kernels.m)
+        row, table, _ = new_memory(self._kernels, self._size)
+        self._rows = np.zeros((count, len(row)))
+        self._tables = np.zeros((count, self._kernels.kept_rows, table.shape[1]))
+        self._u, self._z = np.zeros((count, filter_.kernel_model.inputs)), np.zeros((count, self._kernels.m))
+        self._operate = _operation(self._kernels, is_interpreting())
+
+    def start(self, which: np.ndarray, keys: np.ndarray, z: np.ndarray) -> None:
+        """Set the prior in some copies with keys (len(which), 2), and update it with measurements z (N, m)."""
+        self._rows[which, self._places.key_0] = keys[:, 0]
+        self._rows[which, self._places.key_1] = keys[:, 1]
+        tasks = np.full(len(self._rows), IDLE)
+        tasks[which] = START
+        self._do(tasks, self._u, z)
+
+    def step(self, u: np.ndarray, z: np.ndarray, idle: np.ndarray | None = None) -> None:
+        """Predict with inputs u (N, p), then update with measurements z (N, m); NaN marks a missing channel."""
+        tasks = np.full(len(self._rows), STEP)
+        if idle is not None:
+            tasks[idle] = IDLE
+        self._do(tasks, u, z)
+
+    def _do(self, tasks: np.ndarray, u: np.ndarray, z: np.ndarray) -> None:
+        self._u[:], self._z[:] = u, z
+        count = len(self._rows)
+
+        def part(first: int, last: int) -> None:
+            scratch = new_memory(self._kernels, self._size)
+            self._operate(
+                *scratch, self._size, tasks, self._rows, self._tables, self._u, self._z, self._numbers, first, last
+            )
+
+        if count < THREADED_COPIES:
+            part(0, count)
+        else:
+            spread(part, count, parts_a_thread=1)
+
+    def part(self, name: str, *shape: int) -> np.ndarray:
+        """A copy of a part of all memories, such as "mean": (N, *shape)."""
+        first = getattr(self._places, name)
+        values = self._rows[:, first : first + int(np.prod(shape, dtype=int))]
+        return values.reshape(len(values), *shape).copy()
+
+
+@lru_cache(maxsize=128)
+def _operation(kernels: Kernels, interpreting: bool) -> Callable:
+    operate = inlined(build_operation(kernels))
+    kept = kernels.kept_rows
+    fingerprint = function_fingerprint(kernels.start, kernels.predict, kernels.update)
+
+    def operate_many(row, table, draws, size, tasks, rows, tables, inputs, measurements, numbers, first, last):
+        fingerprint  # noqa: B018 - part of the cache's key
+        u, z = np.zeros(inputs.shape[1]), np.zeros(measurements.shape[1])
+        for b in range(first, last):
+            task = tasks[b]
+            if task == IDLE:
+                continue
+            # Into memory of one's own and back: slices of arrays that threads share cost contended counts.
+            for i in range(row.shape[0]):
+                row[i] = rows[b, i]
+            if task == STEP:
+                for i in range(kept):
+                    for j in range(tables.shape[2]):
+                        table[i, j] = tables[b, i, j]
+            for i in range(u.shape[0]):
+                u[i] = inputs[b, i]
+            for i in range(z.shape[0]):
+                z[i] = measurements[b, i]
+            operate(row, table, draws, size, u, z, numbers, task == START, task == STEP, True)
+            for i in range(row.shape[0]):
+                rows[b, i] = row[i]
+            for i in range(kept):
+                for j in range(tables.shape[2]):
+                    tables[b, i, j] = table[i, j]
+
+    return CompiledOrPython(operate_many)
