@@ -27,29 +27,22 @@ class Session:
         kernels, model, size = filter_.kernels(), filter_.kernel_model, filter_.size
         n, m = kernels.n, kernels.m
         places = memory_places(n, m)
-        self._operate = operation(kernels)
+        self._kernels, self._operate = kernels, operation(kernels)
         self._numbers, self._size, self._places = filter_.numbers, size, places
         self._kept_rows, self._noise_places = kernels.kept_rows, number_places(n, m)
         self._memory = new_memory(kernels, size)
         self._row, self._table, _ = self._memory
         self._extras = self._row[places.extras :]
         self._u, self._z = np.zeros(model.inputs), np.full(m, np.nan)
+        self._scalar = len(self._u) == m == 1
+        self._given = (*self._memory, size, self._u, self._z, self._numbers)
         self.mean = self._row[places.mean : places.mean + n]
         self.cov = self._row[places.cov : places.cov + n * n].reshape(n, n)
         self.innovation = self._row[places.innovation : places.innovation + m]
         self.innovation_cov = self._row[places.innovation_cov : places.innovation_cov + m * m].reshape(m, m)
 
     def _do(self, starting: bool, predicting: bool, updating: bool) -> None:
-        self._operate(
-            *self._memory,
-            self._size,
-            self._u,
-            self._z,
-            self._numbers,
-            starting,
-            predicting,
-            updating,
-        )
+        self._operate(*self._given, starting, predicting, updating)
 
     def set_key(self, key) -> None:
         """Set the key (2,) on which the belief's randomness depends."""
@@ -70,12 +63,15 @@ class Session:
         self.set_key(key)
         self._z[:] = z
         self._do(True, False, True)
+        self._operate = operation(self._kernels).direct  # `step` has to be quick
 
     def step(self, u, z) -> None:
         """Predict with input u (p,), then update with measurement z (m,); NaN marks a missing channel."""
-        self._u[:] = u
-        self._z[:] = z
-        self._do(False, True, True)
+        if self._scalar:  # the frequent case: an assignment to a slice takes twice as long
+            self._u[0], self._z[0] = u[0], z[0]
+        else:
+            self._u[:], self._z[:] = u, z
+        self._operate(*self._given, False, True, True)
 
     def run(self, operation: str, u=None, z=None) -> None:
         """Do one of "start", "predict" or "update" alone, arguments checked."""

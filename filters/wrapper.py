@@ -91,11 +91,18 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     def step(self, action):
         """Step the env, then predict with the clipped action and update with the measurement."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        values = np.asarray(action).ravel().tolist()  # plain floats: fastest for the few inputs of a plant
-        u = [min(max(v, low), high) for v, (low, high) in zip(values, self._bounds, strict=True)]
         z = _measurement(observation, info)
-        self._session.step(u, z)
+        self._session.step(self._clipped(action), z)
         return self._observe(observation, z, info), reward, terminated, truncated, info
+
+    def _clipped(self, action) -> list[float]:
+        # Plain floats are fastest for the few inputs of a plant.
+        values = action.tolist() if type(action) is np.ndarray and action.ndim == 1 else _flat(action)
+        if len(values) == 1:
+            low, high = self._bounds[0]
+            value = values[0]
+            return [low if value < low else high if value > high else value]
+        return [min(max(v, low), high) for v, (low, high) in zip(values, self._bounds, strict=True)]
 
     def _overlay(self):
         return overlay_of(self.filter.name, self.filter.model, self._session.mean, self._session.cov)
@@ -119,6 +126,10 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         if self._appended:
             parts.append(observation[-self._appended :])
         return np.concatenate(parts).astype(np.float32)
+
+
+def _flat(action) -> list[float]:
+    return np.asarray(action).ravel().tolist()
 
 
 def _measurement(observation, info) -> np.ndarray:

@@ -14,7 +14,8 @@ import pytest
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
 from thruster_cli.main import main
-from thruster_env.parameters import TUNNEL, derive_constants
+from thruster_cli.output import console
+from thruster_env.parameters import PRESETS, TUNNEL, derive_constants
 
 
 class Done(NamedTuple):
@@ -104,6 +105,49 @@ def test_inspect_prints_units_and_the_number_of_substeps(thruster, as_json):
     assert data["steady_state"]["omega_m [rad/s]"] == pytest.approx(193.803, abs=1e-3)
 
 
+def test_inspect_shows_the_published_model_beside_ours(thruster, as_json, tmp_path):
+    done = thruster("inspect", "--preset", "open_bladed_corrected")
+    words = " ".join(done.stdout.split())
+    for text in ("published: open_bladed", "-523.7 -1519.8", "they are no linearisation", "none: not stable"):
+        assert text.lower() in words.lower()
+    data = as_json("inspect", "--preset", "open_bladed_corrected")
+    assert data["published"]["A"] == [[-523.7, -1519.8], [-1.15, -0.13]]
+    assert data["published"]["printed"]["A_d"] == [[0.0116, -2.9445], [-0.0022, 1.0260]]
+    assert data["published"]["dc_gain"]["T [N]"] == [None, None]
+    assert data["controllability"]["rank"] == data["observability"]["rank"] == 2
+    assert np.shape(data["B"]) == np.shape(data["B_d"]) == (2, 2)
+    gain = data["bode"]["T/V_s"]["magnitude [N/V]"][0]
+    assert gain == pytest.approx(data["dc_gain"]["T [N]"][0], rel=1e-3)
+    assert len(data["step"]["V_s"]["T [N]"]) == len(data["step"]["time [s]"])
+    assert as_json("inspect", "--preset", "t200")["published"] is None
+    assert not list(tmp_path.iterdir())
+
+
+def test_inspect_draws(thruster, as_json, tmp_path):
+    done = thruster("inspect", "--voltage", 12, "--out", "new/tunnel.png")
+    assert done.returncode == 0 and "new/tunnel.png" in done.stdout
+    assert (tmp_path / "new" / "tunnel.png").read_bytes().startswith(b"\x89PNG")
+    assert as_json("inspect", "--out", "again.png")["picture"] == "again.png"
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("width", [80, 115])
+def test_inspect_fits_the_terminal(thruster, preset, width, monkeypatch):
+    monkeypatch.setattr(console, "width", width)
+    for voltage in (-12, 0, 13):
+        done = thruster("inspect", "--preset", preset, "--voltage", voltage)
+        assert done.returncode == 0 and "…" not in done.stdout
+        lines = done.stdout.splitlines()
+        assert max(map(len, lines)) <= width
+        assert any(line.split()[:4] == ["A", "=", "d", "rates/d(omega_m,"] and "U_a)" in line for line in lines)
+
+
+@pytest.mark.parametrize("command", ["inspect", "simulate"])
+def test_help_lists_every_preset(command, thruster):
+    words = thruster(command, "--help").stdout.replace("│", " ").split()
+    assert set(PRESETS) <= {word.strip(",.") for word in words}
+
+
 @pytest.mark.parametrize("command", ["", "inspect", "simulate", "tune", "evaluate", "reproduce", "demo"])
 def test_help_teaches(command, thruster):
     done = thruster(*filter(None, [command, "--help"]))
@@ -124,6 +168,10 @@ BAD = [
     (("evaluate", "--filter", "ekf", "--seeds", "1"), "held-out seeds must be a whole number of at least 2"),
     (("inspect", "--preset", "none"), "preset must be one of"),
     (("inspect", "--dt", "-1"), "dt must be positive, but got -1.0"),
+    (("inspect", "--voltage", "30"), "voltage must be within plus and minus 24, but got 30.0"),
+    (("inspect", "--out", "picture.pdf"), "--out must end in .png, but got 'picture.pdf'"),
+    (("inspect", "--out", "text.txt/x.png"), "must be where it can be written"),
+    (("inspect", "--voltage", "0", "--out", "x.png"), "the thrust must move with the voltage"),
     (("simulate", "--out", "run.txt"), "--out must end in .csv or .npz, but got 'run.txt'"),
     (("simulate", "--out", "run.csv", "--measurement-noise", "-1"), "no negative variance"),
     (("simulate", "--out", "run.csv", "--voltage", "nan"), "voltage must be a finite number, but got nan"),

@@ -214,28 +214,10 @@ def test_a_sample_time_that_no_substeps_can_follow_is_refused(dt):
         required_substeps(TUNNEL, dt, 24.0)
 
 
-@pytest.mark.parametrize(
-    ("a", "b", "a_d", "b_d"),
-    [
-        (
-            [[-70.7, 1.2], [-2.1, -14.8]],
-            [[1133.2, 0], [0, 1.9]],
-            [[0.4930, 0.0079], [-0.0139, 0.8623]],
-            [[8.1241, 0.0001], [-0.0905, 0.0177]],
-        ),
-        (
-            [[-523.7, -1519.8], [-1.15, -0.13]],
-            [[0.65, 0], [0, 2.73]],
-            [[0.0116, -2.9445], [-0.0022, 1.0260]],
-            [[0.0013, -0.0647], [0, 0.0276]],
-        ),
-    ],
-    ids=["tunnel", "open-bladed"],
-)
-def test_zero_order_hold_reproduces_the_published_discretisation(a, b, a_d, b_d):
-    ours = zero_order_hold(np.array(a), np.array(b), 0.01)
-    np.testing.assert_allclose(ours[0], a_d, rtol=0, atol=5.1e-5)
-    np.testing.assert_allclose(ours[1], b_d, rtol=0, atol=5.1e-5)
+def test_zero_order_hold_has_the_closed_form_of_one_state():
+    a_d, b_d = zero_order_hold(np.array([[-3.0]]), np.array([[2.0, 5.0]]), 0.1)
+    assert a_d == pytest.approx(np.array([[math.exp(-0.3)]]))
+    assert b_d == pytest.approx(np.array([[2.0, 5.0]]) * (1 - math.exp(-0.3)) / 3.0)
 
 
 def test_observability_tells_seen_from_hidden():

@@ -15,8 +15,6 @@ from studies.findings import findings
 from studies.published import NOISE_LEVELS, STEPS, SYSTEMS, H
 from studies.unupdated_ensemble import unupdated_ensemble_means
 from thruster_cli.main import main
-from thruster_env.linear import zero_order_hold
-from thruster_env.published import SAMPLE_TIME
 
 # The Riccati values and the errors of the un-updated ensemble, computed independently of this package.
 OPTIMUM = {
@@ -35,14 +33,6 @@ UNUPDATED = {  # (case, q): mean over 400 runs of the RMSE of a single run from 
 @pytest.fixture(scope="module")
 def comparisons():
     return compare_all(runs=200, members=200, seed=0)
-
-
-@pytest.mark.parametrize("case", SYSTEMS)
-def test_zero_order_hold_gives_the_printed_matrices(case):
-    system = SYSTEMS[case]
-    a_d, b_d = zero_order_hold(np.array(system.a), np.array(system.b), SAMPLE_TIME)
-    np.testing.assert_allclose(a_d, system.printed_a_d, atol=6e-5)
-    np.testing.assert_allclose(b_d, system.printed_b_d, atol=6e-5)
 
 
 @pytest.mark.parametrize("case", SYSTEMS)

@@ -80,10 +80,10 @@ def command(
         "published": published,
         "picture": None if out is None else str(out),
     }
-    emit([_point_table(title, point, spread, ours, plant), "", _model_table(columns), *words], data, json)
+    emit([title, _point_table(point, spread, ours, plant), _model_table(columns), *words], data, json)
 
 
-def _point_table(title: str, point: SteadyState, spread: np.ndarray, analysis: Analysis, plant: Plant):
+def _point_table(point: SteadyState, spread: np.ndarray, analysis: Analysis, plant: Plant):
     rows = [
         ["steady motor speed omega_m [rad/s]", f"{point.omega_m:.4g}"],
         ["steady flow velocity U_a [m/s]", f"{point.U_a:.4g}"],
@@ -93,7 +93,7 @@ def _point_table(title: str, point: SteadyState, spread: np.ndarray, analysis: A
         ["stiffness: largest |eigenvalue| dt", f"{np.abs(analysis.eigenvalues).max() * plant.dt:.3g}"],
         ["Runge-Kutta substeps a sample time", str(plant.substeps)],
     ]
-    return table(title, ["quantity", "value"], rows)
+    return table("", ["quantity", "value"], rows)
 
 
 def _model_table(columns: dict[str, Analysis]):

@@ -40,6 +40,12 @@ def linear_model(p: ThrusterParameters, x, voltage: float = 0.0, ambient_velocit
     return LinearModel(a, np.column_stack([b, [0.0, by_ambient]]), c)
 
 
+def equilibrium(model: LinearModel, u) -> np.ndarray:
+    """Where a linear system stays under u = (V_s, U_0): (omega_m, U_a, T); an unstable one never comes to it."""
+    x = -np.linalg.solve(model.a, model.b @ np.asarray(u, dtype=np.float64))
+    return np.append(x, model.c @ x)
+
+
 def controllability(a: np.ndarray, b: np.ndarray) -> tuple[int, float]:
     """Rank and condition number of the controllability matrix [B, A B, ...] of a discrete pair (A, B)."""
     return observability(a.T, b.T)  # the transposed matrix of the dual pair

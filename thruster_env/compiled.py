@@ -156,6 +156,11 @@ class CompiledOrPython:
                 return self._run(*arguments)
         return self._run(*arguments)
 
+    @property
+    def direct(self) -> Callable:
+        """What a call comes to: machine code, once it has run, without the detour through this object."""
+        return self._run if self._proven and self._run is not self._python else self
+
     def _call_first(self, *arguments):
         if not self._proven:
             try:

@@ -84,13 +84,13 @@ class Registry:
         if isinstance(given, tuple(self.effects.values())):
             return given
         names = ", ".join(self.effects)
-        if not isinstance(given, Mapping) or given.get("name") not in self.effects:
+        if not isinstance(given, Mapping) or given.get("name") not in tuple(self.effects):
             rule = f"each entry of {self.argument} must be a mapping whose name is one of {names}"
             raise ValueError(f"{rule}, but got {shown(given)}")
         cls = self.effects[given["name"]]
         arguments = {key: value for key, value in given.items() if key != "name"}
         fields = [field.name for field in dataclasses.fields(cls)]
-        unknown = sorted(set(arguments) - set(fields))
+        unknown = sorted(set(arguments) - set(fields), key=str)
         if unknown:
             rule = f"arguments of {given['name']!r} must be among {', '.join(fields)}"
             raise ValueError(f"{rule}, but got {unknown}")

@@ -9,6 +9,7 @@ from thruster_env.amplifier import AMPLIFIER_EFFECTS
 from thruster_env.checks import covariance_root
 from thruster_env.effects import Effect, Surroundings, encoded
 from thruster_env.flow import FLOW_SIGNALS
+from thruster_env.linear import zero_order_hold
 from thruster_env.plant import Plant
 from thruster_env.reference import REFERENCE_SIGNALS, Constant
 from thruster_env.sensors import CHANNELS, SENSOR_EFFECTS
@@ -58,13 +59,18 @@ def encode(plant: Plant, task: Task) -> tuple[np.ndarray, int]:
     numbers[at.R_ROOT : at.R_ROOT + r_root.size] = r_root.ravel()
     if plant.linear is not None:
         numbers[at.LINEAR] = 1.0
-        numbers[at.LINEAR_MODEL : at.LINEAR_MODEL + 10] = plant.linear.numbers(plant.dt)
+        numbers[at.LINEAR_MODEL : at.LINEAR_MODEL + 10] = _held(plant)
     numbers[at.REWARD_WEIGHTS : at.REWARD_WEIGHTS + 3] = task.weights
     numbers[at.THRUST_SCALE] = scale
     numbers[at.LIMITS : at.LIMITS + 2] = state_limits(plant)
     program, rows = _program(plant, task, around, numbers)
     numbers[at.CONSTANT_ROWS] = at.FIXED_ROWS + rows if plant.uncertainty else 0.0
     return np.concatenate([numbers, program]), rows + (at.CONSTANT_COUNT if plant.uncertainty else 0)
+
+
+def _held(plant: Plant) -> np.ndarray:
+    a_d, b_d = zero_order_hold(plant.linear.a, plant.linear.b, plant.dt)
+    return np.concatenate([a_d.ravel(), b_d.ravel(), plant.linear.c.ravel()])
 
 
 def _program(plant: Plant, task: Task, around: Surroundings, numbers: np.ndarray) -> tuple[list[float], int]:

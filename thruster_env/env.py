@@ -34,7 +34,7 @@ from thruster_env.reference import Constant
 from thruster_env.rendering.env import RenderedEnv
 from thruster_env.streams import draw_key
 from thruster_env.task import DEFAULT_WEIGHTS, half_thrust, make_task, thrust_scale
-from thruster_env.uncertainty import drawn_parameters
+from thruster_env.uncertainty import LogNormal, Uniform, as_mapping, drawn_parameters
 
 
 class BowThrusterEnv(RenderedEnv):
@@ -138,6 +138,8 @@ class BowThrusterEnv(RenderedEnv):
         self._memory, self._numbers = self._copies.memory, self._copies.numbers
         self._out = np.zeros((REPORTED, 1, 1))
         self._report = self._out.reshape(-1)  # a view
+        self._measurement_view = self._report[self._readings]
+        self._observation_buffer = np.zeros(1, dtype=np.float32)
         self._advance = self._copies.advance
 
     def _reference_signals(self, reference):
@@ -189,7 +191,8 @@ class BowThrusterEnv(RenderedEnv):
             state = vector("the state of options", options["state"], 2)
             plant = self.plant._replace(initial_mean=state, initial_cov=np.zeros((2, 2)))
             numbers = Copies(plant, self.task, 1).numbers
-        report = self._copies.begin(draw_key(self.np_random)[None], numbers=numbers)[:, 0].tolist()
+        self._report[:] = self._copies.begin(draw_key(self.np_random)[None], numbers=numbers)[:, 0]
+        report = self._report.tolist()
         if self.render_mode is not None:
             self._show(report, begin=True)
         return self._observation(report), self._info(report)
@@ -208,7 +211,8 @@ class BowThrusterEnv(RenderedEnv):
 
     def _observation(self, report: list[float]) -> np.ndarray:
         if self._single and -3e38 < report[READINGS] < 3e38:
-            return np.array((report[READINGS],), dtype=np.float32)
+            self._observation_buffer[0] = report[READINGS]
+            return self._observation_buffer.copy()  # twice as fast as a new array of one number
         values = report[self._readings] + [report[i] for i in self._appended]
         # float32 ends at 3.4e38; casting beyond it would warn on its way to infinity.
         values = [value if abs(value) < 3e38 else math.copysign(math.inf, value) for value in values]
@@ -219,7 +223,7 @@ class BowThrusterEnv(RenderedEnv):
         info = {
             "state": np.array((omega, flow)),
             "thrust": thrust,
-            "measurement": np.array(report[self._readings]),
+            "measurement": self._measurement_view.copy(),
             "reference": reference,
             "ambient_velocity": ambient,
             "time": time,
@@ -234,6 +238,8 @@ def _as_json(value):
         return value._asdict()
     if isinstance(value, Effect):
         return value.as_mapping()
+    if isinstance(value, (Uniform, LogNormal)):
+        return as_mapping(value)
     if isinstance(value, Mapping):
         return {key: _as_json(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from thruster_env.amplifier import AMPLIFIER_EFFECTS
+from thruster_env.analysis import LinearModel
 from thruster_env.checks import covariance, finite, one_of, positive, shown, vector
 from thruster_env.dynamics import Constants
 from thruster_env.effects import Effect
@@ -42,7 +43,7 @@ class Plant(NamedTuple):
     flow: tuple[Effect, ...] = ()
     amplifier: tuple[Effect, ...] = ()
     uncertainty: dict[str, Uniform | LogNormal] = {}
-    linear: Any = None  # a LinearDynamics that moves the plant in place of the equations of motion
+    linear: LinearModel | None = None  # moves the plant in place of the equations of motion
 
     @property
     def constants(self) -> Constants:

@@ -15,7 +15,8 @@ What else the print leaves open:
 - Open-bladed: A_22 = -0.13 contradicts C_2/K3 - B_22 = -10.4/4 - 2.73 = -5.33, with which the system would be
   stable. That it is unstable is therefore a slip of the print. (The tunnel's own numbers agree:
   -12.2/0.954 - 1.9 = -14.7 beside -14.8.)
-- Tunnel: -C A^-1 B is -4.8 N/V, so its thrust falls as the voltage grows, and flow opposes rotation.
+- Tunnel: -C A^-1 B is -4.8 N/V, so its thrust falls as the voltage grows, and A_21 < 0
+  makes the water flow against the propeller.
 - Open-bladed: its eigenvalue 3.1872 is printed "31872", and its characteristic polynomial has 528.83 where
   the trace gives 523.83.
 - Open-bladed: B_11 = 0.65 here; Nurhadi et al. print 0.065, but the printed B_d follows from 0.65 only.
@@ -77,8 +78,8 @@ PUBLISHED: dict[str, PublishedLinearModel] = {
 }
 
 NO_LINEARISATION = (
-    "The published matrices are kept as data. They are no linearisation of the equations printed beside them: "
-    "in every state these give at least one slope of thrust or torque the other sign."
+    "The published matrices are kept as data. They are no linearisation of the equations printed beside them, "
+    "which in every state give at least one slope of thrust or torque the other sign."
 )
 
 

@@ -69,8 +69,8 @@ class RecordedSeries(Effect):
 
 def _column(file: str, column: str | None) -> np.ndarray:
     path = Path(file)
-    if not path.is_file():
-        raise ValueError(f"file must be a CSV file that exists, but got {shown(file)}")
+    if not path.is_file() or not path.stat().st_size:
+        raise ValueError(f"file must be a CSV file that exists and is not empty, but got {shown(file)}")
     try:
         table = np.genfromtxt(path, delimiter=",", names=True, dtype=np.float64, encoding="utf-8")
     except ValueError as error:

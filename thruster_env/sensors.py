@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from thruster_env.checks import at_least, finite, positive, within
 from thruster_env.compiled import inlined
 from thruster_env.effects import Effect, Registry, Surroundings, normals, set_field, uniforms
@@ -67,8 +69,8 @@ def bias(memory, b, target, rows, number, numbers, at, begin):
 def quantisation(memory, b, target, rows, number, numbers, at, begin):
     """Round to the nearest multiple of a step."""
     step = numbers[at]
-    for j in range(memory.shape[2]):
-        memory[b, target, j] = math.floor(memory[b, target, j] / step + 0.5) * step
+    for j in range(memory.shape[2]):  # math.floor would make an integer, which ends at 2^63
+        memory[b, target, j] = np.floor(memory[b, target, j] / step + 0.5) * step
 
 
 @inlined

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thruster_env.analysis import equilibrium
 from thruster_env.checks import positive
 from thruster_env.effects import Effect
 from thruster_env.linear import state_range, steady_state
@@ -37,21 +38,23 @@ def thrust_scale(plant: Plant) -> float:
     """Steady thrust at max_voltage, T_max [N]."""
     if plant.linear is None:
         return steady_state(plant.parameters, plant.max_voltage).thrust
-    return float(abs(plant.linear.steady_state((plant.max_voltage, 0.0))[2]))
+    return float(abs(equilibrium(plant.linear, (plant.max_voltage, 0.0))[2]))
 
 
 def half_thrust(plant: Plant) -> float:
     """Steady thrust at half of max_voltage [N]: the reference where no other one is given."""
     if plant.linear is None:
         return steady_state(plant.parameters, plant.max_voltage / 2).thrust
-    return float(plant.linear.steady_state((plant.max_voltage / 2, 0.0))[2])
+    return float(equilibrium(plant.linear, (plant.max_voltage / 2, 0.0))[2])
 
 
 def state_limits(plant: Plant) -> np.ndarray:
     """Magnitudes (2,) of omega_m [rad/s] and U_a [m/s] at which an episode ends."""
     if plant.linear is not None:
-        speed, flow, _ = plant.linear.steady_state((plant.max_voltage, plant.ambient_velocity))
-        return ABSURD * 2 * np.abs([speed, flow])
+        speed, flow, _ = equilibrium(plant.linear, (plant.max_voltage, plant.ambient_velocity))
+        # The open-bladed system hardly answers to the voltage: its noise is larger than its range.
+        stirred = np.sqrt(np.diag(plant.initial_cov)) + np.sqrt(np.diag(plant.process_noise_cov))
+        return ABSURD * (2 * np.abs([speed, flow]) + np.abs(plant.initial_mean) + stirred)
     flow = abs(plant.ambient_velocity)
     turned_by_flow = np.array([flow / plant.constants.blade_speed, flow])
     return ABSURD * (state_range(plant.parameters, plant.max_voltage) + turned_by_flow)

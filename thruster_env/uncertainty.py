@@ -87,7 +87,7 @@ def make_uncertainty(given) -> dict[str, Uniform | LogNormal]:
             continue
         names = ", ".join(DISTRIBUTIONS)
         rule = f"the distribution of {parameter} must be a mapping with arguments and a name out of {names}"
-        if not isinstance(distribution, Mapping) or distribution.get("name") not in DISTRIBUTIONS:
+        if not isinstance(distribution, Mapping) or distribution.get("name") not in tuple(DISTRIBUTIONS):
             raise ValueError(f"{rule}, but got {shown(distribution)}")
         arguments = {key: value for key, value in distribution.items() if key != "name"}
         try:
@@ -97,9 +97,9 @@ def make_uncertainty(given) -> dict[str, Uniform | LogNormal]:
     return made
 
 
-def as_mapping(uncertainty: Mapping) -> dict:
-    """Distributions by parameter as JSON can hold them."""
-    return {key: {"name": value.name, **asdict(value)} for key, value in uncertainty.items()}
+def as_mapping(distribution: Uniform | LogNormal) -> dict:
+    """A distribution as JSON can hold it: its name and its arguments."""
+    return {"name": distribution.name, **asdict(distribution)}
 
 
 def drawn_parameters(nominal: ThrusterParameters, uncertainty: Mapping, keys: np.ndarray) -> ThrusterParameters:
