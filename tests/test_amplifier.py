@@ -131,6 +131,11 @@ def test_a_current_is_that_of_the_applied_voltage():
     assert info["measurement"][0] == pytest.approx(current / (p.load_gain * p.motor_damping), rel=1e-12)
 
 
+def test_a_thruster_without_load_has_no_current():
+    with pytest.raises(ValueError, match="load_gain must be positive for a motor current"):
+        make_plant(TUNNEL_PHYSICAL._replace(load_gain=0.0), sensors=["current"])
+
+
 @pytest.mark.parametrize("amplifier", [None, EFFECTS], ids=["none", "all"])
 def test_the_reward_is_told_of_the_commanded_clipped_voltage(amplifier):
     weights = {"tracking_weight": 0.0, "energy_weight": 0.7, "voltage_rate_weight": 0.3}

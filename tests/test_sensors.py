@@ -9,7 +9,7 @@ from scipy import stats
 
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.dynamics import thrust_and_torque
-from thruster_env.parameters import PRESETS, TUNNEL, TUNNEL_PHYSICAL, derive_constants
+from thruster_env.parameters import PRESETS, TUNNEL_PHYSICAL, derive_constants
 from thruster_env.plant import make_plant
 from thruster_env.sensors import CHANNELS, Bias, Quantisation
 from thruster_env.simulation import simulate
@@ -60,7 +60,7 @@ def assert_white(x):
 
 @pytest.mark.parametrize("degrees", [1.0, 2.5, 3.0, 30.0])
 def test_heavy_tails_are_those_of_student(degrees):
-    noise = added({"name": "student-t", "scale": 0.3, "degrees": degrees})
+    noise = added({"name": "student-t", "scale": 0.3, "degrees": degrees}, copies=5000)
     assert_drawn_from(noise / 0.3, stats.t(degrees))
     assert_white(noise)
 
@@ -108,16 +108,12 @@ def test_a_bias_starts_about_its_value_and_walks():
 def test_a_bias_without_spread_is_a_constant_and_is_forgotten_at_the_next_episode():
     np.testing.assert_allclose(added({"name": "bias", "value": 0.7}), 0.7, rtol=0, atol=1e-12)
     env = gym.make("BowThruster-v0", sensors={"thrust": [Bias(std=3.0, drift=1.0)]}, measurement_noise_cov=0)
-
-    def starts(seed):
+    starts = []
+    for seed in (3, None, 3):
         info = env.reset(seed=seed)[1]
-        return float(info["measurement"][0]) - info["thrust"]
-
-    first = starts(3)
-    for _ in range(50):
+        starts.append(float(info["measurement"][0]) - info["thrust"])
         env.step([1.0])
-    assert starts(None) != first
-    assert starts(3) == first
+    assert starts[0] == starts[2] != starts[1]
 
 
 @pytest.mark.parametrize("step", [0.05, 3.0, 1e-20])
@@ -295,11 +291,6 @@ def test_wrong_sensors_are_refused_with_the_rule(sensors, message):
     with pytest.raises(ValueError, match=message) as error:
         make_plant(sensors={"thrust": [sensors]} if isinstance(sensors, dict) else sensors)
     assert "\n" not in str(error.value)
-
-
-def test_a_thruster_without_load_has_no_current_to_measure():
-    with pytest.raises(ValueError, match="load_gain must be positive"):
-        make_plant(TUNNEL._replace(load_gain=0.0), sensors=["current"])
 
 
 def test_effects_may_be_objects_or_one_mapping():

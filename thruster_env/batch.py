@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 
+from thruster_env.checks import vector
 from thruster_env.copies import advance
 from thruster_env.encoding import encode, is_plain, known_effects
 from thruster_env.memory import (
@@ -60,6 +61,13 @@ class Copies:
         if which is not None:
             scatter(memory, self.memory, which)
         return out[:, : len(keys)]
+
+    def numbers_from(self, options: dict | None) -> np.ndarray | None:
+        """Numbers for `begin` with the initial state that a reset's options fix in "state", or None."""
+        if options is None or options.get("state") is None:
+            return None
+        state = vector("the state of options", options["state"], 2)
+        return encode(self.plant._replace(initial_mean=state, initial_cov=np.zeros((2, 2))), self.task)[0]
 
     def step(self, voltages: np.ndarray) -> np.ndarray:
         """Apply voltages (N,) [V] for one sample time; return the report."""

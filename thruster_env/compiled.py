@@ -157,6 +157,11 @@ class CompiledOrPython:
         return self._run(*arguments)
 
     @property
+    def in_python(self) -> bool:
+        """Whether calls run as Python, as far as is known before the first."""
+        return self._run is self._python
+
+    @property
     def direct(self) -> Callable:
         """What a call comes to: machine code, once it has run, without the detour through this object."""
         return self._run if self._proven and self._run is not self._python else self

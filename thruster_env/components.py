@@ -32,9 +32,9 @@ def written_out(name: str, arguments: str, *lines: str, **names) -> Callable:
 
 
 @cache
-def column_reader(count: int) -> Callable:
-    """Return `column(array, j)`: entries array[0, j] ... array[count-1, j] as a tuple; array is (count, N)."""
-    return written_out("column", "array, j", tuple_of(f"array[{i}, j]" for i in range(count)))
+def column_reader(count: int, first: int = 0) -> Callable:
+    """Return `column(array, j)`: `count` entries of column j, from row first on, as a tuple."""
+    return written_out("column", "array, j", tuple_of(f"array[{first + i}, j]" for i in range(count)))
 
 
 @cache

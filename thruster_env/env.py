@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from thruster_env.batch import Copies
-from thruster_env.checks import finite, vector
+from thruster_env.checks import finite
 from thruster_env.effects import Effect
 from thruster_env.memory import (
     COMMAND,
@@ -186,11 +186,7 @@ class BowThrusterEnv(RenderedEnv):
         `options={"state": [omega_m, U_a]}` fixes the initial state of this episode.
         """
         super().reset(seed=seed)
-        numbers = None
-        if options is not None and "state" in options:
-            state = vector("the state of options", options["state"], 2)
-            plant = self.plant._replace(initial_mean=state, initial_cov=np.zeros((2, 2)))
-            numbers = Copies(plant, self.task, 1).numbers
+        numbers = self._copies.numbers_from(options)
         self._report[:] = self._copies.begin(draw_key(self.np_random)[None], numbers=numbers)[:, 0]
         report = self._report.tolist()
         if self.render_mode is not None:
@@ -215,7 +211,7 @@ class BowThrusterEnv(RenderedEnv):
             return self._observation_buffer.copy()  # twice as fast as a new array of one number
         values = report[self._readings] + [report[i] for i in self._appended]
         # float32 ends at 3.4e38; casting beyond it would warn on its way to infinity.
-        values = [value if abs(value) < 3e38 else math.copysign(math.inf, value) for value in values]
+        values = [value if abs(value) < 3e38 else -math.inf if value < 0 else math.inf for value in values]
         return np.array(values, dtype=np.float32)
 
     def _info(self, report: list[float]) -> dict:

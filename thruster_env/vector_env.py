@@ -68,14 +68,17 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
         return self._copies.bytes_per_copy
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict | None = None):
-        """Start an episode of every copy, or of those where `options["reset_mask"]` (num_envs,) is true."""
+        """Start an episode of every copy, or of those where `options["reset_mask"]` (num_envs,) is true.
+
+        `options={"state": [omega_m, U_a]}` fixes the initial state of these episodes.
+        """
         if isinstance(seed, int):
             self._np_random, self._np_random_seed = np_random(seed)
         mask = _reset_mask(options, self.num_envs)
         self._keys.seed(seed, np.ones(self.num_envs, dtype=bool) if mask is None else mask)
         report = self._copies.report()
         which = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
-        self._restart(which, report)
+        self._restart(which, report, self._copies.numbers_from(options))
         return self._observation(report), self._info(report, mask)
 
     def step(self, actions):
@@ -96,12 +99,12 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
             self._restart(np.flatnonzero(self._done), report)
         return self._observation(report), rewards, terminated, truncated, self._info(report) | ends
 
-    def _restart(self, which: np.ndarray, report: np.ndarray) -> None:
+    def _restart(self, which: np.ndarray, report: np.ndarray, numbers: np.ndarray | None = None) -> None:
         keys = self._keys.draw(which)
         if len(which) == self.num_envs:
-            report[:] = self._copies.begin(keys)
+            report[:] = self._copies.begin(keys, numbers=numbers)
         else:
-            report[:, which] = self._copies.begin(keys, which)
+            report[:, which] = self._copies.begin(keys, which, numbers)
         self._done[which] = False
 
     def _endings(self, report: np.ndarray) -> dict[str, Any]:
@@ -121,7 +124,7 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
         if voltages.shape not in ((self.num_envs,), (self.num_envs, 1)):
             raise ValueError(f"actions must be {self.num_envs} voltages [V], but got {shown(actions)}")
         voltages = voltages.reshape(-1)
-        if np.isnan(voltages.sum()):  # of infinities, too
+        if np.isnan(voltages).any():
             ignored = self._done if self._mode == AutoresetMode.NEXT_STEP else False
             wrong = np.flatnonzero(np.isnan(voltages) & ~np.asarray(ignored))
             if len(wrong):
@@ -133,6 +136,8 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
         with np.errstate(over="ignore"):  # beyond 3.4e38 lies infinity
             for i, reported in enumerate(self._observed):
                 observation[:, i] = report[reported]
+        if np.isnan(observation.sum()):  # of a copy that terminates; a single env reports infinity, too
+            observation[np.isnan(observation)] = np.inf
         return observation
 
     def _info(self, report: np.ndarray, mask: np.ndarray | None = None) -> dict[str, Any]:
