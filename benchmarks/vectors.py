@@ -12,7 +12,7 @@ import numpy as np
 
 import thruster_env  # noqa: F401 - registers BowThruster-v0
 from benchmarks.rows import Row
-from benchmarks.timing import Measure, alone, side_by_side
+from benchmarks.timing import Measure, side_by_side
 from filters.engine import spread
 from thruster_env.batch import Copies
 from thruster_env.compiled import compiled, function_fingerprint

@@ -10,9 +10,9 @@ from scipy import stats
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.batch import Copies
 from thruster_env.flow import FLOW_SIGNALS
-from thruster_env.linear import run_substeps
+from thruster_env.linear import run_substeps, state_range
 from thruster_env.memory import AMBIENT, row
-from thruster_env.parameters import TUNNEL
+from thruster_env.parameters import PRESETS, TUNNEL
 from thruster_env.plant import make_plant
 from thruster_env.recorded import RecordedSeries
 from thruster_env.streams import episode_keys
@@ -171,6 +171,18 @@ def test_flow_drags_the_water_and_turns_the_propeller_along(sign):
         info = env.step([0.0])[4]
     assert sign * info["state"][1] > 0.2
     assert sign * info["thrust"] < 0  # the blades slow it down
+
+
+@pytest.mark.parametrize("preset", ["open_bladed", "open_bladed_corrected"])
+def test_a_flow_signal_is_followed_as_exactly_as_a_constant_flow(preset):
+    plant = {"preset": preset, "process_noise_cov": [0, 0], "initial_state": [0, 0]}
+    constant = gym.make("BowThruster-v0", ambient_velocity=3.0, **plant)
+    recorded = gym.make("BowThruster-v0", flow=[{"name": "recorded", "values": [3.0]}], **plant)
+    constant.reset(seed=0), recorded.reset(seed=0)
+    limit = 1e-4 * state_range(PRESETS[preset], 24.0)
+    for k in range(100):
+        one, other = (env.step([24.0 if k % 20 < 10 else -24.0])[4]["state"] for env in (constant, recorded))
+        assert (np.abs(one - other) <= limit).all()
 
 
 def test_flow_leaves_the_noise_of_a_seed_as_it_is():

@@ -63,6 +63,8 @@ from thruster_env.motion import (
 )
 from thruster_env.streams import MEASUREMENT, normal_block
 
+LARGEST_ERROR = 1e6  # of thrust over T_max: a reward stays finite when a state does not
+
 
 @inlined
 def _measure_thrust(memory, b, numbers):
@@ -107,6 +109,7 @@ def _reward(memory, b, numbers):
     per_thrust, per_volt = 1.0 / numbers[THRUST_SCALE], 1.0 / numbers[TOP_VOLTAGE]
     for j in range(memory.shape[2]):
         error = (memory[b, THRUST, j] - memory[b, REFERENCE, j]) * per_thrust
+        error = error if abs(error) < LARGEST_ERROR else LARGEST_ERROR  # NaN, too, as the episode ends
         voltage = memory[b, COMMAND, j] * per_volt
         change = voltage - memory[b, LAST_COMMAND, j] * per_volt
         memory[b, REWARD, j] = -(tracking * error * error + energy * voltage * voltage + rate * change * change)

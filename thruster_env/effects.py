@@ -44,6 +44,10 @@ class Effect:
         """Number of states that a copy keeps for this effect."""
         return 0
 
+    def largest(self) -> float:
+        """Largest magnitude that a signal comes to, at four standard deviations of what is random."""
+        return 0.0
+
     def as_mapping(self) -> dict:
         """The effect as JSON can hold it: its name and its arguments."""
         return {"name": self.name, **dataclasses.asdict(self)}

@@ -80,6 +80,10 @@ class Sinusoid(Effect):
         set_field(self, "period", positive("period", self.period))
         set_field(self, "phase", finite("phase", self.phase))
 
+    def largest(self) -> float:
+        """The amplitude [m/s]."""
+        return abs(self.amplitude)
+
 
 @FLOW_SIGNALS.register("gauss-markov")
 @dataclass(frozen=True)
@@ -94,6 +98,10 @@ class GaussMarkov(Effect):
         """Check the arguments."""
         set_field(self, "std", positive("std", self.std, zero_allowed=True))
         set_field(self, "time_constant", positive("time_constant", self.time_constant))
+
+    def largest(self) -> float:
+        """Four standard deviations [m/s]."""
+        return 4.0 * self.std
 
     def parameters(self, around: Surroundings) -> list[float]:
         """Standard deviation and the correlation of neighbouring steps."""
@@ -125,6 +133,10 @@ class Gusts(Effect):
         set_field(self, "std", positive("std", self.std, zero_allowed=True))
         set_field(self, "rate", positive("rate", self.rate, zero_allowed=True))
         set_field(self, "duration", positive("duration", self.duration))
+
+    def largest(self) -> float:
+        """Four standard deviations of the height [m/s]."""
+        return 4.0 * self.std
 
     def parameters(self, around: Surroundings) -> list[float]:
         """Probability that one begins in a calm step, standard deviation, duration [s]."""

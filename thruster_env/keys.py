@@ -28,6 +28,11 @@ class EpisodeKeys:
         self._ahead = np.zeros((count, KEYS_AHEAD, 2))
         self._used = np.full(count, KEYS_AHEAD)
 
+    @property
+    def seeded(self) -> bool:
+        """Whether the copies have generators."""
+        return self._generators[0] is not None
+
     def seed(self, seed: int | list[int | None] | None, mask: np.ndarray) -> None:
         """Give copy i of those in the mask a generator from seed + i, or seed[i]; None keeps the one it has."""
         count = len(self._generators)

@@ -107,18 +107,21 @@ def make_plant(
         measurement_noise_cov = [CHANNELS[channel][1] for channel in sensors]
     uncertainty = make_uncertainty(uncertainty)
     corners = extreme_parameters(parameters, uncertainty)
+    flow = FLOW_SIGNALS.make(flow)
+    swing = sum(signal.largest() for signal in flow)
+    flows = {ambient_velocity - swing, ambient_velocity + swing}  # between which the integration has to do
     return Plant(
         parameters,
         dt,
         max_voltage,
         ambient_velocity,
-        max(required_substeps(corner, dt, max_voltage, ambient_velocity) for corner in corners),
+        max(required_substeps(corner, dt, max_voltage, u_0) for corner in corners for u_0 in flows),
         covariance("process_noise_cov", process_noise_cov, 2),
         covariance("measurement_noise_cov", measurement_noise_cov, len(sensors)),
         mean,
         cov,
         sensors,
-        FLOW_SIGNALS.make(flow),
+        flow,
         AMPLIFIER_EFFECTS.make(amplifier),
         uncertainty,
     )

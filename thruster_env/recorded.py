@@ -62,6 +62,10 @@ class RecordedSeries(Effect):
         mapping["values"] = None if self.file is not None else list(self.values)
         return mapping
 
+    def largest(self) -> float:
+        """Largest magnitude in the series."""
+        return max(map(abs, self.values))
+
     def parameters(self, around: Surroundings) -> list[float]:
         """What `recorded_value` takes."""
         return [self.sample_time, float(self.repeat), float(len(self.values)), *self.values]

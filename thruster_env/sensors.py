@@ -29,6 +29,7 @@ without friction, I = K2 (K2 V_s - K1 omega_m)/(K_h K1): the voltage constant is
 """
 
 SENSOR_EFFECTS = Registry("sensors")
+LONGEST_DELAY = 10_000  # steps, each of which takes two numbers of every copy's memory
 assert len(CHANNELS) <= MAX_CHANNELS
 
 
@@ -265,7 +266,10 @@ class Delay(Effect):
 
     def __post_init__(self):
         """Check the argument."""
-        set_field(self, "steps", at_least("steps", self.steps, 1))
+        steps = at_least("steps", self.steps, 1)
+        if steps > LONGEST_DELAY:
+            raise ValueError(f"steps must be at most {LONGEST_DELAY}, but got {self.steps!r}")
+        set_field(self, "steps", steps)
 
     def rows(self, around: Surroundings) -> int:
         """Measurements on their way, and whether they are valid."""

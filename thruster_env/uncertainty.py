@@ -54,7 +54,12 @@ class LogNormal:
 
     def __post_init__(self):
         """Check the argument."""
-        set_field(self, "std", positive("std", self.std, zero_allowed=True))
+        std = positive("std", self.std, zero_allowed=True)
+        if std > 2:
+            raise ValueError(
+                f"std must be at most 2, a factor of 7 at one standard deviation, but got {self.std!r}"
+            )
+        set_field(self, "std", std)
 
     def factors(self, number: int, keys: np.ndarray) -> np.ndarray:
         """Factors of the number-th uncertain parameter for keys (B, 2), shape (B,)."""

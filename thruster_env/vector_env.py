@@ -75,10 +75,11 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
         if isinstance(seed, int):
             self._np_random, self._np_random_seed = np_random(seed)
         mask = _reset_mask(options, self.num_envs)
+        numbers = self._copies.numbers_from(options)
         self._keys.seed(seed, np.ones(self.num_envs, dtype=bool) if mask is None else mask)
         report = self._copies.report()
         which = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
-        self._restart(which, report, self._copies.numbers_from(options))
+        self._restart(which, report, numbers)
         return self._observation(report), self._info(report, mask)
 
     def step(self, actions):
@@ -86,6 +87,8 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
 
         Raises ValueError for actions of another shape, and for NaN in a copy that is not about to be reset.
         """
+        if not self._keys.seeded:
+            raise gym.error.ResetNeeded("call reset() before step()")
         report = self._copies.step(self._voltages(actions))
         if self._mode == AutoresetMode.NEXT_STEP and self._done.any():
             self._restart(np.flatnonzero(self._done), report)
