@@ -24,11 +24,11 @@ def make_linear_plant(system: str = "tunnel", measurement_noise_cov=None, **plan
         ValueError: states the rule and the value.
     """
     model = PUBLISHED[one_of("system", system, tuple(PUBLISHED))]
-    plant = make_plant("tunnel", measurement_noise_cov=measurement_noise_cov, **plant_arguments)
+    plant = make_plant("tunnel", measurement_noise_cov=measurement_noise_cov, substeps=1, **plant_arguments)
     if "current" in plant.channels:
         raise ValueError("the linear systems must be measured by other channels than the current, which they lack")
     dynamics = LinearModel(*(np.array(matrix) for matrix in (model.a, model.b, model.c)))
-    plant = plant._replace(linear=dynamics, substeps=1)
+    plant = plant._replace(linear=dynamics)
     if measurement_noise_cov is None:
         return plant._replace(measurement_noise_cov=PUBLISHED_NOISE * np.eye(len(plant.channels)))
     return plant

@@ -9,7 +9,7 @@ import numpy as np
 
 from thruster_env.amplifier import AMPLIFIER_EFFECTS
 from thruster_env.analysis import LinearModel
-from thruster_env.checks import covariance, finite, one_of, positive, shown, vector
+from thruster_env.checks import at_least, covariance, finite, one_of, positive, shown, vector
 from thruster_env.dynamics import Constants
 from thruster_env.effects import Effect
 from thruster_env.flow import FLOW_SIGNALS
@@ -74,6 +74,7 @@ def make_plant(
     flow=None,
     amplifier=None,
     uncertainty=None,
+    substeps: int | None = None,
 ) -> Plant:
     """Make a plant from plain arguments, the same ones that the env takes.
 
@@ -91,6 +92,7 @@ def make_plant(
             channels to lists of effects, {"thrust": [{"name": "dropout", "probability": 0.1}]}.
         flow: signals of `flow.FLOW_SIGNALS` that add to ambient_velocity.
         amplifier: effects of `amplifier.AMPLIFIER_EFFECTS` between the commanded voltage and the motor.
+        substeps: Runge-Kutta steps a sample time; None for the fewest that hold `linear.ONE_STEP_ACCURACY`.
         uncertainty: distributions of factors on parameters, {"load_gain": {"name": "log-normal", "std": 0.1}}.
 
     Raises:
@@ -110,12 +112,16 @@ def make_plant(
     flow = FLOW_SIGNALS.make(flow)
     swing = sum(signal.largest() for signal in flow)
     flows = {ambient_velocity - swing, ambient_velocity + swing}  # between which the integration has to do
+    if substeps is None:
+        substeps = max(required_substeps(corner, dt, max_voltage, u_0) for corner in corners for u_0 in flows)
+    else:
+        substeps = at_least("substeps", substeps, 1)
     return Plant(
         parameters,
         dt,
         max_voltage,
         ambient_velocity,
-        max(required_substeps(corner, dt, max_voltage, u_0) for corner in corners for u_0 in flows),
+        substeps,
         covariance("process_noise_cov", process_noise_cov, 2),
         covariance("measurement_noise_cov", measurement_noise_cov, len(sensors)),
         mean,
