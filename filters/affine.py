@@ -16,7 +16,7 @@ from thruster_env.components import tuple_of, written_out
 
 
 @cache
-def _affine_functions(n: int, m: int, p: int) -> dict[str, Callable]:
+def affine_functions(n: int, m: int, p: int) -> dict[str, Callable]:
     """Functions of an affine model whose constants c are, by rows and in this order, A, B, a, C, d."""
     places = iter(range(n * (n + p + 1) + m * (n + 1)))
     a, b, offset, c, shift = (
@@ -87,7 +87,7 @@ def affine_model(
     prior_mean = vector("prior_mean", prior_mean, n)
     measurement_noise_cov = covariance("measurement_noise_cov", measurement_noise_cov, m)
     return AffineModel(
-        **_affine_functions(n, m, p),
+        **affine_functions(n, m, p),
         process_noise_cov=process_noise_cov,
         measurement_noise_cov=measurement_noise_cov,
         prior_mean=prior_mean,
@@ -130,4 +130,4 @@ def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
         measurement_noise_cov=model.measurement_noise_cov,
         prior_mean=model.prior_mean,
         prior_cov=model.prior_cov,
-    )
+    ).replace(state_low=model.state_low, state_high=model.state_high)

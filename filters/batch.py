@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.engine import batch, new_memory, spread
+from filters.engine import batch, lanes, new_memory, spread
 from filters.filter import Filter
-from filters.rows import with_root
+from filters.rows import LANES, with_root
 from thruster_env.checks import covariance
 
 
@@ -50,7 +50,52 @@ def run(
     """
     filter_.check_noise(process_noise_covs)
     filter_.check_noise(measurement_noise_covs)
-    kernels, model = filter_.kernels(), filter_.kernel_model
+    keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
+    n, (count, times, m) = filter_.kernel_model.n, z.shape
+    out = Estimates(
+        np.empty((count, times, n)),
+        np.empty((count, times, n, n)),
+        np.empty((count, times, m)),
+        np.empty((count, times, m, m)),
+        np.empty((count, times)),
+        np.empty(count),
+    )
+    noise = (
+        _noise_rows("process_noise_covs", process_noise_covs, times - 1, n),
+        _noise_rows("measurement_noise_covs", measurement_noise_covs, times, m),
+    )
+    run_all = _run_one_by_one if filter_.size else _run_side_by_side
+    run_all(filter_, (keys, inputs, z), noise, out)
+    return out
+
+
+def _run_one_by_one(filter_: Filter, data: tuple, noise: tuple, out: Estimates) -> None:
+    kernels, numbers, size = filter_.kernels(), filter_.numbers, filter_.size
+    run_part = batch(kernels)
+
+    def part(first: int, last: int) -> None:
+        memory = new_memory(kernels, size)  # serves the part's trajectories one after the other
+        run_part(*memory, size, *data, numbers.copy(), noise, tuple(out), first, last)
+
+    spread(part, len(out.means))
+
+
+def _run_side_by_side(filter_: Filter, data: tuple, noise: tuple, out: Estimates) -> None:
+    count, numbers, run_part = len(out.means), filter_.numbers, lanes(filter_.kernels())
+    together = 1 if run_part.in_python else LANES
+
+    def part(first: int, last: int) -> None:
+        last = min(last * together, count)
+        run_part(together, *data, numbers, noise, tuple(out), first * together, last)
+
+    spread(part, -(-count // together))
+
+
+def trajectories(
+    filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The arguments of `run` as the arrays that compiled code takes; ValueError if something is off."""
+    model = filter_.kernel_model
     keys = np.ascontiguousarray(keys, dtype=np.float64)
     inputs = np.ascontiguousarray(inputs, dtype=np.float64)
     z = np.ascontiguousarray(measurements, dtype=np.float64)
@@ -67,27 +112,7 @@ def run(
         )
     if not np.isfinite(inputs).all() or np.isinf(z).any():
         raise ValueError("inputs must be finite, and measurements finite or NaN, but some are not")
-    n = model.n
-    out = Estimates(
-        np.empty((count, times, n)),
-        np.empty((count, times, n, n)),
-        np.empty((count, times, m)),
-        np.empty((count, times, m, m)),
-        np.empty((count, times)),
-        np.empty(count),
-    )
-    noise = (
-        _noise_rows("process_noise_covs", process_noise_covs, times - 1, n),
-        _noise_rows("measurement_noise_covs", measurement_noise_covs, times, m),
-    )
-    run_part, numbers = batch(kernels), filter_.numbers
-
-    def part(first: int, last: int) -> None:
-        memory = new_memory(kernels, filter_.size)  # serves the part's trajectories one after the other
-        run_part(*memory, filter_.size, keys, inputs, z, numbers.copy(), noise, tuple(out), first, last)
-
-    spread(part, count)
-    return out
+    return keys, inputs, z
 
 
 def _noise_rows(name: str, given, count: int, size: int) -> np.ndarray:

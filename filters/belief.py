@@ -35,7 +35,10 @@ class Kernels(NamedTuple):
     `row` and `numbers` are laid out by `filters.rows`; `table` is (table_rows, padded size), its first n rows the
     members, without columns for filters without an ensemble; `draws` has room for `draws_per_member` normals a
     member. What a belief keeps beside mean and covariance are the first `kept_rows` rows of the table and
-    `extras` numbers of the row, from `memory_places(n, m).extras` on.
+    `extras` numbers of the row, from `memory_places(n, m).extras` on; `scratch` numbers that nothing keeps follow.
+
+    `stages`, where given, are what `predict` does before its substeps, in each of them, and after them, as
+    functions of the same arguments: batches then run every stage over many beliefs at once (`filters.lanes`).
     """
 
     n: int
@@ -48,6 +51,8 @@ class Kernels(NamedTuple):
     summarise: Callable  # summarise(memory, size): mean and cov from the members; `update` does it itself
     extras: int = 0
     extra_kept_rows: int = 0  # rows of the table, after the n of members, that belong to the belief
+    scratch: int = 0
+    stages: tuple[Callable, Callable, Callable] | None = None
 
     @property
     def kept_rows(self) -> int:

@@ -10,43 +10,19 @@ from functools import cache, lru_cache
 import numpy as np
 
 from filters.belief import Kernels
+from filters.lanes import build_lanes
+from filters.restart import restart_if_lost
 from filters.rows import LANES, memory_places, number_places, padded
-from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.compiled import CompiledOrPython, function_fingerprint, is_interpreting
 from thruster_env.streams import GROUP
 
 
-@cache
-def _restart_if_lost(kernels: Kernels) -> Callable:
-    """Return a function that puts the prior in place of a belief that is not finite, and counts it."""
-    n, m, start, summarise = kernels.n, kernels.m, kernels.start, kernels.summarise
-    places, r_place = memory_places(n, m), number_places(n, m).r
-    last, divergences = places.gain, places.divergences
-    innovation, s_place, log_likelihood = places.innovation, places.innovation_cov, places.log_likelihood
-
-    @inlined
-    def restart_if_lost(memory, numbers, size):
-        row, _, _ = memory
-        total = 0.0
-        for i in range(last):
-            total += abs(row[i])
-        if not total < 1e300:
-            start(memory, numbers, size)
-            summarise(memory, size)
-            row[divergences] += 1.0
-            row[log_likelihood] = 0.0
-            for i in range(m):
-                row[innovation + i] = 0.0
-            for i in range(m * m):
-                row[s_place + i] = numbers[r_place + i]
-
-    return restart_if_lost
-
-
 def build_operation(kernels: Kernels) -> Callable:
+    """`operation`, not yet compiled."""
     start, predict, update, summarise = kernels.start, kernels.predict, kernels.update, kernels.summarise
     places = memory_places(kernels.n, kernels.m)
     step, divergences = places.step, places.divergences
-    restart_if_lost = _restart_if_lost(kernels)
+    restart = restart_if_lost(kernels)
     fingerprint = function_fingerprint(start, predict, update)
 
     def operate(row, table, draws, size, u, z, numbers, starting, predicting, updating):
@@ -60,7 +36,7 @@ def build_operation(kernels: Kernels) -> Callable:
             predict(memory, u, numbers, size)
         if updating:
             update(memory, z, numbers, size)
-            restart_if_lost(memory, numbers, size)
+            restart(memory, numbers, size)
         else:
             summarise(memory, size)
 
@@ -74,7 +50,7 @@ def _build_batch(kernels: Kernels) -> Callable:
     key_0, key_1, step, divergences = places.key_0, places.key_1, places.step, places.divergences
     log_likelihood = places.log_likelihood
     q_place, r_place = number_places(n, m).q, number_places(n, m).r
-    restart_if_lost = _restart_if_lost(kernels)
+    restart = restart_if_lost(kernels)
     fingerprint = function_fingerprint(start, predict, update)
 
     def batch(row, table, draws, size, keys, inputs, measurements, numbers, noise, out, first, last):
@@ -104,7 +80,7 @@ def _build_batch(kernels: Kernels) -> Callable:
                     for i in range(rs.shape[1]):
                         numbers[r_place + i] = rs[k, i]
                 update(memory, z, numbers, size)
-                restart_if_lost(memory, numbers, size)
+                restart(memory, numbers, size)
                 for i in range(n):
                     means[b, k, i] = row[mean + i]
                     for j in range(n):
@@ -133,6 +109,11 @@ def batch(kernels: Kernels) -> Callable:
     return _runner(_build_batch, kernels, is_interpreting())
 
 
+def lanes(kernels: Kernels) -> Callable:
+    """The same for filters without an ensemble, many trajectories at a time; see `filters.lanes.build_lanes`."""
+    return _runner(build_lanes, kernels, is_interpreting())
+
+
 @lru_cache(maxsize=128)
 def _runner(build: Callable, kernels: Kernels, interpreting: bool) -> CompiledOrPython:
     return CompiledOrPython(build(kernels))
@@ -141,7 +122,7 @@ def _runner(build: Callable, kernels: Kernels, interpreting: bool) -> CompiledOr
 def new_memory(kernels: Kernels, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Row, table and draws for one belief with `size` members, zeros."""
     width = padded(size, LANES)
-    length = memory_places(kernels.n, kernels.m).extras + kernels.extras
+    length = memory_places(kernels.n, kernels.m).extras + kernels.extras + kernels.scratch
     draws = padded(kernels.draws_per_member * width, GROUP)
     return np.zeros(length), np.zeros((kernels.table_rows, width)), np.zeros(draws)
 

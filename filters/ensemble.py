@@ -1,22 +1,23 @@
-"""The stochastic ensemble Kalman filter: a Kalman update with moments taken from an ensemble."""
+"""Ensemble filters: what all kinds share, and the stochastic ensemble Kalman filter."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import ClassVar
 
 from filters import matrices
 from filters.belief import Kernels
 from filters.filter import Filter
+from filters.inflation import with_spread_control
+from filters.members import add_noise, drawer, ensemble_motion, row_covariances, row_means
 from filters.rows import constants_form, constants_reader, memory_places, number_places
-from thruster_env.checks import at_least
+from thruster_env.checks import at_least, positive, shown
 from thruster_env.compiled import inlined
 from thruster_env.components import (
     column_reader,
     column_writer,
-    matrix_of,
     matrix_reader,
     matrix_writer,
     tuple_of,
@@ -24,186 +25,178 @@ from thruster_env.components import (
     vector_writer,
     written_out,
 )
-from thruster_env.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
+from thruster_env.streams import FILTER_MEASUREMENT
 
 LARGEST_ENSEMBLE = 1_000_000
 
 
-@inlined
-def add_noise(table, first, count, draws, numbers, root):
-    """Rows first ... += L W, where the lower triangular L lies at numbers[root] and W, by rows, in draws."""
-    width = table.shape[1]
-    for i in range(count):
-        for k in range(i + 1):
-            factor = numbers[root + i * count + k]
-            if factor != 0.0:
-                for j in range(width):
-                    table[first + i, j] += factor * draws[k * width + j]
+@lru_cache(maxsize=64)
+def measurement_moments(observe, n, m, form) -> Callable:
+    """Return `compare(memory, z, numbers, size)`: what the members expect to be measured, against z.
 
-
-@cache
-def row_means(rows: int) -> Callable:
-    """Return `means(table, size)`: means of the first `size` entries of rows 0 ... rows - 1, in one loop."""
-    places = range(rows)
-    return written_out(
-        "means",
-        "table, size",
-        *(f"s{i} = 0.0" for i in places),
-        "for j in range(size):",
-        *(f"    s{i} += table[{i}, j]" for i in places),
-        tuple_of(f"s{i} / size" for i in places),
-    )
-
-
-@cache
-def row_covariances(first: int, rows: int, second: int, columns: int) -> Callable:
-    """Return `covariances(table, size, means)`: sample covariances of two groups of rows, in one loop.
-
-    Entry (i, j) belongs to rows first + i and second + j; means are those of `row_means`, the divisor is size - 1.
+    It puts y_j = h(x_j) into rows n ... of the table, innovation, S and log-likelihood into the row, and returns
+    mean(y) (m,), innovation = z - mean(y) (m,), cov(x, y) (n, m), S = cov(y, y) + R, R (m, m) and the lower
+    triangular root of S. In a channel that is NaN in z, y_j is 0, and R has no correlations.
     """
-    pairs = [(i, j) for i in range(rows) for j in range(columns) if first != second or j <= i]
-    used = sorted({first + i for i, _ in pairs} | {second + j for _, j in pairs})
+    places, source = memory_places(n, m), number_places(n, m)
+    likelihood_place = places.log_likelihood
+    constants, state, store = constants_reader(n, m, form), column_reader(n), column_writer(m, n)
+    means_of_all, covariances_with_predicted = row_means(n + m), row_covariances(0, n + m, n, m)
+    of_states = written_out("of_states", "c", tuple_of(f"c[{i}]" for i in range(n)))
+    of_predicted = written_out("of_predicted", "c", tuple_of(f"c[{n + i}]" for i in range(m)))
+    read_r, mask, add = matrix_reader(m, m, source.r), matrices.masked(m), matrices.symmetric_sum(m)
+    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    factor, likelihood = matrices.cholesky_factor(m), matrices.innovation_likelihood(m)
+    difference, measured = matrices.innovation(m), vector_reader(m)
 
-    def entry(i, j):
-        return f"s{i}_{j}" if (i, j) in pairs else f"s{j}_{i}"
+    @inlined
+    def compare(memory, z, numbers, size):
+        row, table, _ = memory
+        c = constants(numbers)
+        for j in range(table.shape[1]):
+            store(table, j, observe(state(table, j), c))
+        silence(table, n, z)
+        means = means_of_all(table, size)
+        covariances = covariances_with_predicted(table, size, means)
+        present, expected = measured(z), of_predicted(means)
+        r = mask(read_r(numbers), present)
+        s = add(of_predicted(covariances), r)
+        root = factor(s)
+        innovation = difference(present, expected)
+        store_innovation(row, innovation)
+        store_s(row, s)
+        row[likelihood_place] = likelihood(innovation, root, present)
+        return expected, innovation, of_states(covariances), s, r, root
 
-    return written_out(
-        "covariances",
-        "table, size, means",
-        *(f"s{i}_{j} = 0.0" for i, j in pairs),
-        "for j in range(size):",
-        *(f"    d{k} = table[{k}, j] - means[{k}]" for k in used),
-        *(f"    s{i}_{j} += d{first + i} * d{second + j}" for i, j in pairs),
-        matrix_of(rows, columns, lambda i, j: f"{entry(i, j)} / (size - 1)"),
-    )
+    return compare
+
+
+@inlined
+def silence(table, first, z):
+    """Rows first, first + 1, ... = 0 where z is NaN: what is constant has no covariance with anything."""
+    for i in range(z.shape[0]):
+        if z[i] != z[i]:
+            for j in range(table.shape[1]):
+                table[first + i, j] = 0.0
 
 
 @lru_cache(maxsize=64)
-def ensemble_kernels(transition, observe, n, m, inputs, form) -> Kernels:
-    """Kernels of the stochastic ensemble Kalman filter for model functions and sizes.
+def ensemble_kernels(analysis, transition, observe, n, m, inputs, form) -> Kernels:
+    """Kernels of an ensemble filter for model functions and sizes.
 
-    The table's rows: n of members, m of predicted measurements.
+    Args:
+        analysis: analysis(observe, n, m, form) returns `analyse(memory, z, numbers, size)`, which moves the
+            members and sets the innovation, its covariance and its likelihood.
+        transition: f.
+        observe: h.
+        n: number of states.
+        m: number of measurements.
+        inputs: number of inputs.
+        form: that of `rows.constants_form`.
+
+    The table's rows: n of members, m of predicted measurements, m of scratch.
     """
-    places, source = memory_places(n, m), number_places(n, m)
-    mean_place, cov_place, key_place, step_place = places.mean, places.cov, places.key_0, places.step
-    innovation_place, s_place, gain_place = places.innovation, places.innovation_cov, places.gain
-    likelihood_place, substeps_place = places.log_likelihood, source.substeps
-    prior_mean_place, prior_root_place = source.prior_mean, source.prior_root
-    q_root_place, r_root_place = source.q_root, source.r_root
-    predicted = n
-    means_of_members, means_of_all = row_means(n), row_means(n + m)
-    covariances_of_members = row_covariances(0, n, 0, n)
-    covariances_of_predicted = row_covariances(n, m, n, m)
-    cross_covariances = row_covariances(0, n, n, m)
-    store_mean, store_cov = vector_writer(n, mean_place), matrix_writer(n, n, cov_place)
-    store_innovation = vector_writer(m, innovation_place)
-    difference = matrices.innovation(m, n)
-
-    constants, control = constants_reader(n, m, form), vector_reader(inputs)
-    state, store_state, store_predicted = column_reader(n), column_writer(n), column_writer(m, n)
-    measured = vector_reader(m)
-    read_r, mask = matrix_reader(m, m, source.r), matrices.masked(m)
-    store_s, store_gain = matrix_writer(m, m, s_place), matrix_writer(n, m, gain_place)
-    factor, solve = matrices.cholesky_factor(m), matrices.row_solver(n, m)
-    likelihood, add = matrices.innovation_likelihood(m), matrices.symmetric_sum(m)
-
-    @inlined
-    def draw(draws, count, row, stream):
-        fill_normals(draws, count, row[step_place], stream, row[key_place], row[key_place + 1])
-
-    @inlined
-    def summarise(memory, size):
-        row, table, _ = memory
-        means = means_of_members(table, size)
-        store_mean(row, means)
-        store_cov(row, covariances_of_members(table, size, means))
-
-    @inlined
-    def start(memory, numbers, size):
-        row, table, draws = memory
-        draw(draws, n * table.shape[1], row, FILTER_PRIOR)
-        for i in range(n):
-            for j in range(table.shape[1]):
-                table[i, j] = numbers[prior_mean_place + i]
-        add_noise(table, 0, n, draws, numbers, prior_root_place)
-
-    @inlined
-    def predict(memory, u, numbers, size):
-        row, table, draws = memory
-        v, c = control(u), constants(numbers)
-        for _ in range(int(numbers[substeps_place])):
-            for j in range(table.shape[1]):
-                store_state(table, j, transition(state(table, j), v, c))
-        row[step_place] += 1.0
-        draw(draws, n * table.shape[1], row, FILTER_PROCESS)
-        add_noise(table, 0, n, draws, numbers, q_root_place)
+    motion, analyse = ensemble_motion(transition, n, m, inputs, form), analysis(observe, n, m, form)
+    summarise = motion.summarise
 
     @inlined
     def update(memory, z, numbers, size):
-        row, table, draws = memory
-        c = constants(numbers)
-        for j in range(table.shape[1]):
-            store_predicted(table, j, observe(state(table, j), c))
-        for i in range(m):
-            if z[i] != z[i]:  # a missing channel: constant predictions have no covariance with anything
-                for j in range(table.shape[1]):
-                    table[predicted + i, j] = 0.0
-        means = means_of_all(table, size)
-        present = measured(z)
-        s = add(covariances_of_predicted(table, size, means), mask(read_r(numbers), present))
-        root = factor(s)
-        innovation = difference(present, means)
-        store_innovation(row, innovation)
-        store_s(row, s)
-        store_gain(row, solve(cross_covariances(table, size, means), root))
-        row[likelihood_place] = likelihood(innovation, root, present)
-
-        draw(draws, m * table.shape[1], row, FILTER_MEASUREMENT)
-        add_noise(table, predicted, m, draws, numbers, r_root_place)
-        for i in range(m):
-            if z[i] == z[i]:
-                for a in range(n):
-                    for j in range(table.shape[1]):
-                        table[a, j] += row[gain_place + a * m + i] * (z[i] - table[predicted + i, j])
+        analyse(memory, z, numbers, size)
         summarise(memory, size)
 
-    return Kernels(n, m, n + m, max(n, m), start, predict, update, summarise)
+    return Kernels(n, m, n + 2 * m, max(n, m), motion.start, motion.predict, update, summarise)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EnsembleKalmanFilter(Filter):
-    """Stochastic ensemble Kalman filter, on the full nonlinear model, with perturbed measurements.
+class EnsembleFilter(Filter):
+    """Base of the ensemble filters: kinds supply `analysis`, as `ensemble_kernels` takes it.
 
-        predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
-        update:  y_j = h(x_j),  innovation = z - mean(y),  S = cov(y, y) + R,  K = cov(x, y) S^-1,
-                 x_j += K (z - v_j - y_j),  v_j ~ N(0, R);  sample covariances with divisor N - 1
-
-    The belief's mean and covariance are those of the members. The perturbations of an update depend on the key and
-    the step alone: of two updates within one step the second repeats the first one's.
+    The belief's mean and covariance are those of the members.
 
     Attributes:
         ensemble_size: number N of members, at least 2.
+        inflation: factor on the spread of the members about their mean in every step of the model's dt, after the
+            process noise; 1 is none. For steps of another length dt' it is inflation^(dt'/dt).
+        relaxation: part, 0 to 1, by which each update gives each state's spread back what it took from it.
 
-    Source: Evensen (1994); Burgers, van Leeuwen, Evensen (1998), "Analysis scheme in the EnKF".
+    Sources: Anderson, Anderson (1999), "A Monte Carlo implementation of the nonlinear filtering problem to produce
+    ensemble assimilations and forecasts", for inflation; Whitaker, Hamill (2012), "Evaluating methods to account
+    for system errors in ensemble data assimilation", for relaxation to the prior spread.
     """
 
-    name: ClassVar[str] = "enkf"
+    analysis: ClassVar[Callable]
     ensemble_size: int = 100
+    inflation: float = 1.0
+    relaxation: float = 0.0
 
     def __post_init__(self):
-        """Check the size; raise ValueError if it is not a whole number from 2 to a million."""
+        """Check the numbers; raise ValueError that states the rule and the value."""
         size = at_least("ensemble_size", self.ensemble_size, 2)
         if size > LARGEST_ENSEMBLE:
             raise ValueError(f"ensemble_size must be at most {LARGEST_ENSEMBLE}, but got {size}")
+        relaxation = positive("relaxation", self.relaxation, zero_allowed=True)
+        if relaxation > 1.0:
+            raise ValueError(f"relaxation must be at most 1, but got {shown(self.relaxation)}")
         object.__setattr__(self, "ensemble_size", size)
+        object.__setattr__(self, "inflation", positive("inflation", self.inflation))
+        object.__setattr__(self, "relaxation", relaxation)
 
     @property
     def size(self) -> int:
         """Number of ensemble members."""
         return self.ensemble_size
 
+    @property
+    def own_numbers(self) -> tuple[float, ...]:
+        """Inflation and relaxation."""
+        return self.inflation, self.relaxation
+
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
         model = self.kernel_model
         functions = inlined(model.transition), inlined(model.observe)
-        return ensemble_kernels(*functions, model.n, model.m, model.inputs, constants_form(model.constants))
+        form = constants_form(model.constants)
+        plain = ensemble_kernels(type(self).analysis, *functions, model.n, model.m, model.inputs, form)
+        # Compiled in only where it does something: in the loop over steps even an idle branch takes a tenth.
+        neutral = self.inflation == 1.0 and self.relaxation == 0.0
+        return plain if neutral else with_spread_control(plain, form)
+
+
+@lru_cache(maxsize=64)
+def perturbed_analysis(observe, n, m, form) -> Callable:
+    """Return `analyse(memory, z, numbers, size)` of the stochastic ensemble Kalman filter."""
+    r_root_place = number_places(n, m).r_root
+    compare, draw, solve = measurement_moments(observe, n, m, form), drawer(n, m), matrices.row_solver(n, m)
+    filled = written_out("filled", "z", tuple_of(f"z[{i}] if z[{i}] == z[{i}] else 0.0" for i in range(m)))
+    lines = [f"    d{i} = z[{i}] - table[{n + i}, j]" for i in range(m)]
+    for a in range(n):
+        lines.append(f"    table[{a}, j] += {' + '.join(f'k[{a}][{i}] * d{i}' for i in range(m))}")
+    nudge = written_out("nudge", "table, k, z", "for j in range(table.shape[1]):", *lines, "None")
+
+    @inlined
+    def analyse(memory, z, numbers, size):
+        row, table, draws = memory
+        _, _, cross, _, _, root = compare(memory, z, numbers, size)
+        draw(draws, m * table.shape[1], row, FILTER_MEASUREMENT)
+        add_noise(table, n, m, draws, numbers, r_root_place)
+        nudge(table, solve(cross, root), filled(z))
+
+    return analyse
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EnsembleKalmanFilter(EnsembleFilter):
+    """Stochastic ensemble Kalman filter, on the full nonlinear model, with perturbed measurements.
+
+        predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
+        update:  y_j = h(x_j),  innovation = z - mean(y),  S = cov(y, y) + R,  K = cov(x, y) S^-1,
+                 x_j += K (z - v_j - y_j),  v_j ~ N(0, R);  sample covariances with divisor N - 1
+
+    The perturbations of an update depend on the key and the step alone: of two updates within one step the second
+    repeats the first one's. Attributes are those of `EnsembleFilter`.
+
+    Source: Evensen (1994); Burgers, van Leeuwen, Evensen (1998), "Analysis scheme in the EnKF".
+    """
+
+    name: ClassVar[str] = "enkf"
+    analysis = staticmethod(perturbed_analysis)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import ClassVar
 
 from filters import matrices
@@ -15,9 +15,10 @@ from filters.model import StateSpaceModel
 from filters.rows import constants_form, constants_reader, memory_places, number_places
 from thruster_env.compiled import inlined
 from thruster_env.components import (
+    matrix_of,
     matrix_reader,
     matrix_writer,
-    tuple_of,
+    scaled_sum,
     vector_reader,
     vector_writer,
     written_out,
@@ -46,107 +47,212 @@ def nothing_to_summarise(memory, size):
 
 
 @lru_cache(maxsize=64)
-def gaussian_correction(n: int, m: int) -> Callable:
-    """Return `correct(row, z, predicted, h, numbers)`: the Kalman update of the belief in a row.
+def gaussian_innovation(n: int, m: int) -> Callable:
+    """Return `compare(p, z, predicted, h, r)`: what a measurement says, and how sure it is.
 
-    innovation = z - predicted, S = H P H' + R, K = P H' S^-1, mean += K innovation,
-    P = (I - K H) P (I - K H)' + K R K' (Joseph's form). Channels that are NaN in z have no effect.
+    It returns innovation = z - predicted, S = H P H' + R, the lower triangular root of S, P H', and H and R as
+    they are without the channels that are NaN in z: zeros in the innovation and in H, no correlations in R.
     """
+    mask, factor, present, silent = (
+        matrices.masked(m),
+        matrices.cholesky_factor(m),
+        matrices.innovation(m),
+        silenced(m, n),
+    )
+    p_ht, s_part, add = (
+        matrices.transposed_multiplier(n, n, m),
+        matrices.multiplier(m, n, m),
+        matrices.symmetric_sum(m),
+    )
+
+    @inlined
+    def compare(p, z, predicted, observation_matrix, noise):
+        h = silent(observation_matrix, z)
+        r = mask(noise, z)
+        cross = p_ht(p, h)
+        s = add(s_part(h, cross), r)
+        return present(z, predicted), s, factor(s), cross, h, r
+
+    return compare
+
+
+@lru_cache(maxsize=64)
+def joseph_form(n: int, m: int) -> Callable:
+    """Return `reduce(p, k, h, r)`: (I - K H) P (I - K H)' + K R K', which is positive for any gain K."""
+    less, k_h, times = matrices.identity_less(n), matrices.multiplier(n, m, n), matrices.multiplier(n, n, n)
+    times_transposed, add = matrices.transposed_multiplier(n, n, n), matrices.symmetric_sum(n)
+    k_r, k_r_kt = matrices.multiplier(n, m, m), matrices.transposed_multiplier(n, m, n)
+
+    @inlined
+    def reduce(p, k, h, r):
+        rest = less(k_h(k, h))
+        return add(times_transposed(times(rest, p), rest), k_r_kt(k_r(k, r), k))
+
+    return reduce
+
+
+@lru_cache(maxsize=64)
+def gaussian_update(n: int, m: int) -> Callable:
+    """Return `condition(mean, p, z, predicted, h, r)`: the Kalman update, as a function of tuples.
+
+    innovation = z - predicted, S = H P H' + R, K = P H' S^-1, mean + K innovation,
+    (I - K H) P (I - K H)' + K R K' (Joseph's form). Channels that are NaN in z have no effect. It returns the new
+    mean and covariance, the innovation, S and the log-likelihood.
+    """
+    compare, reduce, likelihood = gaussian_innovation(n, m), joseph_form(n, m), matrices.innovation_likelihood(m)
+    solve, apply, add = matrices.row_solver(n, m), matrices.vector_multiplier(n, m), scaled_sum(n)
+
+    @inlined
+    def condition(mean, p, z, predicted, observation_matrix, noise):
+        innovation, s, root, cross, h, r = compare(p, z, predicted, observation_matrix, noise)
+        k = solve(cross, root)
+        mean = add(mean, 1.0, apply(k, innovation))
+        return mean, reduce(p, k, h, r), innovation, s, likelihood(innovation, root, z)
+
+    return condition
+
+
+@cache
+def silenced(m: int, columns: int) -> Callable:
+    """Return `silent(h, z)`: the matrix h (m, columns) with zero rows for channels that are NaN in z."""
+    source = matrix_of(m, columns, lambda i, j: f"(h[{i}][{j}] if z[{i}] == z[{i}] else 0.0)")
+    return written_out("silent", "h, z", source)
+
+
+@lru_cache(maxsize=64)
+def gaussian_correction(n: int, m: int) -> Callable:
+    """Return `correct(row, z, predicted, h, r)`: `gaussian_update` of the belief in a row."""
+    places = memory_places(n, m)
+    read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
+    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
+    store_innovation = vector_writer(m, places.innovation)
+    store_innovation_cov = matrix_writer(m, m, places.innovation_cov)
+    log_likelihood_place, condition = places.log_likelihood, gaussian_update(n, m)
+
+    @inlined
+    def correct(row, z, predicted, observation_matrix, r):
+        mean, p, innovation, s, log_likelihood = condition(
+            read_mean(row), read_cov(row), z, predicted, observation_matrix, r
+        )
+        store_mean(row, mean)
+        store_cov(row, p)
+        store_innovation(row, innovation)
+        store_innovation_cov(row, s)
+        row[log_likelihood_place] = log_likelihood
+
+    return correct
+
+
+@inlined
+def nothing_at_first(memory, u, numbers, size):
+    """A prediction that starts with its first substep."""
+
+
+@lru_cache(maxsize=64)
+def in_stages(n: int, m: int, begin: Callable, advance: Callable, finish: Callable) -> Callable:
+    """Return `predict(memory, u, numbers, size)`: begin, advance in each of the model's substeps, finish."""
+    substeps_place = number_places(n, m).substeps
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        begin(memory, u, numbers, size)
+        for _ in range(int(numbers[substeps_place])):
+            advance(memory, u, numbers, size)
+        finish(memory, u, numbers, size)
+
+    return predict
+
+
+@lru_cache(maxsize=64)
+def extended_motion(transition, transition_jacobian, n, m, inputs, form) -> Callable:
+    """Return `advance(row, u, numbers)`: mean = f(mean, u), P = F P F' over one substep."""
     places, source = memory_places(n, m), number_places(n, m)
     read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
     store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
-    read_r = matrix_reader(m, m, source.r)
-    store_innovation = vector_writer(m, places.innovation)
-    store_innovation_cov = matrix_writer(m, m, places.innovation_cov)
-    log_likelihood_place = places.log_likelihood
-    mask, factor, likelihood = (
-        matrices.masked(m),
-        matrices.cholesky_factor(m),
-        matrices.innovation_likelihood(m),
+    constants, control = constants_reader(n, m, form), vector_reader(inputs)
+    read_scales, transition_matrix = (
+        vector_reader(n, source.scales),
+        jacobian(transition, transition_jacobian, n, n, "u, c"),
     )
-    p_ht, s_part, solve = (
-        matrices.transposed_multiplier(n, n, m),
-        matrices.multiplier(m, n, m),
-        matrices.row_solver(n, m),
-    )
-    add_m, add_n, less = matrices.symmetric_sum(m), matrices.symmetric_sum(n), matrices.identity_less(n)
-    k_h, times, times_transposed = (
-        matrices.multiplier(n, m, n),
-        matrices.multiplier(n, n, n),
-        matrices.transposed_multiplier(n, n, n),
-    )
-    k_r, k_r_kt, apply = (
-        matrices.multiplier(n, m, m),
-        matrices.transposed_multiplier(n, m, n),
-        matrices.vector_multiplier(n, m),
-    )
-    present = matrices.innovation(m)
-    silent = written_out(
-        "silent",
-        "h, z",
-        tuple_of(tuple_of(f"h[{i}][{j}] if z[{i}] == z[{i}] else 0.0" for j in range(n)) for i in range(m)),
-    )
-    moved = written_out("moved", "x, d", tuple_of(f"x[{i}] + d[{i}]" for i in range(n)))
+    times, times_transposed = matrices.multiplier(n, n, n), matrices.transposed_multiplier(n, n, n)
 
     @inlined
-    def correct(row, z, predicted, observation_matrix, numbers):
-        p = read_cov(row)
-        h = silent(observation_matrix, z)
-        r = mask(read_r(numbers), z)
-        innovation = present(z, predicted)
-        cross = p_ht(p, h)
-        s = add_m(s_part(h, cross), r)
-        root = factor(s)
-        k = solve(cross, root)
-        store_mean(row, moved(read_mean(row), apply(k, innovation)))
-        rest = less(k_h(k, h))
-        store_cov(row, add_n(times_transposed(times(rest, p), rest), k_r_kt(k_r(k, r), k)))
-        store_innovation(row, innovation)
-        store_innovation_cov(row, s)
-        row[log_likelihood_place] = likelihood(innovation, root, z)
+    def advance(row, u, numbers):
+        mean, v, c = read_mean(row), control(u), constants(numbers)
+        f = transition_matrix(mean, read_scales(numbers), v, c)
+        store_mean(row, transition(mean, v, c))
+        store_cov(row, times_transposed(times(f, read_cov(row)), f))
 
-    return correct
+    return advance
+
+
+@lru_cache(maxsize=64)
+def noise_added(n: int, m: int) -> Callable:
+    """Return `settle(row, q)`: P += Q, and one more step is counted."""
+    places, add = memory_places(n, m), matrices.symmetric_sum(n)
+    step_place = places.step
+    read_cov, store_cov = matrix_reader(n, n, places.cov), matrix_writer(n, n, places.cov)
+
+    @inlined
+    def settle(row, q):
+        store_cov(row, add(read_cov(row), q))
+        row[step_place] += 1.0
+
+    return settle
+
+
+@lru_cache(maxsize=64)
+def extended_prediction(transition, transition_jacobian, n, m, inputs, form) -> Callable:
+    """Return `move(row, u, numbers, q)`: the extended filter's prediction of the belief in a row."""
+    substeps_place, settle = number_places(n, m).substeps, noise_added(n, m)
+    advance = extended_motion(transition, transition_jacobian, n, m, inputs, form)
+
+    @inlined
+    def move(row, u, numbers, q):
+        for _ in range(int(numbers[substeps_place])):
+            advance(row, u, numbers)
+        settle(row, q)
+
+    return move
 
 
 @lru_cache(maxsize=64)
 def extended_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form) -> Kernels:
     """Kernels of the extended Kalman filter for model functions and sizes."""
-    places, source = memory_places(n, m), number_places(n, m)
-    substeps_place, step_place = source.substeps, places.step
-    read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
-    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
-    read_q, constants = matrix_reader(n, n, source.q), constants_reader(n, m, form)
-    control, measured, read_scales = vector_reader(inputs), vector_reader(m), vector_reader(n, source.scales)
-    transition_matrix = jacobian(transition, transition_jacobian, n, n, "u, c")
+    source, read_mean = number_places(n, m), vector_reader(n, memory_places(n, m).mean)
+    read_q, read_r, constants = (
+        matrix_reader(n, n, source.q),
+        matrix_reader(m, m, source.r),
+        constants_reader(n, m, form),
+    )
+    measured, read_scales = vector_reader(m), vector_reader(n, source.scales)
     observation_matrix = jacobian(observe, observe_jacobian, m, n, "c")
-    times, times_transposed = matrices.multiplier(n, n, n), matrices.transposed_multiplier(n, n, n)
-    add, correct = matrices.symmetric_sum(n), gaussian_correction(n, m)
+    advance = extended_motion(transition, transition_jacobian, n, m, inputs, form)
+    settle, correct = noise_added(n, m), gaussian_correction(n, m)
 
     @inlined
-    def predict(memory, u, numbers, size):
-        row, _, _ = memory
-        mean, p = read_mean(row), read_cov(row)
-        v, c, scales = control(u), constants(numbers), read_scales(numbers)
-        for _ in range(int(numbers[substeps_place])):
-            f = transition_matrix(mean, scales, v, c)
-            mean = transition(mean, v, c)
-            p = times_transposed(times(f, p), f)
-        store_mean(row, mean)
-        store_cov(row, add(p, read_q(numbers)))
-        row[step_place] += 1.0
+    def substep(memory, u, numbers, size):
+        advance(memory[0], u, numbers)
+
+    @inlined
+    def finish(memory, u, numbers, size):
+        settle(memory[0], read_q(numbers))
 
     @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
         mean, c = read_mean(row), constants(numbers)
-        correct(row, measured(z), observe(mean, c), observation_matrix(mean, read_scales(numbers), c), numbers)
+        h = observation_matrix(mean, read_scales(numbers), c)
+        correct(row, measured(z), observe(mean, c), h, read_r(numbers))
 
-    return Kernels(n, m, n, 0, gaussian_start(n, m), predict, update, nothing_to_summarise)
+    stages = nothing_at_first, substep, finish
+    predict, start = in_stages(n, m, *stages), gaussian_start(n, m)
+    return Kernels(n, m, n, 0, start, predict, update, nothing_to_summarise, stages=stages)
 
 
-def kernels_of(model: StateSpaceModel) -> Kernels:
-    """Extended Kalman kernels for a model."""
-    return extended_kernels(
+def kernels_of(model: StateSpaceModel, build: Callable[..., Kernels] = extended_kernels) -> Kernels:
+    """Kernels for a model, by default extended Kalman ones; build takes the arguments of `extended_kernels`."""
+    return build(
         inlined(model.transition),
         model.transition_jacobian,
         inlined(model.observe),

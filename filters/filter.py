@@ -27,6 +27,8 @@ class Filter:
 
     name: ClassVar[str]
     varying_noise: ClassVar[bool] = True  # whether Q and R may differ from step to step
+    has_covariance: ClassVar[bool] = True  # if not, covariances and log-likelihoods are zero and say nothing
+    gaussian_likelihood: ClassVar[bool] = True  # whether the log-likelihood is that of N(innovation; 0, S)
     model: StateSpaceModel
 
     def kernels(self) -> Kernels:

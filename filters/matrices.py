@@ -12,6 +12,8 @@ from functools import cache
 
 from thruster_env.components import matrix_of, tuple_of, written_out
 
+RESOLUTION = 1e-15  # of the difference of two float64, relative to them
+
 
 @cache
 def multiplier(rows: int, inner: int, columns: int) -> Callable:
@@ -104,6 +106,25 @@ def cholesky_factor(size: int) -> Callable:
 
 
 @cache
+def semidefinite_factor(size: int) -> Callable:
+    """Return `factor(a)`: the lower triangular L with L L' = a, for a that may be singular.
+
+    A column whose pivot is no more than rounding is zero.
+    """
+    lines = []
+    for j in range(size):
+        rest = "".join(f" - l{j}_{k} * l{j}_{k}" for k in range(j))
+        lines.append(f"d = a[{j}][{j}]{rest}")
+        lines.append(f"l{j}_{j} = d ** 0.5 if not d <= {RESOLUTION} * a[{j}][{j}] else 0.0")
+        lines.append(f"r = 1.0 / l{j}_{j} if l{j}_{j} != 0.0 else 0.0")
+        for i in range(j + 1, size):
+            rest = "".join(f" - l{i}_{k} * l{j}_{k}" for k in range(j))
+            lines.append(f"l{i}_{j} = (a[{i}][{j}]{rest}) * r")
+    result = matrix_of(size, size, lambda i, j: f"l{i}_{j}" if j <= i else "0.0")
+    return written_out("factor", "a", *lines, result)
+
+
+@cache
 def row_solver(rows: int, size: int) -> Callable:
     """Return `solve(b, l)`: b (l l')^-1, for b of shape (rows, size) and l lower triangular."""
     lines = []
@@ -118,6 +139,27 @@ def row_solver(rows: int, size: int) -> Callable:
 
 
 @cache
+def triangle_divider(rows: int, size: int) -> Callable:
+    """Return `divide(b, l)`: b l^-1, for b of shape (rows, size) and l lower triangular."""
+    lines = []
+    for r in range(rows):
+        for i in reversed(range(size)):
+            rest = "".join(f" - l[{k}][{i}] * x{r}_{k}" for k in range(i + 1, size))
+            lines.append(f"x{r}_{i} = (b[{r}][{i}]{rest}) / l[{i}][{i}]")
+    return written_out("divide", "b, l", *lines, matrix_of(rows, size, lambda r, i: f"x{r}_{i}"))
+
+
+@cache
+def forward_solver(size: int) -> Callable:
+    """Return `solve(l, v)`: the tuple l^-1 v, for l lower triangular and v of `size` components."""
+    lines = []
+    for i in range(size):
+        rest = "".join(f" - l[{i}][{k}] * y{k}" for k in range(i))
+        lines.append(f"y{i} = (v[{i}]{rest}) / l[{i}][{i}]")
+    return written_out("solve", "l, v", *lines, tuple_of(f"y{i}" for i in range(size)))
+
+
+@cache
 def innovation_likelihood(size: int) -> Callable:
     """Return `log_likelihood(v, l, z)`: log N(v; 0, l l') over the channels that are not NaN in z."""
     lines = ["total = 0.0"]
@@ -127,3 +169,50 @@ def innovation_likelihood(size: int) -> Callable:
         lines.append(f"if z[{i}] == z[{i}]:")
         lines.append(f"    total -= 0.5 * y{i} * y{i} + log(l[{i}][{i}]) + {0.5 * math.log(2.0 * math.pi)!r}")
     return written_out("log_likelihood", "v, l, z", *lines, "total", log=math.log)
+
+
+@cache
+def square(rows: int, columns: int) -> Callable:
+    """Return `square(a)`: a a', exactly symmetric, for a of shape (rows, columns)."""
+    lines = (
+        f"p{i}_{j} = " + " + ".join(f"a[{i}][{k}] * a[{j}][{k}]" for k in range(columns))
+        for i in range(rows)
+        for j in range(i + 1)
+    )
+    return written_out("square", "a", *lines, matrix_of(rows, rows, lambda i, j: f"p{max(i, j)}_{min(i, j)}"))
+
+
+@cache
+def factored_inverse(size: int) -> Callable:
+    """Return `invert(l)`: (l l')^-1 = W' W with W = l^-1, exactly symmetric, for l lower triangular."""
+    lines = []
+    for j in range(size):
+        lines.append(f"w{j}_{j} = 1.0 / l[{j}][{j}]")
+        for i in range(j + 1, size):
+            rest = " + ".join(f"l[{i}][{k}] * w{k}_{j}" for k in range(j, i))
+            lines.append(f"w{i}_{j} = -({rest}) / l[{i}][{i}]")
+    for i in range(size):
+        for j in range(i + 1):
+            lines.append(f"p{i}_{j} = " + " + ".join(f"w{k}_{i} * w{k}_{j}" for k in range(i, size)))
+    return written_out("invert", "l", *lines, matrix_of(size, size, lambda i, j: f"p{max(i, j)}_{min(i, j)}"))
+
+
+@cache
+def triangular_root(rows: int, columns: int) -> Callable:
+    """Return `triangle(a)`: the lower triangular L (rows, rows) with L L' = a a', for a of shape (rows, columns).
+
+    Its rows are those of a in the basis that Gram and Schmidt's method makes of them: the modified method, whose
+    L is as accurate as Householder's. Source: Bjorck (1967), "Solving linear least squares problems by
+    Gram-Schmidt orthogonalization".
+    """
+    lines = [f"a{i}_{j} = a[{i}][{j}]" for i in range(rows) for j in range(columns)]
+    for i in range(rows):
+        lines.append(f"l{i}_{i} = ({' + '.join(f'a{i}_{j} * a{i}_{j}' for j in range(columns))}) ** 0.5")
+        lines.append(f"r = 1.0 / l{i}_{i} if l{i}_{i} != 0.0 else 0.0")
+        lines += [f"a{i}_{j} = a{i}_{j} * r" for j in range(columns)]
+        for k in range(i + 1, rows):
+            lines.append(f"l{k}_{i} = " + " + ".join(f"a{i}_{j} * a{k}_{j}" for j in range(columns)))
+            lines += [f"a{k}_{j} = a{k}_{j} - l{k}_{i} * a{i}_{j}" for j in range(columns)]
+    return written_out(
+        "triangle", "a", *lines, matrix_of(rows, rows, lambda i, j: f"l{i}_{j}" if j <= i else "0.0")
+    )

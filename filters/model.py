@@ -37,6 +37,10 @@ class StateSpaceModel:
         substeps: how often `transition` is applied in one step.
         operating_state: x* (n,) about which a Kalman filter approximates the model; None for affine models.
         operating_input: u* (p,), the input that goes with it.
+        operating_points: `operating_points(count)` gives so many pairs (x*, u*) over the range of the one input,
+            in its order, between which a Kalman filter may be scheduled; None if unknown.
+        state_low: the smallest state of normal operation, by components (n,); None if unknown.
+        state_high: the largest one (n,).
     """
 
     transition: Callable
@@ -52,6 +56,9 @@ class StateSpaceModel:
     substeps: int = 1
     operating_state: Any = None
     operating_input: Any = None
+    operating_points: Callable | None = None
+    state_low: Any = None
+    state_high: Any = None
 
     def __post_init__(self):
         """Check shapes and signs; raise ValueError that states the rule and the value."""
@@ -66,7 +73,8 @@ class StateSpaceModel:
             "substeps": at_least("substeps", self.substeps, 1),
             "inputs": at_least("inputs", self.inputs, 0),
         }
-        for name, size in (("operating_state", n), ("operating_input", checked["inputs"])):
+        sizes = {"operating_state": n, "operating_input": checked["inputs"], "state_low": n, "state_high": n}
+        for name, size in sizes.items():
             if getattr(self, name) is not None:
                 checked[name] = vector(name, getattr(self, name), size)
         for name, value in checked.items():

@@ -7,15 +7,54 @@ import json
 from pathlib import Path
 from typing import Any
 
+from filters.auxiliary import AuxiliaryParticleFilter
+from filters.baselines import Inversion, LowPass, OpenLoop
+from filters.cubature import CubatureKalmanFilter
+from filters.deterministic import DeterministicEnsembleKalmanFilter
 from filters.ensemble import EnsembleKalmanFilter
 from filters.extended import ExtendedKalmanFilter
 from filters.filter import Filter
+from filters.fuzzy import FuzzyKalmanFilter
+from filters.gaussian_sum import GaussianSumFilter
+from filters.iterated import IteratedExtendedKalmanFilter
+from filters.iterated_ensemble import IteratedEnsembleKalmanFilter
 from filters.kalman import KalmanFilter
 from filters.model import StateSpaceModel
+from filters.particle import ParticleFilter
+from filters.robust import RobustExtendedKalmanFilter
+from filters.sage_husa import SageHusaFilter
+from filters.serial import SerialSquareRootFilter
+from filters.steady_state import SteadyStateKalmanFilter
+from filters.transform import EnsembleTransformFilter
+from filters.unscented import UnscentedKalmanFilter
+from filters.variational import VariationalBayesFilter
 from thruster_env.checks import one_of, shown
 
 FILTERS: dict[str, type[Filter]] = {
-    kind.name: kind for kind in (KalmanFilter, ExtendedKalmanFilter, EnsembleKalmanFilter)
+    kind.name: kind
+    for kind in (
+        KalmanFilter,
+        SteadyStateKalmanFilter,
+        ExtendedKalmanFilter,
+        IteratedExtendedKalmanFilter,
+        UnscentedKalmanFilter,
+        CubatureKalmanFilter,
+        EnsembleKalmanFilter,
+        EnsembleTransformFilter,
+        SerialSquareRootFilter,
+        DeterministicEnsembleKalmanFilter,
+        IteratedEnsembleKalmanFilter,
+        ParticleFilter,
+        AuxiliaryParticleFilter,
+        GaussianSumFilter,
+        FuzzyKalmanFilter,
+        SageHusaFilter,
+        VariationalBayesFilter,
+        RobustExtendedKalmanFilter,
+        OpenLoop,
+        LowPass,
+        Inversion,
+    )
 }
 FILE_FORMAT = "thruster-env tuned filter"
 FILE_VERSION = 1

@@ -32,7 +32,7 @@ class Session:
         self._kept_rows, self._noise_places = kernels.kept_rows, number_places(n, m)
         self._memory = new_memory(kernels, size)
         self._row, self._table, _ = self._memory
-        self._extras = self._row[places.extras :]
+        self._extras = self._row[places.extras : places.extras + kernels.extras]
         self._u, self._z = np.zeros(model.inputs), np.full(m, np.nan)
         self._scalar = len(self._u) == m == 1
         self._given = (*self._memory, size, self._u, self._z, self._numbers)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from thruster_env.linear import steady_state, zero_order_hold
 from thruster_env.parameters import ThrusterParameters, checked
 from thruster_env.plant import Plant, make_plant
 from thruster_env.rendering import Overlay
-
 
 ENV_IDS = tuple(f"BowThruster{task}-v0" for task in ("", "Tracking", "Reversal", "Linear"))
 
@@ -139,6 +138,8 @@ def model_of_plant(
         substeps=plant.substeps,
         operating_state=steady_state(plant.parameters, operating_voltage, plant.ambient_velocity)[:2],
         operating_input=[operating_voltage],
+        operating_points=partial(_operating_points, plant),
+        **_operating_range(plant),
     )
 
 
@@ -158,9 +159,17 @@ def model_of_env(env, **changes) -> StateSpaceModel:
     return model_of_plant(plant, **changes)
 
 
+def thrusts_of(model: StateSpaceModel, states: np.ndarray) -> np.ndarray:
+    """Thrust [N] that a model of the thruster has at states (..., 2); NaN for a linear plant's model."""
+    if not isinstance(model.constants, Constants):
+        return np.full(states.shape[:-1], np.nan)
+    return thrust_and_torque((states[..., 0], states[..., 1]), model.constants)[0]
+
+
 def overlay_of(label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
     """What a rendered thruster shows of a belief: the state and its thrust, each with a standard deviation."""
-    (omega, flow), (omega_std, flow_std) = mean.tolist(), np.sqrt(np.diag(cov)).tolist()
+    # A model may have more states, such as parameters, behind these two.
+    (omega, flow), (omega_std, flow_std) = mean[:2].tolist(), np.sqrt(np.diag(cov))[:2].tolist()
     if not isinstance(model.constants, Constants):  # a linear plant's model
         return Overlay(label, None, None, omega, omega_std, flow, flow_std)
     thrust, _ = thrust_and_torque((omega, flow), model.constants)
@@ -186,6 +195,22 @@ def _linear_model(plant: Plant) -> StateSpaceModel:
         prior_mean=plant.initial_mean,
         prior_cov=plant.initial_cov,
     )
+
+
+def _operating_points(plant: Plant, count: int) -> list[tuple[tuple[float, float], tuple[float]]]:
+    """Steady states and their voltages, evenly from -max_voltage to max_voltage."""
+    voltages = np.linspace(-plant.max_voltage, plant.max_voltage, count).tolist()
+    return [(steady_state(plant.parameters, v, plant.ambient_velocity)[:2], (v,)) for v in voltages]
+
+
+def _operating_range(plant: Plant) -> dict[str, np.ndarray]:
+    """Smallest and largest state that the voltages settle to, ambient flow added."""
+    ends = [steady_state(plant.parameters, sign * plant.max_voltage)[:2] for sign in (1.0, -1.0)]
+    flow = np.array([0.0, plant.ambient_velocity])
+    return {
+        "state_low": np.min(ends, axis=0) + np.minimum(flow, 0.0),
+        "state_high": np.max(ends, axis=0) + np.maximum(flow, 0.0),
+    }
 
 
 def _scaled(parameters: ThrusterParameters, factors: Mapping[str, float]) -> ThrusterParameters:

@@ -78,6 +78,19 @@ def test_tune_resume_evaluate_and_wrap(thruster, as_json, tmp_path):
     np.testing.assert_allclose(env.filter.model.constants, expected, rtol=1e-12)
 
 
+def test_evaluate_says_and_draws_whether_a_filter_is_honest(thruster, as_json, tmp_path):
+    options = "evaluate", "--filter", "ekf", "--seeds", 30, "--consistency"
+    done = thruster(*options, "new/honest.png")
+    words = " ".join(done.stdout.split())
+    for part in ("Underconfident: mean NEES", "Innovations are not white", "To try: lower Q", "untuned over true"):
+        assert part in words
+    assert (tmp_path / "new" / "honest.png").read_bytes().startswith(b"\x89PNG")
+    found = as_json(*options, "again.png")["consistency"]
+    assert found["nees"]["mean"][0] < found["nees"]["right"] == 2.0
+    assert found["picture"] == "again.png" and len(found["sentences"]) == 13
+    assert thruster("evaluate", "--help").stdout.count("honest.png") == 1
+
+
 def test_simulate_writes_what_the_env_does_with_units_in_the_header(thruster, tmp_path):
     done = thruster("simulate", "--out", "run.csv", "--seed", 4, "--voltage", 9, "--steps", 20)
     assert done.returncode == 0, done.stderr
@@ -155,7 +168,7 @@ def test_help_teaches(command, thruster):
 
 
 BAD = [
-    (("tune", "--filter", "none"), "filter must be one of kf, ekf, enkf, but got 'none'"),
+    (("tune", "--filter", "none"), "filter must be one of kf, kf-steady, ekf, "),
     (("tune", "--scenario", "none"), "scenario must be one of"),
     (("tune", "--trials", "0"), "trials must be a whole number of at least 1, but got 0"),
     (("tune", "--storage", "sqlite:////no/such/folder/x.db"), "storage must be a database that can be reached"),
@@ -166,6 +179,9 @@ BAD = [
     (("evaluate", "--tuned", "old.json"), "a tuned file must be of version 1, but got 0"),
     (("evaluate",), "give either --tuned FILE or --filter NAME"),
     (("evaluate", "--filter", "ekf", "--seeds", "1"), "held-out seeds must be a whole number of at least 2"),
+    (("evaluate", "--filter", "ekf", "--consistency", "x.pdf"), "--consistency must end in .png, but got 'x.pdf'"),
+    (("evaluate", "--filter", "ekf", "--consistency", "text.txt/x.png"), "must be where it can be written"),
+    (("evaluate", "--filter", "open-loop", "--consistency", "x.png"), "must be for a filter with a covariance"),
     (("inspect", "--preset", "none"), "preset must be one of"),
     (("inspect", "--dt", "-1"), "dt must be positive, but got -1.0"),
     (("inspect", "--voltage", "30"), "voltage must be within plus and minus 24, but got 30.0"),

@@ -1,12 +1,14 @@
 import numpy as np
 import pytest
 
-from filters import affine_model
+from filters import affine_model, make_filter, thruster_model, truth
 from filters.bounds import posterior_bound, riccati_covariances
 from filters.consistency import normalized_squares
+from thruster_env.compiled import interpreted
 from tuning.evaluate import evaluate, score_ratio
 from tuning.scenarios import find_scenario, held_out_seeds
 from tuning.space import choice_of, parameters_of, true_choice, untuned_choice
+from tuning.tuned import summary
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +59,35 @@ def test_the_untuned_ekf_is_worse_and_the_paired_interval_says_so(ekf, untuned_e
     assert ratio.high - ratio.low < unpaired
 
 
+def test_rmse_of_thrust_is_that_of_the_model_s_thrust_at_the_estimate(nominal, data, ekf):
+    from filters import run
+    from filters.thruster import observe
+
+    filter_ = true_choice("ekf", nominal).filter(nominal)
+    estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
+    states = np.moveaxis(estimates.means, -1, 0)
+    errors = observe((states[0], states[1]), filter_.model.constants)[0] - data.thrusts
+    assert ekf.thrust_rmse.value == pytest.approx(np.sqrt((errors[:, 50:] ** 2).mean()), rel=1e-12)
+    assert ekf.thrust_rmse.low < ekf.thrust_rmse.value < ekf.thrust_rmse.high
+
+
+def test_steps_without_a_measurement_do_not_lower_the_mean_nis(nominal, data):
+    lost = np.random.default_rng(0).random(data.measurements.shape) < 0.3
+    gappy = data._replace(measurements=np.where(lost, np.nan, data.measurements))
+    evaluation = evaluate(true_choice("ekf", nominal).filter(nominal), gappy, nominal.scale)
+    assert evaluation.nis.low < 1.0 < evaluation.nis.high
+
+
+def test_a_filter_without_covariance_is_judged_by_its_errors_only(nominal, data):
+    few = data._replace(**{name: part[:3] for name, part in zip(data._fields, data, strict=True)})
+    with interpreted():
+        evaluation = evaluate(make_filter("low-pass", nominal.model()), few, nominal.scale)
+    assert np.isnan([evaluation.nees, evaluation.nis]).all() and np.isnan(evaluation.log_likelihood)
+    assert np.isfinite(evaluation.rmse).all() and np.isfinite(evaluation.thrust_rmse).all()
+    said = summary(evaluation)
+    assert said["nees"] is said["nis"] is said["log_likelihood"] is None
+
+
 def test_a_choice_survives_its_trial_parameters(nominal):
     choice = untuned_choice("enkf", nominal).with_size(17)
     again = choice_of("enkf", parameters_of(choice), nominal)
@@ -103,6 +134,37 @@ def test_on_a_linear_model_the_bound_is_the_kalman_covariance_at_every_step():
         p = p - p @ c.T @ np.linalg.inv(c @ p @ c.T + model.measurement_noise_cov) @ c @ p
         np.testing.assert_allclose(bound[k], p, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(bound[-1], riccati_covariances(model)[1], rtol=1e-6)
+
+
+def test_on_the_thruster_the_bound_is_the_naive_recursion_on_the_same_truths():
+    model, truths = thruster_model(), 30
+    inputs = np.repeat(np.random.default_rng(8).uniform(-12, 12, size=(2, 3, 1)), 10, axis=1)
+    bound = posterior_bound(model, inputs, truths=truths, seed=5)
+    keys = np.random.default_rng(5).integers(0, 2**32, size=(2, truths, 2))
+    q, r, c = np.linalg.inv(model.process_noise_cov), np.linalg.inv(model.measurement_noise_cov), model.constants
+
+    def information_of(states):
+        slopes = [np.array(model.observe_jacobian(tuple(x), c)) for x in states]
+        return np.mean([h.T @ r @ h for h in slopes], axis=0)
+
+    def slopes_of(x, u):
+        chain, x = np.eye(2), tuple(x)
+        for _ in range(model.substeps):
+            chain = np.array(model.transition_jacobian(x, u, c)) @ chain
+            x = model.transition(x, u, c)
+        return chain
+
+    for b in range(2):
+        drawn = truth.simulate(model, keys[b], np.repeat(inputs[b : b + 1], truths, axis=0)).states
+        j = np.linalg.inv(model.prior_cov) + information_of(drawn[:, 0])  # equation 21 with no motion yet
+        np.testing.assert_allclose(bound[b, 0], np.linalg.inv(j), rtol=1e-9)
+        for k in range(30):
+            f = np.array([slopes_of(x, tuple(inputs[b, k])) for x in drawn[:, k]])
+            d11 = np.mean(np.swapaxes(f, 1, 2) @ q @ f, axis=0)
+            d12 = -f.mean(axis=0).T @ q
+            d22 = q + information_of(drawn[:, k + 1])
+            j = d22 - d12.T @ np.linalg.inv(j + d11) @ d12
+            np.testing.assert_allclose(bound[b, k + 1], np.linalg.inv(j), rtol=1e-8)
 
 
 def test_the_bound_starts_from_a_prior_without_spread_and_refuses_a_singular_q():

@@ -46,14 +46,15 @@ def test_filters_go_by_their_names():
 
 
 def test_a_filter_is_made_by_name_with_its_own_numbers():
-    assert [tunable_numbers(name) for name in ("kf", "ekf", "enkf")] == [(), (), ("ensemble_size",)]
+    ensemble = "ensemble_size", "inflation", "relaxation"
+    assert [tunable_numbers(name) for name in ("ekf", "enkf")] == [(), ensemble]
     made = make_filter("enkf", thruster_model(), ensemble_size=7)
     assert isinstance(made, EnsembleKalmanFilter)
     assert made.ensemble_size == made.size == 7
 
 
 def test_an_unknown_filter_is_refused_with_the_known_names():
-    with pytest.raises(ValueError, match=r"filter must be one of kf, ekf, enkf.* but got 'no filter'"):
+    with pytest.raises(ValueError, match=r"filter must be one of kf, .*enkf, .* but got 'no filter'"):
         make_filter("no filter", thruster_model())
 
 
@@ -79,8 +80,8 @@ def test_a_tuned_file_is_read_as_it_was_written(write):
         ({key: TUNED[key] for key in ("format", "filter")}, "version 1, but got None"),
         ({key: TUNED[key] for key in ("format", "version")}, "name, numbers and model"),
         ({**TUNED, "filter": {"name": "ekf"}}, "name, numbers and model"),
-        (changed(name="no filter"), "one of kf, ekf, enkf.* but got 'no filter'"),
-        (changed(name=["enkf"]), "one of kf, ekf, enkf.* but"),
+        (changed(name="no filter"), "one of kf, .*enkf, .* but got 'no filter'"),
+        (changed(name=["enkf"]), "one of kf, .*enkf, .* but"),
         (changed(numbers=3), "numbers"),
         (changed(numbers=[20]), "numbers"),
         (changed(model=None), "model"),

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from thruster_cli.honesty import check_request, judge
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
 from thruster_cli.tables import choice_table, comparison_table
 from tuning.scenarios import find_scenario
@@ -22,10 +23,23 @@ def command(
     ] = None,
     scenario: Annotated[str | None, typer.Option(help="Another scenario than the tuned file's.")] = None,
     seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,
+    consistency: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Also say whether the filter is as sure of itself as it may be, and draw that: a .png file.",
+        ),
+    ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Run a filter on held-out seeds of a scenario, beside the untuned filter and the one with the true Q, R."""
+    """Run a filter on held-out seeds of a scenario, beside the untuned filter and the one with the true Q, R.
+
+    With --consistency its errors and innovations are held against its own covariances: NEES, NIS, whiteness,
+    coverage, CRPS and, for ensembles, ranks; a sentence each, and a picture of all.
+
+    Example: thruster evaluate --filter enkf --scenario mismatch --consistency honest.png
+    """
     if (tuned is None) == (filter_name is None):
         raise ValueError("give either --tuned FILE or --filter NAME")
     if tuned is not None:
@@ -34,6 +48,8 @@ def command(
     else:
         chosen = find_scenario(scenario or "nominal")
         choice = untuned_choice(filter_name, chosen)
+    if consistency is not None:
+        check_request(consistency, choice.name)
     announce_compilation()
     with progress_console.status(f"{choice.name} on {seeds} seeds of {chosen.name} ..."):
         proof = prove(choice, chosen, seed, seeds)
@@ -49,4 +65,10 @@ def command(
         **{name: summary(evaluation) for name, evaluation in evaluations.items()},
     }
     title = f"RMSE on held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
-    emit([choice_table(choices, chosen), comparison_table(evaluations, proof.bound, title)], data, json)
+    shown = [choice_table(choices, chosen), comparison_table(evaluations, proof.bound, title)]
+    if consistency is not None:
+        name = "untuned" if tuned is None else "tuned"
+        with progress_console.status("checking the covariance ..."):
+            said, data["consistency"] = judge(choice, name, chosen, proof, consistency)
+        shown += said
+    emit(shown, data, json)

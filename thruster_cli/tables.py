@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isnan
 
 import numpy as np
 from rich.table import Table
@@ -38,21 +39,25 @@ def comparison_table(evaluations: Mapping[str, Evaluation], bound: np.ndarray, t
     for name, evaluation in evaluations.items():
         above = [100.0 * (rmse.value / b - 1.0) for rmse, b in zip(evaluation.rmse, bound, strict=True)]
         speed, flow = evaluation.rmse
-        honesty = f"{evaluation.nees.value:.3g}", f"{evaluation.nis.value:.3g}"
-        rows.append(
-            [name, about(speed, 3), f"{round(above[0]):+d} %", about(flow, 4), f"{round(above[1]):+d} %", *honesty]
-        )
-    rows.append(["bound", f"{bound[0]:.3f}", "", f"{bound[1]:.4f}", "", "2", "1"])
-    columns = ["filter", "omega_m [rad/s]", "above", "U_a [m/s]", "above", "NEES", "NIS"]
+        states = [about(speed, 3), f"{round(above[0]):+d}", about(flow, 4), f"{round(above[1]):+d}"]
+        honesty = (_unless_blank(mean.value, ".3g") for mean in (evaluation.nees, evaluation.nis))
+        rows.append([name, *states, about(evaluation.thrust_rmse, 3), *honesty])
+    rows.append(["bound", f"{bound[0]:.3f}", "", f"{bound[1]:.4f}", "", "", "2", "1"])
+    columns = ["filter", "omega_m\n[rad/s]", "above\n[%]", "U_a\n[m/s]", "above\n[%]", "T\n[N]", "NEES", "NIS"]
     caption = "above: the bound. ±: half of the 95 % interval. Honest: NEES 2, NIS 1."
     return table(title, columns, rows, caption=caption)
 
 
 def about(value: Interval, digits: int) -> str:
-    """A value with half of its 95 % interval."""
-    return f"{value.value:.{digits}f} ±{(value.high - value.low) / 2:.{digits}f}"
+    """A value with half of its 95 % interval; empty if there is no value."""
+    half_width = (value.high - value.low) / 2
+    return "" if isnan(value.value) else f"{value.value:.{digits}f} ±{half_width:.{digits}f}"
 
 
 def span(value: Interval, digits: int) -> str:
     """A value with its 95 % interval in brackets."""
     return f"{value.value:.{digits}f} [{value.low:.{digits}f}, {value.high:.{digits}f}]"
+
+
+def _unless_blank(value: float, form: str) -> str:
+    return "" if isnan(value) else format(value, form)

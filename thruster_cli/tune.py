@@ -12,6 +12,7 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from filters.registry import filter_class
+from filters.verdicts import mean_sentence
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
 from thruster_cli.tables import choice_table, comparison_table, span
 from thruster_env.checks import at_least
@@ -179,9 +180,5 @@ def _verdict(ratio: Interval) -> str:
 
 
 def _consistency_sentence(evaluation: Evaluation, n: int) -> str:
-    mean = evaluation.nees.value
-    if evaluation.nees.low > 1.2 * n:
-        return f"Overconfident: mean NEES {mean:.3g} where {n} is right. RMSE alone does not see the covariance."
-    if evaluation.nees.high < n / 1.2:
-        return f"Underconfident: mean NEES {mean:.3g}, and {n} is right. RMSE does not see the covariance."
-    return f"Consistent: mean NEES {mean:.3g}, and {n} is right."
+    said = mean_sentence("NEES", evaluation.nees, n)
+    return said if said.startswith("Consistent") else f"{said} RMSE alone does not see the covariance."

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -10,17 +9,14 @@ import numpy as np
 from filters.batch import run
 from filters.consistency import normalized_squares
 from filters.filter import Filter
+from filters.intervals import Interval, interval, mean_interval, resampled_means, rmse_intervals
+from filters.recording import record_members
+from filters.report import ConsistencyReport, consistency_report
+from filters.thruster import thrusts_of
 from tuning.scenarios import FIRST_SCORED_STEP, Data
 
-RESAMPLES = 2000  # bootstrap resamples of whole runs
-
-
-class Interval(NamedTuple):
-    """An estimate with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
+STATES = ("omega_m [rad/s]", "U_a [m/s]")
+MEMBER_RUNS, MEMBER_STEPS = 40, 5  # rank histograms are made of so many runs, and of every fifth step
 
 
 class Evaluation(NamedTuple):
@@ -29,9 +25,10 @@ class Evaluation(NamedTuple):
     rmse: tuple[Interval, ...]  # by state, (omega_m [rad/s], U_a [m/s])
     start_up_rmse: np.ndarray  # (n,), over the steps before 50
     score: Interval  # mean over states of RMSE over scale [-]
-    nees: Interval  # mean; n is right
+    thrust_rmse: Interval  # of the thrust that the filter's model has at its estimate [N]
+    nees: Interval  # mean; n is right; NaN for filters that give no covariance
     nis: Interval  # mean; m is right
-    log_likelihood: float  # mean over seeds of the scored steps' sum
+    log_likelihood: float  # mean over seeds of the scored steps' sum; NaN for filters that give no covariance
     divergences: int  # restarts from the prior, over all seeds
     mean_squares: np.ndarray  # (B, n), mean square error of each run, for paired comparisons
     scale: np.ndarray  # (n,), what the score measures errors in
@@ -55,22 +52,42 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
     errors = estimates.means - data.states
     late = slice(FIRST_SCORED_STEP, None)
     mean_squares = (errors[:, late] ** 2).mean(axis=1)
-    nees = np.nanmean(normalized_squares(errors[:, late], estimates.covs[:, late]), axis=1)
-    nis = np.nanmean(
-        normalized_squares(estimates.innovations[:, late], estimates.innovation_covs[:, late]), axis=1
-    )
-    resampled = np.sqrt(_resampled_means(mean_squares))  # (resamples, n)
-    rmse = np.sqrt(mean_squares.mean(axis=0))
+    with np.errstate(all="ignore"):  # estimates far off, though finite, may have a thrust that is not
+        thrusts = np.clip(thrusts_of(filter_.model, estimates.means[:, late]), -1e100, 1e100)
+    thrust_errors = thrusts - data.thrusts[:, late]
+    innovations, innovation_covs = estimates.innovations[:, late], estimates.innovation_covs[:, late]
+    measured = ~np.isnan(data.measurements[:, late]).all(axis=-1)
+    nis = np.where(measured, normalized_squares(innovations, innovation_covs), np.nan)
+    likelihood = estimates.log_likelihoods[:, late] if filter_.has_covariance else np.full((1, 1), np.nan)
+    resampled = np.sqrt(resampled_means(mean_squares))  # (resamples, n)
     return Evaluation(
-        rmse=tuple(interval(rmse[i], resampled[:, i]) for i in range(len(rmse))),
+        rmse=rmse_intervals(mean_squares),
         start_up_rmse=np.sqrt((errors[:, :FIRST_SCORED_STEP] ** 2).mean(axis=(0, 1))),
         score=interval(score(mean_squares, scale), (resampled / scale).mean(axis=1)),
-        nees=mean_interval(nees),
+        thrust_rmse=rmse_intervals((thrust_errors**2).mean(axis=1, keepdims=True))[0],
+        nees=mean_interval(normalized_squares(errors[:, late], estimates.covs[:, late])),
         nis=mean_interval(nis),
-        log_likelihood=float(estimates.log_likelihoods[:, late].sum(axis=1).mean()),
+        log_likelihood=float(likelihood.sum(axis=1).mean()),
         divergences=int(estimates.divergences.sum()),
         mean_squares=mean_squares,
         scale=scale,
+    )
+
+
+def check_consistency(filter_: Filter, data: Data) -> ConsistencyReport:
+    """Whether a filter's covariance is honest on a scenario, and for an ensemble whether its members are."""
+    estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
+    members = None
+    if filter_.size:
+        some = (part[:MEMBER_RUNS] for part in (data.filter_keys, data.inputs, data.measurements))
+        members = record_members(filter_, *some, first=FIRST_SCORED_STEP, every=MEMBER_STEPS)
+    return consistency_report(
+        estimates,
+        data.states,
+        data.measurements,
+        members=members,
+        first_step=FIRST_SCORED_STEP,
+        names=STATES,
     )
 
 
@@ -89,28 +106,5 @@ def score_ratio(a: Evaluation, b: Evaluation) -> Interval:
         raise ValueError(
             f"a paired comparison needs the same seeds, but got {len(a.mean_squares)} and {len(b.mean_squares)}"
         )
-    scores = [(np.sqrt(_resampled_means(e.mean_squares)) / e.scale).mean(axis=1) for e in (a, b)]
+    scores = [(np.sqrt(resampled_means(e.mean_squares)) / e.scale).mean(axis=1) for e in (a, b)]
     return interval(score(a.mean_squares, a.scale) / score(b.mean_squares, b.scale), scores[0] / scores[1])
-
-
-def interval(value: float, resampled: np.ndarray) -> Interval:
-    """A value with the middle 95 % of its bootstrap resamples."""
-    low, high = np.quantile(resampled, [0.025, 0.975])
-    return Interval(float(value), float(low), float(high))
-
-
-def mean_interval(values: np.ndarray) -> Interval:
-    """Mean of one number a run, with its bootstrap interval over runs."""
-    return interval(values.mean(), _resampled_means(values))
-
-
-def _resampled_means(values: np.ndarray) -> np.ndarray:
-    return _bootstrap_weights(len(values)) @ values
-
-
-@lru_cache(maxsize=8)
-def _bootstrap_weights(count: int) -> np.ndarray:
-    # Row r holds how often resample r picks each run, over their number. The same in every call: paired
-    # quantities stay paired, and results repeat.
-    picks = np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), size=RESAMPLES)
-    return picks / count

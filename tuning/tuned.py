@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import math
 from pathlib import Path
 
+from filters.intervals import Interval
 from filters.registry import FILE_FORMAT, FILE_VERSION, read_tuned_file
 from thruster_env.checks import at_least, positive, shown, vector
 from thruster_env.files import write_whole
@@ -74,16 +76,21 @@ def read_tuned(path: str | Path) -> tuple[Choice, Scenario, int]:
 
 
 def summary(evaluation: Evaluation) -> dict:
-    """The figures of an evaluation as plain numbers for JSON."""
+    """The figures of an evaluation as plain numbers for JSON, None where there is nothing to tell."""
     return {
         "rmse": [list(value) for value in evaluation.rmse],
         "start_up_rmse": evaluation.start_up_rmse.tolist(),
+        "thrust_rmse": _numbers(evaluation.thrust_rmse),
         "score": list(evaluation.score),
-        "nees": list(evaluation.nees),
-        "nis": list(evaluation.nis),
-        "log_likelihood": evaluation.log_likelihood,
+        "nees": _numbers(evaluation.nees),
+        "nis": _numbers(evaluation.nis),
+        "log_likelihood": None if math.isnan(evaluation.log_likelihood) else evaluation.log_likelihood,
         "divergences": evaluation.divergences,
     }
+
+
+def _numbers(value: Interval) -> list[float] | None:
+    return None if math.isnan(value.value) else list(value)
 
 
 def _version(name: str) -> str:

@@ -1,0 +1,148 @@
+"""Joint estimation of state and parameters: a model whose unknown constants are states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.derivatives import RELATIVE_STEP
+from filters.model import StateSpaceModel
+from filters.rows import constants_form
+from thruster_env.checks import finite, positive
+from thruster_env.compiled import inlined
+from thruster_env.components import tuple_of, written_out
+
+
+class Unknown(NamedTuple):
+    """What is believed of a constant that is not known; all in the constant's own unit."""
+
+    std: float  # standard deviation of the prior
+    walk_std: float = 0.0  # standard deviation of its change in a step; 0 for a constant
+    mean: float | None = None  # of the prior; the model's value if None
+
+
+def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unknown]) -> StateSpaceModel:
+    """A model with some constants of another as further states, for any filter to estimate with the rest.
+
+        (x, theta)' = (f(x, u, c with theta), theta) + (w, walk),  z = h(x, c with theta) + v
+
+    Jacobians are the model's own for its states, where it has them, and central differences for the new ones.
+
+    Args:
+        model: n states; its constants are a NamedTuple, or a tuple.
+        parameters: what is believed of each unknown constant, by its name in the NamedTuple, or its number in
+            the tuple; the new states follow in this order.
+
+    Returns:
+        A model of n + len(parameters) states with the same inputs and measurements.
+
+    Raises:
+        ValueError: if a name is not one of the model's constants, or a number is off.
+    """
+    fields = getattr(model.constants, "_fields", range(len(model.constants)))
+    places, means, variances, walks = [], [], [], []
+    for name, unknown in parameters.items():
+        if name not in fields:
+            known = ", ".join(map(str, fields))
+            raise ValueError(f"a parameter must be one of the model's constants {known}, but got {name!r}")
+        unknown = Unknown(*unknown)
+        place = list(fields).index(name)
+        mean = model.constants[place] if unknown.mean is None else unknown.mean
+        places.append(place)
+        means.append(finite(f"mean of {name}", mean))
+        variances.append(positive(f"std of {name}", unknown.std) ** 2)
+        walks.append(positive(f"walk_std of {name}", unknown.walk_std, zero_allowed=True) ** 2)
+    if not places:
+        raise ValueError("parameters must name at least one constant, but got none")
+    functions = _augmented_functions(
+        inlined(model.transition),
+        inlined(model.observe),
+        model.transition_jacobian,
+        model.observe_jacobian,
+        model.n,
+        model.m,
+        constants_form(model.constants),
+        tuple(places),
+    )
+    spread = np.sqrt(np.add(variances, walks))
+    further = {
+        "operating_state": means,
+        "state_low": np.subtract(means, 2.0 * spread),
+        "state_high": np.add(means, 2.0 * spread),
+    }
+    known = {name: getattr(model, name) for name in further}
+    return StateSpaceModel(
+        **functions,
+        process_noise_cov=_block_diagonal(model.process_noise_cov, walks),
+        measurement_noise_cov=model.measurement_noise_cov,
+        prior_mean=np.append(model.prior_mean, means),
+        prior_cov=_block_diagonal(model.prior_cov, variances),
+        inputs=model.inputs,
+        constants=(*map(float, model.constants), *map(float, spread)),
+        substeps=model.substeps,
+        operating_input=model.operating_input,
+        **{name: None if value is None else np.append(value, further[name]) for name, value in known.items()},
+    )
+
+
+def _block_diagonal(cov: np.ndarray, variances: list[float]) -> np.ndarray:
+    n = len(cov)
+    whole = np.diag(np.append(np.zeros(n), variances))
+    whole[:n, :n] = cov
+    return whole
+
+
+@cache
+def _augmented_functions(
+    transition, observe, transition_jacobian, observe_jacobian, n, m, form, places
+) -> dict[str, Callable | None]:
+    """Functions of the augmented model; its constants are the model's own, then the spread of each parameter."""
+    count, added = form if isinstance(form, int) else len(form._fields), len(places)
+    values = [f"t[{places.index(i)}]" if i in places else f"c[{i}]" for i in range(count)]
+    source = tuple_of(values) if isinstance(form, int) else f"Constants({', '.join(values)})"
+    names = {
+        "f": transition,
+        "h": observe,
+        "fill": written_out("fill", "t, c", source, Constants=form),
+        "states": written_out("states", "x", tuple_of(f"x[{i}]" for i in range(n))),
+        "parameters": written_out("parameters", "x", tuple_of(f"x[{n + q}]" for q in range(added))),
+    }
+    begin = ("s = states(x)", "t = parameters(x)")
+    rows = [f"moved[{i}]" for i in range(n)] + [f"t[{q}]" for q in range(added)]
+    functions = {
+        "transition": written_out(
+            "transition", "x, u, c", *begin, "moved = f(s, u, fill(t, c))", tuple_of(rows), **names
+        ),
+        "observe": written_out("observe", "x, c", "h(states(x), fill(parameters(x), c))", **names),
+        "transition_jacobian": None,
+        "observe_jacobian": None,
+    }
+
+    def jacobian(name, function, analytic, size, arguments, identity):
+        lines = [*begin, f"a = analytic(s, {arguments}fill(t, c))"]
+        for q in range(added):
+            lines.append(f"step{q} = {RELATIVE_STEP} * (abs(t[{q}]) + c[{count + q}])")
+            for side, sign in (("above", "+"), ("below", "-")):
+                shifted = tuple_of(f"t[{r}] {sign} step{q}" if r == q else f"t[{r}]" for r in range(added))
+                lines.append(f"{side}{q} = {function}(s, {arguments}fill({shifted}, c))")
+        known = [
+            [f"a[{i}][{j}]" for j in range(n)]
+            + [f"(above{q}[{i}] - below{q}[{i}]) / (2.0 * step{q})" for q in range(added)]
+            for i in range(size)
+        ]
+        rest = (
+            [["1.0" if j == n + q else "0.0" for j in range(n + added)] for q in range(added)] if identity else []
+        )
+        matrix = tuple_of(tuple_of(row) for row in known + rest)
+        return written_out(name, f"x, {arguments}c", *lines, matrix, analytic=inlined(analytic), **names)
+
+    if transition_jacobian is not None:
+        functions["transition_jacobian"] = jacobian(
+            "transition_jacobian", "f", transition_jacobian, n, "u, ", True
+        )
+    if observe_jacobian is not None:
+        functions["observe_jacobian"] = jacobian("observe_jacobian", "h", observe_jacobian, m, "", False)
+    return functions

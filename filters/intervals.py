@@ -1,0 +1,84 @@
+"""Estimates with 95 % intervals, by bootstrap over whole runs: steps of one run are not independent, runs are."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+RESAMPLES = 2000  # bootstrap resamples of whole runs
+
+
+class Interval(NamedTuple):
+    """An estimate with its 95 % interval; NaN where there is nothing to estimate."""
+
+    value: float
+    low: float
+    high: float
+
+    def covers(self, number: float) -> bool:
+        """Whether a number lies in the interval."""
+        return self.low <= number <= self.high
+
+
+def interval(value: float, resampled: np.ndarray) -> Interval:
+    """A value with the middle 95 % of its bootstrap resamples."""
+    low, high = np.quantile(resampled, [0.025, 0.975])
+    return Interval(float(value), float(low), float(high))
+
+
+def mean_interval(values: np.ndarray) -> Interval:
+    """Mean of some numbers a run, (B,) or (B, T), with its interval; NaN entries count as not there."""
+    values = np.reshape(values, (len(values), -1))
+    present = ~np.isnan(values)
+    if not present.any():
+        return Interval(np.nan, np.nan, np.nan)
+    totals, counts = np.where(present, values, 0.0).sum(axis=1), present.sum(axis=1).astype(np.float64)
+    return interval(totals.sum() / counts.sum(), ratio_of_resampled(totals, counts))
+
+
+def ratio_of_resampled(totals: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Sums of totals (B, ...) over sums of counts, (B,) or (B, 1), for resamples of the runs.
+
+    Resamples that pick only runs without any count are left out.
+    """
+    above, below = resampled_means(totals), resampled_means(counts)
+    some = below.reshape(len(below)) > 0
+    return above[some] / below[some]
+
+
+def rmse_intervals(mean_squares: np.ndarray) -> tuple[Interval, ...]:
+    """RMSE of every state with its interval, from mean square errors of runs (B, n)."""
+    resampled, rmse = np.sqrt(resampled_means(mean_squares)), np.sqrt(mean_squares.mean(axis=0))
+    return tuple(interval(rmse[i], resampled[:, i]) for i in range(len(rmse)))
+
+
+def rmse_ratios(a: np.ndarray, b: np.ndarray) -> tuple[Interval, ...]:
+    """RMSE of filter a over that of filter b by state, paired by run, from mean square errors (B, n).
+
+    Both are resampled by the same runs, so what makes a run hard for both cancels.
+
+    Raises:
+        ValueError: if the two have not the same number of runs and states.
+    """
+    if np.shape(a) != np.shape(b):
+        raise ValueError(
+            f"a paired comparison needs the same runs and states, but got {np.shape(a)}, {np.shape(b)}"
+        )
+    ratios = np.sqrt(resampled_means(a) / resampled_means(b))
+    values = np.sqrt(a.mean(axis=0) / b.mean(axis=0))
+    return tuple(interval(values[i], ratios[:, i]) for i in range(len(values)))
+
+
+def resampled_means(values: np.ndarray) -> np.ndarray:
+    """Means over runs of values (B, ...) for every resample, (RESAMPLES, ...)."""
+    return _weights(len(values)) @ values
+
+
+@lru_cache(maxsize=8)
+def _weights(count: int) -> np.ndarray:
+    # Row r holds how often resample r picks each run, over their number. The same in every call: paired
+    # quantities stay paired, and results repeat.
+    picks = np.random.default_rng(0).multinomial(count, np.full(count, 1.0 / count), size=RESAMPLES)
+    return picks / count

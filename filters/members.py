@@ -1,0 +1,132 @@
+"""An ensemble as a table with one column a member: its prior, its motion, its noise and its moments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, lru_cache
+from typing import NamedTuple
+
+from filters.rows import constants_reader, memory_places, number_places
+from thruster_env.compiled import inlined
+from thruster_env.components import (
+    column_reader,
+    column_writer,
+    matrix_of,
+    matrix_writer,
+    tuple_of,
+    vector_reader,
+    vector_writer,
+    written_out,
+)
+from thruster_env.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
+
+
+@inlined
+def add_noise(table, first, count, draws, numbers, root):
+    """Rows first ... += L W, where the lower triangular L lies at numbers[root] and W, by rows, in draws."""
+    width = table.shape[1]
+    for i in range(count):
+        for k in range(i + 1):
+            factor = numbers[root + i * count + k]
+            if factor != 0.0:
+                for j in range(width):
+                    table[first + i, j] += factor * draws[k * width + j]
+
+
+@cache
+def drawer(n: int, m: int) -> Callable:
+    """Return `draw(draws, count, row, stream)`: fill draws with a stream's normals of the belief's step."""
+    places = memory_places(n, m)
+    step_place, key_0, key_1 = places.step, places.key_0, places.key_1
+
+    @inlined
+    def draw(draws, count, row, stream):
+        fill_normals(draws, count, row[step_place], stream, row[key_0], row[key_1])
+
+    return draw
+
+
+@cache
+def row_means(rows: int) -> Callable:
+    """Return `means(table, size)`: means of the first `size` entries of rows 0 ... rows - 1, in one loop."""
+    places = range(rows)
+    return written_out(
+        "means",
+        "table, size",
+        *(f"s{i} = 0.0" for i in places),
+        "for j in range(size):",
+        *(f"    s{i} += table[{i}, j]" for i in places),
+        tuple_of(f"s{i} / size" for i in places),
+    )
+
+
+@cache
+def row_covariances(first: int, rows: int, second: int, columns: int) -> Callable:
+    """Return `covariances(table, size, means)`: sample covariances of two groups of rows, in one loop.
+
+    Entry (i, j) belongs to rows first + i and second + j; means are those of `row_means`, the divisor is size - 1.
+    """
+    pairs = [(i, j) for i in range(rows) for j in range(columns) if first != second or j <= i]
+    used = sorted({first + i for i, _ in pairs} | {second + j for _, j in pairs})
+
+    def entry(i, j):
+        return f"s{i}_{j}" if (i, j) in pairs else f"s{j}_{i}"
+
+    return written_out(
+        "covariances",
+        "table, size, means",
+        *(f"s{i}_{j} = 0.0" for i, j in pairs),
+        "for j in range(size):",
+        *(f"    d{k} = table[{k}, j] - means[{k}]" for k in used),
+        *(f"    s{i}_{j} += d{first + i} * d{second + j}" for i, j in pairs),
+        matrix_of(rows, columns, lambda i, j: f"{entry(i, j)} / (size - 1)"),
+    )
+
+
+class Motion(NamedTuple):
+    """What all ensembles do alike, for one shape of model."""
+
+    start: Callable  # start(memory, numbers, size): members drawn from the prior
+    predict: Callable  # predict(memory, u, numbers, size): members moved, then stirred by process noise
+    summarise: Callable  # summarise(memory, size): the belief's mean and covariance from the members
+
+
+@lru_cache(maxsize=64)
+def ensemble_motion(transition, n, m, inputs, form) -> Motion:
+    """Prior, motion x_j = f(x_j, u) + w_j with w_j ~ N(0, Q), and moments of an ensemble."""
+    places, source = memory_places(n, m), number_places(n, m)
+    prior_mean_place, prior_root_place = source.prior_mean, source.prior_root
+    q_root_place, substeps_place, step_place = source.q_root, source.substeps, places.step
+    means_of_members, covariances_of_members = row_means(n), row_covariances(0, n, 0, n)
+    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
+    constants, control = constants_reader(n, m, form), vector_reader(inputs)
+    state, store_state, draw = column_reader(n), column_writer(n), drawer(n, m)
+
+    @inlined
+    def start(memory, numbers, size):
+        row, table, draws = memory
+        draw(draws, n * table.shape[1], row, FILTER_PRIOR)
+        for i in range(n):
+            for j in range(table.shape[1]):
+                table[i, j] = numbers[prior_mean_place + i]
+        add_noise(table, 0, n, draws, numbers, prior_root_place)
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        row, table, draws = memory
+        v, c = control(u), constants(numbers)
+        for _ in range(int(numbers[substeps_place])):
+            for j in range(table.shape[1]):
+                store_state(table, j, transition(state(table, j), v, c))
+        row[step_place] += 1.0
+        draw(draws, n * table.shape[1], row, FILTER_PROCESS)
+        add_noise(table, 0, n, draws, numbers, q_root_place)
+
+    @inlined
+    def summarise(memory, size):
+        row, table, _ = memory
+        means = means_of_members(table, size)
+        store_mean(row, means)
+        store_cov(row, covariances_of_members(table, size, means))
+
+    return Motion(start, predict, summarise)

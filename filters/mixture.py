@@ -1,0 +1,66 @@
+"""A mixture in a row of numbers, its parts one behind the other at equal distances: entries, mean, covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+from thruster_env.compiled import inlined
+from thruster_env.components import matrix_of, tuple_of, written_out
+
+
+@cache
+def part_vector(count: int, first: int, stride: int) -> tuple[Callable, Callable]:
+    """Functions `read(row, j)` and `store(row, j, x)`: the entries of part j from row[first + stride j] on."""
+    place = f"k = {first} + {stride} * j"
+    read = written_out("read", "row, j", place, tuple_of(f"row[k + {i}]" for i in range(count)))
+    stores = (f"row[k + {i}] = x[{i}]" for i in range(count))
+    return read, written_out("store", "row, j, x", place, *stores, "None")
+
+
+@cache
+def part_matrix(size: int, first: int, stride: int) -> tuple[Callable, Callable]:
+    """Functions `read(row, j)` and `store(row, j, a)`: a square matrix of part j, by rows."""
+    place = f"k = {first} + {stride} * j"
+    places = [(i, j) for i in range(size) for j in range(size)]
+    read = written_out("read", "row, j", place, matrix_of(size, size, lambda i, j: f"row[k + {i * size + j}]"))
+    stores = (f"row[k + {i * size + j}] = a[{i}][{j}]" for i, j in places)
+    return read, written_out("store", "row, j, a", place, *stores, "None")
+
+
+@cache
+def blender(count: int, means: int, covs: int, weights: int, stride: int) -> Callable:
+    """Return `blend(row, parts)`: mean and covariance of a mixture from those of its parts and their weights.
+
+    The covariance is that within the parts and that between them: sum of w (P + (x - mean)(x - mean)'). The means,
+    covariances and weights of the first part lie from row[means], row[covs] and row[weights] on.
+    """
+    pairs = [(i, j) for i in range(count) for j in range(i + 1)]
+    mean_of = written_out(
+        "mean_of",
+        "row, parts",
+        *(f"s{i} = 0.0" for i in range(count)),
+        "for part in range(parts):",
+        f"    k = {stride} * part",
+        f"    w = row[k + {weights}]",
+        *(f"    s{i} += w * row[k + {means + i}]" for i in range(count)),
+        tuple_of(f"s{i}" for i in range(count)),
+    )
+    cov_of = written_out(
+        "cov_of",
+        "row, parts, mean",
+        *(f"s{i}_{j} = 0.0" for i, j in pairs),
+        "for part in range(parts):",
+        f"    k = {stride} * part",
+        f"    w = row[k + {weights}]",
+        *(f"    d{i} = row[k + {means + i}] - mean[{i}]" for i in range(count)),
+        *(f"    s{i}_{j} += w * (row[k + {covs + i * count + j}] + d{i} * d{j})" for i, j in pairs),
+        matrix_of(count, count, lambda i, j: f"s{max(i, j)}_{min(i, j)}"),
+    )
+
+    @inlined
+    def blend(row, parts):
+        mean = mean_of(row, parts)
+        return mean, cov_of(row, parts, mean)
+
+    return blend

@@ -1,0 +1,43 @@
+"""What happens to a belief that is no longer finite: the prior takes its place, and this is counted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+from filters.belief import Kernels
+from filters.rows import memory_places, number_places
+from thruster_env.compiled import inlined
+from thruster_env.components import written_out
+
+LARGEST = 1e300  # what the numbers of a belief may add up to
+
+
+@cache
+def row_magnitude(n: int, m: int) -> Callable:
+    """Return `magnitude(row)`: the sum of the absolute values of the numbers of a belief and its innovation."""
+    return written_out("magnitude", "row", " + ".join(f"abs(row[{i}])" for i in range(memory_places(n, m).gain)))
+
+
+@cache
+def restart_if_lost(kernels: Kernels) -> Callable:
+    """Return `restart(memory, numbers, size)`: put the prior in place of a belief that is not finite."""
+    n, m, start, summarise = kernels.n, kernels.m, kernels.start, kernels.summarise
+    places, r_place = memory_places(n, m), number_places(n, m).r
+    innovation, s_place, log_likelihood = places.innovation, places.innovation_cov, places.log_likelihood
+    divergences, magnitude = places.divergences, row_magnitude(n, m)
+
+    @inlined
+    def restart(memory, numbers, size):
+        row, _, _ = memory
+        if not magnitude(row) < LARGEST:
+            start(memory, numbers, size)
+            summarise(memory, size)
+            row[divergences] += 1.0
+            row[log_likelihood] = 0.0
+            for i in range(m):
+                row[innovation + i] = 0.0
+            for i in range(m * m):
+                row[s_place + i] = numbers[r_place + i]
+
+    return restart

@@ -1,0 +1,178 @@
+"""The information and square-root forms of the Kalman filter: the same estimates, each with its own strength."""
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from filters import KalmanFilter, affine_model, run, thruster_model, truth
+from filters.session import Session
+from thruster_env.compiled import interpreted
+from thruster_env.streams import episode_keys
+
+KEYS = np.zeros((1, 2))
+FORMS = ["information", "square-root"]
+
+
+def plane_model(**changes):
+    """n = 3, p = 2, m = 2, with offsets and correlated noise."""
+    arguments = {
+        "a": [[0.9, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.3, 0.7]],
+        "b": [[1.0, 0.0], [0.5, -0.4], [0.0, 0.8]],
+        "c": [[1.0, 0.0, 0.5], [0.0, 2.0, -1.0]],
+        "state_offset": [0.3, -0.2, 0.1],
+        "measurement_offset": [0.7, -1.5],
+        "process_noise_cov": [[0.3, 0.1, 0.0], [0.1, 0.2, -0.05], [0.0, -0.05, 0.4]],
+        "measurement_noise_cov": [[0.5, 0.2], [0.2, 0.3]],
+        "prior_mean": [1.0, -1.0, 0.5],
+        "prior_cov": [[1.0, 0.2, 0.0], [0.2, 0.5, 0.1], [0.0, 0.1, 0.8]],
+    }
+    return affine_model(**{**arguments, **changes})
+
+
+def simulated(model, steps=100, level=3.0):
+    inputs = np.random.default_rng(1).normal(size=(1, steps, model.inputs)) * level
+    with interpreted():
+        return truth.simulate(model, episode_keys([1]), inputs).measurements, inputs
+
+
+@pytest.fixture(params=FORMS)
+def form(request):
+    return request.param
+
+
+@pytest.mark.parametrize("kind", [plane_model, thruster_model])
+def test_every_form_gives_the_same_estimates(form, kind):
+    model = kind()
+    z, inputs = simulated(model)
+    z[0, 10, 0] = z[0, 20:23] = np.nan
+    with interpreted():
+        estimates = run(KalmanFilter(model=model, form=form), KEYS, inputs, z)
+        expected = run(KalmanFilter(model=model), KEYS, inputs, z)
+    for one, other in zip(estimates, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+
+
+def test_compiled_batch_loop_session_and_python_agree(form):
+    model = plane_model()
+    z, inputs = simulated(model, 30)
+    z[0, 7, 1] = z[0, 9] = np.nan
+    filter_ = KalmanFilter(model=model, form=form)
+    close = {"rtol": 1e-12, "atol": 1e-12}
+    estimates = run(filter_, KEYS, inputs, z)
+    with interpreted():
+        for one, other in zip(run(filter_, KEYS, inputs, z), estimates, strict=True):
+            np.testing.assert_allclose(one, other, **close)
+    session = Session(filter_)
+    session.start(KEYS[0], z[0, 0])
+    belief, _ = filter_.update(filter_.init(), z[0, 0])
+    for k, u in enumerate(inputs[0], start=1):
+        session.step(u, z[0, k])
+        belief, innovation = filter_.update(filter_.predict(belief, u), z[0, k])
+        np.testing.assert_allclose(session.mean, estimates.means[0, k], **close)
+        np.testing.assert_allclose(session.cov, estimates.covs[0, k], **close)
+        np.testing.assert_allclose(belief.mean, estimates.means[0, k], **close)
+        np.testing.assert_allclose(belief.cov, estimates.covs[0, k], **close)
+        assert innovation.log_likelihood == pytest.approx(estimates.log_likelihoods[0, k], rel=1e-11)
+
+
+def test_covariances_are_symmetric_and_positive(form):
+    model = plane_model()
+    z, inputs = simulated(model)
+    with interpreted():
+        estimates = run(KalmanFilter(model=model, form=form), KEYS, inputs, z)
+    for covs in (estimates.covs[0], estimates.innovation_covs[0]):
+        assert (covs == covs.transpose(0, 2, 1)).all()
+        assert (np.linalg.eigvalsh(covs) > 0).all()
+
+
+def test_noise_may_vary_from_step_to_step(form):
+    model = plane_model()
+    z, inputs = simulated(model, 20)
+    factors = np.random.default_rng(2).uniform(0.1, 10.0, size=21)[:, None, None]
+    noise = {
+        "process_noise_covs": factors[1:] * model.process_noise_cov,
+        "measurement_noise_covs": factors * model.measurement_noise_cov,
+    }
+    with interpreted():
+        estimates = run(KalmanFilter(model=model, form=form), KEYS, inputs, z, **noise)
+        expected = run(KalmanFilter(model=model), KEYS, inputs, z, **noise)
+    for one, other in zip(estimates, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+
+
+def test_a_change_of_units_changes_no_estimate(form):
+    model, d = plane_model(), np.diag([1000.0, 0.01, 7.0])
+    a, b, offset, c, shift = model.matrices()
+    rescaled = plane_model(
+        a=d @ a @ np.linalg.inv(d),
+        b=d @ b,
+        c=c @ np.linalg.inv(d),
+        state_offset=d @ offset,
+        process_noise_cov=d @ model.process_noise_cov @ d,
+        prior_mean=d @ model.prior_mean,
+        prior_cov=d @ model.prior_cov @ d,
+    )
+    z, inputs = simulated(model)
+    with interpreted():
+        before = run(KalmanFilter(model=model, form=form), KEYS, inputs, z)
+        after = run(KalmanFilter(model=rescaled, form=form), KEYS, inputs, z)
+    np.testing.assert_allclose(after.means / np.diag(d), before.means, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(after.covs / np.outer(np.diag(d), np.diag(d)), before.covs, rtol=1e-9, atol=1e-9)
+
+
+def test_the_square_root_form_starts_from_an_exact_state_and_the_information_form_refuses_it():
+    model = plane_model(prior_cov=np.diag([1.0, 0.0, 0.0]))
+    z, inputs = simulated(model)
+    with interpreted():
+        estimates = run(KalmanFilter(model=model, form="square-root"), KEYS, inputs, z)
+        expected = run(KalmanFilter(model=model), KEYS, inputs, z)
+    for one, other in zip(estimates, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+    with pytest.raises(ValueError, match="prior_cov must be positive definite"):
+        KalmanFilter(model=model, form="information")
+
+
+def test_the_square_root_form_keeps_its_digits_where_covariances_lose_theirs():
+    """Two nearly equal channels, almost without noise: P (2, 2) then has a condition of 1e18."""
+    small = 1e-9
+    slope = 1.0 + small
+    model = affine_model(
+        a=np.eye(2),
+        b=np.zeros((2, 1)),
+        c=[[1.0, 1.0], [1.0, slope]],
+        process_noise_cov=[0.0, 0.0],
+        measurement_noise_cov=[small**2, small**2],
+        prior_mean=[0.0, 0.0],
+        prior_cov=[1.0, 1.0],
+    )
+    filter_ = KalmanFilter(model=model, form="square-root")
+    with interpreted():
+        belief, _ = filter_.update(filter_.init(), [0.0, 0.0])
+    root = belief.extras.reshape(2, 2)
+    # Y = I + C' C / small^2 and its inverse, in fractions.
+    e, weight = Fraction(slope), 1 / Fraction(small**2)
+    y_00, y_01, y_11 = 1 + 2 * weight, (1 + e) * weight, 1 + (1 + e * e) * weight
+    det = y_00 * y_11 - y_01 * y_01
+    np.testing.assert_allclose(root[0, 0], math.sqrt(y_11 / det), rtol=1e-6)
+    np.testing.assert_allclose(root[1, 0], -float(y_01 / det) / root[0, 0], rtol=1e-6)
+    np.testing.assert_allclose(root[1, 1], math.sqrt(1 / y_11), rtol=1e-6)  # 1e-9 of root[0, 0]
+    assert root[1, 1] ** 2 < 1e-17 * belief.cov[1, 1]  # of this the covariance has nothing left
+
+
+def test_the_root_is_carried_in_the_belief():
+    filter_ = KalmanFilter(model=plane_model(), form="square-root")
+    with interpreted():
+        belief = filter_.init()
+        for _ in range(3):
+            root = belief.extras.reshape(3, 3)
+            assert (root == np.tril(root)).all()
+            np.testing.assert_allclose(root @ root.T, belief.cov, rtol=1e-14, atol=1e-15)
+            belief, _ = filter_.update(filter_.predict(belief, [1.0, 0.0]), [1.0, 2.0])
+
+
+@pytest.mark.parametrize("name", ["cholesky", None, 3])
+def test_an_unknown_form_is_refused(name):
+    with pytest.raises(ValueError, match="form must be .*covariance.*information.*square-root.* but got"):
+        KalmanFilter(model=plane_model(), form=name)

@@ -1,0 +1,246 @@
+"""Unscented and cubature filters against the textbook's weighted sums, FilterPy and the Kalman filter."""
+
+import math
+
+import numpy as np
+import pytest
+
+from filters import (
+    CubatureKalmanFilter,
+    KalmanFilter,
+    StateSpaceModel,
+    UnscentedKalmanFilter,
+    affine_model,
+    run,
+    thruster_model,
+    truth,
+)
+from thruster_env.compiled import interpreted
+from thruster_env.streams import episode_keys
+
+KEYS = np.zeros((1, 2))
+NUMBERS = [(1.0, 2.0, 0.0), (0.1, 2.0, 1.0), (0.5, 0.0, 0.0), (1.3, 1.0, 2.0)]  # alpha, beta, kappa
+
+
+@pytest.fixture(autouse=True)
+def as_python():
+    """Exactness needs no compilation; that both agree is for the contract to test."""
+    with interpreted():
+        yield
+
+
+def swing(x, u, c):
+    """A damped pendulum, semi-implicit Euler; c = (g/l, damping)."""
+    rate = x[1] + 0.05 * (-c[0] * math.sin(x[0]) - c[1] * x[1] * abs(x[1]) + u[0])
+    return (x[0] + 0.05 * rate, rate)
+
+
+def look(x, c):
+    return (math.sin(x[0]), x[0] * x[1])
+
+
+def pendulum(**changes):
+    arguments = {
+        "transition": swing,
+        "observe": look,
+        "process_noise_cov": [[2e-4, 1e-4], [1e-4, 1e-3]],
+        "measurement_noise_cov": [[0.01, 0.003], [0.003, 0.04]],
+        "prior_mean": [0.5, 0.2],
+        "prior_cov": [[0.2, 0.05], [0.05, 0.1]],
+        "constants": (9.81, 0.3),
+    }
+    return StateSpaceModel(**{**arguments, **changes})
+
+
+def simulated(model, steps=100, seed=1, level=3.0):
+    inputs = np.random.default_rng(seed).normal(size=(1, steps, model.inputs)) * level
+    return truth.simulate(model, episode_keys([seed]), inputs), inputs
+
+
+def scaled_weights(n, alpha, beta, kappa):
+    """Weights for mean and covariance and the factor of P, as in Wan and van der Merwe."""
+    surplus = alpha**2 * (n + kappa) - n  # lambda
+    mean = np.full(2 * n + 1, 1 / (2 * (n + surplus)))
+    cov = mean.copy()
+    mean[0] = surplus / (n + surplus)
+    cov[0] = mean[0] + 1 - alpha**2 + beta
+    return mean, cov, n + surplus
+
+
+def cubature_weights(n):
+    """The same for the points of Arasaratnam and Haykin, with a centre that weighs nothing."""
+    weights = np.append(0.0, np.full(2 * n, 1 / (2 * n)))
+    return weights, weights, n
+
+
+def textbook(model, weights, inputs, measurements):
+    """The filter by weighted sums over sigma points, negative weights and all, with P - K S K'."""
+    mean_weights, cov_weights, factor = weights
+    x, p, c = model.prior_mean, model.prior_cov, model.constants
+
+    def points():
+        root = np.linalg.cholesky(factor * p)
+        return np.vstack([x, x + root.T, x - root.T])
+
+    def moments(values):
+        mean = mean_weights @ values
+        return mean, values - mean
+
+    found = []
+    for k, z in enumerate(measurements):
+        if k > 0:
+            moved = points()
+            for _ in range(model.substeps):
+                moved = np.array([model.transition(tuple(point), tuple(inputs[k - 1]), c) for point in moved])
+            x, d = moments(moved)
+            p = (cov_weights * d.T) @ d + model.process_noise_cov
+        drawn = points()
+        z_mean, e = moments(np.array([model.observe(tuple(point), c) for point in drawn]))
+        s = (cov_weights * e.T) @ e + model.measurement_noise_cov
+        gain = (cov_weights * (drawn - x).T) @ e @ np.linalg.inv(s)
+        innovation = z - z_mean
+        x, p = x + gain @ innovation, p - gain @ s @ gain.T
+        found.append((x, p, innovation, s))
+    return [np.array(part) for part in zip(*found, strict=True)]
+
+
+def assert_textbook(filter_, weights, rtol=1e-9):
+    model = filter_.model
+    drawn, inputs = simulated(model)
+    estimates = run(filter_, KEYS, inputs, drawn.measurements)
+    expected = textbook(model, weights, inputs[0], drawn.measurements[0])
+    for found, part in zip(estimates[:4], expected, strict=True):
+        np.testing.assert_allclose(found[0], part, rtol=rtol, atol=1e-9)
+
+
+@pytest.mark.parametrize("numbers", NUMBERS)
+@pytest.mark.parametrize("model", [pendulum(), pendulum(substeps=3), thruster_model()], ids=["1", "3", "thruster"])
+def test_it_is_the_textbook_s_unscented_filter(model, numbers):
+    alpha, beta, kappa = numbers
+    filter_ = UnscentedKalmanFilter(model=model, alpha=alpha, beta=beta, kappa=kappa)
+    assert_textbook(filter_, scaled_weights(2, *numbers))
+
+
+@pytest.mark.parametrize("model", [pendulum(), pendulum(substeps=3), thruster_model()], ids=["1", "3", "thruster"])
+def test_it_is_the_textbook_s_cubature_filter(model):
+    assert_textbook(CubatureKalmanFilter(model=model), cubature_weights(2))
+
+
+@pytest.mark.parametrize("numbers", NUMBERS[:2])
+def test_it_is_filterpy_s_unscented_filter_on_the_thruster(numbers):
+    peer = pytest.importorskip("filterpy.kalman")
+    alpha, beta, kappa = numbers
+    model = thruster_model()
+    inputs = np.repeat(np.random.default_rng(3).uniform(-12, 12, size=(1, 8, 1)), 25, axis=1)
+    drawn = truth.simulate(model, episode_keys([3]), inputs)
+    filter_ = UnscentedKalmanFilter(model=model, alpha=alpha, beta=beta, kappa=kappa)
+    estimates = run(filter_, KEYS, inputs, drawn.measurements)
+
+    def advance(x, dt, u):
+        for _ in range(model.substeps):
+            x = model.transition(tuple(x), u, model.constants)
+        return np.array(x)
+
+    def thrust(x):
+        return np.array(model.observe(tuple(x), model.constants))
+
+    points = peer.MerweScaledSigmaPoints(2, alpha, beta, kappa)
+    other = peer.UnscentedKalmanFilter(2, 1, 0.01, hx=thrust, fx=advance, points=points)
+    other.x, other.P = model.prior_mean, model.prior_cov
+    other.Q, other.R = model.process_noise_cov, model.measurement_noise_cov
+    other.sigmas_f = points.sigma_points(other.x, other.P)
+    for k, z in enumerate(drawn.measurements[0]):
+        if k > 0:
+            other.predict(u=tuple(inputs[0, k - 1]))
+        other.update(z)
+        np.testing.assert_allclose(estimates.means[0, k], other.x, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(estimates.covs[0, k], other.P, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(estimates.innovations[0, k], other.y, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(estimates.innovation_covs[0, k], other.S, rtol=1e-9, atol=1e-9)
+
+
+def space_model(**changes):
+    """n = 4, p = 1, m = 2, affine, with full covariances."""
+    rng = np.random.default_rng(8)
+    roots = [rng.normal(size=(size, size)) for size in (4, 2, 4)]
+    q, r, p_0 = (root @ root.T + 0.1 * np.eye(len(root)) for root in roots)
+    arguments = {
+        "a": 0.4 * rng.normal(size=(4, 4)),
+        "b": rng.normal(size=(4, 1)),
+        "c": rng.normal(size=(2, 4)),
+        "state_offset": rng.normal(size=4),
+        "measurement_offset": rng.normal(size=2),
+        "process_noise_cov": q,
+        "measurement_noise_cov": r,
+        "prior_mean": rng.normal(size=4),
+        "prior_cov": p_0,
+    }
+    return affine_model(**{**arguments, **changes})
+
+
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, CubatureKalmanFilter])
+@pytest.mark.parametrize("prior_cov", [None, np.zeros((4, 4)), np.diag([1.0, 0.0, 2.0, 0.0])])
+def test_on_an_affine_model_it_is_the_kalman_filter(kind, prior_cov):
+    model = space_model(**({} if prior_cov is None else {"prior_cov": prior_cov}))
+    drawn, inputs = simulated(model)
+    drawn.measurements[0, 10, 0] = drawn.measurements[0, 20] = np.nan
+    by_kalman = run(KalmanFilter(model=model), KEYS, inputs, drawn.measurements)
+    found = run(kind(model=model), KEYS, inputs, drawn.measurements)
+    for one, other in zip(found[:5], by_kalman[:5], strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+
+
+def test_states_that_are_known_exactly_move_no_measurement():
+    model = thruster_model(process_noise_cov=[0.0, 0.0]).replace(prior_cov=[0.0, 0.0])
+    inputs = np.full((1, 50, 1), 9.0)
+    for kind in (UnscentedKalmanFilter, CubatureKalmanFilter):
+        estimates = run(kind(model=model), KEYS, inputs, np.full((1, 51, 1), 3.0))
+        np.testing.assert_array_equal(estimates.covs, np.zeros((1, 51, 2, 2)))
+        x = tuple(model.prior_mean)
+        for _ in range(50 * model.substeps):
+            x = model.transition(x, (9.0,), model.constants)
+        np.testing.assert_allclose(estimates.means[0, -1], x, rtol=1e-12)
+
+
+def test_a_cubature_filter_is_an_unscented_one_whose_centre_weighs_nothing():
+    drawn, inputs = simulated(pendulum())
+    cubature = run(CubatureKalmanFilter(model=pendulum()), KEYS, inputs, drawn.measurements)
+    filter_ = UnscentedKalmanFilter(model=pendulum(), alpha=1.0, beta=0.0, kappa=0.0)
+    for one, other in zip(run(filter_, KEYS, inputs, drawn.measurements), cubature, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
+
+
+def bend(x, u, c):
+    return (3.0 * x[0] * x[0], x[1] - x[0] * x[0])
+
+
+@pytest.mark.parametrize("numbers", [(1.0, 0.0, 0.0), (0.01, 0.0, 0.0), (0.5, 2.0, -1.5), (3.0, 9.0, -1.9)])
+def test_covariances_stay_positive_where_the_centre_weighs_less_than_nothing(numbers):
+    alpha, beta, kappa = numbers
+    assert scaled_weights(2, *numbers)[0][0] <= 0
+    model = pendulum(transition=bend, process_noise_cov=[1e-6, 1e-6], prior_cov=[1.0, 1.0])
+    filter_ = UnscentedKalmanFilter(model=model, alpha=alpha, beta=beta, kappa=kappa)
+    belief = filter_.init()
+    for z in ([0.3, -2.0], [1.0, 5.0], [-1.0, 0.0]):
+        belief = filter_.predict(belief, [0.0])
+        assert (belief.cov == belief.cov.T).all() and np.linalg.eigvalsh(belief.cov)[0] > 0
+        belief, innovation = filter_.update(belief, z)
+        assert (belief.cov == belief.cov.T).all() and np.linalg.eigvalsh(belief.cov)[0] > 0
+        assert np.linalg.eigvalsh(innovation.cov)[0] > 0
+
+
+@pytest.mark.parametrize(
+    ("numbers", "rule"),
+    [
+        ({"alpha": 0.0}, "alpha must be positive, but got 0"),
+        ({"alpha": "wide"}, "alpha must be a finite number, but got 'wide'"),
+        ({"beta": math.nan}, "beta must be a finite number"),
+        ({"kappa": -2.0}, "kappa must be above minus the number of states, -2, but got -2.0"),
+        ({"beta": -1.0}, "alpha.2 kappa . beta n must not be negative.* but got alpha=1.0, beta=-1.0"),
+        ({"beta": 0.0, "kappa": -1.0}, "alpha.2 kappa . beta n must not be negative"),
+    ],
+)
+def test_numbers_that_make_no_filter_are_refused(numbers, rule):
+    with pytest.raises(ValueError, match=rule) as error:
+        UnscentedKalmanFilter(model=pendulum(), **numbers)
+    assert "\n" not in str(error.value)
