@@ -12,7 +12,7 @@ from filters.belief import Kernels
 from filters.members import add_noise, ensemble_motion
 from filters.rows import constants_form, constants_reader, memory_places, number_places
 from filters.weighted import WeightedFilter, anything_measured, particle_parts
-from filters.weights import normalise, read_weights, systematic_resampler, weighted_covariances
+from filters.weights import normalise, read_weights, systematic_resampler, weighted_squares
 from thruster_env.compiled import inlined
 from thruster_env.components import column_reader, column_writer, matrix_reader, scaled_sum
 from thruster_env.streams import FILTER_MEASUREMENT, uniform_block
@@ -35,11 +35,11 @@ def auxiliary_kernels(transition, observe, n, m, inputs, form) -> Kernels:
     predicted, store_effect, effects = (
         column_reader(m, scratch),
         column_writer(m, scratch),
-        weighted_covariances(scratch, m, weights),
+        weighted_squares(scratch, m, weights),
     )
     far = scratch + 2 * m
     foreseen, store_foreseen = column_reader(m, scratch + m), column_writer(m, scratch + m)
-    add_scaled, add, no_mean = scaled_sum(m), matrices.symmetric_sum(m), (0.0,) * m
+    add_scaled, add = scaled_sum(m), matrices.symmetric_sum(m)
     read_r, choose = matrix_reader(m, m, source.r), systematic_resampler(n + 1, weights, scratch)
 
     @inlined
@@ -77,7 +77,7 @@ def auxiliary_kernels(transition, observe, n, m, inputs, form) -> Kernels:
                 store_foreseen(table, j, y)
                 store_effect(table, j, add_scaled(predicted(table, j), -1.0, y))
             read_weights(table, logarithms, weights, size)
-            foresight = normal(z, add(effects(table, size, no_mean), read_r(numbers)))
+            foresight = normal(z, add(effects(table, size), read_r(numbers)))
             for j in range(table.shape[1]):
                 table[far, j] = distance(foreseen(table, j), foresight)
             for j in range(table.shape[1]):
@@ -113,7 +113,7 @@ class AuxiliaryParticleFilter(WeightedFilter):
                  lambda_j = w_j N(z; h(mu_j), R + V), parents i(j) drawn by lambda (systematic)
                  x_j = mu_i(j) + noise_j,  w_j = N(z; h(x_j), R)/N(z; h(mu_i(j)), R + V), normalised
                  L = (sum of lambda_j) (mean of w_j before normalisation)
-        belief:  mean = sum of w_j x_j,  cov = sum of w_j (x_j - mean)(x_j - mean)'
+        belief:  mean = sum of w_j x_j,  cov = sum of w_j (x_j - mean)(x_j - mean)'/(1 - sum of w_j^2)
 
     The look-ahead needs the measurement, which the update is the first to know. So the prediction keeps each
     particle's noise; the update takes it away, draws parents by mu, and adds it again: the noise does not depend

@@ -70,12 +70,14 @@ class ParticleFilter(WeightedFilter):
                  x_j = f(x_j, u) + noise_j,  noise_j ~ N(0, Q)
         update:  w_j = w_j p(z | x_j)/L,  L = sum of w_j p(z | x_j),  p(z | x) = N(z; h(x), R)
                  ESS = 1/(sum of w_j^2)
-        belief:  mean = sum of w_j x_j,  cov = sum of w_j (x_j - mean)(x_j - mean)'
+        belief:  mean = sum of w_j x_j,  cov = sum of w_j (x_j - mean)(x_j - mean)'/(1 - sum of w_j^2)
 
     The log-likelihood is log L. The innovation is z less the weighted mean of h(x_j), and its covariance S the
     weighted covariance of h(x_j) plus R. Resampling waits for the next prediction, so that a belief has the
-    moments of the weighted particles, without the noise of a draw. If no particle has any weight, because the
-    model holds the measurement for impossible, the belief restarts from the prior, counted in `divergences`.
+    moments of the weighted particles, without the noise of a draw. Where two or three particles have all the
+    weight, the covariance is nearly singular and the NEES far too large: a sign of too few particles. If none has
+    any, because the model holds the measurement for impossible, the belief restarts from the prior, counted in
+    `divergences`.
 
     `Belief.members` is (n + 1, N), its last row the log weights; `Belief.extras` holds the ESS.
 

@@ -66,7 +66,7 @@ def deviations(size: int, count: int, centre: bool) -> Callable:
 
 @cache
 def scatter(size: int, count: int) -> Callable:
-    """Return `sum(d, shift, w, b)`: w sum d_i d_i' + b shift shift', exactly symmetric, (size, size)."""
+    """Return `scatter(d, shift, w, b)`: w sum d_i d_i' + b shift shift', exactly symmetric, (size, size)."""
     lines = []
     for a in range(size):
         for b in range(a + 1):
@@ -102,7 +102,7 @@ def residuals(n: int, m: int) -> Callable:
 
 
 @cache
-def silenced(count: int, m: int) -> Callable:
+def silenced_columns(count: int, m: int) -> Callable:
     """Return `silence(d, z)`: vectors d (count, m) with zeros in the channels that are NaN in z."""
     return written_out(
         "silence", "d, z", matrix_of(count, m, lambda i, c: f"(d[{i}][{c}] if z[{c}] == z[{c}] else 0.0)")
@@ -130,7 +130,7 @@ def sigma_point_kernels(transition, observe, centre, n, m, inputs, form) -> Kern
     state_deviations, measured_deviations = deviations(n, 2 * n, centre), deviations(m, 2 * n, centre)
     state_scatter, measured_scatter, cross = scatter(n, 2 * n), scatter(m, 2 * n), cross_scatter(n, m)
     add_n, add_m = matrices.symmetric_sum(n), matrices.symmetric_sum(m)
-    silence, silence_shift, mask = silenced(2 * n, m), silenced(1, m), matrices.masked(m)
+    silence, silence_shift, mask = silenced_columns(2 * n, m), silenced_columns(1, m), matrices.masked(m)
     present, factor, solve = matrices.innovation(m), matrices.cholesky_factor(m), matrices.row_solver(n, m)
     rest, apply, likelihood = residuals(n, m), matrices.vector_multiplier(n, m), matrices.innovation_likelihood(m)
     k_r, k_r_kt = matrices.multiplier(n, m, m), matrices.transposed_multiplier(n, m, n)

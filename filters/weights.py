@@ -11,7 +11,7 @@ import numpy as np
 from thruster_env.compiled import inlined
 from thruster_env.components import column_reader, column_writer, matrix_of, tuple_of, written_out
 
-_LOWEST = -300.0  # less is nothing beside 1, and its square would be a denormal number, which is slow
+_LOWEST = -46.0  # e^-46 = 1e-20 is nothing beside 1, and still tells how far the others are off
 _LN_2, _PER_LN_2 = math.log(2.0), 1.0 / math.log(2.0)
 _ROUNDER = 1.5 * 2.0**52  # adding it leaves the nearest whole number in the last bits
 _ROUNDER_BITS = int(np.float64(_ROUNDER).view(np.int64))
@@ -19,7 +19,7 @@ _ROUNDER_BITS = int(np.float64(_ROUNDER).view(np.int64))
 
 @inlined
 def exponential(x):
-    """e^x for x <= 700, as e^-300 below -300 and for NaN; no branch or library call, so that loops vectorise.
+    """e^x for x <= 700, as e^-46 below -46 and for NaN; no branch or library call, so that loops vectorise.
 
     x = k log 2 + r with |r| <= log(2)/2; e^r by its series, to 1e-16, and 2^k by the exponent's bits.
     """
@@ -93,16 +93,43 @@ def weighted_means(first: int, rows: int, weights: int) -> Callable:
 
 @cache
 def weighted_covariances(first: int, rows: int, weights: int) -> Callable:
-    """Return `covariances(table, size, means)`: sum of w (x - mean)(x - mean)' over rows first, ..."""
+    """Return `covariances(table, size, means)`: weighted sample covariance of rows first, first + 1, ...
+
+    It is sum of w (x - mean)(x - mean)' over 1 - sum of w^2, which is unbiased for weights that do not depend on
+    x; for equal ones the divisor is N - 1. Where one weight is all, it is what the others say.
+    """
     pairs = [(i, j) for i in range(rows) for j in range(i + 1)]
     return written_out(
         "covariances",
         "table, size, means",
+        # 1 - sum of w^2 is the sum of w (1 - w). For a weight near 1 the others tell 1 - w without cancellation.
+        "rest = others = 0.0",
         *(f"s{i}_{j} = 0.0" for i, j in pairs),
         "for j in range(size):",
         f"    w = table[{weights}, j]",
+        "    other = w if w <= 0.5 else 0.0",
+        "    others += other",
+        "    rest += other * (1.0 - other)",
         *(f"    d{i} = table[{first + i}, j] - means[{i}]" for i in range(rows)),
         *(f"    s{i}_{j} += w * d{i} * d{j}" for i, j in pairs),
+        "rest += others * (1.0 - others)",
+        matrix_of(rows, rows, lambda i, j: f"s{max(i, j)}_{min(i, j)} / rest"),
+    )
+
+
+@cache
+def weighted_squares(first: int, rows: int, weights: int) -> Callable:
+    """Return `squares(table, size)`: sum of w x x' over rows first, first + 1, ..."""
+    pairs = [(i, j) for i in range(rows) for j in range(i + 1)]
+    return written_out(
+        "squares",
+        "table, size",
+        *(f"s{i}_{j} = 0.0" for i, j in pairs),
+        "for j in range(size):",
+        *(
+            f"    s{i}_{j} += table[{weights}, j] * table[{first + i}, j] * table[{first + j}, j]"
+            for i, j in pairs
+        ),
         matrix_of(rows, rows, lambda i, j: f"s{max(i, j)}_{min(i, j)}"),
     )
 

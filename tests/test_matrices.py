@@ -98,3 +98,52 @@ def test_the_likelihood_is_that_of_scipy_over_the_channels_that_are_there(size):
         part = cov[np.ix_(here, here)]
         expected = multivariate_normal.logpdf(v[here], np.zeros(len(part)), part) if here.any() else 0.0
         assert found == pytest.approx(expected, rel=1e-11, abs=1e-12)
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("rank", SIZES)
+def test_the_semidefinite_factor_has_the_covariance_as_its_square_whatever_the_rank(size, rank):
+    root = random(size, min(rank, size))
+    a = root @ root.T
+    factor = np.array(matrices.semidefinite_factor(size)(rows_of(a)))
+    assert (factor == np.tril(factor)).all()
+    np.testing.assert_allclose(factor @ factor.T, a, rtol=1e-12, atol=1e-13)
+    units = np.diag(10.0 ** np.arange(-3, size - 3))
+    rescaled = np.array(matrices.semidefinite_factor(size)(rows_of(units @ a @ units)))
+    if rank >= size:
+        np.testing.assert_allclose(rescaled, units @ factor, rtol=1e-10)
+        np.testing.assert_allclose(factor, np.linalg.cholesky(a), rtol=1e-10)
+
+
+def test_the_semidefinite_factor_of_nothing_is_nothing_and_of_nan_nan():
+    np.testing.assert_array_equal(matrices.semidefinite_factor(3)(rows_of(np.zeros((3, 3)))), np.zeros((3, 3)))
+    assert np.isnan(matrices.semidefinite_factor(2)(rows_of(np.full((2, 2), math.nan)))).any()
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_squares_and_inverses_of_factors_are_exactly_symmetric(size):
+    a = random_covariance(size)
+    factor = np.linalg.cholesky(a)
+    square = np.array(matrices.square(size, size)(rows_of(factor)))
+    inverse = np.array(matrices.factored_inverse(size)(rows_of(factor)))
+    assert (square == square.T).all() and (inverse == inverse.T).all()
+    np.testing.assert_allclose(square, a, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(inverse @ a, np.eye(size), rtol=1e-9, atol=1e-9)
+    v = random(size)
+    solved = matrices.forward_solver(size)(rows_of(factor), tuple(v))
+    np.testing.assert_allclose(factor @ solved, v, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("rows", SIZES)
+@pytest.mark.parametrize("columns", [4, 7])
+def test_the_triangular_root_is_that_of_a_qr_decomposition(rows, columns):
+    a = random(rows, columns)
+    root = np.array(matrices.triangular_root(rows, columns)(rows_of(a)))
+    expected = np.linalg.qr(a.T, mode="r").T
+    np.testing.assert_allclose(root, expected * np.sign(np.diag(expected)), rtol=1e-12, atol=1e-13)
+
+
+def test_the_triangular_root_of_a_matrix_with_zero_rows_is_finite():
+    a = np.array([[1.0, 2.0, 2.0], [0.0, 0.0, 0.0], [2.0, 4.0, 4.0]])
+    root = np.array(matrices.triangular_root(3, 3)(rows_of(a)))
+    np.testing.assert_allclose(root @ root.T, a @ a.T, rtol=1e-14)
