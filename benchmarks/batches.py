@@ -11,12 +11,12 @@ import numpy as np
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, alone, side_by_side
 from filters import run
-from filters.engine import spread
 from thruster_env.compiled import compiled, function_fingerprint
 from thruster_env.components import column_reader, column_writer, vector_reader
 from thruster_env.dynamics import Constants, substep
 from thruster_env.plant import Plant
 from thruster_env.streams import FILTER_PROCESS, fill_normals
+from thruster_env.threads import spread
 from tuning.evaluate import evaluate
 from tuning.scenarios import find_scenario, training_seeds
 from tuning.space import Choice, true_choice

@@ -13,7 +13,6 @@ import numpy as np
 import thruster_env  # noqa: F401 - registers BowThruster-v0
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, side_by_side
-from filters.engine import spread
 from thruster_env.batch import Copies
 from thruster_env.compiled import compiled, function_fingerprint
 from thruster_env.dynamics import substep
@@ -21,8 +20,9 @@ from thruster_env.memory import COMMAND, SUBSTEPS, VOLTAGE, set_row
 from thruster_env.motion import move_thruster
 from thruster_env.plant import make_plant
 from thruster_env.task import Task
+from thruster_env.threads import spread
 
-COPIES, STEPS = 8192, 50
+COPIES, STEPS = 8192, 200
 PROPAGATED = 65536
 WIDTH, REPEATS = 1024, 200  # of the loops that measure the machine's arithmetic
 

@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.engine import batch, lanes, new_memory, spread
+from filters.engine import batch, lanes, new_memory
 from filters.filter import Filter
 from filters.rows import LANES, with_root
 from thruster_env.checks import covariance
+from thruster_env.threads import spread
 
 
 class Estimates(NamedTuple):

@@ -8,7 +8,6 @@ import numpy as np
 
 from filters.affine import AffineModel
 from filters.derivatives import jacobian
-from filters.engine import spread
 from filters.matrices import multiplier, quadratic_form
 from filters.model import StateSpaceModel
 from filters.rows import constants_form, constants_reader, number_places, padded
@@ -17,6 +16,7 @@ from thruster_env.checks import at_least
 from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.components import matrix_reader, vector_reader, written_out
 from thruster_env.streams import GROUP
+from thruster_env.threads import spread
 
 
 def riccati_covariances(model: AffineModel) -> tuple[np.ndarray, np.ndarray]:

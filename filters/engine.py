@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache, lru_cache
+from functools import lru_cache
 
 import numpy as np
 
@@ -125,22 +123,3 @@ def new_memory(kernels: Kernels, size: int) -> tuple[np.ndarray, np.ndarray, np.
     length = memory_places(kernels.n, kernels.m).extras + kernels.extras + kernels.scratch
     draws = padded(kernels.draws_per_member * width, GROUP)
     return np.zeros(length), np.zeros((kernels.table_rows, width)), np.zeros(draws)
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_threads(), thread_name_prefix="filters")
-
-
-if hasattr(os, "register_at_fork"):  # a forked child has none of the threads
-    os.register_at_fork(after_in_child=_pool.cache_clear)
-
-
-def _threads() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def spread(part: Callable[[int, int], None], count: int, *, parts_a_thread: int = 4) -> None:
-    """Call part(first, last) on all cores until it has covered 0 ... count; part releases the lock."""
-    edges = np.linspace(0, count, 1 + min(count, parts_a_thread * _threads())).astype(int)
-    list(_pool().map(part, edges[:-1], edges[1:]))

@@ -9,7 +9,7 @@ from functools import cache, lru_cache
 import numpy as np
 
 from filters.belief import Kernels
-from filters.engine import new_memory, spread
+from filters.engine import new_memory
 from filters.ensemble import EnsembleFilter
 from filters.members import row_covariances, row_means
 from filters.model import StateSpaceModel
@@ -17,6 +17,7 @@ from filters.restart import restart_if_lost
 from filters.rows import constants_form, memory_places
 from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.components import tuple_of, written_out
+from thruster_env.threads import spread
 
 
 def smooth_ensembles(

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
 
 from filters.belief import Kernels
-from filters.engine import build_operation, new_memory, spread
+from filters.engine import build_operation, new_memory
 from filters.filter import Filter
 from filters.rows import memory_places
-from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.compiled import CompiledOrPython, inlined, is_interpreting
+from thruster_env.threads import crew, in_parts
 
 THREADED_COPIES = 256  # fewer are done before a second thread has woken up
 IDLE, STEP, START = 0, 1, 2  # what a copy's belief does in a call
@@ -24,7 +24,7 @@ class Beliefs:
         """Allocate the memory of `count` beliefs; `start` comes next."""
         self._kernels, self._size, self._numbers = filter_.kernels(), filter_.size, filter_.numbers
         self._places = memory_places(self._kernels.n, self._kernels.m)
-        row, table, _ = new_memory(self._kernels, self._size)
+        row, table, _ = self._own = new_memory(self._kernels, self._size)
         self._rows = np.zeros((count, len(row)))
         self._tables = np.zeros((count, self._kernels.kept_rows, table.shape[1]))
         self._u, self._z = np.zeros((count, filter_.kernel_model.inputs)), np.zeros((count, self._kernels.m))
@@ -47,18 +47,9 @@ class Beliefs:
 
     def _do(self, tasks: np.ndarray, u: np.ndarray, z: np.ndarray) -> None:
         self._u[:], self._z[:] = u, z
-        count = len(self._rows)
-
-        def part(first: int, last: int) -> None:
-            scratch = new_memory(self._kernels, self._size)
-            self._operate(
-                *scratch, self._size, tasks, self._rows, self._tables, self._u, self._z, self._numbers, first, last
-            )
-
-        if count < THREADED_COPIES:
-            part(0, count)
-        else:
-            spread(part, count, parts_a_thread=1)
+        arrays = tasks, self._rows, self._tables, self._u, self._z
+        arguments = *self._own, self._size, *arrays, self._numbers
+        crew().run(self._operate, len(tasks), *arguments, alone=len(tasks) < THREADED_COPIES)
 
     def part(self, name: str, *shape: int) -> np.ndarray:
         """A copy of a part of all memories, such as "mean": (N, *shape)."""
@@ -68,19 +59,18 @@ class Beliefs:
 
 
 @lru_cache(maxsize=128)
-def _operation(kernels: Kernels, interpreting: bool) -> Callable:
+def _operation(kernels: Kernels, interpreting: bool) -> CompiledOrPython:
     operate = inlined(build_operation(kernels))
     kept = kernels.kept_rows
-    fingerprint = function_fingerprint(kernels.start, kernels.predict, kernels.update)
 
-    def operate_many(row, table, draws, size, tasks, rows, tables, inputs, measurements, numbers, first, last):
-        fingerprint  # noqa: B018 - part of the cache's key
+    def operate_many(first, last, row, table, draws, size, tasks, rows, tables, inputs, measurements, numbers):
+        # Each thread works in memory of its own: slices of arrays that threads share cost contended counts.
+        row, table, draws = np.zeros_like(row), np.zeros_like(table), np.zeros_like(draws)
         u, z = np.zeros(inputs.shape[1]), np.zeros(measurements.shape[1])
         for b in range(first, last):
             task = tasks[b]
             if task == IDLE:
                 continue
-            # Into memory of one's own and back: slices of arrays that threads share cost contended counts.
             for i in range(row.shape[0]):
                 row[i] = rows[b, i]
             if task == STEP:
@@ -98,4 +88,4 @@ def _operation(kernels: Kernels, interpreting: bool) -> Callable:
                 for j in range(tables.shape[2]):
                     tables[b, i, j] = table[i, j]
 
-    return CompiledOrPython(operate_many)
+    return in_parts(operate_many)

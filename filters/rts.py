@@ -11,12 +11,12 @@ from filters import matrices
 from filters.affine import affine_functions
 from filters.batch import Estimates
 from filters.derivatives import jacobian
-from filters.engine import spread
 from filters.filter import Filter
 from filters.rows import constants_reader, number_places, own_place
 from filters.schedule import constants_of_affine, interpolator
 from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from thruster_env.components import matrix_of, matrix_reader, tuple_of, vector_reader, written_out
+from thruster_env.threads import spread
 
 NEGLIGIBLE = 1e-13  # a pivot of a predicted covariance below this part of its variance counts as zero
 

@@ -21,7 +21,9 @@ FORBIDDEN = {
     "thruster_cli": set(),
 }
 LEARNING = {"stable_baselines3", "sb3_contrib", "rl_zoo3", "torch"}
-SHARED_TOOLS = {f"thruster_env.{module}" for module in ("checks", "compiled", "components", "keys", "streams")}
+SHARED_TOOLS = {
+    f"thruster_env.{module}" for module in ("checks", "compiled", "components", "keys", "streams", "threads")
+}
 BRIDGE = ROOT / "filters" / "thruster.py"
 
 

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-
 import numpy as np
 
 from thruster_env.checks import vector
-from thruster_env.copies import advance
+from thruster_env.copies import advance, advance_in_parts
 from thruster_env.encoding import encode, is_plain, known_effects
 from thruster_env.memory import (
     COMMAND,
@@ -26,6 +22,7 @@ from thruster_env.memory import (
 from thruster_env.parameters import derive_constants
 from thruster_env.plant import Plant
 from thruster_env.task import Task
+from thruster_env.threads import crew
 from thruster_env.uncertainty import drawn_parameters
 
 THREADED_BLOCKS = 8  # fewer blocks are done before a second thread has woken up
@@ -39,7 +36,8 @@ class Copies:
         self.plant, self.task, self.count = plant, task, count
         self.numbers, self._extra_rows = encode(plant, task)
         self.memory = new_memory(count, self._extra_rows)
-        self.advance = advance(known_effects(plant, task), is_plain(plant, task))
+        effects = known_effects(plant, task), is_plain(plant, task)
+        self.advance, self._advance_in_parts = advance(*effects), advance_in_parts(*effects)
 
     @property
     def bytes_per_copy(self) -> int:
@@ -82,16 +80,10 @@ class Copies:
     def _run(self, memory: np.ndarray, numbers: np.ndarray, begin: bool) -> np.ndarray:
         blocks, _, width = memory.shape
         out = np.empty((REPORTED, blocks, width))
-        if blocks < THREADED_BLOCKS or _threads() == 1:
-            self.advance(memory, numbers, out, begin, 0, blocks)
-            return out.reshape(REPORTED, -1)
-        # This thread takes its share; the others need some microseconds to wake up.
-        edges = np.linspace(0, blocks, _threads() + 1).astype(int)
-        parts = [(memory, numbers, out, begin, a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
-        others = [_pool().submit(self.advance, *part) for part in parts[1:]]
-        self.advance(*parts[0])
-        for other in others:
-            other.result()
+        if blocks < THREADED_BLOCKS:
+            self.advance(0, blocks, memory, numbers, out, begin)
+        else:
+            crew().run(self._advance_in_parts, blocks, memory, numbers, out, begin)
         return out.reshape(REPORTED, -1)
 
     def _draw_constants(self, memory: np.ndarray, keys: np.ndarray) -> None:
@@ -101,17 +93,3 @@ class Copies:
         first = FIXED_ROWS + self._extra_rows - CONSTANT_COUNT
         for i, values in enumerate(constants):
             set_row(memory, first + i, np.broadcast_to(values, len(keys)))
-
-
-@cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max(1, _threads() - 1), thread_name_prefix="thrusters")
-
-
-if hasattr(os, "register_at_fork"):  # a forked child has none of the threads
-    os.register_at_fork(after_in_child=_pool.cache_clear)
-
-
-@cache
-def _threads() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

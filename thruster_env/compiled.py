@@ -44,6 +44,12 @@ def inlined(function: Callable) -> Callable:
     return function
 
 
+def overloaded(function: Callable) -> Callable:
+    """Mark a plain function in whose place compiled functions have machine code, by `numba.extending.overload`."""
+    _marked.add(function)
+    return function
+
+
 def _callees(function: Callable) -> list[Callable]:
     """Plain functions that a function has in its closure or calls by a global name."""
     if not isinstance(function, types.FunctionType):

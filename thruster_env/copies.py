@@ -62,6 +62,7 @@ from thruster_env.motion import (
     move_thruster,
 )
 from thruster_env.streams import MEASUREMENT, normal_block
+from thruster_env.threads import in_parts
 
 LARGEST_ERROR = 1e6  # of thrust over T_max: a reward stays finite when a state does not
 
@@ -151,7 +152,7 @@ def _chain(effects, section: int) -> Callable:
 
 
 def advance(known_effects, plain: bool) -> Callable:
-    """Compiled `step(memory, numbers, out, begin, first, last)` on blocks first ... last - 1 of a memory.
+    """Compiled `step(first, last, memory, numbers, out, begin)` on blocks first ... last - 1 of a memory.
 
     With `begin` it starts an episode of every copy from its key (rows KEY_0, KEY_1), and takes the first
     measurement; else it applies the voltages in row COMMAND for one sample time. The reported rows are copied to
@@ -161,18 +162,23 @@ def advance(known_effects, plain: bool) -> Callable:
         known_effects: a tuple of effects for each registry, as `encoding.known_effects` gives them.
         plain: know only a nominal thruster whose thrust is measured; compiles and runs faster.
     """
-    return _advance(known_effects, plain, is_interpreting())
+    return _build(compiled, known_effects, plain, is_interpreting())
+
+
+def advance_in_parts(known_effects, plain: bool) -> Callable:
+    """The same for `threads.Crew.run`."""
+    return _build(in_parts, known_effects, plain, is_interpreting())
 
 
 @cache
-def _advance(known_effects, plain: bool, interpreting: bool) -> Callable:
+def _build(maker: Callable, known_effects, plain: bool, interpreting: bool) -> Callable:
     amplify, stream, sense, refer = (_chain(effects, section) for section, effects in enumerate(known_effects))
     move, push = (move_thruster, find_thrust) if plain else (move_any, find_any_thrust)
     measure = _measure_thrust if plain else _measure_all
     reported = READINGS + 1 if plain else REPORTED  # rows beyond are of channels that there are not
     fingerprint = function_fingerprint(*(effect.act for effects in known_effects for effect in effects))
 
-    def step(memory, numbers, out, begin, first, last):
+    def step(first, last, memory, numbers, out, begin):
         fingerprint  # noqa: B018 - part of the cache's key
         width = memory.shape[2]
         for b in range(first, last):
@@ -207,4 +213,4 @@ def _advance(known_effects, plain: bool, interpreting: bool) -> Callable:
                 for j in range(width):
                     out[i, b, j] = memory[b, i, j]
 
-    return compiled(step)
+    return maker(step)

@@ -199,7 +199,7 @@ class BowThrusterEnv(RenderedEnv):
         Raises ValueError for an action that is not one number or is NaN.
         """
         self._memory[0, COMMAND, 0] = _as_voltage(action)
-        self._advance(self._memory, self._numbers, self._out, False, 0, 1)
+        self._advance(0, 1, self._memory, self._numbers, self._out, False)
         report = self._report.tolist()
         if self.render_mode is not None:
             self._show(report)
