@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from filterpy.kalman import EnsembleKalmanFilter, KalmanFilter
 
-from filters.affine import AffineModel
+from filters.gaussian.affine import AffineModel
 from thruster_env.compiled import compiled, function_fingerprint
 from thruster_env.components import vector_reader
 from thruster_env.dynamics import Constants, substep, thrust_and_torque

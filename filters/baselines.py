@@ -9,8 +9,8 @@ from typing import ClassVar
 
 from filters import matrices
 from filters.belief import Kernels
-from filters.extended import nothing_to_summarise
 from filters.filter import Filter
+from filters.gaussian.extended import nothing_to_summarise
 from filters.inverse import component_solver
 from filters.rows import constants_form, constants_reader, memory_places, number_places, own_place
 from thruster_env.checks import at_least, positive

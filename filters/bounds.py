@@ -6,8 +6,8 @@ from functools import cache
 
 import numpy as np
 
-from filters.affine import AffineModel
 from filters.derivatives import jacobian
+from filters.gaussian.affine import AffineModel
 from filters.matrices import multiplier, quadratic_form
 from filters.model import StateSpaceModel
 from filters.rows import constants_form, constants_reader, number_places, padded

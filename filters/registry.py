@@ -7,27 +7,27 @@ import json
 from pathlib import Path
 from typing import Any
 
-from filters.auxiliary import AuxiliaryParticleFilter
+from filters.adaptive.robust import RobustExtendedKalmanFilter
+from filters.adaptive.sage_husa import SageHusaFilter
+from filters.adaptive.variational import VariationalBayesFilter
 from filters.baselines import Inversion, LowPass, OpenLoop
-from filters.cubature import CubatureKalmanFilter
-from filters.deterministic import DeterministicEnsembleKalmanFilter
-from filters.ensemble import EnsembleKalmanFilter
-from filters.extended import ExtendedKalmanFilter
+from filters.ensembles.deterministic import DeterministicEnsembleKalmanFilter
+from filters.ensembles.ensemble import EnsembleKalmanFilter
+from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
+from filters.ensembles.serial import SerialSquareRootFilter
+from filters.ensembles.transform import EnsembleTransformFilter
 from filters.filter import Filter
-from filters.fuzzy import FuzzyKalmanFilter
-from filters.gaussian_sum import GaussianSumFilter
-from filters.iterated import IteratedExtendedKalmanFilter
-from filters.iterated_ensemble import IteratedEnsembleKalmanFilter
-from filters.kalman import KalmanFilter
+from filters.gaussian.cubature import CubatureKalmanFilter
+from filters.gaussian.extended import ExtendedKalmanFilter
+from filters.gaussian.fuzzy import FuzzyKalmanFilter
+from filters.gaussian.gaussian_sum import GaussianSumFilter
+from filters.gaussian.iterated import IteratedExtendedKalmanFilter
+from filters.gaussian.kalman import KalmanFilter
+from filters.gaussian.steady_state import SteadyStateKalmanFilter
+from filters.gaussian.unscented import UnscentedKalmanFilter
 from filters.model import StateSpaceModel
-from filters.particle import ParticleFilter
-from filters.robust import RobustExtendedKalmanFilter
-from filters.sage_husa import SageHusaFilter
-from filters.serial import SerialSquareRootFilter
-from filters.steady_state import SteadyStateKalmanFilter
-from filters.transform import EnsembleTransformFilter
-from filters.unscented import UnscentedKalmanFilter
-from filters.variational import VariationalBayesFilter
+from filters.particles.auxiliary import AuxiliaryParticleFilter
+from filters.particles.particle import ParticleFilter
 from thruster_env.checks import one_of, shown
 
 FILTERS: dict[str, type[Filter]] = {

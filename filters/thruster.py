@@ -7,7 +7,7 @@ from functools import cache, partial
 
 import numpy as np
 
-from filters.affine import affine_model
+from filters.gaussian.affine import affine_model
 from filters.model import StateSpaceModel
 from thruster_env.checks import covariance, finite, positive
 from thruster_env.compiled import inlined

@@ -19,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 
 from filters import EnsembleKalmanFilter, KalmanFilter, affine_model, run
-from filters.affine import AffineModel
 from filters.bounds import riccati_covariances
 from filters.filter import Filter
+from filters.gaussian.affine import AffineModel
 from filters.truth import Truth, simulate
 from studies.published import NOISE_LEVELS, STEPS, SYSTEMS, H
 from studies.unupdated_ensemble import unupdated_ensemble_means

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from filters.affine import AffineModel
+from filters.gaussian.affine import AffineModel
 from thruster_env.checks import covariance_root
 
 _BLOCK = 128  # runs at a time: their members stay in the processor's cache

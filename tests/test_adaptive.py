@@ -15,7 +15,7 @@ from filters import (
     thruster_model,
     truth,
 )
-from filters.sage_husa import bounded_step
+from filters.adaptive.sage_husa import bounded_step
 from filters.session import Session
 from thruster_env.compiled import interpreted
 from thruster_env.streams import episode_keys

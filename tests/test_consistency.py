@@ -15,19 +15,18 @@ from filters import (
     truth,
 )
 from filters.batch import Estimates
-from filters.consistency import check_squares, normalized_squares
-from filters.intervals import Interval, mean_interval, rmse_intervals, rmse_ratios
-from filters.recording import Members, record_members
-from filters.report import consistency_report
-from filters.scores import (
+from filters.consistency.intervals import Interval, mean_interval, rmse_intervals, rmse_ratios
+from filters.consistency.nees import check_squares, normalized_squares
+from filters.consistency.report import consistency_report
+from filters.consistency.scores import (
     covered,
     ensemble_crps,
     ensemble_ranks,
     expected_gaussian_crps,
     gaussian_crps,
 )
-from filters.uniformity import uniformity
-from filters.verdicts import (
+from filters.consistency.uniformity import uniformity
+from filters.consistency.verdicts import (
     comparison_sentence,
     confidence,
     coverage_sentence,
@@ -40,7 +39,8 @@ from filters.verdicts import (
     sentences,
     whiteness_sentence,
 )
-from filters.whiteness import whiteness
+from filters.consistency.whiteness import whiteness
+from filters.ensembles.recording import Members, record_members
 from thruster_env.compiled import interpreted
 from thruster_env.streams import episode_keys
 from tuning.consistency_figures import consistency_figure

@@ -3,7 +3,7 @@ import pytest
 
 from filters import affine_model, make_filter, thruster_model, truth
 from filters.bounds import posterior_bound, riccati_covariances
-from filters.consistency import normalized_squares
+from filters.consistency.nees import normalized_squares
 from thruster_env.compiled import interpreted
 from tuning.evaluate import evaluate, score_ratio
 from tuning.scenarios import find_scenario, held_out_seeds

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from filters import FuzzyKalmanFilter, KalmanFilter, StateSpaceModel, affine_model, run, thruster_model, truth
-from filters.fuzzy import memberships
+from filters.gaussian.fuzzy import memberships
 from thruster_env.compiled import interpreted
 from thruster_env.streams import episode_keys
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filters import FILTERS, affine_model, make_filter, run, thruster_model, truth
-from filters.ensemble import EnsembleFilter
+from filters.ensembles.ensemble import EnsembleFilter
 from thruster_env.compiled import interpreted
 from thruster_env.streams import episode_keys, filter_keys
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from filters import make_filter, run
-from filters.consistency import normalized_squares
+from filters.consistency.nees import normalized_squares
 from tuning.evaluate import evaluate
 from tuning.scenarios import FIRST_SCORED_STEP, find_scenario, held_out_seeds
 

@@ -17,14 +17,14 @@ from filters import (
     thruster_model,
     truth,
 )
-from filters.session import Session
-from filters.weights import (
+from filters.particles.weights import (
     exponential,
     normalise,
     systematic_resampler,
     weighted_covariances,
     weighted_means,
 )
+from filters.session import Session
 from thruster_env.compiled import interpreted
 from thruster_env.streams import (
     FILTER_MEASUREMENT,

@@ -20,9 +20,9 @@ from filters import (
     run,
     truth,
 )
-from filters.consistency import normalized_squares
-from filters.intervals import mean_interval, rmse_ratios
-from filters.smoothers import smooth
+from filters.consistency.intervals import mean_interval, rmse_ratios
+from filters.consistency.nees import normalized_squares
+from filters.smoothers.smooth import smooth
 from thruster_env.compiled import interpreted
 from thruster_env.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys, normal_block
 from tuning.scenarios import find_scenario, held_out_seeds

@@ -14,7 +14,7 @@ from filters import (
     run,
     truth,
 )
-from filters.transform import geometric_mean
+from filters.ensembles.transform import geometric_mean
 from thruster_env.compiled import interpreted
 from thruster_env.streams import episode_keys, filter_keys
 from tuning.evaluate import evaluate

@@ -12,7 +12,7 @@ from scipy import stats
 from scipy.linalg import expm
 
 from filters import KalmanFilter, run
-from filters.consistency import normalized_squares
+from filters.consistency.nees import normalized_squares
 from filters.thruster import model_of_env
 from thruster_env.flow import Sinusoid
 from thruster_env.linear_plant import make_linear_plant

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from filters.consistency import SquaresCheck
-from filters.intervals import rmse_ratios
+from filters.consistency.intervals import rmse_ratios
+from filters.consistency.nees import SquaresCheck
+from filters.consistency.report import ConsistencyReport
+from filters.consistency.verdicts import comparison_sentence, sentences
 from filters.registry import filter_class
-from filters.report import ConsistencyReport
-from filters.verdicts import comparison_sentence, sentences
 from thruster_env.files import check_target
 from tuning.consistency_figures import consistency_figure
 from tuning.evaluate import check_consistency

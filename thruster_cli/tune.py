@@ -11,8 +11,8 @@ from typing import Annotated, NamedTuple
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from filters.consistency.verdicts import mean_sentence
 from filters.registry import filter_class
-from filters.verdicts import mean_sentence
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
 from thruster_cli.tables import choice_table, comparison_table, span
 from thruster_env.checks import at_least

@@ -1,4 +1,4 @@
-"""One picture of whether a filter's covariance is honest: the checks of `filters.report`, a panel each."""
+"""One picture of whether a filter's covariance is honest: a panel for each check of `filters.consistency`."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from filters.consistency import SquaresCheck
-from filters.intervals import Interval
-from filters.report import ConsistencyReport
-from filters.scores import LEVELS
-from filters.verdicts import probability_text, rounded
+from filters.consistency.intervals import Interval
+from filters.consistency.nees import SquaresCheck
+from filters.consistency.report import ConsistencyReport
+from filters.consistency.scores import LEVELS
+from filters.consistency.verdicts import probability_text, rounded
 from thruster_env.figures import BLUE, DARK, RUST, new_figure, save_figure, tidy
 
 FOUND = BLUE
@@ -34,7 +34,7 @@ def consistency_figure(
         path: PNG file to write.
         report: the checks of one filter.
         title: said above the picture.
-        comparison: RMSE ratios by state, from `filters.intervals.rmse_ratios`, under the names of the pairs.
+        comparison: RMSE ratios by state, from `intervals.rmse_ratios`, under the names of the pairs.
 
     Raises:
         ValueError: if there is nothing to draw, or nothing can be written.

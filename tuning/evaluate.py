@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.batch import run
-from filters.consistency import normalized_squares
+from filters.consistency.intervals import Interval, interval, mean_interval, resampled_means, rmse_intervals
+from filters.consistency.nees import normalized_squares
+from filters.consistency.report import ConsistencyReport, consistency_report
+from filters.ensembles.recording import record_members
 from filters.filter import Filter
-from filters.intervals import Interval, interval, mean_interval, resampled_means, rmse_intervals
-from filters.recording import record_members
-from filters.report import ConsistencyReport, consistency_report
 from filters.thruster import thrusts_of
 from tuning.scenarios import FIRST_SCORED_STEP, Data
 

@@ -7,7 +7,7 @@ import json
 import math
 from pathlib import Path
 
-from filters.intervals import Interval
+from filters.consistency.intervals import Interval
 from filters.registry import FILE_FORMAT, FILE_VERSION, read_tuned_file
 from thruster_env.checks import at_least, positive, shown, vector
 from thruster_env.files import write_whole

@@ -1,0 +1,94 @@
+"""Is a filter's covariance honest? NEES and NIS of many runs against their chi-square distributions."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtr, chdtri
+
+from filters.consistency.intervals import Interval, mean_interval
+from filters.consistency.uniformity import Uniformity, uniformity
+
+SINGULAR = 1e-12  # a pivot of P below this part of its variance counts as zero
+
+
+def whitened(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
+    """L^-1 e with L L' = P, for errors (..., d) and covariances (..., d, d); NaN where P is singular.
+
+    If the covariances are right, the result has independent components of variance one.
+    """
+    d = errors.shape[-1]
+    root, solved = {}, []
+    regular = np.ones(errors.shape[:-1], dtype=bool)
+    for i in range(d):  # Cholesky factor and forward substitution, each entry an array over all covariances
+        for j in range(i):
+            rest = sum(root[i, k] * root[j, k] for k in range(j))
+            root[i, j] = (covs[..., i, j] - rest) / root[j, j]
+        pivot = covs[..., i, i] - sum(root[i, k] ** 2 for k in range(i))
+        regular &= pivot > SINGULAR * covs[..., i, i]
+        root[i, i] = np.sqrt(np.where(regular, pivot, 1.0))
+        solved.append((errors[..., i] - sum(root[i, k] * solved[k] for k in range(i))) / root[i, i])
+    return np.where(regular[..., None], np.stack(solved, axis=-1), np.nan)
+
+
+def normalized_squares(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
+    """E' P^-1 e for errors (..., d) and covariances (..., d, d); NaN where P is singular.
+
+    With estimation errors this is the NEES, with innovations and their covariances the NIS; for an honest
+    filter each is chi-squared with d degrees of freedom. Source: Bar-Shalom, Li, Kirubarajan (2001),
+    Estimation with Applications to Tracking and Navigation, section 5.4.
+    """
+    return (whitened(errors, covs) ** 2).sum(axis=-1)
+
+
+class SquaresCheck(NamedTuple):
+    """NEES or NIS of B runs over T steps, against chi-square."""
+
+    name: str  # "NEES" or "NIS"
+    dimension: float  # the right mean: number of states, or of channels that were there
+    mean: Interval  # over runs and steps
+    step_means: np.ndarray  # (T,), over runs
+    band: np.ndarray  # (T, 2), where the mean over runs lies with 95 % probability in each step
+    share_inside: float  # of steps inside their band; 0.95 is right
+    beyond: Interval  # share of single values above the 95 % point of chi-square; 0.05 is right
+    distribution: Uniformity  # of the values' probabilities under chi-square
+
+
+def check_squares(
+    name: str, errors: np.ndarray, covs: np.ndarray, present: np.ndarray | None = None
+) -> SquaresCheck:
+    """Hold normalised squares against chi-square, as numbers of B independent runs.
+
+    The sum over runs of one step is chi-squared with as many degrees of freedom as there are components, so its
+    band is exact even where measurements are missing. Intervals and the test of the distribution resample whole
+    runs: values of neighbouring steps are correlated.
+
+    Args:
+        name: "NEES" or "NIS", for reports.
+        errors: estimation errors or innovations, (B, T, d).
+        covs: their covariances, (B, T, d, d); singular ones are left out.
+        present: which components are there, (B, T, d); all if None.
+    """
+    squares = normalized_squares(errors, covs)
+    freedom = np.full(squares.shape, float(errors.shape[-1])) if present is None else present.sum(axis=-1) * 1.0
+    freedom = np.where(np.isnan(squares), 0.0, freedom)
+    counted = freedom > 0
+    squares = np.where(counted, squares, np.nan)
+    runs, total = counted.sum(axis=0), freedom.sum(axis=0)
+    some, below = runs > 0, np.maximum(runs, 1)
+    means = np.where(some, np.nansum(squares, axis=0) / below, np.nan)
+    limits = chdtri(np.maximum(total, 1.0)[:, None], [0.975, 0.025])  # chdtri takes the upper tail
+    band = np.where(some[:, None], limits / below[:, None], np.nan)
+    inside = (means >= band[:, 0]) & (means <= band[:, 1])
+    probability = np.where(counted, chdtr(np.maximum(freedom, 1.0), squares), np.nan)
+    return SquaresCheck(
+        name,
+        float(freedom.sum() / counted.sum()) if counted.any() else np.nan,
+        mean_interval(squares),
+        means,
+        band,
+        float(inside[some].mean()) if some.any() else np.nan,
+        mean_interval(np.where(counted, probability > 0.95, np.nan)),
+        uniformity(probability),
+    )

@@ -1,0 +1,228 @@
+"""A consistency report in sentences, each a function of the numbers that it states."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from filters.consistency.intervals import Interval
+from filters.consistency.nees import SquaresCheck
+from filters.consistency.report import ConsistencyReport
+from filters.consistency.uniformity import FEWEST_RUNS, Uniformity
+from filters.consistency.whiteness import Whiteness
+
+SLIGHT_FACTOR = 1.2  # a mean NEES or NIS this close to the right one is off by little
+SLIGHT_DISTANCE = 0.02  # so are distributions this close
+SLIGHT_CORRELATION = 0.05  # and correlations this small
+SIGNIFICANT = 0.05
+EVEN = "even, as far as these runs show"
+
+
+def sentences(report: ConsistencyReport) -> list[str]:
+    """What a report says, one check a sentence, a remedy last."""
+    said = []
+    for check in (report.nees, report.nis):
+        said.append(squares_sentence(check, report.runs))
+        if not np.isnan(check.mean.value):
+            said.append(distribution_sentence(check))
+    said.append(whiteness_sentence(report.whiteness))
+    of_members = report.ensemble.crps if report.ensemble is not None else (None,) * len(report.states)
+    columns = report.states, report.coverage, report.crps, report.crps_expected, of_members
+    for name, coverage, *crps in zip(*columns, strict=True):
+        said += [coverage_sentence(name, coverage), crps_sentence(name, *crps)]
+    if report.ensemble is not None:
+        size = report.ensemble.size
+        said += [
+            ranks_sentence(name, r, size) for name, r in zip(report.states, report.ensemble.ranks, strict=True)
+        ]
+    said.append(divergence_sentence(report.divergences, report.diverged_runs, report.runs))
+    said.append(remedy_sentence(report))
+    return [sentence for sentence in said if sentence]
+
+
+def confidence(mean: Interval, dimension: float) -> str:
+    """In a word or two: is a filter with this mean NEES or NIS overconfident?"""
+    if mean.covers(dimension):
+        return "consistent"
+    ratio = mean.value / dimension
+    word = "overconfident" if ratio > 1 else "underconfident"
+    return f"slightly {word}" if 1 / SLIGHT_FACTOR < ratio < SLIGHT_FACTOR else word
+
+
+def mean_sentence(name: str, mean: Interval, dimension: float) -> str:
+    """What a mean NEES or NIS says of the covariance."""
+    if np.isnan(mean.value):
+        return f"No {name}: the filter gives no covariance, or a singular one."
+    return f"{_capital(confidence(mean, dimension))}: mean {name} {_span(mean)} where {dimension:.3g} is right."
+
+
+def squares_sentence(check: SquaresCheck, runs: int) -> str:
+    """The mean NEES or NIS, and how many steps lie in their band."""
+    said = mean_sentence(check.name, check.mean, check.dimension)
+    if np.isnan(check.mean.value):
+        return said
+    low, high = np.nanmedian(check.band, axis=0)
+    return (
+        f"{said[:-1]}; the mean of {runs} runs lies in its 95 % band, about [{low:.3g}, {high:.3g}], "
+        f"in {100 * check.share_inside:.0f} % of the steps."
+    )
+
+
+def distribution_sentence(check: SquaresCheck) -> str:
+    """Whether all values together are distributed as they should be."""
+    if _alike(check.distribution):
+        verdict = "is that of chi-square, as far as these runs show"
+    elif check.distribution.distance < SLIGHT_DISTANCE:
+        verdict = "is close to chi-square"
+    else:
+        verdict = "is not that of chi-square"
+    return (
+        f"The distribution of {check.name} {verdict}: {100 * check.beyond.value:.1f} % of the values lie beyond "
+        f"its 95 % point ({_test(check.distribution)})."
+    )
+
+
+def whiteness_sentence(found: Whiteness) -> str:
+    """Whether innovations are white, and which way they are not."""
+    if found.statistic == 0:
+        return "No test of whiteness: the filter gives no innovation covariance, or nothing was measured."
+    lag, i, j = np.unravel_index(np.argmax(np.abs(found.correlations)), found.correlations.shape)
+    largest = found.correlations[lag, i, j]
+    after = "from one step to the next" if lag == 0 else f"over {lag + 1} steps"
+    channels = "" if found.correlations.shape[1] == 1 else f", of channel {i + 1} with channel {j + 1}"
+    share, width = 100 * found.share_inside, np.median(found.half_widths)
+    numbers = (
+        f"the largest correlation is {largest:+.2g} {after}{channels}; {share:.0f} % of them lie within "
+        f"±{width:.2g}, where 95 % do by chance ({probability_text(found.p_value)})"
+    )
+    if found.p_value >= SIGNIFICANT:
+        return f"Innovations are white, as far as these runs show: {numbers}."
+    if abs(largest) < SLIGHT_CORRELATION:
+        return f"Innovations are nearly white: {numbers}."
+    if largest > 0:
+        return f"Innovations are not white, the filter follows too slowly or its model is wrong: {numbers}."
+    return f"Innovations are not white, the filter follows the noise: {numbers}."
+
+
+def coverage_sentence(name: str, coverage: Interval) -> str:
+    """Whether a state's 95 % interval holds the truth as often as it says."""
+    if np.isnan(coverage.value):
+        return ""
+    low, value, high = 100 * coverage.low, 100 * coverage.value, 100 * coverage.high
+    amiss = "too rarely" if value < 95 else "more often than it says"
+    return (
+        f"The 95 % interval of {name} holds the truth in {value:.1f} % [{low:.1f}, {high:.1f}] of cases: "
+        f"{'as it should' if coverage.covers(0.95) else amiss}."
+    )
+
+
+def crps_sentence(name: str, crps: Interval, expected: float, of_members: Interval | None = None) -> str:
+    """A state's CRPS, and what it is in units of what the covariance promises."""
+    if np.isnan(crps.value):
+        return ""
+    members = "" if of_members is None else f"; that of the members themselves is {_span(of_members)}"
+    return (
+        f"CRPS of {name}: {_span(crps)}, {crps.value / expected:.3g} times what the covariance promises{members}."
+    )
+
+
+def ranks_sentence(name: str, ranks: Uniformity, size: int) -> str:
+    """Where the truth stands among the members of an ensemble."""
+    low, high = ranks.frequencies[0], ranks.frequencies[-1]
+    return (
+        f"Ranks of the truth among the {size} members, {name}: {ranks_verdict(ranks)}; the outermost bars of the "
+        f"histogram are {low:.2g} and {high:.2g} times the right height ({_test(ranks)})."
+    )
+
+
+def ranks_verdict(ranks: Uniformity) -> str:
+    """In a few words: do the members lie where the truth may be?
+
+    The outermost bars are looked at by themselves, for the test of the whole distribution hardly sees them.
+    """
+    (first_low, first_high), (last_low, last_high) = ranks.frequency_band[[0, -1]]
+    if min(first_low, last_low) > 1:
+        return "too often outermost, for the members lie too close together"
+    if max(first_high, last_high) < 1:
+        return "too rarely outermost, for the members lie too far apart"
+    if _alike(ranks):
+        return EVEN
+    return "lopsided, for the members lie too " + (
+        "high" if ranks.frequencies[0] > ranks.frequencies[-1] else "low"
+    )
+
+
+def divergence_sentence(divergences: int, diverged_runs: int, runs: int) -> str:
+    """How often a filter lost itself."""
+    if divergences == 0:
+        return "No run diverged."
+    return f"{diverged_runs} of {runs} runs diverged and restarted from the prior, {divergences} times in all."
+
+
+def comparison_sentence(name: str, first: str, second: str, ratio: Interval) -> str:
+    """One state's RMSE of two filters on the same runs, from a ratio of `intervals.rmse_ratios`."""
+    verdict = f"{first} is better" if ratio.high < 1 else f"{second} is better" if ratio.low > 1 else "a tie"
+    return f"RMSE of {name}, {first} over {second} on the same runs: {_span(ratio)}: {verdict}."
+
+
+def remedy_sentence(report: ConsistencyReport) -> str:
+    """What to try: from NIS and the innovations' correlation, else from NEES; empty where nothing is to be done.
+
+    Source: Mehra (1970), "On the identification of variances and adaptive Kalman filtering": with too small a gain
+    innovations are correlated positively, with too large a gain negatively.
+    """
+    nees, nis = report.nees, report.nis
+    if np.isnan(nis.mean.value):
+        return ""
+    over = nis.mean.value > SLIGHT_FACTOR * nis.dimension
+    under = nis.mean.value < nis.dimension / SLIGHT_FACTOR
+    next_step = np.diagonal(report.whiteness.correlations[0])
+    strongest = next_step[np.argmax(np.abs(next_step))]
+    slow, quick = strongest > SLIGHT_CORRELATION, strongest < -SLIGHT_CORRELATION
+    word = confidence(nees.mean, nees.dimension)
+    if over:
+        what = "raise Q, or repair the model" if slow else "raise R" if quick else "raise Q and R alike"
+    elif under:
+        what = "lower R" if slow else "lower Q" if quick else "lower Q and R alike"
+    elif slow or quick:
+        what = "raise Q and lower R, or repair the model" if slow else "lower Q and raise R"
+    elif "overconfident" in word and _ranks_are_right(report):
+        what = "more members; their ranks are right, it is their covariance that is a rough estimate"
+    elif word == "overconfident":
+        what = "raise Q where nothing is measured, or repair the model there; the measured part is consistent"
+    elif word == "underconfident":
+        what = "lower Q where nothing is measured; the measured part is consistent"
+    else:
+        return ""
+    return f"To try: {what}."
+
+
+def _ranks_are_right(report: ConsistencyReport) -> bool:
+    return report.ensemble is not None and all(ranks_verdict(ranks) == EVEN for ranks in report.ensemble.ranks)
+
+
+def _alike(found: Uniformity) -> bool:
+    return found.p_value >= SIGNIFICANT if not np.isnan(found.p_value) else found.distance < SLIGHT_DISTANCE
+
+
+def _test(found: Uniformity) -> str:
+    if np.isnan(found.p_value):
+        return f"distance {found.distance:.2g}; a test takes {FEWEST_RUNS} runs"
+    return f"distance {found.distance:.2g}, {probability_text(found.p_value)}"
+
+
+def probability_text(p: float) -> str:
+    """A p-value as it is told."""
+    return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
+
+
+def rounded(value: float) -> str:
+    """A number to three digits."""
+    return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
+def _span(value: Interval) -> str:
+    return f"{rounded(value.value)} [{rounded(value.low)}, {rounded(value.high)}]"
+
+
+def _capital(words: str) -> str:
+    return words[0].upper() + words[1:]

@@ -1,0 +1,76 @@
+"""Do innovations tell the filter something that it could have known? Their correlation over time."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtrc
+
+from filters.consistency.nees import whitened
+from thruster_env.checks import at_least
+
+LAGS = 20
+
+
+class Whiteness(NamedTuple):
+    """Correlations of normalised innovations over time, pooled over runs; all zero for an honest filter."""
+
+    correlations: np.ndarray  # (lags, m, m): of channel i with channel j so many steps later; lags 1, 2, ...
+    half_widths: np.ndarray  # (lags, m, m): a correlation lies within plus and minus this with 95 % probability
+    share_inside: float  # of correlations within these; 0.95 is right
+    statistic: float  # of the portmanteau test, chi-squared with lags m^2 degrees of freedom
+    p_value: float  # probability of a statistic as large if the innovations were white
+
+
+def whiteness(
+    innovations: np.ndarray, covs: np.ndarray, present: np.ndarray | None = None, lags: int = LAGS
+) -> Whiteness:
+    """Test whether the innovations of B runs are white, with e = L^-1 v and L L' = S.
+
+        rho_ij(l) = sum e_i(k) e_j(k + l) / (c sqrt(mean e_i^2 mean e_j^2)) over all runs and the c pairs of steps
+                    that have both
+        portmanteau: N sum over l, i, j of c rho_ij(l)^2 (N + 2)/N^2, chi-squared with lags m^2 degrees of freedom
+
+    for N values a channel: with one run and one channel the test of Ljung and Box. Innovations have mean zero,
+    so none is subtracted. Many runs find correlations that are too small to matter: look at their size, too.
+
+    Args:
+        innovations: v, (B, T, m).
+        covs: S, (B, T, m, m).
+        present: which channels were measured, (B, T, m); all if None.
+        lags: number of lags, less than T.
+
+    Raises:
+        ValueError: if there are not more steps than lags.
+
+    Source: Ljung, Box (1978), "On a measure of lack of fit in time series models"; Hosking (1980), "The
+    multivariate portmanteau statistic"; Bar-Shalom, Li, Kirubarajan (2001), section 5.4.
+    """
+    count, steps, m = innovations.shape
+    lags = at_least("lags", lags, 1)
+    if steps <= lags:
+        raise ValueError(f"there must be more steps than lags, but got {steps} steps and {lags} lags")
+    e = whitened(innovations, covs)
+    there = ~np.isnan(e) if present is None else present & ~np.isnan(e)
+    e, there = np.where(there, e, 0.0), there.astype(np.float64)
+    values = np.maximum(there.sum(axis=(0, 1)), 1.0)
+    e /= np.sqrt(np.maximum((e**2).sum(axis=(0, 1)) / values, 1e-300))
+    sums, pairs = (np.array([_lagged(x, lag) for lag in range(1, lags + 1)]) for x in (e, there))
+    pairs = np.maximum(pairs, 1.0)
+    correlations = sums / pairs
+    size = np.sqrt(np.outer(values, values))
+    squares = correlations**2 * pairs * (size + 2.0) / size  # each chi-squared with one degree of freedom
+    statistic = float(squares.sum())
+    return Whiteness(
+        correlations,
+        1.96 * np.sqrt(size / (size + 2.0) / pairs),
+        float((squares <= 1.96**2).mean()),
+        statistic,
+        float(chdtrc(lags * m * m, statistic)),
+    )
+
+
+def _lagged(x: np.ndarray, lag: int) -> np.ndarray:
+    """Sums over runs and steps k of x_i(k) x_j(k + lag), (m, m), for x of shape (B, T, m)."""
+    return np.einsum("bki,bkj->ij", x[:, :-lag], x[:, lag:], optimize=True)

@@ -1,0 +1,85 @@
+"""Ensemble analyses without perturbed measurements, and the one with half the gain: the deterministic EnKF."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import ClassVar
+
+from filters import matrices
+from filters.ensembles.ensemble import EnsembleFilter, measurement_moments
+from thruster_env.compiled import inlined
+from thruster_env.components import column_writer, matrix_of, tuple_of, written_out
+
+
+@cache
+def moved_member(n: int, m: int, first: int) -> Callable:
+    """Return `moved(table, j, shift, g, means)`: x_j + shift - g (y_j - mean), y_j in rows first, first + 1, ...
+
+    Shapes: shift (n,), g (n, m), means (m,).
+    """
+    lines = [f"d{i} = table[{first + i}, j] - means[{i}]" for i in range(m)]
+    products = ("".join(f" - g[{a}][{i}] * d{i}" for i in range(m)) for a in range(n))
+    result = tuple_of(f"table[{a}, j] + shift[{a}]{product}" for a, product in enumerate(products))
+    return written_out("moved", "table, j, shift, g, means", *lines, result)
+
+
+@lru_cache(maxsize=64)
+def deterministic_analysis(gain: Callable, observe, n, m, form) -> Callable:
+    """Return `analyse(memory, z, numbers, size)`: x_j += K innovation - G (y_j - mean(y)), K = cov(x, y) S^-1.
+
+    The mean moves as the Kalman filter's. `gain(cross, s, r, root)` returns G (n, m), which decides on the spread,
+    from cov(x, y) (n, m), S = cov(y, y) + R, R (m, m) and the lower triangular root of S.
+    """
+    compare, solve = measurement_moments(observe, n, m, form), matrices.row_solver(n, m)
+    apply, store, moved = matrices.vector_multiplier(n, m), column_writer(n), moved_member(n, m, n)
+
+    @inlined
+    def analyse(memory, z, numbers, size):
+        means, innovation, cross, s, r, root = compare(memory, z, numbers, size)
+        _, table, _ = memory
+        shift, g = apply(solve(cross, root), innovation), gain(cross, s, r, root)
+        for j in range(table.shape[1]):
+            store(table, j, moved(table, j, shift, g, means))
+
+    return analyse
+
+
+@cache
+def half_gain(n: int, m: int) -> Callable:
+    """Return `gain(cross, s, r, root)`: half of K = cross S^-1."""
+    solve = matrices.row_solver(n, m)
+    half = written_out("half", "k", matrix_of(n, m, lambda i, j: f"0.5 * k[{i}][{j}]"))
+
+    @inlined
+    def gain(cross, s, r, root):
+        return half(solve(cross, root))
+
+    return gain
+
+
+@cache
+def half_gain_analysis(observe, n, m, form) -> Callable:
+    """The analysis of the deterministic ensemble Kalman filter; see `ensemble_kernels`."""
+    return deterministic_analysis(half_gain(n, m), observe, n, m, form)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DeterministicEnsembleKalmanFilter(EnsembleFilter):
+    """Deterministic ensemble Kalman filter: the mean moves by the gain, the members' distances by half of it.
+
+        predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
+        update:  y_j = h(x_j),  innovation = z - mean(y),  S = cov(y, y) + R,  K = cov(x, y) S^-1,
+                 mean += K innovation,  x_j - mean(x) -= K (y_j - mean(y))/2;  sample covariances, divisor N - 1
+
+    With a linear h the update leaves P - K H P + K H P H'K'/4, more than the Kalman filter's P - K H P, by little
+    where measurements are poor. The update draws nothing: the process noise that stirs the members is all that is
+    random, and what its sample lacks of mean zero and covariance Q enters the estimate. Attributes are those of
+    `EnsembleFilter`.
+
+    Source: Sakov, Oke (2008), "A deterministic formulation of the ensemble Kalman filter".
+    """
+
+    name: ClassVar[str] = "denkf"
+    analysis = staticmethod(half_gain_analysis)

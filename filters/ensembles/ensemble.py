@@ -1,0 +1,202 @@
+"""Ensemble filters: what all kinds share, and the stochastic ensemble Kalman filter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+from filters import matrices
+from filters.belief import Kernels
+from filters.ensembles.inflation import with_spread_control
+from filters.ensembles.members import add_noise, drawer, ensemble_motion, row_covariances, row_means
+from filters.filter import Filter
+from filters.rows import constants_form, constants_reader, memory_places, number_places
+from thruster_env.checks import at_least, positive, shown
+from thruster_env.compiled import inlined
+from thruster_env.components import (
+    column_reader,
+    column_writer,
+    matrix_reader,
+    matrix_writer,
+    tuple_of,
+    vector_reader,
+    vector_writer,
+    written_out,
+)
+from thruster_env.streams import FILTER_MEASUREMENT
+
+LARGEST_ENSEMBLE = 1_000_000
+
+
+@lru_cache(maxsize=64)
+def measurement_moments(observe, n, m, form) -> Callable:
+    """Return `compare(memory, z, numbers, size)`: what the members expect to be measured, against z.
+
+    It puts y_j = h(x_j) into rows n ... of the table, innovation, S and log-likelihood into the row, and returns
+    mean(y) (m,), innovation = z - mean(y) (m,), cov(x, y) (n, m), S = cov(y, y) + R, R (m, m) and the lower
+    triangular root of S. In a channel that is NaN in z, y_j is 0, and R has no correlations.
+    """
+    places, source = memory_places(n, m), number_places(n, m)
+    likelihood_place = places.log_likelihood
+    constants, state, store = constants_reader(n, m, form), column_reader(n), column_writer(m, n)
+    means_of_all, covariances_with_predicted = row_means(n + m), row_covariances(0, n + m, n, m)
+    of_states = written_out("of_states", "c", tuple_of(f"c[{i}]" for i in range(n)))
+    of_predicted = written_out("of_predicted", "c", tuple_of(f"c[{n + i}]" for i in range(m)))
+    read_r, mask, add = matrix_reader(m, m, source.r), matrices.masked(m), matrices.symmetric_sum(m)
+    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    factor, likelihood = matrices.cholesky_factor(m), matrices.innovation_likelihood(m)
+    difference, measured = matrices.innovation(m), vector_reader(m)
+
+    @inlined
+    def compare(memory, z, numbers, size):
+        row, table, _ = memory
+        c = constants(numbers)
+        for j in range(table.shape[1]):
+            store(table, j, observe(state(table, j), c))
+        silence(table, n, z)
+        means = means_of_all(table, size)
+        covariances = covariances_with_predicted(table, size, means)
+        present, expected = measured(z), of_predicted(means)
+        r = mask(read_r(numbers), present)
+        s = add(of_predicted(covariances), r)
+        root = factor(s)
+        innovation = difference(present, expected)
+        store_innovation(row, innovation)
+        store_s(row, s)
+        row[likelihood_place] = likelihood(innovation, root, present)
+        return expected, innovation, of_states(covariances), s, r, root
+
+    return compare
+
+
+@inlined
+def silence(table, first, z):
+    """Rows first, first + 1, ... = 0 where z is NaN: what is constant has no covariance with anything."""
+    for i in range(z.shape[0]):
+        if z[i] != z[i]:
+            for j in range(table.shape[1]):
+                table[first + i, j] = 0.0
+
+
+@lru_cache(maxsize=64)
+def ensemble_kernels(analysis, transition, observe, n, m, inputs, form) -> Kernels:
+    """Kernels of an ensemble filter for model functions and sizes.
+
+    Args:
+        analysis: analysis(observe, n, m, form) returns `analyse(memory, z, numbers, size)`, which moves the
+            members and sets the innovation, its covariance and its likelihood.
+        transition: f.
+        observe: h.
+        n: number of states.
+        m: number of measurements.
+        inputs: number of inputs.
+        form: that of `rows.constants_form`.
+
+    The table's rows: n of members, m of predicted measurements, m of scratch.
+    """
+    motion, analyse = ensemble_motion(transition, n, m, inputs, form), analysis(observe, n, m, form)
+    summarise = motion.summarise
+
+    @inlined
+    def update(memory, z, numbers, size):
+        analyse(memory, z, numbers, size)
+        summarise(memory, size)
+
+    return Kernels(n, m, n + 2 * m, max(n, m), motion.start, motion.predict, update, summarise)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EnsembleFilter(Filter):
+    """Base of the ensemble filters: kinds supply `analysis`, as `ensemble_kernels` takes it.
+
+    The belief's mean and covariance are those of the members.
+
+    Attributes:
+        ensemble_size: number N of members, at least 2.
+        inflation: factor on the spread of the members about their mean in every step of the model's dt, after the
+            process noise; 1 is none. For steps of another length dt' it is inflation^(dt'/dt).
+        relaxation: part, 0 to 1, by which each update gives each state's spread back what it took from it.
+
+    Sources: Anderson, Anderson (1999), "A Monte Carlo implementation of the nonlinear filtering problem to produce
+    ensemble assimilations and forecasts", for inflation; Whitaker, Hamill (2012), "Evaluating methods to account
+    for system errors in ensemble data assimilation", for relaxation to the prior spread.
+    """
+
+    analysis: ClassVar[Callable]
+    ensemble_size: int = 100
+    inflation: float = 1.0
+    relaxation: float = 0.0
+
+    def __post_init__(self):
+        """Check the numbers; raise ValueError that states the rule and the value."""
+        size = at_least("ensemble_size", self.ensemble_size, 2)
+        if size > LARGEST_ENSEMBLE:
+            raise ValueError(f"ensemble_size must be at most {LARGEST_ENSEMBLE}, but got {size}")
+        relaxation = positive("relaxation", self.relaxation, zero_allowed=True)
+        if relaxation > 1.0:
+            raise ValueError(f"relaxation must be at most 1, but got {shown(self.relaxation)}")
+        object.__setattr__(self, "ensemble_size", size)
+        object.__setattr__(self, "inflation", positive("inflation", self.inflation))
+        object.__setattr__(self, "relaxation", relaxation)
+
+    @property
+    def size(self) -> int:
+        """Number of ensemble members."""
+        return self.ensemble_size
+
+    @property
+    def own_numbers(self) -> tuple[float, ...]:
+        """Inflation and relaxation."""
+        return self.inflation, self.relaxation
+
+    def kernels(self) -> Kernels:
+        """Kernels for the model's functions; see `Filter.kernels`."""
+        model = self.kernel_model
+        functions = inlined(model.transition), inlined(model.observe)
+        form = constants_form(model.constants)
+        plain = ensemble_kernels(type(self).analysis, *functions, model.n, model.m, model.inputs, form)
+        # Compiled in only where it does something: in the loop over steps even an idle branch takes a tenth.
+        neutral = self.inflation == 1.0 and self.relaxation == 0.0
+        return plain if neutral else with_spread_control(plain, form)
+
+
+@lru_cache(maxsize=64)
+def perturbed_analysis(observe, n, m, form) -> Callable:
+    """Return `analyse(memory, z, numbers, size)` of the stochastic ensemble Kalman filter."""
+    r_root_place = number_places(n, m).r_root
+    compare, draw, solve = measurement_moments(observe, n, m, form), drawer(n, m), matrices.row_solver(n, m)
+    filled = written_out("filled", "z", tuple_of(f"z[{i}] if z[{i}] == z[{i}] else 0.0" for i in range(m)))
+    lines = [f"    d{i} = z[{i}] - table[{n + i}, j]" for i in range(m)]
+    for a in range(n):
+        lines.append(f"    table[{a}, j] += {' + '.join(f'k[{a}][{i}] * d{i}' for i in range(m))}")
+    nudge = written_out("nudge", "table, k, z", "for j in range(table.shape[1]):", *lines, "None")
+
+    @inlined
+    def analyse(memory, z, numbers, size):
+        row, table, draws = memory
+        _, _, cross, _, _, root = compare(memory, z, numbers, size)
+        draw(draws, m * table.shape[1], row, FILTER_MEASUREMENT)
+        add_noise(table, n, m, draws, numbers, r_root_place)
+        nudge(table, solve(cross, root), filled(z))
+
+    return analyse
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EnsembleKalmanFilter(EnsembleFilter):
+    """Stochastic ensemble Kalman filter, on the full nonlinear model, with perturbed measurements.
+
+        predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
+        update:  y_j = h(x_j),  innovation = z - mean(y),  S = cov(y, y) + R,  K = cov(x, y) S^-1,
+                 x_j += K (z - v_j - y_j),  v_j ~ N(0, R);  sample covariances with divisor N - 1
+
+    The perturbations of an update depend on the key and the step alone: of two updates within one step the second
+    repeats the first one's. Attributes are those of `EnsembleFilter`.
+
+    Source: Evensen (1994); Burgers, van Leeuwen, Evensen (1998), "Analysis scheme in the EnKF".
+    """
+
+    name: ClassVar[str] = "enkf"
+    analysis = staticmethod(perturbed_analysis)

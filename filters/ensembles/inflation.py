@@ -1,0 +1,59 @@
+"""Inflation of an ensemble's spread by a factor a step, and relaxation to the spread before an update."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, lru_cache
+
+from filters.belief import Kernels
+from filters.ensembles.members import row_covariances, row_means
+from filters.rows import memory_places, own_place
+from thruster_env.compiled import inlined
+from thruster_env.components import tuple_of, vector_reader, written_out
+
+
+@cache
+def spread_scaler(n: int) -> Callable:
+    """Return `scale(table, means, factors)`: x_a = mean_a + factor_a (x_a - mean_a) in rows a = 0 ... n - 1."""
+    lines = (f"    table[{a}, j] = means[{a}] + factors[{a}] * (table[{a}, j] - means[{a}])" for a in range(n))
+    return written_out("scale", "table, means, factors", "for j in range(table.shape[1]):", *lines, "None")
+
+
+@lru_cache(maxsize=64)
+def with_spread_control(kernels: Kernels, form) -> Kernels:
+    """An ensemble's kernels with inflation and relaxation, by the first two of the filter's own numbers.
+
+        predict: ..., then x_j = mean + inflation (x_j - mean)
+        update:  ..., then x_j = mean + (1 + relaxation (b - a)/a) (x_j - mean), by components, where b and a are
+                 the sample standard deviations before and after the update
+
+    Where a component has no spread after the update, it keeps none. The means stay.
+    """
+    n, m, summarise = kernels.n, kernels.m, kernels.summarise
+    predict_plainly, update_plainly, cov_place = kernels.predict, kernels.update, memory_places(n, m).cov
+    inflation_place = own_place(n, m, form)
+    relaxation_place = inflation_place + 1
+    means_of, covariances_of, scale = row_means(n), row_covariances(0, n, 0, n), spread_scaler(n)
+    read_mean = vector_reader(n, memory_places(n, m).mean)
+    variances = written_out("variances", "row", tuple_of(f"row[{cov_place + i * (n + 1)}]" for i in range(n)))
+    diagonal = written_out("diagonal", "p", tuple_of(f"p[{i}][{i}]" for i in range(n)))
+    alike = written_out("alike", "factor", tuple_of(["factor"] * n))
+    ratios = (f"1.0 + part * ((b[{i}] / a[{i}]) ** 0.5 - 1.0) if a[{i}] > 0.0 else 1.0" for i in range(n))
+    towards = written_out("towards", "a, b, part", tuple_of(ratios))
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        predict_plainly(memory, u, numbers, size)
+        _, table, _ = memory
+        scale(table, means_of(table, size), alike(numbers[inflation_place]))
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, table, _ = memory
+        before = diagonal(covariances_of(table, size, means_of(table, size)))
+        update_plainly(memory, z, numbers, size)
+        if numbers[relaxation_place] != 0.0:
+            scale(table, read_mean(row), towards(variances(row), before, numbers[relaxation_place]))
+            summarise(memory, size)
+
+    return kernels._replace(predict=predict, update=update)

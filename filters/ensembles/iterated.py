@@ -1,0 +1,130 @@
+"""The iterated ensemble Kalman filter: the measurement function linearised where the members come to lie."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import ClassVar
+
+from filters import matrices
+from filters.ensembles.deterministic import moved_member
+from filters.ensembles.ensemble import EnsembleFilter, measurement_moments, silence
+from filters.ensembles.members import row_covariances, row_means
+from filters.ensembles.transform import geometric_mean, transform_gain
+from filters.rows import constants_reader, own_place
+from thruster_env.checks import at_least
+from thruster_env.compiled import inlined
+from thruster_env.components import column_writer, tuple_of, vector_reader, written_out
+
+
+@cache
+def transform_undone(n: int, m: int) -> Callable:
+    """Return `undone(table, j, means, d)`: y_j - mean(y) + D Y_j, (m,), with y in rows n ... and Y after them.
+
+    The means are those of the rows, d is (m, m).
+    """
+    products = ("".join(f" + d[{i}][{k}] * table[{n + m + k}, j]" for k in range(m)) for i in range(m))
+    result = tuple_of(f"table[{n + i}, j] - means[{n + i}]{product}" for i, product in enumerate(products))
+    return written_out("undone", "table, j, means, d", result)
+
+
+@cache
+def linear_prediction(m: int) -> Callable:
+    """Return `predict(e, d, s, r, w)`: (E + D (S - R)) w, (m,), what the latest slopes make of the last move."""
+    places = range(m)
+    lines = [f"v{i} = {' + '.join(f'(s[{i}][{k}] - r[{i}][{k}]) * w[{k}]' for k in places)}" for i in places]
+    sums = (" + ".join(f"e[{i}][{k}] * w[{k}] + d[{i}][{k}] * v{k}" for k in places) for i in places)
+    return written_out("predict", "e, d, s, r, w", *lines, tuple_of(sums))
+
+
+@lru_cache(maxsize=64)
+def iterated_analysis(observe, n, m, form) -> Callable:
+    """The analysis of the iterated ensemble Kalman filter; see `ensemble_kernels`."""
+    slopes, iterations_place = n + m, own_place(n, m, form) + 2  # Y lies in rows n + m ... of the table
+    compare, gain, geometric = measurement_moments(observe, n, m, form), transform_gain(n, m), geometric_mean(m)
+    constants, measured, difference = constants_reader(n, m, form), vector_reader(m), matrices.innovation(m, n)
+    store_state, store_predicted, store_slopes = column_writer(n), column_writer(m, n), column_writer(m, slopes)
+    moved, undone, predict = moved_member(n, m, slopes), transform_undone(n, m), linear_prediction(m)
+    add, factor, solve = matrices.symmetric_sum(m), matrices.cholesky_factor(m), matrices.row_solver(m, m)
+    apply, solve_one, means_of = matrices.vector_multiplier(n, m), matrices.row_solver(1, m), row_means(n + m)
+    of_predicted_and_slopes, of_slopes = row_covariances(n, m, slopes, m), row_covariances(slopes, m, slopes, m)
+    of_states_and_slopes, none = row_covariances(0, n, slopes, m), (0.0,) * m
+    known = [*(f"means[{i}]" for i in range(n + m)), *["0.0"] * m]
+    with_slopes = written_out("with_slopes", "means", tuple_of(known))
+    total = written_out("total", "a, b", tuple_of(f"a[{i}] + b[{i}]" for i in range(m)))
+
+    @inlined
+    def analyse(memory, z, numbers, size):
+        expected, innovation, cross, s, r, root = compare(memory, z, numbers, size)
+        _, table, _ = memory
+        for i in range(m):
+            for j in range(table.shape[1]):
+                table[slopes + i, j] = table[n + i, j] - expected[i]
+        c, present = constants(numbers), measured(z)
+        w = solve_one((innovation,), root)[0]
+        shift, g = apply(cross, w), gain(cross, s, r, root)
+        for _ in range(1, int(numbers[iterations_place])):
+            for j in range(table.shape[1]):
+                store_predicted(table, j, observe(moved(table, j, shift, g, none), c))
+            silence(table, n, z)
+            means = with_slopes(means_of(table, size))
+            e = of_predicted_and_slopes(table, size, means)
+            d = solve(e, factor(add(r, geometric(r, s))))
+            for j in range(table.shape[1]):
+                store_slopes(table, j, undone(table, j, means, d))
+            misfit = total(difference(present, means), predict(e, d, s, r, w))
+            cross = of_states_and_slopes(table, size, means)
+            s = add(of_slopes(table, size, means), r)
+            root = factor(s)
+            w = solve_one((misfit,), root)[0]
+            shift, g = apply(cross, w), gain(cross, s, r, root)
+        for j in range(table.shape[1]):
+            store_state(table, j, moved(table, j, shift, g, none))
+
+    return analyse
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class IteratedEnsembleKalmanFilter(EnsembleFilter):
+    """Iterated ensemble Kalman filter (IEnKF) over one update, for nonlinear measurements.
+
+        predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q);  X (n, N) the members' distances from their mean
+        update:  least over w (N,) of (N - 1) w'w + (z - h(mean + X w))' R^-1 (z - h(mean + X w)), by Gauss-Newton:
+                 from w = 0 and T = I on, `iterations` times,
+                 y_j = h(mean + X w + X T e_j),  Y = (y - mean(y)) T^-1,  S = Y Y'/(N - 1) + R,
+                 w = Y' S^-1 (z - mean(y) + Y w)/(N - 1),  T = (I + Y' R^-1 Y/(N - 1))^-1/2;
+                 then x_j = mean + X w + X T e_j,  e_j the j-th unit vector
+
+    The slopes of h thus come from members that lie where the estimate is, as far apart as it is uncertain. One
+    iteration is the `EnsembleTransformFilter`; where h is linear, further ones change nothing. T and its inverse
+    are symmetric and N x N, and never formed. The innovation and its covariance are those of the first iteration.
+
+    What it does not do: the motion f is not run again, as where the last state is estimated anew together with
+    this one (Sakov, Oliver and Bertino do so, without process noise). Steps are not damped: where the measurement
+    fits several states, iterations may jump between them. Where a measurement is far better than the forecast,
+    T^-1 magnifies any bend of h along the states that the measurement leaves open, and iterations gain little.
+
+    Attributes:
+        iterations: evaluations of h by all members in an update, at least 1. The others are those of
+            `EnsembleFilter`.
+
+    Source: Sakov, Oliver, Bertino (2012), "An iterative EnKF for strongly nonlinear systems"; over the update
+    alone it is the filter of Zupanski (2005), "Maximum likelihood ensemble filter: theoretical aspects", solved as
+    in Bocquet, Sakov (2012), "Combining inflation-free and iterative ensemble Kalman filters for strongly
+    nonlinear systems".
+    """
+
+    name: ClassVar[str] = "ienkf"
+    analysis = staticmethod(iterated_analysis)
+    iterations: int = 3
+
+    def __post_init__(self):
+        """Check the numbers; raise ValueError that states the rule and the value."""
+        super().__post_init__()
+        object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1))
+
+    @property
+    def own_numbers(self) -> tuple[float, ...]:
+        """Inflation, relaxation, iterations."""
+        return (*super().own_numbers, float(self.iterations))

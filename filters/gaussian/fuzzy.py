@@ -1,0 +1,233 @@
+"""The Takagi-Sugeno fuzzy Kalman filter: one Kalman filter a rule, blended by memberships of the state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, cached_property, lru_cache
+from typing import Any, ClassVar
+
+import numpy as np
+
+from filters import matrices
+from filters.belief import Belief, Kernels
+from filters.filter import Filter
+from filters.gaussian.affine import AffineModel, affine_functions, linearize
+from filters.gaussian.extended import gaussian_update, nothing_to_summarise
+from filters.gaussian.mixture import blender, part_matrix, part_vector
+from filters.rows import constants_form, memory_places, number_places, own_place
+from thruster_env.checks import shown, vector
+from thruster_env.compiled import inlined
+from thruster_env.components import (
+    matrix_reader,
+    matrix_writer,
+    tuple_of,
+    vector_reader,
+    vector_writer,
+    written_out,
+)
+
+MOST_STATES = 8  # 256 rules
+
+
+@cache
+def memberships(n: int) -> Callable:
+    """Return `weigh(x, low, high)`: memberships of the state x in the 2^n rules, a tuple that sums to one.
+
+    That of rule r is the product over all states i of (high_i - x_i)/(high_i - low_i), or of one less that where
+    bit i of r is set; each factor is held within 0 and 1.
+    """
+    lines, products = [], []
+    for i in range(n):
+        lines.append(f"part = (x[{i}] - low[{i}]) / (high[{i}] - low[{i}])")
+        lines.append(f"of_high{i} = 0.0 if part < 0.0 else 1.0 if part > 1.0 else part")
+        lines.append(f"of_low{i} = 1.0 - of_high{i}")
+        longer = [
+            " * ".join([*product, f"{end}{i}"]) for end in ("of_low", "of_high") for product in products or [()]
+        ]
+        names = [f"w{i}_{rule}" for rule in range(len(longer))]
+        lines += [f"{name} = {source}" for name, source in zip(names, longer, strict=True)]
+        products = [(name,) for name in names]
+    return written_out("weigh", "x, low, high", *lines, tuple_of(names))
+
+
+@lru_cache(maxsize=64)
+def fuzzy_kernels(n: int, m: int, inputs: int, form) -> Kernels:
+    """Kernels for sizes; the rules' models are numbers. Extras: `rule_length` numbers a rule."""
+    places, source, own = memory_places(n, m), number_places(n, m), own_place(n, m, form)
+    step_place, likelihood_place, rules, stride = places.step, places.log_likelihood, 2**n, rule_length(n, m)
+    means = places.extras
+    covs, weights, seen = means + n, means + n + n * n, means + n + n * n + 1
+    seen_covs = seen + m
+    (rule_mean, store_rule_mean), (rule_cov, store_rule_cov) = (
+        part_vector(n, means, stride),
+        part_matrix(n, covs, stride),
+    )
+    (_, store_seen), (_, store_seen_cov) = part_vector(m, seen, stride), part_matrix(m, seen_covs, stride)
+    of_states = blender(n, means, covs, weights, stride)
+    of_innovations = blender(m, seen, seen_covs, weights, stride)
+    transition, observe, transition_jacobian, observe_jacobian = affine_functions(n, m, inputs).values()
+    length = n * (n + inputs + 1) + m * (n + 1)  # of an affine model's constants
+    (rule_constants, _), low, high = (
+        part_vector(length, own + 2 * n, length),
+        vector_reader(n, own),
+        vector_reader(n, own + n),
+    )
+    weigh = memberships(n)
+    store_weights = written_out(
+        "store_weights", "row, w", *(f"row[{weights + stride * r}] = w[{r}]" for r in range(rules)), "None"
+    )
+    read_q, read_r = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r)
+    prior_mean, prior_cov = vector_reader(n, source.prior_mean), matrix_reader(n, n, source.prior_cov)
+    read_mean, store_mean, store_cov = (
+        vector_reader(n, places.mean),
+        vector_writer(n, places.mean),
+        matrix_writer(n, n, places.cov),
+    )
+    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    factor, likelihood = matrices.cholesky_factor(m), matrices.innovation_likelihood(m)
+    control, measured, condition = vector_reader(inputs), vector_reader(m), gaussian_update(n, m)
+    times, times_transposed, add = (
+        matrices.multiplier(n, n, n),
+        matrices.transposed_multiplier(n, n, n),
+        matrices.symmetric_sum(n),
+    )
+
+    @inlined
+    def take_memberships(row, numbers):
+        store_weights(row, weigh(read_mean(row), low(numbers), high(numbers)))
+
+    @inlined
+    def blend(row):
+        mean, cov = of_states(row, rules)
+        store_mean(row, mean)
+        store_cov(row, cov)
+
+    @inlined
+    def start(memory, numbers, size):
+        row, _, _ = memory
+        for j in range(rules):
+            store_rule_mean(row, j, prior_mean(numbers))
+            store_rule_cov(row, j, prior_cov(numbers))
+        store_mean(row, prior_mean(numbers))
+        store_cov(row, prior_cov(numbers))
+        take_memberships(row, numbers)
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        row, _, _ = memory
+        v, q = control(u), read_q(numbers)
+        take_memberships(row, numbers)
+        for j in range(rules):
+            c, mean = rule_constants(numbers, j), rule_mean(row, j)
+            f = transition_jacobian(mean, v, c)
+            store_rule_mean(row, j, transition(mean, v, c))
+            store_rule_cov(row, j, add(times_transposed(times(f, rule_cov(row, j)), f), q))
+        blend(row)
+        row[step_place] += 1.0
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, _, _ = memory
+        present, r = measured(z), read_r(numbers)
+        for j in range(rules):
+            c, mean = rule_constants(numbers, j), rule_mean(row, j)
+            predicted, h = observe(mean, c), observe_jacobian(mean, c)
+            mean, p, innovation, s, _ = condition(mean, rule_cov(row, j), present, predicted, h, r)
+            store_rule_mean(row, j, mean)
+            store_rule_cov(row, j, p)
+            store_seen(row, j, innovation)
+            store_seen_cov(row, j, s)
+        blend(row)
+        innovation, s = of_innovations(row, rules)
+        store_innovation(row, innovation)
+        store_s(row, s)
+        row[likelihood_place] = likelihood(innovation, factor(s), present)
+
+    return Kernels(n, m, n, 0, start, predict, update, nothing_to_summarise, extras=rules * stride)
+
+
+def rule_length(n: int, m: int) -> int:
+    """Numbers that are kept of a rule: mean, covariance, membership, innovation, its covariance."""
+    return n + n * n + 1 + m + m * m
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FuzzyKalmanFilter(Filter):
+    """Takagi-Sugeno fuzzy Kalman filter: 2^n Kalman filters, one for each corner of the range of the states.
+
+        rule r:  if each state i is low or high, as bit i of r says, then x' = A_r x + B_r u + a_r + w and
+                 z = C_r x + d_r + v: the model linearised at that corner, offsets kept, Q and R the model's;
+                 a Kalman filter of that model keeps mean_r and P_r (Joseph's form)
+        blend:   w_r(x) = product over i of (high_i - x_i)/(high_i - low_i) or (x_i - low_i)/(high_i - low_i),
+                 each within 0 and 1;  mean = sum of w_r mean_r,
+                 cov = sum of w_r (P_r + (mean_r - mean)(mean_r - mean)'): that within the rules and between them
+
+    A prediction takes the memberships of the last estimate, and the update after it keeps them. Innovation and S
+    are blended in the same way. With equal rules, as an affine model has them, all this is the Kalman filter.
+
+    A blend of tangents at the corners follows a model only as well as the range is narrow: on the thruster the
+    extended filter, whose tangent moves with the estimate, is far better.
+
+    `Belief.extras` holds for each rule its mean, covariance, membership, innovation and the innovation's
+    covariance; `rule_estimates` takes them apart.
+
+    Attributes:
+        low: the smallest states (n,); the model's `state_low` if None.
+        high: the largest states (n,); the model's `state_high` if None.
+
+    Source: Takagi, Sugeno (1985), "Fuzzy identification of systems and its applications to modeling and control",
+    for the rules; Simon (2003), "Kalman filtering for fuzzy discrete time dynamic systems", for filters by rule;
+    the form with memberships of minima and maxima: Ngatini, Apriliani, Nurhadi (2017), "Ensemble and fuzzy Kalman
+    filter for position estimation of an autonomous underwater vehicle".
+    """
+
+    name: ClassVar[str] = "fuzzy"
+    low: Any = None
+    high: Any = None
+
+    def __post_init__(self):
+        """Check the range; raise ValueError that states the rule and the value."""
+        model = self.model
+        if model.n > MOST_STATES:
+            raise ValueError(f"a fuzzy filter must have at most {MOST_STATES} states, but got {model.n}")
+        low = model.state_low if self.low is None else self.low
+        high = model.state_high if self.high is None else self.high
+        if isinstance(model, AffineModel):  # its rules are all alike, whatever the range
+            low = model.prior_mean - model.scales if low is None else low
+            high = model.prior_mean + model.scales if high is None else high
+        if low is None or high is None:
+            raise ValueError(
+                "a fuzzy filter must know the range of the states, but got neither low and high nor "
+                "a model with state_low and state_high"
+            )
+        low, high = vector("low", low, model.n), vector("high", high, model.n)
+        if not (low < high).all():
+            raise ValueError(f"low must be below high in every state, but got {shown(low)} and {shown(high)}")
+        object.__setattr__(self, "low", low)
+        object.__setattr__(self, "high", high)
+
+    @cached_property
+    def rules(self) -> tuple[AffineModel, ...]:
+        """The affine model of each rule."""
+        model = self.model
+        control = np.zeros(model.inputs) if model.operating_input is None else model.operating_input
+        ends = np.array([self.low, self.high])
+        corners = (ends[[rule >> i & 1 for i in range(model.n)], range(model.n)] for rule in range(2**model.n))
+        return tuple(linearize(model, corner, control) for corner in corners)
+
+    @property
+    def own_numbers(self) -> tuple[float, ...]:
+        """The range, then the rules' models."""
+        return (*self.low, *self.high, *(number for rule in self.rules for number in rule.constants))
+
+    def kernels(self) -> Kernels:
+        """Kernels for the model's sizes; see `Filter.kernels`."""
+        model = self.kernel_model
+        return fuzzy_kernels(model.n, model.m, model.inputs, constants_form(model.constants))
+
+    def rule_estimates(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Means (2^n, n), covariances (2^n, n, n) and memberships (2^n,) of the rules of a belief."""
+        n = self.model.n
+        means, covs, weights, _ = np.split(belief.extras.reshape(2**n, -1), [n, n + n * n, n + n * n + 1], axis=1)
+        return means.copy(), covs.reshape(-1, n, n).copy(), weights[:, 0].copy()

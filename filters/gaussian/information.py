@@ -1,0 +1,64 @@
+"""The information form of the Kalman filter: the update works on the inverse of the covariance."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+from filters import matrices
+from filters.belief import Kernels
+from filters.derivatives import jacobian
+from filters.gaussian.extended import extended_kernels, gaussian_innovation
+from filters.rows import constants_reader, memory_places, number_places
+from thruster_env.compiled import inlined
+from thruster_env.components import (
+    matrix_of,
+    matrix_reader,
+    matrix_writer,
+    scaled_sum,
+    vector_reader,
+    vector_writer,
+    written_out,
+)
+
+
+@lru_cache(maxsize=64)
+def information_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form) -> Kernels:
+    """Kernels for model functions and sizes; they predict as the extended filter does.
+
+        update: Y = P^-1 + H' R^-1 H,  P = Y^-1,  mean += P H' R^-1 innovation
+
+    Every channel adds its own information H' R^-1 H, so many channels and few states are cheap; no gain and no
+    inverse of S are needed, which is here for the likelihood only. P must be positive definite throughout.
+    Inverses are products W' W of inverse Cholesky factors W, symmetric and positive by construction.
+
+    Source: Anderson, Moore (1979), Optimal Filtering, section 6.3.
+    """
+    arguments = transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form
+    places, source = memory_places(n, m), number_places(n, m)
+    read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
+    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
+    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    constants, measured, read_r = constants_reader(n, m, form), vector_reader(m), matrix_reader(m, m, source.r)
+    read_scales, likelihood_place = vector_reader(n, source.scales), places.log_likelihood
+    observation_matrix, compare = jacobian(observe, observe_jacobian, m, n, "c"), gaussian_innovation(n, m)
+    factor_n, factor_m = matrices.cholesky_factor(n), matrices.cholesky_factor(m)
+    invert, likelihood = matrices.factored_inverse(n), matrices.innovation_likelihood(m)
+    transposed = written_out("transposed", "h", matrix_of(n, m, lambda i, j: f"h[{j}][{i}]"))
+    weigh, times, add = matrices.row_solver(n, m), matrices.multiplier(n, m, n), matrices.symmetric_sum(n)
+    apply_n, apply_m, moved = matrices.vector_multiplier(n, n), matrices.vector_multiplier(n, m), scaled_sum(n)
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, _, _ = memory
+        mean, p, c, z = read_mean(row), read_cov(row), constants(numbers), measured(z)
+        h = observation_matrix(mean, read_scales(numbers), c)
+        innovation, s, s_root, _, h, r = compare(p, z, observe(mean, c), h, read_r(numbers))
+        weight = weigh(transposed(h), factor_m(r))  # H' R^-1
+        p = invert(factor_n(add(invert(factor_n(p)), times(weight, h))))
+        store_mean(row, moved(mean, 1.0, apply_n(p, apply_m(weight, innovation))))
+        store_cov(row, p)
+        store_innovation(row, innovation)
+        store_s(row, s)
+        row[likelihood_place] = likelihood(innovation, s_root, z)
+
+    return extended_kernels(*arguments)._replace(update=update)

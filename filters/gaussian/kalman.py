@@ -1,0 +1,108 @@
+"""The Kalman filter, for affine models and for affine approximations of others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from filters.belief import Kernels
+from filters.filter import Filter
+from filters.gaussian.affine import AffineModel, linearize
+from filters.gaussian.extended import extended_kernels, kernels_of
+from filters.gaussian.information import information_kernels
+from filters.gaussian.schedule import scheduled_kernels
+from filters.gaussian.square_root import square_root_kernels
+from thruster_env.checks import at_least, covariance, one_of
+
+FORMS = {
+    "covariance": extended_kernels,
+    "information": information_kernels,
+    "square-root": square_root_kernels,
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AffineFilter(Filter):
+    """Base of filters that run on an affine model, or on the affine approximation of a model about one point."""
+
+    def __post_init__(self):
+        """Raise ValueError if a nonlinear model comes without an operating point."""
+        point = self.model.operating_state, self.model.operating_input
+        if any(part is None for part in point) and not isinstance(self.model, AffineModel):
+            raise ValueError(
+                "a Kalman filter must have an affine model, or one with an operating state and input, but got "
+                f"operating_state={point[0]!r}, operating_input={point[1]!r}"
+            )
+
+    @cached_property
+    def kernel_model(self) -> AffineModel:
+        """The affine model that the filter runs on."""
+        return linearize(self.model, self.model.operating_state, self.model.operating_input)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KalmanFilter(AffineFilter):
+    """Kalman filter of an affine model, or of affine approximations of a model about operating points.
+
+        predict: mean = A mean + B u + a,  P = A P A' + Q
+        update:  innovation = z - C mean - d,  S = C P C' + R,  K = P C' S^-1,
+                 mean += K innovation,  P = (I - K C) P (I - K C)' + K R K'  (Joseph)
+
+    On an affine model the extended filter does exactly this, so it does the work.
+
+    By default the operating point is the model's `operating_state` and `operating_input`; offsets are kept. With a
+    `schedule` of several points A, B, a, C, d follow the input: they are linear in u between the model's
+    `operating_points` and constant beyond them, where those of the first measurement belong to u = 0.
+
+    Attributes:
+        form: what the arithmetic works on, "covariance" as above, "information" (`gaussian.information`) or
+            "square-root" (`gaussian.square_root`). The estimates are the same to rounding.
+        schedule: number of operating points, spread over the range of the input; 1 for the model's own one.
+
+    Raises:
+        ValueError: if a nonlinear model has no operating point, the form is unknown, the information form meets a
+            singular prior covariance, or a schedule meets another form or a model without operating points.
+
+    Source: Kalman (1960), "A new approach to linear filtering and prediction problems"; for schedules Rugh,
+    Shamma (2000), "Research on gain scheduling", Automatica 36(10).
+    """
+
+    name: ClassVar[str] = "kf"
+    form: str = "covariance"
+    schedule: int = 1
+
+    def __post_init__(self):
+        """Check the model, the form and the schedule."""
+        super().__post_init__()
+        one_of("form", self.form, tuple(FORMS))
+        object.__setattr__(self, "schedule", at_least("schedule", self.schedule, 1))
+        if self.form == "information":
+            covariance("prior_cov", self.model.prior_cov, self.model.n, positive_definite=True)
+        if self.schedule > 1 and (self.model.operating_points is None or self.form != "covariance"):
+            raise ValueError(
+                "a schedule must come with the covariance form and a model that has operating points, "
+                f"but got schedule={self.schedule}, form={self.form!r}, "
+                f"operating_points={self.model.operating_points!r}"
+            )
+        _ = self.own_numbers  # an operating point that does not exist shows here
+
+    @cached_property
+    def own_numbers(self) -> tuple[float, ...]:
+        """The inputs of a schedule, then the constants of the affine model at each."""
+        if self.schedule == 1:
+            return ()
+        points = self.model.operating_points(self.schedule)
+        inputs = [float(u) for _, (u,) in points]
+        if not (np.diff(inputs) > 0).all():
+            raise ValueError(f"the inputs of operating points must increase, but got {inputs}")
+        models = [linearize(self.model, state, control) for state, control in points]
+        return (*inputs, *(number for model in models for number in model.constants))
+
+    def kernels(self) -> Kernels:
+        """Kernels of the extended filter, or those of another form or a schedule, on the affine model."""
+        if self.schedule > 1:
+            return scheduled_kernels(self.schedule, self.model.n, self.model.m)
+        return kernels_of(self.kernel_model, FORMS[self.form])

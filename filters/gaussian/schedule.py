@@ -1,0 +1,101 @@
+"""A Kalman filter whose affine model follows the input: gain scheduling."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, lru_cache
+
+from filters.belief import Kernels
+from filters.gaussian.affine import affine_functions
+from filters.gaussian.extended import (
+    gaussian_correction,
+    gaussian_start,
+    in_stages,
+    noise_added,
+    nothing_to_summarise,
+)
+from filters.matrices import multiplier, transposed_multiplier
+from filters.rows import memory_places, number_places, own_place
+from thruster_env.compiled import inlined
+from thruster_env.components import (
+    matrix_reader,
+    matrix_writer,
+    tuple_of,
+    vector_reader,
+    vector_writer,
+    written_out,
+)
+
+
+def constants_of_affine(n: int, m: int, p: int) -> int:
+    """How many constants an affine model has: A, B, a, C, d."""
+    return n * (n + p + 1) + m * (n + 1)
+
+
+@cache
+def interpolator(points: int, count: int, first: int) -> Callable:
+    """Return `blend(numbers, u)`: `count` constants, linear in u between points and constant beyond them.
+
+    At numbers[first] lie the inputs of the points, increasing, then the constants of each point.
+    """
+    inputs = [f"numbers[{first + s}]" for s in range(points)]
+    lines = []
+    for s in range(points):
+        sides = []
+        if s > 0:
+            sides.append(f"(u - {inputs[s - 1]}) / ({inputs[s]} - {inputs[s - 1]})")
+        if s < points - 1:
+            sides.append(f"({inputs[s + 1]} - u) / ({inputs[s + 1]} - {inputs[s]})")
+        lines.append(f"w{s} = max(0.0, min(1.0, {', '.join(sides)}))")
+    table = first + points
+    sums = (" + ".join(f"w{s} * numbers[{table + s * count + i}]" for s in range(points)) for i in range(count))
+    return written_out("blend", "numbers, u", *lines, tuple_of(sums))
+
+
+@lru_cache(maxsize=64)
+def scheduled_kernels(points: int, n: int, m: int) -> Kernels:
+    """Kernels of the Kalman filter on affine models at several inputs (p = 1), one after the other in its numbers.
+
+    The extras are the constants of the model in use, which those of the last input are until the next.
+    """
+    count = constants_of_affine(n, m, 1)
+    places, source = memory_places(n, m), number_places(n, m)
+    transition, observe, transition_matrix, observation_matrix = affine_functions(n, m, 1).values()
+    blend = interpolator(points, count, own_place(n, m, count))
+    read_constants, store_constants = vector_reader(count, places.extras), vector_writer(count, places.extras)
+    read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
+    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
+    read_q, read_r, measured = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r), vector_reader(m)
+    times, times_transposed, control = multiplier(n, n, n), transposed_multiplier(n, n, n), vector_reader(1)
+    start_gaussian, settle, correct = gaussian_start(n, m), noise_added(n, m), gaussian_correction(n, m)
+
+    @inlined
+    def start(memory, numbers, size):
+        start_gaussian(memory, numbers, size)
+        store_constants(memory[0], blend(numbers, 0.0))
+
+    @inlined
+    def begin(memory, u, numbers, size):
+        store_constants(memory[0], blend(numbers, u[0]))
+
+    @inlined
+    def advance(memory, u, numbers, size):
+        row, _, _ = memory
+        mean, c, v = read_mean(row), read_constants(row), control(u)
+        f = transition_matrix(mean, v, c)
+        store_mean(row, transition(mean, v, c))
+        store_cov(row, times_transposed(times(f, read_cov(row)), f))
+
+    @inlined
+    def finish(memory, u, numbers, size):
+        settle(memory[0], read_q(numbers))
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, _, _ = memory
+        mean, c = read_mean(row), read_constants(row)
+        correct(row, measured(z), observe(mean, c), observation_matrix(mean, c), read_r(numbers))
+
+    stages = begin, advance, finish
+    predict = in_stages(n, m, *stages)
+    return Kernels(n, m, n, 0, start, predict, update, nothing_to_summarise, extras=count, stages=stages)

@@ -1,0 +1,1 @@
+"""Filters whose belief is a weighted sample of states."""

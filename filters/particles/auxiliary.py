@@ -1,0 +1,143 @@
+"""The auxiliary particle filter: particles are chosen by how well their prediction fits the measurement."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+from filters import matrices
+from filters.belief import Kernels
+from filters.ensembles.members import add_noise, ensemble_motion
+from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
+from filters.particles.weights import normalise, read_weights, systematic_resampler, weighted_squares
+from filters.rows import constants_form, constants_reader, memory_places, number_places
+from thruster_env.compiled import inlined
+from thruster_env.components import column_reader, column_writer, matrix_reader, scaled_sum
+from thruster_env.streams import FILTER_MEASUREMENT, uniform_block
+
+
+@lru_cache(maxsize=64)
+def auxiliary_kernels(transition, observe, n, m, inputs, form) -> Kernels:
+    """Kernels of the auxiliary particle filter for model functions and sizes.
+
+    The table's rows: n of particles, one of log weights, n of the noise in the particles, weights, scratch.
+    """
+    places, source = memory_places(n, m), number_places(n, m)
+    logarithms, noise, weights = n, n + 1, 2 * n + 1
+    scratch, q_root_place = weights + 1, source.q_root
+    step_place, key_0, key_1, likelihood_place = places.step, places.key_0, places.key_1, places.log_likelihood
+    motion, parts = ensemble_motion(transition, n, m, inputs, form), particle_parts(observe, n, m, form, weights)
+    draw_prior, move = motion.start, motion.predict
+    set_equal, expect, normal, distance, level, weigh, summarise = parts
+    constants, state = constants_reader(n, m, form), column_reader(n)
+    predicted, store_effect, effects = (
+        column_reader(m, scratch),
+        column_writer(m, scratch),
+        weighted_squares(scratch, m, weights),
+    )
+    far = scratch + 2 * m
+    foreseen, store_foreseen = column_reader(m, scratch + m), column_writer(m, scratch + m)
+    add_scaled, add = scaled_sum(m), matrices.symmetric_sum(m)
+    read_r, choose = matrix_reader(m, m, source.r), systematic_resampler(n + 1, weights, scratch)
+
+    @inlined
+    def forget_noise(table):
+        for i in range(n):
+            for j in range(table.shape[1]):
+                table[noise + i, j] = 0.0
+
+    @inlined
+    def start(memory, numbers, size):
+        draw_prior(memory, numbers, size)
+        set_equal(memory, size)
+        forget_noise(memory[1])
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        _, table, draws = memory
+        move(memory, u, numbers, size)
+        forget_noise(table)
+        add_noise(table, noise, n, draws, numbers, q_root_place)  # of the very draws that moved the particles
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, table, _ = memory
+        expect(memory, z, numbers, size)
+        row[likelihood_place] = 0.0
+        if anything_measured(z):
+            c = constants(numbers)
+            # The particles without their noise, what would be measured of them, and what the noise adds to that.
+            for i in range(n):
+                for j in range(table.shape[1]):
+                    table[i, j] -= table[noise + i, j]
+            for j in range(table.shape[1]):
+                y = observe(state(table, j), c)
+                store_foreseen(table, j, y)
+                store_effect(table, j, add_scaled(predicted(table, j), -1.0, y))
+            read_weights(table, logarithms, weights, size)
+            foresight = normal(z, add(effects(table, size), read_r(numbers)))
+            for j in range(table.shape[1]):
+                table[far, j] = distance(foreseen(table, j), foresight)
+            for j in range(table.shape[1]):
+                table[logarithms, j] -= table[far, j]
+            first_stage, _ = normalise(table, logarithms, weights, size)
+            lost = math.nan if first_stage != first_stage else 0.0  # nothing to choose by
+            for j in range(table.shape[1]):
+                table[logarithms, j] = table[far, j] + lost
+            place, _, _, _ = uniform_block(0, row[step_place], FILTER_MEASUREMENT, row[key_0], row[key_1])
+            choose(table, size, place)
+            # The chosen ones with the noise of the place that they went to.
+            for i in range(n):
+                for j in range(table.shape[1]):
+                    table[i, j] += table[noise + i, j]
+            sensor = normal(z, read_r(numbers))
+            for j in range(table.shape[1]):
+                table[logarithms, j] -= distance(observe(state(table, j), c), sensor)
+            row[likelihood_place] = first_stage + weigh(memory, size) - math.log(size) + level(sensor)
+            forget_noise(table)
+        else:
+            summarise(memory, size)
+
+    rows = scratch + max(2 * m + 1, n + 3)
+    return Kernels(n, m, rows, n, start, predict, update, summarise, extras=1, extra_kept_rows=1 + n)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AuxiliaryParticleFilter(WeightedFilter):
+    """Auxiliary particle filter: parents are drawn by how well their noise-free prediction fits z.
+
+        predict: mu_j = f(x_j, u),  x_j = mu_j + noise_j,  noise_j ~ N(0, Q); both are kept
+        update:  V = sum of w_j (h(x_j) - h(mu_j))(h(x_j) - h(mu_j))'
+                 lambda_j = w_j N(z; h(mu_j), R + V), parents i(j) drawn by lambda (systematic)
+                 x_j = mu_i(j) + noise_j,  w_j = N(z; h(x_j), R)/N(z; h(mu_i(j)), R + V), normalised
+                 L = (sum of lambda_j) (mean of w_j before normalisation)
+        belief:  mean = sum of w_j x_j,  cov = sum of w_j (x_j - mean)(x_j - mean)'/(1 - sum of w_j^2)
+
+    The look-ahead needs the measurement, which the update is the first to know. So the prediction keeps each
+    particle's noise; the update takes it away, draws parents by mu, and adds it again: the noise does not depend
+    on the draw, which is all that the method asks for. Before an update a belief is the bootstrap filter's. Right
+    after the prior or another update there is no noise to look through, and parents are drawn by exact weights.
+
+    V, what the noise does to the measurement, keeps the weights w_j bounded where noise is large: with V = 0,
+    the textbook's choice, a few particles that mu had ruled out would take all the weight.
+
+    The log-likelihood is log L; innovation, S and restarts are the bootstrap filter's. `Belief.members` is
+    (2 n + 1, N): particles, log weights, noise. `Belief.extras` holds the effective sample size.
+
+    Attributes:
+        ensemble_size: number N of particles, from 2 to a million.
+
+    Source: Pitt, Shephard (1999), "Filtering via simulation: auxiliary particle filters", section 3, where the
+    first stage's density is free; the likelihood: Pitt (2002), "Smooth particle filters for likelihood evaluation
+    and maximisation".
+    """
+
+    name: ClassVar[str] = "apf"
+
+    def kernels(self) -> Kernels:
+        """Kernels for the model's functions; see `Filter.kernels`."""
+        model = self.kernel_model
+        functions = inlined(model.transition), inlined(model.observe)
+        return auxiliary_kernels(*functions, model.n, model.m, model.inputs, constants_form(model.constants))

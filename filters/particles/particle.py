@@ -1,0 +1,112 @@
+"""The bootstrap particle filter: a weighted sample of states, whose distribution may have any shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+from filters.belief import Kernels
+from filters.ensembles.members import ensemble_motion
+from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
+from filters.particles.weights import read_weights, systematic_resampler
+from filters.rows import constants_form, memory_places, number_places, own_place
+from thruster_env.checks import finite
+from thruster_env.compiled import inlined
+from thruster_env.components import column_reader, matrix_reader
+from thruster_env.streams import FILTER_MEASUREMENT, uniform_block
+
+
+@lru_cache(maxsize=64)
+def particle_kernels(transition, observe, n, m, inputs, form) -> Kernels:
+    """Kernels of the bootstrap particle filter for model functions and sizes."""
+    places, weights = memory_places(n, m), n + 1
+    scratch, logarithms = weights + 1, n
+    size_place, step_place, key_0, key_1 = places.extras, places.step, places.key_0, places.key_1
+    likelihood_place, threshold_place = places.log_likelihood, own_place(n, m, form)
+    motion, parts = ensemble_motion(transition, n, m, inputs, form), particle_parts(observe, n, m, form, weights)
+    draw_prior, move = motion.start, motion.predict
+    set_equal, expect, normal, distance, level, weigh, summarise = parts
+    resample = systematic_resampler(n, weights, scratch)
+    read_r, predicted = matrix_reader(m, m, number_places(n, m).r), column_reader(m, scratch)
+
+    @inlined
+    def start(memory, numbers, size):
+        draw_prior(memory, numbers, size)
+        set_equal(memory, size)
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        row, table, _ = memory
+        if row[size_place] < numbers[threshold_place] * size:
+            read_weights(table, logarithms, weights, size)
+            place, _, _, _ = uniform_block(0, row[step_place], FILTER_MEASUREMENT, row[key_0], row[key_1])
+            resample(table, size, place)
+            set_equal(memory, size)
+        move(memory, u, numbers, size)
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, table, _ = memory
+        expect(memory, z, numbers, size)
+        row[likelihood_place] = 0.0
+        if anything_measured(z):
+            sensor = normal(z, read_r(numbers))
+            for j in range(table.shape[1]):
+                table[logarithms, j] -= distance(predicted(table, j), sensor)
+            row[likelihood_place] = weigh(memory, size) + level(sensor)
+        else:
+            summarise(memory, size)
+
+    rows = scratch + max(m, n + 2)
+    return Kernels(n, m, rows, n, start, predict, update, summarise, extras=1, extra_kept_rows=1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ParticleFilter(WeightedFilter):
+    """Bootstrap particle filter: importance sampling from the prediction, with systematic resampling.
+
+        predict: if ESS < threshold N, draw the particles anew by weight (systematic), and all w_j = 1/N;
+                 x_j = f(x_j, u) + noise_j,  noise_j ~ N(0, Q)
+        update:  w_j = w_j p(z | x_j)/L,  L = sum of w_j p(z | x_j),  p(z | x) = N(z; h(x), R)
+                 ESS = 1/(sum of w_j^2)
+        belief:  mean = sum of w_j x_j,  cov = sum of w_j (x_j - mean)(x_j - mean)'/(1 - sum of w_j^2)
+
+    The log-likelihood is log L. The innovation is z less the weighted mean of h(x_j), and its covariance S the
+    weighted covariance of h(x_j) plus R. Resampling waits for the next prediction, so that a belief has the
+    moments of the weighted particles, without the noise of a draw. Where two or three particles have all the
+    weight, the covariance is nearly singular and the NEES far too large: a sign of too few particles. If none has
+    any, because the model holds the measurement for impossible, the belief restarts from the prior, counted in
+    `divergences`.
+
+    `Belief.members` is (n + 1, N), its last row the log weights; `Belief.extras` holds the ESS.
+
+    Attributes:
+        ensemble_size: number N of particles, from 2 to a million.
+        resampling_threshold: the part of N below which the ESS calls for resampling, from 0 (never) to 1.
+
+    Source: Gordon, Salmond, Smith (1993), "Novel approach to nonlinear/non-Gaussian Bayesian state estimation";
+    Kitagawa (1996) for the resampling; Kong, Liu, Wong (1994) for the ESS.
+    """
+
+    name: ClassVar[str] = "pf"
+    resampling_threshold: float = 0.5
+
+    def __post_init__(self):
+        """Check size and threshold; raise ValueError that states the rule and the value."""
+        super().__post_init__()
+        threshold = finite("resampling_threshold", self.resampling_threshold)
+        if not 0.0 <= threshold <= 1.0:
+            raise ValueError(f"resampling_threshold must be from 0 to 1, but got {threshold}")
+        object.__setattr__(self, "resampling_threshold", threshold)
+
+    @property
+    def own_numbers(self) -> tuple[float, ...]:
+        """The threshold."""
+        return (self.resampling_threshold,)
+
+    def kernels(self) -> Kernels:
+        """Kernels for the model's functions; see `Filter.kernels`."""
+        model = self.kernel_model
+        functions = inlined(model.transition), inlined(model.observe)
+        return particle_kernels(*functions, model.n, model.m, model.inputs, constants_form(model.constants))

@@ -1,0 +1,155 @@
+"""What particle filters share: weights and moments of a sample, what it expects, and its size."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar, NamedTuple
+
+from filters import matrices
+from filters.belief import Belief
+from filters.ensembles.ensemble import LARGEST_ENSEMBLE
+from filters.filter import Filter
+from filters.particles.weights import log_density, normalise, read_weights, weighted_covariances, weighted_means
+from filters.rows import constants_reader, memory_places, number_places
+from thruster_env.checks import at_least
+from thruster_env.compiled import inlined
+from thruster_env.components import (
+    column_reader,
+    column_writer,
+    matrix_reader,
+    matrix_writer,
+    vector_reader,
+    vector_writer,
+)
+
+
+class ParticleParts(NamedTuple):
+    """What particle filters do alike.
+
+    Rows of the table: n of particles, one of log weights, those of a kind, one of weights, scratch.
+    """
+
+    set_equal: Callable  # set_equal(memory, size): the same weight for all
+    expect: Callable  # expect(memory, z, numbers, size): sets innovation and S, and the first scratch rows h(x_j)
+    normal: Callable  # normal(z, cov): the density N(z; y, cov), of the channels that are there, as a value ...
+    distance: Callable  # ... distance(y, normal): whose logarithm at y is level(normal) - distance
+    level: Callable
+    weigh: Callable  # weigh(memory, size): normalises weights, sets mean, cov, ESS; the log of the weights' sum
+    summarise: Callable  # summarise(memory, size): sets mean and cov
+
+
+@lru_cache(maxsize=64)
+def particle_parts(observe, n, m, form, weights) -> ParticleParts:
+    """The parts for a model's observation function and sizes; `weights` is the row of weights."""
+    places, source = memory_places(n, m), number_places(n, m)
+    logarithms, scratch, size_place = n, weights + 1, places.extras
+    constants, state, store_predicted = constants_reader(n, m, form), column_reader(n), column_writer(m, scratch)
+    means, covariances = weighted_means(0, n, weights), weighted_covariances(0, n, weights)
+    means_of_predicted = weighted_means(scratch, m, weights)
+    covariances_of_predicted = weighted_covariances(scratch, m, weights)
+    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
+    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    read_r, mask, add, factor = (
+        matrix_reader(m, m, source.r),
+        matrices.masked(m),
+        matrices.symmetric_sum(m),
+        matrices.cholesky_factor(m),
+    )
+    difference, measured = matrices.innovation(m), vector_reader(m)
+    half_square, constant = log_density(m)
+
+    @inlined
+    def set_equal(memory, size):
+        row, table, _ = memory
+        for j in range(table.shape[1]):
+            table[logarithms, j] = -math.log(size)
+        row[size_place] = size
+
+    @inlined
+    def summarise(memory, size):
+        row, table, _ = memory
+        read_weights(table, logarithms, weights, size)
+        mean = means(table, size)
+        store_mean(row, mean)
+        store_cov(row, covariances(table, size, mean))
+
+    @inlined
+    def expect(memory, z, numbers, size):
+        row, table, _ = memory
+        c, present = constants(numbers), measured(z)
+        for j in range(table.shape[1]):
+            store_predicted(table, j, observe(state(table, j), c))
+        for i in range(m):
+            if z[i] != z[i]:  # a missing channel: constant predictions have no covariance with anything
+                for j in range(table.shape[1]):
+                    table[scratch + i, j] = 0.0
+        read_weights(table, logarithms, weights, size)
+        mean = means_of_predicted(table, size)
+        store_innovation(row, difference(present, mean))
+        s = add(covariances_of_predicted(table, size, mean), mask(read_r(numbers), present))
+        store_s(row, s)
+
+    @inlined
+    def normal(z, cov):
+        present = measured(z)
+        return present, factor(mask(cov, present))
+
+    @inlined
+    def distance(y, normal):
+        return half_square(difference(normal[0], y), normal[1], normal[0])
+
+    @inlined
+    def level(normal):
+        return constant(normal[1], normal[0])
+
+    @inlined
+    def weigh(memory, size):
+        row, table, _ = memory
+        total, row[size_place] = normalise(table, logarithms, weights, size)
+        mean = means(table, size)
+        store_mean(row, mean)
+        store_cov(row, covariances(table, size, mean))
+        return total
+
+    return ParticleParts(set_equal, expect, normal, distance, level, weigh, summarise)
+
+
+@inlined
+def anything_measured(z):
+    """Whether a channel of z is there."""
+    for i in range(z.shape[0]):
+        if z[i] == z[i]:
+            return True
+    return False
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class WeightedFilter(Filter):
+    """Base of the particle filters.
+
+    Attributes:
+        ensemble_size: number N of particles, from 2 to a million.
+    """
+
+    gaussian_likelihood: ClassVar[bool] = False
+    ensemble_size: int = 1000
+
+    def __post_init__(self):
+        """Check the size; raise ValueError if it is not a whole number from 2 to a million."""
+        size = at_least("ensemble_size", self.ensemble_size, 2)
+        if size > LARGEST_ENSEMBLE:
+            raise ValueError(f"ensemble_size must be at most {LARGEST_ENSEMBLE}, but got {size}")
+        object.__setattr__(self, "ensemble_size", size)
+
+    @property
+    def size(self) -> int:
+        """Number of particles."""
+        return self.ensemble_size
+
+    @staticmethod
+    def effective_sample_size(belief: Belief) -> float:
+        """How many equally weighted particles would tell as much, from 1 to N."""
+        return float(belief.extras[0])

@@ -1,0 +1,1 @@
+"""Estimates that use later measurements, too."""

@@ -1,0 +1,147 @@
+"""The ensemble Kalman smoother: each measurement moves the members of earlier steps, too."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import cache, lru_cache
+
+import numpy as np
+
+from filters.belief import Kernels
+from filters.engine import new_memory
+from filters.ensembles.ensemble import EnsembleFilter
+from filters.ensembles.members import row_covariances, row_means
+from filters.model import StateSpaceModel
+from filters.restart import restart_if_lost
+from filters.rows import constants_form, memory_places
+from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.components import tuple_of, written_out
+from thruster_env.threads import spread
+
+
+def smooth_ensembles(
+    filter_: EnsembleFilter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray, lag: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Means (B, K + 1, n) and covariances of an ensemble filter's members given `lag` later measurements.
+
+    The analysis of measurement k is done again for each pair (x_k, x_l) of the members now and at an earlier step
+    l >= k - lag, as one of a state of twice the size of which the first half is measured. The members of step l so
+    get the analysis that they would get as part of one long state: with perturbed measurements
+    x_lj += cov(x_l, y) S^-1 (z - v_j - y_j). Relaxation is for the members of now only, and steps before a restart
+    from the prior are left as they are.
+    """
+    paired = dataclasses.replace(filter_, model=_paired_model(filter_.kernel_model))
+    kernels, pair_kernels, size = filter_.kernels(), paired.kernels(), filter_.size
+    model, form = paired.model, constants_form(paired.model.constants)
+    analyse_pair = type(filter_).analysis(inlined(model.observe), model.n, model.m, form)
+    count, times, _ = measurements.shape
+    n = kernels.n
+    means, covs = np.empty((count, times, n)), np.empty((count, times, n, n))
+    smooth = _smoother(kernels, analyse_pair, is_interpreting())
+
+    def part(first: int, last: int) -> None:
+        now, pair = new_memory(kernels, size), new_memory(pair_kernels, size)
+        history = np.zeros((times, n, now[1].shape[1]))
+        numbers = filter_.numbers, paired.numbers
+        smooth(now, pair, history, size, keys, inputs, measurements, numbers, lag, means, covs, first, last)
+
+    spread(part, count)
+    return means, covs
+
+
+def _paired_model(model: StateSpaceModel) -> StateSpaceModel:
+    """The model of a state (x_k, x_l): the first half moves and is measured, the second stays."""
+    nothing = np.zeros((model.n, model.n))
+    transition, observe = _paired_functions(inlined(model.transition), inlined(model.observe), model.n)
+    return StateSpaceModel(
+        transition=transition,
+        observe=observe,
+        process_noise_cov=np.block([[model.process_noise_cov, nothing], [nothing, nothing]]),
+        measurement_noise_cov=model.measurement_noise_cov,
+        prior_mean=np.tile(model.prior_mean, 2),
+        prior_cov=np.block([[model.prior_cov, nothing], [nothing, nothing]]),
+        inputs=model.inputs,
+        constants=model.constants,
+        substeps=model.substeps,
+    )
+
+
+@cache
+def _paired_functions(transition: Callable, observe: Callable, n: int) -> tuple[Callable, Callable]:
+    now, past = (tuple_of(f"x[{i}]" for i in part) for part in (range(n), range(n, 2 * n)))
+    moves = written_out("moves", "x, u, c", f"transition({now}, u, c) + {past}", transition=transition)
+    return moves, written_out("observe", "x, c", f"measure({now}, c)", measure=observe)
+
+
+@lru_cache(maxsize=64)
+def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> CompiledOrPython:
+    n, m = kernels.n, kernels.m
+    start, predict, update, restart = kernels.start, kernels.predict, kernels.update, restart_if_lost(kernels)
+    places, pair_places = memory_places(n, m), memory_places(2 * n, m)
+    key_0, key_1, step, divergences = places.key_0, places.key_1, places.step, places.divergences
+    pair_key_0, pair_key_1, pair_step = pair_places.key_0, pair_places.key_1, pair_places.step
+    means_of, covariances_of = row_means(n), row_covariances(0, n, 0, n)
+    write_mean = written_out("write", "out, b, k, x", *(f"out[b, k, {i}] = x[{i}]" for i in range(n)), "None")
+    entries = (f"out[b, k, {i}, {j}] = p[{i}][{j}]" for i in range(n) for j in range(n))
+    write_cov = written_out("write", "out, b, k, p", *entries, "None")
+    fingerprint = function_fingerprint(start, predict, update, analyse_pair)
+
+    @inlined
+    def copy(target, first, source):
+        for i in range(n):
+            for j in range(target.shape[1]):
+                target[first + i, j] = source[i, j]
+
+    @inlined
+    def keep(history, k, table, first):
+        for i in range(n):
+            for j in range(table.shape[1]):
+                history[k, i, j] = table[first + i, j]
+
+    @inlined
+    def recall(table, first, history, k):
+        for i in range(n):
+            for j in range(table.shape[1]):
+                table[first + i, j] = history[k, i, j]
+
+    def smooth(now, pair, history, size, keys, inputs, measurements, numbers, lag, means, covs, first, last):
+        fingerprint  # noqa: B018 - part of the cache's key
+        row, table, _ = now
+        pair_row, pair_table, _ = pair
+        own_numbers, pair_numbers = numbers
+        forecast = np.zeros((n, table.shape[1]))
+        u, z, times = np.zeros(inputs.shape[2]), np.zeros(m), measurements.shape[1]
+        for b in range(first, last):
+            row[key_0] = pair_row[pair_key_0] = keys[b, 0]
+            row[key_1] = pair_row[pair_key_1] = keys[b, 1]
+            row[step] = row[divergences] = 0.0
+            oldest = 0
+            for k in range(times):
+                for i in range(m):
+                    z[i] = measurements[b, k, i]
+                if k > 0:
+                    for i in range(u.shape[0]):
+                        u[i] = inputs[b, k - 1, i]
+                    predict(now, u, own_numbers, size)
+                else:
+                    start(now, own_numbers, size)
+                copy(forecast, 0, table)
+                update(now, z, own_numbers, size)
+                restart(now, own_numbers, size)
+                keep(history, k, table, 0)
+                if row[divergences] > 0.0:
+                    oldest, row[divergences] = k, 0.0
+                pair_row[pair_step] = row[step]
+                for past in range(max(oldest, k - lag), k):
+                    copy(pair_table, 0, forecast)
+                    recall(pair_table, n, history, past)
+                    analyse_pair(pair, z, pair_numbers, size)
+                    keep(history, past, pair_table, n)
+            for k in range(times):
+                recall(table, 0, history, k)
+                mean = means_of(table, size)
+                write_mean(means, b, k, mean)
+                write_cov(covs, b, k, covariances_of(table, size, mean))
+
+    return CompiledOrPython(smooth)

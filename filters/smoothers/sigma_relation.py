@@ -1,0 +1,62 @@
+"""What one step's state tells of the next one's, by sigma points: for smoothing what such filters estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+from filters import matrices
+from filters.gaussian.sigma_points import PointSet, cross_scatter, deviations, points_around, residuals, scatter
+from filters.rows import constants_reader, number_places, own_place
+from filters.smoothers.rts import careful_factor
+from thruster_env.compiled import inlined
+from thruster_env.components import matrix_reader, tuple_of, vector_reader, written_out
+
+
+@lru_cache(maxsize=64)
+def sigma_relation(transition, centre, n, m, inputs, form) -> Callable:
+    """Return `relate(mean, p, u, numbers)` of an unscented filter, or of a cubature filter (no centre).
+
+        points x_i = mean +- g L_i,  L L' = P;  f_i = f(x_i, u);  predicted mean and P as the filter predicts,
+        G = cov(x, f) (predicted P)^-1,  d_i = x_i - mean - G (f_i - f_0),
+        bracket = w sum d_i d_i' + b (G s)(G s)' + G Q G'
+
+    with f_0, s, w, b those of `UnscentedKalmanFilter` (the mean of the f_i and s = 0 in a cubature filter). The
+    bracket equals P - G (predicted P) G' and is a sum of squares.
+
+    Source: Sarkka (2008), "Unscented Rauch-Tung-Striebel smoother", algorithm 1, with additive noise; for cubature
+    points Arasaratnam, Haykin (2011), "Cubature Kalman smoothers".
+    """
+    source, own, count = number_places(n, m), own_place(n, m, form), 2 * n + centre
+    substeps_place, constants, control = source.substeps, constants_reader(n, m, form), vector_reader(inputs)
+    read_q, read_set = matrix_reader(n, n, source.q), vector_reader(len(PointSet._fields), own)
+    moved = written_out(
+        "moved", "x, u, c", tuple_of(f"transition(x[{i}], u, c)" for i in range(count)), transition=transition
+    )
+    root_of, around, deviate = (
+        matrices.semidefinite_factor(n),
+        points_around(n, centre),
+        deviations(n, 2 * n, centre),
+    )
+    sum_of, cross, rest = scatter(n, 2 * n), cross_scatter(n, n), residuals(n, n)
+    factor, solve, apply = careful_factor(n), matrices.row_solver(n, n), matrices.vector_multiplier(n, n)
+    times, times_transposed, add = (
+        matrices.multiplier(n, n, n),
+        matrices.transposed_multiplier(n, n, n),
+        matrices.symmetric_sum(n),
+    )
+
+    @inlined
+    def relate(mean, p, u, numbers):
+        v, c, q, root = control(u), constants(numbers), read_q(numbers), root_of(p)
+        spread, weight, bend = read_set(numbers)
+        points = around(mean, root, spread)
+        for _ in range(int(numbers[substeps_place])):
+            points = moved(points, v, c)
+        predicted_mean, shift, d = deviate(points, weight)
+        predicted = add(sum_of(d, shift, weight, bend), q)
+        gain = solve(cross(root, d, weight * spread), factor(predicted))
+        left = sum_of(rest(root, spread, gain, d), apply(gain, shift), weight, bend)
+        return predicted_mean, gain, add(left, times_transposed(times(gain, q), gain))
+
+    return relate

@@ -1,0 +1,91 @@
+"""Smoothers: estimates of each state from measurements of later steps as well as from earlier ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.batch import run, trajectories
+from filters.ensembles.ensemble import EnsembleFilter
+from filters.filter import Filter
+from filters.gaussian.cubature import CubatureKalmanFilter
+from filters.gaussian.extended import ExtendedKalmanFilter
+from filters.gaussian.iterated import IteratedExtendedKalmanFilter
+from filters.gaussian.kalman import KalmanFilter
+from filters.gaussian.unscented import UnscentedKalmanFilter
+from filters.rows import constants_form
+from filters.smoothers.ensemble import smooth_ensembles
+from filters.smoothers.rts import extended_relation, scheduled_relation, smooth_backwards
+from filters.smoothers.sigma_relation import sigma_relation
+from thruster_env.checks import at_least
+from thruster_env.compiled import inlined
+
+LINEARISED = (KalmanFilter, ExtendedKalmanFilter, IteratedExtendedKalmanFilter)
+WITH_POINTS = {UnscentedKalmanFilter: True, CubatureKalmanFilter: False}  # whether the mean is a point
+
+
+class Smoothed(NamedTuple):
+    """Estimates of B trajectories of K steps; index k is given the measurements up to k + lag."""
+
+    means: np.ndarray  # (B, K + 1, n)
+    covs: np.ndarray  # (B, K + 1, n, n)
+
+
+def smooth(
+    filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray, lag: int | None = None
+) -> Smoothed:
+    """Filter trajectories forwards and correct the estimates by later measurements.
+
+    - Kalman filters, also scheduled, extended or iterated extended, unscented and cubature Kalman filters: the
+      recursion of Rauch, Tung and Striebel backwards, on the filter's own linearisation or sigma points.
+    - Ensemble Kalman filters of all kinds: the smoother of Evensen and van Leeuwen. Each update moves the members
+      of earlier steps, too. Each adds its sampling error, so that a small ensemble gains by a short lag only.
+
+    With lag = 0 the result is the filter's own. The full smoother of an ensemble takes K/2 updates a step, so give
+    it a lag of as many steps as the system remembers.
+
+    Args:
+        filter_: a filter of these kinds.
+        keys: random keys, one a trajectory, (B, 2).
+        inputs: u, (B, K, p).
+        measurements: z, (B, K + 1, m), NaN where missing.
+        lag: how many later measurements an estimate has seen, for use with a fixed delay; all of them if None.
+
+    Returns:
+        `Smoothed`, the same whatever the number of cores.
+
+    Raises:
+        ValueError: if shapes do not fit, an input is not finite, or there is no smoother for the filter.
+
+    Source: Rauch, Tung, Striebel (1965), "Maximum likelihood estimates of linear dynamic systems"; Sarkka (2008),
+    "Unscented Rauch-Tung-Striebel smoother"; Evensen, van Leeuwen (2000), "An ensemble Kalman smoother for
+    nonlinear dynamics"; fixed lag: Anderson, Moore (1979), Optimal Filtering, chapter 7.
+    """
+    keys, inputs, measurements = trajectories(filter_, keys, inputs, measurements)
+    steps = inputs.shape[1]
+    lag = steps if lag is None else min(at_least("lag", lag, 0), steps)
+    if isinstance(filter_, EnsembleFilter):
+        return Smoothed(*smooth_ensembles(filter_, keys, inputs, measurements, lag))
+    relate = relation_of(filter_)
+    return Smoothed(*smooth_backwards(filter_, relate, run(filter_, keys, inputs, measurements), inputs, lag))
+
+
+def relation_of(filter_: Filter) -> Callable:
+    """What `smooth_backwards` needs to know of a filter; ValueError if it has no such smoother."""
+    model, kind = filter_.kernel_model, type(filter_)
+    transition, sizes = (
+        inlined(model.transition),
+        (model.n, model.m, model.inputs, constants_form(model.constants)),
+    )
+    if kind is KalmanFilter and filter_.schedule > 1:
+        return scheduled_relation(filter_.schedule, model.n, model.m)
+    if kind in LINEARISED:
+        return extended_relation(transition, model.transition_jacobian, *sizes)
+    if kind in WITH_POINTS:
+        return sigma_relation(transition, WITH_POINTS[kind], *sizes)
+    known = ", ".join(known.name for known in (*LINEARISED, *WITH_POINTS))
+    raise ValueError(
+        f"a smoother needs a filter of {known} or an ensemble Kalman filter, but got {filter_.name!r}"
+    )
