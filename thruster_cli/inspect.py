@@ -38,12 +38,17 @@ def command(
         float, typer.Option(help="Voltage range the integration must follow [V].")
     ] = DEFAULT_MAX_VOLTAGE,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Also draw Bode plot and step response: a .png file.")
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Bode plot and step response, a .png file.",
+            show_default="out/inspect-PRESET-VOLTAGE.png",
+        ),
     ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Show a thruster's steady state and linear model at a voltage: stiffness, control, observation, responses.
+    """Print and draw a thruster's linear model at a voltage: steady state, stiffness, control, responses.
 
     Nothing here is random; --seed is accepted, as by every command, and changes nothing.
 
@@ -64,6 +69,8 @@ def command(
         columns[f"published: {name}"] = theirs
         words = ["", f"{NO_LINEARISATION} {model.remark} Source: {model.source}."]
         published = _plain_published(name, model, theirs)
+    if out is None and ours.model.c.any():  # at rest there is no Bode plot
+        out = Path("out") / f"inspect-{preset}-{voltage:g}V.png"
     if out is not None:
         response_figure(out, ours.model, dt, title.replace("U_0", "$U_0$"))
         words += ["", f"Bode plot and step response: {out}"]
