@@ -124,8 +124,8 @@ def test_a_recorded_flow_may_begin_again(values):
 
 def test_a_recorded_flow_may_come_from_a_file(tmp_path):
     path = tmp_path / "tide.csv"
-    path.write_text("time,tide,other\n0,0.5,9\n1,-0.5,9\n2,1.5,9\n")
-    signal = {"name": "recorded", "file": str(path), "column": "tide", "sample_time": 0.05}
+    path.write_text("# time [s],tide U_0 [m/s],other\n0,0.5,9\n1,-0.5,9\n2,1.5,9\n")
+    signal = {"name": "recorded", "file": str(path), "column": "tide U_0 [m/s]", "sample_time": 0.05}
     by_values = {"name": "recorded", "values": [0.5, -0.5, 1.5], "sample_time": 0.05}
     np.testing.assert_array_equal(flows(signal), flows(by_values))
     env = gym.make("BowThruster-v0", flow=[signal])

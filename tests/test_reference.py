@@ -237,7 +237,8 @@ WRONG = [
     ([{"name": "multi-sine", "periods": []}], "periods must be some finite numbers"),
     ([{"name": "multi-sine", "periods": [1, 0]}], "periods must be positive, but got"),
     ([{"name": "band-limited-noise", "std": -1}], "std must be zero or positive, but got -1"),
-    ([{"name": "band-limited-noise", "bandwidth": 50.0}], "bandwidth must be below 50 Hz at this dt, but got 50"),
+    ([{"name": "band-limited-noise", "bandwidth": 50.0}], "below 50 Hz at this dt, but got 50"),
+    ([{"name": "band-limited-noise", "bandwidth": 1e-5}], "bandwidth must be at least 0.001 Hz and below 50 Hz"),
     ([{"name": "recorded"}], "either values or file must be given"),
 ]
 

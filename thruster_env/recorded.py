@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,11 +76,15 @@ def _column(file: str, column: str | None) -> np.ndarray:
     path = Path(file)
     if not path.is_file() or not path.stat().st_size:
         raise ValueError(f"file must be a CSV file that exists and is not empty, but got {shown(file)}")
-    try:
-        table = np.genfromtxt(path, delimiter=",", names=True, dtype=np.float64, encoding="utf-8")
-    except ValueError as error:
-        raise ValueError(f"file must be a CSV file with a header line, but {file!r} is not: {error}") from None
-    names = table.dtype.names or ()
+    with path.open(newline="", encoding="utf-8-sig") as lines:
+        names, *rows = ([entry.strip() for entry in row] for row in csv.reader(lines) if row)
+    names[0] = names[0].removeprefix("#").strip()  # headers are comments to some programs
     if column not in names:
         raise ValueError(f"column must be one of {', '.join(names)}, but got {column!r}")
-    return np.atleast_1d(table[column])
+    if any(len(row) != len(names) for row in rows):
+        raise ValueError(f"file must be a CSV file with a header line over equally long rows, but {file!r} is not")
+    entries = [row[names.index(column)] for row in rows]
+    try:
+        return np.array(entries, dtype=np.float64)
+    except ValueError:
+        raise ValueError(f"values must be some finite numbers, but got {shown(entries)}") from None

@@ -202,6 +202,9 @@ class MultiSine(Effect):
         return len(self.periods)
 
 
+LEAST_BANDWIDTH = 1e-5  # of the sample rate; a narrower low-pass is lost in rounding
+
+
 @REFERENCE_SIGNALS.register("band-limited-noise")
 @dataclass(frozen=True)
 class BandLimitedNoise(Effect):
@@ -226,10 +229,10 @@ class BandLimitedNoise(Effect):
         from scipy.linalg import solve_discrete_lyapunov
         from scipy.signal import butter, tf2ss
 
-        if not self.bandwidth < 0.5 / around.dt:
-            raise ValueError(
-                f"bandwidth must be below {0.5 / around.dt:g} Hz at this dt, but got {self.bandwidth}"
-            )
+        low, high = LEAST_BANDWIDTH / around.dt, 0.5 / around.dt
+        if not low <= self.bandwidth < high:
+            rule = f"at least {low:g} Hz and below {high:g} Hz at this dt"
+            raise ValueError(f"bandwidth must be {rule}, but got {self.bandwidth}")
         a, b, c, _ = tf2ss(*butter(2, self.bandwidth, fs=1.0 / around.dt))
         cov = solve_discrete_lyapunov(a, b @ b.T)
         c = c * self.std * around.thrust_scale / float((c @ cov @ c.T).item()) ** 0.5
