@@ -1,0 +1,149 @@
+"""The gradient of the innovations' likelihood, and the Q and R that maximise it."""
+
+import numpy as np
+import pytest
+
+from filters import ExtendedKalmanFilter, KalmanFilter, affine_model, run, truth
+from filters.formulas import formula
+from filters.likelihood import likelihood
+from thruster_env.compiled import interpreted
+from thruster_env.streams import episode_keys
+from tuning.gradient import BAD_START, maximise_likelihood
+from tuning.scenarios import find_scenario, training_seeds
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    ("text", "shapes", "expected"),
+    [
+        ("A B' - C", {"A": (2, 3), "B": (4, 3), "C": (2, 4)}, lambda A, B, C: A @ B.T - C),
+        ("A' B A + B", {"A": (3, 3), "B": (3, 3)}, lambda A, B: A.T @ B @ A + B),
+        ("x + A y - A x", {"x": (2,), "A": (2, 2), "y": (2,)}, lambda x, A, y: x + A @ y - A @ x),
+        ("- A", {"A": (1, 2)}, lambda A: -A),
+    ],
+)
+def test_a_formula_is_what_it_says(text, shapes, expected):
+    values = {name: RNG.normal(size=shape) for name, shape in shapes.items()}
+    found = formula(text, **shapes)(*(value.tolist() for value in values.values()))
+    np.testing.assert_allclose(np.array(found), expected(**values), rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("text", "shapes", "rule"),
+    [
+        ("A B", {"A": (2, 3), "B": (2, 3)}, "shapes must fit in 'A B'"),
+        ("A + B", {"A": (2, 3), "B": (3, 2)}, "must have one shape"),
+        ("A + x", {"A": (2, 1), "x": (2,)}, "must have one shape"),
+        ("A B", {"A": (2, 2)}, "'B' has none"),
+    ],
+)
+def test_a_formula_that_does_not_fit_is_refused(text, shapes, rule):
+    with pytest.raises(ValueError, match=rule):
+        formula(text, **shapes)
+
+
+def two_channels():
+    return affine_model(
+        a=[[0.9, 0.2], [-0.1, 0.8]],
+        b=[[0.5], [1.0]],
+        c=[[1.0, 0.3], [0.2, -1.0]],
+        process_noise_cov=[[0.3, 0.1], [0.1, 0.2]],
+        measurement_noise_cov=[[0.5, 0.2], [0.2, 0.4]],
+        prior_mean=[1.0, -1.0],
+        prior_cov=[1.0, 2.0],
+        state_offset=[0.1, 0.0],
+    )
+
+
+def thruster():
+    return find_scenario("nominal").model()
+
+
+CASES = {"affine": (two_channels, KalmanFilter, 1e-6), "thruster": (thruster, ExtendedKalmanFilter, 1e-5)}
+
+
+def data_of(model, count=3, steps=40):
+    keys = episode_keys(range(count))
+    inputs = RNG.uniform(-10, 10, size=(count, steps, 1))
+    measurements = truth.simulate(model, keys, inputs).measurements
+    measurements[0, 5, 0] = np.nan
+    measurements[1, 0] = np.nan
+    return keys, inputs, measurements
+
+
+def directions(model):
+    """All symmetric unit changes of Q, then of R."""
+    sizes = model.n, model.m
+    out = [[], []]
+    for which, size in enumerate(sizes):
+        for i in range(size):
+            for j in range(i + 1):
+                unit = np.zeros((size, size))
+                unit[i, j] = unit[j, i] = 1.0
+                out[which].append(unit)
+                out[1 - which].append(np.zeros((sizes[1 - which],) * 2))
+    return map(np.array, out)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_likelihood_is_the_filters_and_its_gradient_that_of_central_differences(case):
+    make, filter_, accuracy = CASES[case]
+    model = make()
+    keys, inputs, measurements = data_of(model)
+    q_slopes, r_slopes = directions(model)
+
+    def values(q, r):
+        changed = model.replace(process_noise_cov=q, measurement_noise_cov=r)
+        return run(filter_(model=changed), keys, inputs, measurements).log_likelihoods.sum(axis=1)
+
+    found = likelihood(model, inputs, measurements, q_slopes, r_slopes)
+    q, r = model.process_noise_cov, model.measurement_noise_cov
+    np.testing.assert_allclose(found.values, values(q, r), rtol=1e-10)
+    for j, (dq, dr) in enumerate(zip(q_slopes, r_slopes, strict=True)):
+        h = 1e-4 * min(np.diag(q).min() if dq.any() else 1.0, np.diag(r).min() if dr.any() else 1.0)
+        slope = (values(q + h * dq, r + h * dr) - values(q - h * dq, r - h * dr)) / (2 * h)
+        np.testing.assert_allclose(found.gradients[:, j], slope, rtol=accuracy, atol=accuracy * abs(slope).max())
+
+
+def test_the_interpreted_likelihood_is_the_compiled_one():
+    model = two_channels()
+    _, inputs, measurements = data_of(model)
+    slopes = tuple(directions(model))
+    compiled = likelihood(model, inputs, measurements, *slopes)
+    with interpreted():
+        plain = likelihood(model, inputs, measurements, *slopes)
+    for a, b in zip(compiled, plain, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11)
+
+
+def test_shapes_that_do_not_fit_are_refused():
+    model = two_channels()
+    with pytest.raises(ValueError, match="must have the shapes"):
+        likelihood(model, np.zeros((2, 5, 1)), np.zeros((2, 5, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2, 2)))
+
+
+def test_three_starts_lead_to_the_true_q_and_r_within_their_standard_errors():
+    scenario = find_scenario("nominal")
+    found = maximise_likelihood("ekf", scenario, scenario.data(training_seeds(3, 32)))
+    assert found.agree and len({optimum.start for optimum in found.optima}) == 3
+    assert BAD_START in {optimum.start for optimum in found.optima}
+    assert all(optimum.converged for optimum in found.optima)
+    true = np.array([*scenario.process_noise_cov, scenario.measurement_noise_cov])
+    assert found.identified.all() and (found.standard_errors < 0.2).all()
+    assert (abs(np.log(found.best.variances / true)) < 3 * found.standard_errors).all()
+    assert found.names == ("Q11", "Q22", "R")
+    assert found.choice.model["process_noise_cov"] == tuple(found.best.variances[:2])
+
+
+def test_a_variance_that_the_data_do_not_determine_is_said_to_be_so():
+    # One affine model for all voltages errs so much in the flow that Q22 has to cover what Q11 does as well.
+    scenario = find_scenario("nominal")
+    found = maximise_likelihood("kf", scenario, scenario.data(training_seeds(0, 16)), starts=[(1.0, 1.0, 1.0)])
+    assert found.identified.tolist() == [False, True, True]
+
+
+def test_only_filters_with_sensitivities_have_a_gradient():
+    scenario = find_scenario("nominal")
+    with pytest.raises(ValueError, match="filter must be one of kf, ekf, but got 'enkf'"):
+        maximise_likelihood("enkf", scenario, scenario.data(training_seeds(0, 2)))
