@@ -30,13 +30,14 @@ def filter_for(env, filter: str | None, model, tuned: str | None, numbers: dict)
         filter, numbers = entry["name"], {**entry["numbers"], **entry["model"]}
     filter = "ekf" if filter is None else filter
     numbers = dict(numbers)
-    own = {name: numbers.pop(name) for name in tunable_numbers(filter) if name in numbers}
-    return make_filter(filter, _model_for(env, model, numbers), **own)
+    known = tunable_numbers(filter)
+    own = {name: numbers.pop(name) for name in known if name in numbers}
+    return make_filter(filter, _model_for(env, model, numbers, known), **own)
 
 
-def _model_for(env, model, arguments: dict) -> StateSpaceModel:
+def _model_for(env, model, arguments: dict, known: tuple[str, ...]) -> StateSpaceModel:
     if model is None:
-        return model_of_env(env, **arguments)
+        return model_of_env(env, known, **arguments)
     if isinstance(model, StateSpaceModel):
         if arguments:
             raise ValueError(f"a StateSpaceModel must come without arguments of its own, but got {arguments!r}")

@@ -12,10 +12,10 @@ from filters.belief import Kernels
 from filters.filter import Filter
 from filters.gaussian.extended import nothing_to_summarise
 from filters.inverse import component_solver
-from filters.rows import constants_form, constants_reader, memory_places, number_places, own_place
+from filters.rows import constants_form, constants_reader, memory_places, number_places, own_place, row_access
 from thruster_env.checks import at_least, positive
 from thruster_env.compiled import inlined
-from thruster_env.components import matrix_writer, vector_reader, vector_writer
+from thruster_env.components import vector_reader, vector_writer
 
 
 @lru_cache(maxsize=64)
@@ -37,12 +37,7 @@ def baseline_kernels(transition, observe, n, m, inputs, form, inverted) -> Kerne
     substeps_place, step_place, likelihood_place = source.substeps, places.step, places.log_likelihood
     smooth_place, known_place, reach_place, kept_place = places.extras + n, places.extras + n + 1, own, own + 1
     read_open, store_open = vector_reader(n, places.extras), vector_writer(n, places.extras)
-    read_mean, store_mean, store_cov = (
-        vector_reader(n, places.mean),
-        vector_writer(n, places.mean),
-        matrix_writer(n, n, places.cov),
-    )
-    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    (read_mean, _), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
     prior_mean, constants, control = (
         vector_reader(n, source.prior_mean),
         constants_reader(n, m, form),

@@ -89,20 +89,34 @@ def masked(size: int) -> Callable:
     return written_out("mask", "r, z", matrix_of(size, size, entry))
 
 
-@cache
-def cholesky_factor(size: int) -> Callable:
-    """Return `factor(a)`: the lower triangular L with L L' = a; NaN where a is not positive definite."""
+def pivoted_factor(size: int, diagonal: str, **names: float) -> Callable:
+    """Return `factor(a)`: the lower triangular L of Cholesky's method, row by row, with a diagonal of one's own.
+
+        l_ij = (a_ij - sum_k l_ik l_jk) / l_jj for j < i, the sum over k < j
+        d_i = a_ii - sum_k l_ik^2, the sum over k < i, of which l_ii is the root where there is one
+
+    Args:
+        size: rows and columns of a.
+        diagonal: source of l_ii, in which `{d}` stands for d_i and `{a}` for a_ii.
+        names: other names that it uses, with their values.
+    """
     lines = []
     for i in range(size):
         for j in range(i + 1):
             rest = "".join(f" - l{i}_{k} * l{j}_{k}" for k in range(j))
             if i == j:
                 lines.append(f"d{i} = a[{i}][{i}]{rest}")
-                lines.append(f"l{i}_{i} = (d{i} if d{i} > 0.0 else nan) ** 0.5")
+                lines.append(f"l{i}_{i} = " + diagonal.format(d=f"d{i}", a=f"a[{i}][{i}]"))
             else:
                 lines.append(f"l{i}_{j} = (a[{i}][{j}]{rest}) / l{j}_{j}")
     result = matrix_of(size, size, lambda i, j: f"l{i}_{j}" if j <= i else "0.0")
-    return written_out("factor", "a", *lines, result, nan=math.nan)
+    return written_out("factor", "a", *lines, result, **names)
+
+
+@cache
+def cholesky_factor(size: int) -> Callable:
+    """Return `factor(a)`: the lower triangular L with L L' = a; NaN where a is not positive definite."""
+    return pivoted_factor(size, "({d} if {d} > 0.0 else nan) ** 0.5", nan=math.nan)
 
 
 @cache

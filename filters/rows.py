@@ -14,7 +14,14 @@ from typing import NamedTuple
 import numpy as np
 
 from thruster_env.checks import covariance_root
-from thruster_env.components import tuple_of, written_out
+from thruster_env.components import (
+    matrix_reader,
+    matrix_writer,
+    tuple_of,
+    vector_reader,
+    vector_writer,
+    written_out,
+)
 
 LANES = 8  # float64 in the widest vector register: ensembles are padded, so that loops have no remainder
 
@@ -44,6 +51,25 @@ class MemoryPlaces(NamedTuple):
 def memory_places(n: int, m: int) -> MemoryPlaces:
     """Places in the row of a filter."""
     return MemoryPlaces(*_starts(n, n * n, 1, 1, 1, 1, m, m * m, 1, n * m))
+
+
+@cache
+def row_access(n: int, m: int) -> tuple[tuple[Callable, Callable], ...]:
+    """Functions that read and write a filter's row, as pairs: a vector's, then that of its covariance.
+
+    Vectors are tuples, covariances tuples of rows.
+
+    Returns:
+        `read(row)` of the mean (n,) and its covariance (n, n).
+        `write(row, value)` of the same.
+        `write(row, value)` of the innovation (m,) and its covariance (m, m).
+    """
+    places = memory_places(n, m)
+    return (
+        (vector_reader(n, places.mean), matrix_reader(n, n, places.cov)),
+        (vector_writer(n, places.mean), matrix_writer(n, n, places.cov)),
+        (vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)),
+    )
 
 
 class NumberPlaces(NamedTuple):

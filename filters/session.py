@@ -27,7 +27,7 @@ class Session:
         kernels, model, size = filter_.kernels(), filter_.kernel_model, filter_.size
         n, m = kernels.n, kernels.m
         places = memory_places(n, m)
-        self._kernels, self._operate = kernels, operation(kernels)
+        self._name, self._kernels, self._operate = filter_.name, kernels, operation(kernels)
         self._numbers, self._size, self._places = filter_.numbers, size, places
         self._kept_rows, self._noise_places = kernels.kept_rows, number_places(n, m)
         self._memory = new_memory(kernels, size)
@@ -87,7 +87,18 @@ class Session:
         return int(self._row[self._places.divergences])
 
     def load(self, belief: Belief) -> None:
-        """Put a belief into the memory."""
+        """Put a belief into the memory; ValueError for one of another model or kind of filter."""
+        shapes = {
+            "mean": self.mean.shape,
+            "cov": self.cov.shape,
+            "members": (self._kept_rows, self._size),
+            "extras": self._extras.shape,
+        }
+        for name, shape in shapes.items():
+            given = np.shape(getattr(belief, name))
+            if given != shape:
+                whose = f"a belief that the filter {self._name!r} can take"
+                raise ValueError(f"{name} of {whose} must have shape {shape}, but got {given}")
         self.mean[:], self.cov[:] = belief.mean, belief.cov
         if self._size:
             self._table[: self._kept_rows] = belief.members[:, :1]  # the padding follows a real member

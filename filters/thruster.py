@@ -143,19 +143,20 @@ def model_of_plant(
     )
 
 
-def model_of_env(env, **changes) -> StateSpaceModel:
+def model_of_env(env, known: tuple[str, ...] = (), /, **changes) -> StateSpaceModel:
     """The model of a `BowThruster` env; changes are those of `model_of_plant`.
 
     Raises:
-        ValueError: if the env has no plant that this package knows.
+        ValueError: if the env has no plant that this package knows, or a change is unknown; the message then lists
+            those of the model behind others that are `known` to the caller: the filter's own numbers.
     """
     plant = getattr(env.unwrapped, "plant", None)
     if not isinstance(plant, Plant):
         raise ValueError(f"an env other than a bow thruster must come with a model, but got {env}")
     unknown = sorted(set(changes) - set(MODEL_ARGUMENTS))
     if unknown:
-        known = ", ".join(MODEL_ARGUMENTS)
-        raise ValueError(f"arguments must be numbers of the filter or {known}, but got {unknown}")
+        names = ", ".join((*known, *MODEL_ARGUMENTS))
+        raise ValueError(f"arguments must be among {names}, but got {', '.join(map(repr, unknown))}")
     return model_of_plant(plant, **changes)
 
 

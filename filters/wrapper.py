@@ -33,13 +33,13 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
     Args:
         env: any env with Box actions and observations.
-        filter: "kf", "ekf" or "enkf".
+        filter: name of a filter in `filters.FILTERS`, which `thruster filters` lists; "ekf" if None.
         observation: one of the three forms above.
         model: None for the model of a bow thruster env, "module:factory" of a function that returns a
             `StateSpaceModel`, or a `StateSpaceModel` (which JSON cannot hold).
         tuned: path of a tuned file; it gives filter, numbers and model arguments.
-        **numbers: the filter's own numbers (`ensemble_size`) and arguments of the model: for a bow thruster
-            `process_noise_cov`, `measurement_noise_cov`, `parameter_factors`, `operating_voltage`.
+        **numbers: the filter's own numbers, such as `ensemble_size`, and arguments of the model: for a bow
+            thruster `process_noise_cov`, `measurement_noise_cov`, `parameter_factors`, `operating_voltage`.
 
     Raises:
         ValueError: if an argument is unknown or off, or spaces and model do not fit.

@@ -1,9 +1,11 @@
-"""No test opens a window, and in CI no test is skipped for want of a package."""
+"""No test opens a window, in CI no test is skipped for want of a package, and compiling can be left out."""
 
 import os
 import re
 
 import pytest
+
+from thruster_env.compiled import interpreted
 
 # Before anything imports matplotlib or pygame.
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -46,3 +48,10 @@ class MissingPackages:
 def pytest_configure(config):
     if os.environ.get("CI"):
         config.pluginmanager.register(MissingPackages(), "missing-packages")
+
+
+@pytest.fixture
+def as_python():
+    """Nothing is compiled: exactness needs none, and that both ways agree is for the contract to test."""
+    with interpreted():
+        yield

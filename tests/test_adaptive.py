@@ -10,39 +10,19 @@ from filters import (
     RobustExtendedKalmanFilter,
     SageHusaFilter,
     VariationalBayesFilter,
-    affine_model,
     run,
     thruster_model,
     truth,
 )
 from filters.adaptive.sage_husa import bounded_step
 from filters.session import Session
+from tests.models import plane_model, simulated
+from tests.oracles import kalman_update
 from thruster_env.compiled import interpreted
 from thruster_env.streams import episode_keys
 
 KEY = (1, 2)
 adaptive = pytest.mark.parametrize("kind", [SageHusaFilter, VariationalBayesFilter])
-
-
-def plane_model(**changes):
-    """n = m = 2, p = 1, with offsets and correlated noise."""
-    arguments = {
-        "a": [[0.9, 0.3], [-0.2, 0.8]],
-        "b": [[1.0], [0.5]],
-        "c": [[1.0, 0.4], [-0.3, 1.5]],
-        "state_offset": [0.3, -0.2],
-        "measurement_offset": [0.7, -0.1],
-        "process_noise_cov": [[0.3, 0.12], [0.12, 0.2]],
-        "measurement_noise_cov": [[0.5, -0.25], [-0.25, 0.4]],
-        "prior_mean": [1.0, -1.0],
-        "prior_cov": [[1.0, 0.4], [0.4, 0.5]],
-    }
-    return affine_model(**{**arguments, **changes})
-
-
-def simulated(model, steps, count=1):
-    inputs = np.random.default_rng(7).normal(size=(count, steps, 1))
-    return inputs, truth.simulate(model, episode_keys(range(count)), inputs).measurements
 
 
 def noise_moment(p, innovation, h, r):
@@ -52,18 +32,12 @@ def noise_moment(p, innovation, h, r):
     return np.outer(mean, mean) + r - r @ np.linalg.solve(s, r)
 
 
-def textbook_update(x, p, innovation, h, r):
-    s = h @ p @ h.T + r
-    gain = p @ h.T @ np.linalg.inv(s)
-    return x + gain @ innovation, (np.eye(len(x)) - gain @ h) @ p
-
-
 @pytest.mark.parametrize("measured", [[2.0, 1.0], [200.0, 400.0]])
 def test_sage_husa_is_the_textbook_recursion_with_bounded_steps(measured):
     model = plane_model()
     a, b, offset, h, shift = model.matrices()
     filter_ = SageHusaFilter(model=model, forgetting_factor=0.9, process_forgetting_factor=0.8)
-    inputs, measurements = simulated(plane_model(measurement_noise_cov=measured), 30)
+    inputs, measurements = simulated(plane_model(measurement_noise_cov=measured), 30, level=1.0)
     x, p, q, r = model.prior_mean, model.prior_cov, model.process_noise_cov, model.measurement_noise_cov
 
     def length(d, old, less):
@@ -77,8 +51,8 @@ def test_sage_husa_is_the_textbook_recursion_with_bounded_steps(measured):
                 moved = a @ p @ a.T
                 x, p = a @ x + b @ inputs[0, k - 1] + offset, moved + q
             innovation = z - h @ x - shift
-            s, before, old_p = h @ p @ h.T + r, x, p
-            x, p = textbook_update(x, p, innovation, h, r)
+            before, old_p = x, p
+            x, p, s = kalman_update(x, p, innovation, h, r)
             d = length(0.1, r, s)
             r = (1 - d) * r + d * (np.outer(innovation, innovation) - h @ old_p @ h.T)
             if k > 0:
@@ -112,7 +86,7 @@ def test_variational_bayes_is_the_naive_recursion():
     a, b, offset, h, shift = model.matrices()
     rho, weight = 0.95, 8.0
     filter_ = VariationalBayesFilter(model=model, forgetting_factor=rho, prior_weight=weight, iterations=4)
-    inputs, measurements = simulated(plane_model(measurement_noise_cov=[2.0, 1.0]), 30)
+    inputs, measurements = simulated(plane_model(measurement_noise_cov=[2.0, 1.0]), 30, level=1.0)
     x, p, q = model.prior_mean, model.prior_cov, model.process_noise_cov
     scale = weight * model.measurement_noise_cov
     with interpreted():
@@ -130,7 +104,7 @@ def test_variational_bayes_is_the_naive_recursion():
                 new_scale = scale + noise_moment(p, expected, h, r)
                 r = new_scale / weight
             scale = new_scale
-            x, p = textbook_update(x, p, expected, h, r)
+            x, p, _ = kalman_update(x, p, expected, h, r)
             np.testing.assert_allclose(belief.mean, x, rtol=1e-9, atol=1e-12)
             np.testing.assert_allclose(belief.cov, p, rtol=1e-9, atol=1e-12)
             np.testing.assert_allclose(filter_.estimated_noise(belief), r, rtol=1e-9)
@@ -142,7 +116,7 @@ def test_for_one_channel_it_is_the_inverse_gamma_recursion_of_sarkka_and_nummenm
     filter_ = VariationalBayesFilter(model=model, forgetting_factor=0.9, prior_weight=6.0, iterations=30)
     a, b, offset, h, _ = model.matrices()
     x, p, alpha, beta = model.prior_mean, model.prior_cov, 3.0, 3.0 * 0.5
-    inputs, measurements = simulated(model, 20)
+    inputs, measurements = simulated(model, 20, level=1.0)
     with interpreted():
         belief = filter_.init(KEY)
         for k, z in enumerate(measurements[0]):
@@ -153,7 +127,7 @@ def test_for_one_channel_it_is_the_inverse_gamma_recursion_of_sarkka_and_nummenm
             alpha, prior_beta = 0.9 * alpha + 0.5, 0.9 * beta
             beta = prior_beta
             for _ in range(200):  # their algorithm, to its fixed point
-                new_x, new_p = textbook_update(x, p, z - h @ x, h, np.array([[beta / alpha]]))
+                new_x, new_p, _ = kalman_update(x, p, z - h @ x, h, np.array([[beta / alpha]]))
                 beta = prior_beta + 0.5 * float((z - h @ new_x)[0] ** 2 + (h @ new_p @ h.T)[0, 0])
             x, p = new_x, new_p
             assert filter_.estimated_noise(belief)[0, 0] == pytest.approx(beta / alpha, rel=1e-6)
@@ -171,7 +145,7 @@ NEUTRAL = [
 @pytest.mark.parametrize("make", [plane_model, thruster_model])
 def test_with_nothing_to_learn_it_is_the_extended_filter(kind, numbers, make):
     model = make()
-    inputs, z = simulated(model, 40)
+    inputs, z = simulated(model, 40, level=1.0)
     z[0, 7], z[0, 9, 0] = np.nan, np.nan
     with interpreted():
         expected = run(ExtendedKalmanFilter(model=model), np.zeros((1, 2)), inputs, z)
@@ -180,23 +154,27 @@ def test_with_nothing_to_learn_it_is_the_extended_filter(kind, numbers, make):
         np.testing.assert_allclose(one, other, rtol=1e-8, atol=1e-8)
 
 
-def estimates_of_noise(filter_, inputs, measurements):
-    """The estimate of R at the end of every run (B, m, m)."""
-    found, session = [], Session(filter_)
+def many_long(model):
+    """Inputs and measurements of 30 runs of 2000 steps."""
+    return simulated(model, 2000, count=30, seed=7, level=1.0, compiled=True)
+
+
+def last_beliefs(filter_, inputs, measurements):
+    """The belief at the end of every run."""
+    session = Session(filter_)
     for u, z in zip(inputs, measurements, strict=True):
         session.start(KEY, z[0])
         for k in range(len(u)):
             session.step(u[k], z[k + 1])
-        found.append(filter_.estimated_noise(session.belief()))
-    return np.array(found)
+        yield session.belief()
 
 
 @adaptive
 def test_it_finds_the_true_noise_within_2000_steps(kind):
     actual = np.array([[2.0, 0.6], [0.6, 1.0]])
-    inputs, measurements = simulated(plane_model(measurement_noise_cov=actual), 2000, count=30)
+    inputs, measurements = many_long(plane_model(measurement_noise_cov=actual))
     filter_ = kind(model=plane_model(), forgetting_factor=0.995)
-    found = estimates_of_noise(filter_, inputs, measurements)
+    found = np.array([filter_.estimated_noise(last) for last in last_beliefs(filter_, inputs, measurements)])
     spread = found.std(axis=0, ddof=1)
     # Each estimate averages some 400 measurements, and so is off by several per cent.
     assert (spread < 0.15 * np.sqrt(np.outer(np.diag(actual), np.diag(actual)))).all()
@@ -207,14 +185,9 @@ def test_it_finds_the_true_noise_within_2000_steps(kind):
 
 def test_sage_husa_finds_q_where_both_channels_tell_of_it():
     actual = np.array([[1.2, 0.3], [0.3, 0.8]])
-    inputs, measurements = simulated(plane_model(process_noise_cov=actual), 2000, count=30)
+    inputs, measurements = many_long(plane_model(process_noise_cov=actual))
     filter_ = SageHusaFilter(model=plane_model(), forgetting_factor=1.0, process_forgetting_factor=0.995)
-    session, found = Session(filter_), []
-    for u, z in zip(inputs, measurements, strict=True):
-        session.start(KEY, z[0])
-        for k in range(len(u)):
-            session.step(u[k], z[k + 1])
-        found.append(filter_.estimated_process_noise(session.belief()))
+    found = [filter_.estimated_process_noise(last) for last in last_beliefs(filter_, inputs, measurements)]
     spread = np.std(found, axis=0, ddof=1)
     assert (spread < 0.25).all()
     assert (np.abs(np.mean(found, axis=0) - actual) < 3.29 * spread / math.sqrt(30)).all()
@@ -293,7 +266,7 @@ def test_the_robust_filter_is_the_naive_fixed_point():
     for _ in range(7):
         moment = noise_moment(belief.cov, expected, h, r / weight)
         weight = (freedom + 2) / (freedom + np.trace(np.linalg.solve(r, moment)))
-    x, p = textbook_update(belief.mean, belief.cov, expected, h, r / weight)
+    x, p, _ = kalman_update(belief.mean, belief.cov, expected, h, r / weight)
     assert updated.extras[0] == pytest.approx(weight, rel=1e-10)
     np.testing.assert_allclose(updated.mean, x, rtol=1e-10)
     np.testing.assert_allclose(updated.cov, p, rtol=1e-9)

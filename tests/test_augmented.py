@@ -12,20 +12,15 @@ from filters import (
     ExtendedKalmanFilter,
     ParticleFilter,
     Unknown,
-    affine_model,
     augmented_model,
     run,
     thruster_model,
     truth,
 )
 from filters.derivatives import jacobian
+from tests.models import held_voltages, scalar_model
 from thruster_env.compiled import interpreted
 from thruster_env.streams import episode_keys, filter_keys
-
-
-def held_inputs(count, steps, seed=20):
-    levels = np.random.default_rng(seed).uniform(-12.0, 12.0, size=(count, steps // 25, 1))
-    return np.repeat(levels, 25, axis=1)
 
 
 def test_the_new_states_stand_in_for_the_constants():
@@ -70,15 +65,7 @@ def test_a_model_without_jacobians_gets_none():
 
 
 def test_constants_of_a_tuple_go_by_number():
-    model = affine_model(
-        a=[[0.9]],
-        b=[[1.0]],
-        c=[[2.0]],
-        process_noise_cov=[0.1],
-        measurement_noise_cov=[0.2],
-        prior_mean=[3.0],
-        prior_cov=[0.5],
-    )
+    model = scalar_model()
     augmented = augmented_model(model, {0: Unknown(0.1)})
     assert augmented.transition((2.0, 0.7), (0.5,), augmented.constants) == (0.7 * 2.0 + 0.5, 0.7)
     assert augmented.observe((2.0, 0.7), augmented.constants) == (4.0,)
@@ -89,7 +76,7 @@ def test_constants_of_a_tuple_go_by_number():
 
 def test_it_recovers_an_unknown_ambient_flow_and_beats_the_filter_that_ignores_it():
     runs, actual = 40, 0.6
-    inputs = held_inputs(runs, 750)
+    inputs = held_voltages(runs, 30)
     drawn = truth.simulate(thruster_model(ambient_velocity=actual), episode_keys(range(runs)), inputs)
     assumed = thruster_model()  # still water
 
@@ -114,7 +101,7 @@ def test_it_recovers_an_unknown_ambient_flow_and_beats_the_filter_that_ignores_i
 def test_it_recovers_the_load_gain_of_the_physical_tunnel():
     runs, plant = 40, thruster_model(preset="tunnel_physical")
     actual = plant.constants.load_gain
-    inputs = held_inputs(runs, 750)
+    inputs = held_voltages(runs, 30)
     drawn = truth.simulate(plant, episode_keys(range(runs)), inputs)
     assumed = plant.replace(constants=plant.constants._replace(load_gain=0.7 * actual))
     joint = augmented_model(assumed, {"load_gain": Unknown(std=0.5 * actual)})

@@ -8,18 +8,12 @@ from scipy.optimize import brentq
 
 from filters import Inversion, LowPass, OpenLoop, StateSpaceModel, run, thruster_model, truth
 from filters.inverse import component_solver
-from thruster_env.compiled import interpreted
 from thruster_env.streams import episode_keys
 
 KEYS = np.zeros((1, 2))
 KINDS = [OpenLoop, Inversion, LowPass]
 
-
-@pytest.fixture(autouse=True)
-def as_python():
-    """Exactness needs no compilation; that both agree is for the contract to test."""
-    with interpreted():
-        yield
+pytestmark = pytest.mark.usefixtures("as_python")
 
 
 def drift(x, u, c):

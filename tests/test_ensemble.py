@@ -5,56 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from filters import (
-    EnsembleKalmanFilter,
-    ExtendedKalmanFilter,
-    KalmanFilter,
-    StateSpaceModel,
-    affine_model,
-    run,
-    thruster_model,
-    truth,
-)
+from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, run, thruster_model, truth
+from tests.models import KEY, held_voltages, line_model, plane_model, simulated
+from tests.oracles import assert_normal, convergence, normals, relative_errors
 from thruster_env.compiled import interpreted
-from thruster_env.streams import (
-    FILTER_MEASUREMENT,
-    FILTER_PRIOR,
-    FILTER_PROCESS,
-    episode_keys,
-    filter_keys,
-    normal_block,
-)
-
-KEY = (123456789, 4294967295)
-
-
-def plane_model(**changes):
-    """n = m = 2, p = 1, with offsets and correlated noise."""
-    arguments = {
-        "a": [[0.9, 0.3], [-0.2, 0.8]],
-        "b": [[1.0], [0.5]],
-        "c": [[1.0, 0.4], [-0.3, 1.5]],
-        "state_offset": [0.3, -0.2],
-        "measurement_offset": [0.7, -0.1],
-        "process_noise_cov": [[0.3, 0.12], [0.12, 0.2]],
-        "measurement_noise_cov": [[0.5, -0.25], [-0.25, 0.4]],
-        "prior_mean": [1.0, -1.0],
-        "prior_cov": [[1.0, 0.4], [0.4, 0.5]],
-    }
-    return affine_model(**{**arguments, **changes})
-
-
-def line_model():
-    """n = 2, p = m = 1."""
-    return plane_model(c=[[1.0, 0.4]], measurement_offset=[0.7], measurement_noise_cov=[0.5])
-
-
-def normals(stream, key, step, rows, size):
-    """The normals (rows, size) of a stream: channel i of member j is number i * width + j of one long draw."""
-    width = -(-size // 8) * 8  # ensembles are padded to a multiple of eight
-    index = np.arange(rows * width)
-    block = np.array(normal_block(index // 4, step, stream, *key))  # (4, rows * width)
-    return block[index % 4, index].reshape(rows, width)[:, :size]
+from thruster_env.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys, filter_keys
 
 
 def test_one_cycle_is_the_naive_one_with_the_same_normals():
@@ -66,11 +21,11 @@ def test_one_cycle_is_the_naive_one_with_the_same_normals():
     )
     with interpreted():
         belief = filter_.init(KEY)
-        x = model.prior_mean[:, None] + root_p @ normals(FILTER_PRIOR, KEY, 0, 2, size)
+        x = model.prior_mean[:, None] + root_p @ normals(FILTER_PRIOR, 0, 2, size)
         np.testing.assert_allclose(belief.members, x, rtol=1e-12, atol=1e-12)
         for step, (u, z) in enumerate([(0.5, [2.0, -1.0]), (-1.0, [0.3, 0.9])], start=1):
             belief = filter_.predict(belief, [u])
-            x = a @ x + b * u + offset[:, None] + root_q @ normals(FILTER_PROCESS, KEY, step, 2, size)
+            x = a @ x + b * u + offset[:, None] + root_q @ normals(FILTER_PROCESS, step, 2, size)
             np.testing.assert_allclose(belief.members, x, rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(belief.mean, x.mean(axis=1), rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(belief.cov, np.cov(x), rtol=1e-12, atol=1e-12)
@@ -80,21 +35,13 @@ def test_one_cycle_is_the_naive_one_with_the_same_normals():
             joint = np.cov(x, y)  # divisor size - 1
             s = joint[2:, 2:] + model.measurement_noise_cov
             gain = joint[:2, 2:] @ np.linalg.inv(s)
-            v = root_r @ normals(FILTER_MEASUREMENT, KEY, step, 2, size)
+            v = root_r @ normals(FILTER_MEASUREMENT, step, 2, size)
             x = x + gain @ (np.array(z)[:, None] - v - y)
             np.testing.assert_allclose(belief.members, x, rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(belief.mean, x.mean(axis=1), rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(belief.cov, np.cov(x), rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(innovation.value, z - y.mean(axis=1), rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(innovation.cov, s, rtol=1e-12, atol=1e-12)
-
-
-def assert_normal(sample, cov, mean=0.0):
-    """A sample (d, N) has the mean and covariance given, to four standard errors."""
-    size, spread = sample.shape[1], np.sqrt(np.diag(cov))
-    assert (np.abs(sample.mean(axis=1) - mean) < 4 * spread / math.sqrt(size)).all()
-    standard_error = np.sqrt((np.outer(spread**2, spread**2) + cov**2) / size)
-    assert (np.abs(np.cov(sample) - cov) < 4 * standard_error).all()
 
 
 def test_members_are_stirred_by_the_prior_the_process_noise_and_the_measurement_noise():
@@ -127,28 +74,22 @@ def test_members_are_stirred_by_the_prior_the_process_noise_and_the_measurement_
 
 def test_it_converges_to_the_kalman_filter_like_one_over_root_n():
     model = line_model()
-    inputs = np.random.default_rng(0).normal(size=(60, 30, 1))
-    drawn = truth.simulate(model, episode_keys(range(60)), inputs)
-    keys = filter_keys(range(60))
-    exact = run(KalmanFilter(model=model), keys, inputs, drawn.measurements)
-    spread = np.sqrt(np.einsum("bkii->bki", exact.covs))
-    scale = spread[..., :, None] * spread[..., None, :]
-    sizes, in_mean, in_cov = np.array([20, 80, 320, 1280]), [], []
-    for size in sizes:
-        found = run(EnsembleKalmanFilter(model=model, ensemble_size=size), keys, inputs, drawn.measurements)
-        in_mean.append(np.sqrt(np.mean(((found.means - exact.means) / spread) ** 2)))
-        in_cov.append(np.sqrt(np.mean(((found.covs - exact.covs) / scale) ** 2)))
-    for errors in (in_mean, in_cov):
-        slope = np.polyfit(np.log(sizes), np.log(errors), 1)[0]
+    inputs, measurements = simulated(model, 30, count=60, seed=0, level=1.0, compiled=True)
+    data = filter_keys(range(60)), inputs, measurements
+    exact, sizes = run(KalmanFilter(model=model), *data), [20, 80, 320, 1280]
+    errors, found = convergence(
+        lambda size: EnsembleKalmanFilter(model=model, ensemble_size=size), sizes, data, exact.means, exact.covs
+    )
+    for slope in np.polyfit(np.log(sizes), np.log(errors.T), 1)[0]:
         assert -0.6 < slope < -0.4  # 60 independent runs give each error to about 6 %, the slope to 0.03
     # Averaged over the runs nothing remains but the bias of order 1/N: four standard errors of 1/sqrt(60 N).
-    bias = ((found.means - exact.means) / spread)[:, -1].mean(axis=0)
-    assert (np.abs(bias) < 4 * in_mean[-1] / math.sqrt(60)).all()
+    bias = relative_errors(found, exact.means, exact.covs)[0][:, -1].mean(axis=0)
+    assert (np.abs(bias) < 4 * errors[0, -1] / math.sqrt(60)).all()
 
 
 def test_on_the_thruster_a_hundred_members_are_as_good_as_the_extended_filter():
     model = thruster_model(process_noise_cov=[1.0, 4e-4], measurement_noise_cov=0.25)
-    inputs = np.repeat(np.random.default_rng(20).uniform(-12.0, 12.0, size=(100, 20, 1)), 25, axis=1)
+    inputs = held_voltages(100, 20)
     drawn = truth.simulate(model, episode_keys(range(100)), inputs)
 
     def rmse(filter_):
@@ -172,27 +113,3 @@ def test_two_members_are_enough_to_run():
         estimates = run(filter_, np.array([KEY]), np.zeros((1, 20, 1)), np.zeros((1, 21, 1)))
     assert np.isfinite(estimates.means).all()
     assert estimates.divergences.tolist() == [0]
-
-
-def needs_positive(x, u, c):
-    return (math.log(x[0]) + 3.0,)
-
-
-def see(x, c):
-    return (x[0],)
-
-
-def test_only_real_members_are_put_through_the_model():
-    """What pads an ensemble to full vector registers must not fail where no member does."""
-    model = StateSpaceModel(
-        transition=needs_positive,
-        observe=see,
-        process_noise_cov=[0.01],
-        measurement_noise_cov=[0.1],
-        prior_mean=[5.0],
-        prior_cov=[0.01],
-    )
-    filter_ = EnsembleKalmanFilter(model=model, ensemble_size=5)
-    with interpreted():
-        belief = filter_.predict(filter_.init(KEY), [0.0])
-    assert belief.mean[0] == pytest.approx(math.log(5.0) + 3.0, abs=0.3)

@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from filters import EnsembleTransformFilter, StateSpaceModel, affine_model, make_filter
+from filters import EnsembleTransformFilter, StateSpaceModel, make_filter
+from tests.models import KEY, wide_model
 from thruster_env.compiled import interpreted
-
-KEY = (123456789, 4294967295)
 
 
 def stay(x, u, c):
@@ -59,13 +58,11 @@ def test_stone_soup_draws_from_the_same_moments(m, monkeypatch):
     from stonesoup.updater.ensemble import EnsembleSqrtUpdater
 
     matrix, r = np.array([[1.0, 0.0, 0.5], [0.0, 2.0, -1.0]])[:m], np.array([[0.5, 0.2], [0.2, 0.3]])[:m, :m]
-    model = affine_model(
-        a=[[0.9, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.3, 0.7]],
+    model = wide_model(
         b=np.zeros((3, 0)),
         c=matrix,
-        process_noise_cov=[[0.3, 0.1, 0.0], [0.1, 0.2, -0.05], [0.0, -0.05, 0.4]],
+        measurement_offset=np.zeros(m),
         measurement_noise_cov=r,
-        prior_mean=[1.0, -1.0, 0.5],
         prior_cov=[1.0, 0.5, 0.8],
     )
     filter_, z = EnsembleTransformFilter(model=model, ensemble_size=9), np.array([2.0, -1.0])[:m]

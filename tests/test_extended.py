@@ -5,26 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from filters import (
-    ExtendedKalmanFilter,
-    KalmanFilter,
-    StateSpaceModel,
-    affine_model,
-    linearize,
-    run,
-    thruster_model,
-    truth,
-)
+from filters import ExtendedKalmanFilter, KalmanFilter, linearize, run, thruster_model, truth
+from tests import models
+from tests.models import DT, held_voltages, line_model, look, simulated, swing
+from tests.oracles import kalman_update
 from thruster_env.compiled import interpreted
 from thruster_env.streams import episode_keys
-
-DT = 0.05
-
-
-def swing(x, u, c):
-    """A damped pendulum, semi-implicit Euler; c = (g/l, damping)."""
-    rate = x[1] + DT * (-c[0] * math.sin(x[0]) - c[1] * x[1] * abs(x[1]) + u[0])
-    return (x[0] + DT * rate, rate)
 
 
 def swing_jacobian(x, u, c):
@@ -32,56 +18,35 @@ def swing_jacobian(x, u, c):
     return ((1.0 + DT * by_angle, DT * by_rate), (by_angle, by_rate))
 
 
-def look(x, c):
-    return (math.sin(x[0]), x[0] * x[1])
-
-
 def look_jacobian(x, c):
     return ((math.cos(x[0]), 0.0), (x[1], x[0]))
 
 
 def pendulum(analytic=True, **changes):
-    arguments = {
-        "transition": swing,
-        "observe": look,
-        "transition_jacobian": swing_jacobian if analytic else None,
-        "observe_jacobian": look_jacobian if analytic else None,
-        "process_noise_cov": [[2e-4, 1e-4], [1e-4, 1e-3]],
-        "measurement_noise_cov": [[0.01, 0.003], [0.003, 0.04]],
-        "prior_mean": [0.5, 0.2],
-        "prior_cov": [[0.2, 0.05], [0.05, 0.1]],
-        "constants": (9.81, 0.3),
-    }
-    return StateSpaceModel(**{**arguments, **changes})
+    """The pendulum, with its Jacobians or without."""
+    given = {"transition_jacobian": swing_jacobian, "observe_jacobian": look_jacobian} if analytic else {}
+    return models.pendulum(**{**given, **changes})
 
 
-def simulated(model, steps=150, seed=1, level=3.0):
-    inputs = np.random.default_rng(seed).normal(size=(1, steps, model.inputs)) * level
+def estimates_of(model, inputs, measurements, kind=ExtendedKalmanFilter):
     with interpreted():
-        return truth.simulate(model, episode_keys([seed]), inputs), inputs
-
-
-def estimates_of(model, drawn, inputs, kind=ExtendedKalmanFilter):
-    with interpreted():
-        return run(kind(model=model), np.zeros((1, 2)), inputs, drawn.measurements)
+        return run(kind(model=model), np.zeros((1, 2)), inputs, measurements)
 
 
 def test_it_is_the_textbook_filter():
     model = pendulum()
-    drawn, inputs = simulated(model)
-    estimates = estimates_of(model, drawn, inputs)
+    inputs, measurements = simulated(model, 150)
+    estimates = estimates_of(model, inputs, measurements)
     q, r, c = model.process_noise_cov, model.measurement_noise_cov, model.constants
     x, p = model.prior_mean, model.prior_cov
-    for k, z in enumerate(drawn.measurements[0]):
+    for k, z in enumerate(measurements[0]):
         if k > 0:
             f = np.array(swing_jacobian(x, inputs[0, k - 1], c))  # at the last estimate, before it moves
             x = np.array(swing(x, inputs[0, k - 1], c))
             p = f @ p @ f.T + q
         h = np.array(look_jacobian(x, c))
         innovation = z - np.array(look(x, c))
-        s = h @ p @ h.T + r
-        gain = p @ h.T @ np.linalg.inv(s)
-        x, p = x + gain @ innovation, (np.eye(2) - gain @ h) @ p
+        x, p, s = kalman_update(x, p, innovation, h, r)
         np.testing.assert_allclose(estimates.means[0, k], x, rtol=1e-10, atol=1e-10)
         np.testing.assert_allclose(estimates.covs[0, k], p, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(estimates.innovations[0, k], innovation, rtol=1e-10, atol=1e-10)
@@ -89,21 +54,11 @@ def test_it_is_the_textbook_filter():
 
 
 def test_on_an_affine_model_it_is_the_kalman_filter():
-    model = affine_model(
-        a=[[0.9, 0.2], [-0.1, 0.8]],
-        b=[[0.5], [1.0]],
-        c=[[1.0, 0.3]],
-        state_offset=[0.3, -0.2],
-        measurement_offset=[0.7],
-        process_noise_cov=[[0.3, 0.1], [0.1, 0.2]],
-        measurement_noise_cov=[0.5],
-        prior_mean=[1.0, 2.0],
-        prior_cov=[1.0, 2.0],
-    )
-    drawn, inputs = simulated(model)
-    by_kalman = estimates_of(model, drawn, inputs, KalmanFilter)
+    model = line_model()
+    inputs, measurements = simulated(model, 150)
+    by_kalman = estimates_of(model, inputs, measurements, KalmanFilter)
     for derivatives in ({}, {"transition_jacobian": None, "observe_jacobian": None}):
-        extended = estimates_of(model.replace(**derivatives), drawn, inputs)
+        extended = estimates_of(model.replace(**derivatives), inputs, measurements)
         for one, other in zip(extended[:5], by_kalman[:5], strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 
@@ -118,9 +73,9 @@ def test_central_differences_agree_with_the_analytic_jacobian(x):
 
 
 def test_without_jacobians_the_estimates_are_the_same_to_the_differences_accuracy():
-    drawn, inputs = simulated(pendulum())
-    analytic = estimates_of(pendulum(), drawn, inputs)
-    numeric = estimates_of(pendulum(analytic=False), drawn, inputs)
+    inputs, measurements = simulated(pendulum(), 150)
+    analytic = estimates_of(pendulum(), inputs, measurements)
+    numeric = estimates_of(pendulum(analytic=False), inputs, measurements)
     np.testing.assert_allclose(numeric.means, analytic.means, rtol=1e-7, atol=1e-7)
     np.testing.assert_allclose(numeric.covs, analytic.covs, rtol=1e-7, atol=1e-9)
 
@@ -131,9 +86,9 @@ def swing_thrice(x, u, c):
 
 @pytest.mark.parametrize("analytic", [True, False])
 def test_substeps_compose_the_transition_and_chain_its_jacobian(analytic):
-    drawn, inputs = simulated(pendulum(substeps=3))
-    whole = estimates_of(pendulum(analytic=False, transition=swing_thrice), drawn, inputs)
-    parts = estimates_of(pendulum(analytic=analytic, substeps=3), drawn, inputs)
+    inputs, measurements = simulated(pendulum(substeps=3), 150)
+    whole = estimates_of(pendulum(analytic=False, transition=swing_thrice), inputs, measurements)
+    parts = estimates_of(pendulum(analytic=analytic, substeps=3), inputs, measurements)
     np.testing.assert_allclose(parts.means, whole.means, rtol=1e-6, atol=1e-7)
     np.testing.assert_allclose(parts.covs, whole.covs, rtol=1e-6, atol=1e-8)
 
@@ -157,8 +112,7 @@ def test_the_thruster_s_jacobians_are_those_of_its_functions(preset, x):
 def nominal():
     """The thruster with its default noise: 100 truths under voltages held for 0.25 s, with what the EKF says."""
     model = thruster_model(process_noise_cov=[1.0, 4e-4], measurement_noise_cov=0.25)
-    levels = np.random.default_rng(20).uniform(-12.0, 12.0, size=(100, 20, 1))
-    inputs = np.repeat(levels, 25, axis=1)
+    inputs = held_voltages(100, 20)
     drawn = truth.simulate(model, episode_keys(range(100)), inputs)
     return drawn, run(ExtendedKalmanFilter(model=model), np.zeros((100, 2)), inputs, drawn.measurements)
 

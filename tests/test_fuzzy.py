@@ -6,37 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from filters import FuzzyKalmanFilter, KalmanFilter, StateSpaceModel, affine_model, run, thruster_model, truth
+from filters import FuzzyKalmanFilter, KalmanFilter, StateSpaceModel, run, thruster_model, truth
 from filters.gaussian.fuzzy import memberships
-from thruster_env.compiled import interpreted
+from tests.models import random_affine, simulated
 from thruster_env.streams import episode_keys
 
 KEYS = np.zeros((1, 2))
 
-
-@pytest.fixture(autouse=True)
-def as_python():
-    """Exactness needs no compilation; that both agree is for the contract to test."""
-    with interpreted():
-        yield
-
-
-def random_affine(n, m=2, p=1, seed=0):
-    rng = np.random.default_rng(seed)
-    a = rng.normal(size=(n, n))
-    roots = [rng.normal(size=(size, size)) for size in (n, m, n)]
-    q, r, p_0 = (root @ root.T + 0.1 * np.eye(len(root)) for root in roots)
-    return affine_model(
-        a=0.9 * a / np.abs(np.linalg.eigvals(a)).max(),
-        b=rng.normal(size=(n, p)),
-        c=rng.normal(size=(m, n)),
-        state_offset=rng.normal(size=n),
-        measurement_offset=rng.normal(size=m),
-        process_noise_cov=q,
-        measurement_noise_cov=r,
-        prior_mean=rng.normal(size=n),
-        prior_cov=p_0,
-    )
+pytestmark = pytest.mark.usefixtures("as_python")
 
 
 def turn(x, u, c):
@@ -62,9 +39,8 @@ def six_states():
 
 @pytest.mark.parametrize("n", [1, 2, 3, 6])
 def test_with_equal_rules_it_is_the_kalman_filter(n):
-    model = random_affine(n, seed=n)
-    inputs = np.random.default_rng(1).normal(size=(1, 40, 1))
-    z = truth.simulate(model, episode_keys([3]), inputs).measurements
+    model = random_affine(n, p=1, seed=n)
+    inputs, z = simulated(model, 40, level=1.0)
     z[0, 5], z[0, 11, 0] = np.nan, np.nan
     exact = run(KalmanFilter(model=model), KEYS, inputs, z)
     found = run(FuzzyKalmanFilter(model=model, low=[-3.0] * n, high=[2.0] * n), KEYS, inputs, z)
@@ -73,7 +49,7 @@ def test_with_equal_rules_it_is_the_kalman_filter(n):
 
 
 def test_an_affine_model_needs_no_range():
-    model = random_affine(2)
+    model = random_affine(2, p=1)
     z = np.ones((1, 5, 2))
     found = run(FuzzyKalmanFilter(model=model), KEYS, np.zeros((1, 4, 1)), z)
     exact = run(KalmanFilter(model=model), KEYS, np.zeros((1, 4, 1)), z)
@@ -200,4 +176,4 @@ def test_a_nonlinear_model_without_a_range_is_refused():
 
 def test_more_rules_than_sense_are_refused():
     with pytest.raises(ValueError, match="at most 8 states, but got 9"):
-        FuzzyKalmanFilter(model=random_affine(9))
+        FuzzyKalmanFilter(model=random_affine(9, p=1))

@@ -6,32 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from filters import (
-    ExtendedKalmanFilter,
-    GaussianSumFilter,
-    KalmanFilter,
-    StateSpaceModel,
-    affine_model,
-    run,
-    thruster_model,
-    truth,
-)
+from filters import ExtendedKalmanFilter, GaussianSumFilter, KalmanFilter, StateSpaceModel, run
+from tests.models import line_model, simulated
 from thruster_env.compiled import interpreted
-from thruster_env.streams import episode_keys
 
 KEYS = np.zeros((1, 2))
-
-
-def line_model():
-    return affine_model(
-        a=[[0.9, 0.3], [-0.2, 0.8]],
-        b=[[1.0], [0.5]],
-        c=[[1.0, 0.4]],
-        process_noise_cov=[[0.3, 0.12], [0.12, 0.2]],
-        measurement_noise_cov=[0.5],
-        prior_mean=[1.0, -1.0],
-        prior_cov=[[1.0, 0.4], [0.4, 0.5]],
-    )
 
 
 def stay(x, u, c):
@@ -102,8 +81,7 @@ def test_an_update_is_the_naive_one(component):
 
 def test_on_an_affine_model_it_is_nearly_the_kalman_filter():
     model = line_model()
-    inputs = np.random.default_rng(0).normal(size=(1, 60, 1))
-    z = truth.simulate(model, episode_keys([1]), inputs).measurements
+    inputs, z = simulated(model, 60, level=1.0)
     z[0, 10:15] = np.nan
     with interpreted():
         exact = run(KalmanFilter(model=model), KEYS, inputs, z)
@@ -133,19 +111,6 @@ def test_a_component_that_is_known_is_not_split():
         found, _ = GaussianSumFilter(model=model).update(GaussianSumFilter(model=model).init(), [2.0])
     np.testing.assert_allclose(found.mean, exact.mean, rtol=1e-12)
     np.testing.assert_allclose(found.cov, exact.cov, rtol=1e-12, atol=1e-15)
-
-
-def test_on_the_thruster_with_the_published_noise_it_halves_the_extended_filter_s_error():
-    model = thruster_model(process_noise_cov=[0.5, 0.5], measurement_noise_cov=0.5)
-    inputs = np.repeat(np.random.default_rng(20).uniform(-12.0, 12.0, size=(30, 10, 1)), 25, axis=1)
-    drawn = truth.simulate(model, episode_keys(range(30)), inputs)
-    squares = []
-    for kind in (ExtendedKalmanFilter, GaussianSumFilter):
-        estimates = run(kind(model=model), np.zeros((30, 2)), inputs, drawn.measurements)
-        assert (estimates.divergences == 0).all()
-        squares.append(((estimates.means - drawn.states)[:, 50:, 1] ** 2).mean(axis=1))
-    gain = 0.25 * squares[0] - squares[1]  # positive on average if the RMSE is below half
-    assert gain.mean() > 1.96 * gain.std(ddof=1) / math.sqrt(30)
 
 
 @pytest.mark.parametrize(

@@ -11,22 +11,14 @@ from filters import (
     IteratedExtendedKalmanFilter,
     KalmanFilter,
     StateSpaceModel,
-    affine_model,
     run,
     thruster_model,
-    truth,
 )
-from thruster_env.compiled import interpreted
-from thruster_env.streams import episode_keys
+from tests.models import plane_model, simulated
 
 KEYS = np.zeros((1, 2))
 
-
-@pytest.fixture(autouse=True)
-def as_python():
-    """Exactness needs no compilation; that both agree is for the contract to test."""
-    with interpreted():
-        yield
+pytestmark = pytest.mark.usefixtures("as_python")
 
 
 def stay(x, u, c):
@@ -55,11 +47,6 @@ def landmark(**changes):
         "prior_cov": [[2.0, 0.4], [0.4, 1.0]],
     }
     return StateSpaceModel(**{**arguments, **changes})
-
-
-def simulated(model, steps=60, seed=1, level=3.0):
-    inputs = np.random.default_rng(seed).normal(size=(1, steps, model.inputs)) * level
-    return truth.simulate(model, episode_keys([seed]), inputs), inputs
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 4])
@@ -100,30 +87,20 @@ def test_many_iterations_find_the_most_probable_state():
 
 @pytest.mark.parametrize("model", [landmark(), thruster_model()], ids=["landmark", "thruster"])
 def test_one_iteration_is_the_extended_filter(model):
-    drawn, inputs = simulated(model)
-    drawn.measurements[0, 7] = np.nan
-    once = run(IteratedExtendedKalmanFilter(model=model, iterations=1), KEYS, inputs, drawn.measurements)
-    extended = run(ExtendedKalmanFilter(model=model), KEYS, inputs, drawn.measurements)
+    inputs, measurements = simulated(model, 60)
+    measurements[0, 7] = np.nan
+    once = run(IteratedExtendedKalmanFilter(model=model, iterations=1), KEYS, inputs, measurements)
+    extended = run(ExtendedKalmanFilter(model=model), KEYS, inputs, measurements)
     for one, other in zip(once, extended, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
 def test_on_an_affine_model_it_is_the_kalman_filter():
-    model = affine_model(
-        a=[[0.9, 0.2], [-0.1, 0.8]],
-        b=[[0.5], [1.0]],
-        c=[[1.0, 0.3], [0.2, -1.0]],
-        state_offset=[0.3, -0.2],
-        measurement_offset=[0.7, 0.1],
-        process_noise_cov=[[0.3, 0.1], [0.1, 0.2]],
-        measurement_noise_cov=[[0.5, 0.1], [0.1, 0.4]],
-        prior_mean=[1.0, 2.0],
-        prior_cov=[0.0, 2.0],
-    )
-    drawn, inputs = simulated(model)
-    drawn.measurements[0, 10, 0] = drawn.measurements[0, 20] = np.nan
-    by_kalman = run(KalmanFilter(model=model), KEYS, inputs, drawn.measurements)
-    found = run(IteratedExtendedKalmanFilter(model=model), KEYS, inputs, drawn.measurements)
+    model = plane_model(prior_cov=[0.0, 2.0])
+    inputs, measurements = simulated(model, 60)
+    measurements[0, 10, 0] = measurements[0, 20] = np.nan
+    by_kalman = run(KalmanFilter(model=model), KEYS, inputs, measurements)
+    found = run(IteratedExtendedKalmanFilter(model=model), KEYS, inputs, measurements)
     for one, other in zip(found[:5], by_kalman[:5], strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
 

@@ -5,10 +5,10 @@ import pytest
 from scipy.linalg import inv, sqrtm
 from scipy.optimize import minimize_scalar
 
-from filters import EnsembleTransformFilter, IteratedEnsembleKalmanFilter, StateSpaceModel, affine_model
+from filters import EnsembleTransformFilter, IteratedEnsembleKalmanFilter, StateSpaceModel
+from tests.models import KEY, plane_model
 from thruster_env.compiled import interpreted
 
-KEY = (123456789, 4294967295)
 SIZE = 9
 
 
@@ -95,16 +95,7 @@ def test_its_first_iteration_is_the_transform_filter_with_its_innovation():
 
 
 def test_where_measurements_are_linear_further_iterations_change_nothing():
-    model = affine_model(
-        a=[[0.9, 0.3], [-0.2, 0.8]],
-        b=np.zeros((2, 0)),
-        c=[[1.0, 0.4], [-0.3, 1.5]],
-        measurement_offset=[0.7, -0.1],
-        process_noise_cov=[[0.3, 0.12], [0.12, 0.2]],
-        measurement_noise_cov=[[0.5, -0.25], [-0.25, 0.4]],
-        prior_mean=[1.0, -1.0],
-        prior_cov=[[1.0, 0.4], [0.4, 0.5]],
-    )
+    model = plane_model(b=np.zeros((2, 0)))
     _, once, _ = updated(IteratedEnsembleKalmanFilter, model, [2.0, -1.0], iterations=1)
     _, often, _ = updated(IteratedEnsembleKalmanFilter, model, [2.0, -1.0], iterations=20)
     np.testing.assert_allclose(often.members, once.members, rtol=1e-10, atol=1e-10)

@@ -6,88 +6,53 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from filters import ExtendedKalmanFilter, KalmanFilter, affine_model, linearize, run, thruster_model, truth
-from thruster_env.compiled import interpreted
+from filters import ExtendedKalmanFilter, KalmanFilter, linearize, run, thruster_model, truth
+from tests.models import held_voltages, random_affine, simulated
+from tests.oracles import kalman_update
 from thruster_env.streams import episode_keys
 
+KEYS = np.zeros((1, 2))
 
-@pytest.fixture(autouse=True)
-def as_python():
-    """Exactness needs no compilation; that both agree is for the contract to test."""
-    with interpreted():
-        yield
+pytestmark = pytest.mark.usefixtures("as_python")
 
 
-def random_affine(n=3, m=2, p=2, seed=0):
-    """A stable affine model with offsets and full covariances, and its matrices A, B, a, C, d, Q, R."""
-    rng = np.random.default_rng(seed)
-    a = rng.normal(size=(n, n))
-    a *= 0.9 / np.abs(np.linalg.eigvals(a)).max()
-    b, c = rng.normal(size=(n, p)), rng.normal(size=(m, n))
-    offset, shift = rng.normal(size=n), rng.normal(size=m)
-    roots = [rng.normal(size=(size, size)) for size in (n, m, n)]
-    q, r, p_0 = (root @ root.T + 0.1 * np.eye(len(root)) for root in roots)
-    model = affine_model(
-        a=a,
-        b=b,
-        c=c,
-        state_offset=offset,
-        measurement_offset=shift,
-        process_noise_cov=q,
-        measurement_noise_cov=r,
-        prior_mean=rng.normal(size=n),
-        prior_cov=p_0,
-    )
-    return model, (a, b, offset, c, shift, q, r)
-
-
-def simulated(model, steps, seed=1, level=1.0):
-    inputs = np.random.default_rng(seed).normal(size=(1, steps, model.inputs)) * level
-    return truth.simulate(model, episode_keys([seed]), inputs), inputs
-
-
-def textbook(model, matrices, inputs, measurements):
+def textbook(model, inputs, measurements):
     """Kalman (1960) as in any book: x, P, innovations and S after every measurement."""
-    a, b, offset, c, shift, q, r = matrices
+    a, b, offset, c, shift = model.matrices()
     x, p = model.prior_mean, model.prior_cov
     found = []
     for k, z in enumerate(measurements):
         if k > 0:
             x = a @ x + b @ inputs[k - 1] + offset
-            p = a @ p @ a.T + q
+            p = a @ p @ a.T + model.process_noise_cov
         innovation = z - (c @ x + shift)
-        s = c @ p @ c.T + r
-        gain = p @ c.T @ np.linalg.inv(s)
-        x = x + gain @ innovation
-        p = (np.eye(len(x)) - gain @ c) @ p
+        x, p, s = kalman_update(x, p, innovation, c, model.measurement_noise_cov)
         found.append((x, p, innovation, s))
     return [np.array(part) for part in zip(*found, strict=True)]
 
 
-KEYS = np.zeros((1, 2))
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_it_is_the_textbook_filter(seed):
-    model, matrices = random_affine(seed=seed)
-    drawn, inputs = simulated(model, 200)
-    estimates = run(KalmanFilter(model=model), KEYS, inputs, drawn.measurements)
-    expected = textbook(model, matrices, inputs[0], drawn.measurements[0])
+    model = random_affine(seed=seed)
+    inputs, measurements = simulated(model, 200)
+    estimates = run(KalmanFilter(model=model), KEYS, inputs, measurements)
+    expected = textbook(model, inputs[0], measurements[0])
     for found, part in zip(estimates[:4], expected, strict=True):
         np.testing.assert_allclose(found[0], part, rtol=1e-10, atol=1e-10)
 
 
 def test_it_is_filterpy_s_kalman_filter():
     peer = pytest.importorskip("filterpy.kalman")
-    model, (a, b, offset, c, shift, q, r) = random_affine(seed=5)
-    drawn, inputs = simulated(model, 200)
-    estimates = run(KalmanFilter(model=model), KEYS, inputs, drawn.measurements)
+    model = random_affine(seed=5)
+    a, b, offset, c, shift = model.matrices()
+    inputs, measurements = simulated(model, 200)
+    estimates = run(KalmanFilter(model=model), KEYS, inputs, measurements)
 
     other = peer.KalmanFilter(dim_x=3, dim_z=2, dim_u=3)
     other.F, other.B, other.H = a, np.column_stack([b, offset]), c  # the offset as an input that is always 1
-    other.Q, other.R = q, r
+    other.Q, other.R = model.process_noise_cov, model.measurement_noise_cov
     other.x, other.P = model.prior_mean.reshape(3, 1), model.prior_cov
-    for k, z in enumerate(drawn.measurements[0]):
+    for k, z in enumerate(measurements[0]):
         if k > 0:
             other.predict(u=np.append(inputs[0, k - 1], 1.0).reshape(3, 1))
         other.update((z - shift).reshape(2, 1))
@@ -100,7 +65,7 @@ def test_it_is_filterpy_s_kalman_filter():
 def test_the_extended_filter_is_filterpy_s_on_the_thruster():
     peer = pytest.importorskip("filterpy.kalman")
     model = thruster_model()
-    inputs = np.repeat(np.random.default_rng(3).uniform(-12, 12, size=(1, 8, 1)), 25, axis=1)
+    inputs = held_voltages(1, 8, seed=3)
     drawn = truth.simulate(model, episode_keys([3]), inputs)
     estimates = run(ExtendedKalmanFilter(model=model), KEYS, inputs, drawn.measurements)
     constants = model.constants
@@ -134,8 +99,9 @@ def test_the_extended_filter_is_filterpy_s_on_the_thruster():
 
 
 def test_its_steady_covariance_solves_riccati_s_equation():
-    model, (a, _, _, c, _, q, r) = random_affine(seed=2)
-    predicted = solve_discrete_are(a.T, c.T, q, r)
+    model = random_affine(seed=2)
+    (a, _, _, c, _), r = model.matrices(), model.measurement_noise_cov
+    predicted = solve_discrete_are(a.T, c.T, model.process_noise_cov, r)
     updated = predicted - predicted @ c.T @ np.linalg.inv(c @ predicted @ c.T + r) @ c @ predicted
     estimates = run(KalmanFilter(model=model), KEYS, np.zeros((1, 200, 2)), np.zeros((1, 201, 2)))
     np.testing.assert_allclose(estimates.covs[0, -1], updated, rtol=1e-9)
@@ -143,7 +109,7 @@ def test_its_steady_covariance_solves_riccati_s_equation():
 
 
 def test_its_errors_are_as_large_as_it_says():
-    model, _ = random_affine(seed=4)
+    model = random_affine(seed=4)
     inputs = np.zeros((100, 20, 2))
     drawn = truth.simulate(model, episode_keys(range(100)), inputs)
     estimates = run(KalmanFilter(model=model), np.zeros((100, 2)), inputs, drawn.measurements)
@@ -160,9 +126,9 @@ def test_on_the_thruster_it_is_the_affine_filter_about_the_operating_point(volta
     model = thruster_model(operating_voltage=voltage)
     x, u = model.operating_state, model.operating_input
     assert u[0] == (12.0 if voltage is None else voltage)  # half of max_voltage
-    drawn, inputs = simulated(model, 50, level=6.0)
-    of_nonlinear = run(KalmanFilter(model=model), KEYS, inputs, drawn.measurements)
-    of_affine = run(KalmanFilter(model=linearize(model, x, u)), KEYS, inputs, drawn.measurements)
+    inputs, measurements = simulated(model, 50, level=6.0)
+    of_nonlinear = run(KalmanFilter(model=model), KEYS, inputs, measurements)
+    of_affine = run(KalmanFilter(model=linearize(model, x, u)), KEYS, inputs, measurements)
     for one, other in zip(of_nonlinear, of_affine, strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -199,7 +165,7 @@ def test_linearize_keeps_the_offsets_and_has_the_slopes_of_the_whole_step():
 
 
 def test_an_affine_model_is_its_own_linearisation():
-    model, _ = random_affine()
+    model = random_affine()
     assert linearize(model, np.ones(3), np.ones(2)) is model
 
 
@@ -210,13 +176,13 @@ def test_a_nonlinear_model_without_an_operating_point_is_refused():
 
 
 def test_a_state_known_exactly_at_first_stays_known_through_the_first_measurement():
-    model, matrices = random_affine()
+    model = random_affine()
     model = model.replace(prior_cov=np.zeros((3, 3)))
-    drawn, inputs = simulated(model, 20)
-    estimates = run(KalmanFilter(model=model), KEYS, inputs, drawn.measurements)
+    inputs, measurements = simulated(model, 20)
+    estimates = run(KalmanFilter(model=model), KEYS, inputs, measurements)
     np.testing.assert_array_equal(estimates.means[0, 0], model.prior_mean)
     np.testing.assert_array_equal(estimates.covs[0, 0], np.zeros((3, 3)))
-    expected = textbook(model, matrices, inputs[0], drawn.measurements[0])
+    expected = textbook(model, inputs[0], measurements[0])
     np.testing.assert_allclose(estimates.means[0], expected[0], rtol=1e-10, atol=1e-10)
 
 

@@ -6,35 +6,13 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from filters import KalmanFilter, affine_model, run, thruster_model, truth
+from filters import KalmanFilter, affine_model, run, thruster_model
 from filters.session import Session
+from tests.models import rescaled, simulated, wide_model
 from thruster_env.compiled import interpreted
-from thruster_env.streams import episode_keys
 
 KEYS = np.zeros((1, 2))
 FORMS = ["information", "square-root"]
-
-
-def plane_model(**changes):
-    """n = 3, p = 2, m = 2, with offsets and correlated noise."""
-    arguments = {
-        "a": [[0.9, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.3, 0.7]],
-        "b": [[1.0, 0.0], [0.5, -0.4], [0.0, 0.8]],
-        "c": [[1.0, 0.0, 0.5], [0.0, 2.0, -1.0]],
-        "state_offset": [0.3, -0.2, 0.1],
-        "measurement_offset": [0.7, -1.5],
-        "process_noise_cov": [[0.3, 0.1, 0.0], [0.1, 0.2, -0.05], [0.0, -0.05, 0.4]],
-        "measurement_noise_cov": [[0.5, 0.2], [0.2, 0.3]],
-        "prior_mean": [1.0, -1.0, 0.5],
-        "prior_cov": [[1.0, 0.2, 0.0], [0.2, 0.5, 0.1], [0.0, 0.1, 0.8]],
-    }
-    return affine_model(**{**arguments, **changes})
-
-
-def simulated(model, steps=100, level=3.0):
-    inputs = np.random.default_rng(1).normal(size=(1, steps, model.inputs)) * level
-    with interpreted():
-        return truth.simulate(model, episode_keys([1]), inputs).measurements, inputs
 
 
 @pytest.fixture(params=FORMS)
@@ -42,10 +20,10 @@ def form(request):
     return request.param
 
 
-@pytest.mark.parametrize("kind", [plane_model, thruster_model])
+@pytest.mark.parametrize("kind", [wide_model, thruster_model])
 def test_every_form_gives_the_same_estimates(form, kind):
     model = kind()
-    z, inputs = simulated(model)
+    inputs, z = simulated(model)
     z[0, 10, 0] = z[0, 20:23] = np.nan
     with interpreted():
         estimates = run(KalmanFilter(model=model, form=form), KEYS, inputs, z)
@@ -55,8 +33,8 @@ def test_every_form_gives_the_same_estimates(form, kind):
 
 
 def test_compiled_batch_loop_session_and_python_agree(form):
-    model = plane_model()
-    z, inputs = simulated(model, 30)
+    model = wide_model()
+    inputs, z = simulated(model, 30)
     z[0, 7, 1] = z[0, 9] = np.nan
     filter_ = KalmanFilter(model=model, form=form)
     close = {"rtol": 1e-12, "atol": 1e-12}
@@ -78,8 +56,8 @@ def test_compiled_batch_loop_session_and_python_agree(form):
 
 
 def test_covariances_are_symmetric_and_positive(form):
-    model = plane_model()
-    z, inputs = simulated(model)
+    model = wide_model()
+    inputs, z = simulated(model)
     with interpreted():
         estimates = run(KalmanFilter(model=model, form=form), KEYS, inputs, z)
     for covs in (estimates.covs[0], estimates.innovation_covs[0]):
@@ -88,8 +66,8 @@ def test_covariances_are_symmetric_and_positive(form):
 
 
 def test_noise_may_vary_from_step_to_step(form):
-    model = plane_model()
-    z, inputs = simulated(model, 20)
+    model = wide_model()
+    inputs, z = simulated(model, 20)
     factors = np.random.default_rng(2).uniform(0.1, 10.0, size=21)[:, None, None]
     noise = {
         "process_noise_covs": factors[1:] * model.process_noise_cov,
@@ -103,28 +81,19 @@ def test_noise_may_vary_from_step_to_step(form):
 
 
 def test_a_change_of_units_changes_no_estimate(form):
-    model, d = plane_model(), np.diag([1000.0, 0.01, 7.0])
-    a, b, offset, c, shift = model.matrices()
-    rescaled = plane_model(
-        a=d @ a @ np.linalg.inv(d),
-        b=d @ b,
-        c=c @ np.linalg.inv(d),
-        state_offset=d @ offset,
-        process_noise_cov=d @ model.process_noise_cov @ d,
-        prior_mean=d @ model.prior_mean,
-        prior_cov=d @ model.prior_cov @ d,
-    )
-    z, inputs = simulated(model)
+    model, units = wide_model(), np.array([1000.0, 0.01, 7.0])
+    other = rescaled(model, units, np.ones(2))
+    inputs, z = simulated(model)
     with interpreted():
         before = run(KalmanFilter(model=model, form=form), KEYS, inputs, z)
-        after = run(KalmanFilter(model=rescaled, form=form), KEYS, inputs, z)
-    np.testing.assert_allclose(after.means / np.diag(d), before.means, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(after.covs / np.outer(np.diag(d), np.diag(d)), before.covs, rtol=1e-9, atol=1e-9)
+        after = run(KalmanFilter(model=other, form=form), KEYS, inputs, z)
+    np.testing.assert_allclose(after.means / units, before.means, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(after.covs / np.outer(units, units), before.covs, rtol=1e-9, atol=1e-9)
 
 
 def test_the_square_root_form_starts_from_an_exact_state_and_the_information_form_refuses_it():
-    model = plane_model(prior_cov=np.diag([1.0, 0.0, 0.0]))
-    z, inputs = simulated(model)
+    model = wide_model(prior_cov=np.diag([1.0, 0.0, 0.0]))
+    inputs, z = simulated(model)
     with interpreted():
         estimates = run(KalmanFilter(model=model, form="square-root"), KEYS, inputs, z)
         expected = run(KalmanFilter(model=model), KEYS, inputs, z)
@@ -162,7 +131,7 @@ def test_the_square_root_form_keeps_its_digits_where_covariances_lose_theirs():
 
 
 def test_the_root_is_carried_in_the_belief():
-    filter_ = KalmanFilter(model=plane_model(), form="square-root")
+    filter_ = KalmanFilter(model=wide_model(), form="square-root")
     with interpreted():
         belief = filter_.init()
         for _ in range(3):
@@ -175,4 +144,4 @@ def test_the_root_is_carried_in_the_belief():
 @pytest.mark.parametrize("name", ["cholesky", None, 3])
 def test_an_unknown_form_is_refused(name):
     with pytest.raises(ValueError, match="form must be .*covariance.*information.*square-root.* but got"):
-        KalmanFilter(model=plane_model(), form=name)
+        KalmanFilter(model=wide_model(), form=name)

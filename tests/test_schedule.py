@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from filters import KalmanFilter, StateSpaceModel, linearize, run, thruster_model, truth
+from tests.models import held_voltages
 from thruster_env.compiled import interpreted
 from thruster_env.linear import steady_state
 from thruster_env.plant import make_plant
@@ -13,7 +14,7 @@ KEYS = np.zeros((1, 2))
 
 
 def simulated(model, steps=100):
-    inputs = np.repeat(np.random.default_rng(1).uniform(-30, 30, size=(1, steps // 10, 1)), 10, axis=1)
+    inputs = held_voltages(1, steps // 10, hold=10, seed=1, limit=30.0)
     with interpreted():
         return truth.simulate(model, episode_keys([1]), inputs).measurements, inputs
 
@@ -68,7 +69,7 @@ def test_compiled_batch_loop_and_python_agree():
 
 def test_on_the_thruster_it_is_much_better_than_the_filter_of_one_point():
     model = thruster_model()
-    inputs = np.repeat(np.random.default_rng(20).uniform(-12.0, 12.0, size=(40, 20, 1)), 25, axis=1)
+    inputs = held_voltages(40, 20)
     drawn = truth.simulate(model, episode_keys(range(40)), inputs)
 
     def rmse(filter_):

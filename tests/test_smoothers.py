@@ -8,89 +8,23 @@ import pytest
 from filters import (
     CubatureKalmanFilter,
     EnsembleKalmanFilter,
-    EnsembleTransformFilter,
     ExtendedKalmanFilter,
-    IteratedEnsembleKalmanFilter,
     IteratedExtendedKalmanFilter,
     KalmanFilter,
-    SerialSquareRootFilter,
-    StateSpaceModel,
     UnscentedKalmanFilter,
-    affine_model,
     run,
     truth,
 )
 from filters.consistency.intervals import mean_interval, rmse_ratios
 from filters.consistency.nees import normalized_squares
 from filters.smoothers.smooth import smooth
+from tests.models import KEY, held_voltages, pendulum, scalar_model, simulated, swing, wide_model
 from thruster_env.compiled import interpreted
-from thruster_env.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys, normal_block
+from thruster_env.streams import episode_keys
 from tuning.scenarios import find_scenario, held_out_seeds
 
-KEY = (123456789, 4294967295)
 KEYS = np.array([KEY])
-
-
-def wide(**changes):
-    """n = 3, p = 2, m = 2, with offsets and correlated noise."""
-    arguments = {
-        "a": [[0.9, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.3, 0.7]],
-        "b": [[1.0, 0.0], [0.5, -0.4], [0.0, 0.8]],
-        "c": [[1.0, 0.0, 0.5], [0.0, 2.0, -1.0]],
-        "state_offset": [0.3, -0.2, 0.1],
-        "measurement_offset": [0.7, -1.5],
-        "process_noise_cov": [[0.3, 0.1, 0.0], [0.1, 0.2, -0.05], [0.0, -0.05, 0.4]],
-        "measurement_noise_cov": [[0.5, 0.2], [0.2, 0.3]],
-        "prior_mean": [1.0, -1.0, 0.5],
-        "prior_cov": [[1.0, 0.2, 0.0], [0.2, 0.5, 0.1], [0.0, 0.1, 0.8]],
-    }
-    return affine_model(**{**arguments, **changes})
-
-
-def line(**changes):
-    """n = m = p = 1."""
-    arguments = {
-        "a": [[0.9]],
-        "b": [[1.0]],
-        "c": [[2.0]],
-        "process_noise_cov": [0.1],
-        "measurement_noise_cov": [0.2],
-        "prior_mean": [3.0],
-        "prior_cov": [0.5],
-    }
-    return affine_model(**{**arguments, **changes})
-
-
-def swing(x, u, c):
-    """A damped pendulum."""
-    rate = x[1] + 0.05 * (-c[0] * np.sin(x[0]) - c[1] * x[1] * abs(x[1]) + u[0])
-    return (x[0] + 0.05 * rate, rate)
-
-
-def look(x, c):
-    return (np.sin(x[0]), x[0] * x[1])
-
-
-def pendulum(**changes):
-    arguments = {
-        "transition": swing,
-        "observe": look,
-        "process_noise_cov": [[2e-4, 1e-4], [1e-4, 1e-3]],
-        "measurement_noise_cov": [[0.01, 0.003], [0.003, 0.04]],
-        "prior_mean": [0.5, 0.2],
-        "prior_cov": [[0.2, 0.05], [0.05, 0.1]],
-        "constants": (9.81, 0.3),
-    }
-    return StateSpaceModel(**{**arguments, **changes})
-
-
-def drawn(model, steps, count=1, level=1.0, missing=0.25):
-    """Inputs, and measurements of which a part is missing."""
-    rng = np.random.default_rng(7)
-    inputs = level * rng.normal(size=(count, steps, model.inputs))
-    with interpreted():
-        measurements = truth.simulate(model, episode_keys(range(count)), inputs).measurements
-    return inputs, np.where(rng.random(measurements.shape) < missing, np.nan, measurements)
+with_gaps = partial(simulated, level=1.0, missing=0.25)
 
 
 def as_one_gaussian(model, inputs, measurements, lag):
@@ -122,12 +56,6 @@ def as_one_gaussian(model, inputs, measurements, lag):
     return means, covs
 
 
-@pytest.fixture
-def as_python():
-    with interpreted():
-        yield
-
-
 LINEAR = {
     "full rank": {},
     "a start that is known": {"prior_cov": np.zeros((3, 3))},
@@ -151,8 +79,8 @@ LINEAR = {
     ],
 )
 def test_on_an_affine_model_it_is_the_whole_trajectory_as_one_gaussian(kind, lag, changes):
-    model = wide(**changes)
-    inputs, measurements = drawn(model, 25)
+    model = wide_model(**changes)
+    inputs, measurements = with_gaps(model, 25)
     with interpreted():
         found = smooth(kind(model=model), KEYS, inputs, measurements, lag)
     means, covs = as_one_gaussian(model, inputs[0], measurements[0], 25 if lag is None else lag)
@@ -166,7 +94,7 @@ def test_on_an_affine_model_it_is_the_whole_trajectory_as_one_gaussian(kind, lag
 def test_no_lag_is_the_filter_and_the_longest_the_full_smoother(kind):
     model = pendulum()
     filter_ = kind(model=model, **({} if kind is ExtendedKalmanFilter else {"ensemble_size": 8}))
-    inputs, measurements = drawn(model, 30, count=3)
+    inputs, measurements = with_gaps(model, 30, count=3)
     keys = episode_keys(range(3))
     filtered = run(filter_, keys, inputs, measurements)
     without = smooth(filter_, keys, inputs, measurements, lag=0)
@@ -187,7 +115,7 @@ def test_no_lag_is_the_filter_and_the_longest_the_full_smoother(kind):
 def test_compiled_and_as_python_it_is_the_same(kind):
     model = find_scenario("nominal").model()
     filter_ = kind(model=model, **({} if kind is ExtendedKalmanFilter else {"ensemble_size": 11}))
-    inputs, measurements = drawn(model, 12, count=2, level=6.0)
+    inputs, measurements = with_gaps(model, 12, count=2, level=6.0)
     keys = episode_keys(range(2))
     compiled = smooth(filter_, keys, inputs, measurements, lag=5)
     with interpreted():
@@ -198,7 +126,7 @@ def test_compiled_and_as_python_it_is_the_same(kind):
 
 def test_on_the_pendulum_it_is_the_textbook_recursion():
     model = pendulum()
-    inputs, measurements = drawn(model, 40, level=3.0)
+    inputs, measurements = with_gaps(model, 40, level=3.0)
     with interpreted():
         filter_ = ExtendedKalmanFilter(model=model)
         filtered = run(filter_, KEYS, inputs, measurements)
@@ -229,7 +157,7 @@ def test_by_sigma_points_it_is_sarkka_s_algorithm(kind):
         centre, others = 1 - 2 / reach, 0.5 / reach
         spread_of_centre = centre + 1 - alpha**2 + beta
     weights, spreads = (np.array([w, *[others] * 4]) for w in (centre, spread_of_centre))
-    inputs, measurements = drawn(model, 15, level=3.0)
+    inputs, measurements = with_gaps(model, 15, level=3.0)
     with interpreted():
         filtered = run(filter_, KEYS, inputs, measurements)
         found = smooth(filter_, KEYS, inputs, measurements)
@@ -252,7 +180,7 @@ def test_by_sigma_points_it_is_sarkka_s_algorithm(kind):
 def test_a_scheduled_filter_is_smoothed_with_the_model_of_each_input():
     model = find_scenario("nominal").model()
     filter_ = KalmanFilter(model=model, schedule=5)
-    inputs = np.repeat(np.random.default_rng(2).uniform(-12, 12, size=(1, 5, 1)), 4, axis=1)
+    inputs = held_voltages(1, 5, hold=4, seed=2)
     with interpreted():
         measurements = truth.simulate(model, episode_keys([2]), inputs).measurements
         filtered = run(filter_, KEYS, inputs, measurements)
@@ -267,72 +195,6 @@ def test_a_scheduled_filter_is_smoothed_with_the_model_of_each_input():
             x, p = kept.mean + gain @ (x - predicted.mean), kept.cov + gain @ (p - predicted.cov) @ gain.T
             np.testing.assert_allclose(found.means[0, k], x, rtol=1e-8, atol=1e-9)
             np.testing.assert_allclose(found.covs[0, k], p, rtol=1e-8, atol=1e-9)
-
-
-def normals(stream, step, rows, size):
-    """The normals (rows, size) of a stream: number i of member j is number i * width + j of one long draw."""
-    width = -(-size // 8) * 8
-    index = np.arange(rows * width)
-    return np.array(normal_block(index // 4, step, stream, *KEY))[index % 4, index].reshape(rows, width)[:, :size]
-
-
-@pytest.mark.parametrize("lag", [2, 8])
-def test_the_ensemble_smoother_is_the_naive_one_with_the_same_normals(lag):
-    size, steps, model = 11, 8, wide()
-    a, b, offset, c, shift = model.matrices()
-    root_p, root_q, root_r = (
-        np.linalg.cholesky(p) for p in (model.prior_cov, model.process_noise_cov, model.measurement_noise_cov)
-    )
-    inputs, measurements = drawn(model, steps, missing=0.0)
-    measurements[0, 3, 1] = measurements[0, 5] = np.nan
-    with interpreted():
-        filter_ = EnsembleKalmanFilter(model=model, ensemble_size=size)
-        found = smooth(filter_, KEYS, inputs, measurements, lag)
-    states = [
-        model.prior_mean[:, None] + root_p @ normals(FILTER_PRIOR, 0, 3, size)
-    ]  # members at all steps so far
-    for k, z in enumerate(measurements[0]):
-        if k > 0:
-            stirred = root_q @ normals(FILTER_PROCESS, k, 3, size)
-            states.append(a @ states[-1] + (b @ inputs[0, k - 1] + offset)[:, None] + stirred)
-        there = ~np.isnan(z)
-        y = (c @ states[-1] + shift[:, None])[there]
-        v = (root_r @ normals(FILTER_MEASUREMENT, k, 2, size))[there]
-        s = np.cov(y).reshape(len(y), len(y)) + model.measurement_noise_cov[np.ix_(there, there)]
-        moves = np.linalg.solve(s, z[there][:, None] - y - v)
-        for j in range(max(0, k - lag), k + 1):
-            states[j] = states[j] + np.cov(states[j], y)[:3, 3:] @ moves
-    np.testing.assert_allclose(found.means[0], [x.mean(axis=1) for x in states], rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(found.covs[0], [np.cov(x) for x in states], rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.usefixtures("as_python")
-def test_large_ensembles_approach_the_kalman_smoother():
-    model, runs = line(), 30
-    inputs, measurements = drawn(model, 5)
-    many = np.repeat(inputs, runs, axis=0), np.repeat(measurements, runs, axis=0)
-    distances = []
-    for size in (50, 200):
-        filter_ = EnsembleKalmanFilter(model=model, ensemble_size=size)
-        found = smooth(filter_, episode_keys(range(runs)), *many, lag=3)
-        exact = smooth(KalmanFilter(model=model), KEYS, inputs, measurements, lag=3)
-        distances.append(np.sqrt(((found.means - exact.means) ** 2).mean()))
-    assert distances[1] < 0.15 * np.sqrt(exact.covs[0, :, 0, 0].mean())
-    assert 0.35 < distances[1] / distances[0] < 0.7  # 1/sqrt(4) but for chance
-
-
-@pytest.mark.parametrize("kind", [EnsembleTransformFilter, SerialSquareRootFilter, IteratedEnsembleKalmanFilter])
-def test_without_process_noise_square_root_smoothers_are_exact_for_their_own_prior(kind):
-    model = wide(process_noise_cov=np.zeros((3, 3)))
-    filter_ = kind(model=model, ensemble_size=9)
-    inputs, measurements = drawn(model, 12)
-    with interpreted():
-        prior = filter_.init(KEY)
-        found = smooth(filter_, KEYS, inputs, measurements, lag=4)
-        same_prior = model.replace(prior_mean=prior.mean, prior_cov=prior.cov)
-        exact = smooth(KalmanFilter(model=same_prior), KEYS, inputs, measurements, lag=4)
-    np.testing.assert_allclose(found.means, exact.means, rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose(found.covs, exact.covs, rtol=1e-8, atol=1e-8)
 
 
 @pytest.fixture(scope="module")
@@ -367,7 +229,8 @@ def test_on_the_thruster_the_ensemble_smoother_beats_the_filter_where_thrust_tel
 @pytest.mark.parametrize("kind", [KalmanFilter, EnsembleKalmanFilter])
 @pytest.mark.usefixtures("as_python")
 def test_nothing_is_carried_back_over_a_restart(kind):
-    filter_ = kind(model=line(b=[[1e200]]))  # an input of 1e150 makes the state infinite, and the filter restarts
+    # An input of 1e150 makes the state infinite, and the filter restarts.
+    filter_ = kind(model=scalar_model(b=[[1e200]]))
     inputs = np.zeros((1, 9, 1))
     inputs[0, 4] = 1e150
     measurements = np.random.default_rng(3).normal(6.0, 1.0, size=(1, 10, 1))
@@ -389,7 +252,7 @@ def test_what_cannot_be_smoothed_is_refused():
         name = "other"
 
     model = pendulum()
-    inputs, measurements = drawn(model, 3)
+    inputs, measurements = with_gaps(model, 3)
     with pytest.raises(ValueError, match="a smoother needs a filter of .*, but got 'other'"):
         smooth(Other(model=model), KEYS, inputs, measurements)
     with pytest.raises(ValueError, match="lag must be a whole number of at least 0, but got -1"):

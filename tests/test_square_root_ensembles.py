@@ -9,18 +9,17 @@ from filters import (
     EnsembleTransformFilter,
     KalmanFilter,
     SerialSquareRootFilter,
-    affine_model,
     make_filter,
     run,
-    truth,
 )
 from filters.ensembles.transform import geometric_mean
+from tests.models import KEY, simulated, wide_model
+from tests.oracles import convergence
 from thruster_env.compiled import interpreted
-from thruster_env.streams import episode_keys, filter_keys
+from thruster_env.streams import filter_keys
 from tuning.evaluate import evaluate
 from tuning.scenarios import find_scenario, held_out_seeds
 
-KEY = (123456789, 4294967295)
 SIZE = 9
 SQUARE_ROOTS = EnsembleTransformFilter, SerialSquareRootFilter
 SCALES = {1: [1.0], 2: [1.0, 30.0], 3: [1.0, 30.0, 0.02], 4: [1.0, 30.0, 0.02, 5.0]}  # of channels
@@ -31,15 +30,11 @@ def linear_model(m, seed=3):
     generator = np.random.default_rng(seed)
     units = np.diag(SCALES[m])
     noise = generator.normal(size=(m, m)) + np.eye(m)
-    return affine_model(
-        a=[[0.9, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.3, 0.7]],
+    return wide_model(
         b=[[1.0], [0.5], [0.0]],
         c=units @ generator.normal(size=(m, 3)),
         measurement_offset=generator.normal(size=m),
-        process_noise_cov=[[0.3, 0.1, 0.0], [0.1, 0.2, -0.05], [0.0, -0.05, 0.4]],
         measurement_noise_cov=units @ noise @ noise.T @ units,
-        prior_mean=[1.0, -1.0, 0.5],
-        prior_cov=[[1.0, 0.2, 0.0], [0.2, 0.5, 0.1], [0.0, 0.1, 0.8]],
     )
 
 
@@ -198,22 +193,15 @@ def half_gain_recursion(model, inputs, measurements):
 @pytest.mark.parametrize("name", ["etkf", "denkf"])
 def test_it_converges_to_its_limit_like_one_over_root_n(name):
     model = linear_model(1)
-    inputs = np.random.default_rng(0).normal(size=(60, 30, 1))
-    drawn = truth.simulate(model, episode_keys(range(60)), inputs)
-    keys = filter_keys(range(60))
+    inputs, measurements = simulated(model, 30, count=60, seed=0, level=1.0, compiled=True)
+    data = filter_keys(range(60)), inputs, measurements
     if name == "denkf":
-        means, covs = half_gain_recursion(model, inputs, drawn.measurements)
+        means, covs = half_gain_recursion(model, inputs, measurements)
     else:
-        means, covs, *_ = run(KalmanFilter(model=model), keys, inputs, drawn.measurements)
-    spread = np.sqrt(np.einsum("bkii->bki", covs))
-    scale = spread[..., :, None] * spread[..., None, :]
-    sizes, in_mean, in_cov = np.array([20, 80, 320, 1280]), [], []
-    for size in sizes:
-        found = run(make_filter(name, model, ensemble_size=size), keys, inputs, drawn.measurements)
-        in_mean.append(np.sqrt(np.mean(((found.means - means) / spread) ** 2)))
-        in_cov.append(np.sqrt(np.mean(((found.covs - covs) / scale) ** 2)))
-    for errors in (in_mean, in_cov):
-        slope = np.polyfit(np.log(sizes), np.log(errors), 1)[0]
+        means, covs, *_ = run(KalmanFilter(model=model), *data)
+    sizes = [20, 80, 320, 1280]
+    errors, _ = convergence(lambda size: make_filter(name, model, ensemble_size=size), sizes, data, means, covs)
+    for slope in np.polyfit(np.log(sizes), np.log(errors.T), 1)[0]:
         assert -0.6 < slope < -0.4  # 60 independent runs give each error to about 6 %, the slope to 0.03
 
 

@@ -4,48 +4,21 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from filters import KalmanFilter, SteadyStateKalmanFilter, affine_model, linearize, run, thruster_model, truth
+from filters import KalmanFilter, SteadyStateKalmanFilter, linearize, run, thruster_model
 from filters.bounds import riccati_covariances
-from thruster_env.compiled import interpreted
-from thruster_env.streams import episode_keys
+from tests.models import simulated, wide_model
 
 KEYS = np.zeros((1, 2))
 
-
-@pytest.fixture(autouse=True)
-def as_python():
-    """Exactness needs no compilation; that both agree is for the contract to test."""
-    with interpreted():
-        yield
-
-
-def wide_model(**changes):
-    """n = 3, p = 2, m = 2, with offsets and correlated noise."""
-    arguments = {
-        "a": [[0.9, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.3, 0.7]],
-        "b": [[1.0, 0.0], [0.5, -0.4], [0.0, 0.8]],
-        "c": [[1.0, 0.0, 0.5], [0.0, 2.0, -1.0]],
-        "state_offset": [0.3, -0.2, 0.1],
-        "measurement_offset": [0.7, -1.5],
-        "process_noise_cov": [[0.3, 0.1, 0.0], [0.1, 0.2, -0.05], [0.0, -0.05, 0.4]],
-        "measurement_noise_cov": [[0.5, 0.2], [0.2, 0.3]],
-        "prior_mean": [1.0, -1.0, 0.5],
-        "prior_cov": [1.0, 0.5, 0.8],
-    }
-    return affine_model(**{**arguments, **changes})
-
-
-def simulated(model, steps=100, count=1, level=3.0):
-    inputs = np.random.default_rng(1).normal(size=(count, steps, model.inputs)) * level
-    return truth.simulate(model, episode_keys(range(count)), inputs), inputs
+pytestmark = pytest.mark.usefixtures("as_python")
 
 
 def test_from_riccati_s_covariance_on_it_is_the_kalman_filter():
     model = wide_model()
     model = model.replace(prior_cov=riccati_covariances(model)[0])
-    drawn, inputs = simulated(model)
-    steady = run(SteadyStateKalmanFilter(model=model), KEYS, inputs, drawn.measurements)
-    for one, other in zip(steady, run(KalmanFilter(model=model), KEYS, inputs, drawn.measurements), strict=True):
+    inputs, measurements = simulated(model)
+    steady = run(SteadyStateKalmanFilter(model=model), KEYS, inputs, measurements)
+    for one, other in zip(steady, run(KalmanFilter(model=model), KEYS, inputs, measurements), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
 
 
@@ -61,9 +34,9 @@ def test_its_gain_is_the_limit_of_the_kalman_filter_s():
 
 def test_estimates_and_covariances_approach_the_kalman_filter_s():
     model = wide_model()
-    drawn, inputs = simulated(model, 300)
-    steady = run(SteadyStateKalmanFilter(model=model), KEYS, inputs, drawn.measurements)
-    kalman = run(KalmanFilter(model=model), KEYS, inputs, drawn.measurements)
+    inputs, measurements = simulated(model, 300)
+    steady = run(SteadyStateKalmanFilter(model=model), KEYS, inputs, measurements)
+    kalman = run(KalmanFilter(model=model), KEYS, inputs, measurements)
     assert np.abs(steady.means[0, 1] - kalman.means[0, 1]).max() > 1e-3
     for one, other in zip(steady[:5], kalman[:5], strict=True):
         np.testing.assert_allclose(one[0, -1], other[0, -1], rtol=1e-9, atol=1e-9)
@@ -74,8 +47,7 @@ def test_its_covariance_is_that_of_its_errors_from_the_prior_on_and_through_gaps
     a, b, offset, c, shift = model.matrices()
     filter_ = SteadyStateKalmanFilter(model=model)
     gain, q, r = filter_.gain, model.process_noise_cov, model.measurement_noise_cov
-    drawn, inputs = simulated(model, 20)
-    z = drawn.measurements.copy()
+    inputs, z = simulated(model, 20)
     z[0, 5:9], z[0, 12, 1], z[0, 13, 0] = np.nan, np.nan, np.nan
     estimates = run(filter_, KEYS, inputs, z)
     x, p = model.prior_mean, model.prior_cov
@@ -98,16 +70,16 @@ def test_on_the_thruster_it_is_the_filter_of_the_affine_approximation():
     p = solve_discrete_are(a.T, c.T, model.process_noise_cov, model.measurement_noise_cov)
     filter_ = SteadyStateKalmanFilter(model=model)
     np.testing.assert_allclose(filter_.gain, p @ c.T / (c @ p @ c.T + model.measurement_noise_cov), rtol=1e-9)
-    drawn, inputs = simulated(model, 50)
-    of_affine = run(SteadyStateKalmanFilter(model=affine), KEYS, inputs, drawn.measurements)
-    for one, other in zip(run(filter_, KEYS, inputs, drawn.measurements), of_affine, strict=True):
+    inputs, measurements = simulated(model, 50)
+    of_affine = run(SteadyStateKalmanFilter(model=affine), KEYS, inputs, measurements)
+    for one, other in zip(run(filter_, KEYS, inputs, measurements), of_affine, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
 def test_a_state_known_exactly_at_first_is_allowed():
     model = wide_model(prior_cov=np.zeros((3, 3)))
-    drawn, inputs = simulated(model)
-    estimates = run(SteadyStateKalmanFilter(model=model), KEYS, inputs, drawn.measurements)
+    inputs, measurements = simulated(model)
+    estimates = run(SteadyStateKalmanFilter(model=model), KEYS, inputs, measurements)
     assert np.isfinite(estimates.means).all()
     assert (np.linalg.eigvalsh(estimates.covs) > -1e-15).all()  # two measurements stir two of three directions
     assert (np.linalg.eigvalsh(estimates.covs[0, 1:]) > 0).all()

@@ -5,56 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from filters import (
-    CubatureKalmanFilter,
-    KalmanFilter,
-    StateSpaceModel,
-    UnscentedKalmanFilter,
-    affine_model,
-    run,
-    thruster_model,
-    truth,
-)
-from thruster_env.compiled import interpreted
+from filters import CubatureKalmanFilter, KalmanFilter, UnscentedKalmanFilter, run, thruster_model, truth
+from tests.models import held_voltages, pendulum, random_affine, simulated
 from thruster_env.streams import episode_keys
 
 KEYS = np.zeros((1, 2))
 NUMBERS = [(1.0, 2.0, 0.0), (0.1, 2.0, 1.0), (0.5, 0.0, 0.0), (1.3, 1.0, 2.0)]  # alpha, beta, kappa
 
-
-@pytest.fixture(autouse=True)
-def as_python():
-    """Exactness needs no compilation; that both agree is for the contract to test."""
-    with interpreted():
-        yield
-
-
-def swing(x, u, c):
-    """A damped pendulum, semi-implicit Euler; c = (g/l, damping)."""
-    rate = x[1] + 0.05 * (-c[0] * math.sin(x[0]) - c[1] * x[1] * abs(x[1]) + u[0])
-    return (x[0] + 0.05 * rate, rate)
-
-
-def look(x, c):
-    return (math.sin(x[0]), x[0] * x[1])
-
-
-def pendulum(**changes):
-    arguments = {
-        "transition": swing,
-        "observe": look,
-        "process_noise_cov": [[2e-4, 1e-4], [1e-4, 1e-3]],
-        "measurement_noise_cov": [[0.01, 0.003], [0.003, 0.04]],
-        "prior_mean": [0.5, 0.2],
-        "prior_cov": [[0.2, 0.05], [0.05, 0.1]],
-        "constants": (9.81, 0.3),
-    }
-    return StateSpaceModel(**{**arguments, **changes})
-
-
-def simulated(model, steps=100, seed=1, level=3.0):
-    inputs = np.random.default_rng(seed).normal(size=(1, steps, model.inputs)) * level
-    return truth.simulate(model, episode_keys([seed]), inputs), inputs
+pytestmark = pytest.mark.usefixtures("as_python")
 
 
 def scaled_weights(n, alpha, beta, kappa):
@@ -106,9 +64,9 @@ def textbook(model, weights, inputs, measurements):
 
 def assert_textbook(filter_, weights, rtol=1e-9):
     model = filter_.model
-    drawn, inputs = simulated(model)
-    estimates = run(filter_, KEYS, inputs, drawn.measurements)
-    expected = textbook(model, weights, inputs[0], drawn.measurements[0])
+    inputs, measurements = simulated(model)
+    estimates = run(filter_, KEYS, inputs, measurements)
+    expected = textbook(model, weights, inputs[0], measurements[0])
     for found, part in zip(estimates[:4], expected, strict=True):
         np.testing.assert_allclose(found[0], part, rtol=rtol, atol=1e-9)
 
@@ -131,7 +89,7 @@ def test_it_is_filterpy_s_unscented_filter_on_the_thruster(numbers):
     peer = pytest.importorskip("filterpy.kalman")
     alpha, beta, kappa = numbers
     model = thruster_model()
-    inputs = np.repeat(np.random.default_rng(3).uniform(-12, 12, size=(1, 8, 1)), 25, axis=1)
+    inputs = held_voltages(1, 8, seed=3)
     drawn = truth.simulate(model, episode_keys([3]), inputs)
     filter_ = UnscentedKalmanFilter(model=model, alpha=alpha, beta=beta, kappa=kappa)
     estimates = run(filter_, KEYS, inputs, drawn.measurements)
@@ -159,33 +117,15 @@ def test_it_is_filterpy_s_unscented_filter_on_the_thruster(numbers):
         np.testing.assert_allclose(estimates.innovation_covs[0, k], other.S, rtol=1e-9, atol=1e-9)
 
 
-def space_model(**changes):
-    """n = 4, p = 1, m = 2, affine, with full covariances."""
-    rng = np.random.default_rng(8)
-    roots = [rng.normal(size=(size, size)) for size in (4, 2, 4)]
-    q, r, p_0 = (root @ root.T + 0.1 * np.eye(len(root)) for root in roots)
-    arguments = {
-        "a": 0.4 * rng.normal(size=(4, 4)),
-        "b": rng.normal(size=(4, 1)),
-        "c": rng.normal(size=(2, 4)),
-        "state_offset": rng.normal(size=4),
-        "measurement_offset": rng.normal(size=2),
-        "process_noise_cov": q,
-        "measurement_noise_cov": r,
-        "prior_mean": rng.normal(size=4),
-        "prior_cov": p_0,
-    }
-    return affine_model(**{**arguments, **changes})
-
-
 @pytest.mark.parametrize("kind", [UnscentedKalmanFilter, CubatureKalmanFilter])
 @pytest.mark.parametrize("prior_cov", [None, np.zeros((4, 4)), np.diag([1.0, 0.0, 2.0, 0.0])])
 def test_on_an_affine_model_it_is_the_kalman_filter(kind, prior_cov):
-    model = space_model(**({} if prior_cov is None else {"prior_cov": prior_cov}))
-    drawn, inputs = simulated(model)
-    drawn.measurements[0, 10, 0] = drawn.measurements[0, 20] = np.nan
-    by_kalman = run(KalmanFilter(model=model), KEYS, inputs, drawn.measurements)
-    found = run(kind(model=model), KEYS, inputs, drawn.measurements)
+    model = random_affine(n=4, p=1, seed=8)
+    model = model if prior_cov is None else model.replace(prior_cov=prior_cov)
+    inputs, measurements = simulated(model)
+    measurements[0, 10, 0] = measurements[0, 20] = np.nan
+    by_kalman = run(KalmanFilter(model=model), KEYS, inputs, measurements)
+    found = run(kind(model=model), KEYS, inputs, measurements)
     for one, other in zip(found[:5], by_kalman[:5], strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
 
@@ -203,10 +143,10 @@ def test_states_that_are_known_exactly_move_no_measurement():
 
 
 def test_a_cubature_filter_is_an_unscented_one_whose_centre_weighs_nothing():
-    drawn, inputs = simulated(pendulum())
-    cubature = run(CubatureKalmanFilter(model=pendulum()), KEYS, inputs, drawn.measurements)
+    inputs, measurements = simulated(pendulum())
+    cubature = run(CubatureKalmanFilter(model=pendulum()), KEYS, inputs, measurements)
     filter_ = UnscentedKalmanFilter(model=pendulum(), alpha=1.0, beta=0.0, kappa=0.0)
-    for one, other in zip(run(filter_, KEYS, inputs, drawn.measurements), cubature, strict=True):
+    for one, other in zip(run(filter_, KEYS, inputs, measurements), cubature, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)
 
 

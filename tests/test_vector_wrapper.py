@@ -92,6 +92,8 @@ def still():
     )
 
 
+# The checker would like a bare env with actions in [-1, 1] and bounded observations; volts and a filter are meant.
+@pytest.mark.filterwarnings(r"ignore:.*(symmetric and normalized|probably too|is different from the):UserWarning")
 @pytest.mark.parametrize("task", ["", "Tracking", "Linear"])
 def test_filtered_ids_make_single_and_vector_envs(task):
     name = f"filters:BowThruster{task}-EKF-v0"

@@ -12,17 +12,10 @@ from filters.belief import Kernels
 from filters.derivatives import jacobian
 from filters.filter import Filter
 from filters.gaussian.extended import extended_kernels, gaussian_update, kernels_of
-from filters.rows import constants_reader, memory_places, number_places, own_place
+from filters.rows import constants_reader, memory_places, number_places, own_place, row_access
 from thruster_env.checks import at_least, positive
 from thruster_env.compiled import inlined
-from thruster_env.components import (
-    matrix_of,
-    matrix_reader,
-    matrix_writer,
-    vector_reader,
-    vector_writer,
-    written_out,
-)
+from thruster_env.components import matrix_of, matrix_reader, vector_reader, written_out
 
 
 @lru_cache(maxsize=64)
@@ -31,9 +24,7 @@ def robust_kernels(transition, transition_jacobian, observe, observe_jacobian, n
     places, source, own = memory_places(n, m), number_places(n, m), own_place(n, m, form)
     iterations_place, weight_place, likelihood_place = own + 1, places.extras, places.log_likelihood
     read_r, factor, solve = matrix_reader(m, m, source.r), matrices.cholesky_factor(m), matrices.row_solver(m, m)
-    read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
-    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
-    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
     measured, read_scales = vector_reader(m), vector_reader(n, source.scales)
     constants, observation_matrix = constants_reader(n, m, form), jacobian(observe, observe_jacobian, m, n, "c")
     plain = extended_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form)

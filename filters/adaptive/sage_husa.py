@@ -21,18 +21,10 @@ from filters.gaussian.extended import (
     kernels_of,
     nothing_to_summarise,
 )
-from filters.rows import constants_reader, memory_places, number_places, own_place
+from filters.rows import constants_reader, memory_places, number_places, own_place, row_access
 from thruster_env.checks import finite
 from thruster_env.compiled import inlined
-from thruster_env.components import (
-    matrix_of,
-    matrix_reader,
-    matrix_writer,
-    scaled_sum,
-    vector_reader,
-    vector_writer,
-    written_out,
-)
+from thruster_env.components import matrix_of, matrix_reader, matrix_writer, scaled_sum, vector_reader, written_out
 
 
 @lru_cache(maxsize=64)
@@ -69,9 +61,7 @@ def sage_husa_kernels(transition, transition_jacobian, observe, observe_jacobian
     prior_r, prior_q = matrix_reader(m, m, source.r), matrix_reader(n, n, source.q)
     read_r, store_r = matrix_reader(m, m, r_place), matrix_writer(m, m, r_place)
     read_q, store_q = matrix_reader(n, n, q_place), matrix_writer(n, n, q_place)
-    read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
-    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
-    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
     measured, read_scales = vector_reader(m), vector_reader(n, source.scales)
     constants, observation_matrix = constants_reader(n, m, form), jacobian(observe, observe_jacobian, m, n, "c")
     begin, condition = gaussian_start(n, m), gaussian_update(n, m)

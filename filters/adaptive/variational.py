@@ -15,10 +15,10 @@ from filters.derivatives import jacobian
 from filters.filter import Filter
 from filters.gaussian.extended import extended_kernels, gaussian_update, kernels_of, nothing_to_summarise
 from filters.particles.weighted import anything_measured
-from filters.rows import constants_reader, memory_places, number_places, own_place
+from filters.rows import constants_reader, memory_places, number_places, own_place, row_access
 from thruster_env.checks import at_least, positive
 from thruster_env.compiled import inlined
-from thruster_env.components import matrix_reader, matrix_writer, vector_reader, vector_writer
+from thruster_env.components import matrix_reader, matrix_writer, vector_reader
 
 
 @lru_cache(maxsize=64)
@@ -32,9 +32,7 @@ def variational_kernels(transition, transition_jacobian, observe, observe_jacobi
         matrix_reader(m, m, scale_place),
         matrix_writer(m, m, scale_place),
     )
-    read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
-    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
-    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
     measured, read_scales = vector_reader(m), vector_reader(n, source.scales)
     constants, observation_matrix = constants_reader(n, m, form), jacobian(observe, observe_jacobian, m, n, "c")
     plain = extended_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form)

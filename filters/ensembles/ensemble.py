@@ -12,17 +12,15 @@ from filters.belief import Kernels
 from filters.ensembles.inflation import with_spread_control
 from filters.ensembles.members import add_noise, drawer, ensemble_motion, row_covariances, row_means
 from filters.filter import Filter
-from filters.rows import constants_form, constants_reader, memory_places, number_places
+from filters.rows import constants_form, constants_reader, memory_places, number_places, row_access
 from thruster_env.checks import at_least, positive, shown
 from thruster_env.compiled import inlined
 from thruster_env.components import (
     column_reader,
     column_writer,
     matrix_reader,
-    matrix_writer,
     tuple_of,
     vector_reader,
-    vector_writer,
     written_out,
 )
 from thruster_env.streams import FILTER_MEASUREMENT
@@ -45,7 +43,7 @@ def measurement_moments(observe, n, m, form) -> Callable:
     of_states = written_out("of_states", "c", tuple_of(f"c[{i}]" for i in range(n)))
     of_predicted = written_out("of_predicted", "c", tuple_of(f"c[{n + i}]" for i in range(m)))
     read_r, mask, add = matrix_reader(m, m, source.r), matrices.masked(m), matrices.symmetric_sum(m)
-    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    _, _, (store_innovation, store_s) = row_access(n, m)
     factor, likelihood = matrices.cholesky_factor(m), matrices.innovation_likelihood(m)
     difference, measured = matrices.innovation(m), vector_reader(m)
 

@@ -6,18 +6,9 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import NamedTuple
 
-from filters.rows import constants_reader, memory_places, number_places
+from filters.rows import constants_reader, memory_places, number_places, row_access
 from thruster_env.compiled import inlined
-from thruster_env.components import (
-    column_reader,
-    column_writer,
-    matrix_of,
-    matrix_writer,
-    tuple_of,
-    vector_reader,
-    vector_writer,
-    written_out,
-)
+from thruster_env.components import column_reader, column_writer, matrix_of, tuple_of, vector_reader, written_out
 from thruster_env.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
 
 
@@ -98,7 +89,7 @@ def ensemble_motion(transition, n, m, inputs, form) -> Motion:
     prior_mean_place, prior_root_place = source.prior_mean, source.prior_root
     q_root_place, substeps_place, step_place = source.q_root, source.substeps, places.step
     means_of_members, covariances_of_members = row_means(n), row_covariances(0, n, 0, n)
-    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
+    _, (store_mean, store_cov), _ = row_access(n, m)
     constants, control = constants_reader(n, m, form), vector_reader(inputs)
     state, store_state, draw = column_reader(n), column_writer(n), drawer(n, m)
 

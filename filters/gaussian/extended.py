@@ -12,25 +12,17 @@ from filters.belief import Kernels
 from filters.derivatives import jacobian
 from filters.filter import Filter
 from filters.model import StateSpaceModel
-from filters.rows import constants_form, constants_reader, memory_places, number_places
+from filters.rows import constants_form, constants_reader, memory_places, number_places, row_access
 from thruster_env.compiled import inlined
-from thruster_env.components import (
-    matrix_of,
-    matrix_reader,
-    matrix_writer,
-    scaled_sum,
-    vector_reader,
-    vector_writer,
-    written_out,
-)
+from thruster_env.components import matrix_of, matrix_reader, matrix_writer, scaled_sum, vector_reader, written_out
 
 
 @lru_cache(maxsize=64)
 def gaussian_start(n: int, m: int) -> Callable:
     """Return `start(memory, numbers, size)`: belief = prior, for filters of mean and covariance."""
-    places, source = memory_places(n, m), number_places(n, m)
+    source = number_places(n, m)
     read_mean, read_cov = vector_reader(n, source.prior_mean), matrix_reader(n, n, source.prior_cov)
-    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
+    _, (store_mean, store_cov), _ = row_access(n, m)
 
     @inlined
     def start(memory, numbers, size):
@@ -122,12 +114,8 @@ def silenced(m: int, columns: int) -> Callable:
 @lru_cache(maxsize=64)
 def gaussian_correction(n: int, m: int) -> Callable:
     """Return `correct(row, z, predicted, h, r)`: `gaussian_update` of the belief in a row."""
-    places = memory_places(n, m)
-    read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
-    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
-    store_innovation = vector_writer(m, places.innovation)
-    store_innovation_cov = matrix_writer(m, m, places.innovation_cov)
-    log_likelihood_place, condition = places.log_likelihood, gaussian_update(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_innovation_cov) = row_access(n, m)
+    log_likelihood_place, condition = memory_places(n, m).log_likelihood, gaussian_update(n, m)
 
     @inlined
     def correct(row, z, predicted, observation_matrix, r):
@@ -166,9 +154,8 @@ def in_stages(n: int, m: int, begin: Callable, advance: Callable, finish: Callab
 @lru_cache(maxsize=64)
 def extended_motion(transition, transition_jacobian, n, m, inputs, form) -> Callable:
     """Return `advance(row, u, numbers)`: mean = f(mean, u), P = F P F' over one substep."""
-    places, source = memory_places(n, m), number_places(n, m)
-    read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
-    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
+    source = number_places(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), _ = row_access(n, m)
     constants, control = constants_reader(n, m, form), vector_reader(inputs)
     read_scales, transition_matrix = (
         vector_reader(n, source.scales),

@@ -15,17 +15,10 @@ from filters.filter import Filter
 from filters.gaussian.affine import AffineModel, affine_functions, linearize
 from filters.gaussian.extended import gaussian_update, nothing_to_summarise
 from filters.gaussian.mixture import blender, part_matrix, part_vector
-from filters.rows import constants_form, memory_places, number_places, own_place
+from filters.rows import constants_form, memory_places, number_places, own_place, row_access
 from thruster_env.checks import shown, vector
 from thruster_env.compiled import inlined
-from thruster_env.components import (
-    matrix_reader,
-    matrix_writer,
-    tuple_of,
-    vector_reader,
-    vector_writer,
-    written_out,
-)
+from thruster_env.components import matrix_reader, tuple_of, vector_reader, written_out
 
 MOST_STATES = 8  # 256 rules
 
@@ -79,12 +72,7 @@ def fuzzy_kernels(n: int, m: int, inputs: int, form) -> Kernels:
     )
     read_q, read_r = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r)
     prior_mean, prior_cov = vector_reader(n, source.prior_mean), matrix_reader(n, n, source.prior_cov)
-    read_mean, store_mean, store_cov = (
-        vector_reader(n, places.mean),
-        vector_writer(n, places.mean),
-        matrix_writer(n, n, places.cov),
-    )
-    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    (read_mean, _), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
     factor, likelihood = matrices.cholesky_factor(m), matrices.innovation_likelihood(m)
     control, measured, condition = vector_reader(inputs), vector_reader(m), gaussian_update(n, m)
     times, times_transposed, add = (

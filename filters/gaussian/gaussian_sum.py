@@ -17,18 +17,10 @@ from filters.filter import Filter
 from filters.gaussian.extended import extended_kernels, gaussian_update, kernels_of
 from filters.gaussian.mixture import blender, part_matrix, part_vector
 from filters.particles.weighted import anything_measured
-from filters.rows import constants_reader, memory_places, number_places, own_place
+from filters.rows import constants_reader, memory_places, number_places, own_place, row_access
 from thruster_env.checks import at_least
 from thruster_env.compiled import inlined
-from thruster_env.components import (
-    matrix_reader,
-    matrix_writer,
-    scaled_sum,
-    tuple_of,
-    vector_reader,
-    vector_writer,
-    written_out,
-)
+from thruster_env.components import matrix_reader, scaled_sum, tuple_of, vector_reader, written_out
 
 FEWEST_PARTS = 7
 REACH = 4.5  # of the outermost parts, in standard deviations of the split component
@@ -50,13 +42,8 @@ def gaussian_sum_kernels(
     of_states = blender(n, means, covs, weights, stride)
     of_innovations = blender(m, seen, seen_covs, weights, stride)
     component_place, variance_place, nodes_place, shares_place = own, own + 1, own + 2, own + 2 + parts
-    read_mean, read_cov, read_r = (
-        vector_reader(n, places.mean),
-        matrix_reader(n, n, places.cov),
-        matrix_reader(m, m, source.r),
-    )
-    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
-    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    read_r = matrix_reader(m, m, source.r)
     column = written_out(
         "column", "row, i, factor", tuple_of(f"factor * row[{places.cov + n * j} + i]" for j in range(n))
     )

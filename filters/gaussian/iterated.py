@@ -10,17 +10,10 @@ from filters.belief import Kernels
 from filters.derivatives import jacobian
 from filters.filter import Filter
 from filters.gaussian.extended import extended_kernels, gaussian_update, kernels_of
-from filters.rows import constants_reader, memory_places, number_places
+from filters.rows import constants_reader, memory_places, number_places, row_access
 from thruster_env.checks import at_least
 from thruster_env.compiled import inlined
-from thruster_env.components import (
-    matrix_reader,
-    matrix_writer,
-    tuple_of,
-    vector_reader,
-    vector_writer,
-    written_out,
-)
+from thruster_env.components import matrix_reader, tuple_of, vector_reader, written_out
 
 MOST_ITERATIONS = 20
 
@@ -32,9 +25,7 @@ def iterated_kernels(
     """Kernels of the iterated extended Kalman filter for model functions and sizes."""
     arguments = transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form
     places, source = memory_places(n, m), number_places(n, m)
-    read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
-    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
-    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
     constants, measured, read_r = constants_reader(n, m, form), vector_reader(m), matrix_reader(m, m, source.r)
     read_scales, likelihood_place = vector_reader(n, source.scales), places.log_likelihood
     observation_matrix, condition = jacobian(observe, observe_jacobian, m, n, "c"), gaussian_update(n, m)

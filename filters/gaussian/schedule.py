@@ -15,16 +15,9 @@ from filters.gaussian.extended import (
     nothing_to_summarise,
 )
 from filters.matrices import multiplier, transposed_multiplier
-from filters.rows import memory_places, number_places, own_place
+from filters.rows import memory_places, number_places, own_place, row_access
 from thruster_env.compiled import inlined
-from thruster_env.components import (
-    matrix_reader,
-    matrix_writer,
-    tuple_of,
-    vector_reader,
-    vector_writer,
-    written_out,
-)
+from thruster_env.components import matrix_reader, tuple_of, vector_reader, vector_writer, written_out
 
 
 def constants_of_affine(n: int, m: int, p: int) -> int:
@@ -63,8 +56,7 @@ def scheduled_kernels(points: int, n: int, m: int) -> Kernels:
     transition, observe, transition_matrix, observation_matrix = affine_functions(n, m, 1).values()
     blend = interpolator(points, count, own_place(n, m, count))
     read_constants, store_constants = vector_reader(count, places.extras), vector_writer(count, places.extras)
-    read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
-    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
+    (read_mean, read_cov), (store_mean, store_cov), _ = row_access(n, m)
     read_q, read_r, measured = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r), vector_reader(m)
     times, times_transposed, control = multiplier(n, n, n), transposed_multiplier(n, n, n), vector_reader(1)
     start_gaussian, settle, correct = gaussian_start(n, m), noise_added(n, m), gaussian_correction(n, m)

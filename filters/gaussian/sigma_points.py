@@ -10,7 +10,7 @@ from filters import matrices
 from filters.belief import Kernels
 from filters.gaussian.extended import gaussian_start, in_stages, nothing_to_summarise
 from filters.model import StateSpaceModel
-from filters.rows import constants_form, constants_reader, memory_places, number_places, own_place
+from filters.rows import constants_form, constants_reader, memory_places, number_places, own_place, row_access
 from thruster_env.compiled import inlined
 from thruster_env.components import (
     matrix_of,
@@ -19,7 +19,6 @@ from thruster_env.components import (
     scaled_sum,
     tuple_of,
     vector_reader,
-    vector_writer,
     written_out,
 )
 
@@ -115,10 +114,8 @@ def sigma_point_kernels(transition, observe, centre, n, m, inputs, form) -> Kern
     places, source, own = memory_places(n, m), number_places(n, m), own_place(n, m, form)
     step_place, likelihood_place, first = places.step, places.log_likelihood, places.extras
     count = 2 * n + centre
-    read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
-    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
     read_points, store_points = matrix_reader(count, n, first), matrix_writer(count, n, first)
-    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
     read_q, read_r = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r)
     constants, control, measured = constants_reader(n, m, form), vector_reader(inputs), vector_reader(m)
     read_set = vector_reader(3, own)

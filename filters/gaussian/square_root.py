@@ -8,7 +8,7 @@ from filters import matrices
 from filters.belief import Kernels
 from filters.derivatives import jacobian
 from filters.gaussian.extended import gaussian_start, in_stages, nothing_at_first, nothing_to_summarise, silenced
-from filters.rows import constants_reader, memory_places, number_places
+from filters.rows import constants_reader, memory_places, number_places, row_access
 from thruster_env.compiled import inlined
 from thruster_env.components import (
     matrix_of,
@@ -42,7 +42,7 @@ def square_root_kernels(transition, transition_jacobian, observe, observe_jacobi
     read_mean, store_mean = vector_reader(n, places.mean), vector_writer(n, places.mean)
     read_root, write_root = matrix_reader(n, n, places.extras), matrix_writer(n, n, places.extras)
     write_cov, prior_root = matrix_writer(n, n, places.cov), matrix_reader(n, n, source.prior_root)
-    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    _, _, (store_innovation, store_s) = row_access(n, m)
     read_q_root, read_r = matrix_reader(n, n, source.q_root), matrix_reader(m, m, source.r)
     constants, control, measured = constants_reader(n, m, form), vector_reader(inputs), vector_reader(m)
     read_scales, begin = vector_reader(n, source.scales), gaussian_start(n, m)

@@ -13,17 +13,9 @@ from filters.belief import Kernels
 from filters.bounds import riccati_covariances
 from filters.gaussian.extended import extended_kernels, gaussian_innovation, joseph_form, kernels_of
 from filters.gaussian.kalman import AffineFilter
-from filters.rows import constants_reader, memory_places, number_places, own_place
+from filters.rows import constants_reader, memory_places, number_places, own_place, row_access
 from thruster_env.compiled import inlined
-from thruster_env.components import (
-    matrix_of,
-    matrix_reader,
-    matrix_writer,
-    scaled_sum,
-    vector_reader,
-    vector_writer,
-    written_out,
-)
+from thruster_env.components import matrix_of, matrix_reader, scaled_sum, vector_reader, written_out
 
 STABLE = 1.0 - 1e-7  # magnitude of an eigenvalue of A (I - K C): an error lasts for less than ten million steps
 
@@ -33,9 +25,7 @@ def steady_kernels(transition, transition_jacobian, observe, observe_jacobian, n
     """Kernels for an affine model's functions and sizes; the filter's own numbers are the gain (n, m)."""
     arguments = transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form
     places, source = memory_places(n, m), number_places(n, m)
-    read_mean, read_cov = vector_reader(n, places.mean), matrix_reader(n, n, places.cov)
-    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
-    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
     constants, measured, read_r = constants_reader(n, m, form), vector_reader(m), matrix_reader(m, m, source.r)
     read_gain, likelihood_place = matrix_reader(n, m, own_place(n, m, form)), places.log_likelihood
     gain_of_present = written_out(

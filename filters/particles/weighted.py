@@ -13,17 +13,10 @@ from filters.belief import Belief
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.filter import Filter
 from filters.particles.weights import log_density, normalise, read_weights, weighted_covariances, weighted_means
-from filters.rows import constants_reader, memory_places, number_places
+from filters.rows import constants_reader, memory_places, number_places, row_access
 from thruster_env.checks import at_least
 from thruster_env.compiled import inlined
-from thruster_env.components import (
-    column_reader,
-    column_writer,
-    matrix_reader,
-    matrix_writer,
-    vector_reader,
-    vector_writer,
-)
+from thruster_env.components import column_reader, column_writer, matrix_reader, vector_reader
 
 
 class ParticleParts(NamedTuple):
@@ -50,8 +43,7 @@ def particle_parts(observe, n, m, form, weights) -> ParticleParts:
     means, covariances = weighted_means(0, n, weights), weighted_covariances(0, n, weights)
     means_of_predicted = weighted_means(scratch, m, weights)
     covariances_of_predicted = weighted_covariances(scratch, m, weights)
-    store_mean, store_cov = vector_writer(n, places.mean), matrix_writer(n, n, places.cov)
-    store_innovation, store_s = vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)
+    _, (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
     read_r, mask, add, factor = (
         matrix_reader(m, m, source.r),
         matrices.masked(m),

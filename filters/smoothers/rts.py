@@ -59,17 +59,9 @@ def careful_factor(size: int) -> Callable:
     Where a pivot is zero the diagonal of L is infinite, so that solving gives zero there. For a right-hand side in
     the range of a that is a solution: what is known exactly has no share in a gain.
     """
-    lines = []
-    for i in range(size):
-        for j in range(i + 1):
-            rest = "".join(f" - l{i}_{k} * l{j}_{k}" for k in range(j))
-            if i == j:
-                lines.append(f"d{i} = a[{i}][{i}]{rest}")
-                lines.append(f"l{i}_{i} = d{i} ** 0.5 if d{i} > {NEGLIGIBLE} * a[{i}][{i}] else infinity")
-            else:
-                lines.append(f"l{i}_{j} = (a[{i}][{j}]{rest}) / l{j}_{j}")
-    result = matrix_of(size, size, lambda i, j: f"l{i}_{j}" if j <= i else "0.0")
-    return written_out("factor", "a", *lines, result, infinity=np.inf)
+    return matrices.pivoted_factor(
+        size, f"{{d}} ** 0.5 if {{d}} > {NEGLIGIBLE} * {{a}} else infinity", infinity=np.inf
+    )
 
 
 @cache

@@ -1,0 +1,163 @@
+"""Small models and filters that tests share, and trajectories drawn from the models."""
+
+import math
+from contextlib import nullcontext
+
+import numpy as np
+
+from filters import StateSpaceModel, affine_model, make_filter, thruster_model, truth
+from filters.registry import tunable_numbers
+from thruster_env.compiled import interpreted
+from thruster_env.streams import episode_keys
+
+KEY = (123456789, 4294967295)  # of a filter's random numbers
+DT = 0.05  # of the pendulum
+
+
+def scalar_model(**changes):
+    """Affine, n = m = p = 1, without offsets."""
+    arguments = {
+        "a": [[0.9]],
+        "b": [[1.0]],
+        "c": [[2.0]],
+        "process_noise_cov": [0.1],
+        "measurement_noise_cov": [0.2],
+        "prior_mean": [3.0],
+        "prior_cov": [0.5],
+    }
+    return affine_model(**{**arguments, **changes})
+
+
+def plane_model(**changes):
+    """Affine, n = m = 2, p = 1, with offsets and correlated noise."""
+    arguments = {
+        "a": [[0.9, 0.3], [-0.2, 0.8]],
+        "b": [[1.0], [0.5]],
+        "c": [[1.0, 0.4], [-0.3, 1.5]],
+        "state_offset": [0.3, -0.2],
+        "measurement_offset": [0.7, -0.1],
+        "process_noise_cov": [[0.3, 0.12], [0.12, 0.2]],
+        "measurement_noise_cov": [[0.5, -0.25], [-0.25, 0.4]],
+        "prior_mean": [1.0, -1.0],
+        "prior_cov": [[1.0, 0.4], [0.4, 0.5]],
+    }
+    return affine_model(**{**arguments, **changes})
+
+
+def line_model(**changes):
+    """The model of the plane with its first channel only: n = 2, p = m = 1."""
+    first = {"c": [[1.0, 0.4]], "measurement_offset": [0.7], "measurement_noise_cov": [0.5]}
+    return plane_model(**{**first, **changes})
+
+
+def wide_model(**changes):
+    """Affine, n = 3, p = 2, m = 2, stable, with offsets and correlated noise."""
+    arguments = {
+        "a": [[0.9, 0.2, 0.0], [-0.1, 0.8, 0.1], [0.0, 0.3, 0.7]],
+        "b": [[1.0, 0.0], [0.5, -0.4], [0.0, 0.8]],
+        "c": [[1.0, 0.0, 0.5], [0.0, 2.0, -1.0]],
+        "state_offset": [0.3, -0.2, 0.1],
+        "measurement_offset": [0.7, -1.5],
+        "process_noise_cov": [[0.3, 0.1, 0.0], [0.1, 0.2, -0.05], [0.0, -0.05, 0.4]],
+        "measurement_noise_cov": [[0.5, 0.2], [0.2, 0.3]],
+        "prior_mean": [1.0, -1.0, 0.5],
+        "prior_cov": [[1.0, 0.2, 0.0], [0.2, 0.5, 0.1], [0.0, 0.1, 0.8]],
+    }
+    return affine_model(**{**arguments, **changes})
+
+
+def lonely_model():
+    """The scalar model without input, and so without a place to give one."""
+    return scalar_model(b=np.zeros((1, 0)))
+
+
+def random_affine(n=3, m=2, p=2, seed=0):
+    """A stable affine model with offsets and full covariances."""
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(n, n))
+    a *= 0.9 / np.abs(np.linalg.eigvals(a)).max()
+    b, c = rng.normal(size=(n, p)), rng.normal(size=(m, n))
+    offset, shift = rng.normal(size=n), rng.normal(size=m)
+    roots = [rng.normal(size=(size, size)) for size in (n, m, n)]
+    q, r, p_0 = (root @ root.T + 0.1 * np.eye(len(root)) for root in roots)
+    return affine_model(
+        a=a,
+        b=b,
+        c=c,
+        state_offset=offset,
+        measurement_offset=shift,
+        process_noise_cov=q,
+        measurement_noise_cov=r,
+        prior_mean=rng.normal(size=n),
+        prior_cov=p_0,
+    )
+
+
+def rescaled(model, states, channels):
+    """An affine model in other units: its states times `states` (n,), its measurements times `channels` (m,)."""
+    d, e = np.diag(states), np.diag(channels)
+    a, b, offset, c, shift = model.matrices()
+    return affine_model(
+        a=d @ a @ np.linalg.inv(d),
+        b=d @ b,
+        c=e @ c @ np.linalg.inv(d),
+        state_offset=d @ offset,
+        measurement_offset=e @ shift,
+        process_noise_cov=d @ model.process_noise_cov @ d,
+        measurement_noise_cov=e @ model.measurement_noise_cov @ e,
+        prior_mean=d @ model.prior_mean,
+        prior_cov=d @ model.prior_cov @ d,
+    )
+
+
+def swing(x, u, c):
+    """A damped pendulum, semi-implicit Euler; c = (g/l, damping)."""
+    rate = x[1] + DT * (-c[0] * math.sin(x[0]) - c[1] * x[1] * abs(x[1]) + u[0])
+    return (x[0] + DT * rate, rate)
+
+
+def look(x, c):
+    """Its horizontal place, and angle times rate."""
+    return (math.sin(x[0]), x[0] * x[1])
+
+
+def pendulum(**changes):
+    """n = m = 2, p = 1, nonlinear in both functions, without Jacobians."""
+    arguments = {
+        "transition": swing,
+        "observe": look,
+        "process_noise_cov": [[2e-4, 1e-4], [1e-4, 1e-3]],
+        "measurement_noise_cov": [[0.01, 0.003], [0.003, 0.04]],
+        "prior_mean": [0.5, 0.2],
+        "prior_cov": [[0.2, 0.05], [0.05, 0.1]],
+        "constants": (9.81, 0.3),
+    }
+    return StateSpaceModel(**{**arguments, **changes})
+
+
+MODELS = {"thruster": thruster_model, "wide affine": wide_model, "no input": lonely_model}  # for every filter
+
+
+def simulated(model, steps=100, *, count=1, seed=1, level=3.0, missing=0.0, compiled=False):
+    """Normal inputs (count, steps, p) of standard deviation `level`, and the measurements (count, steps + 1, m).
+
+    Of the measurements a part may be missing, channel by channel.
+    Compiling a model takes seconds: it pays for many thousand steps only.
+    """
+    inputs = np.random.default_rng(seed).normal(size=(count, steps, model.inputs)) * level
+    with nullcontext() if compiled else interpreted():
+        drawn = truth.simulate(model, episode_keys(range(seed, seed + count)), inputs)
+    gone = np.random.default_rng((seed, 1)).random(drawn.measurements.shape) < missing
+    return inputs, np.where(gone, np.nan, drawn.measurements)
+
+
+def held_voltages(count, levels, hold=25, seed=20, limit=12.0):
+    """Inputs (count, levels * hold, 1) for thrusters: uniform within +-limit, each held for `hold` steps."""
+    drawn = np.random.default_rng(seed).uniform(-limit, limit, size=(count, levels, 1))
+    return np.repeat(drawn, hold, axis=1)
+
+
+def small(name, model, size=10):
+    """A filter by name; ensembles small, and of a size that fills no vector register."""
+    numbers = {"ensemble_size": size} if "ensemble_size" in tunable_numbers(name) else {}
+    return make_filter(name, model, **numbers)

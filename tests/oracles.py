@@ -1,0 +1,60 @@
+"""Naive computations that tests of several filters compare with."""
+
+import math
+
+import numpy as np
+
+from filters import run
+from tests.models import KEY
+from thruster_env.streams import normal_block
+
+
+def normals(stream, step, rows, size):
+    """The normals (rows, size) of KEY's stream: channel i of member j is number i * width + j of one long draw."""
+    width = -(-size // 8) * 8  # ensembles are padded to a multiple of eight
+    index = np.arange(rows * width)
+    block = np.array(normal_block(index // 4, step, stream, *KEY))  # (4, rows * width)
+    return block[index % 4, index].reshape(rows, width)[:, :size]
+
+
+def kalman_update(x, p, innovation, h, r):
+    """Mean and covariance after a measurement, and S = H P H' + R, as in Kalman (1960)."""
+    s = h @ p @ h.T + r
+    gain = p @ h.T @ np.linalg.inv(s)
+    return x + gain @ innovation, (np.eye(len(x)) - gain @ h) @ p, s
+
+
+def equal(one, other):
+    """Whether two named tuples (beliefs, innovations, estimates) hold the same numbers."""
+    return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def relative_errors(found, means, covs):
+    """Errors of the estimates' means (B, K, n) and covariances, in units of the spread that `covs` says."""
+    spread = np.sqrt(np.einsum("bkii->bki", covs))
+    return (found.means - means) / spread, (found.covs - covs) / (spread[..., :, None] * spread[..., None, :])
+
+
+def convergence(make, sizes, data, means, covs):
+    """Relative RMS errors (2, sizes) of means and covariances, and the estimates of the largest ensemble.
+
+    Args:
+        make: make(size) is a filter of so many members.
+        sizes: the numbers of members.
+        data: keys, inputs and measurements, for `filters.run`.
+        means: (B, K + 1, n), what the filters' means have as their limit.
+        covs: the same of the covariances.
+    """
+    errors = []
+    for size in sizes:
+        found = run(make(size), *data)
+        errors.append([np.sqrt(np.mean(error**2)) for error in relative_errors(found, means, covs)])
+    return np.transpose(errors), found
+
+
+def assert_normal(sample, cov, mean=0.0):
+    """A sample (d, N) has the mean and covariance given, to four standard errors."""
+    size, spread = sample.shape[1], np.sqrt(np.diag(cov))
+    assert (np.abs(sample.mean(axis=1) - mean) < 4 * spread / math.sqrt(size)).all()
+    standard_error = np.sqrt((np.outer(spread**2, spread**2) + cov**2) / size)
+    assert (np.abs(np.cov(sample) - cov) < 4 * standard_error).all()
