@@ -5,12 +5,14 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq -c constraints.txt
 TEST_EXTRAS := rl,render,peers,dev
+BENCH_EXTRAS := peers,bench
 ARGS :=
 
 # Stamps: present only after a complete install, so a second run needs no network and an interrupted one starts over.
 MADE := $(VENV)/.made
 BASE := $(VENV)/.base
 TEST := $(VENV)/.test
+BENCH := $(VENV)/.bench
 
 .PHONY: help demo test bench lint clean
 .NOTPARALLEL:
@@ -24,7 +26,7 @@ demo: $(BASE) ## install what is needed (once) and run the main job from end to 
 test: $(TEST) ## install what tests need (once) and run all tests; ARGS="-k name" picks some
 	@$(BIN)/python -m pytest $(ARGS)
 
-bench: $(TEST) ## time it against other packages, side by side
+bench: $(BENCH) ## install what benchmarks need (once) and time it against other packages, side by side
 	@$(BIN)/python -m benchmarks $(ARGS)
 
 lint: $(TEST) ## check style and formatting
@@ -44,14 +46,16 @@ $(MADE):
 # are pinned by the same file, so neither install changes a version that the other one put there.
 $(BASE): pyproject.toml constraints.txt | $(MADE)
 	@echo "installing the base into $(VENV) (once, about a minute) ..."
-	@rm -f $(BASE) $(TEST)
+	@rm -f $(BASE) $(TEST) $(BENCH)
 	@$(PIP) setuptools
 	@$(PIP) --no-build-isolation -e .
 	@touch $(BASE)
 
-$(TEST): pyproject.toml constraints.txt | $(MADE)
-	@echo "installing what tests need into $(VENV) (once, some minutes) ..."
-	@rm -f $(BASE) $(TEST)
+$(TEST): EXTRAS := $(TEST_EXTRAS)
+$(BENCH): EXTRAS := $(BENCH_EXTRAS)
+$(TEST) $(BENCH): pyproject.toml constraints.txt | $(MADE)
+	@echo "installing what tests or benchmarks need into $(VENV) (once, some minutes) ..."
+	@rm -f $(BASE) $@
 	@$(PIP) setuptools
-	@$(PIP) --no-build-isolation -e ".[$(TEST_EXTRAS)]"
-	@touch $(BASE) $(TEST)
+	@$(PIP) --no-build-isolation -e ".[$(EXTRAS)]"
+	@touch $(BASE) $@

@@ -13,8 +13,9 @@ from thruster_cli.output import JsonOption, SeedOption, announce_compilation, em
 
 CAPTION = (
     "A step's time counts env, filter and fresh info arrays; FilterPy's, one predict and update and no env. "
-    "evaluate: nanoseconds a member and step, 500 steps, on all cores. Times are the best of many rounds, "
-    "ratios the median over rounds that measure both in turn. Goals are upper limits; (in brackets) for later."
+    "Ensembles in evaluate and in batches: time a member and step, 500 steps, on all cores; batches are of 256 "
+    "trajectories. On copies of a vector env: time a copy and step, env and filter. Times are the best of many "
+    "rounds, ratios the median over rounds that measure both in turn. Goals are upper limits."
 )
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -28,7 +29,7 @@ def command(
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Measure the speed of env, filters and evaluation beside Gymnasium's and FilterPy's, in about a minute.
+    """Measure the speed of env, filters and evaluation beside Gymnasium's, FilterPy's and JAX's, in two minutes.
 
     All is measured in this run, ours and the peer in turns, on an otherwise idle machine if the times are to
     mean much. A goal that is missed prints "no" and fails nothing: times are the machine's as well.
@@ -37,12 +38,13 @@ def command(
         raise ValueError(
             "FilterPy must be installed to compare with: `make bench` does it, or pip install -e '.[peers]'"
         )
-    from benchmarks import batches, processes, steps, vectors  # after the check: they import FilterPy
+    # After the check: they import FilterPy.
+    from benchmarks import batches, processes, steps, trajectories, vector_filters, vectors
 
     announce_compilation()
     rows = []
     with progress_console.status("measuring ...") as status:
-        for part in (steps, vectors, batches, processes):
+        for part in (steps, vectors, vector_filters, batches, trajectories, processes):
             for row in part.rows(seed, quick):
                 rows.append(row)
                 status.update(f"measured: {row.what} ...")

@@ -44,9 +44,9 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     floor = floor_measures(scenario.plant, scenario.steps)
     whole_floor = _sum(*floor.values())
     workload = f"{SEEDS} seeds, N = {ENSEMBLE_SIZE}"
-    timing = side_by_side(_shared(judge, count), whole_floor, rounds)
+    timing = side_by_side(shared(judge, count), whole_floor, rounds)
     yield Row(f"evaluate, {workload}", "floor", timing, time_goal=15e-9)
-    timing = side_by_side(_shared(lambda: _run(choice, scenario, data), count), whole_floor, rounds)
+    timing = side_by_side(shared(lambda: _run(choice, scenario, data), count), whole_floor, rounds)
     yield Row("the same without metrics", "floor", timing, time_goal=15e-9)
     for name, measure in floor.items():
         yield Row(f"floor: {name}", None, alone(measure, rounds))
@@ -56,7 +56,7 @@ def _run(choice: Choice, scenario, data) -> None:
     run(choice.filter(scenario), data.filter_keys, data.inputs, data.measurements)
 
 
-def _shared(work: Callable[[], object], count: int) -> Measure:
+def shared(work: Callable[[], object], count: int) -> Measure:
     """A measure of work that is shared by `count` members and steps."""
 
     def measure() -> float:
@@ -92,8 +92,8 @@ def floor_measures(plant: Plant, steps: int) -> dict[str, Measure]:
 
     count = BLOCKS * WIDTH * steps
     return {
-        f"{plant.substeps} Runge-Kutta steps": _shared(lambda: spread(motion, BLOCKS), count),
-        f"{NORMALS} normals": _shared(lambda: spread(noise, BLOCKS), count),
+        f"{plant.substeps} Runge-Kutta steps": shared(lambda: spread(motion, BLOCKS), count),
+        f"{NORMALS} normals": shared(lambda: spread(noise, BLOCKS), count),
     }
 
 

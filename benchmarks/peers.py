@@ -6,7 +6,12 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
-from filterpy.kalman import EnsembleKalmanFilter, KalmanFilter
+from filterpy.kalman import (
+    EnsembleKalmanFilter,
+    KalmanFilter,
+    MerweScaledSigmaPoints,
+    UnscentedKalmanFilter,
+)
 
 from filters.gaussian.affine import AffineModel
 from thruster_env.compiled import compiled, function_fingerprint
@@ -84,6 +89,29 @@ class EnsembleStep:
     def reset(self) -> None:
         """Put the prior back, with members from NumPy's global generator."""
         self.filter.initialize(self._plant.initial_mean, self._plant.initial_cov)
+
+    def __call__(self, voltage: float, z: np.ndarray) -> None:
+        """Do the step."""
+        self._u[0] = voltage
+        self.filter.predict()
+        self.filter.update(z)
+
+
+class UnscentedStep:
+    """One predict and update of FilterPy's unscented Kalman filter under a voltage."""
+
+    def __init__(self, plant: Plant, points: tuple[float, float, float], model: Callable):
+        """Make the filter; points are (alpha, beta, kappa), model is `python_model` or `compiled_model`."""
+        self._u, fx, hx = model(plant)
+        self._plant = plant
+        sigma_points = MerweScaledSigmaPoints(2, *points)
+        self.filter = UnscentedKalmanFilter(2, 1, plant.dt, lambda x: [hx(x)], fx, sigma_points)
+        self.filter.Q, self.filter.R = plant.process_noise_cov, plant.measurement_noise_cov
+        self.reset()
+
+    def reset(self) -> None:
+        """Put the prior back."""
+        self.filter.x, self.filter.P = self._plant.initial_mean, self._plant.initial_cov
 
     def __call__(self, voltage: float, z: np.ndarray) -> None:
         """Do the step."""

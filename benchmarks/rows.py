@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import platform
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.timing import Timing
 
 COLUMNS = ["what; peer", "ours", "peer", "ratio", "goal", "met?"]
-PACKAGES = ("numba", "gymnasium", "numpy", "filterpy")
+PACKAGES = ("numba", "gymnasium", "numpy", "filterpy", "jax")
 
 
 class Row(NamedTuple):
@@ -22,13 +23,10 @@ class Row(NamedTuple):
     timing: Timing
     ratio_goal: float | None = None
     time_goal: float | None = None  # [s]
-    later: bool = False  # a goal for later, not judged yet
 
     @property
     def met(self) -> bool | None:
-        """Whether the goal is met; None without a goal that is judged."""
-        if self.later:
-            return None
+        """Whether the goal is met; None without a goal."""
         if self.ratio_goal is not None:
             return self.timing.ratio <= self.ratio_goal
         return None if self.time_goal is None else self.timing.ours <= self.time_goal
@@ -44,7 +42,7 @@ class Row(NamedTuple):
             readable(self.timing.ours),
             "-" if self.timing.peer is None else readable(self.timing.peer),
             "-" if self.timing.ratio is None else f"{self.timing.ratio:.3g}",
-            f"({goal})" if self.later else goal,
+            goal,
             {True: "yes", False: "no", None: "-"}[self.met],
         ]
 
@@ -58,7 +56,6 @@ class Row(NamedTuple):
             "ratio": self.timing.ratio,
             "ratio_goal": self.ratio_goal,
             "time_goal_seconds": self.time_goal,
-            "goal_is_for_later": self.later,
             "met": self.met,
         }
 
@@ -78,7 +75,7 @@ def machine() -> dict[str, str | int]:
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
-        **{package: version(package) for package in PACKAGES},
+        **{package: version(package) for package in PACKAGES if find_spec(package)},
     }
 
 
@@ -93,7 +90,7 @@ def _cpu() -> str:
 
 def machine_lines(facts: dict) -> list[str]:
     """The machine in two lines of text."""
-    packages = ", ".join(f"{name} {facts[name]}" for name in PACKAGES)
+    packages = ", ".join(f"{name} {facts[name]}" for name in PACKAGES if name in facts)
     return [
         f"Machine: {facts['cpu']}, {facts['cores']} cores, {facts['system']}.",
         f"Python {facts['python']}, {packages}.",

@@ -8,14 +8,14 @@ import gymnasium as gym
 import numpy as np
 
 import thruster_env  # noqa: F401 - registers BowThruster-v0
-from benchmarks.peers import EnsembleStep, KalmanStep, compiled_model, python_model
+from benchmarks.peers import EnsembleStep, KalmanStep, UnscentedStep, compiled_model, python_model
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, seconds_a_call, side_by_side
 from filters.wrapper import EstimateState
 from thruster_env.plant import Plant
 
 ENSEMBLE_SIZE = 50
-PEER_STEPS = 100  # of FilterPy's slow ensemble in a round; its time a step does not depend on their number
+PEER_STEPS = 100  # of FilterPy's slow filters in a round; their time a step does not depend on their number
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
@@ -29,7 +29,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     yield Row("env step", "Pendulum-v1", timing, ratio_goal=0.35)
 
     for model, peer_name, goal in (
-        (python_model, "FilterPy", 1 / 25),
+        (python_model, "FilterPy", 1 / 40),
         (compiled_model, "FilterPy with numba", None),
     ):
         wrapped = EstimateState(gym.make("BowThruster-v0"), filter="enkf", ensemble_size=ENSEMBLE_SIZE)
@@ -43,7 +43,15 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
         inputs = np.column_stack([voltages, np.ones_like(voltages)])
         peer = seconds_a_call(step, zip(inputs, measurements, strict=True), step.reset)
         timing = side_by_side(episode(wrapped, seed), peer, 10 if quick else 200)
-        yield Row(f"{name.upper()} step", "FilterPy's KF", timing, ratio_goal=1 / 3, later=True)
+        yield Row(f"{name.upper()} step", "FilterPy's KF", timing, ratio_goal=1 / 3)
+
+    wrapped = EstimateState(gym.make("BowThruster-v0"), filter="ukf")
+    points = wrapped.filter.alpha, wrapped.filter.beta, wrapped.filter.kappa
+    step = UnscentedStep(plant, points, python_model)
+    given = zip(voltages[:PEER_STEPS].tolist(), measurements[:PEER_STEPS], strict=True)
+    peer = seconds_a_call(step, given, step.reset)
+    timing = side_by_side(episode(wrapped, seed), peer, 10 if quick else 100)
+    yield Row("UKF step", "FilterPy's UKF", timing, ratio_goal=1 / 10)
 
 
 def recorded_episode(seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -45,18 +45,18 @@ def memory_line() -> str:
     return f"Memory: {env.unwrapped.bytes_per_copy} bytes a copy of the vector env while it steps."
 
 
-def vector_steps(name: str, seed: int) -> Measure:
+def vector_steps(name: str, seed: int, copies: int = COPIES, steps: int = STEPS, **arguments) -> Measure:
     """A measure of one copy's step in a vector env of many copies under random actions."""
-    env = gym.make_vec(name, num_envs=COPIES)
+    env = gym.make_vec(name, num_envs=copies, **arguments)
     env.action_space.seed(seed)
     actions = env.action_space.sample()
 
     def measure() -> float:
         env.reset(seed=seed)
         begin = perf_counter()
-        for _ in range(STEPS):
+        for _ in range(steps):
             env.step(actions)
-        return (perf_counter() - begin) / (STEPS * COPIES)
+        return (perf_counter() - begin) / (steps * copies)
 
     return measure
 

@@ -8,15 +8,14 @@ The pictures go into FOLDER, docs/ by default. If there is a plant.md in it, its
 
 from __future__ import annotations
 
-import argparse
 import math
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 
+from docs.page import SKY, label_grid, legend_below, make_page
 from docs.plant_tables import FULL_VOLTAGE, TABLES, thrust_coefficient
 from thruster_env.amplifier import AMPLIFIER_EFFECTS
 from thruster_env.batch import Copies
@@ -35,7 +34,7 @@ from thruster_env.task import Task
 # Presets are told apart by colour and by dashes; open_bladed hardly turns and is left out of the pictures.
 LOOKS = {
     "tunnel": (BLUE, "-"),
-    "tunnel_physical": ("#56b4e9", "--"),
+    "tunnel_physical": (SKY, "--"),
     "open_bladed_corrected": (RUST, "-."),
     "t200": (DARK, (0, (1, 1))),
 }
@@ -67,7 +66,7 @@ def responses(path: Path) -> Path:
     for axis in axes[-1]:
         axis.set_xlabel("time [ms]")
     figure.align_ylabels(axes[:, 0])
-    _legend(figure, axes[0, 0])
+    legend_below(figure, axes[0, 0])
     return save_figure(figure, path)
 
 
@@ -101,7 +100,7 @@ def steady_states(path: Path) -> Path:
     axes[2].set_xticks(range(len(LOOKS)), [name.replace("_", "\n") for name in LOOKS], fontsize=8)
     axes[2].grid(axis="x", visible=False)
     axes[2].legend(fontsize=8, frameon=False, loc="upper left")
-    _legend(figure, axes[0])
+    legend_below(figure, axes[0])
     return save_figure(figure, path)
 
 
@@ -129,8 +128,8 @@ def sensor_effects(path: Path) -> Path:
         missing = ~valid
         axis.plot(time[missing], record[missing, READINGS], "x", color=RUST, markersize=3.5, label="missing")
         axis.set_title(title, fontsize=9)
-    _label_grid(axes, "time [s]", "thrust [N]")
-    _legend(figure, axes[0, 0])
+    label_grid(axes, "time [s]", "thrust [N]")
+    legend_below(figure, axes[0, 0])
     return save_figure(figure, path)
 
 
@@ -183,7 +182,7 @@ def references(path: Path) -> Path:
         axis.step(0.01 * np.arange(501), record[:, REFERENCE], where="post", color=BLUE, linewidth=1.4)
         axis.set_title(title, fontsize=9)
     axes[0, 0].set_ylim(0, 50)
-    _label_grid(axes, "time [s]", "reference thrust [N]")
+    label_grid(axes, "time [s]", "reference thrust [N]")
     return save_figure(figure, path)
 
 
@@ -232,19 +231,8 @@ def _signals(path: Path, plants: dict[str, Plant], plain: Plant, voltages, shown
     axes[0, 0].set_ylabel(label)
     axes[1, 0].set_ylabel("thrust [N]")
     figure.align_ylabels(axes[:, 0])
-    _legend(figure, axes[0, 0])
+    legend_below(figure, axes[0, 0])
     return save_figure(figure, path)
-
-
-def _legend(figure, axis) -> None:
-    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
-
-
-def _label_grid(axes, x: str, y: str) -> None:
-    for axis in axes[-1]:
-        axis.set_xlabel(x)
-    for axis in axes[:, 0]:
-        axis.set_ylabel(y)
 
 
 FIGURES = {
@@ -258,24 +246,9 @@ FIGURES = {
 }
 
 
-def with_tables(page: str) -> str:
-    """The page with its computed tables written anew."""
-
-    def anew(match: re.Match) -> str:
-        return f"{match[1]}\n{TABLES[match[2]]()}\n{match[3]}"
-
-    return re.sub(r"(<!-- table (\w+) -->).*?(<!-- end -->)", anew, page, flags=re.DOTALL)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
-    parser = argparse.ArgumentParser(prog="python -m docs.plant_figures", description=__doc__.splitlines()[0])
-    parser.add_argument("folder", nargs="?", type=Path, default=Path(__file__).parent, metavar="FOLDER")
-    folder = parser.parse_args(arguments).folder
-    for name, draw in FIGURES.items():
-        draw(folder / name)
-    if (folder / "plant.md").exists():
-        write_whole(folder / "plant.md", with_tables((folder / "plant.md").read_text()))
+    make_page("plant", "docs.plant_figures", FIGURES, TABLES, __doc__.splitlines()[0], arguments)
 
 
 if __name__ == "__main__":

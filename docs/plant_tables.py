@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from docs.page import digits, table
 from thruster_env.control import LQRController, PIController
 from thruster_env.dynamics import rates
 from thruster_env.linear import jacobians, required_substeps, run_substeps, state_range, steady_state
@@ -67,27 +68,27 @@ def presets() -> str:
         ),
         "sub-steps in 10 ms": lambda name, p: f"{required_substeps(p, DEFAULT_DT, FULL_VOLTAGE[name])}",
         "K_T at the bollard": lambda name, p: _thrust_coefficients(p),
-        "default sensor noise over thrust at half voltage": lambda name, p: _digits(
+        "default sensor noise over thrust at half voltage": lambda name, p: digits(
             math.sqrt(DEFAULT_MEASUREMENT_NOISE) / _points(name, p)[1].thrust, 2
         ),
         "source": lambda name, p: SOURCES[name],
         "inferred": lambda name, p: INFERRED[name],
     }
     cells = [[label, *(cell(name, p) for name, p in PRESETS.items())] for label, cell in rows.items()]
-    return _table(["", *(f"`{name}`" for name in PRESETS)], cells)
+    return table(["", *(f"`{name}`" for name in PRESETS)], cells)
 
 
 def parameters() -> str:
     """The parameters of every preset, with their names in code, symbols and units."""
 
     def cell(value) -> str:
-        return value if isinstance(value, str) else _digits(value, 5)
+        return value if isinstance(value, str) else digits(value, 5)
 
     rows = [
         [f"`{field}`", symbol, *(cell(getattr(p, field)) for p in PRESETS.values())]
         for field, symbol in SYMBOLS.items()
     ]
-    return _table(["field", "symbol", *(f"`{name}`" for name in PRESETS)], rows)
+    return table(["field", "symbol", *(f"`{name}`" for name in PRESETS)], rows)
 
 
 def accuracy() -> str:
@@ -100,7 +101,7 @@ def accuracy() -> str:
         cells = {count: _small(error) for count, error in errors.items()}
         cells[chosen] = f"**{cells[chosen]}**"
         rows.append([f"`{name}`", *cells.values()])
-    return _table(["preset", *map(str, COUNTS)], rows)
+    return table(["preset", *map(str, COUNTS)], rows)
 
 
 def one_step_error(p: ThrusterParameters, max_voltage: float, substeps: int) -> float:
@@ -132,7 +133,7 @@ def returns() -> str:
             (seen, LQRController.for_env(seen)),
         ]
         rows.append([f"`{task}`", *(_mean_return(*policy) for policy in policies)])
-    return _table(["", "0 V", "feed-forward alone", "PI with feed-forward", "LQR on the true state"], rows)
+    return table(["", "0 V", "feed-forward alone", "PI with feed-forward", "LQR on the true state"], rows)
 
 
 def _mean_return(env, controller) -> str:
@@ -168,27 +169,18 @@ def thrust_coefficient(p: ThrusterParameters, voltage: float) -> float:
 
 
 def _thrust_coefficients(p: ThrusterParameters) -> str:
-    ahead, astern = (_digits(thrust_coefficient(p, voltage)) for voltage in (1.0, -1.0))
+    ahead, astern = (digits(thrust_coefficient(p, voltage)) for voltage in (1.0, -1.0))
     return f"{ahead}, {astern} astern" if p.thrust_asymmetry else ahead
 
 
 def _list(values) -> str:
-    return ", ".join(_digits(value) for value in values)
-
-
-def _digits(value: float, count: int = 3) -> str:
-    return f"{float(f'{value:.{count}g}'):.6g}"  # the detour keeps 8820 from becoming 8.82e+03
+    return ", ".join(digits(value) for value in values)
 
 
 def _small(error: float) -> str:
     if error < 1e-6:  # the reference is not much better
         return "< 1e-6"
     return f"{error:.1e}".replace("e-0", "e-").replace("e+00", "")
-
-
-def _table(header: list[str], rows: list[list[str]]) -> str:
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |".replace("|  |", "| |") for line in lines)
 
 
 TABLES = {"parameters": parameters, "presets": presets, "accuracy": accuracy, "returns": returns}

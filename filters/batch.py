@@ -97,9 +97,9 @@ def trajectories(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The arguments of `run` as the arrays that compiled code takes; ValueError if something is off."""
     model = filter_.kernel_model
-    keys = np.ascontiguousarray(keys, dtype=np.float64)
-    inputs = np.ascontiguousarray(inputs, dtype=np.float64)
-    z = np.ascontiguousarray(measurements, dtype=np.float64)
+    # Arrays that may be written to: others are another type to numba, which compiles once more for them.
+    requirements = "C_CONTIGUOUS", "WRITEABLE"
+    keys, inputs, z = (np.require(value, np.float64, requirements) for value in (keys, inputs, measurements))
     if z.ndim != 3 or inputs.ndim != 3 or keys.shape != (len(z), 2):
         raise ValueError(
             "keys, inputs, measurements must have shapes (B, 2), (B, K, p), (B, K + 1, m), "

@@ -1,7 +1,9 @@
-"""docs/plant.md says what the code does: its examples run, its tables are the code's, its pictures are there."""
+"""docs/plant.md and docs/filters.md say what the code does: examples, tables and pictures are the code's."""
 
 import ast
 import dataclasses
+import importlib
+import importlib.util
 import inspect
 import re
 import shutil
@@ -10,9 +12,13 @@ import sys
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
+from filters.arguments import OBSERVATIONS
+from filters.registry import FILTERS
+from filters.thruster import thruster_model
 from thruster_env.amplifier import AMPLIFIER_EFFECTS
 from thruster_env.env import BowThrusterEnv
 from thruster_env.flow import FLOW_SIGNALS
@@ -27,7 +33,11 @@ ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "plant.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
 NUMBER = r"(\d+(?:\.\d+)?(?:e-?\d+)?)"
-PICTURES = re.findall(r"!\[.*?\]\((.*?)\)", PAGE)
+FILTER_PAGE = (ROOT / "docs" / "filters.md").read_text()
+PAGES = {"plant": PAGE, "filters": FILTER_PAGE}
+SCRIPTS = {"plant": "docs.plant_figures", "filters": "docs.filter_figures"}
+FILTER_EXAMPLES = re.findall(r"```python\n(.*?)```", FILTER_PAGE, flags=re.DOTALL)
+every_page = pytest.mark.parametrize("page", PAGES)
 KINDS = {
     "Reference signals": REFERENCE_SIGNALS.effects,
     "Sensors": SENSOR_EFFECTS.effects,
@@ -36,6 +46,10 @@ KINDS = {
     "Initial state and uncertain parameters": DISTRIBUTIONS,
 }
 EFFECTS = [(section, name) for section, effects in KINDS.items() for name in effects]
+
+
+def pictures_of(page):
+    return set(re.findall(r"!\[.*?\]\((.*?)\)", PAGES[page]))
 
 
 def rows_of(section):
@@ -111,20 +125,79 @@ def test_the_page_names_every_env_and_every_preset():
     assert all(f"`{name}`" in PAGE for name in PRESETS)
 
 
-def test_every_link_leads_somewhere():
-    headings = re.findall(r"^#+ (.*)$", PAGE, flags=re.MULTILINE)
+@every_page
+def test_every_link_leads_somewhere(page):
+    text = PAGES[page]
+    headings = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
     anchors = {re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings}
-    for target in re.findall(r"\]\((?!http)([^)]+)\)", PAGE):
+    for target in re.findall(r"\]\((?!http)([^)]+)\)", text):
         assert target[1:] in anchors if target.startswith("#") else (ROOT / "docs" / target).exists(), target
 
 
+@every_page
+def test_the_page_shows_what_its_script_draws_and_has_the_tables_it_makes(page):
+    script = importlib.import_module(SCRIPTS[page])
+    assert set(script.FIGURES) <= pictures_of(page)
+    assert set(script.TABLES) <= set(re.findall(r"<!-- table (\w+) -->", PAGES[page]))
+    assert all((ROOT / "docs" / name).stat().st_size < 150_000 for name in script.FIGURES)
+
+
+@pytest.mark.parametrize("code", FILTER_EXAMPLES, ids=range(len(FILTER_EXAMPLES)))
+def test_an_example_of_a_filter_runs(code, capsys, tmp_path, monkeypatch):
+    """As a module of its own: what compiles is kept under the name of its module."""
+    path = tmp_path / "filters_example.py"
+    path.write_text(code)
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, path.stem, module)
+    spec.loader.exec_module(module)
+    names = vars(module)
+    if "Pendulum" in code:
+        assert sum(line != "" for line in code.splitlines()) < 30
+        assert names["angle"] < 0.5 * names["raw_angle"] and names["speed"] < 0.5 * names["raw_speed"]
+
+
+def test_every_family_of_filters_has_an_example_and_a_picture():
+    sections = re.split(r"^## ", FILTER_PAGE.partition("## All filters")[2], flags=re.MULTILINE)[1:]
+    families = sections[: [section.startswith("Around an env") for section in sections].index(True)]
+    assert len(families) == 11
+    for section in families:
+        assert "```python" in section and "](filters_" in section, section.partition("\n")[0]
+        assert "*Works" in section and "*Fails" in section, section.partition("\n")[0]
+
+
+def test_the_table_of_all_filters_is_that_of_the_code():
+    from docs.filter_tables import kinds
+
+    table = kinds()
+    assert table in FILTER_PAGE
+    assert [line.split("`")[1] for line in table.splitlines()[2:]] == list(FILTERS)
+    assert all(f"`{kind.__name__}`" in table for kind in FILTERS.values())
+
+
+def test_the_thrust_of_the_tunnel_falls_with_the_flow_velocity_as_the_page_says():
+    model = thruster_model()
+    states = [(speed, flow) for speed in (-190.0, -5.0, 5.0, 190.0) for flow in np.linspace(-40.0, 40.0, 801)]
+    assert max(model.observe_jacobian(state, model.constants)[0][1] for state in states) < 0
+
+
+def test_the_table_of_info_is_that_of_the_wrapper():
+    env = gym.make("filters:BowThruster-EKF-v0")
+    _, with_filter = env.reset(seed=0)
+    _, without = env.unwrapped.reset(seed=0)
+    told = re.findall(r"^\| `(\w+)` \|", FILTER_PAGE.partition("| `info` |")[2], flags=re.MULTILINE)
+    assert set(told) == set(with_filter) - set(without)
+    assert all(f'| `"{form}"` |' in FILTER_PAGE for form in OBSERVATIONS)
+
+
 @pytest.mark.slow
-def test_pictures_and_tables_are_those_of_the_code(tmp_path):
+@every_page
+def test_pictures_and_tables_are_those_of_the_code(page, tmp_path):
     pytest.importorskip("pygame")
-    shutil.copy(ROOT / "docs" / "plant.md", tmp_path)
-    subprocess.run([sys.executable, "-m", "docs.plant_figures", str(tmp_path)], cwd=ROOT, check=True)
-    anew, here = (re.split(NUMBER, page) for page in ((tmp_path / "plant.md").read_text(), PAGE))
+    shutil.copy(ROOT / "docs" / f"{page}.md", tmp_path)
+    subprocess.run([sys.executable, "-m", SCRIPTS[page], str(tmp_path)], cwd=ROOT, check=True)
+    anew, here = (re.split(NUMBER, text) for text in ((tmp_path / f"{page}.md").read_text(), PAGES[page]))
     assert anew[::2] == here[::2]
     assert [float(n) for n in here[1::2]] == pytest.approx([float(n) for n in anew[1::2]], rel=0.03)
-    assert {path.name for path in tmp_path.glob("*.png")} == set(PICTURES)
+    assert {path.name for path in tmp_path.glob("*.png")} == set(importlib.import_module(SCRIPTS[page]).FIGURES)
     assert all(path.stat().st_size < 150_000 for path in tmp_path.glob("*.png"))

@@ -1,9 +1,15 @@
-"""Where filters differ: each claim in a quick form whose paired 95 % interval still leaves no doubt."""
+"""Where filters differ: each claim in a quick form whose paired interval leaves no doubt, and docs/ranking.md."""
+
+import dataclasses
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from docs.ranking_tables import TABLES, main, scenarios, with_tables
 from tuning.compare import compare, contender
+from tuning.excitation import EXCITATIONS
 from tuning.scenarios import find_scenario, held_out_seeds
 
 
@@ -59,3 +65,59 @@ def test_there_a_filter_that_sees_two_modes_or_iterates_has_at_most_half_of_its_
 def test_there_iteration_brings_the_ekf_to_half_and_an_honest_covariance(published_noise):
     assert published_noise["iekf"].ratios[1].high < 0.55
     assert published_noise["iekf"].evaluation.nees.value < 3
+
+
+PAGE = (Path(__file__).parents[1] / "docs" / "ranking.md").read_text()
+
+
+def table(name):
+    """Cells of a table of the page, by filter or scenario."""
+    text = re.search(rf"<!-- table {name} -->\n(.*?)\n<!-- end -->", PAGE, flags=re.DOTALL)[1]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[2:]]
+    return {cells[0]: cells[1:] for cells in rows}
+
+
+def upper(cell):
+    """Upper end of "value ± half width"."""
+    value, half_width = map(float, cell.split(" ± "))
+    return value + half_width
+
+
+def test_the_page_has_every_table_and_they_show_the_claims_on_200_seeds():
+    assert set(re.findall(r"<!-- table (\w+) -->", PAGE)) == set(TABLES)
+    published = table("published")
+    assert float(published["ekf"][4]) > 20
+    assert upper(published["enkf 100"][3]) < 0.7
+    assert max(upper(published[name][3]) for name in ("pf 1000", "pf 5000", "gsf", "ienkf 100")) < 0.5
+    assert upper(table("speed")["pf 5000"][1]) < 0.85
+    assert max(upper(table("outliers")["ekf-robust"][i]) for i in (1, 3)) < 0.7
+    assert max(upper(table("ambient")["ekf + U_0"][i]) for i in (1, 3)) < 1
+    assert upper(table("reference")["pf 1000"][3]) < 1.02
+    assert len(table("scores")) == 15
+
+
+def test_only_the_tables_that_are_asked_for_are_made_anew(tmp_path):
+    page = "<!-- table scenarios -->\n<!-- end --> <!-- table speed -->\nold\n<!-- end -->"
+    made = f"<!-- table scenarios -->\n{scenarios()}\n<!-- end --> <!-- table speed -->\nold\n<!-- end -->"
+    assert with_tables(page, ["scenarios"]) == made
+    (tmp_path / "page.md").write_text(page)
+    main([str(tmp_path / "page.md"), "--table", "scenarios"])
+    assert (tmp_path / "page.md").read_text() == made
+    assert scenarios() in PAGE
+
+
+def test_the_page_has_every_excitation_with_its_arguments():
+    for name, kind in EXCITATIONS.effects.items():
+        (line,) = [
+            line for line in PAGE.splitlines() if line.startswith(f"| `{name}` | ") and line.count("|") == 4
+        ]
+        for field in dataclasses.fields(kind):
+            assert f"`{field.name}` = `{field.default}`" in line
+
+
+def test_the_page_s_scenario_file_can_be_read(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (text,) = re.findall(r"```toml\n(.*?)```", PAGE, flags=re.DOTALL)
+    (tmp_path / "my.toml").write_text(text)
+    scenario = find_scenario("my.toml")
+    assert scenario.excitation.name == "prbs" and scenario.scale[1] < find_scenario("nominal").scale[1]

@@ -1,4 +1,5 @@
 import dataclasses
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -6,8 +7,11 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState, run
+from filters.bounds import riccati_covariances
+from tuning.scenario_list import main
 from tuning.scenarios import (
     SCENARIOS,
+    computed_scale,
     find_scenario,
     held_out_seeds,
     training_seeds,
@@ -39,6 +43,48 @@ def test_an_env_stepped_with_a_scenarios_voltages_makes_the_scenarios_data_and_e
     np.testing.assert_allclose(info["state"], data.states[1, -1], rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_every_scenario_s_data_are_those_of_an_env_of_its_plant(name):
+    scenario = SCENARIOS[name].replace(steps=60)
+    data = scenario.data([5, 11])
+    env = gym.make(
+        "BowThruster-v0" if scenario.system is None else "BowThrusterLinear-v0", **scenario.plant_arguments
+    )
+    _, info = env.reset(seed=11)
+    for k in range(60):
+        valid = info.get("measurement_valid", [True])[0]
+        assert np.isnan(data.measurements[1, k, 0]) == (not valid)
+        if valid:
+            assert info["measurement"][0] == data.measurements[1, k, 0]
+        np.testing.assert_array_equal(info["state"], data.states[1, k])
+        assert info["thrust"] == data.thrusts[1, k]
+        _, _, _, _, info = env.step(data.inputs[1, k])
+
+
+def test_what_a_scenario_is_named_for_is_in_its_data():
+    def data(name):
+        return find_scenario(name).data(range(20))
+
+    nominal = data("nominal")
+    for name in ("outliers", "dropout", "mismatch"):  # the same truth, whatever spoils the sensor or the model
+        np.testing.assert_array_equal(data(name).states, nominal.states)
+    errors = np.abs(data("outliers").measurements[..., 0] - nominal.thrusts)
+    assert 0.02 < (errors > 4.0).mean() < 0.08
+    assert 0.3 < np.isnan(data("dropout").measurements).mean() < 0.7
+    biased = data("bias")
+    offsets = (biased.measurements[..., 0] - biased.thrusts).mean(axis=1)
+    assert 1.0 < offsets.std() < 2.5
+    assert (data("quantised").measurements % 4.0 == 0).all()
+    assert np.abs(data("startup").states[:, 0]).mean(axis=0)[0] > 40.0
+    swallowed = data("deadband").states[:, 100:, 0].std() / data("quantised").states[:, 100:, 0].std()
+    assert swallowed < 0.9
+    flows = data("ambient").states[:, 300:, 1] - nominal.states[:, 300:, 1]
+    assert flows.mean(axis=1).std() > 0.1
+    assert (data("speed_magnitude").measurements > -4.0).all()
+    mixed = data("mixed")
+    assert np.abs(mixed.inputs).max() > 12.0 and np.isnan(mixed.measurements).any()
+
+
 def test_training_and_held_out_seeds_never_meet():
     for seed in range(3):
         assert not set(training_seeds(seed, 1000)) & set(held_out_seeds(seed, 1000))
@@ -55,15 +101,34 @@ def test_voltages_hold_their_level_and_fill_the_range():
     assert abs((levels[:, :, 0] ** 2).mean() - 48.0) < 5 * 48.0 * np.sqrt(0.8 / 800)
 
 
-@pytest.mark.parametrize("name", ["nominal", "published_noise"])
+@pytest.mark.parametrize("name", ["nominal", "published_noise", "speed_magnitude", "reversal", "bias", "mixed"])
 def test_the_stored_scale_is_the_bound(name):
     scenario = find_scenario(name)
-    bound = scenario.bound(scenario.data(range(120)), truths=50)
-    np.testing.assert_allclose(bound, scenario.scale, rtol=0.03)
+    np.testing.assert_allclose(computed_scale(scenario, 120, truths=50), scenario.scale, rtol=0.03)
 
 
-def test_mismatch_shares_the_scale_of_its_gaussian_core():
-    assert SCENARIOS["mismatch"].scale == SCENARIOS["nominal"].scale
+@pytest.mark.parametrize("name", ["published_tunnel", "published_open_bladed"])
+def test_the_scale_of_a_linear_scenario_is_riccatis(name):
+    scenario = find_scenario(name)
+    _, posterior = riccati_covariances(scenario.model())
+    np.testing.assert_allclose(scenario.scale, np.sqrt(np.diag(posterior)), rtol=1e-3)
+
+
+def test_the_scale_of_the_published_tunnel_is_the_optimum_of_the_papers_runs():
+    assert find_scenario("published_tunnel").scale == (0.8066, 0.1457)
+
+
+def test_anyone_can_compute_a_scale_anew(capsys, monkeypatch):
+    few = partial(computed_scale, sequences=2, truths=2)  # a linear bound depends on neither
+    monkeypatch.setattr("tuning.scenario_list.computed_scale", few)
+    main(["published_tunnel"])
+    assert capsys.readouterr().out == "published_tunnel: (0.8066, 0.1457), stored (0.8066, 0.1457)\n"
+
+
+def test_scenarios_with_the_same_gaussian_core_share_its_scale():
+    for name in ("mismatch", "ambient", "outliers", "dropout"):
+        assert SCENARIOS[name].scale == SCENARIOS["nominal"].scale
+    assert SCENARIOS["deadband"].scale == SCENARIOS["quantised"].scale
     assert dict(SCENARIOS["mismatch"].parameter_factors) == {"lift_coefficient": 1.15, "voltage_gain": 0.95}
 
 
@@ -80,8 +145,23 @@ def test_scenarios_and_their_data_cannot_be_changed():
         scenario.steps = 3
     with pytest.raises(TypeError):
         SCENARIOS["mismatch"].parameter_factors["area"] = 2.0
+    with pytest.raises(TypeError):
+        SCENARIOS["outliers"].sensors["thrust"][0]["std"] = 2.0
     with pytest.raises(ValueError, match="read-only"):
         scenario.data([1]).states[0, 0, 0] = 1.0
+
+
+def test_scenarios_are_values():
+    for scenario in SCENARIOS.values():
+        again = scenario.replace()
+        assert again == scenario and hash(again) == hash(scenario) and again is not scenario
+        assert scenario.replace(amplifier=[{"name": "sag", "fraction": 0.1}]) != scenario
+    assert len(set(SCENARIOS.values())) == len(SCENARIOS)
+
+
+def test_voltages_are_cut_off_as_the_env_does():
+    data = find_scenario("nominal").replace(max_voltage=6.0).data(range(3))
+    assert np.abs(data.inputs).max() == 6.0
 
 
 @pytest.mark.parametrize(

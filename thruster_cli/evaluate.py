@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from thruster_cli.honesty import check_request, judge
-from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
+from thruster_cli.output import FILTER_HELP, JsonOption, SeedOption, announce_compilation, emit, progress_console
 from thruster_cli.tables import choice_table, comparison_table
 from tuning.scenarios import find_scenario
 from tuning.space import true_choice, untuned_choice
@@ -19,7 +19,7 @@ from tuning.tuned import read_tuned, summary
 def command(
     tuned: Annotated[Path | None, typer.Option(help="Tuned file; it names filter, numbers and scenario.")] = None,
     filter_name: Annotated[
-        str | None, typer.Option("--filter", help="Without a tuned file: kf, ekf, enkf.")
+        str | None, typer.Option("--filter", help=f"Without a tuned file. {FILTER_HELP}")
     ] = None,
     scenario: Annotated[str | None, typer.Option(help="Another scenario than the tuned file's.")] = None,
     seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,

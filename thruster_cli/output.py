@@ -27,19 +27,22 @@ PresetOption = Annotated[str, typer.Option("--preset", help=f"{', '.join(PRESETS
 SeedOption = Annotated[
     int, typer.Option("--seed", min=0, help="Seed of all randomness; the same seed repeats all.")
 ]
+FILTER_HELP = "Name of a filter; `thruster filters` lists them."
 
 console = Console(markup=False, highlight=False)
 progress_console = Console(stderr=True, markup=False, highlight=False)
 
 
-def table(title: str, columns: list[str], rows: list[list[Any]], *, caption: str | None = None) -> Table:
-    """A table for the terminal; the first column is left-aligned, the others to the right."""
+def table(
+    title: str, columns: list[str], rows: list[list[Any]], *, caption: str | None = None, words: bool = False
+) -> Table:
+    """A table for the terminal; the first column is left-aligned, others to the right unless they hold words."""
     out = Table(title=title, caption=caption, title_justify="left", caption_justify="left", box=SIMPLE_HEAD)
     out.padding, out.pad_edge = (0, 1, 0, 0), False  # five figures with their intervals fit into 80 columns
     for index, column in enumerate(columns):
-        out.add_column(Text(column), justify="left" if index == 0 else "right")
-    for row in rows:
-        out.add_row(*[Text(str(cell)) for cell in row])  # Text: units in brackets are no markup
+        out.add_column(Text(column), justify="left" if index == 0 or words else "right")
+    for row in rows:  # Text: units in brackets are no markup
+        out.add_row(*[cell if isinstance(cell, Text) else Text(str(cell)) for cell in row])
     return out
 
 

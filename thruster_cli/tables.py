@@ -8,6 +8,7 @@ from math import isnan
 import numpy as np
 from rich.table import Table
 
+from filters.registry import filter_class
 from thruster_cli.output import table
 from tuning.evaluate import Evaluation, Interval
 from tuning.scenarios import Scenario
@@ -18,19 +19,26 @@ Q_UNITS = ("(rad/s)^2", "(m/s)^2")
 
 def choice_table(choices: Mapping[str, Choice], scenario: Scenario) -> Table:
     """The numbers of filters of one kind, a column each."""
-    models = [choice.model for choice in choices.values()]
-    rows = [
-        [f"Q{i}{i} [{unit}]", *(f"{model['process_noise_cov'][i - 1]:.4g}" for model in models)]
-        for i, unit in enumerate(Q_UNITS, start=1)
-    ]
-    rows.append(["R [N^2]", *(f"{model['measurement_noise_cov']:.4g}" for model in models)])
-    sizes = [choice.numbers.get("ensemble_size") for choice in choices.values()]
-    if None not in sizes:
-        rows.append(["N", *map(str, sizes)])
     kind, caption = next(iter(choices.values())).name, None
-    if kind == "kf":
-        caption = f"kf: on the affine approximation about {scenario.model().operating_input[0]:g} V"
+    models, rows = [choice.model for choice in choices.values()], []
+    if filter_class(kind).has_covariance:
+        rows = [
+            [f"Q{i}{i} [{unit}]", *(f"{model['process_noise_cov'][i - 1]:.4g}" for model in models)]
+            for i, unit in enumerate(Q_UNITS, start=1)
+        ]
+        unit = "N^2" if scenario.plant.channels == ("thrust",) else "(rad/s)^2"
+        rows.append([f"R [{unit}]", *(f"{model['measurement_noise_cov']:.4g}" for model in models)])
+    for name in dict.fromkeys(name for choice in choices.values() for name in choice.numbers):
+        label = "N" if name == "ensemble_size" else name.replace("_", " ")
+        rows.append([label, *(_number(choice.numbers.get(name)) for choice in choices.values())])
+    operating = scenario.model().operating_input
+    if kind == "kf" and operating is not None:
+        caption = f"kf: on the affine approximation about {operating[0]:g} V"
     return table(f"Numbers of the {kind} filter", ["", *choices], rows, caption=caption)
+
+
+def _number(value) -> str:
+    return "default" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def comparison_table(evaluations: Mapping[str, Evaluation], bound: np.ndarray, title: str) -> Table:

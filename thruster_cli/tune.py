@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from filters.consistency.verdicts import mean_sentence
 from filters.registry import filter_class
-from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
+from thruster_cli.output import FILTER_HELP, JsonOption, SeedOption, announce_compilation, emit, progress_console
 from thruster_cli.tables import choice_table, comparison_table, span
 from thruster_env.checks import at_least
 from thruster_env.files import check_target
@@ -47,7 +47,7 @@ class Tuning(NamedTuple):
 
 
 def command(
-    filter_name: Annotated[str, typer.Option("--filter", help="kf, ekf or enkf.")] = "enkf",
+    filter_name: Annotated[str, typer.Option("--filter", help=FILTER_HELP)] = "enkf",
     scenario: Annotated[str, typer.Option(help="nominal, published_noise or mismatch.")] = "mismatch",
     trials: Annotated[int, typer.Option(help="Finished trials that the study shall have in total.")] = 50,
     storage: Annotated[

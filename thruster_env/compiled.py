@@ -130,7 +130,7 @@ def function_fingerprint(*functions: Callable | None) -> str:
         seen.add(function)
         digest.update(_code_text(function.__code__).encode())
         waiting += _callees(function)
-        if not function.__module__.startswith(_PACKAGES):
+        if not (function.__module__ or "").startswith(_PACKAGES):
             try:
                 digest.update(Path(inspect.getsourcefile(function) or "").read_bytes())
             except (OSError, TypeError):

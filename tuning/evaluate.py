@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.batch import run
+from filters.batch import Estimates, run
 from filters.consistency.intervals import Interval, interval, mean_interval, resampled_means, rmse_intervals
 from filters.consistency.nees import normalized_squares
 from filters.consistency.report import ConsistencyReport, consistency_report
@@ -27,6 +27,7 @@ class Evaluation(NamedTuple):
     score: Interval  # mean over states of RMSE over scale [-]
     thrust_rmse: Interval  # of the thrust that the filter's model has at its estimate [N]
     nees: Interval  # mean; n is right; NaN for filters that give no covariance
+    median_nees: float  # for two states 1.39 is right; says more where a few steps have all of the mean
     nis: Interval  # mean; m is right
     log_likelihood: float  # mean over seeds of the scored steps' sum; NaN for filters that give no covariance
     divergences: int  # restarts from the prior, over all seeds
@@ -38,19 +39,24 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
     """Run a filter over all seeds of some data in one compiled, parallel call, and judge it.
 
     Args:
-        filter_: the filter.
+        filter_: the filter; where it estimates more than the plant's n states, these come first.
         data: truth, inputs and measurements of a scenario.
         scale: (n,) what errors are measured in for the score, as the scenario says.
 
     Raises:
         ValueError: if the scale is not positive.
     """
+    return judge(filter_, run(filter_, data.filter_keys, data.inputs, data.measurements), data, scale)
+
+
+def judge(filter_: Filter, estimates: Estimates, data: Data, scale) -> Evaluation:
+    """What the estimates of a filter on some data are worth; arguments and errors are those of `evaluate`."""
     scale = np.asarray(scale, dtype=np.float64)
     if not (scale > 0).all():
         raise ValueError(f"scale must be positive in every state, but got {scale.tolist()}")
-    estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
-    errors = estimates.means - data.states
-    late = slice(FIRST_SCORED_STEP, None)
+    n, late = data.states.shape[-1], slice(FIRST_SCORED_STEP, None)
+    errors = estimates.means[..., :n] - data.states
+    squares = normalized_squares(errors[:, late], estimates.covs[:, late, :n, :n])
     mean_squares = (errors[:, late] ** 2).mean(axis=1)
     with np.errstate(all="ignore"):  # estimates far off, though finite, may have a thrust that is not
         thrusts = np.clip(thrusts_of(filter_.model, estimates.means[:, late]), -1e100, 1e100)
@@ -65,7 +71,8 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
         start_up_rmse=np.sqrt((errors[:, :FIRST_SCORED_STEP] ** 2).mean(axis=(0, 1))),
         score=interval(score(mean_squares, scale), (resampled / scale).mean(axis=1)),
         thrust_rmse=rmse_intervals((thrust_errors**2).mean(axis=1, keepdims=True))[0],
-        nees=mean_interval(normalized_squares(errors[:, late], estimates.covs[:, late])),
+        nees=mean_interval(squares),
+        median_nees=float(np.nanmedian(squares)) if np.isfinite(squares).any() else np.nan,
         nis=mean_interval(nis),
         log_likelihood=float(likelihood.sum(axis=1).mean()),
         divergences=int(estimates.divergences.sum()),

@@ -16,10 +16,13 @@ from optuna.trial import FrozenTrial, TrialState
 from tuning.evaluate import Evaluation, evaluate, score_ratio
 from tuning.scenarios import Data, Scenario, held_out_seeds, training_seeds
 from tuning.space import (
+    SIZE_LADDER,  # noqa: F401 - for those who show the sizes
     Choice,
     choice_of,
     has_ensemble,
+    has_search_space,
     parameters_of,
+    size_ladder,
     suggest,
     true_choice,
     untuned_choice,
@@ -28,7 +31,6 @@ from tuning.storage import PROCESS, retry_orphans, this_process
 
 TRAINING_SEEDS = 32
 HELD_OUT_SEEDS = 200
-SIZE_LADDER = (5, 7, 10, 14, 20, 30, 50, 70, 100, 140, 200)
 SIZE_TOLERANCE = 0.01  # the tuned ensemble is the smallest whose paired score is this close to the best
 DIVERGENCE_PENALTY = 10.0  # added to the score for each run that had to restart
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
@@ -74,8 +76,11 @@ def open_study(
     """Create a study or load it to go on; its first trial is the untuned filter.
 
     Raises:
-        ValueError: if a study of this name was made for something else or by another version of Optuna.
+        ValueError: if the filter has nothing to tune, or a study of this name was made for something else or by
+            another version of Optuna.
     """
+    if not has_search_space(filter_name):
+        raise ValueError(f"filter must be one that has something to tune, but got {filter_name!r}")
     identity = {
         "filter": filter_name,
         "scenario": scenario.name,
@@ -190,7 +195,7 @@ def _training_score(choice: Choice, scenario: Scenario, data: Data) -> float:
 
 def ensemble_sizes(choice: Choice, scenario: Scenario, data: Data) -> list[SizeRow]:
     """The score of a choice against ensemble size, paired on the same seeds, smallest size first."""
-    sizes = sorted({*SIZE_LADDER, choice.numbers["ensemble_size"]})
+    sizes = sorted({*size_ladder(choice.name), choice.numbers["ensemble_size"]})
     evaluations = [evaluate(choice.with_size(n).filter(scenario), data, scenario.scale) for n in sizes]
     best = min(evaluations, key=lambda e: e.score.value)
     return [SizeRow(n, e, score_ratio(e, best).value) for n, e in zip(sizes, evaluations, strict=True)]

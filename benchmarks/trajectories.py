@@ -1,0 +1,62 @@
+"""Filters over many trajectories at once, on all cores; the ensemble filter beside one written in JAX."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from importlib.util import find_spec
+from math import gcd
+
+import numpy as np
+
+from benchmarks.batches import shared
+from benchmarks.jax_enkf import jax_filter
+from benchmarks.rows import Row
+from benchmarks.timing import alone, side_by_side
+from filters import run
+from filters.filter import Filter
+from thruster_env.threads import cores
+from tuning.scenarios import Data, find_scenario, training_seeds
+from tuning.space import true_choice
+
+TRAJECTORIES, ENSEMBLE_SIZE = 256, 100
+AGREEMENT = 0.03  # how far the RMSE of two filters that differ in their random numbers alone may lie apart
+ALONE = (("ekf", 0.1e-6), ("ukf", 0.2e-6))  # filters without an ensemble, and the most a step may take [s]
+
+
+def rows(seed: int, quick: bool) -> Iterator[Row]:
+    """Measure, one row after the other."""
+    scenario = find_scenario("nominal")
+    count = TRAJECTORIES // 4 if quick else TRAJECTORIES
+    data, steps = scenario.data(training_seeds(seed, count)), count * scenario.steps
+    for name, goal in ALONE:
+        filter_ = true_choice(name, scenario).filter(scenario)
+        measure = shared(partial(estimates, filter_, data), steps)
+        yield Row(f"{name.upper()} batch, a step", None, alone(measure, 5 if quick else 40), time_goal=goal)
+
+    filter_ = true_choice("enkf", scenario).with_size(ENSEMBLE_SIZE).filter(scenario)
+    ours = shared(partial(estimates, filter_, data), steps * ENSEMBLE_SIZE)
+    rounds, what = 2 if quick else 10, f"EnKF batch, N = {ENSEMBLE_SIZE}"
+    yield Row(what, None, alone(ours, 5 * rounds), time_goal=8e-9)
+    if find_spec("jax") is None:
+        yield Row(what, "JAX is not installed", alone(ours, rounds))
+        return
+    given = data.inputs[..., 0], data.measurements[..., 0]
+    parts = gcd(cores(), count)
+    for devices, name, goal in ((1, "JAX", 1 / 7), (parts, f"JAX, {parts} devices", None)):
+        estimate = partial(jax_filter(scenario.plant, ENSEMBLE_SIZE, seed, devices), *given)
+        check_agreement(estimates(filter_, data), estimate()[0], data.states)
+        peer = shared(estimate, steps * ENSEMBLE_SIZE)
+        yield Row(what, name, side_by_side(ours, peer, rounds, warm_up=False), ratio_goal=goal)
+
+
+def estimates(filter_: Filter, data: Data) -> np.ndarray:
+    """The means that a filter finds, (B, K + 1, n)."""
+    return run(filter_, data.filter_keys, data.inputs, data.measurements).means
+
+
+def check_agreement(ours: np.ndarray, theirs: np.ndarray, states: np.ndarray) -> None:
+    """Raise ValueError unless two filters' estimates (B, K + 1, n) are as good: else their times tell nothing."""
+    ratio = np.sqrt(np.mean((ours - states) ** 2, axis=(0, 1)) / np.mean((theirs - states) ** 2, axis=(0, 1)))
+    if np.any(np.abs(ratio - 1.0) > AGREEMENT):
+        raise ValueError(f"two ensemble filters must have the same RMSE within {AGREEMENT:.0%}, but got {ratio}")

@@ -1,0 +1,85 @@
+"""What the scripts of all pages share: tables in Markdown, common parts of pictures, the command line."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from thruster_env.files import write_whole
+
+SKY, MUSTARD = "#56b4e9", "#b8860b"  # beside those of thruster_env.figures
+
+
+def table(header: list[str], rows: list[list[str]]) -> str:
+    """A table in Markdown."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line)} |".replace("|  |", "| |") for line in lines)
+
+
+def digits(value: float, count: int = 3) -> str:
+    """A number to so many digits."""
+    return f"{float(f'{value:.{count}g}'):.6g}"  # the detour keeps 8820 from becoming 8.82e+03
+
+
+def legend_below(figure, axis, columns: int = 4) -> None:
+    """One legend for a whole figure, that of one of its axes."""
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=columns, frameon=False)
+
+
+def label_grid(axes, x: str, y: str) -> None:
+    """Label a grid of axes along its lower and its left side."""
+    for axis in axes[-1]:
+        axis.set_xlabel(x)
+    for axis in axes[:, 0]:
+        axis.set_ylabel(y)
+
+
+def log_ticks(axis, values: Sequence[float]) -> None:
+    """Make an axis logarithmic, with plain numbers at some values."""
+    from matplotlib.ticker import FixedFormatter, FixedLocator, NullLocator
+
+    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+    axis.set_major_locator(FixedLocator(values))
+    axis.set_major_formatter(FixedFormatter([f"{value:g}" for value in values]))
+    axis.set_minor_locator(NullLocator())
+
+
+def with_tables(page: str, tables: Mapping[str, Callable[[], str]]) -> str:
+    """The page with these computed tables written anew; others stay."""
+
+    def anew(match: re.Match) -> str:
+        if match[2] not in tables:
+            return match[0]
+        return f"{match[1]}\n{tables[match[2]]()}\n{match[3]}"
+
+    return re.sub(r"(<!-- table (\w+) -->).*?(<!-- end -->)", anew, page, flags=re.DOTALL)
+
+
+def make_page(
+    name: str,
+    module: str,
+    figures: Mapping[str, Callable[[Path], Path]],
+    tables: Mapping[str, Callable[[], str]],
+    about: str,
+    arguments: Sequence[str] | None,
+) -> None:
+    """Run the command line of a page's script: draw its pictures, write its tables anew.
+
+    Args:
+        name: of the page, "plant" for plant.md.
+        module: the script.
+        figures: what draws each picture, by file name.
+        tables: what makes each computed table, by name.
+        about: one line for help.
+        arguments: of the command line; those of the process if None.
+    """
+    parser = argparse.ArgumentParser(prog=f"python -m {module}", description=about)
+    parser.add_argument("folder", nargs="?", type=Path, default=Path(__file__).parent, metavar="FOLDER")
+    folder = parser.parse_args(arguments).folder
+    for file_name, draw in figures.items():
+        draw(folder / file_name)
+    page = folder / f"{name}.md"
+    if page.exists():
+        write_whole(page, with_tables(page.read_text(), tables))

@@ -1,0 +1,164 @@
+"""Make the tables of docs/ranking.md: which filter beats which where, on held-out seeds.
+
+    python -m docs.ranking_tables [PAGE] [--table NAME]...
+
+The tables between the comments `<!-- table NAME -->` and `<!-- end -->` of PAGE, docs/ranking.md by default, are
+written anew; all of them take some ten minutes on two cores. Every run gives the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from filters.consistency.intervals import Interval
+from thruster_env.files import write_whole
+from tuning.compare import Contender, Leaderboard, Row, compare, contender
+from tuning.excitation import Steps
+from tuning.scenarios import SCENARIOS, Scenario, find_scenario, held_out_seeds
+
+SEEDS = 200
+REFERENCE_SEEDS, REFERENCE_SIZE = 20, 100_000
+EKF, ROBUST, IEKF, UKF, GSF = (contender(name) for name in ("ekf", "ekf-robust", "iekf", "ukf", "gsf"))
+PF, MANY = contender("pf"), contender("pf", ensemble_size=5000)
+ENKF, IENKF = (contender(name, ensemble_size=100) for name in ("enkf", "ienkf"))
+SMALL = contender("enkf", ensemble_size=30)
+INFLATED, SMALL_INFLATED = (contender("enkf", ensemble_size=size, inflation=1.1) for size in (100, 30))
+IENKF_INFLATED = contender("ienkf", ensemble_size=100, inflation=1.1)
+FLOW = {"ambient_velocity": None}
+COLUMNS = ("omega_m [rad/s]", "over {0}", "U_a [m/s]", "over {0}", "NEES", "NIS", "log L")
+
+
+def speed() -> str:
+    """|speed| at slow crossings and dwells."""
+    by_speed = contender("gsf", component=0)  # the sum is split along omega_m
+    return _table(_board(find_scenario("speed_magnitude"), [EKF, UKF, by_speed, ENKF, PF, MANY]))
+
+
+def fast() -> str:
+    """|speed| at fast reversals."""
+    slow = find_scenario("speed_magnitude")
+    scenario = slow.replace(name="fast_reversals", excitation=Steps(12.0), measurement_noise_cov=25.0)
+    return _table(_board(scenario, [EKF, UKF, MANY]))
+
+
+def outliers() -> str:
+    """Outliers in the thrust."""
+    return _table(_board(find_scenario("outliers"), [EKF, ROBUST, ENKF, PF]))
+
+
+def ambient() -> str:
+    """A flow that the filter does not know, and filters that estimate it."""
+    joint = [contender("ekf", unknown=FLOW), contender("enkf", unknown=FLOW, ensemble_size=100)]
+    return _table(_board(find_scenario("ambient"), [EKF, joint[0], ENKF, joint[1]]))
+
+
+def published() -> str:
+    """The published noise."""
+    ensembles = [SMALL, SMALL_INFLATED, ENKF, INFLATED, IENKF, IENKF_INFLATED]
+    return _table(_board(find_scenario("published_noise"), [EKF, IEKF, UKF, *ensembles, GSF, PF, MANY]))
+
+
+def reference() -> str:
+    """The published noise, beside a particle filter with so many particles that more change nothing."""
+    best = contender("pf", ensemble_size=REFERENCE_SIZE)
+    filters = [best, EKF, IEKF, UKF, ENKF, IENKF, GSF, PF, MANY]
+    return _table(_board(find_scenario("published_noise"), filters, REFERENCE_SEEDS))
+
+
+def startup() -> str:
+    """RMSE of the first 50 steps from an unknown state."""
+    lines = ["| filter | omega_m [rad/s] | U_a [m/s] |", "|---|---|---|"]
+    for row in _board(find_scenario("startup"), [EKF, IEKF, UKF, ENKF, GSF, PF]).rows:
+        speed_error, flow_error = row.evaluation.start_up_rmse
+        lines.append(f"| {row.label} | {speed_error:.1f} | {flow_error:.3f} |")
+    return "\n".join(lines)
+
+
+def scores() -> str:
+    """Scores over that of the EKF, a row a scenario."""
+    filters = [EKF, ROBUST, IEKF, UKF, ENKF, GSF, PF]
+    boards = [_board(scenario, filters) for scenario in SCENARIOS.values()]
+    labels = [one.label for one in filters[1:]]
+    lines = [f"| scenario | ekf: score | {' | '.join(labels)} |", "|---" * (len(labels) + 2) + "|"]
+    for board in boards:
+        first, *others = board.rows
+        cells = [f"`{board.scenario.name}`", f"{first.evaluation.score.value:.2f}", *map(_ratio, others)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def scenarios() -> str:
+    """What each scenario is."""
+    lines = ["| scenario | what it is | excitation | scale |", "|---|---|---|---|"]
+    for one in SCENARIOS.values():
+        arguments = [f"{key} {value}" for key, value in one.excitation.as_mapping().items() if key != "name"]
+        excitation = f"`{one.excitation.name}`: {', '.join(arguments)}"
+        speed_scale, flow_scale = one.scale
+        lines.append(f"| `{one.name}` | {one.about} | {excitation} | {speed_scale} rad/s, {flow_scale} m/s |")
+    return "\n".join(lines)
+
+
+def _board(scenario: Scenario, filters: Sequence[Contender], seeds: int = SEEDS) -> Leaderboard:
+    (board,), interrupted = compare(filters, [scenario], held_out_seeds(0, seeds))
+    if interrupted:
+        raise KeyboardInterrupt
+    return board
+
+
+def _table(board: Leaderboard) -> str:
+    """RMSE by state with its distance from the bound, the paired ratio, and consistency, a row a filter."""
+    lines = [f"| filter | {' | '.join(COLUMNS).format(board.rows[0].label)} |", "|---" * 8 + "|"]
+    for row in board.rows:
+        cells = [row.label]
+        for rmse, above, ratio, digits in zip(
+            row.evaluation.rmse, row.above_bound, row.ratios, (3, 4), strict=True
+        ):
+            cells.append(f"{_about(rmse, digits)} ({100 * above:+.0f} %)")
+            cells.append("" if row is board.rows[0] else _about(ratio, 3))
+        nees = f"{row.nees:.2f} (median)" if row.nees_is_median else f"{row.nees:.3g}"
+        cells += [nees, f"{row.evaluation.nis.value:.3g}", f"{row.evaluation.log_likelihood:.0f}"]
+        lines.append(f"| {' | '.join(cells)} |")
+    bound = f"| bound | {board.bound[0]:.3f} | | {board.bound[1]:.4f} | | 2 (median 1.39) | 1 | |"
+    return "\n".join([*lines, bound])
+
+
+def _ratio(row: Row) -> str:
+    """The ratio of scores; bold where the filter is significantly better, in brackets where no worse either."""
+    text = f"{row.score_ratio.value:.3f}"
+    return {"better": f"**{text}**", "worse": text, "tie": f"({text})"}[row.verdict]
+
+
+def _about(value: Interval, digits: int) -> str:
+    return f"{value.value:.{digits}f} ± {(value.high - value.low) / 2:.{digits}f}"
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    table.__name__: table
+    for table in (speed, fast, outliers, ambient, published, reference, startup, scores, scenarios)
+}
+
+
+def with_tables(page: str, names: Sequence[str] = tuple(TABLES)) -> str:
+    """The page with some of its computed tables written anew."""
+
+    def anew(match: re.Match) -> str:
+        return f"{match[1]}\n{TABLES[match[2]]()}\n{match[3]}" if match[2] in names else match[0]
+
+    return re.sub(r"(<!-- table (\w+) -->).*?(<!-- end -->)", anew, page, flags=re.DOTALL)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(prog="python -m docs.ranking_tables", description=__doc__.splitlines()[0])
+    parser.add_argument("page", nargs="?", type=Path, default=Path(__file__).parent / "ranking.md", metavar="PAGE")
+    parser.add_argument("--table", action="append", choices=list(TABLES), help="only this one; may be repeated")
+    given = parser.parse_args(arguments)
+    for name in given.table or TABLES:  # written one by one, so that what is done stays
+        write_whole(given.page, with_tables(given.page.read_text(), [name]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,191 @@
+import json
+import os
+import signal
+import sys
+
+import numpy as np
+import pytest
+
+from filters.augmented import Unknown
+from thruster_cli.main import main
+from tuning.compare import compare, contender, default_belief, sized
+from tuning.evaluate import evaluate, score_ratio
+from tuning.scenarios import find_scenario, held_out_seeds
+from tuning.space import true_choice, untuned_choice
+from tuning.study import Comparison, StudyResult
+from tuning.tuned import write_tuned
+
+NOMINAL, SEEDS = find_scenario("nominal"), held_out_seeds(0, 12)
+
+
+def test_a_row_is_the_filter_s_evaluation_beside_the_first_one_s():
+    contenders = [contender("ekf"), contender("ukf", "untuned")]
+    (board,), interrupted = compare(contenders, [NOMINAL], SEEDS)
+    assert not interrupted and [row.label for row in board.rows] == ["ekf", "ukf"]
+    data = NOMINAL.data(SEEDS)
+    ekf = evaluate(true_choice("ekf", NOMINAL).filter(NOMINAL), data, NOMINAL.scale)
+    ukf = evaluate(untuned_choice("ukf", NOMINAL).filter(NOMINAL), data, NOMINAL.scale)
+    first, second = board.rows
+    assert first.evaluation.rmse == ekf.rmse and second.evaluation.rmse == ukf.rmse
+    assert first.score_ratio == (1.0, 1.0, 1.0) and first.verdict == "tie"
+    assert second.score_ratio == score_ratio(ukf, ekf) and second.verdict == "worse"
+    np.testing.assert_allclose(board.bound, NOMINAL.bound(data))
+    np.testing.assert_allclose(
+        first.above_bound, [e.value / b - 1 for e, b in zip(ekf.rmse, board.bound, strict=True)]
+    )
+    assert first.microseconds > 0 and first.nees == ekf.nees.value and not first.nees_is_median
+
+
+def test_particle_filters_have_a_thousand_particles_and_are_judged_by_the_median():
+    (board,), _ = compare(
+        [contender("ekf"), contender("pf"), contender("enkf", ensemble_size=7)], [NOMINAL], SEEDS
+    )
+    ekf, pf, enkf = board.rows
+    assert (pf.label, enkf.label) == ("pf 1000", "enkf 7")
+    assert pf.nees_is_median and pf.nees == pf.evaluation.median_nees
+    assert 1.2 < pf.nees < 1.7 and 1.2 < ekf.evaluation.median_nees < 1.6  # chi-square's is 1.386
+    assert enkf.evaluation.score.value > ekf.evaluation.score.value
+
+
+def test_an_augmented_filter_is_judged_by_the_plant_s_states():
+    ambient = find_scenario("ambient")
+    plain, joint = contender("ekf"), contender("ekf", unknown={"ambient_velocity": Unknown(0.5, 0.02)})
+    assert joint.label == "ekf + U_0" and contender("enkf", inflation=1.1).label == "enkf 30 inflation 1.1"
+    model = joint.filter(ambient).model
+    assert model.n == 3 and model.prior_cov[2, 2] == 0.25 and model.process_noise_cov[2, 2] == pytest.approx(4e-4)
+    (board,), _ = compare([plain, joint], [ambient], SEEDS)
+    assert board.rows[1].verdict == "better" and len(board.rows[1].ratios) == 2
+    assert board.rows[1].evaluation.nees.value < board.rows[0].evaluation.nees.value
+
+
+def test_what_is_believed_by_default():
+    assert default_belief("ambient_velocity", 0.0) == Unknown(0.5, 0.01)
+    assert default_belief("load_gain", -20.0) == Unknown(4.0, pytest.approx(0.08))
+    with pytest.raises(ValueError, match="the assumed asymmetry, .* must be positive, but got 0.0"):
+        default_belief("asymmetry", 0.0)
+
+
+def test_a_size_is_for_filters_that_have_an_ensemble():
+    assert sized(true_choice("ekf", NOMINAL), 50) == true_choice("ekf", NOMINAL)
+    assert sized(true_choice("enkf", NOMINAL), 50).numbers == {"ensemble_size": 50}
+    assert sized(true_choice("enkf", NOMINAL), None).numbers == {"ensemble_size": 30}
+
+
+@pytest.mark.parametrize(
+    ("call", "rule"),
+    [
+        (lambda: compare([], [NOMINAL], SEEDS), "a comparison must be of different filters, but got none"),
+        (lambda: compare([contender("ekf")] * 2, [NOMINAL], SEEDS), "different filters, but got ekf, ekf"),
+        (lambda: contender("none"), "filter must be one of"),
+        (lambda: contender("ekf", "much"), "knows must be one of true, untuned, but got 'much'"),
+        (lambda: contender("enkf", ensemble_size=1).filter(NOMINAL), "ensemble_size must be"),
+        (
+            lambda: contender("ekf", unknown={"colour": None}).filter(NOMINAL),
+            "a constant to estimate must be one of motor_damping, .*, but got 'colour'",
+        ),
+        (
+            lambda: contender("ekf", unknown={"ambient_velocity": None}).filter(find_scenario("published_tunnel")),
+            "a constant to estimate must be one of ",
+        ),
+    ],
+)
+def test_wrong_arguments_are_refused_with_the_rule_and_the_value(call, rule):
+    with pytest.raises(ValueError, match=rule):
+        call()
+
+
+def interrupt_at(label):
+    def on_row(scenario, shown):
+        if shown == label:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    return on_row
+
+
+def test_ctrl_c_keeps_the_rows_that_are_done():
+    contenders = [contender(name) for name in ("ekf", "ukf", "ckf")]
+    boards, interrupted = compare(contenders, [NOMINAL] * 2, SEEDS, interrupt_at("ukf"))
+    assert interrupted and [[row.label for row in board.rows] for board in boards] == [["ekf", "ukf"]]
+
+
+@pytest.fixture
+def thruster(tmp_path, monkeypatch, capsys):
+    """Run the command in this process, in an empty folder; return its exit code, output and errors."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["thruster", "compare", *map(str, arguments)])
+        capsys.readouterr()
+        code = 0
+        try:
+            main()
+        except SystemExit as stop:
+            code = stop.code or 0
+        return code, *capsys.readouterr()
+
+    return run
+
+
+def test_the_command_ranks_filters_on_scenarios(thruster, tmp_path):
+    options = ("--filter", "ekf", "--filter", "ekf-robust", "--seeds", 8)
+    code, out, _ = thruster(*options, "--scenario", "outliers", "--scenario", "nominal", "--json", "board.json")
+    assert code == 0
+    for word in ("outliers: one thrust in twenty", "RMSE on held-out seeds 500000 to 500007", "rad/s", "bound"):
+        assert word in out
+    assert "On outliers, against ekf by the score: better: ekf-robust." in out
+    content = json.loads((tmp_path / "board.json").read_text())
+    assert content["seeds"] == [500000, 500008] and set(content["scenarios"]) == {"outliers", "nominal"}
+    row = content["scenarios"]["outliers"]["filters"]["ekf-robust"]
+    assert row["verdict"] == "better" and row["score_over_first"][2] < 1 and row["divergences"] == 0
+    assert len(row["rmse_over_first"]) == 2 and row["microseconds_a_step"] > 0
+
+
+def test_the_command_takes_sizes_augmentation_and_scenario_files(thruster, tmp_path):
+    (tmp_path / "my.toml").write_text('base = "ambient"\nsteps = 100\nscale = [1.0, 0.05]\n')
+    options = ("--filter", "ekf", "--filter", "enkf", "--filter", "low-pass", "--ensemble-size", "enkf=12")
+    code, out, _ = thruster(
+        *options, "--augment", "ambient_velocity:0.4:0.01", "--scenario", "my.toml", "--seeds", 4, "--json", "-"
+    )
+    labels = ["ekf", "ekf + U_0", "enkf 12", "enkf 12 + U_0", "low-pass"]
+    filters = json.loads(out)["scenarios"]["my.toml"]["filters"]
+    assert code == 0 and list(filters) == labels
+    assert filters["low-pass"]["nees"] is None and filters["low-pass"]["median_nees"] is None
+
+
+def test_the_command_takes_tuned_files(thruster, tmp_path):
+    scenario = find_scenario("mismatch")
+    choice = untuned_choice("enkf", scenario)
+    evaluation = evaluate(choice.filter(scenario), scenario.data([1, 2]), scenario.scale)
+    proof = Comparison(evaluation, evaluation, evaluation, np.array(scenario.scale), range(2))
+    write_tuned(tmp_path / "mine.json", scenario, 0, StudyResult(choice, 1.0, [], [], 0.0, False), proof, "s")
+    code, out, _ = thruster("mine.json", "--filter", "ekf", "--seeds", 4, "--ensemble-size", 20)
+    assert code == 0 and "mismatch:" in out and "Over mine, paired" in out
+    code, out, _ = thruster("mine.json", "--seeds", 4, "--scenario", "nominal")
+    assert code == 0 and "On nominal there is nothing to compare mine with." in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("--filter", "none"), "filter must be one of kf, "),
+        (("--scenario", "none"), "scenario must be one of nominal, "),
+        (("--scenario", "no.toml"), "a scenario file must be readable, but no.toml is not"),
+        (("--knows", "all"), "knows must be one of true, untuned, but got 'all'"),
+        (("--seeds", "1"), "held-out seeds must be a whole number of at least 2, but got 1"),
+        (("--ensemble-size", "many"), "--ensemble-size must be a finite number, but got 'many'"),
+        (("--ensemble-size", "ekf=5"), "--ensemble-size must be for a filter with an ensemble, but got 'ekf=5'"),
+        (("--augment", "ambient_velocity:x"), "--augment must be NAME, NAME:STD or NAME:STD:WALK, but got"),
+        (("--filter", "ekf", "--augment", "colour"), "a constant to estimate must be one of motor_damping"),
+        (("--filter", "ekf", "--augment", "load_gain:-1"), "std of load_gain must be positive, but got -1.0"),
+        (("missing.json",), "a tuned file must be readable"),
+    ],
+)
+def test_a_users_mistake_is_one_clear_line_and_exit_code_2(arguments, line, thruster):
+    code, _, errors = thruster(*arguments)
+    assert code == 2 and line in errors and "Traceback" not in errors
+
+
+def test_help_teaches_by_an_example(thruster):
+    code, out, _ = thruster("--help")
+    assert code == 0 and "Example: thruster compare --filter ekf" in " ".join(out.split())

@@ -1,0 +1,146 @@
+"""`thruster filters`: the filters there are, and the numbers that each can be given."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import textwrap
+from inspect import cleandoc
+from itertools import groupby
+from typing import Annotated, Any, NamedTuple
+
+import typer
+from rich.text import Text
+
+from filters.filter import Filter
+from filters.registry import FILTERS, filter_class, tunable_numbers
+from thruster_cli.output import JsonOption, console, emit, table
+from tuning.space import has_ensemble
+
+ATTRIBUTES, ERRORS = "Attributes:", "Raises:"  # what these sections of a docstring begin with
+OWNERS_WIDTH = 27  # of the longest number, so that the names of filters take no room from what it means
+
+
+class Number(NamedTuple):
+    """A number that a filter can be given."""
+
+    name: str
+    default: Any
+    meaning: str
+
+
+class Entry(NamedTuple):
+    """What is said of a filter."""
+
+    name: str
+    about: str
+    covariance: bool  # whether it says how far it may be off
+    ensemble: bool
+    numbers: tuple[Number, ...]
+    documentation: str
+
+
+def command(
+    name: Annotated[str | None, typer.Argument(help="A filter, to be shown in full.")] = None,
+    json: JsonOption = None,
+) -> None:
+    """List the filters, their numbers and what these mean; or show one filter with its equations and sources.
+
+    Every name can be given to --filter of other commands, to EstimateState and to make_filter.
+
+    Example: thruster filters ukf
+    """
+    if name is not None:
+        filter_class(name)
+    entries = [entry(known) for known in FILTERS if name in (None, known)]
+    shown = overview(entries) if name is None else in_full(entries[0], console.width)
+    emit(shown, {"filters": [_plain(one) for one in entries]}, json)
+
+
+def entry(name: str) -> Entry:
+    """What the class of a filter says of it."""
+    kind = filter_class(name)
+    text, meaning = cleandoc(kind.__doc__), _meanings(kind)
+    defaults = {field.name: field.default for field in dataclasses.fields(kind)}
+    numbers = tuple(Number(number, defaults[number], meaning[number]) for number in tunable_numbers(name))
+    return Entry(name, first_sentence(text), kind.has_covariance, has_ensemble(name), numbers, text)
+
+
+def overview(entries: list[Entry]) -> list:
+    """All filters in one table and all their numbers in another, each number once for all who share it."""
+    filters = [[one.name, one.about, _yes(one.covariance), _yes(one.ensemble)] for one in entries]
+    owners: dict[Number, list[str]] = {}
+    for one in entries:
+        for number in one.numbers:
+            owners.setdefault(number, []).append(one.name)
+    numbers = []
+    for names, group in groupby(owners, owners.get):
+        numbers.append([Text(textwrap.fill(", ".join(names), OWNERS_WIDTH), style="bold"), "", ""])
+        numbers += [[f"  {number.name}", number.default, first_sentence(number.meaning)] for number in group]
+    return [
+        table("Filters", ["filter", "what it is", "cov.", "ens."], filters, words=True),
+        table("Their own numbers, beside the model's", ["of; number", "default", "meaning"], numbers, words=True),
+        "cov.: it has a covariance, which says how far the estimate may be off. ens.: it has an ensemble.",
+        "thruster filters NAME shows one in full, with its equations and sources.",
+    ]
+
+
+def in_full(one: Entry, width: int) -> list:
+    """One filter: its documentation, fitted to a width, and a table of its numbers."""
+    kind = filter_class(one.name)
+    has = f"covariance: {_yes(one.covariance)}, ensemble: {_yes(one.ensemble)}"
+    shown = [Text(one.name, style="bold"), f"{kind.__module__}.{kind.__name__}", has, ""]
+    shown.append(fitted(one.documentation, width))
+    if one.numbers:
+        shown += ["", table("Its own numbers", ["number", "default", "meaning"], list(one.numbers), words=True)]
+    return shown
+
+
+def first_sentence(text: str) -> str:
+    """The text up to the first full stop that ends a sentence, on one line."""
+    return re.match(r".*?(\.(?=\s|$)|$)", " ".join(text.split())).group()
+
+
+def fitted(documentation: str, width: int) -> str:
+    """A docstring without its attributes: sentences fill the width, equations keep their lines while these fit."""
+    paragraphs = [part for part in documentation.split("\n\n") if not part.startswith(ATTRIBUTES)]
+    return "\n\n".join(_fitted_paragraph(part, width) for part in paragraphs)
+
+
+def _fitted_paragraph(text: str, width: int) -> str:
+    if text[0] != " " and not text.startswith(ERRORS):
+        return textwrap.fill(" ".join(text.split()), width, break_on_hyphens=False)
+    return "\n".join(_fitted_equations(line, width) for line in text.splitlines())
+
+
+def _fitted_equations(line: str, width: int) -> str:
+    """A line of equations, broken where two spaces part them; the rest stands below the first one."""
+    label = re.match(r" *([\w, ]+: +)?", line).end()
+    lines, parts = [line[:label]], re.split(r"(?<=\S)  (?=\S)", line[label:])
+    for number, part in enumerate(parts):
+        if number and len(lines[-1]) + 2 + len(part) <= width:
+            lines[-1] += "  " + part
+            continue
+        first = " " * label if number else lines.pop()
+        indents = {"initial_indent": first, "subsequent_indent": " " * (label + 2)}
+        lines += textwrap.wrap(part, width, **indents, break_on_hyphens=False)
+    return "\n".join(lines)
+
+
+def _meanings(kind: type[Filter]) -> dict[str, str]:
+    """What the docstrings of a class and of its bases say of each attribute."""
+    found = {}
+    for base in reversed(kind.__mro__):
+        text = cleandoc(base.__doc__ or "")
+        for section in (part for part in text.split("\n\n") if part.startswith(ATTRIBUTES)):
+            for name, meaning in re.findall(r"^    (\w+): (.*(?:\n     .*)*)", section, flags=re.MULTILINE):
+                found[name] = " ".join(meaning.split())
+    return found
+
+
+def _yes(answer: bool) -> str:
+    return "yes" if answer else "no"
+
+
+def _plain(one: Entry) -> dict:
+    return {**one._asdict(), "numbers": [number._asdict() for number in one.numbers]}

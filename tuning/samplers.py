@@ -1,0 +1,63 @@
+"""Optuna's samplers by name: how a study proposes its next choice."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+
+import numpy as np
+import optuna
+
+from thruster_env.checks import one_of
+
+SAMPLERS = {
+    "tpe": "tree-structured Parzen estimator, all numbers together; good from some ten trials on",
+    "gp": "Gaussian process; the fewest trials, but 0.1 to 0.4 s for each proposal (needs torch)",
+    "cma-es": "covariance matrix adaptation; good for many trials of a smooth error (needs cmaes)",
+    "nsga-ii": "genetic, made for two objectives",
+    "random": "independent draws, what every other sampler should beat",
+    "grid": "every combination of some values of each number, in random order",
+}
+GRID_VALUES = 5  # of each number
+NEEDS = {"gp": ("torch", "rl"), "cma-es": ("cmaes", "samplers")}
+
+
+def make_sampler(name: str, seed: int, present: int, distributions: Mapping) -> optuna.samplers.BaseSampler:
+    """A sampler.
+
+    Args:
+        name: one of SAMPLERS.
+        seed: the study's; the same seed gives the same study in one process.
+        present: trials that the study has; a sampler with the same seed would repeat its first trials on resume.
+        distributions: of all numbers by name, from which a grid is made.
+
+    Raises:
+        ValueError: for an unknown name, or a missing package.
+    """
+    one_of("sampler", name, tuple(SAMPLERS))
+    package, extra = NEEDS.get(name, (None, None))
+    if package is not None and importlib.util.find_spec(package) is None:
+        raise ValueError(f"the sampler {name!r} needs {package}: pip install 'thruster-env[{extra}]'")
+    seed = int(np.random.SeedSequence([seed, present]).generate_state(1)[0])
+    if name == "grid":
+        values = {key: _grid(distribution) for key, distribution in distributions.items()}
+        return optuna.samplers.GridSampler(values, seed=seed)
+    makers = {
+        "tpe": optuna.samplers.TPESampler,
+        "gp": optuna.samplers.GPSampler,
+        "cma-es": optuna.samplers.CmaEsSampler,
+        "nsga-ii": optuna.samplers.NSGAIISampler,
+        "random": optuna.samplers.RandomSampler,
+    }
+    return makers[name](seed=seed)
+
+
+def _grid(distribution: optuna.distributions.BaseDistribution) -> list:
+    """Some values over the range of a number, evenly on its own scale."""
+    if isinstance(distribution, optuna.distributions.CategoricalDistribution):
+        return list(distribution.choices)
+    spaced = np.geomspace if distribution.log else np.linspace
+    values = spaced(distribution.low, distribution.high, GRID_VALUES)
+    if isinstance(distribution, optuna.distributions.IntDistribution):
+        return sorted({int(round(value)) for value in values})
+    return [float(np.clip(value, distribution.low, distribution.high)) for value in values]

@@ -1,0 +1,212 @@
+"""`Scenario`: a named, seeded, immutable recipe that makes truth, inputs and measurements once for all filters."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, lru_cache
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.bounds import posterior_bound
+from filters.model import StateSpaceModel
+from filters.thruster import model_of_plant
+from thruster_env.analysis import equilibrium
+from thruster_env.checks import at_least, positive, shown, vector
+from thruster_env.linear import state_range
+from thruster_env.linear_plant import make_linear_plant
+from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_PROCESS_NOISE, Plant, make_plant
+from thruster_env.sensors import CHANNELS
+from thruster_env.simulation import simulate
+from thruster_env.streams import episode_keys, filter_keys
+from tuning.excitation import EXCITATIONS, Excitation, Steps
+
+FIRST_SCORED_STEP = 50  # RMSE counts steps 50 to 500; start-up is reported apart
+UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as part of each state's range
+SCALE_SEQUENCES = 1200  # voltage sequences that a stored scale is the bound of
+
+
+class Data(NamedTuple):
+    """What a scenario makes for B seeds and K steps."""
+
+    seeds: tuple[int, ...]
+    inputs: np.ndarray  # (B, K, 1) [V]
+    states: np.ndarray  # (B, K + 1, 2)
+    thrusts: np.ndarray  # (B, K + 1) [N]
+    measurements: np.ndarray  # (B, K + 1, 1), NaN where missing
+    filter_keys: np.ndarray  # (B, 2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """A plant, an excitation and what a filter assumes of the plant.
+
+    A filter's model is the plant's, but for `parameter_factors`; it knows the distribution of the initial state
+    and a constant `ambient_velocity`. Of sensor effects, `flow`, `amplifier` and `uncertainty` it knows nothing.
+
+    Attributes:
+        name: its name; that of its file if it was read from one.
+        about: one line for tables and help.
+        measurement_noise_cov: the plant's R, the variance of the sensor's sheet [N^2, or the channel's unit^2].
+        process_noise_cov: the plant's Q, two variances a step [(rad/s)^2, (m/s)^2].
+        scale: bound on the standard error of each state, (omega_m [rad/s], U_a [m/s]), of the scenario's Gaussian
+            core: fixed numbers that errors are measured in, made by `computed_scale`.
+        parameter_factors: factors on the plant's parameters in the filter's model.
+        excitation: makes the voltages; one of `excitation.EXCITATIONS`, or a mapping with its name.
+        steps: length of a run.
+        system: a published linear system that is the plant, "tunnel" or "open_bladed"; None for the equations.
+        preset: the thruster, as for `thruster_env.plant.make_plant`; so are all that follow.
+        dt: sample time [s].
+        max_voltage: voltages are clipped to plus and minus this [V].
+        ambient_velocity: constant flow U_0 [m/s].
+        initial_state: None, two numbers, or a mapping.
+        sensors: one channel, a list of its name or a mapping from it to a list of effects.
+        flow: list of signals.
+        amplifier: list of effects.
+        uncertainty: distributions of factors on parameters, drawn anew for each seed.
+    """
+
+    name: str
+    about: str = ""
+    process_noise_cov: tuple[float, float] = DEFAULT_PROCESS_NOISE
+    measurement_noise_cov: float = CHANNELS["thrust"][1]
+    scale: tuple[float, float]
+    parameter_factors: Mapping[str, float] = field(default_factory=dict)
+    excitation: Excitation | Mapping = field(default_factory=Steps)
+    steps: int = 500
+    system: str | None = None
+    preset: str | Mapping = "tunnel"
+    dt: float = DEFAULT_DT
+    max_voltage: float = DEFAULT_MAX_VOLTAGE
+    ambient_velocity: float = 0.0
+    initial_state: Sequence | Mapping | None = None
+    sensors: Sequence | Mapping = ("thrust",)
+    flow: Sequence = ()
+    amplifier: Sequence = ()
+    uncertainty: Mapping = field(default_factory=dict)
+
+    def __post_init__(self):
+        """Check what the plant, which is made when it is needed, does not."""
+        if not isinstance(self.excitation, Excitation):
+            object.__setattr__(self, "excitation", EXCITATIONS.make([self.excitation])[0])
+        for name, kind, called in (("about", str, "text"), ("parameter_factors", Mapping, "a mapping")):
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"{name} must be {called}, but got {shown(getattr(self, name))}")
+        if isinstance(self.sensors, str) or not isinstance(self.sensors, Collection) or len(self.sensors) != 1:
+            raise ValueError(f"sensors of a scenario must be one channel, but got {shown(self.sensors)}")
+        scale = vector("scale", self.scale, 2)
+        if not (scale > 0).all():
+            raise ValueError(f"scale must be positive in every state, but got {scale.tolist()}")
+        checked = {
+            "process_noise_cov": vector("process_noise_cov", self.process_noise_cov, 2).tolist(),
+            "measurement_noise_cov": positive("measurement_noise_cov", self.measurement_noise_cov),
+            "scale": scale.tolist(),
+            "steps": at_least("steps", self.steps, FIRST_SCORED_STEP + 1),
+        }
+        for entry in fields(self):
+            object.__setattr__(self, entry.name, frozen(checked.get(entry.name, getattr(self, entry.name))))
+
+    @property
+    def plant_arguments(self) -> dict:
+        """Arguments of the env of the same plant, `BowThruster-v0`, or `BowThrusterLinear-v0` of a linear one."""
+        own = {"name", "about", "scale", "parameter_factors", "excitation", "steps"}
+        left_out = {"system"} if self.system is None else {"preset", "uncertainty"}
+        names = [entry.name for entry in fields(self) if entry.name not in own | left_out]
+        return {name: plain(getattr(self, name)) for name in names}
+
+    @cached_property
+    def plant(self) -> Plant:
+        """The true plant."""
+        return (make_plant if self.system is None else make_linear_plant)(**self.plant_arguments)
+
+    def model(self, **changes) -> StateSpaceModel:
+        """What the filter assumes; changes are arguments of `filters.thruster.model_of_plant`."""
+        return model_of_plant(self.plant, **{"parameter_factors": dict(self.parameter_factors), **changes})
+
+    @property
+    def untuned(self) -> dict:
+        """Model arguments of the untuned filter: R from the sheet, Q from 1 % of each state's range."""
+        deviation = UNTUNED_RANGE_FRACTION * _range(self.plant)
+        return {
+            "process_noise_cov": tuple(float(v) for v in deviation**2),
+            "measurement_noise_cov": self.measurement_noise_cov,
+        }
+
+    @property
+    def true(self) -> dict:
+        """Model arguments of the filter that knows the plant's Q and R."""
+        return {
+            "process_noise_cov": self.process_noise_cov,
+            "measurement_noise_cov": self.measurement_noise_cov,
+        }
+
+    def replace(self, **changes) -> Scenario:
+        """The same scenario with some fields changed."""
+        return replace(self, **changes)
+
+    def data(self, seeds: Sequence[int]) -> Data:
+        """Truth, inputs and measurements for seeds; the same as an env's that is reset with these seeds."""
+        return _data(self, tuple(int(seed) for seed in seeds))
+
+    def bound(self, data: Data, truths: int = 100) -> np.ndarray:
+        """Bound on the standard error of each state (2,), averaged over the data's inputs and scored steps.
+
+        It is that of the scenario's Gaussian core: the nominal plant with the same Q, R and inputs, with no
+        sensor effects, flow signals or amplifier.
+        """
+        exact = model_of_plant(self.plant)
+        variances = np.einsum("bkii->bki", posterior_bound(exact, data.inputs, truths=truths))
+        return np.sqrt(variances[:, FIRST_SCORED_STEP:].mean(axis=(0, 1)))
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.process_noise_cov, self.measurement_noise_cov, self.excitation, self.steps))
+
+
+def computed_scale(scenario: Scenario, sequences: int = SCALE_SEQUENCES, truths: int = 100) -> np.ndarray:
+    """The scale (2,) of a scenario: `Scenario.bound` over voltage sequences of the seeds 0, 1, 2, ...
+
+    Raises:
+        ValueError: if it is zero or not finite.
+    """
+    scale = scenario.bound(scenario.data(range(at_least("sequences", sequences, 1))), truths)
+    if not (np.isfinite(scale).all() and (scale > 0).all()):
+        raise ValueError(f"scale must be positive in every state, but the bound is {scale.tolist()}")
+    return scale
+
+
+@lru_cache(maxsize=8)
+def _data(scenario: Scenario, seeds: tuple[int, ...]) -> Data:
+    keys, plant = episode_keys(seeds), scenario.plant
+    voltages = scenario.excitation.voltages(plant, keys, scenario.steps)
+    voltages = np.clip(voltages, -plant.max_voltage, plant.max_voltage)  # as the env does
+    simulation = simulate(plant, keys, voltages)
+    measurements = np.where(simulation.valid, simulation.measurements, np.nan)  # as filters take missing ones
+    truth = simulation.states, simulation.thrusts
+    data = Data(seeds, voltages[..., None], *truth, measurements, filter_keys(seeds))
+    for array in data[1:]:
+        array.setflags(write=False)
+    return data
+
+
+def _range(plant: Plant) -> np.ndarray:
+    """Range (2,) of the steady states over the voltage range."""
+    if plant.linear is None:
+        return state_range(plant.parameters, plant.max_voltage)
+    ends = (equilibrium(plant.linear, (sign * plant.max_voltage, 0.0)) for sign in (1.0, -1.0))
+    return np.abs(np.subtract(*ends))[:2]
+
+
+def frozen(value):
+    """A value of mappings and lists as one that cannot be changed."""
+    if isinstance(value, Mapping):
+        return MappingProxyType({key: frozen(part) for key, part in value.items()})
+    return tuple(frozen(part) for part in value) if isinstance(value, list | tuple) else value
+
+
+def plain(value):
+    """The inverse of `frozen`: dictionaries and lists, which JSON and deep copies take."""
+    if isinstance(value, Mapping):
+        return {key: plain(part) for key, part in value.items()}
+    return [plain(part) for part in value] if isinstance(value, list | tuple) else value

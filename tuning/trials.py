@@ -1,0 +1,88 @@
+"""One trial of a study: the same seeds for all, in blocks, and an early end for what cannot win."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import optuna
+
+from filters.batch import Estimates, run
+from tuning.evaluate import Evaluation, judge, run_scores
+from tuning.objectives import nis_violation, penalised
+from tuning.plan import Plan
+from tuning.scenarios import Data
+from tuning.space import Choice, suggest
+
+BLOCK = 8  # seeds between two decisions whether to go on
+CONSISTENCY = "mean NIS outside its band"  # name of the constraint; at most zero is inside
+P_THRESHOLD = 0.1  # of Wilcoxon's signed-rank test, below which a trial ends
+
+
+class Measured(NamedTuple):
+    """A choice on the training data of all scenarios."""
+
+    evaluations: list[Evaluation]
+    microseconds: float  # a step of one run, on all cores
+
+
+def make_pruner(plan: Plan) -> optuna.pruners.BasePruner:
+    """Wilcoxon's signed-rank test over seeds, paired with the best trial's; or none."""
+    if not plan.prune or len(plan.objectives) > 1:
+        return optuna.pruners.NopPruner()
+    return optuna.pruners.WilcoxonPruner(p_threshold=P_THRESHOLD, n_startup_steps=BLOCK)
+
+
+def run_trial(trial: optuna.Trial, plan: Plan, data: Sequence[Data]) -> list[float]:
+    """Values of a trial, one for each objective.
+
+    Raises:
+        optuna.TrialPruned: if it is significantly worse than the best one on the seeds so far.
+    """
+    choice = suggest(trial, plan.filter, plan.scenarios[0])
+    prunes = plan.prune and plan.objectives == ("score",)
+    measured = measure(choice, plan, data, trial if prunes else None)
+    if plan.is_constrained:
+        trial.set_constraint(CONSISTENCY, max(nis_violation(e) for e in measured.evaluations))
+    return values(measured, plan)
+
+
+def values(measured: Measured, plan: Plan) -> list[float]:
+    """Objectives of a measured choice, each the mean over scenarios."""
+    return [
+        float(np.mean([penalised(objective.value(e, measured.microseconds), e) for e in measured.evaluations]))
+        for objective in plan.found_objectives()
+    ]
+
+
+def measure(choice: Choice, plan: Plan, data: Sequence[Data], trial: optuna.Trial | None = None) -> Measured:
+    """Run a choice on all data; with a trial, tell it each seed's score and end where it should be pruned."""
+    filters = [choice.filter(scenario) for scenario in plan.scenarios]
+    count = len(data[0].seeds)
+    size = count if trial is None else BLOCK
+    parts: list[list[Estimates]] = [[] for _ in filters]
+    seconds = 0.0
+    for first in range(0, count, size):
+        block = [Data(*(part[first : first + size] for part in one)) for one in data]
+        begin = time.perf_counter()
+        for estimates, filter_, one in zip(parts, filters, block, strict=True):
+            estimates.append(run(filter_, one.filter_keys, one.inputs, one.measurements))
+        seconds += time.perf_counter() - begin
+        if trial is not None:
+            _report(trial, first, [estimates[-1] for estimates in parts], block, plan)
+            if first + size < count and trial.should_prune():
+                raise optuna.TrialPruned
+    whole = [Estimates(*map(np.concatenate, zip(*estimates, strict=True))) for estimates in parts]
+    rows = zip(filters, whole, data, plan.scenarios, strict=True)
+    evaluations = [judge(filter_, estimates, one, scenario.scale) for filter_, estimates, one, scenario in rows]
+    steps = sum(one.measurements.shape[0] * one.measurements.shape[1] for one in data)
+    return Measured(evaluations, 1e6 * seconds / steps)
+
+
+def _report(trial: optuna.Trial, first: int, estimates: list[Estimates], block: list[Data], plan: Plan) -> None:
+    rows = zip(estimates, block, plan.scenarios, strict=True)
+    scores = np.mean([run_scores(found, one, scenario.scale) for found, one, scenario in rows], axis=0)
+    for place, score in enumerate(scores):
+        trial.report(float(score), first + place)
