@@ -7,14 +7,14 @@ from functools import lru_cache
 import numpy as np
 
 from filters.belief import Kernels
-from filters.engine import build_operation, new_memory
+from filters.engine import PREDICT, START, UPDATE, build_operation, new_memory
 from filters.filter import Filter
 from filters.rows import memory_places
 from thruster_env.compiled import CompiledOrPython, inlined, is_interpreting
 from thruster_env.threads import crew, in_parts
 
 THREADED_COPIES = 256  # fewer are done before a second thread has woken up
-IDLE, STEP, START = 0, 1, 2  # what a copy's belief does in a call
+IDLE, STEP, BEGIN = 0, PREDICT + UPDATE, START + UPDATE  # what a copy's belief does in a call
 
 
 class Beliefs:
@@ -35,7 +35,7 @@ class Beliefs:
         self._rows[which, self._places.key_0] = keys[:, 0]
         self._rows[which, self._places.key_1] = keys[:, 1]
         tasks = np.full(len(self._rows), IDLE)
-        tasks[which] = START
+        tasks[which] = BEGIN
         self._do(tasks, self._u, z)
 
     def step(self, u: np.ndarray, z: np.ndarray, idle: np.ndarray | None = None) -> None:
@@ -66,7 +66,8 @@ def _operation(kernels: Kernels, interpreting: bool) -> CompiledOrPython:
     def operate_many(first, last, row, table, draws, size, tasks, rows, tables, inputs, measurements, numbers):
         # Each thread works in memory of its own: slices of arrays that threads share cost contended counts.
         row, table, draws = np.zeros_like(row), np.zeros_like(table), np.zeros_like(draws)
-        u, z = np.zeros(inputs.shape[1]), np.zeros(measurements.shape[1])
+        p, m = inputs.shape[1], measurements.shape[1]
+        given = np.zeros(p + m)
         for b in range(first, last):
             task = tasks[b]
             if task == IDLE:
@@ -77,11 +78,11 @@ def _operation(kernels: Kernels, interpreting: bool) -> CompiledOrPython:
                 for i in range(kept):
                     for j in range(tables.shape[2]):
                         table[i, j] = tables[b, i, j]
-            for i in range(u.shape[0]):
-                u[i] = inputs[b, i]
-            for i in range(z.shape[0]):
-                z[i] = measurements[b, i]
-            operate(row, table, draws, size, u, z, numbers, task == START, task == STEP, True)
+            for i in range(p):
+                given[i] = inputs[b, i]
+            for i in range(m):
+                given[p + i] = measurements[b, i]
+            operate(row, table, draws, size, given, numbers, task)
             for i in range(row.shape[0]):
                 rows[b, i] = row[i]
             for i in range(kept):

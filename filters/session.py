@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from filters.belief import Belief, Innovation
-from filters.engine import new_memory, operation
+from filters.engine import PREDICT, START, UPDATE, new_memory, operation
 from filters.rows import memory_places, number_places, with_root
 from thruster_env.checks import covariance
 
 if TYPE_CHECKING:
     from filters.filter import Filter
+
+STEP = PREDICT + UPDATE
+TASKS = {"start": START, "predict": PREDICT, "update": UPDATE}
 
 
 class Session:
@@ -20,6 +23,7 @@ class Session:
 
     Attributes:
         mean, cov, innovation, innovation_cov: views on the memory, (n,), (n, n), (m,), (m, m).
+        divergences: restarts from the prior, so far, after an estimate that was not finite.
     """
 
     def __init__(self, filter_: Filter):
@@ -33,16 +37,18 @@ class Session:
         self._memory = new_memory(kernels, size)
         self._row, self._table, _ = self._memory
         self._extras = self._row[places.extras : places.extras + kernels.extras]
-        self._u, self._z = np.zeros(model.inputs), np.full(m, np.nan)
+        values = np.append(np.zeros(model.inputs), np.full(m, np.nan))
+        self._u, self._z, self._values = values[: model.inputs], values[model.inputs :], values
         self._scalar = len(self._u) == m == 1
-        self._given = (*self._memory, size, self._u, self._z, self._numbers)
+        self.divergences = 0
+        self._given = (*self._memory, size, values, self._numbers)
         self.mean = self._row[places.mean : places.mean + n]
         self.cov = self._row[places.cov : places.cov + n * n].reshape(n, n)
         self.innovation = self._row[places.innovation : places.innovation + m]
         self.innovation_cov = self._row[places.innovation_cov : places.innovation_cov + m * m].reshape(m, m)
 
-    def _do(self, starting: bool, predicting: bool, updating: bool) -> None:
-        self._operate(*self._given, starting, predicting, updating)
+    def _do(self, task: int) -> None:
+        self.divergences = self._operate(*self._given, task)
 
     def set_key(self, key) -> None:
         """Set the key (2,) on which the belief's randomness depends."""
@@ -62,16 +68,16 @@ class Session:
         """Set the prior with a random key (2,) and update it with a first measurement z (m,)."""
         self.set_key(key)
         self._z[:] = z
-        self._do(True, False, True)
+        self._do(START + UPDATE)
         self._operate = operation(self._kernels).direct  # `step` has to be quick
 
     def step(self, u, z) -> None:
         """Predict with input u (p,), then update with measurement z (m,); NaN marks a missing channel."""
         if self._scalar:  # the frequent case: an assignment to a slice takes twice as long
-            self._u[0], self._z[0] = u[0], z[0]
+            self._values[0], self._values[1] = u[0], z[0]
         else:
             self._u[:], self._z[:] = u, z
-        self._operate(*self._given, False, True, True)
+        self.divergences = self._operate(*self._given, STEP)
 
     def run(self, operation: str, u=None, z=None) -> None:
         """Do one of "start", "predict" or "update" alone, arguments checked."""
@@ -79,12 +85,7 @@ class Session:
             self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
         if z is not None:
             self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
-        self._do(operation == "start", operation == "predict", operation == "update")
-
-    @property
-    def divergences(self) -> int:
-        """Restarts from the prior, so far, after an estimate that was not finite."""
-        return int(self._row[self._places.divergences])
+        self._do(TASKS[operation])
 
     def load(self, belief: Belief) -> None:
         """Put a belief into the memory; ValueError for one of another model or kind of filter."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import gymnasium as gym
 import numpy as np
 
@@ -11,6 +13,8 @@ from filters.session import Session
 from filters.thruster import overlay_of
 from thruster_env.checks import one_of, shown
 from thruster_env.streams import draw_key, filter_generator
+
+FLOAT32 = np.dtype(np.float32)  # a cast to a dtype is quicker than one to its type
 
 
 class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
@@ -74,6 +78,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
             env.unwrapped.render_overlay = self._overlay
         low, high = env.action_space.low.ravel(), env.action_space.high.ravel()
         self._bounds = list(zip(low.tolist(), high.tolist(), strict=True))
+        self._has_one_input = len(self._bounds) == 1
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Reset env and filter; the belief is the prior, updated with the first measurement."""
@@ -91,17 +96,17 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     def step(self, action):
         """Step the env, then predict with the clipped action and update with the measurement."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        z = _measurement(observation, info)
+        z = info.get("measurement")
+        if z is None or "measurement_valid" in info:
+            z = _measurement(observation, info)
         self._session.step(self._clipped(action), z)
         return self._observe(observation, z, info), reward, terminated, truncated, info
 
-    def _clipped(self, action) -> list[float]:
-        # Plain floats are fastest for the few inputs of a plant.
-        values = action.tolist() if type(action) is np.ndarray and action.ndim == 1 else _flat(action)
-        if len(values) == 1:
-            low, high = self._bounds[0]
-            value = values[0]
-            return [low if value < low else high if value > high else value]
+    def _clipped(self, action) -> Sequence[float]:
+        if self._has_one_input and type(action) is np.ndarray:  # the frequent case has to be quick
+            value, (low, high) = action.item(), self._bounds[0]
+            return (low if value < low else high if value > high else value,)
+        values = np.asarray(action).ravel().tolist()
         return [min(max(v, low), high) for v, (low, high) in zip(values, self._bounds, strict=True)]
 
     def _overlay(self):
@@ -116,7 +121,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         info["innovation_cov"] = session.innovation_cov.copy()
         info["estimate_divergences"] = session.divergences
         if self._form == "estimate" and not self._appended:
-            return mean.astype(np.float32)
+            return mean.astype(FLOAT32)
         parts = [mean]
         if self._form == "belief":
             parts.append(np.sqrt(np.diag(cov)))
@@ -126,10 +131,6 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         if self._appended:
             parts.append(observation[-self._appended :])
         return np.concatenate(parts).astype(np.float32)
-
-
-def _flat(action) -> list[float]:
-    return np.asarray(action).ravel().tolist()
 
 
 def _measurement(observation, info) -> np.ndarray:

@@ -138,7 +138,7 @@ class BowThrusterEnv(RenderedEnv):
         self._memory, self._numbers = self._copies.memory, self._copies.numbers
         self._out = np.zeros((REPORTED, 1, 1))
         self._report = self._out.reshape(-1)  # a view
-        self._measurement_view = self._report[self._readings]
+        self._state_view, self._measurement_view = self._report[:2], self._report[self._readings]
         self._observation_buffer = np.zeros(1, dtype=np.float32)
         self._advance = self._copies.advance
 
@@ -215,9 +215,9 @@ class BowThrusterEnv(RenderedEnv):
         return np.array(values, dtype=np.float32)
 
     def _info(self, report: list[float]) -> dict:
-        omega, flow, thrust, ambient, reference, _, _, time = report[:8]
+        _, _, thrust, ambient, reference, _, _, time = report[:8]
         info = {
-            "state": np.array((omega, flow)),
+            "state": self._state_view.copy(),
             "thrust": thrust,
             "measurement": self._measurement_view.copy(),
             "reference": reference,
@@ -245,7 +245,8 @@ def _as_json(value):
 
 def _as_voltage(action) -> float:
     try:
-        voltage = float(action.item() if hasattr(action, "item") else np.asarray(action, dtype=np.float64).item())
+        item = action.item if hasattr(action, "item") else np.asarray(action, dtype=np.float64).item
+        voltage = float(item())
     except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: a torch tensor of several numbers
         voltage = math.nan
     if voltage != voltage:
