@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from filters.derivatives import complex_step
 from thruster_env.checks import at_least, covariance, covariance_root, vector
 
 
@@ -34,6 +35,8 @@ class StateSpaceModel:
         constants: a NamedTuple (or tuple) of floats that is passed to every function.
         transition_jacobian: df/dx(x, u, c) of one application; central differences if None.
         observe_jacobian: dh/dx(x, c); central differences if None.
+        analytic: whether f and h are analytic functions that take complex numbers: Jacobians that are None are
+            then found by complex steps, exactly (`derivatives.complex_step`).
         substeps: how often `transition` is applied in one step.
         operating_state: x* (n,) about which a Kalman filter approximates the model; None for affine models.
         operating_input: u* (p,), the input that goes with it.
@@ -53,6 +56,7 @@ class StateSpaceModel:
     constants: tuple = ()
     transition_jacobian: Callable | None = None
     observe_jacobian: Callable | None = None
+    analytic: bool = False
     substeps: int = 1
     operating_state: Any = None
     operating_input: Any = None
@@ -77,8 +81,18 @@ class StateSpaceModel:
         for name, size in sizes.items():
             if getattr(self, name) is not None:
                 checked[name] = vector(name, getattr(self, name), size)
+        if self.analytic:
+            checked["transition_jacobian"] = self._exact("transition", n, n, "u, c")
+            checked["observe_jacobian"] = self._exact("observe", len(checked["measurement_noise_cov"]), n, "c")
         for name, value in checked.items():
             object.__setattr__(self, name, value)
+
+    def _exact(self, name: str, rows: int, columns: int, arguments: str) -> Callable:
+        """The Jacobian given, or one by complex steps; one that was made before `replace` is made anew."""
+        given, function = getattr(self, f"{name}_jacobian"), getattr(self, name)
+        if given is not None and not hasattr(given, "differentiates"):
+            return given
+        return complex_step(function, rows, columns, arguments)
 
     @property
     def n(self) -> int:

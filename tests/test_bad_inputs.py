@@ -6,7 +6,7 @@ import pytest
 from filters import FILTERS, make_filter, run, thruster_model
 from filters.registry import tunable_numbers
 
-RUNS, STEPS = 200, 100
+RUNS, STEPS = 1000, 100
 EXTREME = [0.0, 5e-324, 1e-300, 1e8, -1e8, 1e30, -1e30, 1e154, -1e154, 1e300, -1e300, 1e308]
 
 
@@ -17,7 +17,7 @@ def ordinary_and_extreme(rng, shape, extremes):
 
 @pytest.fixture(scope="module")
 def data():
-    """20 000 steps: half of the runs with voltages that a plant may take, one in ten without a measurement."""
+    """100 000 steps: half of the runs with voltages that a plant may take, one in ten without a measurement."""
     rng = np.random.default_rng(0)
     keys = rng.integers(0, 2**32, (RUNS, 2)).astype(float)
     inputs = ordinary_and_extreme(rng, (RUNS, STEPS, 1), EXTREME)

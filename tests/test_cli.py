@@ -66,7 +66,7 @@ def test_tune_resume_evaluate_and_wrap(thruster, as_json, tmp_path):
     assert second["best_training_score"] <= first["best_training_score"]
 
     evaluated = as_json("evaluate", "--tuned", second["file"])
-    assert evaluated["tuned"] == second["held_out"]["tuned"]
+    assert evaluated["tuned"] == second["held_out"]["mismatch"]["tuned"]
 
     env = EstimateState(gym.make("BowThruster-v0"), tuned=str(tmp_path / second["file"]))
     assert env.filter.name == "ekf"

@@ -10,6 +10,7 @@ from filters.augmented import Unknown
 from thruster_cli.main import main
 from tuning.compare import compare, contender, default_belief, sized
 from tuning.evaluate import evaluate, score_ratio
+from tuning.plan import Plan
 from tuning.scenarios import find_scenario, held_out_seeds
 from tuning.space import true_choice, untuned_choice
 from tuning.study import Comparison, StudyResult
@@ -158,7 +159,8 @@ def test_the_command_takes_tuned_files(thruster, tmp_path):
     choice = untuned_choice("enkf", scenario)
     evaluation = evaluate(choice.filter(scenario), scenario.data([1, 2]), scenario.scale)
     proof = Comparison(evaluation, evaluation, evaluation, np.array(scenario.scale), range(2))
-    write_tuned(tmp_path / "mine.json", scenario, 0, StudyResult(choice, 1.0, [], [], 0.0, False), proof, "s")
+    result = StudyResult(choice, 1.0, [], [], 0.0, False)
+    write_tuned(tmp_path / "mine.json", Plan("enkf", (scenario,)), result, [proof], "s")
     code, out, _ = thruster("mine.json", "--filter", "ekf", "--seeds", 4, "--ensemble-size", 20)
     assert code == 0 and "mismatch:" in out and "Over mine, paired" in out
     code, out, _ = thruster("mine.json", "--seeds", 4, "--scenario", "nominal")

@@ -1,5 +1,6 @@
 """Models of one's own: their checks, truths drawn from them, and what numba does or does not make of them."""
 
+import contextlib
 import os
 import subprocess
 import sys
@@ -290,3 +291,53 @@ def test_a_model_that_was_edited_is_never_served_from_the_old_cache(tmp_path):
             check=True,
         )
         assert float(found.stdout) == float(factor)
+
+
+def swing(x, u, c):
+    return (x[0] + 0.05 * x[1], x[1] + 0.05 * (15.0 * np.sin(x[0]) + 3.0 * u[0]))
+
+
+def swing_jacobian(x, u, c):
+    return ((1.0, 0.05), (0.75 * np.cos(x[0]), 1.0))
+
+
+def seen(x, c):
+    return (np.cos(x[0]), np.exp(0.1 * x[0] * x[1]), 2.0)
+
+
+def swinging(**changes):
+    arguments = {
+        "transition": swing,
+        "observe": seen,
+        "process_noise_cov": [1e-4, 1e-2],
+        "measurement_noise_cov": [0.01, 0.01, 1.0],
+        "prior_mean": [0.3, -0.2],
+        "prior_cov": [0.1, 0.1],
+    }
+    return StateSpaceModel(**arguments | changes)
+
+
+@pytest.mark.parametrize("plainly", [False, True])
+def test_complex_steps_give_an_analytic_model_exact_jacobians(plainly):
+    keys, inputs = episode_keys(range(3)), np.random.default_rng(0).normal(size=(3, 30, 1))
+    measurements = truth.simulate(swinging(), keys, inputs).measurements
+    exact, declared = swinging(transition_jacobian=swing_jacobian), swinging(analytic=True)
+    x, u = (0.7, -1.3), (0.4,)
+    assert declared.transition_jacobian(x, u, ()) == pytest.approx(np.array(swing_jacobian(x, u, ())), rel=1e-15)
+    slope = np.exp(-0.091) * 0.1
+    expected = np.array([[-np.sin(0.7), 0.0], [-1.3 * slope, 0.7 * slope], [0.0, 0.0]])
+    assert np.array(declared.observe_jacobian(x, ())) == pytest.approx(expected, rel=1e-15)
+    with interpreted() if plainly else contextlib.nullcontext():
+        found, wanted = (
+            run(ExtendedKalmanFilter(model=model), keys, inputs, measurements)
+            for model in (declared, exact.replace(observe_jacobian=declared.observe_jacobian))
+        )
+    np.testing.assert_allclose(found.means, wanted.means, rtol=1e-13, atol=1e-13)
+
+
+def test_a_jacobian_by_complex_steps_follows_its_function_and_a_given_one_stays():
+    model = swinging(analytic=True, transition_jacobian=swing_jacobian)
+    assert model.transition_jacobian is swing_jacobian
+    changed = model.replace(observe=lambda x, c: (x[0] ** 2, x[1], 0.0))
+    assert np.array(changed.observe_jacobian((3.0, 1.0), ())) == pytest.approx(np.array([[6, 0], [0, 1], [0, 0]]))
+    assert changed.transition_jacobian is swing_jacobian

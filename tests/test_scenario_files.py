@@ -3,6 +3,7 @@ import pytest
 
 from tuning.evaluate import evaluate
 from tuning.excitation import BinarySequence, Steps
+from tuning.plan import Plan
 from tuning.scenarios import computed_scale, find_scenario
 from tuning.space import untuned_choice
 from tuning.study import Comparison, StudyResult
@@ -59,7 +60,7 @@ def test_a_tuned_filter_finds_the_file_of_its_scenario_again(file):
     evaluation = evaluate(choice.filter(scenario), scenario.data([1, 2]), scenario.scale)
     result = StudyResult(choice, 1.0, [], [], 0.0, False)
     proof = Comparison(evaluation, evaluation, evaluation, np.array([1.0, 1.0]), range(2))
-    write_tuned("tuned.json", scenario, 0, result, proof, "s")
+    write_tuned("tuned.json", Plan("ekf", (scenario,)), result, [proof], "s")
     assert read_tuned("tuned.json") == (choice, scenario, 0)
 
 

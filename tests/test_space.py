@@ -2,6 +2,7 @@ import optuna
 import pytest
 
 from filters.registry import FILTERS
+from tuning.plan import Plan
 from tuning.scenarios import find_scenario
 from tuning.space import choice_of, parameters_of, size_ladder, untuned_choice
 from tuning.study import open_study
@@ -18,7 +19,7 @@ def test_a_choice_survives_its_trial_parameters(name):
 
 @pytest.mark.parametrize(("name", "size"), [("enkf", 30), ("ienkf", 30), ("pf", 1000), ("apf", 1000)])
 def test_particle_filters_have_sizes_of_their_own(name, size):
-    assert untuned_choice(name, NOMINAL).numbers == {"ensemble_size": size}
+    assert untuned_choice(name, NOMINAL).numbers["ensemble_size"] == size
     ladder = size_ladder(name)
     assert (ladder[0], ladder[-1]) == ((5, 200) if size == 30 else (200, 5000)) and size in ladder
 
@@ -31,4 +32,4 @@ def test_baselines_are_not_searched_over_q_and_r():
     storage = optuna.storages.InMemoryStorage()
     for name in ("open-loop", "inversion"):
         with pytest.raises(ValueError, match=f"filter must be one that has something to tune, but got '{name}'"):
-            open_study("s", name, NOMINAL, 0, storage)
+            open_study("s", Plan(name, (NOMINAL,)), storage)

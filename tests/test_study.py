@@ -8,6 +8,7 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
+from tuning.plan import Plan
 from tuning.scenarios import find_scenario
 from tuning.space import parameters_of, untuned_choice
 from tuning.storage import PROCESS, RETRY_OF, open_storage
@@ -15,6 +16,7 @@ from tuning.study import finished_trials, open_study, prove, run_study
 from tuning.tuned import read_tuned, write_tuned
 
 SCENARIO = find_scenario("mismatch")
+PLAN = Plan("ekf", (SCENARIO,))
 
 
 @pytest.fixture(autouse=True)
@@ -23,13 +25,13 @@ def quiet():
 
 
 def study_in(storage, name="s", seed=0):
-    return open_study(name, "ekf", SCENARIO, seed, storage)
+    return open_study(name, PLAN._replace(seed=seed), storage)
 
 
 def test_a_study_starts_untuned_never_sees_the_truth_and_improves_on_held_out_seeds(tmp_path):
     study = study_in(open_storage(str(tmp_path / "j")))
     seen = []
-    result = run_study(study, "ekf", SCENARIO, 0, 25, lambda study, finished: seen.append(finished))
+    result = run_study(study, PLAN, 25, lambda study, finished: seen.append(finished))
     assert seen == list(range(1, 26))
     first = result.trials[0].params
     assert first == pytest.approx(dict(parameters_of(untuned_choice("ekf", SCENARIO))))
@@ -40,15 +42,15 @@ def test_a_study_starts_untuned_never_sees_the_truth_and_improves_on_held_out_se
     assert result.best_value < result.trials[0].value
 
     path = tmp_path / "tuned.json"
-    write_tuned(path, SCENARIO, 0, result, proof, "s")
+    write_tuned(path, PLAN, result, [proof], "s")
     assert read_tuned(path) == (result.choice, SCENARIO, 0)
-    assert json.loads(path.read_text())["held_out"]["tuned"]["rmse"][0] == list(proof.tuned.rmse[0])
+    assert json.loads(path.read_text())["held_out"]["mismatch"]["tuned"]["rmse"][0] == list(proof.tuned.rmse[0])
 
 
 def test_the_same_seed_gives_the_same_study_and_another_seed_another():
     def values(seed):
         study = study_in(optuna.storages.InMemoryStorage(), seed=seed)
-        return [t.params for t in run_study(study, "ekf", SCENARIO, seed, 12).trials]
+        return [t.params for t in run_study(study, PLAN._replace(seed=seed), 12).trials]
 
     assert values(0) == values(0)
     assert values(0)[1:] != values(1)[1:]
@@ -56,8 +58,8 @@ def test_the_same_seed_gives_the_same_study_and_another_seed_another():
 
 def test_a_resumed_study_counts_what_is_there_and_does_not_repeat_it(tmp_path):
     path = str(tmp_path / "j")
-    run_study(study_in(open_storage(path)), "ekf", SCENARIO, 0, 5)
-    resumed = run_study(study_in(open_storage(path)), "ekf", SCENARIO, 0, 9)
+    run_study(study_in(open_storage(path)), PLAN, 5)
+    resumed = run_study(study_in(open_storage(path)), PLAN, 9)
     assert len(resumed.trials) == 9
     points = [tuple(t.params.values()) for t in resumed.trials]
     assert len(set(points)) == 9
@@ -77,7 +79,7 @@ def test_ctrl_c_keeps_finished_trials(tmp_path):
         if finished == 4:
             raise KeyboardInterrupt
 
-    result = run_study(study, "ekf", SCENARIO, 0, 50, interrupt)
+    result = run_study(study, PLAN, 50, interrupt)
     assert result.interrupted and finished_trials(study) == 4
     assert not [t for t in study.trials if t.state == TrialState.RUNNING]
 
@@ -106,12 +108,12 @@ def test_a_running_trial_of_a_living_process_is_left_alone(tmp_path):
 
 def test_a_torn_last_line_is_cut_off_and_the_study_goes_on(tmp_path):
     path = tmp_path / "j"
-    run_study(study_in(open_storage(str(path))), "ekf", SCENARIO, 0, 3)
+    run_study(study_in(open_storage(str(path))), PLAN, 3)
     with path.open("a") as stream:
         stream.write('{"op_code": 5, "worker_id": "x", "tri')
     with pytest.warns(UserWarning, match="cut off its last line"):
         storage = open_storage(str(path))
-    assert len(run_study(study_in(storage), "ekf", SCENARIO, 0, 5).trials) == 5
+    assert len(run_study(study_in(storage), PLAN, 5).trials) == 5
 
 
 def test_a_killed_process_loses_its_running_trial_only(tmp_path):
@@ -120,10 +122,12 @@ def test_a_killed_process_loses_its_running_trial_only(tmp_path):
         "import optuna; optuna.logging.set_verbosity(optuna.logging.WARNING)\n"
         "from tuning.scenarios import find_scenario\n"
         "from tuning.storage import open_storage\n"
+        "from tuning.plan import Plan\n"
         "from tuning.study import open_study, run_study\n"
         f"s = find_scenario('mismatch'); storage = open_storage({str(path)!r})\n"
-        "study = open_study('s', 'ekf', s, 0, storage)\n"
-        "run_study(study, 'ekf', s, 0, 100000, lambda study, n: print(n, flush=True))\n"
+        "plan = Plan('ekf', (s,))\n"
+        "study = open_study('s', plan, storage)\n"
+        "run_study(study, plan, 100000, lambda study, n: print(n, flush=True))\n"
     )
     process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
     for line in process.stdout:
@@ -134,7 +138,7 @@ def test_a_killed_process_loses_its_running_trial_only(tmp_path):
     study = study_in(open_storage(str(path)))
     done = finished_trials(study)
     assert done >= 4
-    result = run_study(study, "ekf", SCENARIO, 0, done + 2)
+    result = run_study(study, PLAN, done + 2)
     assert finished_trials(study) == done + 2
     assert not [t for t in result.trials if t.state == TrialState.RUNNING]
 
@@ -164,7 +168,7 @@ def test_the_first_ctrl_c_lets_the_running_trial_finish(tmp_path):
         if finished == 3:
             os.kill(os.getpid(), signal.SIGINT)
 
-    result = run_study(study, "ekf", SCENARIO, 0, 50, interrupt)
+    result = run_study(study, PLAN, 50, interrupt)
     assert result.interrupted and finished_trials(study) == 3
     assert signal.getsignal(signal.SIGINT) is handler
 
@@ -179,9 +183,9 @@ def test_the_first_ctrl_c_lets_the_running_trial_finish(tmp_path):
     ],
 )
 def test_a_tuned_file_edited_by_hand_is_refused(tmp_path, change, rule):
-    result = run_study(study_in(optuna.storages.InMemoryStorage()), "ekf", SCENARIO, 0, 2)
+    result = run_study(study_in(optuna.storages.InMemoryStorage()), PLAN, 2)
     path = tmp_path / "tuned.json"
-    write_tuned(path, SCENARIO, 0, result, prove(result.choice, SCENARIO, 0, 2), "s")
+    write_tuned(path, PLAN, result, [prove(result.choice, SCENARIO, 0, 2)], "s")
     content = json.loads(path.read_text())
     content["filter"]["model"].update(change)
     path.write_text(json.dumps(content))

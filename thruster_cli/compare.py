@@ -18,9 +18,9 @@ from thruster_cli.tables import about
 from thruster_env.checks import at_least
 from tuning.compare import Contender, Leaderboard, Row, compare, contender, sized
 from tuning.evaluate import STATES
+from tuning.plan import HELD_OUT_SEEDS
 from tuning.scenarios import SCENARIOS, Scenario, find_scenario, held_out_seeds
 from tuning.space import has_ensemble
-from tuning.study import HELD_OUT_SEEDS
 from tuning.tuned import read_tuned, summary
 
 DEFAULT_FILTERS = ("ekf", "enkf", "pf")

@@ -11,9 +11,11 @@ import typer
 
 from thruster_cli.output import JsonOption, SeedOption, emit, progress_console
 from thruster_cli.reproduce import reproduce
-from thruster_cli.tune import Tuning, as_json, report, tune
+from thruster_cli.tune import tune
+from thruster_cli.tuning_report import Tuning, as_json, report
 from tuning.evaluate import score_ratio
 from tuning.figures import comparison_figure, estimates_figure, history_figure
+from tuning.plan import Plan
 from tuning.scenarios import find_scenario, held_out_seeds
 from tuning.space import true_choice
 
@@ -30,7 +32,8 @@ def command(
     """Tune an ensemble Kalman filter, prove it on held-out seeds, and reproduce a published table."""
     started = time.perf_counter()
     file = out / f"{FILTER}-{SCENARIO}-seed{seed}.json"
-    tuning = tune(FILTER, SCENARIO, trials, storage=str(out / "studies.journal"), out=file, seed=seed)
+    plan = Plan(FILTER, (find_scenario(SCENARIO),), seed)
+    tuning = tune(plan, trials, storage=str(out / "studies.journal"), out=file)
     with progress_console.status("drawing ..."):
         pictures = draw(tuning, out, seed)
     tables, published = reproduce((STUDY,), seed=seed)

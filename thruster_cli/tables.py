@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import isnan
 
 import numpy as np
@@ -11,6 +11,8 @@ from rich.table import Table
 from filters.registry import filter_class
 from thruster_cli.output import table
 from tuning.evaluate import Evaluation, Interval
+from tuning.gradient import GradientResult
+from tuning.plan import Plan
 from tuning.scenarios import Scenario
 from tuning.space import Choice
 
@@ -54,6 +56,33 @@ def comparison_table(evaluations: Mapping[str, Evaluation], bound: np.ndarray, t
     columns = ["filter", "omega_m\n[rad/s]", "above\n[%]", "U_a\n[m/s]", "above\n[%]", "T\n[N]", "NEES", "NIS"]
     caption = "above: the bound. ±: half of the 95 % interval. Honest: NEES 2, NIS 1."
     return table(title, columns, rows, caption=caption)
+
+
+def front_table(plan: Plan, front: Sequence) -> Table:
+    """Trials that no other beats in both objectives, the best in the first objective first."""
+    names = list(front[0].params)
+    rows = [
+        [str(trial.number + 1), *(f"{v:.4g}" for v in trial.values), *(_number(trial.params[n]) for n in names)]
+        for trial in sorted(front, key=lambda trial: trial.values)
+    ]
+    caption = "No trial is better in both. The first one is the tuned filter."
+    return table("Pareto front on the training seeds", ["trial", *plan.objectives, *names], rows, caption=caption)
+
+
+def gradient_table(found: GradientResult) -> Table:
+    """Where each start led, and how well the data determine the maximum."""
+    rows = [
+        ["x ".join(f"{factor:g}" for factor in optimum.start)]
+        + [f"{variance:.4g}" for variance in optimum.variances]
+        + [f"{optimum.log_likelihood:.2f}", str(optimum.evaluations)]
+        for optimum in found.optima
+    ]
+    errors = [
+        f"± {100 * error:.0f} %" if error < 1 else f"x/: {np.exp(error):.2g}" for error in found.standard_errors
+    ]
+    rows.append(["standard error", *errors, "", ""])
+    columns = ["start, factors on the untuned", *found.names, "log L", "evaluations"]
+    return table("Maximum of the innovations' likelihood on the training seeds", columns, rows)
 
 
 def about(value: Interval, digits: int) -> str:

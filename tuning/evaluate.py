@@ -29,6 +29,7 @@ class Evaluation(NamedTuple):
     nees: Interval  # mean; n is right; NaN for filters that give no covariance
     median_nees: float  # for two states 1.39 is right; says more where a few steps have all of the mean
     nis: Interval  # mean; m is right
+    channels: int  # m
     log_likelihood: float  # mean over seeds of the scored steps' sum; NaN for filters that give no covariance
     divergences: int  # restarts from the prior, over all seeds
     mean_squares: np.ndarray  # (B, n), mean square error of each run, for paired comparisons
@@ -74,6 +75,7 @@ def judge(filter_: Filter, estimates: Estimates, data: Data, scale) -> Evaluatio
         nees=mean_interval(squares),
         median_nees=float(np.nanmedian(squares)) if np.isfinite(squares).any() else np.nan,
         nis=mean_interval(nis),
+        channels=data.measurements.shape[-1],
         log_likelihood=float(likelihood.sum(axis=1).mean()),
         divergences=int(estimates.divergences.sum()),
         mean_squares=mean_squares,
@@ -101,6 +103,13 @@ def check_consistency(filter_: Filter, data: Data) -> ConsistencyReport:
 def score(mean_squares: np.ndarray, scale: np.ndarray) -> float:
     """Mean over states of RMSE over scale, from mean square errors of runs (B, n)."""
     return float((np.sqrt(mean_squares.mean(axis=0)) / scale).mean())
+
+
+def run_scores(estimates: Estimates, data: Data, scale) -> np.ndarray:
+    """The score of each run by itself, (B,): mean over states of its RMSE over scale."""
+    late = slice(FIRST_SCORED_STEP, None)
+    errors = estimates.means[:, late, : data.states.shape[-1]] - data.states[:, late]
+    return (np.sqrt((errors**2).mean(axis=1)) / np.asarray(scale)).mean(axis=1)
 
 
 def score_ratio(a: Evaluation, b: Evaluation) -> Interval:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import optuna
+from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
 
 from filters.filter import Filter
 from filters.particles.weighted import WeightedFilter
@@ -14,7 +15,18 @@ from tuning.scenario import Scenario
 
 Q_FACTORS = (1e-5, 1e2)  # range of each process noise variance, as factors on the untuned one
 R_FACTORS = (1e-2, 1e3)  # range of the measurement noise variance, as factors on the sensor sheet's
-TIME_CONSTANTS = (0.2, 50.0)  # range of a low-pass filter's, in steps
+# Ranges of numbers that filters have beside Q, R and N; they hold the defaults of all filters.
+OWN_NUMBERS: dict[str, BaseDistribution] = {
+    "inflation": FloatDistribution(1.0, 1.3),
+    "relaxation": FloatDistribution(0.0, 0.9),
+    "iterations": IntDistribution(1, 8),
+    "alpha": FloatDistribution(0.05, 2.0, log=True),
+    "resampling_threshold": FloatDistribution(0.1, 1.0),
+    "forgetting_factor": FloatDistribution(0.9, 0.9999),
+    "prior_weight": FloatDistribution(1.0, 100.0, log=True),
+    "degrees_of_freedom": FloatDistribution(2.5, 50.0, log=True),
+    "time_constant": FloatDistribution(0.2, 50.0, log=True),  # in steps
+}
 SIZE_LADDER = (5, 7, 10, 14, 20, 30, 50, 70, 100, 140, 200, 300, 500, 700, 1000, 1400, 2000, 3000, 5000)
 
 
@@ -61,9 +73,10 @@ def has_ensemble(name: str) -> bool:
     return "ensemble_size" in tunable_numbers(name)
 
 
-def has_time_constant(name: str) -> bool:
-    """Whether a filter is a low-pass filter, whose time constant can be chosen."""
-    return "time_constant" in tunable_numbers(name)
+def own_numbers(name: str) -> dict[str, BaseDistribution]:
+    """Ranges of the numbers that a study may choose for a filter beside Q, R and N."""
+    known = tunable_numbers(name)
+    return {number: distribution for number, distribution in OWN_NUMBERS.items() if number in known}
 
 
 def ensemble_sizes_of(name: str) -> Sizes:
@@ -79,36 +92,52 @@ def size_ladder(name: str) -> tuple[int, ...]:
 
 def _default_numbers(name: str) -> dict:
     numbers = {"ensemble_size": ensemble_sizes_of(name).untuned} if has_ensemble(name) else {}
-    return numbers | ({"time_constant": filter_class(name).time_constant} if has_time_constant(name) else {})
+    return numbers | {number: getattr(filter_class(name), number) for number in own_numbers(name)}
+
+
+def distributions(name: str, scenario: Scenario) -> dict[str, BaseDistribution]:
+    """What a study may choose for a filter, by the names of its trials' parameters.
+
+    Q for each state, R and N are chosen on logarithmic scales. Baselines, which know neither Q nor R, keep the
+    untuned ones.
+    """
+    untuned, found = scenario.untuned, {}
+    if filter_class(name).has_covariance:
+        for number, variance in enumerate(untuned["process_noise_cov"], start=1):
+            found[f"Q{number}{number}"] = _scaled(variance, Q_FACTORS)
+        found["R"] = _scaled(untuned["measurement_noise_cov"], R_FACTORS)
+    if has_ensemble(name):
+        _, low, high = ensemble_sizes_of(name)
+        found["N"] = IntDistribution(low, high, log=True)
+    return found | own_numbers(name)
+
+
+def _scaled(value: float, factors: tuple[float, float]) -> FloatDistribution:
+    return FloatDistribution(value * factors[0], value * factors[1], log=True)
 
 
 def suggest(trial: optuna.trial.BaseTrial, name: str, scenario: Scenario) -> Choice:
-    """Let a trial choose, all on a logarithmic scale: Q for each state, R, and for ensembles N.
+    """Let a trial choose all that `distributions` lists."""
+    chosen = {}
+    for key, distribution in distributions(name, scenario).items():
+        draw = trial.suggest_int if isinstance(distribution, IntDistribution) else trial.suggest_float
+        chosen[key] = draw(key, distribution.low, distribution.high, log=distribution.log)
+    return _choice(name, chosen, scenario)
 
-    Baselines, which know neither Q nor R, keep the untuned ones; a low-pass filter has a time constant to choose.
-    """
-    model, numbers = scenario.untuned, {}
-    if filter_class(name).has_covariance:
-        q = []
-        for number, variance in enumerate(model["process_noise_cov"], start=1):
-            low, high = (variance * factor for factor in Q_FACTORS)
-            q.append(trial.suggest_float(f"Q{number}{number}", low, high, log=True))
-        low, high = (model["measurement_noise_cov"] * factor for factor in R_FACTORS)
-        model = {
-            "process_noise_cov": tuple(q),
-            "measurement_noise_cov": trial.suggest_float("R", low, high, log=True),
-        }
-    if has_ensemble(name):
-        _, low, high = ensemble_sizes_of(name)
-        numbers["ensemble_size"] = trial.suggest_int("N", low, high, log=True)
-    if has_time_constant(name):
-        numbers["time_constant"] = trial.suggest_float("time_constant", *TIME_CONSTANTS, log=True)
-    return Choice(name, model, numbers)
+
+def _choice(name: str, chosen: Mapping[str, float | int], scenario: Scenario) -> Choice:
+    model = dict(scenario.untuned)
+    if "R" in chosen:
+        states = range(1, len(model["process_noise_cov"]) + 1)
+        q = tuple(chosen[f"Q{number}{number}"] for number in states)
+        model = {"process_noise_cov": q, "measurement_noise_cov": chosen["R"]}
+    numbers = {"ensemble_size": chosen["N"]} if "N" in chosen else {}
+    return Choice(name, model, numbers | {number: chosen[number] for number in own_numbers(name)})
 
 
 def has_search_space(name: str) -> bool:
     """Whether there is anything to choose for a filter."""
-    return filter_class(name).has_covariance or has_ensemble(name) or has_time_constant(name)
+    return filter_class(name).has_covariance or has_ensemble(name) or bool(own_numbers(name))
 
 
 def parameters_of(choice: Choice) -> Mapping[str, float | int]:
@@ -117,10 +146,11 @@ def parameters_of(choice: Choice) -> Mapping[str, float | int]:
     if filter_class(choice.name).has_covariance:
         parameters = {f"Q{i}{i}": value for i, value in enumerate(choice.model["process_noise_cov"], start=1)}
         parameters["R"] = choice.model["measurement_noise_cov"]
-    names = {"ensemble_size": "N", "time_constant": "time_constant"}
-    return parameters | {names[key]: value for key, value in choice.numbers.items() if key in names}
+    if "ensemble_size" in choice.numbers:
+        parameters["N"] = choice.numbers["ensemble_size"]
+    return parameters | {number: choice.numbers[number] for number in own_numbers(choice.name)}
 
 
 def choice_of(name: str, parameters: Mapping[str, float | int], scenario: Scenario) -> Choice:
     """The choice that trial parameters stand for."""
-    return suggest(optuna.trial.FixedTrial(dict(parameters)), name, scenario)
+    return _choice(name, parameters, scenario)

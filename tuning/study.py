@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -14,25 +14,25 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from tuning.evaluate import Evaluation, evaluate, score_ratio
-from tuning.scenarios import Data, Scenario, held_out_seeds, training_seeds
+from tuning.plan import HELD_OUT_SEEDS, Plan
+from tuning.samplers import make_sampler
+from tuning.scenarios import Data, Scenario, held_out_seeds
 from tuning.space import (
-    SIZE_LADDER,  # noqa: F401 - for those who show the sizes
     Choice,
     choice_of,
+    distributions,
     has_ensemble,
-    has_search_space,
     parameters_of,
     size_ladder,
-    suggest,
     true_choice,
     untuned_choice,
 )
 from tuning.storage import PROCESS, retry_orphans, this_process
+from tuning.trials import CONSISTENCY, NIS, make_pruner, run_trial
 
-TRAINING_SEEDS = 32
-HELD_OUT_SEEDS = 200
 SIZE_TOLERANCE = 0.01  # the tuned ensemble is the smallest whose paired score is this close to the best
-DIVERGENCE_PENALTY = 10.0  # added to the score for each run that had to restart
+TWIN = "consistent twin"  # attribute: how often a trial's Q and R have been scaled
+TWINS = 2  # so often at most: nonlinear filters may need a second time
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 
 
@@ -63,44 +63,47 @@ class StudyResult(NamedTuple):
     """What a study found, before it is proved on held-out data."""
 
     choice: Choice  # with the smallest sufficient ensemble
-    best_value: float  # score of the best trial on the training seeds
+    best_value: float  # first objective of the best trial, on the training seeds
     trials: list[FrozenTrial]
     sizes: list[SizeRow]  # score against ensemble size, empty without an ensemble
     seconds: float
     interrupted: bool
+    free_value: float | None = None  # first objective of the best trial, consistent or not; None where all count
+    front: tuple[FrozenTrial, ...] = ()  # trials that no other beats in both of two objectives
+
+    @property
+    def pruned(self) -> int:
+        """Trials that ended early."""
+        return sum(trial.state == TrialState.PRUNED for trial in self.trials)
 
 
-def open_study(
-    name: str, filter_name: str, scenario: Scenario, seed: int, storage: optuna.storages.BaseStorage
-) -> optuna.Study:
+def open_study(name: str, plan: Plan, storage: optuna.storages.BaseStorage) -> optuna.Study:
     """Create a study or load it to go on; its first trial is the untuned filter.
 
     Raises:
-        ValueError: if the filter has nothing to tune, or a study of this name was made for something else or by
-            another version of Optuna.
+        ValueError: if the plan cannot work, or a study of this name was made for something else or by another
+            version of Optuna.
     """
-    if not has_search_space(filter_name):
-        raise ValueError(f"filter must be one that has something to tune, but got {filter_name!r}")
-    identity = {
-        "filter": filter_name,
-        "scenario": scenario.name,
-        "seed": seed,
-        "optuna": optuna.__version__.split(".")[0],
-    }
-    untuned = parameters_of(untuned_choice(filter_name, scenario))
-    study = optuna.create_study(study_name=name, storage=storage, direction="minimize", load_if_exists=True)
-    found = study.user_attrs.get("identity", identity)
-    if found != identity:
-        raise ValueError(f"study {name!r} must be for {identity}, but it was made for {found}")
+    plan = plan.checked()
+    scenario = plan.scenarios[0]
+    space = distributions(plan.filter, scenario)
+    make_sampler(plan.sampler, plan.seed, 0, space)  # a clear error before anything is stored
+    study = optuna.create_study(
+        study_name=name,
+        storage=storage,
+        directions=["minimize"] * len(plan.objectives),
+        load_if_exists=True,
+        pruner=make_pruner(plan),
+    )
+    found = study.user_attrs.get("identity", plan.identity)
+    if found != plan.identity:
+        raise ValueError(f"study {name!r} must be for {plan.identity}, but it was made for {found}")
     retry_orphans(study)
     present = len(study.get_trials(deepcopy=False))
-    # A sampler with the same seed would repeat its first trials after a resume.
-    study.sampler = optuna.samplers.TPESampler(
-        seed=int(np.random.SeedSequence([seed, present]).generate_state(1)[0])
-    )
+    study.sampler = make_sampler(plan.sampler, plan.seed, present, space)
     if not present:
-        study.set_user_attr("identity", identity)
-        study.enqueue_trial(untuned)
+        study.set_user_attr("identity", plan.identity)
+        study.enqueue_trial(parameters_of(untuned_choice(plan.filter, scenario)))
     return study
 
 
@@ -109,11 +112,22 @@ def finished_trials(study: optuna.Study) -> int:
     return len(study.get_trials(deepcopy=False, states=FINISHED))
 
 
+def best_trial(trials: Sequence[FrozenTrial]) -> FrozenTrial | None:
+    """The complete, consistent trial with the least first objective; else the least inconsistent one."""
+    complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    if not complete:
+        return None
+    return min(complete, key=lambda trial: (max(violation(trial), 0.0), trial.values[0]))
+
+
+def violation(trial: FrozenTrial) -> float:
+    """How far a trial's mean NIS is outside its band, in logarithms; at most zero inside, or without a band."""
+    return trial.constraints.get(CONSISTENCY, 0.0)
+
+
 def run_study(
     study: optuna.Study,
-    filter_name: str,
-    scenario: Scenario,
-    seed: int,
+    plan: Plan,
     trials: int,
     on_trial: Callable[[optuna.Study, int], None] = lambda study, finished: None,
 ) -> StudyResult:
@@ -123,42 +137,53 @@ def run_study(
 
     Args:
         study: from `open_study`.
-        filter_name: name of the filter.
-        scenario: what data to tune on.
-        seed: chooses the training seeds.
+        plan: what the study is for.
         trials: finished trials that the study shall have in total.
         on_trial: called after each trial with the study and the number of finished trials.
 
     Raises:
         KeyboardInterrupt: if it is interrupted before any trial is finished.
     """
-    data = scenario.data(training_seeds(seed, TRAINING_SEEDS))
+    data = plan.training_data()
     started, interrupted = time.perf_counter(), False
     try:
         with stop_on_interrupt() as stopped:
             while not stopped() and (done := finished_trials(study)) < trials:
-                _run_trial(study, filter_name, scenario, data)
+                _run_trial(study, plan, data)
+                if plan.is_constrained and done + 1 < trials:
+                    _enqueue_consistent_twin(study, plan)
                 on_trial(study, done + 1)
         interrupted = stopped()
     except KeyboardInterrupt:
         interrupted = True
-    if not finished_trials(study):
+    present = study.get_trials(deepcopy=False)
+    best = best_trial(present)
+    if best is None:
         raise KeyboardInterrupt
-    best = study.best_trial
-    choice = choice_of(filter_name, best.params, scenario)
-    sizes = ensemble_sizes(choice, scenario, data) if has_ensemble(filter_name) else []
+    choice = choice_of(plan.filter, best.params, plan.scenarios[0])
+    sizes = ensemble_sizes(choice, plan, data) if has_ensemble(plan.filter) and len(plan.objectives) == 1 else []
     if sizes:
         choice = choice.with_size(next(row.size for row in sizes if row.ratio <= 1.0 + SIZE_TOLERANCE))
-    seconds = time.perf_counter() - started
-    return StudyResult(choice, best.value, study.get_trials(deepcopy=False), sizes, seconds, interrupted)
+    complete = [trial.values[0] for trial in present if trial.state == TrialState.COMPLETE]
+    return StudyResult(
+        choice,
+        best.values[0],
+        present,
+        sizes,
+        time.perf_counter() - started,
+        interrupted,
+        min(complete) if plan.is_constrained else None,
+        tuple(study.best_trials) if len(plan.objectives) > 1 else (),
+    )
 
 
-def _run_trial(study: optuna.Study, filter_name: str, scenario: Scenario, data: Data) -> None:
+def _run_trial(study: optuna.Study, plan: Plan, data: Sequence[Data]) -> None:
     trial = study.ask()
     try:
         trial.set_user_attr(PROCESS, this_process())
-        choice = suggest(trial, filter_name, scenario)
-        study.tell(trial, _training_score(choice, scenario, data))
+        study.tell(trial, run_trial(trial, plan, data))
+    except optuna.TrialPruned:
+        study.tell(trial, state=TrialState.PRUNED)
     except BaseException:
         study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
         raise
@@ -188,17 +213,39 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _training_score(choice: Choice, scenario: Scenario, data: Data) -> float:
-    evaluation = evaluate(choice.filter(scenario), data, scenario.scale)
-    return min(evaluation.score.value, 1e6) + DIVERGENCE_PENALTY * evaluation.divergences
+def _enqueue_consistent_twin(study: optuna.Study, plan: Plan) -> None:
+    """Ask next for the last trial with Q and R scaled by its mean NIS, if it is the better for being inconsistent.
+
+    A common factor on Q and R leaves the gain of a linear filter as it is, and divides the NIS: without this a
+    sampler would have to find by chance, for every good ratio of Q and R, the one scale that is consistent.
+    """
+    trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    last, best = trials[-1] if trials else None, best_trial(trials)
+    if last is None or violation(last) <= 0 or last.user_attrs.get(TWIN, 0) == TWINS:
+        return
+    if violation(best) <= 0 and best.values[0] < last.values[0]:
+        return
+    space, factor = distributions(plan.filter, plan.scenarios[0]), last.user_attrs[NIS]
+    scaled = {
+        name: float(np.clip(factor * value, space[name].low, space[name].high))
+        for name, value in last.params.items()
+        if name == "R" or name.startswith("Q")
+    }
+    twin = {TWIN: last.user_attrs.get(TWIN, 0) + 1, f"{TWIN} of": last.number}
+    study.enqueue_trial({**last.params, **scaled}, user_attrs=twin)
 
 
-def ensemble_sizes(choice: Choice, scenario: Scenario, data: Data) -> list[SizeRow]:
-    """The score of a choice against ensemble size, paired on the same seeds, smallest size first."""
+def ensemble_sizes(choice: Choice, plan: Plan, data: Sequence[Data]) -> list[SizeRow]:
+    """The score of a choice against ensemble size, paired on the same seeds, smallest size first.
+
+    With several scenarios the ratio is the largest of them: a size that suffices for all.
+    """
     sizes = sorted({*size_ladder(choice.name), choice.numbers["ensemble_size"]})
-    evaluations = [evaluate(choice.with_size(n).filter(scenario), data, scenario.scale) for n in sizes]
-    best = min(evaluations, key=lambda e: e.score.value)
-    return [SizeRow(n, e, score_ratio(e, best).value) for n, e in zip(sizes, evaluations, strict=True)]
+    pairs = list(zip(plan.scenarios, data, strict=True))
+    tables = [[evaluate(choice.with_size(n).filter(one), part, one.scale) for n in sizes] for one, part in pairs]
+    best = [min(evaluations, key=lambda e: e.score.value) for evaluations in tables]
+    ratios = [[score_ratio(e, least).value for e in found] for found, least in zip(tables, best, strict=True)]
+    return [SizeRow(n, tables[0][i], max(column[i] for column in ratios)) for i, n in enumerate(sizes)]
 
 
 def prove(choice: Choice, scenario: Scenario, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:

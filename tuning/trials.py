@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Sequence
+from statistics import geometric_mean
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +20,7 @@ from tuning.space import Choice, suggest
 
 BLOCK = 8  # seeds between two decisions whether to go on
 CONSISTENCY = "mean NIS outside its band"  # name of the constraint; at most zero is inside
+NIS = "mean NIS over the number of channels"
 P_THRESHOLD = 0.1  # of Wilcoxon's signed-rank test, below which a trial ends
 
 
@@ -32,7 +35,9 @@ def make_pruner(plan: Plan) -> optuna.pruners.BasePruner:
     """Wilcoxon's signed-rank test over seeds, paired with the best trial's; or none."""
     if not plan.prune or len(plan.objectives) > 1:
         return optuna.pruners.NopPruner()
-    return optuna.pruners.WilcoxonPruner(p_threshold=P_THRESHOLD, n_startup_steps=BLOCK)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        return optuna.pruners.WilcoxonPruner(p_threshold=P_THRESHOLD, n_startup_steps=BLOCK)
 
 
 def run_trial(trial: optuna.Trial, plan: Plan, data: Sequence[Data]) -> list[float]:
@@ -46,6 +51,7 @@ def run_trial(trial: optuna.Trial, plan: Plan, data: Sequence[Data]) -> list[flo
     measured = measure(choice, plan, data, trial if prunes else None)
     if plan.is_constrained:
         trial.set_constraint(CONSISTENCY, max(nis_violation(e) for e in measured.evaluations))
+        trial.set_user_attr(NIS, geometric_mean([e.nis.value / e.channels for e in measured.evaluations]))
     return values(measured, plan)
 
 

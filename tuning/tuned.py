@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 from filters.consistency.intervals import Interval
@@ -12,6 +13,7 @@ from filters.registry import FILE_FORMAT, FILE_VERSION, read_tuned_file
 from thruster_env.checks import at_least, positive, shown, vector
 from thruster_env.files import write_whole
 from tuning.evaluate import Evaluation
+from tuning.plan import Plan
 from tuning.scenarios import Scenario, find_scenario
 from tuning.space import Choice
 from tuning.study import Comparison, StudyResult
@@ -20,14 +22,14 @@ PACKAGES = ("thruster-env", "optuna", "numpy", "numba", "gymnasium")
 
 
 def write_tuned(
-    path: str | Path, scenario: Scenario, seed: int, result: StudyResult, proof: Comparison, study_name: str
+    path: str | Path, plan: Plan, result: StudyResult, proofs: Sequence[Comparison], study_name: str
 ) -> None:
     """Write a tuned file whole or not at all.
 
     Raises:
         ValueError: if the folder cannot be written.
     """
-    choice = result.choice
+    choice, scenario = result.choice, plan.scenarios[0]
     content = {
         "format": FILE_FORMAT,
         "version": FILE_VERSION,
@@ -40,14 +42,17 @@ def write_tuned(
         "scenario": scenario.name,
         "study": {
             "name": study_name,
-            "seed": seed,
+            **plan.identity,
             "trials": len(result.trials),
-            "best_training_score": result.best_value,
+            "best_training_value": result.best_value,
         },
         "held_out": {
-            "seeds": [proof.seeds.start, proof.seeds.stop],
-            "bound": proof.bound.tolist(),
-            **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
+            one.name: {
+                "seeds": [proof.seeds.start, proof.seeds.stop],
+                "bound": proof.bound.tolist(),
+                **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
+            }
+            for one, proof in zip(plan.scenarios, proofs, strict=True)
         },
     }
     write_whole(Path(path), json.dumps(content, indent=2) + "\n")

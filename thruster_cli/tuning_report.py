@@ -1,0 +1,170 @@
+"""What `thruster tune` says of a study: tables and sentences, or plain data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from filters.consistency.verdicts import mean_sentence
+from thruster_cli.tables import choice_table, comparison_table, front_table, gradient_table, span
+from tuning.evaluate import Evaluation, Interval, score_ratio
+from tuning.gradient import GradientResult
+from tuning.plan import Plan
+from tuning.scenarios import Scenario
+from tuning.space import size_ladder, true_choice, untuned_choice
+from tuning.study import Comparison, StudyResult
+from tuning.tuned import summary
+
+
+class Tuning(NamedTuple):
+    """All that a tuning made."""
+
+    study: str
+    plan: Plan
+    result: StudyResult
+    proofs: tuple[Comparison, ...]  # one for each scenario
+    file: Path
+    gradient: GradientResult | None = None  # where the choice is the maximum of the likelihood ...
+    rival: Comparison | None = None  # ... and what an Optuna study in its stead would have chosen
+
+    @property
+    def scenario(self) -> Scenario:
+        """The first scenario."""
+        return self.plan.scenarios[0]
+
+    @property
+    def proof(self) -> Comparison:
+        """The proof on the first scenario."""
+        return self.proofs[0]
+
+
+def report(tuning: Tuning) -> list:
+    """Tables and sentences that say what a tuning found and what it is worth."""
+    result, plan = tuning.result, tuning.plan
+    shown = []
+    for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True):
+        choices = {
+            "untuned": untuned_choice(plan.filter, scenario),
+            "tuned": result.choice,
+            "true": true_choice(plan.filter, scenario),
+        }
+        evaluations = {"untuned": proof.untuned, "tuned": proof.tuned, "true Q, R": proof.true}
+        title = f"RMSE on held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {scenario.name}"
+        shown += [choice_table(choices, scenario), comparison_table(evaluations, proof.bound, title)]
+        ratio = score_ratio(proof.tuned, proof.untuned)
+        shown.append(
+            f"Tuned against untuned on {len(proof.seeds)} held-out seeds: score x {span(ratio, 3)} "
+            f"(paired 95 % interval). {_verdict(ratio)}"
+        )
+        shown.append(_consistency_sentence(proof.tuned))
+    shown += _search_sentences(tuning)
+    trained = (
+        f"{len(result.trials)} trials, {result.pruned} of them ended early, {result.seconds:.1f} s in this run"
+    )
+    shown.append(f"Study {tuning.study!r}: {trained}. Tuned filter: {tuning.file}")
+    if result.interrupted:
+        shown.append("Interrupted: this is on the trials that were finished; the same command goes on.")
+    return shown
+
+
+def _search_sentences(tuning: Tuning) -> list:
+    """What the search itself has to say: sizes, the price of consistency, optimism, a front, a maximum."""
+    result, plan, shown = tuning.result, tuning.plan, []
+    if tuning.gradient is not None:
+        return [gradient_table(tuning.gradient), *_gradient_sentences(tuning)]
+    if result.sizes:
+        kept, ladder = result.choice.numbers["ensemble_size"], size_ladder(plan.filter)
+        ratios = ", ".join(f"{row.size}: {row.ratio:.3f}" for row in result.sizes if row.size in ladder)
+        shown.append(
+            f"Score over the best by ensemble size, on the training seeds: {ratios}. "
+            f"N = {kept} is the smallest within 1 %."
+        )
+    if result.free_value is not None:
+        price = 100 * (result.best_value / result.free_value - 1)
+        shown.append(
+            f"Consistency costs {price:.1f} % of the score on the training seeds: the best trial has "
+            f"{result.free_value:.3f} whatever its NIS, {result.best_value:.3f} with it in its band."
+        )
+    if plan.objectives == ("score",):
+        found = sum(proof.tuned.score.value for proof in tuning.proofs) / len(tuning.proofs)
+        shown.append(
+            f"Optimism: the best trial scores {result.best_value:.3f} on the training seeds, the tuned filter "
+            f"{found:.3f} on the held-out ones."
+        )
+    if result.front:
+        shown.append(front_table(plan, result.front))
+    return shown
+
+
+def _gradient_sentences(tuning: Tuning) -> list[str]:
+    gradient, ours, theirs = tuning.gradient, tuning.proof.tuned, tuning.rival.tuned
+    loose = [name for name, known in zip(gradient.names, gradient.identified, strict=True) if not known]
+    words = []
+    if loose:
+        words.append(
+            f"The data do not determine {', '.join(loose)}: the standard error is more than a factor of ten, or "
+            "the maximum lies at the end of the range."
+        )
+    agree = (
+        "All starts lead to one maximum."
+        if gradient.agree
+        else "Starts lead to different maxima: the best is kept."
+    )
+    ratio = score_ratio(ours, theirs)
+    words.append(
+        f"{agree} It took {gradient.seconds:.1f} s; {len(tuning.result.trials)} trials of Optuna took "
+        f"{tuning.result.seconds:.1f} s in this run. Score over Optuna's on the held-out seeds: {span(ratio, 3)}."
+    )
+    return words
+
+
+def as_json(tuning: Tuning) -> dict:
+    """The result of a tuning as plain data."""
+    result, plan = tuning.result, tuning.plan
+    held_out = {
+        scenario.name: {
+            "seeds": [proof.seeds.start, proof.seeds.stop],
+            "bound": proof.bound,
+            **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
+            "tuned_over_untuned": score_ratio(proof.tuned, proof.untuned),
+        }
+        for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True)
+    }
+    data = {
+        "study": tuning.study,
+        "plan": plan.identity,
+        "filter": result.choice._asdict(),
+        "trials": len(result.trials),
+        "pruned": result.pruned,
+        "best_training_value": result.best_value,
+        "best_training_value_without_consistency": result.free_value,
+        "interrupted": result.interrupted,
+        "sizes": [{"N": r.size, "ratio": r.ratio, "score": r.evaluation.score.value} for r in result.sizes],
+        "front": [{"values": trial.values, "parameters": trial.params} for trial in result.front],
+        "held_out": held_out,
+        "file": str(tuning.file),
+    }
+    if tuning.gradient is not None:
+        found = tuning.gradient
+        data["gradient"] = {
+            "log_likelihood": found.best.log_likelihood,
+            "standard_errors_of_logarithms": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
+            "identified": dict(zip(found.names, found.identified.tolist(), strict=True)),
+            "agree": found.agree,
+            "seconds": found.seconds,
+            "score_over_optuna": score_ratio(tuning.proof.tuned, tuning.rival.tuned),
+        }
+    return data
+
+
+def _verdict(ratio: Interval) -> str:
+    if ratio.high < 1:
+        return f"Tuning lowers the error by {100 * (1 - ratio.value):.0f} %."
+    return "Tuning makes it worse." if ratio.low > 1 else "No difference that these seeds can show."
+
+
+def _consistency_sentence(evaluation: Evaluation) -> str:
+    said = mean_sentence("NEES", evaluation.nees, len(evaluation.rmse))
+    return (
+        said if said.startswith("Consistent") else f"{said} RMSE and NIS alone do not see all of the covariance."
+    )
