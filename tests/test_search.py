@@ -1,0 +1,132 @@
+"""What a study searches, minimises and keeps: objectives, consistency, pruning, samplers, several scenarios."""
+
+import importlib.util
+
+import numpy as np
+import optuna
+import pytest
+from optuna.trial import TrialState
+
+from tuning.evaluate import evaluate
+from tuning.objectives import NIS_BAND, nis_violation
+from tuning.plan import Plan
+from tuning.samplers import SAMPLERS, make_sampler
+from tuning.scenarios import find_scenario
+from tuning.space import choice_of, distributions, untuned_choice
+from tuning.study import TWIN, best_trial, open_study, run_study, violation
+from tuning.trials import BLOCK, measure
+
+MISMATCH, NOMINAL, OUTLIERS = map(find_scenario, ("mismatch", "nominal", "outliers"))
+PLAN = Plan("ekf", (MISMATCH,))
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+
+
+def studied(plan, trials):
+    return run_study(open_study("s", plan, optuna.storages.InMemoryStorage()), plan, trials)
+
+
+def test_the_winner_of_a_study_is_consistent_on_its_training_seeds_at_hardly_any_cost():
+    result = studied(PLAN, 40)
+    best = best_trial(result.trials)
+    assert violation(best) <= 0 and result.best_value == best.values[0]
+    (evaluation,) = measure(result.choice, PLAN, PLAN.training_data()).evaluations
+    assert NIS_BAND[0] <= evaluation.nis.value <= NIS_BAND[1] and nis_violation(evaluation) <= 0
+    assert result.free_value <= result.best_value < 1.01 * result.free_value
+
+
+def test_a_common_factor_on_q_and_r_is_what_makes_a_trial_consistent():
+    result = studied(PLAN, 3)
+    untuned, twin = result.trials[:2]
+    assert violation(untuned) > 0 and twin.user_attrs[TWIN] == 1
+    factors = {name: twin.params[name] / untuned.params[name] for name in ("Q11", "Q22", "R")}
+    assert factors["Q11"] == pytest.approx(factors["R"]) == pytest.approx(factors["Q22"])
+    assert twin.values[0] == pytest.approx(untuned.values[0], rel=0.02) and violation(twin) <= 0
+
+
+def test_without_consistency_any_nis_will_do():
+    result = studied(PLAN._replace(consistent=False), 8)
+    assert result.free_value is None and not any(TWIN in trial.user_attrs for trial in result.trials)
+    assert {violation(trial) for trial in result.trials} == {0.0}
+
+
+def test_a_trial_ends_early_only_if_it_is_worse_on_the_same_seeds():
+    result = studied(PLAN, 40)
+    data = PLAN.training_data()
+    pruned = [trial for trial in result.trials if trial.state == TrialState.PRUNED]
+    assert len(pruned) == result.pruned > 0
+    for trial in pruned[:5]:
+        assert len(trial.intermediate_values) % BLOCK == 0 and len(trial.intermediate_values) < 32
+        (whole,) = measure(choice_of("ekf", trial.params, MISMATCH), PLAN, data).evaluations
+        assert whole.score.value > result.best_value
+    unpruned = studied(PLAN._replace(prune=False), 12)
+    assert unpruned.pruned == 0 and not any(trial.intermediate_values for trial in unpruned.trials)
+
+
+def test_the_reported_values_are_the_scores_of_single_seeds():
+    result = studied(PLAN, 1)
+    data = MISMATCH.data(range(32))
+    for seed in (0, 9, 31):
+        alone = type(data)(*(part[seed : seed + 1] for part in data))
+        filter_ = untuned_choice("ekf", MISMATCH).filter(MISMATCH)
+        found = evaluate(filter_, alone, MISMATCH.scale).score.value
+        assert result.trials[0].intermediate_values[seed] == pytest.approx(found, rel=1e-12)
+
+
+def test_several_scenarios_are_averaged():
+    plan = PLAN._replace(scenarios=(MISMATCH, OUTLIERS), prune=False)
+    values = [
+        studied(PLAN._replace(scenarios=(one,), prune=False), 1).trials[0].values[0] for one in plan.scenarios
+    ]
+    assert studied(plan, 1).trials[0].values[0] == pytest.approx(np.mean(values), rel=1e-12)
+
+
+@pytest.mark.parametrize("objective", ["thrust", "likelihood", "consistency"])
+def test_every_objective_falls(objective):
+    result = studied(PLAN._replace(objectives=(objective,), consistent=False), 15)
+    assert result.best_value < result.trials[0].values[0]
+
+
+def test_two_objectives_give_a_front_that_no_trial_beats():
+    plan = Plan("enkf", (NOMINAL,), objectives=("score", "cost"))
+    result = studied(plan, 12)
+    values = np.array([trial.values for trial in result.front])
+    assert 1 <= len(values) and (np.diff(values[np.argsort(values[:, 0])][:, 1]) <= 0).all()
+    assert {len(trial.values) for trial in result.trials} == {2}
+
+
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_every_sampler_proposes_within_the_ranges(name):
+    needed = {"gp": "torch", "cma-es": "cmaes"}.get(name)
+    plan = PLAN._replace(sampler=name, consistent=False)
+    if needed is not None and importlib.util.find_spec(needed) is None:
+        with pytest.raises(ValueError, match=f"the sampler {name!r} needs {needed}: pip install"):
+            open_study("s", plan, optuna.storages.InMemoryStorage())
+        return
+    result = studied(plan, 4)
+    assert len({tuple(trial.params.values()) for trial in result.trials}) == 4
+    for key, distribution in distributions("ekf", MISMATCH).items():
+        assert all(distribution.low <= trial.params[key] <= distribution.high for trial in result.trials)
+
+
+def test_a_grid_ends_where_it_is_exhausted():
+    sampler = make_sampler("grid", 0, 0, {"N": distributions("enkf", NOMINAL)["N"]})
+    assert isinstance(sampler, optuna.samplers.GridSampler)
+
+
+@pytest.mark.parametrize(
+    ("change", "rule"),
+    [
+        ({"scenarios": ()}, "a study must have at least one scenario, but got none"),
+        ({"objectives": ("score", "score")}, "objectives must be one, or two different ones"),
+        ({"objectives": ("speed",)}, "objective must be one of score, thrust, likelihood, consistency, cost"),
+        ({"filter": "low-pass", "objectives": ("likelihood",)}, "'likelihood' needs a filter with a covariance"),
+        ({"sampler": "guess"}, "sampler must be one of tpe, gp, cma-es, nsga-ii, random, grid, but got 'guess'"),
+    ],
+)
+def test_a_plan_that_cannot_work_is_refused(change, rule):
+    with pytest.raises(ValueError, match=rule):
+        open_study("s", PLAN._replace(**change), optuna.storages.InMemoryStorage())
