@@ -39,12 +39,12 @@ def command(
             "FilterPy must be installed to compare with: `make bench` does it, or pip install -e '.[peers]'"
         )
     # After the check: they import FilterPy.
-    from benchmarks import batches, processes, steps, trajectories, vector_filters, vectors
+    from benchmarks import batches, processes, steps, studies, trajectories, vector_filters, vectors
 
     announce_compilation()
     rows = []
     with progress_console.status("measuring ...") as status:
-        for part in (steps, vectors, vector_filters, batches, trajectories, processes):
+        for part in (steps, vectors, vector_filters, batches, trajectories, studies, processes):
             for row in part.rows(seed, quick):
                 rows.append(row)
                 status.update(f"measured: {row.what} ...")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +59,7 @@ FILTERS: dict[str, type[Filter]] = {
     )
 }
 FILE_FORMAT = "thruster-env tuned filter"
-FILE_VERSION = 1
+FILE_VERSION = 2  # 2: held-out metrics by scenario, the study's whole plan, a hash
 
 
 def filter_class(name: str) -> type[Filter]:
@@ -78,11 +80,17 @@ def make_filter(name: str, model: StateSpaceModel, **numbers) -> Filter:
     return filter_class(name)(model=model, **numbers)
 
 
+def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of a tuned file with its hash, the SHA-256 of everything else as JSON with sorted keys."""
+    rest = {key: value for key, value in content.items() if key != "hash"}
+    return {**rest, "hash": hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()}
+
+
 def read_tuned_file(path: str | Path) -> dict[str, Any]:
     """Content of a tuned file; its "filter" entry holds `name`, `numbers` and the `model` arguments.
 
     Raises:
-        ValueError: if the file cannot be read, is damaged or was written by another version.
+        ValueError: if the file cannot be read, is damaged, was edited or was written by another version.
     """
     try:
         content = json.loads(Path(path).read_text())
@@ -92,8 +100,12 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
         raise ValueError(f"a tuned file must be whole JSON, but {path} is not: {error}") from None
     if not isinstance(content, dict) or content.get("format") != FILE_FORMAT:
         raise ValueError(f"a tuned file must say format: {FILE_FORMAT!r}, but {path} does not")
-    if content.get("version") != FILE_VERSION:
-        raise ValueError(f"a tuned file must be of version {FILE_VERSION}, but got {content.get('version')!r}")
+    _check_version(path, content.get("version"))
+    if content.get("hash") != sealed(content)["hash"]:
+        raise ValueError(
+            "a tuned file must be as it was written, with the hash of its content, "
+            f"but {path} was edited: its hash is {shown(content.get('hash'))}"
+        )
     entry = content.get("filter")
     if not isinstance(entry, dict) or set(entry) != {"name", "numbers", "model"}:
         raise ValueError(f"a tuned file must have a filter with name, numbers and model, but {path} has not")
@@ -105,3 +117,14 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
             raise ValueError(f"the model of a tuned file must have a {name}, but {path} has none")
     one_of("the filter of a tuned file", entry["name"], tuple(FILTERS))
     return content
+
+
+def _check_version(path: str | Path, version) -> None:
+    if version == FILE_VERSION:
+        return
+    advice = ""
+    if isinstance(version, int):
+        advice = ": update thruster-env" if version > FILE_VERSION else ": tune again"
+    raise ValueError(
+        f"a tuned file must be of version {FILE_VERSION}, but {path} is of version {shown(version)}{advice}"
+    )

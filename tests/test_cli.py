@@ -63,7 +63,7 @@ def test_tune_resume_evaluate_and_wrap(thruster, as_json, tmp_path):
         assert word in again.stdout
     second = json.loads((tmp_path / "again.json").read_text())
     assert second["trials"] == 15
-    assert second["best_training_score"] <= first["best_training_score"]
+    assert second["best_training_value"] <= first["best_training_value"]
 
     evaluated = as_json("evaluate", "--tuned", second["file"])
     assert evaluated["tuned"] == second["held_out"]["mismatch"]["tuned"]
@@ -163,7 +163,9 @@ def test_help_lists_every_preset(command, thruster):
     assert set(PRESETS) <= {word.strip(",.") for word in words}
 
 
-@pytest.mark.parametrize("command", ["", "inspect", "simulate", "tune", "evaluate", "reproduce", "demo"])
+@pytest.mark.parametrize(
+    "command", ["", "inspect", "simulate", "tune", "evaluate", "verify", "report", "reproduce", "demo"]
+)
 def test_help_teaches(command, thruster):
     done = thruster(*filter(None, [command, "--help"]))
     assert done.returncode == 0 and "Usage" in done.stdout
@@ -178,7 +180,15 @@ BAD = [
     (("tune", "--filter", "ekf", "--trials", "1", "--out", "text.txt/x.json"), "must be where it can be written"),
     (("evaluate", "--tuned", "missing.json"), "a tuned file must be readable"),
     (("evaluate", "--tuned", "text.txt"), "a tuned file must be whole JSON"),
-    (("evaluate", "--tuned", "old.json"), "a tuned file must be of version 1, but got 0"),
+    (
+        ("evaluate", "--tuned", "old.json"),
+        "a tuned file must be of version 2, but old.json is of version 1: tune again",
+    ),
+    (("verify", "missing.json"), "a tuned file must be readable"),
+    (
+        ("report", "missing"),
+        "a report must be of a tuned file or of a study in out/studies.journal, but got 'missing'",
+    ),
     (("evaluate",), "give either --tuned FILE or --filter NAME"),
     (("evaluate", "--filter", "ekf", "--seeds", "1"), "held-out seeds must be a whole number of at least 2"),
     (("evaluate", "--filter", "ekf", "--consistency", "x.pdf"), "--consistency must end in .png, but got 'x.pdf'"),
@@ -201,7 +211,7 @@ BAD = [
 @pytest.mark.parametrize(("arguments", "line"), BAD, ids=[" ".join(arguments) for arguments, _ in BAD])
 def test_a_users_mistake_is_one_clear_line_and_exit_code_2(arguments, line, thruster, tmp_path):
     (tmp_path / "text.txt").write_text("hello\n")
-    (tmp_path / "old.json").write_text(json.dumps({"format": "thruster-env tuned filter", "version": 0}))
+    (tmp_path / "old.json").write_text(json.dumps({"format": "thruster-env tuned filter", "version": 1}))
     done = thruster(*arguments)
     assert done.returncode == 2
     assert line in done.stderr and "Traceback" not in done.stderr

@@ -68,8 +68,8 @@ def test_what_is_believed_by_default():
 
 def test_a_size_is_for_filters_that_have_an_ensemble():
     assert sized(true_choice("ekf", NOMINAL), 50) == true_choice("ekf", NOMINAL)
-    assert sized(true_choice("enkf", NOMINAL), 50).numbers == {"ensemble_size": 50}
-    assert sized(true_choice("enkf", NOMINAL), None).numbers == {"ensemble_size": 30}
+    assert sized(true_choice("enkf", NOMINAL), 50).numbers["ensemble_size"] == 50
+    assert sized(true_choice("enkf", NOMINAL), None).numbers["ensemble_size"] == 30
 
 
 @pytest.mark.parametrize(

@@ -34,8 +34,9 @@ PAGE = (ROOT / "docs" / "plant.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
 NUMBER = r"(\d+(?:\.\d+)?(?:e-?\d+)?)"
 FILTER_PAGE = (ROOT / "docs" / "filters.md").read_text()
-PAGES = {"plant": PAGE, "filters": FILTER_PAGE}
-SCRIPTS = {"plant": "docs.plant_figures", "filters": "docs.filter_figures"}
+TUNING_PAGE = (ROOT / "docs" / "tuning.md").read_text()
+PAGES = {"plant": PAGE, "filters": FILTER_PAGE, "tuning": TUNING_PAGE}
+SCRIPTS = {"plant": "docs.plant_figures", "filters": "docs.filter_figures", "tuning": "docs.tuning_figures"}
 FILTER_EXAMPLES = re.findall(r"```python\n(.*?)```", FILTER_PAGE, flags=re.DOTALL)
 every_page = pytest.mark.parametrize("page", PAGES)
 KINDS = {
@@ -191,7 +192,7 @@ def test_the_table_of_info_is_that_of_the_wrapper():
 
 
 @pytest.mark.slow
-@every_page
+@pytest.mark.parametrize("page", ["plant", "filters"])
 def test_pictures_and_tables_are_those_of_the_code(page, tmp_path):
     pytest.importorskip("pygame")
     shutil.copy(ROOT / "docs" / f"{page}.md", tmp_path)
@@ -201,3 +202,21 @@ def test_pictures_and_tables_are_those_of_the_code(page, tmp_path):
     assert [float(n) for n in here[1::2]] == pytest.approx([float(n) for n in anew[1::2]], rel=0.03)
     assert {path.name for path in tmp_path.glob("*.png")} == set(importlib.import_module(SCRIPTS[page]).FIGURES)
     assert all(path.stat().st_size < 150_000 for path in tmp_path.glob("*.png"))
+
+
+def test_the_page_on_tuning_holds_what_its_script_makes():
+    import docs.tuning_figures as script
+
+    assert script.likeliest() in TUNING_PAGE
+    lines = script.earned(["outliers"], trials=8).splitlines()[2:]
+    assert [line.split(" | ")[1] for line in lines] == ["`kf`", "`ekf`", "`enkf`"]
+    assert all(float(line.split(" | ")[2].split()[0]) < 1 for line in lines)  # over untuned
+
+
+def test_the_tables_on_tuning_say_what_the_page_says():
+    rows = [line.strip("| ").split(" | ") for line in TUNING_PAGE.splitlines() if "`" in line and " ± " in line]
+    published = {row[0].strip("`"): float(row[2].split()[0]) for row in rows if len(row) == 3}
+    assert set(published) == {"published_tunnel", "published_open_bladed"}
+    assert all(abs(ratio - 1) < 0.005 for ratio in published.values())
+    earned = [[float(cell.split()[0]) for cell in row if "±" in cell] for row in rows if len(row) > 3]
+    assert len(earned) == 12 and all(ratio < 1 for row in earned for ratio in row)

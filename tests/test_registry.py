@@ -12,21 +12,23 @@ from filters import (
     make_filter,
     thruster_model,
 )
-from filters.registry import filter_class, read_tuned_file, tunable_numbers
+from filters.registry import filter_class, read_tuned_file, sealed, tunable_numbers
 
-TUNED = {
-    "format": "thruster-env tuned filter",
-    "version": 1,
-    "filter": {
-        "name": "enkf",
-        "numbers": {"ensemble_size": 20},
-        "model": {"process_noise_cov": [1, 4e-4], "measurement_noise_cov": 0.25},
-    },
-}
+TUNED = sealed(
+    {
+        "format": "thruster-env tuned filter",
+        "version": 2,
+        "filter": {
+            "name": "enkf",
+            "numbers": {"ensemble_size": 20},
+            "model": {"process_noise_cov": [1, 4e-4], "measurement_noise_cov": 0.25},
+        },
+    }
+)
 
 
 def changed(**entries):
-    return {**TUNED, "filter": {**TUNED["filter"], **entries}}
+    return sealed({**TUNED, "filter": {**TUNED["filter"], **entries}})
 
 
 @pytest.fixture
@@ -76,10 +78,16 @@ def test_a_tuned_file_is_read_as_it_was_written(write):
         ("", "whole JSON"),
         ([TUNED], "format"),
         ({**TUNED, "format": "something else"}, "format"),
-        ({**TUNED, "version": 2}, "version 1, but got 2"),
-        ({key: TUNED[key] for key in ("format", "filter")}, "version 1, but got None"),
-        ({key: TUNED[key] for key in ("format", "version")}, "name, numbers and model"),
-        ({**TUNED, "filter": {"name": "ekf"}}, "name, numbers and model"),
+        ({**TUNED, "version": 3}, "version 2, but .*tuned.json is of version 3: update thruster-env"),
+        ({**TUNED, "version": 1}, "version 2, but .*tuned.json is of version 1: tune again"),
+        ({**TUNED, "version": [2]}, r"version 2, but .*tuned.json is of version \[2\]$"),
+        ({key: TUNED[key] for key in ("format", "filter")}, "version 2, but .*tuned.json is of version None"),
+        ({**TUNED, "filter": {**TUNED["filter"], "name": "ekf"}}, f"was edited: its hash is '{TUNED['hash']}'"),
+        ({**TUNED, "note": "mine"}, "was edited"),
+        ({**TUNED, "hash": 3}, "with the hash of its content, but .*tuned.json was edited: its hash is 3"),
+        ({key: TUNED[key] for key in ("format", "version", "filter")}, "was edited: its hash is None"),
+        (sealed({key: TUNED[key] for key in ("format", "version")}), "name, numbers and model"),
+        (sealed({**TUNED, "filter": {"name": "ekf"}}), "name, numbers and model"),
         (changed(name="no filter"), "one of kf, .*enkf, .* but got 'no filter'"),
         (changed(name=["enkf"]), "one of kf, .*enkf, .* but"),
         (changed(numbers=3), "numbers"),
@@ -91,6 +99,12 @@ def test_a_damaged_tuned_file_is_refused_in_one_line(write, content, rule):
     with pytest.raises(ValueError, match=rule) as error:
         read_tuned_file(write(content))
     assert "\n" not in str(error.value)
+
+
+def test_the_hash_does_not_depend_on_order_and_layout(write):
+    entries = reversed(TUNED.items())
+    assert read_tuned_file(write(json.dumps(dict(entries), indent=7))) == TUNED
+    assert sealed(TUNED) == TUNED
 
 
 def test_a_tuned_file_that_is_not_there_is_refused(tmp_path):

@@ -7,13 +7,14 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from tuning.evaluate import evaluate
+from tuning.evaluate import evaluate, score_ratio
+from tuning.gradient import BAD_START
 from tuning.objectives import NIS_BAND, nis_violation
 from tuning.plan import Plan
 from tuning.samplers import SAMPLERS, make_sampler
 from tuning.scenarios import find_scenario
-from tuning.space import choice_of, distributions, untuned_choice
-from tuning.study import TWIN, best_trial, open_study, run_study, violation
+from tuning.space import choice_of, distributions, true_choice, untuned_choice
+from tuning.study import TWIN, best_trial, open_study, prove, run_study, violation
 from tuning.trials import BLOCK, measure
 
 MISMATCH, NOMINAL, OUTLIERS = map(find_scenario, ("mismatch", "nominal", "outliers"))
@@ -130,3 +131,17 @@ def test_a_grid_ends_where_it_is_exhausted():
 def test_a_plan_that_cannot_work_is_refused(change, rule):
     with pytest.raises(ValueError, match=rule):
         open_study("s", PLAN._replace(**change), optuna.storages.InMemoryStorage())
+
+
+@pytest.mark.parametrize(("name", "kind"), [("nominal", "ekf"), ("published_tunnel", "kf")])
+def test_from_a_bad_start_a_study_of_a_perfect_model_comes_within_half_a_per_cent_of_the_true_q_and_r(name, kind):
+    scenario = find_scenario(name)
+    plan, true = Plan(kind, (scenario,)), true_choice(kind, scenario)
+    factors = np.array(BAD_START)
+    q, r = np.array(true.model["process_noise_cov"]) * factors[:2], scenario.measurement_noise_cov * factors[2]
+    bad = true._replace(model={"process_noise_cov": tuple(q.tolist()), "measurement_noise_cov": float(r)})
+    study = open_study("s", plan, optuna.storages.InMemoryStorage(), bad)
+    proof = prove(run_study(study, plan, 100).choice, scenario, plan.seed)
+    started = evaluate(bad.filter(scenario), scenario.data(proof.seeds), scenario.scale)
+    assert score_ratio(started, proof.true).low > 1.1
+    assert score_ratio(proof.tuned, proof.true).high < 1.005

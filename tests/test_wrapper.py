@@ -11,6 +11,7 @@ from gymnasium.utils.env_checker import check_env
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import FILTERS, EstimateState, StateSpaceModel, affine_model, make_filter, run, thruster_model
+from filters.registry import sealed
 from filters.thruster import model_of_env
 from thruster_env.parameters import TUNNEL, derive_constants
 from thruster_env.plant import make_plant
@@ -316,15 +317,17 @@ class TestSpecifications:
         assert env.filter.ensemble_size == 20
 
 
-TUNED = {
-    "format": "thruster-env tuned filter",
-    "version": 1,
-    "filter": {
-        "name": "enkf",
-        "numbers": {"ensemble_size": 20},
-        "model": {"process_noise_cov": [1, 4e-4], "measurement_noise_cov": 0.25},
-    },
-}
+TUNED = sealed(
+    {
+        "format": "thruster-env tuned filter",
+        "version": 2,
+        "filter": {
+            "name": "enkf",
+            "numbers": {"ensemble_size": 20},
+            "model": {"process_noise_cov": [1, 4e-4], "measurement_noise_cov": 0.25},
+        },
+    }
+)
 
 
 class TestModels:
@@ -400,14 +403,15 @@ def test_a_wrong_argument_is_refused_with_rule_and_value(arguments, rule):
     "content",
     [
         json.dumps(TUNED)[:40],
-        json.dumps({**TUNED, "version": 2}),
-        json.dumps({**TUNED, "filter": {**TUNED["filter"], "name": "no filter"}}),
-        json.dumps({**TUNED, "filter": {**TUNED["filter"], "numbers": {"ensemble_size": 1}}}),
-        json.dumps({**TUNED, "filter": {**TUNED["filter"], "numbers": {"size": 9}}}),
-        json.dumps({**TUNED, "filter": {**TUNED["filter"], "numbers": [9]}}),
-        json.dumps({**TUNED, "filter": {**TUNED["filter"], "model": None}}),
+        json.dumps({**TUNED, "version": 3}),
+        json.dumps({**TUNED, "filter": {**TUNED["filter"], "name": "ekf"}}),
+        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "name": "no filter"}})),
+        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "numbers": {"ensemble_size": 1}}})),
+        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "numbers": {"size": 9}}})),
+        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "numbers": [9]}})),
+        json.dumps(sealed({**TUNED, "filter": {**TUNED["filter"], "model": None}})),
     ],
-    ids=["truncated", "version", "filter", "value", "number", "list", "model"],
+    ids=["truncated", "version", "edited", "filter", "value", "number", "list", "model"],
 )
 def test_a_damaged_tuned_file_is_refused(tmp_path, content):
     path = tmp_path / "tuned.json"

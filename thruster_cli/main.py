@@ -7,7 +7,7 @@ import sys
 
 import typer
 
-from thruster_cli import compare, demo, evaluate, filters, inspect, reproduce, simulate, tune
+from thruster_cli import compare, demo, evaluate, filters, inspect, report, reproduce, simulate, tune, verify
 
 app = typer.Typer(
     help="A ship's bow thruster, the filters that estimate its hidden state, and the tuning that makes them good.",
@@ -21,6 +21,8 @@ app.command("inspect")(inspect.command)
 app.command("simulate")(simulate.command)
 app.command("tune")(tune.command)
 app.command("evaluate")(evaluate.command)
+app.command("report")(report.command)
+app.command("verify")(verify.command)
 app.command("compare")(compare.command)
 app.command("filters")(filters.command)
 app.command("reproduce")(reproduce.command)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -21,8 +22,9 @@ from tuning.plan import Plan
 from tuning.samplers import SAMPLERS
 from tuning.scenarios import SCENARIOS, find_scenario
 from tuning.storage import open_storage
-from tuning.study import best_trial, finished_trials, open_study, prove, quiet_optuna, run_study
+from tuning.study import best_trial, finished_trials, open_study, prove, quiet_optuna, run_study, run_trials
 from tuning.tuned import write_tuned
+from tuning.workers import run_in_workers
 
 DEFAULT_STORAGE = "out/studies.journal"
 METHODS = ("optuna", "gradient")
@@ -49,8 +51,12 @@ def command(
         str,
         typer.Option(help="optuna, or gradient: maximum likelihood, for kf and ekf; optuna runs for comparison."),
     ] = "optuna",
+    workers: Annotated[int, typer.Option(help="Processes on this host that share the study.")] = 1,
     storage: Annotated[
-        str, typer.Option(help="Journal file, or an Optuna storage URL such as postgresql+psycopg2://...")
+        str,
+        typer.Option(
+            help="Journal file, for one host; for several a database, postgresql+psycopg2://USER@HOST/NAME."
+        ),
     ] = DEFAULT_STORAGE,
     study: Annotated[str | None, typer.Option(help="Name of the study; by default from the above.")] = None,
     out: Annotated[Path | None, typer.Option(help="Tuned file; out/STUDY.json by default.")] = None,
@@ -72,7 +78,7 @@ def command(
     scenarios = tuple(find_scenario(name) for name in scenario or ["mismatch"])
     objectives = tuple(objective or ["score"])
     plan = Plan(filter_name, scenarios, seed, objectives, consistency, sampler, pruning)
-    tuning = tune(plan, trials, storage, study, out, by_gradient=method == "gradient")
+    tuning = tune(plan, trials, storage, study, out, by_gradient=method == "gradient", workers=workers)
     emit(report(tuning), as_json(tuning), json)
     if tuning.result.interrupted:
         sys.exit(130)
@@ -86,9 +92,10 @@ def tune(
     out: Path | None = None,
     *,
     by_gradient: bool = False,
+    workers: int = 1,
 ) -> Tuning:
     """Run or resume a study with a progress bar, prove its choice and write the tuned file."""
-    trials = at_least("trials", trials, 1)
+    trials, workers = at_least("trials", trials, 1), at_least("workers", workers, 1)
     if by_gradient:
         one_of("a filter whose likelihood has a gradient", plan.filter, DIFFERENTIABLE)
     name = study_name or _name(plan, by_gradient)
@@ -102,8 +109,9 @@ def tune(
     already = finished_trials(study)
     if already:
         progress_console.print(f"study {name!r} goes on after {already} finished trials")
+    run = run_trials if workers == 1 else partial(run_in_workers, storage=storage, workers=workers)
     with _bar(f"tuning {plan.filter} on {_scenarios(plan)}", trials, already) as advance:
-        result = run_study(study, plan, trials, advance)
+        result = run_study(study, plan, trials, advance, run)
     gradient = rival = None
     if by_gradient:
         with progress_console.status("maximising the likelihood ..."):

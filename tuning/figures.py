@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +12,9 @@ from filters.batch import run
 from filters.filter import Filter
 from thruster_env.figures import BLUE, DARK, RUST, STATES, new_figure, save_figure, tidy
 from tuning.scenarios import Data
-from tuning.study import Comparison
+from tuning.study import Comparison, violation
 
+SCORE = "score: mean RMSE over bound [-]"
 TRUTH, ESTIMATE, BOUND = DARK, BLUE, RUST
 COLOURS = {"untuned": "#9aa5ad", "tuned": ESTIMATE, "true Q, R": "#5a8f3c"}
 
@@ -25,9 +26,15 @@ def _new(rows: int, columns: int, size: tuple[float, float], **options):
     return figure, axes
 
 
-def estimates_figure(path: Path, filters: Mapping[str, Filter], data: Data, run_index: int, dt: float) -> Path:
-    """Truth and estimate of every state over time, and the error in its 95 % band; one column a filter."""
-    figure, axes = _new(4, len(filters), (5.4 * len(filters), 8.0), sharex=True, height_ratios=(2, 1.3, 2, 1.3))
+def estimates_figure(
+    path: Path, filters: Mapping[str, Filter], data: Data, run_index: int, dt: float, **options
+) -> Path:
+    """Truth and estimate of every state over time, and the error in its 95 % band; one column a filter.
+
+    Options such as `sharey="row"` are those of matplotlib's `subplots`.
+    """
+    size, options = (5.4 * len(filters), 8.0), {"sharex": True, "height_ratios": (2, 1.3, 2, 1.3), **options}
+    figure, axes = _new(4, len(filters), size, **options)
     one = slice(run_index, run_index + 1)
     time = dt * np.arange(data.states.shape[1])
     for column, (title, filter_) in enumerate(filters.items()):
@@ -56,24 +63,53 @@ def estimates_figure(path: Path, filters: Mapping[str, Filter], data: Data, run_
     return save_figure(figure, path)
 
 
-def history_figure(path: Path, trials: list[FrozenTrial], title: str) -> Path:
-    """Score of every trial of a study and the best so far; the first trial is the untuned filter."""
-    figure, axes = _new(1, 1, (6.4, 4.0))
+def history_figure(path: Path, trials: Sequence[FrozenTrial], title: str, label: str = SCORE) -> Path:
+    """First objective of every trial of a study and the best so far; the first trial is the untuned filter.
+
+    Hollow circles are trials whose mean NIS is outside its band: they are not among the best. Crosses are trials
+    that ended early: the mean of the seeds that they came to.
+    """
+    figure, axes = _new(1, 1, (6.4, 4.4))
     axis = axes[0, 0]
     done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    numbers, values = [trial.number + 1 for trial in done], [trial.value for trial in done]
-    axis.plot(numbers[1:], values[1:], "o", color=COLOURS["untuned"], markersize=4, label="trial")
-    axis.plot(numbers[:1], values[:1], "s", color=BOUND, markersize=7, label="untuned (first trial)")
-    axis.step(numbers, np.minimum.accumulate(values), where="post", color=ESTIMATE, label="best so far")
-    low = min(values)
-    top = max(1.3 * low, 1.15 * values[0])
-    axis.set_ylim(0.9 * low, top)
-    beyond = sum(value > top for value in values)
-    axis.set_xlabel(f"trial ({beyond} of {len(values)} lie above the axis)" if beyond else "trial")
-    axis.set_ylabel("score: mean RMSE over bound [-]")
+    values = [trial.values[0] for trial in done]
+    early = early_trials(trials)
+    if early:
+        x, y = [trial.number + 1 for trial, _ in early], [value for _, value in early]
+        axis.plot(x, y, "x", color=COLOURS["untuned"], markersize=4, label="ended early: mean of its seeds")
+    for inside, face, name in ((True, COLOURS["untuned"], "trial"), (False, "none", "NIS outside its band")):
+        some = [trial for trial in done[1:] if (violation(trial) <= 0) == inside]
+        if some:
+            x, y = [trial.number + 1 for trial in some], [trial.values[0] for trial in some]
+            axis.plot(x, y, "o", color=COLOURS["untuned"], markerfacecolor=face, markersize=4, label=name)
+    if done:
+        axis.plot(done[0].number + 1, values[0], "s", color=BOUND, markersize=7, label="first trial")
+        counted = [value if violation(trial) <= 0 else np.inf for trial, value in zip(done, values, strict=True)]
+        best = np.minimum.accumulate(counted)
+        best[np.isinf(best)] = np.nan
+        axis.step([t.number + 1 for t in done], best, where="post", color=ESTIMATE, label="best so far")
+        beyond = limit_values(axis, values + [value for _, value in early])
+        figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    above = f" ({beyond} of {len(done) + len(early)} lie above the axis)" if done and beyond else ""
+    axis.set_xlabel(f"trial{above}")
+    axis.set_ylabel(label)
     axis.set_title(title, fontsize=11)
-    axis.legend(frameon=False)
     return save_figure(figure, path)
+
+
+def early_trials(trials: Sequence[FrozenTrial]) -> list[tuple[FrozenTrial, float]]:
+    """Trials that ended early, each with the mean of what it reported: scores of single seeds."""
+    early = [trial for trial in trials if trial.state == TrialState.PRUNED and trial.intermediate_values]
+    return [(trial, float(np.mean(list(trial.intermediate_values.values())))) for trial in early]
+
+
+def limit_values(axis, values: list[float]) -> int:
+    """Let an axis of objective values show the good ones and the first; return how many lie above it."""
+    low, spread = min(values), max(values) - min(values)
+    room = 0.1 * abs(low) or 0.1 * spread or 1.0
+    top = max(low + 3 * room, values[0] + 1.5 * room)
+    axis.set_ylim(low - room, top)
+    return sum(value > top for value in values)
 
 
 def comparison_figure(path: Path, proof: Comparison, title: str) -> Path:

@@ -12,7 +12,7 @@ from filters.likelihood import likelihood
 from filters.registry import make_filter
 from thruster_env.checks import one_of
 from tuning.scenarios import Data, Scenario
-from tuning.space import Q_FACTORS, R_FACTORS, Choice, untuned_choice
+from tuning.space import Choice, distributions, untuned_choice
 
 DIFFERENTIABLE = ("kf", "ekf")
 BAD_START = (1.0, 1e-2, 1e2)  # factors on the untuned Q11, Q22 and R
@@ -93,8 +93,9 @@ def maximise_likelihood(
             return value, gradient
         return DIVERGED, np.zeros_like(gradient)  # the line search takes a shorter step
 
-    factors = [Q_FACTORS] * n + [R_FACTORS] * m
-    bounds = [tuple(np.log(v * np.array(f))) for v, f in zip(reference, factors, strict=True)]
+    space = distributions(filter_name, scenario)
+    names = [f"Q{i}{i}" for i in range(1, n + 1)] + ["R"]
+    bounds = [tuple(np.log([space[name].low, space[name].high])) for name in names]
     optima = []
     for start in starts:
         first = np.log(reference * np.asarray(start, dtype=np.float64))
@@ -109,10 +110,7 @@ def maximise_likelihood(
     apart = [np.abs(np.log(o.variances / best.variances))[identified] for o in optima]
     return GradientResult(
         choice=_choice(filter_name, best.variances, n, m),
-        names=(
-            *(f"Q{i}{i}" for i in range(1, n + 1)),
-            *(["R"] if m == 1 else [f"R{i}{i}" for i in range(1, m + 1)]),
-        ),
+        names=tuple(names),
         best=best,
         optima=tuple(optima),
         standard_errors=errors,

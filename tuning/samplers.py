@@ -22,7 +22,9 @@ GRID_VALUES = 5  # of each number
 NEEDS = {"gp": ("torch", "rl"), "cma-es": ("cmaes", "samplers")}
 
 
-def make_sampler(name: str, seed: int, present: int, distributions: Mapping) -> optuna.samplers.BaseSampler:
+def make_sampler(
+    name: str, seed: int, present: int, distributions: Mapping, worker: int = 0
+) -> optuna.samplers.BaseSampler:
     """A sampler.
 
     Args:
@@ -30,6 +32,7 @@ def make_sampler(name: str, seed: int, present: int, distributions: Mapping) -> 
         seed: the study's; the same seed gives the same study in one process.
         present: trials that the study has; a sampler with the same seed would repeat its first trials on resume.
         distributions: of all numbers by name, from which a grid is made.
+        worker: place among the processes that share the study; each proposes what is its own.
 
     Raises:
         ValueError: for an unknown name, or a missing package.
@@ -38,10 +41,10 @@ def make_sampler(name: str, seed: int, present: int, distributions: Mapping) -> 
     package, extra = NEEDS.get(name, (None, None))
     if package is not None and importlib.util.find_spec(package) is None:
         raise ValueError(f"the sampler {name!r} needs {package}: pip install 'thruster-env[{extra}]'")
-    seed = int(np.random.SeedSequence([seed, present]).generate_state(1)[0])
-    if name == "grid":
+    if name == "grid":  # its order, and so its seed, has to be the same in every process
         values = {key: _grid(distribution) for key, distribution in distributions.items()}
         return optuna.samplers.GridSampler(values, seed=seed)
+    seed = int(np.random.SeedSequence([seed, present, worker]).generate_state(1)[0])
     makers = {
         "tpe": optuna.samplers.TPESampler,
         "gp": optuna.samplers.GPSampler,

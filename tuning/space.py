@@ -103,17 +103,17 @@ def distributions(name: str, scenario: Scenario) -> dict[str, BaseDistribution]:
     """
     untuned, found = scenario.untuned, {}
     if filter_class(name).has_covariance:
-        for number, variance in enumerate(untuned["process_noise_cov"], start=1):
-            found[f"Q{number}{number}"] = _scaled(variance, Q_FACTORS)
-        found["R"] = _scaled(untuned["measurement_noise_cov"], R_FACTORS)
+        pairs = zip(untuned["process_noise_cov"], scenario.scale, strict=True)
+        for number, (variance, scale) in enumerate(pairs, start=1):
+            # Where the voltage hardly moves a state, noise may move it more.
+            low, high = Q_FACTORS[0] * variance, Q_FACTORS[1] * max(variance, scale**2)
+            found[f"Q{number}{number}"] = FloatDistribution(low, high, log=True)
+        low, high = (untuned["measurement_noise_cov"] * factor for factor in R_FACTORS)
+        found["R"] = FloatDistribution(low, high, log=True)
     if has_ensemble(name):
         _, low, high = ensemble_sizes_of(name)
         found["N"] = IntDistribution(low, high, log=True)
     return found | own_numbers(name)
-
-
-def _scaled(value: float, factors: tuple[float, float]) -> FloatDistribution:
-    return FloatDistribution(value * factors[0], value * factors[1], log=True)
 
 
 def suggest(trial: optuna.trial.BaseTrial, name: str, scenario: Scenario) -> Choice:

@@ -1,23 +1,38 @@
-"""Where studies live: a journal file by default, made safe to resume; any Optuna URL otherwise."""
+"""Where studies live: a journal file by default, made safe to resume; a database for several machines."""
 
 from __future__ import annotations
 
 import json
 import os
+import time
 import warnings
+from collections.abc import Callable
+from functools import wraps
+from itertools import count
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import optuna
-from optuna.storages import BaseStorage, JournalStorage
+from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
+from optuna.storages import BaseStorage, GrpcStorageProxy, JournalStorage, RDBStorage
+from optuna.storages._cached_storage import _CachedStorage
+from optuna.storages._heartbeat import BaseHeartbeat
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
-from optuna.trial import TrialState
+from optuna.trial import FrozenTrial, TrialState
 
 LOCK_SECONDS = 5  # after which a lock counts as left behind
+SIGNATURE_SECONDS = 2 * LOCK_SECONDS  # by which a living process has signed its trial
+PATIENCE_SECONDS = 60  # for which a database may be away
+HEARTBEAT_SECONDS = 10  # between two signs of life of a running trial in a database
+GRACE_SECONDS = 180  # without one, after which it counts as lost; an outage is shorter
+PROXY_PORT, PROXY_SECONDS = 13000, 10  # where a proxy listens by default, and how soon it has to answer
 PROCESS, RETRY_OF = "process", "retry_of"  # trial attributes: who runs it, and what it repeats
 
 
 def open_storage(storage: str) -> BaseStorage:
-    """Open a storage: a URL such as "sqlite:///file.db" or "postgresql+psycopg2://...", else a journal file.
+    """Open a storage: a URL such as "postgresql+psycopg2://..." or "grpc://host:port", else a journal file.
+
+    A database may go away for a minute; a trial that it hears no more of is lost, and queued once more.
 
     A last line that a killed process left unfinished in a journal is cut off, with a warning.
 
@@ -26,7 +41,7 @@ def open_storage(storage: str) -> BaseStorage:
     """
     if "://" in storage:
         try:
-            return optuna.storages.RDBStorage(storage)
+            return _proxy(storage) if storage.startswith("grpc://") else _PatientStorage(_database(storage))
         except Exception as error:  # SQLAlchemy, its drivers and the network raise whatever they like
             reason = str(error).strip().splitlines()[0]
             raise ValueError(
@@ -48,6 +63,67 @@ def open_storage(storage: str) -> BaseStorage:
         raise ValueError(
             f"storage must be a journal file that can be written, but got {storage}: {error}"
         ) from None
+
+
+def _database(url: str) -> RDBStorage:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        return RDBStorage(
+            url,
+            heartbeat_interval=HEARTBEAT_SECONDS,
+            grace_period=GRACE_SECONDS,
+            heartbeat_stale_trial_callback=retry_once,
+        )
+
+
+def _proxy(url: str) -> BaseStorage:
+    parts = urlsplit(url)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        proxy = GrpcStorageProxy(host=parts.hostname, port=parts.port or PROXY_PORT)
+    proxy.wait_server_ready(timeout=PROXY_SECONDS)
+    return proxy
+
+
+def _patient(method: Callable) -> Callable:
+    """The same method of a storage, called again until the database answers.
+
+    Raises:
+        ValueError: if that takes more than PATIENCE_SECONDS.
+    """
+
+    @wraps(method)
+    def patient(self, *args, **kwargs):
+        began = time.monotonic()
+        for attempt in count():
+            try:
+                return method(self, *args, **kwargs)
+            except UpdateFinishedTrialError:
+                if not attempt:
+                    raise
+                return True  # the attempt whose answer got lost has done its work
+            except StorageInternalError as error:
+                reason = str(error.__cause__ or error).strip().splitlines()[0]
+            if time.monotonic() > began + PATIENCE_SECONDS:
+                raise ValueError(f"a database must answer within {PATIENCE_SECONDS} s, but got: {reason}")
+            if attempt == 1:  # the first may have met a connection from before an outage
+                warnings.warn(
+                    f"no answer from the database, trying for {PATIENCE_SECONDS} s: {reason}", stacklevel=2
+                )
+            time.sleep(0.5)
+
+    return patient
+
+
+def _all_patient(storage: type) -> type:
+    for name in BaseStorage.__abstractmethods__ | BaseHeartbeat.__abstractmethods__:
+        setattr(storage, name, _patient(getattr(storage, name)))
+    return storage
+
+
+@_all_patient
+class _PatientStorage(_CachedStorage):
+    """What Optuna makes of a database, in no hurry."""
 
 
 def _cut_unfinished_line(path: Path) -> None:
@@ -76,17 +152,42 @@ def this_process() -> str:
 
 def retry_orphans(study: optuna.Study) -> int:
     """Fail running trials whose process on this host is gone, and queue each once more; return how many."""
-    host = os.uname().nodename
     retried = 0
     for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
-        owner, _, number = str(trial.user_attrs.get(PROCESS, f"{host}:0")).rpartition(":")
-        if owner != host or _alive(int(number)):
+        signed = _wait_for_signature(study, trial)
+        if signed.state != TrialState.RUNNING or _may_live(signed.user_attrs.get(PROCESS)):
             continue
-        study.tell(trial.number, state=TrialState.FAIL)
-        if RETRY_OF not in trial.user_attrs and trial.params:
-            study.enqueue_trial(trial.params, user_attrs={RETRY_OF: trial.number})
-            retried += 1
+        try:
+            study.tell(signed.number, state=TrialState.FAIL)
+        except (ValueError, UpdateFinishedTrialError):  # another process was faster
+            continue
+        retried += retry_once(study, signed)
     return retried
+
+
+def retry_once(study: optuna.Study, trial: FrozenTrial) -> bool:
+    """Queue a lost trial once more, unless it is a second try or had no numbers yet; return whether it is."""
+    if RETRY_OF in trial.user_attrs or not trial.params:
+        return False
+    study.enqueue_trial(trial.params, user_attrs={RETRY_OF: trial.number})
+    return True
+
+
+def _wait_for_signature(study: optuna.Study, trial: FrozenTrial) -> FrozenTrial:
+    """The trial as it is when its process has signed it, right after asking for it, or has had time to."""
+    deadline = time.monotonic() + SIGNATURE_SECONDS
+    while trial.state == TrialState.RUNNING and PROCESS not in trial.user_attrs and time.monotonic() < deadline:
+        time.sleep(0.1)
+        trial = study.get_trials(deepcopy=False)[trial.number]
+    return trial
+
+
+def _may_live(process: str | None) -> bool:
+    """Whether a process, as `this_process` names it, is alive or on another host."""
+    if process is None:
+        return False
+    host, _, number = process.rpartition(":")
+    return host != os.uname().nodename or _alive(int(number))
 
 
 def _alive(process: int) -> bool:

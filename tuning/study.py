@@ -34,11 +34,12 @@ SIZE_TOLERANCE = 0.01  # the tuned ensemble is the smallest whose paired score i
 TWIN = "consistent twin"  # attribute: how often a trial's Q and R have been scaled
 TWINS = 2  # so often at most: nonlinear filters may need a second time
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+OnTrial = Callable[[optuna.Study, int], None]
 
 
 def quiet_optuna() -> None:
-    """Let Optuna report warnings only, for programs that show progress of their own."""
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    """Let Optuna report errors only, for programs that show progress of their own."""
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
 
 
 class Comparison(NamedTuple):
@@ -77,8 +78,17 @@ class StudyResult(NamedTuple):
         return sum(trial.state == TrialState.PRUNED for trial in self.trials)
 
 
-def open_study(name: str, plan: Plan, storage: optuna.storages.BaseStorage) -> optuna.Study:
-    """Create a study or load it to go on; its first trial is the untuned filter.
+def open_study(
+    name: str, plan: Plan, storage: optuna.storages.BaseStorage, start: Choice | None = None, worker: int = 0
+) -> optuna.Study:
+    """Create a study or load it to go on; its first trial is `start`, by default the untuned filter.
+
+    Args:
+        name: of the study.
+        plan: what the study is for.
+        storage: from `open_storage`.
+        start: the first trial.
+        worker: place of this process among those that share the study.
 
     Raises:
         ValueError: if the plan cannot work, or a study of this name was made for something else or by another
@@ -100,10 +110,10 @@ def open_study(name: str, plan: Plan, storage: optuna.storages.BaseStorage) -> o
         raise ValueError(f"study {name!r} must be for {plan.identity}, but it was made for {found}")
     retry_orphans(study)
     present = len(study.get_trials(deepcopy=False))
-    study.sampler = make_sampler(plan.sampler, plan.seed, present, space)
+    study.sampler = make_sampler(plan.sampler, plan.seed, present, space, worker)
     if not present:
         study.set_user_attr("identity", plan.identity)
-        study.enqueue_trial(parameters_of(untuned_choice(plan.filter, scenario)))
+        study.enqueue_trial(parameters_of(start or untuned_choice(plan.filter, scenario)))
     return study
 
 
@@ -129,7 +139,8 @@ def run_study(
     study: optuna.Study,
     plan: Plan,
     trials: int,
-    on_trial: Callable[[optuna.Study, int], None] = lambda study, finished: None,
+    on_trial: OnTrial = lambda study, finished: None,
+    run: Callable[[optuna.Study, Plan, Sequence[Data], int, OnTrial], bool] | None = None,
 ) -> StudyResult:
     """Run a study until it has `trials` finished trials, all on the same training seeds.
 
@@ -140,22 +151,14 @@ def run_study(
         plan: what the study is for.
         trials: finished trials that the study shall have in total.
         on_trial: called after each trial with the study and the number of finished trials.
+        run: runs the trials and returns whether it was interrupted; `run_trials` by default.
 
     Raises:
         KeyboardInterrupt: if it is interrupted before any trial is finished.
     """
     data = plan.training_data()
-    started, interrupted = time.perf_counter(), False
-    try:
-        with stop_on_interrupt() as stopped:
-            while not stopped() and (done := finished_trials(study)) < trials:
-                _run_trial(study, plan, data)
-                if plan.is_constrained and done + 1 < trials:
-                    _enqueue_consistent_twin(study, plan)
-                on_trial(study, done + 1)
-        interrupted = stopped()
-    except KeyboardInterrupt:
-        interrupted = True
+    started = time.perf_counter()
+    interrupted = (run or run_trials)(study, plan, data, trials, on_trial)
     present = study.get_trials(deepcopy=False)
     best = best_trial(present)
     if best is None:
@@ -163,7 +166,7 @@ def run_study(
     choice = choice_of(plan.filter, best.params, plan.scenarios[0])
     sizes = ensemble_sizes(choice, plan, data) if has_ensemble(plan.filter) and len(plan.objectives) == 1 else []
     if sizes:
-        choice = choice.with_size(next(row.size for row in sizes if row.ratio <= 1.0 + SIZE_TOLERANCE))
+        choice = choice.with_size(sufficient_size(sizes))
     complete = [trial.values[0] for trial in present if trial.state == TrialState.COMPLETE]
     return StudyResult(
         choice,
@@ -177,16 +180,45 @@ def run_study(
     )
 
 
-def _run_trial(study: optuna.Study, plan: Plan, data: Sequence[Data]) -> None:
-    trial = study.ask()
-    try:
+def run_trials(
+    study: optuna.Study,
+    plan: Plan,
+    data: Sequence[Data],
+    trials: int,
+    on_trial: OnTrial = lambda study, finished: None,
+    stop: Callable[[], bool] = lambda: False,
+) -> bool:
+    """Run trials in this process until the study has `trials` finished ones; return whether Ctrl-C ended it.
+
+    Args:
+        study: from `open_study`; other processes may run trials of it, too.
+        plan: what the study is for.
+        data: the plan's training data.
+        trials: finished trials that the study shall have in total.
+        on_trial: called after each trial with the study and the number of finished trials.
+        stop: asked before the first and after each trial whether to end.
+    """
+    if stop() or finished_trials(study) >= trials:
+        return False
+
+    def objective(trial: optuna.Trial) -> list[float]:
         trial.set_user_attr(PROCESS, this_process())
-        study.tell(trial, run_trial(trial, plan, data))
-    except optuna.TrialPruned:
-        study.tell(trial, state=TrialState.PRUNED)
-    except BaseException:
-        study.tell(trial, state=TrialState.FAIL, skip_if_finished=True)
-        raise
+        return run_trial(trial, plan, data)
+
+    def after(study: optuna.Study, trial: FrozenTrial) -> None:
+        finished = finished_trials(study)
+        if plan.is_constrained and finished < trials:
+            _enqueue_consistent_twin(study, plan, trial)
+        on_trial(study, finished)
+        if finished >= trials or interrupted() or stop():
+            study.stop()
+
+    try:
+        with stop_on_interrupt() as interrupted:
+            study.optimize(objective, callbacks=[after])
+        return interrupted()
+    except KeyboardInterrupt:
+        return True
 
 
 @contextmanager
@@ -213,16 +245,16 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _enqueue_consistent_twin(study: optuna.Study, plan: Plan) -> None:
+def _enqueue_consistent_twin(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:
     """Ask next for the last trial with Q and R scaled by its mean NIS, if it is the better for being inconsistent.
 
     A common factor on Q and R leaves the gain of a linear filter as it is, and divides the NIS: without this a
     sampler would have to find by chance, for every good ratio of Q and R, the one scale that is consistent.
     """
-    trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    last, best = trials[-1] if trials else None, best_trial(trials)
-    if last is None or violation(last) <= 0 or last.user_attrs.get(TWIN, 0) == TWINS:
+    complete = last.state == TrialState.COMPLETE
+    if not complete or violation(last) <= 0 or last.user_attrs.get(TWIN, 0) == TWINS:
         return
+    best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
     if violation(best) <= 0 and best.values[0] < last.values[0]:
         return
     space, factor = distributions(plan.filter, plan.scenarios[0]), last.user_attrs[NIS]
@@ -246,6 +278,12 @@ def ensemble_sizes(choice: Choice, plan: Plan, data: Sequence[Data]) -> list[Siz
     best = [min(evaluations, key=lambda e: e.score.value) for evaluations in tables]
     ratios = [[score_ratio(e, least).value for e in found] for found, least in zip(tables, best, strict=True)]
     return [SizeRow(n, tables[0][i], max(column[i] for column in ratios)) for i, n in enumerate(sizes)]
+
+
+def sufficient_size(sizes: Sequence[SizeRow]) -> int:
+    """The smallest size that is as good as the best one; with several scenarios no size is best on all of them."""
+    least = min(row.ratio for row in sizes)
+    return next(row.size for row in sizes if row.ratio <= (1.0 + SIZE_TOLERANCE) * least)
 
 
 def prove(choice: Choice, scenario: Scenario, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:

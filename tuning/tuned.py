@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from filters.consistency.intervals import Interval
-from filters.registry import FILE_FORMAT, FILE_VERSION, read_tuned_file
+from filters.registry import FILE_FORMAT, FILE_VERSION, read_tuned_file, sealed
 from thruster_env.checks import at_least, positive, shown, vector
 from thruster_env.files import write_whole
 from tuning.evaluate import Evaluation
@@ -33,7 +33,7 @@ def write_tuned(
     content = {
         "format": FILE_FORMAT,
         "version": FILE_VERSION,
-        "made_with": {name: _version(name) for name in PACKAGES},
+        "made_with": versions(),
         "filter": {
             "name": choice.name,
             "numbers": choice.numbers,
@@ -46,16 +46,9 @@ def write_tuned(
             "trials": len(result.trials),
             "best_training_value": result.best_value,
         },
-        "held_out": {
-            one.name: {
-                "seeds": [proof.seeds.start, proof.seeds.stop],
-                "bound": proof.bound.tolist(),
-                **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
-            }
-            for one, proof in zip(plan.scenarios, proofs, strict=True)
-        },
+        "held_out": {one.name: metrics(proof) for one, proof in zip(plan.scenarios, proofs, strict=True)},
     }
-    write_whole(Path(path), json.dumps(content, indent=2) + "\n")
+    write_whole(Path(path), json.dumps(sealed(content), indent=2) + "\n")
 
 
 def read_tuned(path: str | Path) -> tuple[Choice, Scenario, int]:
@@ -78,6 +71,20 @@ def read_tuned(path: str | Path) -> tuple[Choice, Scenario, int]:
     choice = Choice(entry["name"], {"process_noise_cov": q, "measurement_noise_cov": r}, dict(entry["numbers"]))
     choice.filter(scenario)  # a clear error for numbers that the filter does not take
     return choice, scenario, seed
+
+
+def metrics(proof: Comparison) -> dict:
+    """The figures of a proof on held-out seeds as plain numbers for JSON."""
+    return {
+        "seeds": [proof.seeds.start, proof.seeds.stop],
+        "bound": proof.bound.tolist(),
+        **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that a tuned file depends on, as they are installed."""
+    return {name: _version(name) for name in PACKAGES}
 
 
 def summary(evaluation: Evaluation) -> dict:

@@ -1,0 +1,214 @@
+"""The report of a tuning: one page that needs nothing else, and its tables."""
+
+import base64
+import json
+import sys
+from html.parser import HTMLParser
+
+import numpy as np
+import optuna
+import pytest
+
+from filters.consistency.intervals import Interval
+from thruster_cli.main import main
+from tuning.figures import early_trials
+from tuning.plan import Plan
+from tuning.report import write_report
+from tuning.report_figures import FEWEST_TRIALS, importances
+from tuning.report_page import Picture, Section, Table, Words, html_page, markdown_page
+from tuning.report_parts import advice
+from tuning.scenarios import find_scenario
+from tuning.space import untuned_choice
+from tuning.storage import open_storage
+from tuning.study import Comparison, open_study, prove, run_study
+from tuning.tuned import write_tuned
+
+MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+STORAGE = "j.journal"
+
+
+class Page(HTMLParser):
+    """Reads a page, and refuses one whose elements do not close."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.words, self.attributes, self.headings = [], [], [], []
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attributes):
+        self.attributes.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] not in ("style", "title"):
+            self.words.append(data)
+            if self.open[-1] == "h2":
+                self.headings.append(data)
+
+    def pictures(self):
+        return [found for tag, found in self.attributes if tag == "img"]
+
+
+def tuned(plan, trials, name="s", seeds=6):
+    """A small study in a journal, and its tuned file, s.json."""
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    result = run_study(open_study(name, plan, open_storage(STORAGE)), plan, trials)
+    proofs = [prove(result.choice, scenario, plan.seed, seeds) for scenario in plan.scenarios]
+    write_tuned(f"{name}.json", plan, result, proofs, name)
+    return result
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_page_of_a_tuned_ensemble_has_all_parts_and_needs_no_network(folder):
+    result = tuned(Plan("enkf", (MISMATCH,)), 14)
+    report = write_report("s.json", STORAGE)
+    assert (report.page.as_posix(), report.tables.as_posix()) == ("s.html", "s.md")
+    text = report.page.read_text()
+    page = Page(text)
+    assert page.headings == [
+        "Before and after, on held-out seeds",
+        "The numbers",
+        "The study",
+        "Error against ensemble size",
+        "One run over time",
+        "Is the covariance honest?",
+        "What was done",
+    ]
+    assert "http" not in text and not {"script", "link", "iframe"} & {tag for tag, _ in page.attributes}
+    assert len(page.pictures()) in (6, 7)  # importances where enough trials are complete
+    for picture in page.pictures():
+        head, _, data = picture["src"].partition(",")
+        assert head == "data:image/png;base64" and base64.b64decode(data).startswith(b"\x89PNG")
+        assert picture["alt"].endswith(".")
+    words = " ".join(page.words)
+    assert report.advice in words and f"take N = {result.choice.numbers['ensemble_size']};" in report.advice
+    assert report.advice.startswith("Tuning lowers the score by ") and "(mean NEES " in report.advice
+    assert "held-out seeds 500000 to 500005" in words and "14, " in words
+    assert str(folder) not in text
+    tables = report.tables.read_text()
+    assert report.advice in tables and "| untuned | " in tables and "| true Q, R | " in tables
+    assert write_report("s.json", STORAGE, "again").page.read_text() == text
+
+
+def test_without_its_study_a_tuned_file_still_has_a_page():
+    plan = Plan("ekf", (MISMATCH,))
+    tuned(plan, 2)
+    open_study("s", plan._replace(seed=1), open_storage("other.journal"))  # of the same name
+    for storage in ("nowhere.journal", "other.journal", STORAGE):
+        page = Page(write_report("s.json", storage, "out").page.read_text())
+        said = "Study 's' is not in the storage" in " ".join(page.words)
+        assert said == (storage != STORAGE)
+        assert "Error against ensemble size" not in page.headings
+
+
+def test_a_study_of_two_scenarios_and_objectives_has_a_front(monkeypatch):
+    monkeypatch.setattr("tuning.report_subject.HELD_OUT_SEEDS", 6)
+    plan = Plan("ekf", (MISMATCH, OUTLIERS), objectives=("score", "consistency"), consistent=False)
+    run_study(open_study("front", plan, open_storage(STORAGE)), plan, FEWEST_TRIALS)
+    report = write_report("front", STORAGE)
+    assert report.page.as_posix() == "out/front.html"
+    page = Page(report.page.read_text())
+    words = " ".join(page.words)
+    assert "Pareto front" in words and "mismatch, held-out seeds" in words and "outliers, held-out seeds" in words
+    assert " on mismatch and " in report.advice and len(page.pictures()) == 2 + 4 + 2
+
+
+def test_a_baseline_has_no_covariance_to_speak_of():
+    tuned(Plan("low-pass", (MISMATCH,)), 3)
+    report = write_report("s.json", STORAGE)
+    assert "covariance" not in report.advice
+    page = Page(report.page.read_text())
+    assert "Is the covariance honest?" not in page.headings
+    assert "| tuned | " in report.tables.read_text() and "nan" not in report.tables.read_text()
+
+
+def test_importances_need_enough_trials_and_sum_to_one():
+    plan = Plan("ekf", (MISMATCH,), prune=False)
+    study = open_study("s", plan, optuna.storages.InMemoryStorage())
+    run_study(study, plan, FEWEST_TRIALS - 1)
+    assert importances(study) == {}
+    run_study(study, plan, FEWEST_TRIALS + 2)
+    found = importances(study)
+    assert set(found) == {"Q11", "Q22", "R"} and sum(found.values()) == pytest.approx(1.0)
+
+
+def test_trials_that_ended_early_stand_at_the_mean_of_their_seeds():
+    plan = Plan("ekf", (MISMATCH,))
+    result = run_study(open_study("s", plan, optuna.storages.InMemoryStorage()), plan, 20)
+    early = early_trials(result.trials)
+    assert len(early) == result.pruned > 0
+    trial, value = early[0]
+    assert value == pytest.approx(np.mean(list(trial.intermediate_values.values())))
+
+
+def test_the_advice_says_when_tuning_is_worth_nothing_or_harms():
+    choice = untuned_choice("ekf", MISMATCH)
+    proof = prove(choice, MISMATCH, 0, 4)
+    plan = Plan("ekf", (MISMATCH,))
+    assert advice(choice, plan, [proof]).startswith("Tuning makes no difference that 4 seeds can show; the cov")
+    worse = proof.untuned._replace(mean_squares=4 * proof.untuned.mean_squares)
+    said = advice(choice, plan, [proof._replace(tuned=worse)])
+    assert said.startswith("Tuning raises the score by 100 % [100, 100]; ")
+    blank = proof.tuned._replace(nees=Interval(np.nan, np.nan, np.nan))
+    assert advice(choice, plan, [Comparison(blank, blank, blank, proof.bound, range(4))]).endswith("can show.")
+
+
+def test_what_is_said_is_escaped():
+    table = Table("a < b", ["<script>", "b"], [["x & y", 'say "1"']])
+    text = html_page("<t>", "a & b", [Section("<h>", [table, Words(["<i>"]), Picture(b"", '"><b>')])])
+    page = Page(text)
+    assert {tag for tag, _ in page.attributes} & {"script", "i", "b", "t", "h"} == set()
+    assert "x & y" in page.words and 'say "1"' in page.words and page.pictures()[0]["alt"] == '"><b>'
+    markdown = markdown_page("a_b", "1 < 2", [Table("c|d", ["", "e"], [["f|g", "h*"]])])
+    assert markdown == "# a\\_b\n\n1 \\< 2\n\n**c\\|d**\n\n|  | e |\n| --- | ---: |\n| f\\|g | h\\* |\n"
+
+
+def test_an_interval_stands_below_its_value():
+    text = Table("", ["", "a", "b"], [["x", "1.2 [1.1, 1.3]", "score [-]"]]).html()
+    assert "<td>1.2<small>[1.1, 1.3]</small></td><td>score [-]</td>" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("none",), "a report must be of a tuned file or of a study in out/studies.journal, but got 'none'"),
+        (("none.json",), "a tuned file must be readable, but none.json is not"),
+        (("text.txt",), "a tuned file must be whole JSON, but text.txt is not"),
+        (("none", "--storage", "text.txt"), "storage must be a journal file"),
+        (("empty", "--storage", STORAGE), "a study must have a complete trial for a report, but 'empty' has none"),
+        (("foreign", "--storage", STORAGE), "a report needs the plan of the study, but study 'foreign' has None"),
+    ],
+)
+def test_a_mistake_is_one_clear_line(arguments, line, folder, monkeypatch, capsys):
+    (folder / "text.txt").write_text("hello\n")
+    open_study("empty", Plan("ekf", (MISMATCH,)), open_storage(STORAGE))
+    optuna.create_study(study_name="foreign", storage=open_storage(STORAGE))
+    before = {path.name for path in folder.iterdir()}
+    monkeypatch.setattr(sys, "argv", ["thruster", "report", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2 and line in capsys.readouterr().err
+    assert {path.name for path in folder.iterdir()} == before
+
+
+def test_the_command_says_what_it_wrote(monkeypatch, capsys):
+    tuned(Plan("ekf", (MISMATCH,)), 2)
+    monkeypatch.setattr(
+        sys, "argv", ["thruster", "report", "s.json", "--storage", STORAGE, "--out", "new", "--json", "-"]
+    )
+    with pytest.raises(SystemExit):
+        main()
+    said = json.loads(capsys.readouterr().out)
+    assert said["page"] == "new/s.html" and said["tables"] == "new/s.md" and said["advice"].startswith("Tuning ")

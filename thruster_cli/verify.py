@@ -1,0 +1,57 @@
+"""`thruster verify`: whether the metrics in a tuned file hold."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
+from tuning.verify import TOLERANCE, Verification, verify
+
+LISTED = 10  # differences in the table; --json has all
+
+
+def command(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Tuned file, as `thruster tune` writes it.")],
+    json: JsonOption = None,
+) -> None:
+    """Compute the held-out metrics of a tuned file once more, on its seeds, and say whether they hold.
+
+    They hold where every number is the same within rounding; the exit code is 0 then, and 1 otherwise. Packages
+    whose versions are not those that the file was made with are named.
+
+    Example: thruster verify out/enkf-mismatch-seed0.json
+    """
+    announce_compilation()
+    with progress_console.status(f"computing the metrics of {file} once more ..."):
+        found = verify(file)
+    emit(_shown(file, found), _as_json(file, found), json)
+    if not found.holds:
+        sys.exit(1)
+
+
+def _shown(file: Path, found: Verification) -> list:
+    shown = []
+    if found.holds:
+        shown.append(f"{file} holds: {found.checked} numbers are the same within {TOLERANCE:g} of their size.")
+    else:
+        rows = [[d.place, str(d.stored), str(d.found), f"{d.relative:.1e}"] for d in found.differences[:LISTED]]
+        shown.append(f"{file} does not hold: {len(found.differences)} of {found.checked} numbers differ.")
+        shown.append(table("The largest differences", ["number", "stored", "found", "relative"], rows))
+    if found.packages:
+        changes = ", ".join(f"{name} {then} then, {now} now" for name, (then, now) in found.packages.items())
+        shown.append(f"Packages of other versions than those that the file was made with: {changes}.")
+    return shown
+
+
+def _as_json(file: Path, found: Verification) -> dict:
+    return {
+        "file": str(file),
+        "holds": found.holds,
+        "checked": found.checked,
+        "differences": [{**d._asdict(), "relative": d.relative} for d in found.differences],
+        "packages": {name: {"stored": then, "here": now} for name, (then, now) in found.packages.items()},
+    }

@@ -1,0 +1,203 @@
+"""What stands in a report: the advice, tables of what was achieved, and sections with pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from math import isnan
+from pathlib import Path
+from typing import NamedTuple
+
+from optuna.trial import TrialState
+
+from filters.consistency.intervals import Interval
+from filters.consistency.verdicts import confidence, rounded, sentences
+from filters.registry import filter_class
+from tuning.consistency_figures import consistency_figure
+from tuning.evaluate import check_consistency, score_ratio
+from tuning.figures import SCORE, comparison_figure, estimates_figure, history_figure
+from tuning.objectives import find_objective
+from tuning.plan import TRAINING_SEEDS, Plan
+from tuning.report_figures import (
+    FEWEST_TRIALS,
+    front_figure,
+    importance_figure,
+    importances,
+    sizes_figure,
+    slices_figure,
+)
+from tuning.report_page import Picture, Section, Table, Words
+from tuning.report_subject import Subject
+from tuning.scenarios import Scenario, training_seeds
+from tuning.space import Choice, parameters_of, true_choice, untuned_choice
+from tuning.study import Comparison, SizeRow
+from tuning.tuned import versions
+
+MANY_TRIALS = 50
+KINDS = ("untuned", "tuned", "true")
+
+
+class Sketchbook(NamedTuple):
+    """A folder in which pictures are drawn that a page then holds."""
+
+    folder: Path
+
+    def picture(self, caption: str, draw: Callable, *arguments, **options) -> Picture:
+        """What a function draws that takes a path first."""
+        return Picture(draw(self.folder / "picture.png", *arguments, **options).read_bytes(), caption)
+
+
+def advice(choice: Choice, plan: Plan, proofs: Sequence[Comparison]) -> str:
+    """One sentence: what tuning is worth, the ensemble size to take, and whether the covariance is honest."""
+    places = [f" on {scenario.name}" if len(proofs) > 1 else "" for scenario in plan.scenarios]
+    worth = [f"{_worth(proof)}{place}" for proof, place in zip(proofs, places, strict=True)]
+    parts = [f"Tuning {' and '.join(worth)}"]
+    if "ensemble_size" in choice.numbers:
+        parts.append(f"take N = {choice.numbers['ensemble_size']}")
+    squares, right = [proof.tuned.nees for proof in proofs], len(proofs[0].tuned.rmse)
+    if not any(isnan(nees.value) for nees in squares):
+        honest = [
+            f"{confidence(nees, right)}{place} (mean NEES {rounded(nees.value)} where {right} is right)"
+            for nees, place in zip(squares, places, strict=True)
+        ]
+        parts.append(f"the covariance is {' and '.join(honest)}")
+    return "; ".join(parts) + "."
+
+
+def _worth(proof: Comparison) -> str:
+    ratio = score_ratio(proof.tuned, proof.untuned)
+    if ratio.low <= 1 <= ratio.high:
+        return f"makes no difference that {len(proof.seeds)} seeds can show"
+    ends = sorted(100 * abs(1 - part) for part in (ratio.low, ratio.high))
+    verb = "lowers" if ratio.high < 1 else "raises"
+    return f"{verb} the score by {100 * abs(1 - ratio.value):.0f} % [{ends[0]:.0f}, {ends[1]:.0f}]"
+
+
+def errors_table(scenario: Scenario, proof: Comparison) -> Table:
+    """RMSE, score and consistency of the untuned, tuned and true filter on held-out seeds, and the bound."""
+    evaluations = zip(("untuned", "tuned", "true Q, R"), (getattr(proof, kind) for kind in KINDS), strict=True)
+    rows = [
+        [name, *map(_span, e.rmse), _span(e.thrust_rmse), _span(e.score), _span(e.nees), _span(e.nis)]
+        for name, e in evaluations
+    ]
+    right = [str(len(proof.bound)), str(proof.tuned.channels)] if rows[0][-1] else ["", ""]
+    rows.append(["bound; what is right", *map(rounded, proof.bound), "", "", *right])
+    columns = [
+        "filter", "RMSE ω_m [rad/s]", "RMSE U_a [m/s]", "RMSE thrust [N]", "score", "mean NEES", "mean NIS"
+    ]  # fmt: skip
+    seeds = f"held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}"
+    return Table(f"{scenario.name}, {seeds}, with 95 % intervals", columns, rows)
+
+
+def numbers_table(choice: Choice, scenario: Scenario) -> Table:
+    """The numbers of the untuned, tuned and true filter."""
+    choices = untuned_choice(choice.name, scenario), choice, true_choice(choice.name, scenario)
+    columns = [parameters_of(one._replace(numbers={**choices[0].numbers, **one.numbers})) for one in choices]
+    unit = "N²" if scenario.plant.channels == ("thrust",) else "(rad/s)²"
+    units = {"Q11": " [(rad/s)²]", "Q22": " [(m/s)²]", "R": f" [{unit}]"}
+    rows = [
+        [name.replace("_", " ") + units.get(name, ""), *(f"{column[name]:.4g}" for column in columns)]
+        for name in columns[0]
+    ]
+    return Table(f"Numbers of the {choice.name} filter", ["", "untuned", "tuned", "true Q, R"], rows)
+
+
+def proof_section(book: Sketchbook, subject: Subject, proofs: Sequence[Comparison]) -> Section:
+    """Errors before and after, scenario by scenario."""
+    parts = []
+    for scenario, proof in zip(subject.plan.scenarios, proofs, strict=True):
+        caption = (
+            f"RMSE on {len(proof.seeds)} held-out seeds of {scenario.name} with 95 % intervals, and the bound."
+        )
+        title = f"{subject.choice.name} on {scenario.name}"
+        parts += [errors_table(scenario, proof), book.picture(caption, comparison_figure, proof, title)]
+    return Section("Before and after, on held-out seeds", parts)
+
+
+def search_section(book: Sketchbook, subject: Subject) -> Section:
+    """How the study went: convergence, importances, slices, and the front of two objectives."""
+    study, title = subject.study, "The study"
+    if study is None:
+        said = f"Study {subject.name!r} is not in the storage, so how it went is not told here."
+        return Section(title, [Words([said])])
+    trials = study.get_trials(deepcopy=False)
+    objectives = subject.plan.objectives
+    labels = [SCORE if name == "score" else f"{name}:\n{find_objective(name).about}" for name in objectives]
+    caption = "First objective of each trial on the training seeds, and the best so far."
+    parts = [book.picture(caption, history_figure, trials, f"Study {subject.name}", labels[0])]
+    found = importances(study)
+    if found:
+        complete = [trial.state for trial in trials].count(TrialState.COMPLETE)
+        caption = (
+            "How much each number matters for a trial to be among the best tenth: PED-ANOVA on "
+            f"{complete} complete trials{', rough on so few' if complete < MANY_TRIALS else ''}."
+        )
+        parts.append(book.picture(caption, importance_figure, found))
+    else:
+        parts.append(Words([f"Importances of the numbers need {FEWEST_TRIALS} complete trials or more."]))
+    caption = (
+        "First objective against each number; dashed is the best trial. Hollow: mean NIS outside its band. "
+        "Crosses: ended early, at the mean of the seeds seen."
+    )
+    parts.append(book.picture(caption, slices_figure, trials, labels[0]))
+    if len(objectives) > 1:
+        caption = "Trials by both objectives; no trial beats those of the Pareto front in both."
+        parts.append(book.picture(caption, front_figure, trials, study.best_trials, labels))
+    return Section(title, parts)
+
+
+def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) -> Section:
+    """Errors against ensemble size."""
+    caption = f"RMSE on the training seeds of {subject.plan.scenarios[0].name} with 95 % intervals; dashed is N."
+    kept = subject.choice.numbers["ensemble_size"]
+    ratios = [[f"{row.size}", f"{row.ratio:.3f}"] for row in sizes]
+    said = "Score over the best, paired on the same seeds; of several scenarios the largest"
+    return Section(
+        "Error against ensemble size",
+        [book.picture(caption, sizes_figure, sizes, kept), Table(said, ["N", "score over the best"], ratios)],
+    )
+
+
+def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[Section]:
+    """One held-out run over time, and whether the covariance is honest, both on the first scenario."""
+    choice, scenario = subject.choice, subject.plan.scenarios[0]
+    data, tuned = scenario.data(proof.seeds), choice.filter(scenario)
+    pair = {"untuned": untuned_choice(choice.name, scenario).filter(scenario), "tuned": tuned}
+    caption = (
+        f"Truth, estimate and 95 % band on {scenario.name}, held-out seed {proof.seeds.start}, before and after."
+    )
+    picture = book.picture(caption, estimates_figure, pair, data, 0, scenario.plant.dt, sharey="row")
+    sections = [Section("One run over time", [picture])]
+    if filter_class(choice.name).has_covariance:
+        report = check_consistency(tuned, data)
+        caption = f"Checks of the tuned filter's covariance on {report.runs} held-out seeds of {scenario.name}."
+        title = f"{choice.name}, tuned, on {report.runs} seeds of {scenario.name}"
+        picture = book.picture(caption, consistency_figure, report, title)
+        sections.append(Section("Is the covariance honest?", [Words(sentences(report)), picture]))
+    return sections
+
+
+def facts_section(subject: Subject) -> Section:
+    """What was tuned, on what and with what."""
+    plan, training = subject.plan, training_seeds(subject.plan.seed, TRAINING_SEEDS)
+    about = [f"{one.name}: {one.about}" if one.about else one.name for one in plan.scenarios]
+    rows = [
+        ["filter", plan.filter],
+        ["scenarios" if len(about) > 1 else "scenario", "; ".join(about)],
+        ["made small", "; ".join(f"{name}: {find_objective(name).about}" for name in plan.objectives)],
+        ["mean NIS", "held in its band" if plan.is_constrained else "free"],
+        ["sampler", plan.sampler],
+        ["training seeds", f"{training.start} to {training.stop - 1}"],
+        ["study", subject.name],
+    ]
+    if subject.study is not None:
+        states = [trial.state for trial in subject.study.get_trials(deepcopy=False)]
+        complete, early = states.count(TrialState.COMPLETE), states.count(TrialState.PRUNED)
+        rows.append(["finished trials", f"{complete + early}, {early} of them ended early"])
+    rows.append(["computed here with", ", ".join(f"{name} {version}" for name, version in versions().items())])
+    return Section("What was done", [Table("", [], rows)])
+
+
+def _span(value: Interval) -> str:
+    """A value with its 95 % interval in brackets; empty if there is no value."""
+    middle, low, high = (f"{part:#.4g}".rstrip(".") for part in value)
+    return "" if isnan(value.value) else f"{middle} [{low}, {high}]"
