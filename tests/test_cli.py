@@ -174,6 +174,11 @@ def test_help_teaches(command, thruster):
 BAD = [
     (("tune", "--filter", "none"), "filter must be one of kf, kf-steady, ekf, "),
     (("tune", "--scenario", "none"), "scenario must be one of"),
+    (("tune", "--filter", "ekf", "--method", "gradient", "--hold-r"), "R must be free for --method gradient"),
+    (
+        ("tune", "--filter", "enkf", "--method", "gradient"),
+        "a filter whose likelihood has a gradient must be one of kf",
+    ),
     (("tune", "--trials", "0"), "trials must be a whole number of at least 1, but got 0"),
     (("tune", "--storage", "sqlite:////no/such/folder/x.db"), "storage must be a database that can be reached"),
     (("tune", "--storage", "text.txt"), "storage must be a journal file"),

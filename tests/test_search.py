@@ -7,9 +7,10 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
+from tuning import trials
 from tuning.evaluate import evaluate, score_ratio
 from tuning.gradient import BAD_START
-from tuning.objectives import NIS_BAND, nis_violation
+from tuning.objectives import LARGEST, NIS_BAND, nis_violation
 from tuning.plan import Plan
 from tuning.samplers import SAMPLERS, make_sampler
 from tuning.scenarios import find_scenario
@@ -145,3 +146,22 @@ def test_from_a_bad_start_a_study_of_a_perfect_model_comes_within_half_a_per_cen
     started = evaluate(bad.filter(scenario), scenario.data(proof.seeds), scenario.scale)
     assert score_ratio(started, proof.true).low > 1.1
     assert score_ratio(proof.tuned, proof.true).high < 1.005
+
+
+def test_a_trial_whose_nis_is_not_finite_is_inconsistent_and_has_no_twin(monkeypatch):
+    def lost(filter_, estimates, data, scale, judge=trials.judge):
+        evaluation = judge(filter_, estimates, data, scale)
+        return evaluation._replace(nis=evaluation.nis._replace(value=np.nan))
+
+    monkeypatch.setattr(trials, "judge", lost)
+    result = studied(PLAN, 3)
+    assert len(result.trials) == 3 and all(violation(trial) == LARGEST for trial in result.trials)
+    assert not any(TWIN in trial.user_attrs for trial in result.trials)
+
+
+def test_r_may_be_held_at_the_sensor_s_sheet():
+    result = studied(PLAN._replace(hold_r=True), 10)
+    assert set(result.trials[0].params) == {"Q11", "Q22"}
+    assert result.choice.model["measurement_noise_cov"] == MISMATCH.measurement_noise_cov
+    assert not any(TWIN in trial.user_attrs for trial in result.trials)
+    assert result.best_value < result.trials[0].values[0]

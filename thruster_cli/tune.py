@@ -43,6 +43,7 @@ def command(
     consistency: Annotated[
         bool, typer.Option(help="Hold the mean NIS between 0.8 and 1.25 of what is right.")
     ] = True,
+    hold_r: Annotated[bool, typer.Option("--hold-r", help="Leave R at the sensor's sheet, tune Q alone.")] = False,
     sampler: Annotated[str, typer.Option(help=", ".join(SAMPLERS))] = "tpe",
     pruning: Annotated[
         bool, typer.Option(help="End a trial early that is significantly worse than the best on the same seeds.")
@@ -77,7 +78,7 @@ def command(
     one_of("method", method, METHODS)
     scenarios = tuple(find_scenario(name) for name in scenario or ["mismatch"])
     objectives = tuple(objective or ["score"])
-    plan = Plan(filter_name, scenarios, seed, objectives, consistency, sampler, pruning)
+    plan = Plan(filter_name, scenarios, seed, objectives, consistency, sampler, hold_r, pruning)
     tuning = tune(plan, trials, storage, study, out, by_gradient=method == "gradient", workers=workers)
     emit(report(tuning), as_json(tuning), json)
     if tuning.result.interrupted:
@@ -98,6 +99,8 @@ def tune(
     trials, workers = at_least("trials", trials, 1), at_least("workers", workers, 1)
     if by_gradient:
         one_of("a filter whose likelihood has a gradient", plan.filter, DIFFERENTIABLE)
+        if plan.hold_r:
+            raise ValueError("R must be free for --method gradient, but got --hold-r")
     name = study_name or _name(plan, by_gradient)
     if "/" in name:
         raise ValueError(f"study must be a name without slashes, but got {name!r}")
@@ -128,6 +131,7 @@ def _name(plan: Plan, by_gradient: bool) -> str:
     """A name for a study of a plan: what differs from the default is in it."""
     parts = [plan.filter, _scenarios(plan).replace(", ", "+"), f"seed{plan.seed}"]
     parts += ["+".join(plan.objectives)] * (plan.objectives != ("score",))
+    parts += ["hold-r"] * plan.hold_r
     parts += ["any-nis"] * (not plan.consistent) + [plan.sampler] * (plan.sampler != "tpe")
     return "-".join(parts + ["gradient"] * by_gradient)
 

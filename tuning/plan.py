@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import optuna
+from optuna.distributions import BaseDistribution
 
 from filters.registry import filter_class
 from tuning.objectives import Objective, find_objective
 from tuning.scenarios import Data, Scenario, held_out_seeds, training_seeds
-from tuning.space import has_search_space
+from tuning.space import distributions, has_search_space
 
 TRAINING_SEEDS = 32
 HELD_OUT_SEEDS = 200
@@ -24,6 +25,7 @@ class Plan(NamedTuple):
     objectives: tuple[str, ...] = ("score",)
     consistent: bool = True  # whether the mean NIS has to be within its band
     sampler: str = "tpe"
+    hold_r: bool = False  # whether R stays that of the sensor's sheet
     prune: bool = True  # whether a trial ends early that is worse than the best one on the same seeds
 
     @property
@@ -36,6 +38,7 @@ class Plan(NamedTuple):
             "objectives": list(self.objectives),
             "consistent": self.consistent,
             "sampler": self.sampler,
+            "hold_r": self.hold_r,
             "optuna": optuna.__version__.split(".")[0],
         }
 
@@ -62,6 +65,10 @@ class Plan(NamedTuple):
     def found_objectives(self) -> list[Objective]:
         """The objectives themselves."""
         return [find_objective(name) for name in self.objectives]
+
+    def space(self) -> dict[str, BaseDistribution]:
+        """What a trial may choose, by name; ranges are those of the first scenario."""
+        return distributions(self.filter, self.scenarios[0], hold_r=self.hold_r)
 
     def training_data(self) -> list[Data]:
         """Data that every trial shares, one for each scenario."""

@@ -87,7 +87,15 @@ def _plan(identity, where: str | Path) -> Plan:
     try:
         scenarios = tuple(find_scenario(name) for name in identity["scenarios"])
         objectives, seed = tuple(identity["objectives"]), at_least("seed", identity["seed"], 0)
-        plan = Plan(identity["filter"], scenarios, seed, objectives, identity["consistent"], identity["sampler"])
+        plan = Plan(
+            identity["filter"],
+            scenarios,
+            seed,
+            objectives,
+            identity["consistent"],
+            identity["sampler"],
+            identity["hold_r"],
+        )
     except (KeyError, TypeError):
         raise ValueError(f"a report needs the plan of the study, but {where} has {shown(identity)}") from None
     return plan.checked()

@@ -95,11 +95,11 @@ def _default_numbers(name: str) -> dict:
     return numbers | {number: getattr(filter_class(name), number) for number in own_numbers(name)}
 
 
-def distributions(name: str, scenario: Scenario) -> dict[str, BaseDistribution]:
+def distributions(name: str, scenario: Scenario, *, hold_r: bool = False) -> dict[str, BaseDistribution]:
     """What a study may choose for a filter, by the names of its trials' parameters.
 
     Q for each state, R and N are chosen on logarithmic scales. Baselines, which know neither Q nor R, keep the
-    untuned ones.
+    untuned ones; with `hold_r` R stays that of the sensor's sheet.
     """
     untuned, found = scenario.untuned, {}
     if filter_class(name).has_covariance:
@@ -108,31 +108,35 @@ def distributions(name: str, scenario: Scenario) -> dict[str, BaseDistribution]:
             # Where the voltage hardly moves a state, noise may move it more.
             low, high = Q_FACTORS[0] * variance, Q_FACTORS[1] * max(variance, scale**2)
             found[f"Q{number}{number}"] = FloatDistribution(low, high, log=True)
-        low, high = (untuned["measurement_noise_cov"] * factor for factor in R_FACTORS)
-        found["R"] = FloatDistribution(low, high, log=True)
+        if not hold_r:
+            low, high = (untuned["measurement_noise_cov"] * factor for factor in R_FACTORS)
+            found["R"] = FloatDistribution(low, high, log=True)
     if has_ensemble(name):
         _, low, high = ensemble_sizes_of(name)
         found["N"] = IntDistribution(low, high, log=True)
     return found | own_numbers(name)
 
 
-def suggest(trial: optuna.trial.BaseTrial, name: str, scenario: Scenario) -> Choice:
-    """Let a trial choose all that `distributions` lists."""
+def suggest(
+    trial: optuna.trial.BaseTrial, name: str, scenario: Scenario, space: Mapping[str, BaseDistribution]
+) -> Choice:
+    """Let a trial choose all that a space of `distributions` lists."""
     chosen = {}
-    for key, distribution in distributions(name, scenario).items():
+    for key, distribution in space.items():
         draw = trial.suggest_int if isinstance(distribution, IntDistribution) else trial.suggest_float
         chosen[key] = draw(key, distribution.low, distribution.high, log=distribution.log)
-    return _choice(name, chosen, scenario)
+    return choice_of(name, chosen, scenario)
 
 
-def _choice(name: str, chosen: Mapping[str, float | int], scenario: Scenario) -> Choice:
+def choice_of(name: str, parameters: Mapping[str, float | int], scenario: Scenario) -> Choice:
+    """The choice that trial parameters stand for; Q or R that are not among them are the untuned ones."""
     model = dict(scenario.untuned)
-    if "R" in chosen:
+    if "Q11" in parameters:
         states = range(1, len(model["process_noise_cov"]) + 1)
-        q = tuple(chosen[f"Q{number}{number}"] for number in states)
-        model = {"process_noise_cov": q, "measurement_noise_cov": chosen["R"]}
-    numbers = {"ensemble_size": chosen["N"]} if "N" in chosen else {}
-    return Choice(name, model, numbers | {number: chosen[number] for number in own_numbers(name)})
+        model["process_noise_cov"] = tuple(parameters[f"Q{number}{number}"] for number in states)
+    model["measurement_noise_cov"] = parameters.get("R", model["measurement_noise_cov"])
+    numbers = {"ensemble_size": parameters["N"]} if "N" in parameters else {}
+    return Choice(name, model, numbers | {number: parameters[number] for number in own_numbers(name)})
 
 
 def has_search_space(name: str) -> bool:
@@ -149,8 +153,3 @@ def parameters_of(choice: Choice) -> Mapping[str, float | int]:
     if "ensemble_size" in choice.numbers:
         parameters["N"] = choice.numbers["ensemble_size"]
     return parameters | {number: choice.numbers[number] for number in own_numbers(choice.name)}
-
-
-def choice_of(name: str, parameters: Mapping[str, float | int], scenario: Scenario) -> Choice:
-    """The choice that trial parameters stand for."""
-    return _choice(name, parameters, scenario)

@@ -20,7 +20,6 @@ from tuning.scenarios import Data, Scenario, held_out_seeds
 from tuning.space import (
     Choice,
     choice_of,
-    distributions,
     has_ensemble,
     parameters_of,
     size_ladder,
@@ -96,7 +95,7 @@ def open_study(
     """
     plan = plan.checked()
     scenario = plan.scenarios[0]
-    space = distributions(plan.filter, scenario)
+    space = plan.space()
     make_sampler(plan.sampler, plan.seed, 0, space)  # a clear error before anything is stored
     study = optuna.create_study(
         study_name=name,
@@ -113,7 +112,8 @@ def open_study(
     study.sampler = make_sampler(plan.sampler, plan.seed, present, space, worker)
     if not present:
         study.set_user_attr("identity", plan.identity)
-        study.enqueue_trial(parameters_of(start or untuned_choice(plan.filter, scenario)))
+        first = parameters_of(start or untuned_choice(plan.filter, scenario))
+        study.enqueue_trial({name: first[name] for name in space})
     return study
 
 
@@ -251,13 +251,18 @@ def _enqueue_consistent_twin(study: optuna.Study, plan: Plan, last: FrozenTrial)
     A common factor on Q and R leaves the gain of a linear filter as it is, and divides the NIS: without this a
     sampler would have to find by chance, for every good ratio of Q and R, the one scale that is consistent.
     """
-    complete = last.state == TrialState.COMPLETE
-    if not complete or violation(last) <= 0 or last.user_attrs.get(TWIN, 0) == TWINS:
+    if (
+        plan.hold_r
+        or last.state != TrialState.COMPLETE
+        or violation(last) <= 0
+        or NIS not in last.user_attrs
+        or last.user_attrs.get(TWIN) == TWINS
+    ):
         return
     best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
     if violation(best) <= 0 and best.values[0] < last.values[0]:
         return
-    space, factor = distributions(plan.filter, plan.scenarios[0]), last.user_attrs[NIS]
+    space, factor = plan.space(), last.user_attrs[NIS]
     scaled = {
         name: float(np.clip(factor * value, space[name].low, space[name].high))
         for name, value in last.params.items()

@@ -13,7 +13,7 @@ import optuna
 
 from filters.batch import Estimates, run
 from tuning.evaluate import Evaluation, judge, run_scores
-from tuning.objectives import nis_violation, penalised
+from tuning.objectives import LARGEST, nis_violation, penalised
 from tuning.plan import Plan
 from tuning.scenarios import Data
 from tuning.space import Choice, suggest
@@ -46,12 +46,14 @@ def run_trial(trial: optuna.Trial, plan: Plan, data: Sequence[Data]) -> list[flo
     Raises:
         optuna.TrialPruned: if it is significantly worse than the best one on the seeds so far.
     """
-    choice = suggest(trial, plan.filter, plan.scenarios[0])
+    choice = suggest(trial, plan.filter, plan.scenarios[0], plan.space())
     prunes = plan.prune and plan.objectives == ("score",)
     measured = measure(choice, plan, data, trial if prunes else None)
     if plan.is_constrained:
-        trial.set_constraint(CONSISTENCY, max(nis_violation(e) for e in measured.evaluations))
-        trial.set_user_attr(NIS, geometric_mean([e.nis.value / e.channels for e in measured.evaluations]))
+        outside = max(nis_violation(e) for e in measured.evaluations)
+        trial.set_constraint(CONSISTENCY, outside)
+        if outside < LARGEST:  # else there is no finite NIS to speak of
+            trial.set_user_attr(NIS, geometric_mean([e.nis.value / e.channels for e in measured.evaluations]))
     return values(measured, plan)
 
 
