@@ -40,24 +40,25 @@ def command(
         list[str] | None,
         typer.Option(help=f"What to make small: {', '.join(OBJECTIVES)}; two for a Pareto front."),
     ] = None,
-    consistency: Annotated[
-        bool, typer.Option(help="Hold the mean NIS between 0.8 and 1.25 of what is right.")
-    ] = True,
+    any_nis: Annotated[
+        bool,
+        typer.Option("--no-consistency", help="Do not hold the mean NIS between 0.8 and 1.25 of what is right."),
+    ] = False,
     hold_r: Annotated[bool, typer.Option("--hold-r", help="Leave R at the sensor's sheet, tune Q alone.")] = False,
     sampler: Annotated[str, typer.Option(help=", ".join(SAMPLERS))] = "tpe",
-    pruning: Annotated[
-        bool, typer.Option(help="End a trial early that is significantly worse than the best on the same seeds.")
-    ] = True,
+    no_pruning: Annotated[
+        bool,
+        typer.Option(
+            "--no-pruning", help="Do not end a trial that is significantly worse than the best on the same seeds."
+        ),
+    ] = False,
     method: Annotated[
         str,
         typer.Option(help="optuna, or gradient: maximum likelihood, for kf and ekf; optuna runs for comparison."),
     ] = "optuna",
     workers: Annotated[int, typer.Option(help="Processes on this host that share the study.")] = 1,
     storage: Annotated[
-        str,
-        typer.Option(
-            help="Journal file, for one host; for several a database, postgresql+psycopg2://USER@HOST/NAME."
-        ),
+        str, typer.Option(help="Journal file for one host; for several, a database as docs/workers.md tells.")
     ] = DEFAULT_STORAGE,
     study: Annotated[str | None, typer.Option(help="Name of the study; by default from the above.")] = None,
     out: Annotated[Path | None, typer.Option(help="Tuned file; out/STUDY.json by default.")] = None,
@@ -78,7 +79,7 @@ def command(
     one_of("method", method, METHODS)
     scenarios = tuple(find_scenario(name) for name in scenario or ["mismatch"])
     objectives = tuple(objective or ["score"])
-    plan = Plan(filter_name, scenarios, seed, objectives, consistency, sampler, hold_r, pruning)
+    plan = Plan(filter_name, scenarios, seed, objectives, not any_nis, sampler, hold_r, not no_pruning)
     tuning = tune(plan, trials, storage, study, out, by_gradient=method == "gradient", workers=workers)
     emit(report(tuning), as_json(tuning), json)
     if tuning.result.interrupted:
