@@ -151,6 +151,7 @@ def test_workers_propose_different_things_and_go_through_one_grid():
     assert proposals("grid", 0) == proposals("grid", 1)  # Optuna marks the places that are taken
 
 
+@pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed to be used with Study.optimize")
 def test_a_trial_without_a_heartbeat_is_lost_and_tried_once_more(tmp_path, monkeypatch):
     monkeypatch.setattr(storages, "HEARTBEAT_SECONDS", 1)
     monkeypatch.setattr(storages, "GRACE_SECONDS", 1)
@@ -185,6 +186,7 @@ def flaky(tmp_path, monkeypatch):
     return storage, fail
 
 
+@pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed to be used with Study.optimize")
 def test_an_answer_that_gets_lost_is_asked_for_again(flaky):
     storage, fail = flaky
     study = optuna.create_study(storage=storage)
