@@ -51,7 +51,7 @@ def command(
     facts = machine()
     shown = table("Speed, side by side", COLUMNS, [row.cells() for row in rows], caption=CAPTION)
     emit(
-        [shown, *machine_lines(facts)],
+        [shown, vectors.memory_line(), *machine_lines(facts)],
         {"rows": [row.as_json() for row in rows], "machine": facts, "seed": seed, "quick": quick},
         json,
     )

@@ -9,10 +9,10 @@ written anew; all of them take some ten minutes on two cores. Every run gives th
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from docs.page import with_tables
 from filters.consistency.intervals import Interval
 from thruster_env.files import write_whole
 from tuning.compare import Contender, Leaderboard, Row, compare, contender
@@ -141,15 +141,6 @@ TABLES: dict[str, Callable[[], str]] = {
 }
 
 
-def with_tables(page: str, names: Sequence[str] = tuple(TABLES)) -> str:
-    """The page with some of its computed tables written anew."""
-
-    def anew(match: re.Match) -> str:
-        return f"{match[1]}\n{TABLES[match[2]]()}\n{match[3]}" if match[2] in names else match[0]
-
-    return re.sub(r"(<!-- table (\w+) -->).*?(<!-- end -->)", anew, page, flags=re.DOTALL)
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(prog="python -m docs.ranking_tables", description=__doc__.splitlines()[0])
@@ -157,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--table", action="append", choices=list(TABLES), help="only this one; may be repeated")
     given = parser.parse_args(arguments)
     for name in given.table or TABLES:  # written one by one, so that what is done stays
-        write_whole(given.page, with_tables(given.page.read_text(), [name]))
+        write_whole(given.page, with_tables(given.page.read_text(), {name: TABLES[name]}))
 
 
 if __name__ == "__main__":

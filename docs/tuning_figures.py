@@ -20,9 +20,10 @@ from tuning.evaluate import Evaluation, evaluate, score_ratio
 from tuning.gradient import BAD_START, maximise_likelihood
 from tuning.objectives import NIS_BAND
 from tuning.plan import Plan
+from tuning.proof import prove
 from tuning.scenarios import Scenario, find_scenario
 from tuning.space import Choice, true_choice
-from tuning.study import StudyResult, open_study, prove, quiet_optuna, run_study
+from tuning.study import StudyResult, open_study, quiet_optuna, run_study
 
 SEED, TRIALS = 0, 100
 FILTERS = ("kf", "ekf", "enkf")

@@ -6,7 +6,7 @@ from contextlib import nullcontext
 import numpy as np
 
 from filters import StateSpaceModel, affine_model, make_filter, thruster_model, truth
-from filters.registry import tunable_numbers
+from filters.registry import sealed, tunable_numbers
 from thruster_env.compiled import interpreted
 from thruster_env.streams import episode_keys
 
@@ -161,3 +161,17 @@ def small(name, model, size=10):
     """A filter by name; ensembles small, and of a size that fills no vector register."""
     numbers = {"ensemble_size": size} if "ensemble_size" in tunable_numbers(name) else {}
     return make_filter(name, model, **numbers)
+
+
+# What a tuned file holds at least.
+TUNED = sealed(
+    {
+        "format": "thruster-env tuned filter",
+        "version": 2,
+        "filter": {
+            "name": "enkf",
+            "numbers": {"ensemble_size": 20},
+            "model": {"process_noise_cov": [1, 4e-4], "measurement_noise_cov": 0.25},
+        },
+    }
+)

@@ -11,9 +11,10 @@ from thruster_cli.main import main
 from tuning.compare import compare, contender, default_belief, sized
 from tuning.evaluate import evaluate, score_ratio
 from tuning.plan import Plan
+from tuning.proof import Comparison
 from tuning.scenarios import find_scenario, held_out_seeds
 from tuning.space import true_choice, untuned_choice
-from tuning.study import Comparison, StudyResult
+from tuning.study import StudyResult
 from tuning.tuned import write_tuned
 
 NOMINAL, SEEDS = find_scenario("nominal"), held_out_seeds(0, 12)

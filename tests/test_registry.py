@@ -13,18 +13,7 @@ from filters import (
     thruster_model,
 )
 from filters.registry import filter_class, read_tuned_file, sealed, tunable_numbers
-
-TUNED = sealed(
-    {
-        "format": "thruster-env tuned filter",
-        "version": 2,
-        "filter": {
-            "name": "enkf",
-            "numbers": {"ensemble_size": 20},
-            "model": {"process_noise_cov": [1, 4e-4], "measurement_noise_cov": 0.25},
-        },
-    }
-)
+from tests.models import TUNED
 
 
 def changed(**entries):

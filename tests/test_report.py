@@ -13,6 +13,7 @@ from filters.consistency.intervals import Interval
 from thruster_cli.main import main
 from tuning.figures import early_trials
 from tuning.plan import Plan
+from tuning.proof import Comparison, prove
 from tuning.report import write_report
 from tuning.report_figures import FEWEST_TRIALS, importances
 from tuning.report_page import Picture, Section, Table, Words, html_page, markdown_page
@@ -20,7 +21,7 @@ from tuning.report_parts import advice
 from tuning.scenarios import find_scenario
 from tuning.space import untuned_choice
 from tuning.storage import open_storage
-from tuning.study import Comparison, open_study, prove, run_study
+from tuning.study import open_study, run_study
 from tuning.tuned import write_tuned
 
 MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")

@@ -4,9 +4,10 @@ import pytest
 from tuning.evaluate import evaluate
 from tuning.excitation import BinarySequence, Steps
 from tuning.plan import Plan
+from tuning.proof import Comparison
 from tuning.scenarios import computed_scale, find_scenario
 from tuning.space import untuned_choice
-from tuning.study import Comparison, StudyResult
+from tuning.study import StudyResult
 from tuning.tuned import read_tuned, write_tuned
 
 

@@ -12,10 +12,11 @@ from tuning.evaluate import evaluate, score_ratio
 from tuning.gradient import BAD_START
 from tuning.objectives import LARGEST, NIS_BAND, nis_violation
 from tuning.plan import Plan
+from tuning.proof import prove
 from tuning.samplers import SAMPLERS, make_sampler
 from tuning.scenarios import find_scenario
 from tuning.space import choice_of, distributions, true_choice, untuned_choice
-from tuning.study import TWIN, best_trial, open_study, prove, run_study, violation
+from tuning.study import TWIN, best_trial, open_study, run_study, violation
 from tuning.trials import BLOCK, measure
 
 MISMATCH, NOMINAL, OUTLIERS = map(find_scenario, ("mismatch", "nominal", "outliers"))

@@ -10,10 +10,11 @@ from optuna.trial import TrialState
 
 from filters.registry import sealed
 from tuning.plan import Plan
+from tuning.proof import SizeRow, prove, sufficient_size
 from tuning.scenarios import find_scenario
 from tuning.space import parameters_of, untuned_choice
 from tuning.storage import PROCESS, RETRY_OF, open_storage
-from tuning.study import SizeRow, finished_trials, open_study, prove, run_study, sufficient_size
+from tuning.study import finished_trials, open_study, run_study
 from tuning.tuned import read_tuned, write_tuned
 
 SCENARIO = find_scenario("mismatch")

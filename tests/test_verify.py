@@ -9,8 +9,9 @@ import pytest
 from filters.registry import sealed
 from thruster_cli.main import main
 from tuning.plan import Plan
+from tuning.proof import prove
 from tuning.scenarios import find_scenario
-from tuning.study import open_study, prove, run_study
+from tuning.study import open_study, run_study
 from tuning.tuned import write_tuned
 from tuning.verify import Difference, verify
 

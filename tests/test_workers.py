@@ -58,7 +58,7 @@ def run_with_a_kill(storage, trials, on_trial=lambda study, finished: None):
     return study, killed[0]
 
 
-def check(study, lost, trials):
+def assert_nothing_is_lost(study, lost, trials):
     found = study.get_trials()
     assert [trial.number for trial in found] == list(range(len(found)))
     assert trials <= finished_trials(study) < trials + WORKERS
@@ -74,7 +74,7 @@ def check(study, lost, trials):
 
 def test_a_study_survives_the_death_of_one_of_three_workers(tmp_path):
     study, lost = run_with_a_kill(str(tmp_path / "j"), 80)
-    check(study, lost, 80)
+    assert_nothing_is_lost(study, lost, 80)
 
 
 @pytest.mark.slow
@@ -91,7 +91,7 @@ def test_a_study_in_a_database_survives_an_outage_too(postgres):
     with pytest.warns(UserWarning, match="no answer from the database, trying for 60 s: .*connection"):
         study, lost = run_with_a_kill(url, 60, interrupt_service)
     outages[0].join()
-    check(study, lost, 60)
+    assert_nothing_is_lost(study, lost, 60)
 
 
 @pytest.fixture

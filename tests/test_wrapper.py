@@ -13,6 +13,7 @@ import thruster_env  # noqa: F401 - registers the env
 from filters import FILTERS, EstimateState, StateSpaceModel, affine_model, make_filter, run, thruster_model
 from filters.registry import sealed
 from filters.thruster import model_of_env
+from tests.models import TUNED
 from thruster_env.parameters import TUNNEL, derive_constants
 from thruster_env.plant import make_plant
 from thruster_env.simulation import simulate
@@ -315,19 +316,6 @@ class TestSpecifications:
         np.testing.assert_array_equal(found[0], found[1])
         np.testing.assert_array_equal(found[0], found[2])
         assert env.filter.ensemble_size == 20
-
-
-TUNED = sealed(
-    {
-        "format": "thruster-env tuned filter",
-        "version": 2,
-        "filter": {
-            "name": "enkf",
-            "numbers": {"ensemble_size": 20},
-            "model": {"process_noise_cov": [1, 4e-4], "measurement_noise_cov": 0.25},
-        },
-    }
-)
 
 
 class TestModels:

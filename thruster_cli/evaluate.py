@@ -11,9 +11,9 @@ from thruster_cli.honesty import check_request, judge
 from thruster_cli.output import FILTER_HELP, JsonOption, SeedOption, announce_compilation, emit, progress_console
 from thruster_cli.tables import choice_table, comparison_table
 from tuning.plan import HELD_OUT_SEEDS
+from tuning.proof import prove
 from tuning.scenarios import find_scenario
 from tuning.space import true_choice, untuned_choice
-from tuning.study import prove
 from tuning.tuned import read_tuned, summary
 
 

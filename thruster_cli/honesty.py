@@ -12,9 +12,9 @@ from filters.registry import filter_class
 from thruster_env.files import check_target
 from tuning.consistency_figures import consistency_figure
 from tuning.evaluate import check_consistency
+from tuning.proof import Comparison
 from tuning.scenarios import Scenario
 from tuning.space import Choice
-from tuning.study import Comparison
 
 
 def check_request(path: Path, filter_name: str) -> None:

@@ -19,10 +19,11 @@ from thruster_env.files import check_target
 from tuning.gradient import DIFFERENTIABLE, maximise_likelihood
 from tuning.objectives import OBJECTIVES
 from tuning.plan import Plan
+from tuning.proof import prove
 from tuning.samplers import SAMPLERS
 from tuning.scenarios import SCENARIOS, find_scenario
 from tuning.storage import open_storage
-from tuning.study import best_trial, finished_trials, open_study, prove, quiet_optuna, run_study, run_trials
+from tuning.study import best_trial, finished_trials, open_study, quiet_optuna, run_study, run_trials
 from tuning.tuned import write_tuned
 from tuning.workers import run_in_workers
 

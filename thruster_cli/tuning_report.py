@@ -10,9 +10,10 @@ from thruster_cli.tables import choice_table, comparison_table, front_table, gra
 from tuning.evaluate import Evaluation, Interval, score_ratio
 from tuning.gradient import GradientResult
 from tuning.plan import Plan
+from tuning.proof import Comparison
 from tuning.scenarios import Scenario
 from tuning.space import size_ladder, true_choice, untuned_choice
-from tuning.study import Comparison, StudyResult
+from tuning.study import StudyResult
 from tuning.tuned import summary
 
 

@@ -16,9 +16,9 @@ from filters.particles.weighted import WeightedFilter
 from filters.registry import filter_class, make_filter
 from thruster_env.checks import one_of, positive
 from tuning.evaluate import Evaluation, judge, score_ratio
+from tuning.interruption import stop_on_interrupt
 from tuning.scenarios import Data, Scenario
 from tuning.space import Choice, ensemble_sizes_of, has_ensemble, true_choice, untuned_choice
-from tuning.study import stop_on_interrupt
 
 KNOWLEDGE = {"true": true_choice, "untuned": untuned_choice}  # of the plant's Q and R
 # What is believed of a constant by default: a flow of so many m/s, of others a part of their value.

@@ -11,8 +11,9 @@ from optuna.trial import FrozenTrial, TrialState
 from filters.batch import run
 from filters.filter import Filter
 from thruster_env.figures import BLUE, DARK, RUST, STATES, new_figure, save_figure, tidy
+from tuning.proof import Comparison
 from tuning.scenarios import Data
-from tuning.study import Comparison, violation
+from tuning.study import violation
 
 SCORE = "score: mean RMSE over bound [-]"
 TRUTH, ESTIMATE, BOUND = DARK, BLUE, RUST

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from thruster_env.files import check_target, write_whole
+from tuning.proof import ensemble_sizes, prove, sufficient_size
 from tuning.report_page import Section, html_page, markdown_page
 from tuning.report_parts import (
     Sketchbook,
@@ -21,7 +22,6 @@ from tuning.report_parts import (
 )
 from tuning.report_subject import find_subject, is_file
 from tuning.space import has_ensemble
-from tuning.study import ensemble_sizes, prove, sufficient_size
 
 
 class Report(NamedTuple):

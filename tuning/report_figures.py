@@ -12,7 +12,8 @@ from optuna.trial import FrozenTrial, TrialState
 
 from thruster_env.figures import BLUE, RUST, STATES, new_figure, save_figure, tidy
 from tuning.figures import COLOURS, early_trials, limit_values
-from tuning.study import SizeRow, best_trial, violation
+from tuning.proof import SizeRow
+from tuning.study import best_trial, violation
 
 FEWEST_TRIALS = 10  # complete ones, for importances to mean anything
 COLUMNS = 3

@@ -17,6 +17,7 @@ from tuning.evaluate import check_consistency, score_ratio
 from tuning.figures import SCORE, comparison_figure, estimates_figure, history_figure
 from tuning.objectives import find_objective
 from tuning.plan import TRAINING_SEEDS, Plan
+from tuning.proof import Comparison, SizeRow
 from tuning.report_figures import (
     FEWEST_TRIALS,
     front_figure,
@@ -29,7 +30,6 @@ from tuning.report_page import Picture, Section, Table, Words
 from tuning.report_subject import Subject
 from tuning.scenarios import Scenario, training_seeds
 from tuning.space import Choice, parameters_of, true_choice, untuned_choice
-from tuning.study import Comparison, SizeRow
 from tuning.tuned import versions
 
 MANY_TRIALS = 50

@@ -1,35 +1,30 @@
-"""Optuna studies of a filter's numbers: common random numbers in, a choice and its proof out."""
+"""Optuna studies of a filter's numbers: common random numbers in, a choice out."""
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from tuning.evaluate import Evaluation, evaluate, score_ratio
-from tuning.plan import HELD_OUT_SEEDS, Plan
+from tuning.interruption import stop_on_interrupt
+from tuning.plan import Plan
+from tuning.proof import SizeRow, ensemble_sizes, sufficient_size
 from tuning.samplers import make_sampler
-from tuning.scenarios import Data, Scenario, held_out_seeds
+from tuning.scenarios import Data
 from tuning.space import (
     Choice,
     choice_of,
     has_ensemble,
     parameters_of,
-    size_ladder,
-    true_choice,
     untuned_choice,
 )
 from tuning.storage import PROCESS, retry_orphans, this_process
 from tuning.trials import CONSISTENCY, NIS, make_pruner, run_trial
 
-SIZE_TOLERANCE = 0.01  # the tuned ensemble is the smallest whose paired score is this close to the best
 TWIN = "consistent twin"  # attribute: how often a trial's Q and R have been scaled
 TWINS = 2  # so often at most: nonlinear filters may need a second time
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
@@ -39,24 +34,6 @@ OnTrial = Callable[[optuna.Study, int], None]
 def quiet_optuna() -> None:
     """Let Optuna report errors only, for programs that show progress of their own."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-
-
-class Comparison(NamedTuple):
-    """Three choices on the same held-out seeds, and the bound on these."""
-
-    untuned: Evaluation
-    tuned: Evaluation
-    true: Evaluation
-    bound: np.ndarray  # (n,) bound on the standard error of each state
-    seeds: range
-
-
-class SizeRow(NamedTuple):
-    """How an ensemble of one size does against the best one."""
-
-    size: int
-    evaluation: Evaluation
-    ratio: float  # score over the best score on the same seeds
 
 
 class StudyResult(NamedTuple):
@@ -221,30 +198,6 @@ def run_trials(
         return True
 
 
-@contextmanager
-def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Within this context the first Ctrl-C only makes the yielded function return True.
-
-    An exception in the midst of compiled code or a storage's lock could get lost or leave the lock behind.
-    Outside the main thread, where Python takes no signals, nothing changes.
-    """
-    caught = []
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    before = signal.getsignal(signal.SIGINT)
-
-    def note(number, frame):
-        caught.append(number)
-        signal.signal(signal.SIGINT, before)
-
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield lambda: bool(caught)
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 def _enqueue_consistent_twin(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:
     """Ask next for the last trial with Q and R scaled by its mean NIS, if it is the better for being inconsistent.
 
@@ -270,31 +223,3 @@ def _enqueue_consistent_twin(study: optuna.Study, plan: Plan, last: FrozenTrial)
     }
     twin = {TWIN: last.user_attrs.get(TWIN, 0) + 1, f"{TWIN} of": last.number}
     study.enqueue_trial({**last.params, **scaled}, user_attrs=twin)
-
-
-def ensemble_sizes(choice: Choice, plan: Plan, data: Sequence[Data]) -> list[SizeRow]:
-    """The score of a choice against ensemble size, paired on the same seeds, smallest size first.
-
-    With several scenarios the ratio is the largest of them: a size that suffices for all.
-    """
-    sizes = sorted({*size_ladder(choice.name), choice.numbers["ensemble_size"]})
-    pairs = list(zip(plan.scenarios, data, strict=True))
-    tables = [[evaluate(choice.with_size(n).filter(one), part, one.scale) for n in sizes] for one, part in pairs]
-    best = [min(evaluations, key=lambda e: e.score.value) for evaluations in tables]
-    ratios = [[score_ratio(e, least).value for e in found] for found, least in zip(tables, best, strict=True)]
-    return [SizeRow(n, tables[0][i], max(column[i] for column in ratios)) for i, n in enumerate(sizes)]
-
-
-def sufficient_size(sizes: Sequence[SizeRow]) -> int:
-    """The smallest size that is as good as the best one; with several scenarios no size is best on all of them."""
-    least = min(row.ratio for row in sizes)
-    return next(row.size for row in sizes if row.ratio <= (1.0 + SIZE_TOLERANCE) * least)
-
-
-def prove(choice: Choice, scenario: Scenario, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:
-    """Untuned, tuned and true filter on seeds that the study never saw, with the bound on these seeds."""
-    seeds = held_out_seeds(seed, count)
-    data = scenario.data(seeds)
-    choices = (untuned_choice(choice.name, scenario), choice, true_choice(choice.name, scenario))
-    evaluations = [evaluate(c.filter(scenario), data, scenario.scale) for c in choices]
-    return Comparison(*evaluations, bound=scenario.bound(data), seeds=seeds)

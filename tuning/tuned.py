@@ -14,9 +14,10 @@ from thruster_env.checks import at_least, positive, shown, vector
 from thruster_env.files import write_whole
 from tuning.evaluate import Evaluation
 from tuning.plan import Plan
+from tuning.proof import Comparison
 from tuning.scenarios import Scenario, find_scenario
 from tuning.space import Choice
-from tuning.study import Comparison, StudyResult
+from tuning.study import StudyResult
 
 PACKAGES = ("thruster-env", "optuna", "numpy", "numba", "gymnasium")
 

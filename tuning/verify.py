@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 from filters.registry import read_tuned_file
 from thruster_env.checks import shown
+from tuning.proof import prove
 from tuning.scenarios import find_scenario
-from tuning.study import prove
 from tuning.tuned import metrics, read_tuned, versions
 
 TOLERANCE = 1e-9  # relative: what the order of a sum may change

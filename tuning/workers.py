@@ -20,10 +20,11 @@ import optuna
 from optuna.trial import TrialState
 
 from thruster_env.threads import cores
+from tuning.interruption import stop_on_interrupt
 from tuning.plan import Plan
 from tuning.scenarios import Data, find_scenario
 from tuning.storage import open_storage, retry_orphans
-from tuning.study import OnTrial, finished_trials, open_study, quiet_optuna, run_trials, stop_on_interrupt
+from tuning.study import OnTrial, finished_trials, open_study, quiet_optuna, run_trials
 
 POLL_SECONDS = 0.2
 

@@ -1,0 +1,32 @@
+"""Ctrl-C in the midst of long work: the first one asks for an end, the second one makes it."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
+    """Within this context the first Ctrl-C only makes the yielded function return True.
+
+    An exception in the midst of compiled code or a storage's lock could get lost or leave the lock behind.
+    Outside the main thread, where Python takes no signals, nothing changes.
+    """
+    caught = []
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def note(number, frame):
+        caught.append(number)
+        signal.signal(signal.SIGINT, before)
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield lambda: bool(caught)
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,61 @@
+"""What a choice is worth: against ensemble size on the training seeds, and on seeds that no trial saw."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from tuning.evaluate import Evaluation, evaluate, score_ratio
+from tuning.plan import HELD_OUT_SEEDS, Plan
+from tuning.scenarios import Data, Scenario, held_out_seeds
+from tuning.space import Choice, size_ladder, true_choice, untuned_choice
+
+SIZE_TOLERANCE = 0.01  # the tuned ensemble is the smallest whose paired score is this close to the best
+
+
+class Comparison(NamedTuple):
+    """Three choices on the same held-out seeds, and the bound on these."""
+
+    untuned: Evaluation
+    tuned: Evaluation
+    true: Evaluation
+    bound: np.ndarray  # (n,) bound on the standard error of each state
+    seeds: range
+
+
+class SizeRow(NamedTuple):
+    """How an ensemble of one size does against the best one."""
+
+    size: int
+    evaluation: Evaluation
+    ratio: float  # score over the best score on the same seeds
+
+
+def ensemble_sizes(choice: Choice, plan: Plan, data: Sequence[Data]) -> list[SizeRow]:
+    """The score of a choice against ensemble size, paired on the same seeds, smallest size first.
+
+    With several scenarios the ratio is the largest of them: a size that suffices for all.
+    """
+    sizes = sorted({*size_ladder(choice.name), choice.numbers["ensemble_size"]})
+    pairs = list(zip(plan.scenarios, data, strict=True))
+    tables = [[evaluate(choice.with_size(n).filter(one), part, one.scale) for n in sizes] for one, part in pairs]
+    best = [min(evaluations, key=lambda e: e.score.value) for evaluations in tables]
+    ratios = [[score_ratio(e, least).value for e in found] for found, least in zip(tables, best, strict=True)]
+    return [SizeRow(n, tables[0][i], max(column[i] for column in ratios)) for i, n in enumerate(sizes)]
+
+
+def sufficient_size(sizes: Sequence[SizeRow]) -> int:
+    """The smallest size that is as good as the best one; with several scenarios no size is best on all of them."""
+    least = min(row.ratio for row in sizes)
+    return next(row.size for row in sizes if row.ratio <= (1.0 + SIZE_TOLERANCE) * least)
+
+
+def prove(choice: Choice, scenario: Scenario, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:
+    """Untuned, tuned and true filter on seeds that the study never saw, with the bound on these seeds."""
+    seeds = held_out_seeds(seed, count)
+    data = scenario.data(seeds)
+    choices = (untuned_choice(choice.name, scenario), choice, true_choice(choice.name, scenario))
+    evaluations = [evaluate(c.filter(scenario), data, scenario.scale) for c in choices]
+    return Comparison(*evaluations, bound=scenario.bound(data), seeds=seeds)
