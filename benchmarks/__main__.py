@@ -48,11 +48,19 @@ def command(
             for row in part.rows(seed, quick):
                 rows.append(row)
                 status.update(f"measured: {row.what} ...")
+        status.update("memory of the study ...")
+        resident = studies.resident_memory(seed, quick)
     facts = machine()
     shown = table("Speed, side by side", COLUMNS, [row.cells() for row in rows], caption=CAPTION)
     emit(
-        [shown, vectors.memory_line(), *machine_lines(facts)],
-        {"rows": [row.as_json() for row in rows], "machine": facts, "seed": seed, "quick": quick},
+        [shown, vectors.memory_line(), studies.memory_line(resident), *machine_lines(facts)],
+        {
+            "rows": [row.as_json() for row in rows],
+            "study_resident_megabytes": resident,
+            "machine": facts,
+            "seed": seed,
+            "quick": quick,
+        },
         json,
     )
 

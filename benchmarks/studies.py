@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from time import perf_counter
 from unittest import mock
 
@@ -18,20 +21,53 @@ from tuning.study import StudyResult, open_study, quiet_optuna, run_study
 
 TRIALS = 200
 SIZES, PEER_STEPS = (20, 200), 50  # FilterPy's time a step is a straight line over N
-GOAL = 6.0  # [s]
+GOAL, MEMORY_GOAL = 6.0, 500.0  # [s], [MB]
+IN_A_PROCESS = """
+from tuning.plan import Plan
+from tuning.scenarios import find_scenario
+from tuning.study import open_study, quiet_optuna, run_study
+quiet_optuna()
+plan = Plan("enkf", (find_scenario("nominal"),), {seed})
+run_study(open_study("memory", plan, None), plan, {trials})
+status = dict(line.split(":", 1) for line in open("/proc/self/status"))
+print(status["VmHWM"].split()[0])
+"""
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
     """Measure a study, then the share of it that is Optuna's, then what FilterPy would take for its runs."""
-    count = 15 if quick else TRIALS
+    count = _trials(quick)
     plan = Plan("enkf", (find_scenario("nominal"),), seed)
     _study(plan, 2)  # compiles
     total, own, result = _timed(plan, count)
     what = f"study, {count} trials of an EnKF"
     yield Row(what, None, Timing(total, None, None), time_goal=GOAL)
-    yield Row("the same; all but filters and scores", None, Timing(total - own, None, None))
+    rest = total - own
+    yield Row("of it outside filters and scores", "the whole", Timing(rest, total, rest / total))
     peer = filterpy_seconds(plan.scenarios[0], result)
     yield Row(what, "FilterPy, extrapolated", Timing(total, peer, total / peer), ratio_goal=1 / 300)
+
+
+def _trials(quick: bool) -> int:
+    return 15 if quick else TRIALS
+
+
+def resident_memory(seed: int, quick: bool) -> float | None:
+    """The most memory [MB] that a process keeps while it runs the study alone; None where the system tells not."""
+    if not Path("/proc/self/status").exists():
+        return None
+    # Not of resource.getrusage: a child's begins with that of its parent.
+    source = IN_A_PROCESS.format(seed=seed, trials=_trials(quick))
+    done = subprocess.run([sys.executable, "-c", source], check=True, stdout=subprocess.PIPE, text=True)
+    return int(done.stdout) * 1024 / 1e6
+
+
+def memory_line(resident: float | None) -> str:
+    """Memory of the study, in words."""
+    if resident is None:
+        return "Memory of the study: not measured, this system has no /proc."
+    met = "met" if resident <= MEMORY_GOAL else "missed"
+    return f"Memory: {resident:.0f} MB resident at most in the study; goal {MEMORY_GOAL:.0f} MB, {met}."
 
 
 def _study(plan: Plan, count: int) -> StudyResult:

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from thruster_env.files import write_whole
+from thruster_env.markdown import table as table  # for the scripts, beside what follows
+from thruster_env.markdown import with_tables
 
 SKY, MUSTARD = "#56b4e9", "#b8860b"  # beside those of thruster_env.figures
-
-
-def table(header: list[str], rows: list[list[str]]) -> str:
-    """A table in Markdown."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |".replace("|  |", "| |") for line in lines)
 
 
 def digits(value: float, count: int = 3) -> str:
@@ -44,17 +39,6 @@ def log_ticks(axis, values: Sequence[float]) -> None:
     axis.set_major_locator(FixedLocator(values))
     axis.set_major_formatter(FixedFormatter([f"{value:g}" for value in values]))
     axis.set_minor_locator(NullLocator())
-
-
-def with_tables(page: str, tables: Mapping[str, Callable[[], str]]) -> str:
-    """The page with these computed tables written anew; others stay."""
-
-    def anew(match: re.Match) -> str:
-        if match[2] not in tables:
-            return match[0]
-        return f"{match[1]}\n{tables[match[2]]()}\n{match[3]}"
-
-    return re.sub(r"(<!-- table (\w+) -->).*?(<!-- end -->)", anew, page, flags=re.DOTALL)
 
 
 def make_page(

@@ -76,13 +76,20 @@ def _channel_functions(channels: tuple[str, ...]) -> tuple[Callable, Callable]:
     )
 
 
-MODEL_ARGUMENTS = ("process_noise_cov", "measurement_noise_cov", "parameter_factors", "operating_voltage")
+MODEL_ARGUMENTS = (
+    "process_noise_cov",
+    "measurement_noise_cov",
+    "prior_cov_factor",
+    "parameter_factors",
+    "operating_voltage",
+)
 
 
 def thruster_model(
     *,
     parameter_factors: Mapping[str, float] | None = None,
     operating_voltage: float | None = None,
+    prior_cov_factor: float = 1.0,
     **plant_arguments,
 ) -> StateSpaceModel:
     """What a filter assumes of a thruster, from plain arguments that JSON can hold.
@@ -90,6 +97,7 @@ def thruster_model(
     Args:
         parameter_factors: factors on fields of `ThrusterParameters`, by which the assumed thruster differs.
         operating_voltage: where a Kalman filter approximates the model [V]; half of max_voltage if None.
+        prior_cov_factor: P_0, the covariance of the filter's prior, over that of the plant's initial state.
         **plant_arguments: those of `thruster_env.plant.make_plant`; the noise covariances are the filter's.
 
     Raises:
@@ -99,6 +107,7 @@ def thruster_model(
         make_plant(**plant_arguments),
         parameter_factors=parameter_factors,
         operating_voltage=operating_voltage,
+        prior_cov_factor=prior_cov_factor,
     )
 
 
@@ -109,6 +118,7 @@ def model_of_plant(
     operating_voltage: float | None = None,
     process_noise_cov=None,
     measurement_noise_cov=None,
+    prior_cov_factor: float = 1.0,
 ) -> StateSpaceModel:
     """The model of a plant, exact unless told otherwise; see `thruster_model` for the arguments."""
     if plant.linear is not None and parameter_factors:
@@ -119,6 +129,7 @@ def model_of_plant(
     if measurement_noise_cov is not None:
         r = covariance("measurement_noise_cov", measurement_noise_cov, len(plant.channels))
         plant = plant._replace(measurement_noise_cov=r)
+    plant = plant._replace(initial_cov=positive("prior_cov_factor", prior_cov_factor) * plant.initial_cov)
     if operating_voltage is None:
         operating_voltage = plant.max_voltage / 2
     operating_voltage = finite("operating_voltage", operating_voltage)

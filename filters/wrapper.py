@@ -43,7 +43,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
             `StateSpaceModel`, or a `StateSpaceModel` (which JSON cannot hold).
         tuned: path of a tuned file; it gives filter, numbers and model arguments.
         **numbers: the filter's own numbers, such as `ensemble_size`, and arguments of the model: for a bow
-            thruster `process_noise_cov`, `measurement_noise_cov`, `parameter_factors`, `operating_voltage`.
+            thruster `process_noise_cov`, `measurement_noise_cov`, `prior_cov_factor`, `parameter_factors`,
+            `operating_voltage`.
 
     Raises:
         ValueError: if an argument is unknown or off, or spaces and model do not fit.

@@ -24,10 +24,14 @@ def test_the_quick_benchmark_measures_every_row():
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    rows = json.loads(done.stdout)["rows"]
+    found = json.loads(done.stdout)
+    rows = found["rows"]
     assert len(rows) >= 20
     assert all(row["ours_seconds"] > 0 for row in rows)
     assert {"FilterPy", "FilterPy's UKF", "FilterPy's KF"} < {row["peer"] for row in rows}
+    assert found["study_resident_megabytes"] is None or 50 < found["study_resident_megabytes"] < 500
+    (outside,) = [row["ratio"] for row in rows if "outside filters" in row["what"]]
+    assert 0 < outside < 1
     assert any(row["peer"] in ("JAX", "JAX is not installed") for row in rows)
 
 

@@ -9,14 +9,16 @@ from optuna.trial import TrialState
 
 from tuning import trials
 from tuning.evaluate import evaluate, score_ratio
+from tuning.followers import TWIN
 from tuning.gradient import BAD_START
 from tuning.objectives import LARGEST, NIS_BAND, nis_violation
+from tuning.outcome import best_trial, violation
 from tuning.plan import Plan
 from tuning.proof import prove
 from tuning.samplers import SAMPLERS, make_sampler
 from tuning.scenarios import find_scenario
 from tuning.space import choice_of, distributions, true_choice, untuned_choice
-from tuning.study import TWIN, best_trial, open_study, run_study, violation
+from tuning.study import open_study, run_study
 from tuning.trials import BLOCK, measure
 
 MISMATCH, NOMINAL, OUTLIERS = map(find_scenario, ("mismatch", "nominal", "outliers"))
@@ -36,7 +38,7 @@ def test_the_winner_of_a_study_is_consistent_on_its_training_seeds_at_hardly_any
     result = studied(PLAN, 40)
     best = best_trial(result.trials)
     assert violation(best) <= 0 and result.best_value == best.values[0]
-    (evaluation,) = measure(result.choice, PLAN, PLAN.training_data()).evaluations
+    (evaluation,) = measure(result.choice, PLAN, PLAN.training_data())
     assert NIS_BAND[0] <= evaluation.nis.value <= NIS_BAND[1] and nis_violation(evaluation) <= 0
     assert result.free_value <= result.best_value < 1.01 * result.free_value
 
@@ -63,7 +65,7 @@ def test_a_trial_ends_early_only_if_it_is_worse_on_the_same_seeds():
     assert len(pruned) == result.pruned > 0
     for trial in pruned[:5]:
         assert len(trial.intermediate_values) % BLOCK == 0 and len(trial.intermediate_values) < 32
-        (whole,) = measure(choice_of("ekf", trial.params, MISMATCH), PLAN, data).evaluations
+        (whole,) = measure(choice_of("ekf", trial.params, MISMATCH), PLAN, data)
         assert whole.score.value > result.best_value
     unpruned = studied(PLAN._replace(prune=False), 12)
     assert unpruned.pruned == 0 and not any(trial.intermediate_values for trial in unpruned.trials)

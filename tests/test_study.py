@@ -181,7 +181,7 @@ def test_the_first_ctrl_c_lets_the_running_trial_finish(tmp_path):
         ({"parameter_factors": {"voltage_gain": 3.0}}, "must be that of its scenario"),
         ({"preset": "rubbish"}, "must be that of its scenario"),
         ({"measurement_noise_cov": None}, "must have a measurement_noise_cov"),
-        ({"process_noise_cov": [1.0]}, "process_noise_cov must be 2 finite numbers"),
+        ({"process_noise_cov": [1.0]}, "process_noise_cov must be 2 variances or a symmetric 2 x 2 matrix"),
     ],
 )
 def test_a_tuned_file_edited_by_hand_is_refused(tmp_path, change, rule):

@@ -4,7 +4,6 @@ import dataclasses
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -18,13 +17,12 @@ import typer
 from optuna.trial import TrialState
 
 from thruster_cli.main import app
-from tuning import storage as storages
 from tuning.plan import Plan
 from tuning.samplers import make_sampler
 from tuning.scenarios import find_scenario
 from tuning.space import distributions
 from tuning.storage import PROCESS, RETRY_OF, open_storage
-from tuning.study import finished_trials, open_study, run_study
+from tuning.study import finished_trials, open_study
 from tuning.workers import run_in_workers
 
 PLAN = Plan("enkf", (find_scenario("mismatch"),), prune=False)
@@ -151,85 +149,15 @@ def test_workers_propose_different_things_and_go_through_one_grid():
     assert proposals("grid", 0) == proposals("grid", 1)  # Optuna marks the places that are taken
 
 
-@pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed to be used with Study.optimize")
-def test_a_trial_without_a_heartbeat_is_lost_and_tried_once_more(tmp_path, monkeypatch):
-    monkeypatch.setattr(storages, "HEARTBEAT_SECONDS", 1)
-    monkeypatch.setattr(storages, "GRACE_SECONDS", 1)
-    plan = PLAN._replace(filter="ekf")
-    storage = open_storage(f"sqlite:///{tmp_path}/s.db")
-    study = open_study("s", plan, storage)
-    trial = study.ask(distributions("ekf", plan.scenarios[0]))
-    trial.set_user_attr(PROCESS, "elsewhere:1")
-    storage.record_heartbeat(trial._trial_id)
-    time.sleep(2.5)
-    found = run_study(open_study("s", plan, storage), plan, 2).trials
-    assert found[0].state == TrialState.FAIL
-    assert [t.params for t in found if t.user_attrs.get(RETRY_OF) == 0] == [found[0].params]
-
-
-@pytest.fixture
-def flaky(tmp_path, monkeypatch):
-    """Makes a database do its work and fail to say so, as often as told."""
-    storage = open_storage(f"sqlite:///{tmp_path}/s.db")
-
-    def fail(name, times):
-        method, failures = getattr(storage._backend, name), iter(range(times))
-
-        def lost(*args, **kwargs):
-            answer = method(*args, **kwargs)
-            if next(failures, None) is not None:
-                raise optuna.exceptions.StorageInternalError("connection lost")
-            return answer
-
-        monkeypatch.setattr(storage._backend, name, lost)
-
-    return storage, fail
-
-
-@pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed to be used with Study.optimize")
-def test_an_answer_that_gets_lost_is_asked_for_again(flaky):
-    storage, fail = flaky
-    study = optuna.create_study(storage=storage)
-    trial = study.ask()
-    fail("set_trial_state_values", 1)
-    study.tell(trial, 1.0)
-    assert [trial.values for trial in study.trials] == [[1.0]]
-    with pytest.raises(ValueError):  # what is finished cannot be told twice
-        study.tell(trial.number, 1.0)
-
-
-def test_patience_has_an_end(flaky, monkeypatch):
-    storage, fail = flaky
-    study = optuna.create_study(storage=storage)
-    monkeypatch.setattr(storages, "PATIENCE_SECONDS", 1)
-    fail("set_study_user_attr", 100)
-    with (
-        pytest.warns(UserWarning, match="no answer from the database, trying for 1 s: connection lost"),
-        pytest.raises(ValueError, match="a database must answer within 1 s, but got: connection lost"),
-    ):
-        study.set_user_attr("a", 1)
-
-
-def test_a_proxy_stands_between_a_study_and_its_database(tmp_path, monkeypatch):
-    pytest.importorskip("grpc")
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    monkeypatch.setattr(storages, "PROXY_SECONDS", 0.1)
-    with pytest.raises(ValueError, match="storage must be a database that can be reached, but got grpc:"):
-        open_storage(f"grpc://localhost:{port}")
-    program = "import sys, optuna; optuna.storages.run_grpc_proxy_server("
-    program += "optuna.storages.RDBStorage(sys.argv[1]), port=int(sys.argv[2]))"
-    url = f"sqlite:///{tmp_path}/s.db"
-    server = subprocess.Popen([sys.executable, "-c", program, url, str(port)], stderr=subprocess.DEVNULL)
-    try:
-        monkeypatch.setattr(storages, "PROXY_SECONDS", 30)
-        plan = PLAN._replace(filter="ekf")
-        result = run_study(open_study("s", plan, open_storage(f"grpc://localhost:{port}")), plan, 3)
-        assert [trial.state for trial in result.trials] == [TrialState.COMPLETE] * 3
-    finally:
-        server.terminate()
-        server.wait()
+@pytest.mark.slow
+def test_workers_share_a_study_in_mysql():
+    url = os.environ.get("THRUSTER_TEST_MYSQL")  # of a database that may be filled, by pymysql
+    if not url:
+        pytest.skip("not tested: no wheel brings a MySQL server; THRUSTER_TEST_MYSQL names one by its URL")
+    study = open_study(f"s{time.time_ns()}", PLAN._replace(filter="kf"), open_storage(url))
+    run_in_workers(study, PLAN._replace(filter="kf"), [], 40, lambda *_: None, storage=url, workers=WORKERS)
+    assert {trial.state for trial in study.get_trials()} <= {TrialState.COMPLETE, TrialState.WAITING}
+    assert 40 <= finished_trials(study) < 40 + WORKERS
 
 
 def test_the_page_names_options_that_there_are():
@@ -238,3 +166,24 @@ def test_the_page_names_options_that_there_are():
     known = {option for parameter in tune.params for option in parameter.opts}
     named = set(re.findall(r"(?<=\s)--[a-z]+", " ".join(re.findall(r"^ *thruster tune.*", page, re.MULTILINE))))
     assert {"--workers", "--storage", "--trials"} <= named <= known
+
+
+def test_the_page_has_the_picture_and_the_lines_that_its_script_makes():
+    import docs.workers_figures as script
+
+    folder = Path(__file__).parents[1] / "docs"
+    page = (folder / "workers.md").read_text()
+    assert all(f"]({picture})" in page and (folder / picture).exists() for picture in script.FIGURES)
+    lines = page.partition("<!-- table trials_a_second -->")[2].partition("<!-- end -->")[0].strip().splitlines()
+    head, _, *rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert head[2:] == [str(count) for count in script.COUNTS]
+    assert [row[0] for row in rows[::2]] == [work.name for work in script.WORKS]
+    for row, work in zip(rows[::2], script.WORKS, strict=True):
+        assert [int(n) for n, cell in zip(head[2:], row[2:], strict=True) if cell] == list(work.workers)
+
+
+@pytest.mark.slow
+def test_a_worker_gets_through_trials_while_it_is_watched(tmp_path):
+    from docs.workers_rates import NOTHING, rate
+
+    assert rate(NOTHING, str(tmp_path / "j"), 1) > 1

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from filters.augmented import Unknown
 from filters.registry import FILTERS, filter_class
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
-from thruster_cli.tables import about
+from thruster_cli.tables import about, unless_blank
 from thruster_env.checks import at_least
 from tuning.compare import Contender, Leaderboard, Row, compare, contender, sized
 from tuning.evaluate import STATES
@@ -171,13 +171,13 @@ def winners(board: Leaderboard) -> str:
 
 def _errors(row: Row) -> list[str]:
     speed, flow = row.evaluation.rmse
-    above = [f"{100.0 * part:+.0f}" for part in row.above_bound]
+    above = [unless_blank(100.0 * part, "+.0f") for part in row.above_bound]
     at_first = [f"{part:.3g}" for part in row.evaluation.start_up_rmse]
     return [row.label, about(speed, 3), above[0], about(flow, 4), above[1], *at_first]
 
 
 def _bound_row(board: Leaderboard) -> list[str]:
-    return ["bound", f"{board.bound[0]:.3f}", "", f"{board.bound[1]:.4f}", "", "", ""]
+    return ["bound", unless_blank(board.bound[0], ".3f"), "", unless_blank(board.bound[1], ".4f"), "", "", ""]
 
 
 def _against(row: Row, is_first: bool) -> list[str]:

@@ -8,31 +8,28 @@ from math import isnan
 import numpy as np
 from rich.table import Table
 
-from filters.registry import filter_class
 from thruster_cli.output import table
 from tuning.evaluate import Evaluation, Interval
 from tuning.gradient import GradientResult
+from tuning.kinds import Kind
 from tuning.plan import Plan
 from tuning.scenarios import Scenario
-from tuning.space import Choice
-
-Q_UNITS = ("(rad/s)^2", "(m/s)^2")
+from tuning.space import Choice, neutral, parameters_of
 
 
 def choice_table(choices: Mapping[str, Choice], scenario: Scenario) -> Table:
     """The numbers of filters of one kind, a column each."""
     kind, caption = next(iter(choices.values())).name, None
-    models, rows = [choice.model for choice in choices.values()], []
-    if filter_class(kind).has_covariance:
-        rows = [
-            [f"Q{i}{i} [{unit}]", *(f"{model['process_noise_cov'][i - 1]:.4g}" for model in models)]
-            for i, unit in enumerate(Q_UNITS, start=1)
+    unit = "N^2" if scenario.plant.channels == ("thrust",) else "(rad/s)^2"
+    units = {"Q11": " [(rad/s)^2]", "Q22": " [(m/s)^2]", "R": f" [{unit}]"}
+    columns = [parameters_of(choice) for choice in choices.values()]
+    rows = [
+        [
+            name.replace("_", " ") + units.get(name, ""),
+            *(_number(column.get(name, neutral(name))) for column in columns),
         ]
-        unit = "N^2" if scenario.plant.channels == ("thrust",) else "(rad/s)^2"
-        rows.append([f"R [{unit}]", *(f"{model['measurement_noise_cov']:.4g}" for model in models)])
-    for name in dict.fromkeys(name for choice in choices.values() for name in choice.numbers):
-        label = "N" if name == "ensemble_size" else name.replace("_", " ")
-        rows.append([label, *(_number(choice.numbers.get(name)) for choice in choices.values())])
+        for name in dict.fromkeys(name for column in columns for name in column)
+    ]
     operating = scenario.model().operating_input
     if kind == "kf" and operating is not None:
         caption = f"kf: on the affine approximation about {operating[0]:g} V"
@@ -48,11 +45,12 @@ def comparison_table(evaluations: Mapping[str, Evaluation], bound: np.ndarray, t
     rows = []
     for name, evaluation in evaluations.items():
         above = [100.0 * (rmse.value / b - 1.0) for rmse, b in zip(evaluation.rmse, bound, strict=True)]
+        above = [unless_blank(part, "+.0f") for part in above]
         speed, flow = evaluation.rmse
-        states = [about(speed, 3), f"{round(above[0]):+d}", about(flow, 4), f"{round(above[1]):+d}"]
-        honesty = (_unless_blank(mean.value, ".3g") for mean in (evaluation.nees, evaluation.nis))
+        states = [about(speed, 3), above[0], about(flow, 4), above[1]]
+        honesty = (unless_blank(mean.value, ".3g") for mean in (evaluation.nees, evaluation.nis))
         rows.append([name, *states, about(evaluation.thrust_rmse, 3), *honesty])
-    rows.append(["bound", f"{bound[0]:.3f}", "", f"{bound[1]:.4f}", "", "", "2", "1"])
+    rows.append(["bound", unless_blank(bound[0], ".3f"), "", unless_blank(bound[1], ".4f"), "", "", "2", "1"])
     columns = ["filter", "omega_m\n[rad/s]", "above\n[%]", "U_a\n[m/s]", "above\n[%]", "T\n[N]", "NEES", "NIS"]
     caption = "above: the bound. ±: half of the 95 % interval. Honest: NEES 2, NIS 1."
     return table(title, columns, rows, caption=caption)
@@ -60,13 +58,30 @@ def comparison_table(evaluations: Mapping[str, Evaluation], bound: np.ndarray, t
 
 def front_table(plan: Plan, front: Sequence) -> Table:
     """Trials that no other beats in both objectives, the best in the first objective first."""
-    names = list(front[0].params)
+    names = list(dict.fromkeys(name for trial in front for name in trial.params))
     rows = [
-        [str(trial.number + 1), *(f"{v:.4g}" for v in trial.values), *(_number(trial.params[n]) for n in names)]
+        [str(trial.number + 1), *(f"{v:.4g}" for v in trial.values)]
+        + [_number(trial.params.get(name, "")) for name in names]
         for trial in sorted(front, key=lambda trial: trial.values)
     ]
     caption = "No trial is better in both. The first one is the tuned filter."
     return table("Pareto front on the training seeds", ["trial", *plan.objectives, *names], rows, caption=caption)
+
+
+def kinds_table(kinds: Sequence[Kind], plan: Plan) -> Table:
+    """Kinds of filters that a study tried, the best first."""
+    rows = [
+        [kind.name, str(kind.trials), str(kind.pruned), str(kind.over_budget), _best(kind)]
+        + ["" if kind.microseconds is None else f"{kind.microseconds:.3g}"]
+        for kind in kinds
+    ]
+    columns = ["filter", "trials", "ended\nearly", "over\nbudget", f"best\n{plan.objectives[0]}", "us a\nstep"]
+    caption = "us a step: of the best trial; of the cheapest where none is complete. *: mean NIS outside its band."
+    return table("Filters that were tried, on the training seeds", columns, rows, caption=caption)
+
+
+def _best(kind: Kind) -> str:
+    return "" if kind.value is None else f"{kind.value:.4g}{'' if kind.consistent else '*'}"
 
 
 def gradient_table(found: GradientResult) -> Table:
@@ -96,5 +111,6 @@ def span(value: Interval, digits: int) -> str:
     return f"{value.value:.{digits}f} [{value.low:.{digits}f}, {value.high:.{digits}f}]"
 
 
-def _unless_blank(value: float, form: str) -> str:
+def unless_blank(value: float, form: str) -> str:
+    """A value in a form; empty if there is no value."""
     return "" if isnan(value) else format(value, form)

@@ -17,22 +17,25 @@ from thruster_cli.tuning_report import Tuning, as_json, report
 from thruster_env.checks import at_least, one_of
 from thruster_env.files import check_target
 from tuning.gradient import DIFFERENTIABLE, maximise_likelihood
+from tuning.identifiability import identify
 from tuning.objectives import OBJECTIVES
+from tuning.outcome import best_trial
 from tuning.plan import Plan
 from tuning.proof import prove
 from tuning.samplers import SAMPLERS
 from tuning.scenarios import SCENARIOS, find_scenario
 from tuning.storage import open_storage
-from tuning.study import best_trial, finished_trials, open_study, quiet_optuna, run_study, run_trials
+from tuning.study import finished_trials, open_study, quiet_optuna, run_study, run_trials
 from tuning.tuned import write_tuned
 from tuning.workers import run_in_workers
 
 DEFAULT_STORAGE = "out/studies.journal"
 METHODS = ("optuna", "gradient")
+TUNED_FILTER_HELP = f"{FILTER_HELP} Or auto: the best of all within --budget."
 
 
 def command(
-    filter_name: Annotated[str, typer.Option("--filter", help=FILTER_HELP)] = "enkf",
+    filter_name: Annotated[str, typer.Option("--filter", help=TUNED_FILTER_HELP)] = "enkf",
     scenario: Annotated[
         list[str] | None, typer.Option(help=f"{', '.join(SCENARIOS)}, or a .toml file; several are averaged.")
     ] = None,
@@ -46,6 +49,11 @@ def command(
         typer.Option("--no-consistency", help="Do not hold the mean NIS between 0.8 and 1.25 of what is right."),
     ] = False,
     hold_r: Annotated[bool, typer.Option("--hold-r", help="Leave R at the sensor's sheet, tune Q alone.")] = False,
+    full_q: Annotated[bool, typer.Option("--full-q", help="Tune the correlations of Q, too.")] = False,
+    budget: Annotated[
+        float | None,
+        typer.Option(metavar="MICROSECONDS", help="What a step of the filter may cost, in time of one core."),
+    ] = None,
     sampler: Annotated[str, typer.Option(help=", ".join(SAMPLERS))] = "tpe",
     no_pruning: Annotated[
         bool,
@@ -76,11 +84,24 @@ def command(
     unless --no-consistency is given, and the report says what that costs.
 
     Example: thruster tune --filter ekf --scenario mismatch --scenario outliers --trials 100
+
+    Example: thruster tune --filter auto --budget 2 --scenario published_noise --trials 100
     """
     one_of("method", method, METHODS)
     scenarios = tuple(find_scenario(name) for name in scenario or ["mismatch"])
     objectives = tuple(objective or ["score"])
-    plan = Plan(filter_name, scenarios, seed, objectives, not any_nis, sampler, hold_r, not no_pruning)
+    plan = Plan(
+        filter_name,
+        scenarios,
+        seed,
+        objectives,
+        consistent=not any_nis,
+        sampler=sampler,
+        hold_r=hold_r,
+        prune=not no_pruning,
+        budget=budget,
+        full_q=full_q,
+    )
     tuning = tune(plan, trials, storage, study, out, by_gradient=method == "gradient", workers=workers)
     emit(report(tuning), as_json(tuning), json)
     if tuning.result.interrupted:
@@ -103,6 +124,10 @@ def tune(
         one_of("a filter whose likelihood has a gradient", plan.filter, DIFFERENTIABLE)
         if plan.hold_r:
             raise ValueError("R must be free for --method gradient, but got --hold-r")
+        if plan.full_q:
+            raise ValueError("Q must be diagonal for --method gradient, but got --full-q")
+        if plan.budget is not None:
+            raise ValueError("--method gradient must come without a budget, but got --budget")
     name = study_name or _name(plan, by_gradient)
     if "/" in name:
         raise ValueError(f"study must be a name without slashes, but got {name!r}")
@@ -125,15 +150,17 @@ def tune(
         result = result._replace(choice=gradient.choice)
     with progress_console.status("proving the choice on held-out seeds ..."):
         proofs = tuple(prove(result.choice, scenario, plan.seed) for scenario in plan.scenarios)
-    write_tuned(file, plan, result, proofs, name)
-    return Tuning(name, plan, result, proofs, file, gradient, rival)
+    write_tuned(file, plan, result, proofs, name, METHODS[by_gradient])
+    known = None if by_gradient else identify(result.choice, plan.scenarios, plan.training_data(), plan.space())
+    return Tuning(name, plan, result, proofs, file, gradient, rival, known)
 
 
 def _name(plan: Plan, by_gradient: bool) -> str:
     """A name for a study of a plan: what differs from the default is in it."""
     parts = [plan.filter, _scenarios(plan).replace(", ", "+"), f"seed{plan.seed}"]
     parts += ["+".join(plan.objectives)] * (plan.objectives != ("score",))
-    parts += ["hold-r"] * plan.hold_r
+    parts += ["hold-r"] * plan.hold_r + ["full-q"] * plan.full_q
+    parts += [] if plan.budget is None else [f"budget{plan.budget:g}"]
     parts += ["any-nis"] * (not plan.consistent) + [plan.sampler] * (plan.sampler != "tpe")
     return "-".join(parts + ["gradient"] * by_gradient)
 

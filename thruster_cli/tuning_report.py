@@ -6,9 +6,19 @@ from pathlib import Path
 from typing import NamedTuple
 
 from filters.consistency.verdicts import mean_sentence
-from thruster_cli.tables import choice_table, comparison_table, front_table, gradient_table, span
+from thruster_cli.tables import (
+    choice_table,
+    comparison_table,
+    front_table,
+    gradient_table,
+    kinds_table,
+    span,
+)
 from tuning.evaluate import Evaluation, Interval, score_ratio
 from tuning.gradient import GradientResult
+from tuning.identifiability import Identifiability, as_data, sentences
+from tuning.kinds import kinds_tried
+from tuning.outcome import is_over_budget
 from tuning.plan import Plan
 from tuning.proof import Comparison
 from tuning.scenarios import Scenario
@@ -27,6 +37,7 @@ class Tuning(NamedTuple):
     file: Path
     gradient: GradientResult | None = None  # where the choice is the maximum of the likelihood ...
     rival: Comparison | None = None  # ... and what an Optuna study in its stead would have chosen
+    known: Identifiability | None = None  # what the innovations determine; None without a covariance
 
     @property
     def scenario(self) -> Scenario:
@@ -45,9 +56,9 @@ def report(tuning: Tuning) -> list:
     shown = []
     for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True):
         choices = {
-            "untuned": untuned_choice(plan.filter, scenario),
+            "untuned": untuned_choice(result.choice.name, scenario),
             "tuned": result.choice,
-            "true": true_choice(plan.filter, scenario),
+            "true": true_choice(result.choice.name, scenario),
         }
         evaluations = {"untuned": proof.untuned, "tuned": proof.tuned, "true Q, R": proof.true}
         title = f"RMSE on held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {scenario.name}"
@@ -58,10 +69,16 @@ def report(tuning: Tuning) -> list:
             f"(paired 95 % interval). {_verdict(ratio)}"
         )
         shown.append(_consistency_sentence(proof.tuned))
+        if not scenario.has_bound:
+            shown.append(
+                f"{scenario.name} has no bound, for its Q is singular. Its score is RMSE over its scale, which is "
+                "the RMSE of the open loop unless it was given."
+            )
+    shown += sentences(tuning.known) if tuning.known else []
     shown += _search_sentences(tuning)
-    trained = (
-        f"{len(result.trials)} trials, {result.pruned} of them ended early, {result.seconds:.1f} s in this run"
-    )
+    trained = f"{result.finished} trials, {result.pruned} of them ended early, {result.seconds:.1f} s in this run"
+    over = sum(map(is_over_budget, result.trials))
+    trained += f"; {over} ended for their cost" if over else ""
     shown.append(f"Study {tuning.study!r}: {trained}. Tuned filter: {tuning.file}")
     if result.interrupted:
         shown.append("Interrupted: this is on the trials that were finished; the same command goes on.")
@@ -73,8 +90,16 @@ def _search_sentences(tuning: Tuning) -> list:
     result, plan, shown = tuning.result, tuning.plan, []
     if tuning.gradient is not None:
         return [gradient_table(tuning.gradient), *_gradient_sentences(tuning)]
+    kinds = kinds_tried(result.trials)
+    if kinds:
+        shown.append(kinds_table(kinds, plan))
+    if plan.budget is not None:
+        shown.append(
+            f"A step of the tuned {result.choice.name} takes {result.microseconds:.3g} microseconds of one core; "
+            f"the budget is {plan.budget:g}."
+        )
     if result.sizes:
-        kept, ladder = result.choice.numbers["ensemble_size"], size_ladder(plan.filter)
+        kept, ladder = result.choice.numbers["ensemble_size"], size_ladder(result.choice.name)
         ratios = ", ".join(f"{row.size}: {row.ratio:.3f}" for row in result.sizes if row.size in ladder)
         shown.append(
             f"Score over the best by ensemble size, on the training seeds: {ratios}. "
@@ -103,7 +128,7 @@ def _gradient_sentences(tuning: Tuning) -> list[str]:
     words = []
     if loose:
         words.append(
-            f"The data do not determine {', '.join(loose)}: the standard error is more than a factor of ten, or "
+            f"The data do not determine {', '.join(loose)}: the 95 % interval reaches beyond a factor of ten, or "
             "the maximum lies at the end of the range."
         )
     agree = (
@@ -113,7 +138,7 @@ def _gradient_sentences(tuning: Tuning) -> list[str]:
     )
     ratio = score_ratio(ours, theirs)
     words.append(
-        f"{agree} It took {gradient.seconds:.1f} s; {len(tuning.result.trials)} trials of Optuna took "
+        f"{agree} It took {gradient.seconds:.1f} s; {tuning.result.finished} trials of Optuna took "
         f"{tuning.result.seconds:.1f} s in this run. Score over Optuna's on the held-out seeds: {span(ratio, 3)}."
     )
     return words
@@ -135,8 +160,10 @@ def as_json(tuning: Tuning) -> dict:
         "study": tuning.study,
         "plan": plan.identity,
         "filter": result.choice._asdict(),
-        "trials": len(result.trials),
+        "trials": result.finished,
         "pruned": result.pruned,
+        "microseconds_a_step": result.microseconds,
+        "kinds": [kind._asdict() for kind in kinds_tried(result.trials)],
         "best_training_value": result.best_value,
         "best_training_value_without_consistency": result.free_value,
         "interrupted": result.interrupted,
@@ -145,6 +172,8 @@ def as_json(tuning: Tuning) -> dict:
         "held_out": held_out,
         "file": str(tuning.file),
     }
+    if tuning.known is not None:
+        data["innovations_alone"] = as_data(tuning.known)
     if tuning.gradient is not None:
         found = tuning.gradient
         data["gradient"] = {

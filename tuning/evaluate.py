@@ -20,7 +20,7 @@ MEMBER_RUNS, MEMBER_STEPS = 40, 5  # rank histograms are made of so many runs, a
 
 
 class Evaluation(NamedTuple):
-    """What a filter achieved on B seeds; errors are pooled over seeds and over steps from 50 on."""
+    """What a filter achieved on B seeds; errors are pooled over seeds and over the steps that count."""
 
     rmse: tuple[Interval, ...]  # by state, (omega_m [rad/s], U_a [m/s])
     start_up_rmse: np.ndarray  # (n,), over the steps before 50
@@ -55,7 +55,7 @@ def judge(filter_: Filter, estimates: Estimates, data: Data, scale) -> Evaluatio
     scale = np.asarray(scale, dtype=np.float64)
     if not (scale > 0).all():
         raise ValueError(f"scale must be positive in every state, but got {scale.tolist()}")
-    n, late = data.states.shape[-1], slice(FIRST_SCORED_STEP, None)
+    n, late = data.states.shape[-1], data.scored
     errors = estimates.means[..., :n] - data.states
     squares = normalized_squares(errors[:, late], estimates.covs[:, late, :n, :n])
     mean_squares = (errors[:, late] ** 2).mean(axis=1)
@@ -89,13 +89,13 @@ def check_consistency(filter_: Filter, data: Data) -> ConsistencyReport:
     members = None
     if filter_.size:
         some = (part[:MEMBER_RUNS] for part in (data.filter_keys, data.inputs, data.measurements))
-        members = record_members(filter_, *some, first=FIRST_SCORED_STEP, every=MEMBER_STEPS)
+        members = record_members(filter_, *some, first=data.scored.start, every=MEMBER_STEPS)
     return consistency_report(
         estimates,
         data.states,
         data.measurements,
         members=members,
-        first_step=FIRST_SCORED_STEP,
+        first_step=data.scored.start,
         names=STATES,
     )
 
@@ -107,7 +107,7 @@ def score(mean_squares: np.ndarray, scale: np.ndarray) -> float:
 
 def run_scores(estimates: Estimates, data: Data, scale) -> np.ndarray:
     """The score of each run by itself, (B,): mean over states of its RMSE over scale."""
-    late = slice(FIRST_SCORED_STEP, None)
+    late = data.scored
     errors = estimates.means[:, late, : data.states.shape[-1]] - data.states[:, late]
     return (np.sqrt((errors**2).mean(axis=1)) / np.asarray(scale)).mean(axis=1)
 

@@ -11,9 +11,9 @@ from optuna.trial import FrozenTrial, TrialState
 from filters.batch import run
 from filters.filter import Filter
 from thruster_env.figures import BLUE, DARK, RUST, STATES, new_figure, save_figure, tidy
+from tuning.outcome import violation
 from tuning.proof import Comparison
 from tuning.scenarios import Data
-from tuning.study import violation
 
 SCORE = "score: mean RMSE over bound [-]"
 TRUTH, ESTIMATE, BOUND = DARK, BLUE, RUST
@@ -124,7 +124,8 @@ def comparison_figure(path: Path, proof: Comparison, title: str) -> Path:
             whiskers = [[rmse.value - rmse.low], [rmse.high - rmse.value]]
             axis.bar(place, rmse.value, 0.62, yerr=whiskers, color=COLOURS[name], capsize=4)
             axis.annotate(f"{rmse.value:.3g}", (place, rmse.high), (0, 4), textcoords="offset points", ha="center")
-        axis.axhline(proof.bound[column], color=BOUND, linestyle="--", label="posterior Cramér-Rao bound")
+        if np.isfinite(proof.bound[column]):
+            axis.axhline(proof.bound[column], color=BOUND, linestyle="--", label="posterior Cramér-Rao bound")
         axis.set_xticks(range(len(names)), list(names))
         axis.set_ylabel(f"RMSE of {label} [{unit}]")
         axis.margins(y=0.15)

@@ -11,6 +11,7 @@ import numpy as np
 from filters.likelihood import likelihood
 from filters.registry import make_filter
 from thruster_env.checks import one_of
+from tuning.identifiability import KNOWN_WITHIN, TWO_SIDED
 from tuning.scenarios import Data, Scenario
 from tuning.space import Choice, distributions, untuned_choice
 
@@ -18,7 +19,6 @@ DIFFERENTIABLE = ("kf", "ekf")
 BAD_START = (1.0, 1e-2, 1e2)  # factors on the untuned Q11, Q22 and R
 STARTS = ((1.0, 1.0, 1.0), BAD_START, (0.1, 0.1, 10.0))
 STEP = 1e-3  # in the logarithms, of the differences of gradients that give the Hessian
-KNOWN_WITHIN = np.log(10.0)  # a direction with a standard error beyond a factor of ten is not identified
 FLAT = 1e-12  # curvature over the largest one, below which there is none
 DIVERGED = 1e12  # stands in for -log L where the filter diverges
 EQUAL_LOGARITHMS = 0.02  # optima this close in every logarithm are one
@@ -42,7 +42,7 @@ class GradientResult(NamedTuple):
     best: Optimum
     optima: tuple[Optimum, ...]  # one for each start
     standard_errors: np.ndarray  # (n + m,), of the variances' logarithms, from the scatter between runs
-    identified: np.ndarray  # (n + m,) whether the data determine a variance within a factor of ten
+    identified: np.ndarray  # (n + m,) whether a variance's 95 % interval is within a factor of ten
     agree: bool  # whether all starts led to the same place, in the identified variances
     seconds: float
 
@@ -106,7 +106,7 @@ def maximise_likelihood(
     inside = np.array(
         [low < value < high for value, (low, high) in zip(np.log(best.variances), bounds, strict=True)]
     )
-    identified = inside & (errors < KNOWN_WITHIN)
+    identified = inside & (errors * TWO_SIDED < KNOWN_WITHIN)
     apart = [np.abs(np.log(o.variances / best.variances))[identified] for o in optima]
     return GradientResult(
         choice=_choice(filter_name, best.variances, n, m),

@@ -37,7 +37,7 @@ OBJECTIVES = {
         "negative log-likelihood of the innovations, a run", lambda e, _: -e.log_likelihood, needs_covariance=True
     ),
     "consistency": Objective("|log(mean NEES / n)| + |log(mean NIS / m)|", _inconsistency, needs_covariance=True),
-    "cost": Objective("microseconds a step of one run, on all cores", lambda _, microseconds: microseconds),
+    "cost": Objective("microseconds a step of one run, of one core", lambda _, microseconds: microseconds),
 }
 
 

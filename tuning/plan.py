@@ -8,9 +8,10 @@ import optuna
 from optuna.distributions import BaseDistribution
 
 from filters.registry import filter_class
+from thruster_env.checks import positive
 from tuning.objectives import Objective, find_objective
 from tuning.scenarios import Data, Scenario, held_out_seeds, training_seeds
-from tuning.space import distributions, has_search_space
+from tuning.space import AUTO, AUTO_KINDS, has_search_space, joint_distributions
 
 TRAINING_SEEDS = 32
 HELD_OUT_SEEDS = 200
@@ -19,7 +20,7 @@ HELD_OUT_SEEDS = 200
 class Plan(NamedTuple):
     """A filter, what to tune it on, what to make small and how to search."""
 
-    filter: str
+    filter: str  # a name, or "auto" for the best of many kinds
     scenarios: tuple[Scenario, ...]
     seed: int = 0
     objectives: tuple[str, ...] = ("score",)
@@ -27,13 +28,19 @@ class Plan(NamedTuple):
     sampler: str = "tpe"
     hold_r: bool = False  # whether R stays that of the sensor's sheet
     prune: bool = True  # whether a trial ends early that is worse than the best one on the same seeds
+    budget: float | None = None  # microseconds that a step may cost, as `cost.microseconds_a_step` measures them
+    full_q: bool = False  # whether Q has correlations
 
     @property
     def identity(self) -> dict:
         """What has to be the same for a study to go on."""
         return {
             "filter": self.filter,
+            "kinds": list(self.kinds),
+            "budget": self.budget,
+            "full_q": self.full_q,
             "scenarios": [scenario.name for scenario in self.scenarios],
+            "scenario_digests": [scenario.digest for scenario in self.scenarios],
             "seed": self.seed,
             "objectives": list(self.objectives),
             "consistent": self.consistent,
@@ -43,23 +50,42 @@ class Plan(NamedTuple):
         }
 
     @property
+    def kinds(self) -> tuple[str, ...]:
+        """Names of the filters among which a trial chooses."""
+        return AUTO_KINDS if self.filter == AUTO else (self.filter,)
+
+    @property
     def is_constrained(self) -> bool:
         """Whether the mean NIS is held in its band: a filter without a covariance has none."""
-        return self.consistent and filter_class(self.filter).has_covariance
+        return self.consistent and all(filter_class(kind).has_covariance for kind in self.kinds)
+
+    @property
+    def asks_for_cost(self) -> bool:
+        """Whether the cost of a step has to be measured."""
+        return self.budget is not None or "cost" in self.objectives
 
     def checked(self) -> Plan:
         """The same plan; ValueError where it cannot work."""
-        if not has_search_space(self.filter):
+        if not all(map(has_search_space, self.kinds)):
             raise ValueError(f"filter must be one that has something to tune, but got {self.filter!r}")
         if not self.scenarios:
             raise ValueError("a study must have at least one scenario, but got none")
         if not 1 <= len(self.objectives) <= 2 or len(set(self.objectives)) < len(self.objectives):
             raise ValueError(f"objectives must be one, or two different ones, but got {list(self.objectives)}")
         for name, objective in zip(self.objectives, self.found_objectives(), strict=True):
-            if objective.needs_covariance and not filter_class(self.filter).has_covariance:
+            if objective.needs_covariance and not all(filter_class(k).has_covariance for k in self.kinds):
                 raise ValueError(
                     f"the objective {name!r} needs a filter with a covariance, but got {self.filter!r}"
                 )
+        if self.full_q and not all(filter_class(kind).has_covariance for kind in self.kinds):
+            raise ValueError(f"a full Q needs a filter with a covariance, but got {self.filter!r}")
+        if self.budget is not None:
+            positive("budget", self.budget)
+        elif self.filter == AUTO and "cost" not in self.objectives:
+            raise ValueError(
+                "a study of filter 'auto' must have a budget of microseconds a step (an ekf takes about 0.1, an "
+                "enkf of 30 members 0.7, a pf of 1000 particles 20) or the objective 'cost', but got neither"
+            )
         return self
 
     def found_objectives(self) -> list[Objective]:
@@ -67,8 +93,13 @@ class Plan(NamedTuple):
         return [find_objective(name) for name in self.objectives]
 
     def space(self) -> dict[str, BaseDistribution]:
-        """What a trial may choose, by name; ranges are those of the first scenario."""
-        return distributions(self.filter, self.scenarios[0], hold_r=self.hold_r)
+        """What a trial may choose, by name; ranges are those of the first scenario.
+
+        The scale of P_0 is among it where a scenario counts the start-up.
+        """
+        prior = any(scenario.counts_start_up for scenario in self.scenarios)
+        options = {"hold_r": self.hold_r, "full_q": self.full_q, "prior": prior}
+        return joint_distributions(self.kinds, self.scenarios[0], **options)
 
     def training_data(self) -> list[Data]:
         """Data that every trial shares, one for each scenario."""

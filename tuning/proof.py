@@ -36,9 +36,11 @@ class SizeRow(NamedTuple):
 def ensemble_sizes(choice: Choice, plan: Plan, data: Sequence[Data]) -> list[SizeRow]:
     """The score of a choice against ensemble size, paired on the same seeds, smallest size first.
 
-    With several scenarios the ratio is the largest of them: a size that suffices for all.
+    With several scenarios the ratio is the largest of them: a size that suffices for all. Where the plan has a
+    budget, no size is above that of the choice, which is known to be within it.
     """
-    sizes = sorted({*size_ladder(choice.name), choice.numbers["ensemble_size"]})
+    size = choice.numbers["ensemble_size"]
+    sizes = [n for n in sorted({*size_ladder(choice.name), size}) if plan.budget is None or n <= size]
     pairs = list(zip(plan.scenarios, data, strict=True))
     tables = [[evaluate(choice.with_size(n).filter(one), part, one.scale) for n in sizes] for one, part in pairs]
     best = [min(evaluations, key=lambda e: e.score.value) for evaluations in tables]

@@ -7,13 +7,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 from thruster_env.files import check_target, write_whole
+from tuning.identifiability import identify, sentences
 from tuning.proof import ensemble_sizes, prove, sufficient_size
-from tuning.report_page import Section, html_page, markdown_page
+from tuning.report_page import Section, Words, html_page, markdown_page
 from tuning.report_parts import (
     Sketchbook,
     advice,
     errors_table,
     facts_section,
+    known_table,
     numbers_table,
     proof_section,
     run_sections,
@@ -50,18 +52,20 @@ def write_report(source: str | Path, storage: str, out: str | Path | None = None
     page, tables = folder / f"{name}.html", folder / f"{name}.md"
     for target in (page, tables):
         check_target(target)
-    sizes = ensemble_sizes(choice, plan, plan.training_data()) if has_ensemble(plan.filter) else []
+    sizes = ensemble_sizes(choice, plan, plan.training_data()) if has_ensemble(choice.name) else []
     if sizes and not subject.chosen:
         choice = choice.with_size(sufficient_size(sizes))
         subject = subject._replace(choice=choice)
     proofs = [prove(choice, scenario, plan.seed, subject.seeds) for scenario in plan.scenarios]
-    title = f"{plan.filter} tuned on {', '.join(Path(scenario.name).stem for scenario in plan.scenarios)}"
-    said, numbers = advice(choice, plan, proofs), numbers_table(choice, plan.scenarios[0])
+    title = f"{choice.name} tuned on {', '.join(Path(scenario.name).stem for scenario in plan.scenarios)}"
+    said = advice(choice, plan, proofs)
+    known = identify(choice, plan.scenarios, plan.training_data(), plan.space())
+    numbers = [numbers_table(choice, plan.scenarios[0]), *([known_table(known)] if known else [])]
     with tempfile.TemporaryDirectory() as scratch:
         book = Sketchbook(Path(scratch))
         sections = [
             proof_section(book, subject, proofs),
-            Section("The numbers", [numbers]),
+            Section("The numbers", [*numbers, *([Words(sentences(known))] if known else [])]),
             search_section(book, subject),
             *([sizes_section(book, subject, sizes)] if sizes else []),
             *run_sections(book, subject, proofs[0]),
@@ -69,5 +73,5 @@ def write_report(source: str | Path, storage: str, out: str | Path | None = None
         ]
     write_whole(page, html_page(title, said, sections))
     errors = [errors_table(scenario, proof) for scenario, proof in zip(plan.scenarios, proofs, strict=True)]
-    write_whole(tables, markdown_page(title, said, [*errors, numbers]))
+    write_whole(tables, markdown_page(title, said, [*errors, *numbers]))
     return Report(page, tables, said)

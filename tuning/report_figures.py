@@ -12,8 +12,9 @@ from optuna.trial import FrozenTrial, TrialState
 
 from thruster_env.figures import BLUE, RUST, STATES, new_figure, save_figure, tidy
 from tuning.figures import COLOURS, early_trials, limit_values
+from tuning.outcome import best_trial, violation
 from tuning.proof import SizeRow
-from tuning.study import best_trial, violation
+from tuning.space import KIND
 
 FEWEST_TRIALS = 10  # complete ones, for importances to mean anything
 COLUMNS = 3
@@ -23,14 +24,17 @@ CROSS = {"color": COLOURS["untuned"], "markersize": 4, "markeredgewidth": 0.8}
 def importances(study: optuna.Study) -> dict[str, float]:
     """How much each number matters for a trial to be among the best tenth; empty where trials are too few.
 
-    With two objectives the best are those nearest to the Pareto front.
+    With two objectives the best are those nearest to the Pareto front. In a study over several kinds of filters
+    only numbers that all kinds have are told.
 
     Source: Watanabe et al. (2023), "PED-ANOVA: efficiently quantifying hyperparameter importance in arbitrary
     subspaces".
     """
-    if len(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))) < FEWEST_TRIALS:
+    complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    if len(complete) < FEWEST_TRIALS:
         return {}
-    return get_param_importances(study, evaluator=PedAnovaImportanceEvaluator())
+    shared = [name for name in complete[0].params if all(name in trial.params for trial in complete)]
+    return get_param_importances(study, evaluator=PedAnovaImportanceEvaluator(), params=shared)
 
 
 def importance_figure(path: Path, found: Mapping[str, float]) -> Path:
@@ -54,7 +58,7 @@ def slices_figure(path: Path, trials: Sequence[FrozenTrial], label: str) -> Path
     Hollow circles have a mean NIS outside its band; crosses ended early and stand at the mean of their seeds.
     """
     done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    early, names = early_trials(trials), list(done[0].params)
+    early, names = early_trials(trials), [name for name in done[0].params if name != KIND]
     columns = min(COLUMNS, len(names))
     rows = -(-len(names) // columns)
     figure = new_figure((3.2 * columns, 2.7 * rows + 0.4))
@@ -69,7 +73,7 @@ def slices_figure(path: Path, trials: Sequence[FrozenTrial], label: str) -> Path
         axis.axvline(best.params[name], color=RUST, linestyle="--", linewidth=1)
         if getattr(best.distributions[name], "log", False):
             axis.set_xscale("log")
-        if name == "N":
+        if name == "N" or name.endswith(" N"):
             _size_axis(axis, sorted(trial.params[name] for trial in trials if name in trial.params))
         axis.set_xlabel(words(name))
     limit_values(axes[0, 0], values)

@@ -7,7 +7,7 @@ from math import isnan
 from pathlib import Path
 from typing import NamedTuple
 
-from optuna.trial import TrialState
+from optuna.trial import FrozenTrial, TrialState
 
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import confidence, rounded, sentences
@@ -15,6 +15,8 @@ from filters.registry import filter_class
 from tuning.consistency_figures import consistency_figure
 from tuning.evaluate import check_consistency, score_ratio
 from tuning.figures import SCORE, comparison_figure, estimates_figure, history_figure
+from tuning.identifiability import Identifiability
+from tuning.kinds import kinds_tried, trials_of_kind
 from tuning.objectives import find_objective
 from tuning.plan import TRAINING_SEEDS, Plan
 from tuning.proof import Comparison, SizeRow
@@ -29,7 +31,7 @@ from tuning.report_figures import (
 from tuning.report_page import Picture, Section, Table, Words
 from tuning.report_subject import Subject
 from tuning.scenarios import Scenario, training_seeds
-from tuning.space import Choice, parameters_of, true_choice, untuned_choice
+from tuning.space import AUTO, Choice, neutral, parameters_of, true_choice, untuned_choice
 from tuning.tuned import versions
 
 MANY_TRIALS = 50
@@ -80,7 +82,8 @@ def errors_table(scenario: Scenario, proof: Comparison) -> Table:
         for name, e in evaluations
     ]
     right = [str(len(proof.bound)), str(proof.tuned.channels)] if rows[0][-1] else ["", ""]
-    rows.append(["bound; what is right", *map(rounded, proof.bound), "", "", *right])
+    bound = ["" if isnan(part) else rounded(part) for part in proof.bound]
+    rows.append(["bound; what is right", *bound, "", "", *right])
     columns = [
         "filter", "RMSE ω_m [rad/s]", "RMSE U_a [m/s]", "RMSE thrust [N]", "score", "mean NEES", "mean NIS"
     ]  # fmt: skip
@@ -95,10 +98,22 @@ def numbers_table(choice: Choice, scenario: Scenario) -> Table:
     unit = "N²" if scenario.plant.channels == ("thrust",) else "(rad/s)²"
     units = {"Q11": " [(rad/s)²]", "Q22": " [(m/s)²]", "R": f" [{unit}]"}
     rows = [
-        [name.replace("_", " ") + units.get(name, ""), *(f"{column[name]:.4g}" for column in columns)]
-        for name in columns[0]
+        [name.replace("_", " ") + units.get(name, "")]
+        + [f"{column.get(name, neutral(name)):.4g}" for column in columns]
+        for name in dict.fromkeys(name for column in columns for name in column)
     ]
     return Table(f"Numbers of the {choice.name} filter", ["", "untuned", "tuned", "true Q, R"], rows)
+
+
+def known_table(found: Identifiability) -> Table:
+    """What the innovations alone say of the numbers, and whether they determine them."""
+    columns = found.names, found.tuned, found.likeliest, found.factors, found.identified
+    rows = [
+        [name, f"{tuned:.4g}", f"{best:.4g}", f"{factor:.3g}" if known else "", "yes" if known else "no"]
+        for name, tuned, best, factor, known in zip(*columns, strict=True)
+    ]
+    header = ["", "tuned", "most likely", "known within a factor of", "determined"]
+    return Table("What the innovations of the training runs say, with 95 % probability", header, rows)
 
 
 def proof_section(book: Sketchbook, subject: Subject, proofs: Sequence[Comparison]) -> Section:
@@ -138,11 +153,24 @@ def search_section(book: Sketchbook, subject: Subject) -> Section:
         "First objective against each number; dashed is the best trial. Hollow: mean NIS outside its band. "
         "Crosses: ended early, at the mean of the seeds seen."
     )
-    parts.append(book.picture(caption, slices_figure, trials, labels[0]))
+    parts.append(book.picture(caption, slices_figure, trials_of_kind(trials, subject.choice.name), labels[0]))
+    if subject.plan.filter == AUTO:
+        parts.append(_kinds_table(trials, objectives[0]))
     if len(objectives) > 1:
         caption = "Trials by both objectives; no trial beats those of the Pareto front in both."
         parts.append(book.picture(caption, front_figure, trials, study.best_trials, labels))
     return Section(title, parts)
+
+
+def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
+    """Kinds of filters that the trials chose, the best first."""
+    columns = ["filter", "trials", "ended early", "over budget", f"best {objective}", "µs a step"]
+    rows = [
+        [kind.name, f"{kind.trials}", f"{kind.pruned}", f"{kind.over_budget}"]
+        + ["" if value is None else f"{value:.4g}" for value in (kind.value, kind.microseconds)]
+        for kind in kinds_tried(trials)
+    ]
+    return Table("Filters that were tried, on the training seeds; the slices are those of the best", columns, rows)
 
 
 def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) -> Section:
@@ -181,7 +209,8 @@ def facts_section(subject: Subject) -> Section:
     plan, training = subject.plan, training_seeds(subject.plan.seed, TRAINING_SEEDS)
     about = [f"{one.name}: {one.about}" if one.about else one.name for one in plan.scenarios]
     rows = [
-        ["filter", plan.filter],
+        ["filter", plan.filter if plan.filter == subject.choice.name else f"{plan.filter}: {subject.choice.name}"],
+        *([["budget", f"{plan.budget:g} µs a step of one core"]] if plan.budget is not None else []),
         ["scenarios" if len(about) > 1 else "scenario", "; ".join(about)],
         ["made small", "; ".join(f"{name}: {find_objective(name).about}" for name in plan.objectives)],
         ["mean NIS", "held in its band" if plan.is_constrained else "free"],

@@ -9,11 +9,11 @@ import optuna
 
 from filters.registry import read_tuned_file
 from thruster_env.checks import at_least, shown
+from tuning.outcome import best_trial
 from tuning.plan import HELD_OUT_SEEDS, Plan
 from tuning.scenarios import find_scenario
 from tuning.space import Choice, choice_of
 from tuning.storage import open_storage
-from tuning.study import best_trial
 from tuning.tuned import read_tuned
 
 
@@ -95,6 +95,8 @@ def _plan(identity, where: str | Path) -> Plan:
             identity["consistent"],
             identity["sampler"],
             identity["hold_r"],
+            budget=identity["budget"],
+            full_q=identity["full_q"],
         )
     except (KeyError, TypeError):
         raise ValueError(f"a report needs the plan of the study, but {where} has {shown(identity)}") from None

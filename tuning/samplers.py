@@ -9,6 +9,7 @@ import numpy as np
 import optuna
 
 from thruster_env.checks import one_of
+from tuning.space import KIND
 
 SAMPLERS = {
     "tpe": "tree-structured Parzen estimator, all numbers together; good from some ten trials on",
@@ -18,6 +19,7 @@ SAMPLERS = {
     "random": "independent draws, what every other sampler should beat",
     "grid": "every combination of some values of each number, in random order",
 }
+WITHOUT_KINDS = ("cma-es", "grid")  # which cannot choose among filters with numbers of their own
 GRID_VALUES = 5  # of each number
 NEEDS = {"gp": ("torch", "rl"), "cma-es": ("cmaes", "samplers")}
 
@@ -35,12 +37,15 @@ def make_sampler(
         worker: place among the processes that share the study; each proposes what is its own.
 
     Raises:
-        ValueError: for an unknown name, or a missing package.
+        ValueError: for an unknown name, a missing package, or one that cannot choose among kinds of filters.
     """
     one_of("sampler", name, tuple(SAMPLERS))
     package, extra = NEEDS.get(name, (None, None))
     if package is not None and importlib.util.find_spec(package) is None:
         raise ValueError(f"the sampler {name!r} needs {package}: pip install 'thruster-env[{extra}]'")
+    if name in WITHOUT_KINDS and KIND in distributions:
+        able = ", ".join(one for one in SAMPLERS if one not in WITHOUT_KINDS)
+        raise ValueError(f"a sampler that chooses among filters must be one of {able}, but got {name!r}")
     if name == "grid":  # its order, and so its seed, has to be the same in every process
         values = {key: _grid(distribution) for key, distribution in distributions.items()}
         return optuna.samplers.GridSampler(values, seed=seed)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
@@ -25,7 +27,6 @@ from tuning.excitation import EXCITATIONS, Excitation, Steps
 
 FIRST_SCORED_STEP = 50  # RMSE counts steps 50 to 500; start-up is reported apart
 UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as part of each state's range
-SCALE_SEQUENCES = 1200  # voltage sequences that a stored scale is the bound of
 
 
 class Data(NamedTuple):
@@ -37,6 +38,12 @@ class Data(NamedTuple):
     thrusts: np.ndarray  # (B, K + 1) [N]
     measurements: np.ndarray  # (B, K + 1, 1), NaN where missing
     filter_keys: np.ndarray  # (B, 2)
+    first_scored: np.ndarray  # (B,) the first step of each run that counts, the same for all
+
+    @property
+    def scored(self) -> slice:
+        """The steps that count."""
+        return slice(int(self.first_scored[0]), None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +59,12 @@ class Scenario:
         measurement_noise_cov: the plant's R, the variance of the sensor's sheet [N^2, or the channel's unit^2].
         process_noise_cov: the plant's Q, two variances a step [(rad/s)^2, (m/s)^2].
         scale: bound on the standard error of each state, (omega_m [rad/s], U_a [m/s]), of the scenario's Gaussian
-            core: fixed numbers that errors are measured in, made by `computed_scale`.
+            core: fixed numbers that errors are measured in, made by `scale.computed_scale`.
         parameter_factors: factors on the plant's parameters in the filter's model.
         excitation: makes the voltages; one of `excitation.EXCITATIONS`, or a mapping with its name.
         steps: length of a run.
+        first_scored_step: where errors begin to count. Below 50 the start-up counts, too, and a study then tunes
+            the scale of P_0.
         system: a published linear system that is the plant, "tunnel" or "open_bladed"; None for the equations.
         preset: the thruster, as for `thruster_env.plant.make_plant`; so are all that follow.
         dt: sample time [s].
@@ -76,6 +85,7 @@ class Scenario:
     parameter_factors: Mapping[str, float] = field(default_factory=dict)
     excitation: Excitation | Mapping = field(default_factory=Steps)
     steps: int = 500
+    first_scored_step: int = FIRST_SCORED_STEP
     system: str | None = None
     preset: str | Mapping = "tunnel"
     dt: float = DEFAULT_DT
@@ -104,14 +114,20 @@ class Scenario:
             "measurement_noise_cov": positive("measurement_noise_cov", self.measurement_noise_cov),
             "scale": scale.tolist(),
             "steps": at_least("steps", self.steps, FIRST_SCORED_STEP + 1),
+            "first_scored_step": at_least("first_scored_step", self.first_scored_step, 0),
         }
+        if checked["first_scored_step"] >= checked["steps"]:
+            raise ValueError(
+                f"first_scored_step must be below the number of steps, {self.steps}, "
+                f"but got {self.first_scored_step}"
+            )
         for entry in fields(self):
             object.__setattr__(self, entry.name, frozen(checked.get(entry.name, getattr(self, entry.name))))
 
     @property
     def plant_arguments(self) -> dict:
         """Arguments of the env of the same plant, `BowThruster-v0`, or `BowThrusterLinear-v0` of a linear one."""
-        own = {"name", "about", "scale", "parameter_factors", "excitation", "steps"}
+        own = {"name", "about", "scale", "parameter_factors", "excitation", "steps", "first_scored_step"}
         left_out = {"system"} if self.system is None else {"preset", "uncertainty"}
         names = [entry.name for entry in fields(self) if entry.name not in own | left_out]
         return {name: plain(getattr(self, name)) for name in names}
@@ -142,6 +158,24 @@ class Scenario:
             "measurement_noise_cov": self.measurement_noise_cov,
         }
 
+    @property
+    def counts_start_up(self) -> bool:
+        """Whether the first steps count, in which P_0 is felt."""
+        return self.first_scored_step < FIRST_SCORED_STEP
+
+    @property
+    def has_bound(self) -> bool:
+        """Whether there is a posterior Cramér-Rao bound: its recursion needs the inverse of Q."""
+        return bool(np.linalg.eigvalsh(self.plant.process_noise_cov)[0] > 0)
+
+    @property
+    def digest(self) -> str:
+        """The first part of a SHA-256 of all that the scenario says but for its name and what it is about."""
+        content = {entry.name: plain(getattr(self, entry.name)) for entry in fields(self)}
+        content |= {"excitation": self.excitation.as_mapping(), "scale": [f"{part:.6g}" for part in self.scale]}
+        del content["name"], content["about"]
+        return hashlib.sha256(json.dumps(content, sort_keys=True, default=repr).encode()).hexdigest()[:12]
+
     def replace(self, **changes) -> Scenario:
         """The same scenario with some fields changed."""
         return replace(self, **changes)
@@ -154,26 +188,16 @@ class Scenario:
         """Bound on the standard error of each state (2,), averaged over the data's inputs and scored steps.
 
         It is that of the scenario's Gaussian core: the nominal plant with the same Q, R and inputs, with no
-        sensor effects, flow signals or amplifier.
+        sensor effects, flow signals or amplifier. NaN where there is none.
         """
+        if not self.has_bound:
+            return np.full(2, np.nan)
         exact = model_of_plant(self.plant)
         variances = np.einsum("bkii->bki", posterior_bound(exact, data.inputs, truths=truths))
-        return np.sqrt(variances[:, FIRST_SCORED_STEP:].mean(axis=(0, 1)))
+        return np.sqrt(variances[:, self.first_scored_step :].mean(axis=(0, 1)))
 
     def __hash__(self) -> int:
         return hash((self.name, self.process_noise_cov, self.measurement_noise_cov, self.excitation, self.steps))
-
-
-def computed_scale(scenario: Scenario, sequences: int = SCALE_SEQUENCES, truths: int = 100) -> np.ndarray:
-    """The scale (2,) of a scenario: `Scenario.bound` over voltage sequences of the seeds 0, 1, 2, ...
-
-    Raises:
-        ValueError: if it is zero or not finite.
-    """
-    scale = scenario.bound(scenario.data(range(at_least("sequences", sequences, 1))), truths)
-    if not (np.isfinite(scale).all() and (scale > 0).all()):
-        raise ValueError(f"scale must be positive in every state, but the bound is {scale.tolist()}")
-    return scale
 
 
 @lru_cache(maxsize=8)
@@ -184,7 +208,8 @@ def _data(scenario: Scenario, seeds: tuple[int, ...]) -> Data:
     simulation = simulate(plant, keys, voltages)
     measurements = np.where(simulation.valid, simulation.measurements, np.nan)  # as filters take missing ones
     truth = simulation.states, simulation.thrusts
-    data = Data(seeds, voltages[..., None], *truth, measurements, filter_keys(seeds))
+    first = np.full(len(seeds), scenario.first_scored_step)
+    data = Data(seeds, voltages[..., None], *truth, measurements, filter_keys(seeds), first)
     for array in data[1:]:
         array.setflags(write=False)
     return data

@@ -8,7 +8,8 @@ from dataclasses import fields
 from pathlib import Path
 
 from thruster_env.checks import shown
-from tuning.scenario import Scenario, computed_scale
+from tuning.scale import computed_scale
+from tuning.scenario import Scenario
 
 FILE_SEQUENCES = 200  # voltage sequences for the scale of a file that gives none
 KEYS = ("base", *(entry.name for entry in fields(Scenario) if entry.name != "name"))
@@ -18,7 +19,8 @@ def read_scenario(path: str | Path, find_base: Callable[[str], Scenario]) -> Sce
     """A scenario from a TOML file, named by the path.
 
     Its keys are the fields of `Scenario` but for the name, and `base`: the scenario whose fields are taken where
-    the file has none of its own, "nominal" if it is left out. Where the file has no `scale`, it is computed.
+    the file has none of its own, "nominal" if it is left out. Where the file has no `scale`, it is computed
+    (`scale.computed_scale`).
 
         base = "outliers"
         about = "outliers under a binary sequence, with a flow that the filter does not know"

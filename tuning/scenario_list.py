@@ -11,7 +11,8 @@ import sys
 
 from thruster_env.checks import one_of
 from tuning.excitation import BinarySequence, ClosedLoop, Dwells, MultiSine
-from tuning.scenario import Scenario, computed_scale
+from tuning.scale import computed_scale
+from tuning.scenario import Scenario
 
 # Bounds from 1200 voltage sequences and 100 truths each, good to half a per cent; a test computes them anew.
 NOMINAL_SCALE = (1.0753, 0.0464)
@@ -93,9 +94,10 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         Scenario(
             name="startup",
-            about="the thruster may already turn, either way, as the run begins",
+            about="the thruster may already turn, either way, as the run begins, and every step counts",
+            first_scored_step=0,
             initial_state={"mean": [0.0, 0.0], "cov": [[100.0**2, 0.0], [0.0, 2.0**2]]},
-            scale=(1.0748, 0.0461),
+            scale=(1.0917, 0.0456),
         ),
         Scenario(
             name="published_tunnel",
@@ -110,6 +112,20 @@ SCENARIOS: dict[str, Scenario] = {
             system="open_bladed",
             **LINEAR_NOISE,
             scale=(4.8663, 2.1588),
+        ),
+        *(
+            Scenario(
+                name=name,
+                about=f"strong process noise, and a thrust sensor with {about}: for policies on what it shows",
+                process_noise_cov=(4.0, 0.01),
+                measurement_noise_cov=variance,
+                scale=scale,
+            )
+            for name, about, variance, scale in (
+                ("low_noise", "0.5 N of noise", 0.25, (2.1173, 0.1068)),
+                ("medium_noise", "2 N of noise", 4.0, (2.2619, 0.1846)),
+                ("high_noise", "4 N of noise", 16.0, (2.2885, 0.2292)),
+            )
         ),
         Scenario(
             name="mixed",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from thruster_env.checks import at_least, shown
 from tuning.excitation import held_levels
-from tuning.scenario import FIRST_SCORED_STEP, Data, Scenario, computed_scale
+from tuning.scale import computed_scale
+from tuning.scenario import FIRST_SCORED_STEP, Data, Scenario
 from tuning.scenario_files import read_scenario
 from tuning.scenario_list import SCENARIOS
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import time
 import warnings
 from collections.abc import Callable
@@ -19,9 +20,11 @@ from optuna.storages._cached_storage import _CachedStorage
 from optuna.storages._heartbeat import BaseHeartbeat
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 from optuna.trial import FrozenTrial, TrialState
+from sqlalchemy.exc import DBAPIError, OperationalError
 
 LOCK_SECONDS = 5  # after which a lock counts as left behind
 SIGNATURE_SECONDS = 2 * LOCK_SECONDS  # by which a living process has signed its trial
+TABLE_TRIES = 5  # to make the tables of a database, or to find them made
 PATIENCE_SECONDS = 60  # for which a database may be away
 HEARTBEAT_SECONDS = 10  # between two signs of life of a running trial in a database
 GRACE_SECONDS = 180  # without one, after which it counts as lost; an outage is shorter
@@ -44,8 +47,9 @@ def open_storage(storage: str) -> BaseStorage:
             return _proxy(storage) if storage.startswith("grpc://") else _PatientStorage(_database(storage))
         except Exception as error:  # SQLAlchemy, its drivers and the network raise whatever they like
             reason = str(error).strip().splitlines()[0]
+            shown = re.sub(r"(?<=://)([^:/@]*):[^/]*@", r"\1:***@", storage)  # without the password
             raise ValueError(
-                f"storage must be a database that can be reached, but got {storage}: {reason}"
+                f"storage must be a database that can be reached, but got {shown}: {reason}"
             ) from None
     path = Path(storage).absolute()
     try:
@@ -66,6 +70,18 @@ def open_storage(storage: str) -> BaseStorage:
 
 
 def _database(url: str) -> RDBStorage:
+    """A database, with its tables; tried again when another host makes them at the same time."""
+    for _ in range(TABLE_TRIES - 1):
+        try:
+            return _connected(url)
+        except (DBAPIError, AssertionError) as error:
+            if isinstance(error, OperationalError) and "already exists" not in str(error):
+                raise  # it cannot be reached
+            time.sleep(0.5)
+    return _connected(url)
+
+
+def _connected(url: str) -> RDBStorage:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         return RDBStorage(

@@ -6,27 +6,21 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
+from tuning.cost import COST
+from tuning.followers import enqueue_followers
 from tuning.interruption import stop_on_interrupt
+from tuning.outcome import best_trial
 from tuning.plan import Plan
 from tuning.proof import SizeRow, ensemble_sizes, sufficient_size
 from tuning.samplers import make_sampler
 from tuning.scenarios import Data
-from tuning.space import (
-    Choice,
-    choice_of,
-    has_ensemble,
-    parameters_of,
-    untuned_choice,
-)
+from tuning.space import Choice, choice_of, has_ensemble, trial_parameters, untuned_choice
 from tuning.storage import PROCESS, retry_orphans, this_process
-from tuning.trials import CONSISTENCY, NIS, make_pruner, run_trial
+from tuning.trials import cost_of, make_pruner, run_trial
 
-TWIN = "consistent twin"  # attribute: how often a trial's Q and R have been scaled
-TWINS = 2  # so often at most: nonlinear filters may need a second time
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 OnTrial = Callable[[optuna.Study, int], None]
 
@@ -47,6 +41,12 @@ class StudyResult(NamedTuple):
     interrupted: bool
     free_value: float | None = None  # first objective of the best trial, consistent or not; None where all count
     front: tuple[FrozenTrial, ...] = ()  # trials that no other beats in both of two objectives
+    microseconds: float | None = None  # that a step of the choice takes, where the plan asks for it
+
+    @property
+    def finished(self) -> int:
+        """Trials that count: complete ones and those that ended early."""
+        return sum(trial.state in FINISHED for trial in self.trials)
 
     @property
     def pruned(self) -> int:
@@ -59,11 +59,13 @@ def open_study(
 ) -> optuna.Study:
     """Create a study or load it to go on; its first trial is `start`, by default the untuned filter.
 
+    A study over several kinds begins with the untuned filter of every kind.
+
     Args:
         name: of the study.
         plan: what the study is for.
         storage: from `open_storage`.
-        start: the first trial.
+        start: the first trial, in place of untuned ones.
         worker: place of this process among those that share the study.
 
     Raises:
@@ -81,35 +83,28 @@ def open_study(
         load_if_exists=True,
         pruner=make_pruner(plan),
     )
-    found = study.user_attrs.get("identity", plan.identity)
-    if found != plan.identity:
-        raise ValueError(f"study {name!r} must be for {plan.identity}, but it was made for {found}")
+    _check_identity(name, plan.identity, study.user_attrs.get("identity", plan.identity))
     retry_orphans(study)
     present = len(study.get_trials(deepcopy=False))
     study.sampler = make_sampler(plan.sampler, plan.seed, present, space, worker)
     if not present:
         study.set_user_attr("identity", plan.identity)
-        first = parameters_of(start or untuned_choice(plan.filter, scenario))
-        study.enqueue_trial({name: first[name] for name in space})
+        for choice in [start] if start else [untuned_choice(kind, scenario) for kind in plan.kinds]:
+            study.enqueue_trial(trial_parameters(choice, space))
     return study
+
+
+def _check_identity(name: str, wanted: dict, found: dict) -> None:
+    """Raise ValueError, with what differs, unless a study is for what is wanted."""
+    if found != wanted:
+        differing = [key for key in {**wanted, **found} if wanted.get(key) != found.get(key)]
+        wanted, found = ({key: part.get(key) for key in differing} for part in (wanted, found))
+        raise ValueError(f"study {name!r} must be for {wanted}, but it was made for {found}")
 
 
 def finished_trials(study: optuna.Study) -> int:
     """Number of trials that count: complete and pruned ones."""
     return len(study.get_trials(deepcopy=False, states=FINISHED))
-
-
-def best_trial(trials: Sequence[FrozenTrial]) -> FrozenTrial | None:
-    """The complete, consistent trial with the least first objective; else the least inconsistent one."""
-    complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    if not complete:
-        return None
-    return min(complete, key=lambda trial: (max(violation(trial), 0.0), trial.values[0]))
-
-
-def violation(trial: FrozenTrial) -> float:
-    """How far a trial's mean NIS is outside its band, in logarithms; at most zero inside, or without a band."""
-    return trial.constraints.get(CONSISTENCY, 0.0)
 
 
 def run_study(
@@ -131,7 +126,8 @@ def run_study(
         run: runs the trials and returns whether it was interrupted; `run_trials` by default.
 
     Raises:
-        KeyboardInterrupt: if it is interrupted before any trial is finished.
+        ValueError: if all trials are over the plan's budget.
+        KeyboardInterrupt: if it is interrupted before any trial is complete.
     """
     data = plan.training_data()
     started = time.perf_counter()
@@ -139,9 +135,15 @@ def run_study(
     present = study.get_trials(deepcopy=False)
     best = best_trial(present)
     if best is None:
-        raise KeyboardInterrupt
+        costs = [trial.user_attrs[COST] for trial in present if COST in trial.user_attrs]
+        if plan.budget is None or interrupted or not costs:
+            raise KeyboardInterrupt
+        raise ValueError(
+            f"budget must be at least what the cheapest trial takes, {min(costs):.3g} microseconds a step, "
+            f"but got {plan.budget:g}"
+        )
     choice = choice_of(plan.filter, best.params, plan.scenarios[0])
-    sizes = ensemble_sizes(choice, plan, data) if has_ensemble(plan.filter) and len(plan.objectives) == 1 else []
+    sizes = ensemble_sizes(choice, plan, data) if has_ensemble(choice.name) and len(plan.objectives) == 1 else []
     if sizes:
         choice = choice.with_size(sufficient_size(sizes))
     complete = [trial.values[0] for trial in present if trial.state == TrialState.COMPLETE]
@@ -154,6 +156,8 @@ def run_study(
         interrupted,
         min(complete) if plan.is_constrained else None,
         tuple(study.best_trials) if len(plan.objectives) > 1 else (),
+        # A smaller ensemble takes no longer than the trial's.
+        min(cost_of(choice, plan, data), best.user_attrs[COST]) if plan.asks_for_cost else None,
     )
 
 
@@ -184,8 +188,8 @@ def run_trials(
 
     def after(study: optuna.Study, trial: FrozenTrial) -> None:
         finished = finished_trials(study)
-        if plan.is_constrained and finished < trials:
-            _enqueue_consistent_twin(study, plan, trial)
+        if finished < trials:
+            enqueue_followers(study, plan, trial)
         on_trial(study, finished)
         if finished >= trials or interrupted() or stop():
             study.stop()
@@ -196,30 +200,3 @@ def run_trials(
         return interrupted()
     except KeyboardInterrupt:
         return True
-
-
-def _enqueue_consistent_twin(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:
-    """Ask next for the last trial with Q and R scaled by its mean NIS, if it is the better for being inconsistent.
-
-    A common factor on Q and R leaves the gain of a linear filter as it is, and divides the NIS: without this a
-    sampler would have to find by chance, for every good ratio of Q and R, the one scale that is consistent.
-    """
-    if (
-        plan.hold_r
-        or last.state != TrialState.COMPLETE
-        or violation(last) <= 0
-        or NIS not in last.user_attrs
-        or last.user_attrs.get(TWIN) == TWINS
-    ):
-        return
-    best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
-    if violation(best) <= 0 and best.values[0] < last.values[0]:
-        return
-    space, factor = plan.space(), last.user_attrs[NIS]
-    scaled = {
-        name: float(np.clip(factor * value, space[name].low, space[name].high))
-        for name, value in last.params.items()
-        if name == "R" or name.startswith("Q")
-    }
-    twin = {TWIN: last.user_attrs.get(TWIN, 0) + 1, f"{TWIN} of": last.number}
-    study.enqueue_trial({**last.params, **scaled}, user_attrs=twin)

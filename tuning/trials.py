@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import time
+import math
 import warnings
 from collections.abc import Sequence
 from statistics import geometric_mean
-from typing import NamedTuple
 
 import numpy as np
 import optuna
 
 from filters.batch import Estimates, run
+from tuning.cost import BUDGET, COST, microseconds_a_step, over_budget
 from tuning.evaluate import Evaluation, judge, run_scores
 from tuning.objectives import LARGEST, nis_violation, penalised
 from tuning.plan import Plan
@@ -22,13 +22,6 @@ BLOCK = 8  # seeds between two decisions whether to go on
 CONSISTENCY = "mean NIS outside its band"  # name of the constraint; at most zero is inside
 NIS = "mean NIS over the number of channels"
 P_THRESHOLD = 0.1  # of Wilcoxon's signed-rank test, below which a trial ends
-
-
-class Measured(NamedTuple):
-    """A choice on the training data of all scenarios."""
-
-    evaluations: list[Evaluation]
-    microseconds: float  # a step of one run, on all cores
 
 
 def make_pruner(plan: Plan) -> optuna.pruners.BasePruner:
@@ -44,49 +37,56 @@ def run_trial(trial: optuna.Trial, plan: Plan, data: Sequence[Data]) -> list[flo
     """Values of a trial, one for each objective.
 
     Raises:
-        optuna.TrialPruned: if it is significantly worse than the best one on the seeds so far.
+        optuna.TrialPruned: if it is over the plan's budget, or significantly worse than the best one on the seeds
+            so far.
     """
     choice = suggest(trial, plan.filter, plan.scenarios[0], plan.space())
+    microseconds = math.nan
+    if plan.asks_for_cost:
+        microseconds = cost_of(choice, plan, data)
+        trial.set_user_attr(COST, microseconds)
+    if plan.budget is not None:
+        trial.set_constraint(BUDGET, over_budget(microseconds, plan.budget))
+        if microseconds > plan.budget:
+            raise optuna.TrialPruned
     prunes = plan.prune and plan.objectives == ("score",)
-    measured = measure(choice, plan, data, trial if prunes else None)
+    evaluations = measure(choice, plan, data, trial if prunes else None)
     if plan.is_constrained:
-        outside = max(nis_violation(e) for e in measured.evaluations)
+        outside = max(map(nis_violation, evaluations))
         trial.set_constraint(CONSISTENCY, outside)
         if outside < LARGEST:  # else there is no finite NIS to speak of
-            trial.set_user_attr(NIS, geometric_mean([e.nis.value / e.channels for e in measured.evaluations]))
-    return values(measured, plan)
-
-
-def values(measured: Measured, plan: Plan) -> list[float]:
-    """Objectives of a measured choice, each the mean over scenarios."""
+            trial.set_user_attr(NIS, geometric_mean([e.nis.value / e.channels for e in evaluations]))
     return [
-        float(np.mean([penalised(objective.value(e, measured.microseconds), e) for e in measured.evaluations]))
+        float(np.mean([penalised(objective.value(e, microseconds), e) for e in evaluations]))
         for objective in plan.found_objectives()
     ]
 
 
-def measure(choice: Choice, plan: Plan, data: Sequence[Data], trial: optuna.Trial | None = None) -> Measured:
+def cost_of(choice: Choice, plan: Plan, data: Sequence[Data]) -> float:
+    """Microseconds that a step of a choice takes, on the scenario where that is most."""
+    pairs = zip(plan.scenarios, data, strict=True)
+    return max(microseconds_a_step(choice.filter(scenario), one) for scenario, one in pairs)
+
+
+def measure(
+    choice: Choice, plan: Plan, data: Sequence[Data], trial: optuna.Trial | None = None
+) -> list[Evaluation]:
     """Run a choice on all data; with a trial, tell it each seed's score and end where it should be pruned."""
     filters = [choice.filter(scenario) for scenario in plan.scenarios]
     count = len(data[0].seeds)
     size = count if trial is None else BLOCK
     parts: list[list[Estimates]] = [[] for _ in filters]
-    seconds = 0.0
     for first in range(0, count, size):
         block = [Data(*(part[first : first + size] for part in one)) for one in data]
-        begin = time.perf_counter()
         for estimates, filter_, one in zip(parts, filters, block, strict=True):
             estimates.append(run(filter_, one.filter_keys, one.inputs, one.measurements))
-        seconds += time.perf_counter() - begin
         if trial is not None:
             _report(trial, first, [estimates[-1] for estimates in parts], block, plan)
             if first + size < count and trial.should_prune():
                 raise optuna.TrialPruned
     whole = [Estimates(*map(np.concatenate, zip(*estimates, strict=True))) for estimates in parts]
     rows = zip(filters, whole, data, plan.scenarios, strict=True)
-    evaluations = [judge(filter_, estimates, one, scenario.scale) for filter_, estimates, one, scenario in rows]
-    steps = sum(one.measurements.shape[0] * one.measurements.shape[1] for one in data)
-    return Measured(evaluations, 1e6 * seconds / steps)
+    return [judge(filter_, estimates, one, scenario.scale) for filter_, estimates, one, scenario in rows]
 
 
 def _report(trial: optuna.Trial, first: int, estimates: list[Estimates], block: list[Data], plan: Plan) -> None:

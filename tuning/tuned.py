@@ -8,13 +8,16 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from filters.consistency.intervals import Interval
 from filters.registry import FILE_FORMAT, FILE_VERSION, read_tuned_file, sealed
-from thruster_env.checks import at_least, positive, shown, vector
+from thruster_env.checks import at_least, covariance, positive, shown
 from thruster_env.files import write_whole
 from tuning.evaluate import Evaluation
 from tuning.plan import Plan
 from tuning.proof import Comparison
+from tuning.scenario import frozen
 from tuning.scenarios import Scenario, find_scenario
 from tuning.space import Choice
 from tuning.study import StudyResult
@@ -23,9 +26,22 @@ PACKAGES = ("thruster-env", "optuna", "numpy", "numba", "gymnasium")
 
 
 def write_tuned(
-    path: str | Path, plan: Plan, result: StudyResult, proofs: Sequence[Comparison], study_name: str
+    path: str | Path,
+    plan: Plan,
+    result: StudyResult,
+    proofs: Sequence[Comparison],
+    study_name: str,
+    method: str = "optuna",
 ) -> None:
     """Write a tuned file whole or not at all.
+
+    Args:
+        path: of the file.
+        plan: what the study was for.
+        result: the choice, and where it comes from.
+        proofs: on held-out seeds, one for each scenario.
+        study_name: of the study.
+        method: what made the choice, "optuna" or "gradient".
 
     Raises:
         ValueError: if the folder cannot be written.
@@ -44,8 +60,10 @@ def write_tuned(
         "study": {
             "name": study_name,
             **plan.identity,
-            "trials": len(result.trials),
-            "best_training_value": result.best_value,
+            "method": method,
+            "trials": result.finished,
+            "best_training_value": result.best_value if method == "optuna" else None,
+            "microseconds_a_step": result.microseconds,
         },
         "held_out": {one.name: metrics(proof) for one, proof in zip(plan.scenarios, proofs, strict=True)},
     }
@@ -60,8 +78,12 @@ def read_tuned(path: str | Path) -> tuple[Choice, Scenario, int]:
         scenario, seed = find_scenario(content["scenario"]), at_least("seed", content["study"]["seed"], 0)
         given = dict(entry["model"])
         factors = given.pop("parameter_factors", {})
-        q = tuple(vector("process_noise_cov", given.pop("process_noise_cov"), 2).tolist())
-        r = positive("measurement_noise_cov", given.pop("measurement_noise_cov"))
+        model = {
+            "process_noise_cov": _noise(given.pop("process_noise_cov")),
+            "measurement_noise_cov": positive("measurement_noise_cov", given.pop("measurement_noise_cov")),
+        }
+        if "prior_cov_factor" in given:
+            model["prior_cov_factor"] = positive("prior_cov_factor", given.pop("prior_cov_factor"))
     except (KeyError, TypeError) as error:
         raise ValueError(f"a tuned file must have all its entries, but {path} lacks or bends {error}") from None
     if given or factors != dict(scenario.parameter_factors):
@@ -69,16 +91,22 @@ def read_tuned(path: str | Path) -> tuple[Choice, Scenario, int]:
             f"the model of a tuned file must be that of its scenario, {dict(scenario.parameter_factors)}, "
             f"but {path} has {shown(entry['model'])}"
         )
-    choice = Choice(entry["name"], {"process_noise_cov": q, "measurement_noise_cov": r}, dict(entry["numbers"]))
+    choice = Choice(entry["name"], model, dict(entry["numbers"]))
     choice.filter(scenario)  # a clear error for numbers that the filter does not take
     return choice, scenario, seed
+
+
+def _noise(given) -> tuple:
+    """Q as a choice holds it: variances, or the rows of a matrix."""
+    matrix = covariance("process_noise_cov", given, 2, positive_definite=True)
+    return frozen((matrix if np.ndim(given) == 2 else np.diag(matrix)).tolist())
 
 
 def metrics(proof: Comparison) -> dict:
     """The figures of a proof on held-out seeds as plain numbers for JSON."""
     return {
         "seeds": [proof.seeds.start, proof.seeds.stop],
-        "bound": proof.bound.tolist(),
+        "bound": [None if math.isnan(part) else part for part in proof.bound.tolist()],
         **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
     }
 

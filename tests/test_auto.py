@@ -1,0 +1,211 @@
+"""A study that chooses the filter, too, under a budget of time a step."""
+
+import json
+import math
+import sys
+
+import numpy as np
+import optuna
+import pytest
+from optuna.trial import TrialState
+
+from filters.registry import FILTERS
+from thruster_cli.main import main
+from tuning import trials
+from tuning.cost import BUDGET, COST, microseconds_a_step, over_budget
+from tuning.followers import HEIR, SMALLER, _ends_a_round
+from tuning.kinds import kinds_tried, trials_of_kind
+from tuning.outcome import best_trial, is_over_budget, violation
+from tuning.plan import Plan
+from tuning.proof import prove
+from tuning.scenarios import find_scenario
+from tuning.space import (
+    AUTO_KINDS,
+    KIND,
+    choice_of,
+    joint_distributions,
+    trial_parameters,
+    untuned_choice,
+)
+from tuning.study import open_study, run_study
+from tuning.tuned import write_tuned
+
+MISMATCH = find_scenario("mismatch")
+PLAN = Plan("auto", (MISMATCH,), budget=1.0)
+FEW = ("ekf", "kf", "enkf", "pf")  # kinds of most tests, for speed
+COSTS = {"ekf": lambda n: 0.1, "kf": lambda n: 0.07, "enkf": lambda n: 0.05 * n, "pf": lambda n: 0.02 * n}
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+
+
+@pytest.fixture
+def priced(monkeypatch):
+    """Few kinds, and costs that do not depend on the machine."""
+    monkeypatch.setattr("tuning.plan.AUTO_KINDS", FEW)
+    monkeypatch.setattr(trials, "microseconds_a_step", lambda filter_, data: COSTS[filter_.name](filter_.size))
+
+
+def studied(plan, count):
+    return run_study(open_study("s", plan, optuna.storages.InMemoryStorage()), plan, count)
+
+
+def test_the_kinds_are_all_filters_with_a_covariance_the_ekf_first():
+    assert AUTO_KINDS[0] == "ekf" and len(set(AUTO_KINDS)) == len(AUTO_KINDS)
+    assert set(AUTO_KINDS) == {name for name, kind in FILTERS.items() if kind.has_covariance}
+
+
+@pytest.mark.parametrize("kind", AUTO_KINDS)
+def test_a_choice_of_any_kind_survives_its_trial_parameters(kind):
+    space, choice = joint_distributions(AUTO_KINDS, MISMATCH), untuned_choice(kind, MISMATCH)
+    parameters = trial_parameters(choice, space)
+    assert choice_of("auto", parameters, MISMATCH) == choice
+    assert all(" " not in key or key.startswith(f"{kind} ") for key in parameters)
+    assert all(space[key]._contains(space[key].to_internal_repr(value)) for key, value in parameters.items())
+
+
+def test_numbers_of_a_kind_are_chosen_for_that_kind_alone_and_noise_for_all(priced):
+    result = studied(PLAN, 30)
+    for trial in result.trials:
+        kind = trial.params[KIND]
+        own = {key for key in trial.params if " " in key}
+        assert {"Q11", "Q22", "R"} < set(trial.params) and all(key.startswith(f"{kind} ") for key in own)
+        assert (f"{kind} N" in own) == (kind in ("enkf", "pf"))
+
+
+def test_a_study_of_kinds_begins_with_the_untuned_filter_of_each(priced):
+    result = studied(PLAN, len(FEW))
+    found = [choice_of("auto", trial.params, MISMATCH) for trial in result.trials[: len(FEW)]]
+    assert found == [untuned_choice(kind, MISMATCH) for kind in FEW]
+
+
+def test_what_is_over_the_budget_ends_at_once_and_never_wins(priced):
+    result = studied(PLAN, 40)
+    over = [trial for trial in result.trials if is_over_budget(trial)]
+    assert over and all(trial.state == TrialState.PRUNED and not trial.intermediate_values for trial in over)
+    for trial in result.trials:
+        if trial.state != TrialState.WAITING:
+            cost = COSTS[trial.params[KIND]](trial.params.get(f"{trial.params[KIND]} N", 0))
+            assert trial.user_attrs[COST] == cost and trial.constraints[BUDGET] == math.log(cost / 1.0)
+            assert is_over_budget(trial) == (cost > 1.0)
+    best = best_trial(result.trials)
+    assert best.user_attrs[COST] <= 1.0 and result.microseconds <= 1.0 and violation(best) <= 0
+    assert result.choice.name == best.params[KIND]
+    kinds = {kind.name: kind for kind in kinds_tried(result.trials)}
+    assert sum(kind.trials for kind in kinds.values()) == 40 and kinds["pf"].over_budget == kinds["pf"].trials
+    assert kinds["pf"].value is None and kinds["pf"].microseconds > 1.0
+    assert kinds[best.params[KIND]].value == best.values[0] and list(kinds)[0] == best.params[KIND]
+    assert {t.params[KIND] for t in trials_of_kind(result.trials, "kf")} == {"kf"}
+
+
+def test_a_filter_over_the_budget_is_tried_with_fewer_members(priced):
+    result = studied(PLAN, 12)
+    untuned = next(trial for trial in result.trials if trial.params[KIND] == "enkf")
+    (smaller,) = [trial for trial in result.trials if SMALLER in trial.user_attrs]  # none for pf: 200 are too many
+    assert smaller.user_attrs[SMALLER] == untuned.number and smaller.params["enkf N"] == 18
+    assert {**smaller.params, "enkf N": 30} == untuned.params and not is_over_budget(smaller)
+
+
+def test_other_kinds_inherit_the_noise_of_the_best_one(priced):
+    assert [n for n in range(1, 65) if _ends_a_round(n, 4)] == [12, 24, 48]
+    result = studied(PLAN._replace(prune=False), 17)
+    heirs = [trial for trial in result.trials if HEIR in trial.user_attrs]
+    (best,) = {trial.user_attrs[HEIR] for trial in heirs}
+    best = result.trials[best]
+    kinds = [trial.params[KIND] for trial in heirs]
+    assert best.params[KIND] not in kinds and "pf" not in kinds  # which is over the budget
+    assert 2 <= len(kinds) == len(set(kinds))
+    assert all(trial.params[key] == best.params[key] for trial in heirs for key in ("Q11", "Q22", "R"))
+
+
+def test_a_budget_holds_one_kind_too_and_no_size_goes_beyond_it(priced):
+    plan = Plan("enkf", (MISMATCH,), budget=1.0)
+    result = studied(plan, 15)
+    assert result.choice.numbers["ensemble_size"] <= 20 and max(row.size for row in result.sizes) <= 20
+    assert kinds_tried(result.trials) == []
+
+
+def test_a_budget_that_nothing_keeps_is_one_clear_line(priced):
+    with pytest.raises(ValueError, match="budget must be at least what the cheapest trial takes, 0.07 mi.* 0.01"):
+        studied(PLAN._replace(budget=0.01), 6)
+
+
+def test_without_a_budget_a_front_of_error_against_cost_tells_the_kinds(priced):
+    plan = PLAN._replace(budget=None, objectives=("score", "cost"))
+    result = studied(plan, 10)
+    assert {trial.params[KIND] for trial in result.front} and result.choice.name in FEW
+    assert min(trial.values[1] for trial in result.front) == 0.07
+
+
+def test_the_same_seed_gives_the_same_study(priced):
+    first, second = ([trial.params for trial in studied(PLAN, 14).trials] for _ in range(2))
+    assert first == second
+
+
+@pytest.mark.parametrize(
+    ("change", "rule"),
+    [
+        ({"budget": None}, "'auto' must have a budget of microseconds a step .* or the objective 'cost'"),
+        ({"budget": 0.0}, "budget must be positive, but got 0.0"),
+        ({"sampler": "grid"}, "a sampler that chooses among filters must be one of tpe, .*, but got 'grid'"),
+        ({"filter": "low-pass", "full_q": True}, "a full Q needs a filter with a covariance, but got 'low-pass'"),
+    ],
+)
+def test_a_plan_that_cannot_work_is_refused(change, rule):
+    with pytest.raises(ValueError, match=rule):
+        open_study("s", PLAN._replace(**change), optuna.storages.InMemoryStorage())
+
+
+def test_budget_and_kinds_belong_to_the_identity(monkeypatch):
+    storage = optuna.storages.InMemoryStorage()
+    open_study("s", PLAN, storage)
+    with pytest.raises(ValueError, match="must be for {'budget': 2.0}, but it was made for {'budget': 1.0}"):
+        open_study("s", PLAN._replace(budget=2.0), storage)
+    monkeypatch.setattr("tuning.plan.AUTO_KINDS", FEW)
+    with pytest.raises(ValueError, match="must be for {'kinds': .*'pf'"):
+        open_study("s", PLAN, storage)
+
+
+def test_cost_is_of_one_core_and_grows_with_the_ensemble():
+    data = MISMATCH.data(range(32))
+    untuned = untuned_choice("enkf", MISMATCH)
+    small, large = (microseconds_a_step(untuned.with_size(n).filter(MISMATCH), data) for n in (10, 200))
+    ekf = microseconds_a_step(untuned_choice("ekf", MISMATCH).filter(MISMATCH), data)
+    assert 0 < ekf < small and 3 < large / small < 40
+    assert over_budget(2.0, 1.0) == pytest.approx(np.log(2)) and over_budget(1.0, 1.0) == 0.0
+
+
+def test_the_command_says_which_filters_it_tried_and_reports_on_the_winner(priced, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tuning.proof.HELD_OUT_SEEDS", 8)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["thruster", *arguments])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        assert not stop.value.code
+        return capsys.readouterr().out
+
+    tune = ("tune", "--filter", "auto", "--budget", "1", "--trials", "12")
+    said = run(*tune)
+    assert "Filters that were tried" in said and "the budget is 1." in said
+    name = "auto-mismatch-seed0-budget1"
+    content = json.loads((tmp_path / "out" / f"{name}.json").read_text())
+    assert content["filter"]["name"] in FEW and content["study"]["microseconds_a_step"] <= 1.0
+    again = json.loads(run(*tune, "--json", "-"))
+    assert again["filter"]["name"] == content["filter"]["name"] and len(again["kinds"]) == 4
+    assert again["trials"] == content["study"]["trials"]
+    assert "tuned on mismatch" in run("report", f"out/{name}.json") + (tmp_path / f"out/{name}.md").read_text()
+    assert "Filters that were tried" in (tmp_path / f"out/{name}.html").read_text()
+
+
+@pytest.mark.parametrize("method", ["optuna", "gradient"])
+def test_the_tuned_file_says_what_made_the_choice(tmp_path, method):
+    plan, path = Plan("ekf", (MISMATCH,)), tmp_path / "t.json"
+    result = studied(plan, 1)
+    write_tuned(path, plan, result, [prove(result.choice, MISMATCH, 0, 2)], "s", method)
+    study = json.loads(path.read_text())["study"]
+    assert study["method"] == method
+    assert study["best_training_value"] == (result.best_value if method == "optuna" else None)

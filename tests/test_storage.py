@@ -1,0 +1,127 @@
+"""Databases as storages: tables, signs of life, lost answers, an end of patience, the proxy."""
+
+import socket
+import subprocess
+import sys
+import time
+
+import optuna
+import pytest
+import sqlalchemy
+from optuna.trial import TrialState
+
+from tuning import storage as storages
+from tuning.plan import Plan
+from tuning.scenarios import find_scenario
+from tuning.space import distributions
+from tuning.storage import PROCESS, RETRY_OF, open_storage
+from tuning.study import open_study, run_study
+
+PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+
+
+@pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed to be used with Study.optimize")
+def test_a_trial_without_a_heartbeat_is_lost_and_tried_once_more(tmp_path, monkeypatch):
+    monkeypatch.setattr(storages, "HEARTBEAT_SECONDS", 1)
+    monkeypatch.setattr(storages, "GRACE_SECONDS", 1)
+    storage = open_storage(f"sqlite:///{tmp_path}/s.db")
+    study = open_study("s", PLAN, storage)
+    trial = study.ask(distributions("ekf", PLAN.scenarios[0]))
+    trial.set_user_attr(PROCESS, "elsewhere:1")
+    storage.record_heartbeat(trial._trial_id)
+    time.sleep(2.5)
+    found = run_study(open_study("s", PLAN, storage), PLAN, 2).trials
+    assert found[0].state == TrialState.FAIL
+    assert [t.params for t in found if t.user_attrs.get(RETRY_OF) == 0] == [found[0].params]
+
+
+def test_tables_that_another_host_is_making_are_found_in_the_end(tmp_path, monkeypatch):
+    url, connected, tries = f"sqlite:///{tmp_path}/s.db", storages._connected, []
+
+    def half_made(url):
+        tries.append(url)
+        if len(tries) < 3:
+            raise sqlalchemy.exc.OperationalError("CREATE", {}, Exception("Table 'studies' already exists"))
+        return connected(url)
+
+    monkeypatch.setattr(storages, "_connected", half_made)
+    assert not open_study("s", PLAN, open_storage(url)).trials[0].params
+    assert len(tries) == 3
+
+
+def test_a_password_is_not_told():
+    pytest.importorskip("psycopg2")
+    with pytest.raises(
+        ValueError, match="database that can be reached, but got .*//tuner:...@localhost:1/s:"
+    ) as e:
+        open_storage("postgresql+psycopg2://tuner:secret@localhost:1/s")
+    assert "secret" not in str(e.value)
+
+
+@pytest.fixture
+def flaky(tmp_path, monkeypatch):
+    """Makes a database do its work and fail to say so, as often as told."""
+    storage = open_storage(f"sqlite:///{tmp_path}/s.db")
+
+    def fail(name, times):
+        method, failures = getattr(storage._backend, name), iter(range(times))
+
+        def lost(*args, **kwargs):
+            answer = method(*args, **kwargs)
+            if next(failures, None) is not None:
+                raise optuna.exceptions.StorageInternalError("connection lost")
+            return answer
+
+        monkeypatch.setattr(storage._backend, name, lost)
+
+    return storage, fail
+
+
+@pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed to be used with Study.optimize")
+def test_an_answer_that_gets_lost_is_asked_for_again(flaky):
+    storage, fail = flaky
+    study = optuna.create_study(storage=storage)
+    trial = study.ask()
+    fail("set_trial_state_values", 1)
+    study.tell(trial, 1.0)
+    assert [trial.values for trial in study.trials] == [[1.0]]
+    with pytest.raises(ValueError):  # what is finished cannot be told twice
+        study.tell(trial.number, 1.0)
+
+
+def test_patience_has_an_end(flaky, monkeypatch):
+    storage, fail = flaky
+    study = optuna.create_study(storage=storage)
+    monkeypatch.setattr(storages, "PATIENCE_SECONDS", 1)
+    fail("set_study_user_attr", 100)
+    with (
+        pytest.warns(UserWarning, match="no answer from the database, trying for 1 s: connection lost"),
+        pytest.raises(ValueError, match="a database must answer within 1 s, but got: connection lost"),
+    ):
+        study.set_user_attr("a", 1)
+
+
+def test_a_proxy_stands_between_a_study_and_its_database(tmp_path, monkeypatch):
+    pytest.importorskip("grpc")
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    monkeypatch.setattr(storages, "PROXY_SECONDS", 0.1)
+    with pytest.raises(ValueError, match="storage must be a database that can be reached, but got grpc:"):
+        open_storage(f"grpc://localhost:{port}")
+    program = "import sys, optuna; optuna.storages.run_grpc_proxy_server("
+    program += "optuna.storages.RDBStorage(sys.argv[1]), port=int(sys.argv[2]))"
+    url = f"sqlite:///{tmp_path}/s.db"
+    server = subprocess.Popen([sys.executable, "-c", program, url, str(port)], stderr=subprocess.DEVNULL)
+    try:
+        monkeypatch.setattr(storages, "PROXY_SECONDS", 30)
+        result = run_study(open_study("s", PLAN, open_storage(f"grpc://localhost:{port}")), PLAN, 3)
+        assert [trial.state for trial in result.trials] == [TrialState.COMPLETE] * 3
+    finally:
+        server.terminate()
+        server.wait()

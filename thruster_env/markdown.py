@@ -1,0 +1,26 @@
+"""Tables in Markdown, and pages whose tables are computed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(line)} |".replace("|  |", "| |") for line in lines)
+
+
+def with_tables(page: str, tables: Mapping[str, Callable[[], str]]) -> str:
+    """The page with these computed tables written anew; others stay.
+
+    A table stands between `<!-- table NAME -->` and `<!-- end -->`.
+    """
+
+    def anew(match: re.Match) -> str:
+        if match[2] not in tables:
+            return match[0]
+        return f"{match[1]}\n{tables[match[2]]()}\n{match[3]}"
+
+    return re.sub(r"(<!-- table (\w+) -->).*?(<!-- end -->)", anew, page, flags=re.DOTALL)

@@ -1,0 +1,31 @@
+"""How a trial ended: whether it keeps to its constraints, and which one is best."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from optuna.trial import FrozenTrial, TrialState
+
+from tuning.cost import BUDGET
+from tuning.trials import CONSISTENCY
+
+
+def best_trial(trials: Sequence[FrozenTrial]) -> FrozenTrial | None:
+    """The complete, consistent trial with the least first objective; else the least inconsistent one.
+
+    A trial over the budget is never complete.
+    """
+    complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    if not complete:
+        return None
+    return min(complete, key=lambda trial: (max(violation(trial), 0.0), trial.values[0]))
+
+
+def violation(trial: FrozenTrial) -> float:
+    """How far a trial's mean NIS is outside its band, in logarithms; at most zero inside, or without a band."""
+    return trial.constraints.get(CONSISTENCY, 0.0)
+
+
+def is_over_budget(trial: FrozenTrial) -> bool:
+    """Whether a trial ended because its filter costs too much."""
+    return trial.constraints.get(BUDGET, 0.0) > 0
