@@ -9,8 +9,8 @@ from optuna.trial import TrialState
 
 from tuning import trials
 from tuning.evaluate import evaluate, score_ratio
-from tuning.followers import TWIN
-from tuning.gradient import BAD_START
+from tuning.followers import LIKELIEST, LIKELIEST_AFTER, TWIN
+from tuning.gradient import BAD_START, maximise_likelihood
 from tuning.objectives import LARGEST, NIS_BAND, nis_violation
 from tuning.outcome import best_trial, violation
 from tuning.plan import Plan
@@ -50,6 +50,22 @@ def test_a_common_factor_on_q_and_r_is_what_makes_a_trial_consistent():
     factors = {name: twin.params[name] / untuned.params[name] for name in ("Q11", "Q22", "R")}
     assert factors["Q11"] == pytest.approx(factors["R"]) == pytest.approx(factors["Q22"])
     assert twin.values[0] == pytest.approx(untuned.values[0], rel=0.02) and violation(twin) <= 0
+
+
+def test_one_trial_has_the_likeliest_noise_and_finds_what_sampling_finds_late():
+    plan = Plan("ekf", (NOMINAL,), seed=3)
+    result = studied(plan, LIKELIEST_AFTER + 2)
+    (likeliest,) = [trial for trial in result.trials if LIKELIEST in trial.user_attrs]
+    assert likeliest.number >= LIKELIEST_AFTER
+    found = maximise_likelihood("ekf", NOMINAL, plan.training_data()[0], [(1, 1, 1)])
+    assert [likeliest.params[name] for name in found.names] == pytest.approx(found.best.variances)
+    true = evaluate(true_choice("ekf", NOMINAL).filter(NOMINAL), plan.training_data()[0], NOMINAL.scale)
+    assert likeliest.values[0] < 1.005 * true.score.value
+
+
+def test_with_r_held_no_trial_has_the_likeliest_noise():
+    result = studied(Plan("ekf", (NOMINAL,), hold_r=True), LIKELIEST_AFTER + 2)
+    assert not any(LIKELIEST in trial.user_attrs for trial in result.trials)
 
 
 def test_without_consistency_any_nis_will_do():

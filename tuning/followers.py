@@ -7,6 +7,7 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from tuning.cost import COST
+from tuning.gradient import maximise_likelihood
 from tuning.outcome import best_trial, is_over_budget, violation
 from tuning.plan import Plan
 from tuning.space import KIND
@@ -18,14 +19,21 @@ SMALLER = "smaller ensemble of"  # attribute: number of the trial that was over 
 HEIR = "noise of"  # attribute: number of the trial of another kind that Q and R are from
 FIRST_ROUND = 3  # trials for each kind, after which the noise of the best one is tried with all
 ROOM = 0.9  # of the budget, for which a smaller ensemble is meant
+LIKELIEST = "likeliest noise"  # attribute of the trial whose Q and R make the innovations likeliest
+LIKELIEST_AFTER = 20  # trials
 
 
 def enqueue_followers(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:
-    """Ask for what the last trial calls for: a consistent twin, a smaller ensemble, its noise for other kinds."""
+    """Ask for what the last trial calls for.
+
+    That is a consistent twin, a smaller ensemble, the likeliest noise, its own noise for other kinds.
+    """
     if plan.is_constrained and not plan.hold_r:
         _enqueue_consistent_twin(study, plan, last)
     if plan.budget is not None and last.number < len(plan.kinds):
         _enqueue_smaller_ensemble(study, plan, last)
+    if last.number == LIKELIEST_AFTER - 1 and not plan.hold_r:
+        _enqueue_likeliest(study, plan)
     if len(plan.kinds) > 1 and _ends_a_round(last.number + 1, len(plan.kinds)):
         _enqueue_heirs(study, plan)
 
@@ -68,6 +76,26 @@ def _enqueue_smaller_ensemble(study: optuna.Study, plan: Plan, last: FrozenTrial
     size = int(ROOM * last.params[names[0]] * plan.budget / last.user_attrs[COST])
     if size >= plan.space()[names[0]].low:
         study.enqueue_trial({**last.params, names[0]: size}, user_attrs={SMALLER: last.number})
+
+
+def _enqueue_likeliest(study: optuna.Study, plan: Plan) -> None:
+    """Ask for the best trial with the Q and R under which the innovations are likeliest.
+
+    They are those of the first scenario's model in an extended Kalman filter, or in the Kalman filter where that
+    is tuned. Near the best Q and R the score is so flat that a sampler finds the place late; where the model is
+    wrong the trial is one among many.
+    """
+    best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
+    if best is None:
+        return
+    name = "kf" if plan.kinds == ("kf",) else "ekf"
+    found = maximise_likelihood(name, plan.scenarios[0], plan.training_data()[0], [(1.0, 1.0, 1.0)])
+    space = plan.space()
+    likeliest = {
+        name: float(np.clip(value, space[name].low, space[name].high))
+        for name, value in zip(found.names, found.best.variances, strict=True)
+    }
+    study.enqueue_trial({**best.params, **likeliest}, user_attrs={LIKELIEST: True})
 
 
 def _ends_a_round(trials: int, kinds: int) -> bool:
