@@ -8,16 +8,17 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-ROOMS = ("thruster_env", "filters", "tuning", "studies", "thruster_cli")
+ROOMS = ("thruster_env", "filters", "tuning", "training", "studies", "thruster_cli")
 FILES = [path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
 every_file = pytest.mark.parametrize("path", FILES, ids=lambda path: path.relative_to(ROOT).as_posix())
 every_room = pytest.mark.parametrize("room", ROOMS)
 
 FORBIDDEN = {
-    "thruster_env": {"filters", "tuning", "studies", "thruster_cli"},
-    "filters": {"tuning", "studies", "thruster_cli"},
-    "tuning": {"thruster_cli"},
-    "studies": {"thruster_cli"},
+    "thruster_env": {"filters", "tuning", "training", "studies", "thruster_cli"},
+    "filters": {"tuning", "training", "studies", "thruster_cli"},
+    "tuning": {"training", "thruster_cli"},
+    "training": {"studies", "thruster_cli"},
+    "studies": {"training", "thruster_cli"},
     "thruster_cli": set(),
 }
 LEARNING = {"stable_baselines3", "sb3_contrib", "rl_zoo3", "torch"}
@@ -74,10 +75,8 @@ def test_only_tuning_imports_optuna(path):
 
 
 @every_file
-def test_no_package_that_learns_policies_is_needed(path):
-    room = path.relative_to(ROOT).parts[0]
-    if room in ("thruster_env", "filters", "tuning"):
-        assert not packages_of(path) & LEARNING
+def test_only_training_imports_packages_that_learn_policies(path):
+    assert not packages_of(path) & LEARNING or path.relative_to(ROOT).parts[0] == "training"
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "filters").rglob("*.py")), ids=lambda path: path.name)
@@ -102,6 +101,12 @@ def test_a_file_is_at_most_300_lines_long(path):
 def test_a_package_says_that_it_is_typed(room):
     assert (ROOT / room / "__init__.py").is_file()
     assert (ROOT / room / "py.typed").is_file()
+
+
+def test_the_command_line_starts_without_packages_that_learn_policies():
+    code = f"import sys, thruster_cli.main; print([name for name in {sorted(LEARNING)} if name in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
 
 
 def test_importing_the_env_stays_light():

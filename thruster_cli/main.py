@@ -7,7 +7,22 @@ import sys
 
 import typer
 
-from thruster_cli import compare, demo, evaluate, filters, inspect, report, reproduce, simulate, tune, verify
+from thruster_cli import (
+    compare,
+    demo,
+    evaluate,
+    filters,
+    inspect,
+    play,
+    report,
+    reproduce,
+    score,
+    simulate,
+    study,
+    train,
+    tune,
+    verify,
+)
 
 app = typer.Typer(
     help="A ship's bow thruster, the filters that estimate its hidden state, and the tuning that makes them good.",
@@ -26,6 +41,10 @@ app.command("verify")(verify.command)
 app.command("compare")(compare.command)
 app.command("filters")(filters.command)
 app.command("reproduce")(reproduce.command)
+app.command("train")(train.command)
+app.command("play")(play.command)
+app.command("score")(score.command)
+app.add_typer(study.app, name="study")
 
 
 @app.callback()

@@ -1,0 +1,73 @@
+"""Learning a policy on filtered state: our vector env with its batched filter against single envs side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from time import perf_counter
+
+import numpy as np
+
+from benchmarks.rows import Row
+from benchmarks.timing import Measure, alone, side_by_side
+from tuning.scenarios import find_scenario, training_seeds
+
+COPIES = 64
+GOAL = 1 / 1.5  # of the time that PPO takes with DummyVecEnv
+
+
+def rows(seed: int, quick: bool) -> Iterator[Row]:
+    """Measure, one row after the other."""
+    rounds, rollouts = (1, 1) if quick else (5, 4)
+    ours, peer = (learning(seed, native, rollouts) for native in (True, False))
+    timing = side_by_side(ours, peer, rounds)
+    yield Row(f"a step of PPO on an EKF, {COPIES} copies", "DummyVecEnv", timing, ratio_goal=GOAL)
+    stepping = side_by_side(*(acting(seed, "ekf", native) for native in (True, False)), rounds)
+    yield Row("  of it env and EKF", "DummyVecEnv", stepping)
+    yield Row("  of it env alone", None, alone(acting(seed, "raw", True), rounds))
+
+
+def learning(seed: int, native: bool, rollouts: int) -> Measure:
+    """Seconds a step of a short training."""
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    from training.algorithms import find_algorithm
+    from training.environments import make_environments
+    from training.learn import one_thread
+
+    setup = _setup("ekf", seed)
+    numbers = dict(setup.hyperparameters)
+    steps = rollouts * COPIES * numbers["n_steps"]
+    envs = VecNormalize(make_environments(setup, training_seeds(seed, COPIES), native=native))
+    algorithm = find_algorithm("ppo")
+    model = algorithm.load_class()(algorithm.policy, envs, seed=seed, device="cpu", **numbers)
+
+    def measure() -> float:
+        with one_thread():
+            begin = perf_counter()
+            model.learn(steps)
+            return (perf_counter() - begin) / steps
+
+    return measure
+
+
+def acting(seed: int, observe: str, native: bool, steps: int = 200) -> Measure:
+    """Seconds a copy and step of the envs alone."""
+    from training.environments import make_environments
+
+    envs = make_environments(_setup(observe, seed), training_seeds(seed, COPIES), native=native)
+    actions = np.random.default_rng(seed).uniform(-1, 1, (steps, COPIES, 1)).astype(np.float32)
+
+    def measure() -> float:
+        envs.reset()
+        begin = perf_counter()
+        for action in actions:
+            envs.step(action)
+        return (perf_counter() - begin) / (steps * COPIES)
+
+    return measure
+
+
+def _setup(observe: str, seed: int):
+    from training.setup import make_setup
+
+    return make_setup("manoeuvre", find_scenario("medium_noise"), observe, seed=seed, num_envs=COPIES)

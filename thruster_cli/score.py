@@ -1,0 +1,159 @@
+"""`thruster score`: trained policies, and classical ones beside them, on held-out episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NamedTuple
+
+import typer
+
+from filters.consistency.intervals import mean_interval
+from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
+from thruster_cli.tables import about, unless_blank
+from thruster_cli.train import LEARNABLE
+from thruster_env.checks import one_of
+from training.extras import check_installed
+from training.setup import Setup, in_scenario
+from tuning.plan import HELD_OUT_SEEDS
+from tuning.scenarios import Scenario, find_scenario, held_out_seeds
+
+if TYPE_CHECKING:
+    from training.score import Scores
+
+PARTS = ("transient", "steady", "reversal", "observed")
+
+
+class Scored(NamedTuple):
+    """A policy and how it did."""
+
+    label: str
+    folder: Path | None  # of a learnt policy
+    setup: Setup
+    scores: Scores
+
+
+def command(
+    models: Annotated[list[Path], typer.Argument(metavar="MODEL", help="Folders that `thruster train` made.")],
+    scenario: Annotated[
+        str | None,
+        typer.Option(help=f"Another plant than that of training: {', '.join(LEARNABLE)}, or a .toml file."),
+    ] = None,
+    classical: Annotated[
+        list[str] | None,
+        typer.Option(help="pi or lqr; may be repeated. A controller that observes what each policy does."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(help="Number of held-out episodes.")] = HELD_OUT_SEEDS,
+    seed: SeedOption = 0,
+    json: JsonOption = None,
+) -> None:
+    """Score trained policies on held-out episodes, the same for all, without exploration.
+
+    Returns come with 95 % intervals. Thrust errors are root mean squares of the true thrust against the reference:
+    within 0.15 s of its steps, elsewhere, and within 0.15 s of changes of its sign. Several policies are compared
+    with the first one episode by episode.
+
+    With --scenario the plant changes, its noise and sensors too, and nobody is told: a filter goes on assuming the
+    plant of training, a classical controller keeps its gains. What a scenario says of filters is left out.
+
+    Needs the extra rl: pip install 'thruster-env[rl]'
+
+    Example: thruster score out/policies/* --classical pi --scenario ambient
+    """
+    check_installed()
+    held_out = held_out_seeds(seed, seeds)
+    plant = None if scenario is None else find_scenario(scenario)
+    with progress_console.status("loading torch ..."):
+        from training.classical import CONTROLLERS
+        from training.saved import find_saved, read_setup
+    for name in classical or []:
+        one_of("classical", name, CONTROLLERS)
+    folders = {model: find_saved(model) for model in models}
+    setups = {model: read_setup(folder) for model, folder in folders.items()}
+    check_alike(list(setups.values()), plant)
+    announce_compilation()
+    scored = []
+    with progress_console.status("scoring ...") as status:
+        for model, folder in folders.items():
+            status.update(f"scoring {model} on {seeds} episodes ...")
+            scored.append(_learnt(model, folder, setups[model], plant, held_out))
+        for name in classical or []:
+            for setup in _each_arm(setups.values()):
+                status.update(f"scoring {name} on {setup.observe} ...")
+                scored.append(_classical(name, setup, plant, held_out))
+    emit(report(scored, held_out), as_json(scored, held_out), json)
+
+
+def check_alike(setups: Sequence[Setup], plant: Scenario | None) -> None:
+    """Raise ValueError unless all policies do the same task, on the same plant once a scenario is given."""
+    for name in ("task", "env_id") + (("scenario",) if plant is None else ()):
+        found = sorted({getattr(setup, name) for setup in setups})
+        if len(found) > 1:
+            way_out = ": give one with --scenario" if name == "scenario" else ""
+            raise ValueError(
+                f"models to compare must have one {name.replace('_', ' ')}, but got {', '.join(found)}{way_out}"
+            )
+
+
+def _learnt(model: Path, folder: Path, setup: Setup, plant: Scenario | None, seeds: Sequence[int]) -> Scored:
+    from training.environments import make_environments
+    from training.saved import load
+    from training.score import score
+
+    met = setup if plant is None else in_scenario(setup, plant)
+    policy = load(folder, make_environments(met, seeds[:1]))
+    return Scored(f"{setup.observe} {setup.algo}", model, setup, score(policy, met, seeds))
+
+
+def _classical(name: str, setup: Setup, plant: Scenario | None, seeds: Sequence[int]) -> Scored:
+    from training.classical import classical_policy
+    from training.score import score
+
+    met = setup if plant is None else in_scenario(setup, plant)
+    return Scored(f"{setup.observe} {name}", None, setup, score(classical_policy(name, setup), met, seeds))
+
+
+def _each_arm(setups) -> list[Setup]:
+    """One setup for each way to observe, filter arguments included."""
+    found: list[Setup] = []
+    for setup in setups:
+        if all((setup.observe, setup.filter_arguments) != (one.observe, one.filter_arguments) for one in found):
+            found.append(setup)
+    return found
+
+
+def report(scored: Sequence[Scored], seeds: range) -> list:
+    """A table of policies, and where the learnt ones lie."""
+    rows, first = [], scored[0].scores.returns
+    for number, (label, _, _, scores) in enumerate(scored, start=1):
+        over = "" if number == 1 else about(mean_interval(scores.returns - first), 3)
+        parts = [unless_blank(getattr(scores, part).rms, ".2f") for part in PARTS]
+        rows.append([f"{number} {label}", about(mean_interval(scores.returns), 3), over, *parts])
+    columns = ["policy", "mean return", "over the\nfirst", "transient\n[N]", "steady\n[N]", "reversal\n[N]"]
+    title = f"Held-out episodes {seeds.start} to {seeds.stop - 1}, {scored[0].setup.task}"
+    caption = (
+        "±: half of the 95 % interval. [N]: root mean square error of thrust. "
+        "seen: of the thrust that the policy is shown; blank: no such step."
+    )
+    shown: list = [table(title, [*columns, "seen\n[N]"], rows, caption=caption)]
+    learnt = [(number, one) for number, one in enumerate(scored, start=1) if one.folder is not None]
+    return shown + [f"{number} {one.label}: {one.folder}" for number, one in learnt]
+
+
+def as_json(scored: Sequence[Scored], seeds: range) -> dict:
+    """The same as plain data, with the return of every episode."""
+    first = scored[0].scores.returns
+    return {
+        "seeds": [seeds.start, seeds.stop],
+        "policies": [
+            {
+                "policy": label,
+                "folder": None if folder is None else str(folder),
+                "mean_return": mean_interval(scores.returns)._asdict(),
+                "over_the_first": mean_interval(scores.returns - first)._asdict(),
+                **{f"{part}_rms": getattr(scores, part).rms for part in PARTS},
+                "returns": scores.returns,
+            }
+            for label, folder, _, scores in scored
+        ],
+    }

@@ -1,0 +1,92 @@
+"""`thruster study`: comparisons that take their time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from thruster_cli.output import announce_compilation, console, progress_console, table
+from thruster_env.files import check_target
+
+app = typer.Typer(help="Comparisons that take their time.", no_args_is_help=True)
+
+
+@app.callback()
+def _callback() -> None:
+    pass
+
+
+@app.command("policies")
+def policies(
+    quick: Annotated[
+        bool, typer.Option("--quick", help="One noise, two seeds, few steps: whether it works, not what it says.")
+    ] = False,
+    seeds: Annotated[int | None, typer.Option(min=1, help="Training seeds of each learnt policy; 5.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps that each learns from; 400000.")] = None,
+    recurrent: Annotated[
+        bool, typer.Option("--recurrent", help="Also PPO with an LSTM on raw measurements: many hours.")
+    ] = False,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder of results; what is there is not done again.")] = Path(
+        "out/policies"
+    ),
+    page: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.md", help="Page whose tables are written anew, with the pictures beside it."),
+    ] = None,
+) -> None:
+    """Train policies on raw, filtered and true state, and compare them with PI and LQG.
+
+    PPO at three noises of the thrust sensor; the same network, steps and held-out episodes for all. Writes a page
+    with tables and two pictures. Ctrl-C keeps what is done, and the same command goes on. On two cores it takes
+    an hour.
+
+    Example: thruster study policies --quick
+    """
+    from training.extras import check_installed
+
+    check_installed()
+    from training.comparison.plan import QUICK, Comparison
+    from training.comparison.report import PAGE, write_report
+    from training.comparison.runs import run_comparison
+    from training.comparison.tables import HEADER, answers, rows_of
+
+    comparison = QUICK if quick else Comparison()
+    given = {"seeds": seeds, "steps": steps, "recurrent": recurrent or None}
+    comparison = comparison._replace(**{name: value for name, value in given.items() if value is not None})
+    target = page or out / PAGE
+    check_target(target)
+    announce_compilation()
+    columns = [
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    ]
+    with Progress(*columns, console=progress_console) as progress:
+        task = progress.add_task("policies", total=None)
+        results = run_comparison(
+            comparison,
+            out,
+            jobs,
+            lambda run, done, count: progress.update(task, description=run.name, completed=done, total=count),
+        )
+    written = write_report(results, comparison, target)
+    for noise in comparison.noises:
+        console.print(
+            table(f"{noise} noise of the thrust sensor; thrust errors in N", HEADER, rows_of(results, noise))
+        )
+    for sentence in answers(results):
+        console.print(sentence)
+    console.print("\n".join(f"wrote {path}" for path in written))

@@ -1,0 +1,169 @@
+"""`thruster train`: a policy that learns on raw, filtered or true state, with progress and a way to go on."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from math import isnan
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
+from thruster_env.checks import at_least
+from training.algorithms import ALGORITHMS
+from training.arms import ARMS
+from training.extras import check_installed
+from training.setup import TASKS, Setup, make_setup
+from tuning.scenario import plain
+from tuning.scenarios import SCENARIOS, find_scenario
+
+if TYPE_CHECKING:
+    from training.learn import Trained
+
+POLICIES = Path("out") / "policies"
+SHOWN_EVALUATIONS = 8
+LEARNABLE = [name for name, scenario in SCENARIOS.items() if scenario.system is None]
+FEWEST_STEPS = ", ".join(f"{name} {algorithm.steps}" for name, algorithm in ALGORITHMS.items())
+
+
+def command(
+    task: Annotated[str, typer.Option(help=f"{', '.join(TASKS)}.")] = "tracking",
+    observe: Annotated[str, typer.Option(metavar="ARM", help=f"What the policy sees: {', '.join(ARMS)}.")] = "ekf",
+    algo: Annotated[str, typer.Option(help=f"{', '.join(ALGORITHMS)}.")] = "ppo",
+    steps: Annotated[
+        int | None, typer.Option(metavar="N", help=f"Steps of the env to learn from; by default {FEWEST_STEPS}.")
+    ] = None,
+    scenario: Annotated[
+        str, typer.Option(help=f"The plant and its noise: {', '.join(LEARNABLE)}, or a .toml file.")
+    ] = "medium_noise",
+    tuned: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Tuned file of the filter, from `thruster tune`."),
+    ] = None,
+    untuned: Annotated[
+        bool,
+        typer.Option("--untuned", help="Give the filter R by the sensor's sheet and Q by a rule of thumb."),
+    ] = False,
+    envs: Annotated[int | None, typer.Option(metavar="N", help="Copies of the env, stepped together.")] = None,
+    evaluations: Annotated[
+        int, typer.Option(metavar="N", help="How often the policy is tried out meanwhile.")
+    ] = 20,
+    checkpoints: Annotated[int, typer.Option(metavar="N", help="How often it is saved meanwhile.")] = 10,
+    no_tensorboard: Annotated[bool, typer.Option("--no-tensorboard", help="Do not write what it shows.")] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="By default one in out/policies, named after all these."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the network, the noise and the episodes.")] = 0,
+    json: JsonOption = None,
+) -> None:
+    """Train a policy on raw, filtered or true state, with Stable-Baselines3.
+
+    The reward is that of the true thrust, whatever the policy sees. A filter knows the plant's Q and R, unless
+    --tuned or --untuned says otherwise. The return that is shown is that of 32 episodes, the same each time and
+    none of them held out; `thruster score` has those.
+
+    Ctrl-C saves a checkpoint, and the same command goes on from it; so it does after a crash, or with more steps.
+
+    Needs the extra rl: pip install 'thruster-env[rl]'. To watch it learn: tensorboard --logdir out/policies
+
+    Example: thruster train --task manoeuvre --observe enkf --seed 1
+    """
+    chosen = find_scenario(scenario)
+    if untuned and tuned is not None:
+        raise ValueError("give either --tuned FILE or --untuned, but got both")
+    setup = make_setup(
+        task,
+        chosen,
+        observe,
+        algo,
+        steps,
+        seed,
+        filter_arguments={name: plain(value) for name, value in chosen.untuned.items()} if untuned else None,
+        tuned=tuned,
+        num_envs=envs,
+    )
+    evaluations, checkpoints = at_least("evaluations", evaluations, 1), at_least("checkpoints", checkpoints, 1)
+    check_installed()
+    folder = out or POLICIES / name_of(setup, tuned, untuned)
+    with progress_console.status("loading torch ..."):
+        from training.learn import train
+    announce_compilation()
+    with _bar(f"{algo} on {observe}", setup.steps) as on_progress:
+        trained = train(
+            setup,
+            folder,
+            evaluations=evaluations,
+            checkpoints=checkpoints,
+            tensorboard=not no_tensorboard,
+            on_progress=on_progress,
+        )
+    emit(report(setup, trained), as_json(setup, trained), json)
+    if trained.interrupted:
+        sys.exit(130)
+
+
+def name_of(setup: Setup, tuned: Path | None = None, untuned: bool = False) -> str:
+    """Name of the folder of a training: what it learns, from what, by what."""
+    parts = [setup.task, Path(setup.scenario).stem, setup.observe]
+    parts += ["untuned"] * untuned + ([] if tuned is None else [tuned.stem])
+    return "-".join([*parts, setup.algo, f"seed{setup.seed}"])
+
+
+def report(setup: Setup, trained: Trained) -> list:
+    """What to print of a training: returns in its course, its speed, and what to do next."""
+    curve, title = trained.curve, f"{setup.algo} on {setup.observe}, {setup.task}, scenario {setup.scenario}"
+    last = len(curve) - 1
+    picked = sorted({round(i * last / (SHOWN_EVALUATIONS - 1)) for i in range(SHOWN_EVALUATIONS)}) if curve else []
+    rows = [[curve[i][0], f"{curve[i][1]:.3f}"] for i in picked]
+    speed = f"{trained.learnt / trained.seconds:.0f} steps/s" if trained.learnt else "nothing was left to learn"
+    shown = [title, table("", ["steps", "mean return"], rows, caption="0 is perfect.")] if rows else []
+    shown.append(f"{trained.steps} steps, {trained.learnt} of them now in {trained.seconds:.1f} s: {speed}.")
+    shown.append(f"Policy: {trained.folder}")
+    if trained.interrupted:
+        return [*shown, "Interrupted: a checkpoint is saved, and the same command goes on from it."]
+    return [*shown, f"Watch it: thruster play {trained.folder}", f"Score it: thruster score {trained.folder}"]
+
+
+def as_json(setup: Setup, trained: Trained) -> dict:
+    """The same as plain data."""
+    return {
+        "folder": str(trained.folder),
+        "steps": trained.steps,
+        "learnt_now": trained.learnt,
+        "seconds": trained.seconds,
+        "evaluations": [{"steps": steps, "mean_return": value} for steps, value in trained.curve],
+        "interrupted": trained.interrupted,
+        "setup": vars(setup),
+    }
+
+
+@contextmanager
+def _bar(title: str, total: int) -> Iterator[Callable[[int, float], None]]:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[speed]} steps/s  return {task.fields[mean_return]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=progress_console) as progress:
+        task = progress.add_task(title, total=total, speed="-", mean_return="-")
+        first: list[tuple[int, float]] = []
+
+        def advance(steps: int, mean_return: float) -> None:
+            first.append((steps, time.perf_counter())) if not first else None
+            seconds = time.perf_counter() - first[0][1]
+            progress.update(
+                task,
+                completed=min(steps, total),
+                speed=f"{(steps - first[0][0]) / seconds:.0f}" if seconds > 1 else "-",
+                mean_return="-" if isnan(mean_return) else f"{mean_return:.2f}",
+            )
+
+        yield advance

@@ -1,0 +1,101 @@
+"""Algorithms of Stable-Baselines3 by name, with hyperparameters that suit the thruster.
+
+The motor answers within two or three sample times and the flow within some twenty, so a short horizon (gamma 0.95)
+suffices and speeds learning up. `hyperparams/` has the same numbers for rl_zoo3.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from thruster_env.checks import one_of
+from training.extras import check_installed
+
+LAYERS = {"net_arch": [64, 64]}
+ON_POLICY = {"gamma": 0.95, "gae_lambda": 0.9, "n_epochs": 10, "policy_kwargs": {**LAYERS, "log_std_init": -1.0}}
+OFF_POLICY = {
+    "gamma": 0.95,
+    "learning_rate": 1e-3,
+    "batch_size": 256,
+    "buffer_size": 200_000,
+    "learning_starts": 2_000,
+    "train_freq": 1,
+    "gradient_steps": 2,
+    "policy_kwargs": LAYERS,
+}
+
+
+class Algorithm(NamedTuple):
+    """An algorithm and what it is given by default."""
+
+    about: str
+    module: str
+    policy: str
+    steps: int
+    num_envs: int
+    hyperparameters: Mapping
+    falls: bool  # whether the learning rate falls linearly to zero
+
+    @property
+    def name(self) -> str:
+        """Name of its class."""
+        return self.module.partition(":")[2]
+
+    def load_class(self):
+        """The class itself; raises ValueError if the extra `rl` is not installed."""
+        check_installed()
+        module, _, name = self.module.partition(":")
+        return getattr(importlib.import_module(module), name)
+
+
+ALGORITHMS: dict[str, Algorithm] = {
+    "ppo": Algorithm(
+        "proximal policy optimisation, on-policy; the fastest by the clock",
+        "stable_baselines3:PPO",
+        "MlpPolicy",
+        400_000,
+        64,
+        {**ON_POLICY, "n_steps": 64, "batch_size": 512, "learning_rate": 1e-3},
+        True,
+    ),
+    "sac": Algorithm(
+        "soft actor-critic, off-policy; few steps, each of them slow",
+        "stable_baselines3:SAC",
+        "MlpPolicy",
+        100_000,
+        16,
+        OFF_POLICY,
+        False,
+    ),
+    "td3": Algorithm(
+        "twin delayed deep deterministic policy gradient, off-policy",
+        "stable_baselines3:TD3",
+        "MlpPolicy",
+        100_000,
+        16,
+        {**OFF_POLICY, "noise_std": 0.1},  # of actions, for its policy explores by nothing else
+        False,
+    ),
+    "recurrent-ppo": Algorithm(
+        "PPO with an LSTM, which may learn a filter of its own; very slow",
+        "sb3_contrib:RecurrentPPO",
+        "MlpLstmPolicy",
+        400_000,
+        64,
+        {
+            **ON_POLICY,
+            "n_steps": 64,
+            "batch_size": 512,
+            "learning_rate": 1e-3,
+            "policy_kwargs": {"net_arch": [64], "log_std_init": -1.0, "lstm_hidden_size": 32},
+        },
+        True,
+    ),
+}
+
+
+def find_algorithm(name: str) -> Algorithm:
+    """The algorithm of a name; raises ValueError for an unknown one."""
+    return ALGORITHMS[one_of("algo", name, tuple(ALGORITHMS))]

@@ -1,0 +1,41 @@
+"""The page of a comparison: tables in Markdown, answers, two pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from thruster_env.files import write_whole
+from thruster_env.markdown import table, with_tables
+from training.comparison.figures import cost_against_error, learning_curves
+from training.comparison.plan import Comparison
+from training.comparison.runs import Result
+from training.comparison.tables import HEADER, answers, rows_of
+
+PAGE = "policies.md"
+CURVES, ERRORS = "policies_curves.png", "policies_errors.png"
+
+
+def write_report(results: Sequence[Result], comparison: Comparison, page: Path) -> list[Path]:
+    """Write the tables of a page anew, and the pictures beside it; return the files.
+
+    A page that is not there yet is made. Tables stand between `<!-- table NAME -->` and `<!-- end -->`.
+    """
+    tables: dict[str, Callable[[], str]] = {
+        f"policies_{noise}": lambda noise=noise: table(HEADER, rows_of(results, noise))
+        for noise in comparison.noises
+    }
+    tables["answers"] = lambda: "\n".join(f"- {sentence}" for sentence in answers(results))
+    text = page.read_text() if page.is_file() else _new_page(comparison, list(tables))
+    curves = learning_curves(results, page.with_name(CURVES))
+    errors = cost_against_error(results, page.with_name(ERRORS))
+    write_whole(page, with_tables(text, tables))
+    return [page, curves, errors]
+
+
+def _new_page(comparison: Comparison, names: Sequence[str]) -> str:
+    said = f"PPO, {comparison.steps} steps, {comparison.seeds} seeds; {comparison.episodes} held-out episodes."
+    parts = [f"# Policies on raw, filtered and true state\n\n{said} Thrust errors are in N."]
+    parts += [f"<!-- table {name} -->\n<!-- end -->" for name in names]
+    parts += [f"![Learning curves]({CURVES})", f"![Cost against the error of what is observed]({ERRORS})"]
+    return "\n\n".join(parts) + "\n"

@@ -1,0 +1,147 @@
+"""Do the runs of a comparison, side by side on the cores; what is done is kept, and done once."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from thruster_env.files import write_whole
+from thruster_env.threads import cores
+from training.comparison.plan import Comparison, Run, runs_of
+from training.score import Part, Scores
+from tuning.scenarios import held_out_seeds
+
+RUNS = "runs"
+OnRun = Callable[[Run, int, int], None]  # a run that is done, how many are, of how many
+
+
+class Result(NamedTuple):
+    """What a run came to."""
+
+    run: Run
+    scores: Scores
+    curve: list[tuple[int, float]]  # steps and mean return of evaluations in the course of training
+    seconds: float
+
+
+def run_comparison(
+    comparison: Comparison,
+    folder: str | Path,
+    jobs: int | None = None,
+    on_run: OnRun = lambda run, done, count: None,
+) -> list[Result]:
+    """Do all runs that the folder does not hold yet, and return all results.
+
+    Ctrl-C ends it; a later call goes on, trainings from their last checkpoints.
+
+    Args:
+        comparison: what is compared.
+        folder: where each run gets a file of results and a folder of its training.
+        jobs: processes; as many as cores if None.
+        on_run: called after each run.
+
+    Raises:
+        ValueError: if a file of results is damaged, or a process ended without a word.
+        KeyboardInterrupt: on Ctrl-C.
+    """
+    folder, runs = Path(folder), runs_of(comparison)
+    results = {run.name: _read(folder, run, comparison.episodes) for run in runs}
+    missing = [run for run in runs if results[run.name] is None]
+    done = len(runs) - len(missing)
+    context = multiprocessing.get_context("spawn")
+    workers = min(jobs or cores(), max(1, len(missing)))
+    pool = ProcessPoolExecutor(workers, context, _prepare, (context.Value("i", 0),))
+    try:
+        futures: dict[Future, Run] = {pool.submit(_do, run, folder, comparison.episodes): run for run in missing}
+        for future in as_completed(futures):
+            future.result()
+            run, done = futures[future], done + 1
+            results[run.name] = _read(folder, run, comparison.episodes)
+            on_run(run, done, len(runs))
+    except BrokenProcessPool:
+        raise ValueError(
+            "processes must live until their runs are done, but one was killed: go on by the same call"
+        ) from None
+    except BaseException:
+        for process in list((pool._processes or {}).values()):
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    return [results[run.name] for run in runs]
+
+
+def _prepare(counter) -> None:
+    """Give a process one core, and leave Ctrl-C to its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with counter.get_lock():
+        place, counter.value = counter.value, counter.value + 1
+    if hasattr(os, "sched_setaffinity"):
+        available = sorted(os.sched_getaffinity(0))
+        os.sched_setaffinity(0, {available[place % len(available)]})
+
+
+def _do(run: Run, folder: Path, episodes: int) -> None:
+    """Train and score one policy; write its results."""
+    from training.classical import classical_policy
+    from training.environments import make_environments
+    from training.learn import one_thread, train
+    from training.saved import FINAL, load
+    from training.score import score
+
+    curve, seconds = [], 0.0
+    with one_thread():
+        if run.kind in ("pi", "lqr"):
+            policy = classical_policy(run.kind, run.setup)
+        else:
+            trained = train(run.setup, folder / RUNS / run.name, checkpoints=4, tensorboard=False)
+            curve, seconds = trained.curve, trained.seconds
+            policy = load(trained.folder / FINAL, make_environments(run.setup, range(1)))
+        scores = score(policy, run.setup, held_out_seeds(0, episodes))
+    content = {
+        "setup": json.loads(run.setup.as_json()),
+        "episodes": episodes,
+        "returns": scores.returns.tolist(),
+        "parts": {name: [part.squares.tolist(), part.steps.tolist()] for name, part in _parts(scores).items()},
+        "curve": curve,
+        "seconds": seconds,
+    }
+    write_whole(_file(folder, run), json.dumps(content))
+
+
+def _read(folder: Path, run: Run, episodes: int) -> Result | None:
+    """The result of a run, or None where there is none of this very setup."""
+    path = _file(folder, run)
+    if not path.is_file():
+        return None
+    try:
+        content = json.loads(path.read_text())
+        if content["setup"] != json.loads(run.setup.as_json()) or content["episodes"] != episodes:
+            return None
+        parts = {name: Part(*map(np.array, pair)) for name, pair in content["parts"].items()}
+        scores = Scores(returns=np.array(content["returns"]), **parts)
+        return Result(run, scores, [tuple(point) for point in content["curve"]], content["seconds"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path} must be a whole file of results, but cannot be read: {error}") from None
+
+
+def _file(folder: Path, run: Run) -> Path:
+    return folder / RUNS / f"{run.name}.json"
+
+
+def _parts(scores: Scores) -> dict[str, Part]:
+    return {name: part for name, part in scores._asdict().items() if isinstance(part, Part)}
+
+
+def done_runs(results: Sequence[Result], kind: str) -> list[Result]:
+    """Results of one kind of policy."""
+    return [result for result in results if result.run.kind == kind]

@@ -1,0 +1,218 @@
+"""Train a policy: evaluation, checkpoints, TensorBoard, and going on where a run was interrupted."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from thruster_env.files import write_whole
+from training.algorithms import find_algorithm
+from training.environments import make_environments
+from training.saved import (
+    BEST,
+    CHECKPOINTS,
+    FINAL,
+    POLICY,
+    SETUP,
+    latest_checkpoint,
+    load,
+    read_setup,
+    reopen,
+    save,
+)
+from training.setup import Setup
+from tuning.interruption import stop_on_interrupt
+from tuning.scenarios import SEEDS_APART, training_seeds
+
+VALIDATION_EPISODES = 32  # of an evaluation in the course of training; always the same ones
+KEPT = 2  # checkpoints
+EVALUATIONS = "evaluations"
+OnProgress = Callable[[int, float], None]  # steps, and the mean return of the last evaluation (NaN before it)
+
+
+class Trained(NamedTuple):
+    """How a training went."""
+
+    folder: Path
+    steps: int  # in all
+    learnt: int  # of them in this call
+    seconds: float  # of this call
+    curve: list[tuple[int, float]]  # steps and mean return of each evaluation
+    interrupted: bool
+
+
+def train(
+    setup: Setup,
+    folder: str | Path,
+    *,
+    evaluations: int = 20,
+    checkpoints: int = 10,
+    native: bool = True,
+    tensorboard: bool = True,
+    on_progress: OnProgress = lambda steps, mean_return: None,
+) -> Trained:
+    """Train a policy until it has learnt from `setup.steps` steps, and save it.
+
+    The folder gets `final/`, `best/` (by evaluation), `checkpoints/`, the evaluations and TensorBoard's files. If
+    it holds a training of the same setup, this one goes on from its latest checkpoint, with other episodes.
+    Ctrl-C ends it after the running step and saves a checkpoint.
+
+    Args:
+        setup: what is learnt.
+        folder: where everything goes.
+        evaluations: how often the policy is evaluated, on the same episodes each time; none of them is held out.
+        checkpoints: how often it is saved meanwhile; the last two are kept.
+        native: whether all copies are stepped in one call.
+        tensorboard: whether to write what TensorBoard shows.
+        on_progress: called after each step of the envs.
+
+    Raises:
+        ValueError: if the folder holds something else, or a checkpoint in it is damaged.
+    """
+    folder = Path(folder)
+    start = _start(folder, setup)
+    seeds = training_seeds(setup.seed, VALIDATION_EPISODES + setup.num_envs)
+    envs = make_environments(setup, seeds[VALIDATION_EPISODES:], native=native)
+    validation = make_environments(setup, seeds[:VALIDATION_EPISODES])
+    model = _model(setup, envs, start, folder / "tensorboard" if tensorboard else None)
+    # A model seeds its envs anew, all by its own seed; and one that goes on has seen the first episodes.
+    envs.unwrapped._seeds = _episodes_after(setup, model.num_timesteps)
+    evaluation = _Evaluation(
+        setup, folder, validation, seeds[:VALIDATION_EPISODES], evaluations, model.num_timesteps
+    )
+    before = model.num_timesteps
+    remaining = setup.steps - before
+    if remaining > 0 and start == folder / FINAL:
+        reopen(folder, before)
+    if not (folder / FINAL).exists():
+        write_whole(folder / SETUP, setup.as_json())
+    began = time.perf_counter()
+    with stop_on_interrupt() as interrupted, one_thread():
+        watch = _Watch(setup, folder, checkpoints, evaluation, interrupted, on_progress)
+        if remaining > 0:
+            model.learn(remaining, [evaluation, watch], tb_log_name=setup.observe, reset_num_timesteps=False)
+        stopped = interrupted()
+    if stopped:
+        watch.save()
+    elif not (folder / FINAL).exists():
+        save(folder / FINAL, setup, model)
+    curve = list(zip(evaluation.evaluations_timesteps, evaluation.returns, strict=True))
+    seconds = time.perf_counter() - began
+    envs.close()
+    validation.close()
+    return Trained(folder, model.num_timesteps, model.num_timesteps - before, seconds, curve, stopped)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Within this context torch works on one thread, which is quickest for networks this small."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _start(folder: Path, setup: Setup) -> Path | None:
+    """The saved policy to go on from, if any."""
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return None
+    if not (folder / SETUP).is_file():
+        raise ValueError(f"the folder must be new, empty or that of a training, but {folder} holds other things")
+    differences = read_setup(folder).differences(setup)
+    if differences:
+        rule = f"{folder} must hold a training of the same setup to go on with, but differs in"
+        raise ValueError(f"{rule} {', '.join(differences)}: give another folder")
+    latest = latest_checkpoint(folder)
+    return folder / FINAL if (folder / FINAL / POLICY).is_file() else latest
+
+
+def _episodes_after(setup: Setup, steps: int) -> list[int]:
+    """Seeds of the first episodes of every copy of a training that begins, or goes on, after some steps."""
+    first = VALIDATION_EPISODES + steps % (SEEDS_APART // 4)  # far from seeds that are held out
+    return list(training_seeds(setup.seed, first + setup.num_envs)[first:])
+
+
+def _model(setup: Setup, envs: VecEnv, start: Path | None, tensorboard: Path | None) -> BaseAlgorithm:
+    algorithm = find_algorithm(setup.algo)
+    kind = algorithm.load_class()
+    if start is not None:
+        model = load(start, envs, training=True).model
+        model.tensorboard_log = None if tensorboard is None else str(tensorboard)
+        return model
+    numbers = dict(setup.hyperparameters)
+    if algorithm.falls:
+        rate = numbers["learning_rate"]
+        numbers["learning_rate"] = lambda remaining: rate * remaining
+    if "noise_std" in numbers:
+        deviation = numbers.pop("noise_std")
+        numbers["action_noise"] = NormalActionNoise(np.zeros(1), np.full(1, deviation))
+    normalised = VecNormalize(envs, gamma=numbers["gamma"])
+    log = None if tensorboard is None else str(tensorboard)
+    return kind(algorithm.policy, normalised, seed=setup.seed, tensorboard_log=log, device="cpu", **numbers)
+
+
+class _Evaluation(EvalCallback):
+    """Evaluate on the same episodes each time, keep the best policy, go on with the evaluations of before."""
+
+    def __init__(self, setup: Setup, folder: Path, envs: VecEnv, seeds, count: int, steps: int):
+        self._seeds, self._setup, self._best = seeds, setup, folder / BEST
+        self.returns: list[float] = []
+        normalised = VecNormalize(envs, training=False, norm_reward=False)
+        every = max(1, setup.steps // (count * setup.num_envs))
+        super().__init__(normalised, n_eval_episodes=len(seeds), eval_freq=every, log_path=str(folder), verbose=0)
+        path = folder / f"{EVALUATIONS}.npz"
+        if steps and path.is_file():
+            with np.load(path) as before:
+                kept = before["timesteps"] <= steps
+                self.evaluations_timesteps = before["timesteps"][kept].tolist()
+                self.evaluations_results = before["results"][kept].tolist()
+                self.evaluations_length = before["ep_lengths"][kept].tolist()
+            self.returns = [float(np.mean(row)) for row in self.evaluations_results]
+            self.best_mean_reward = max(self.returns, default=-np.inf)
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self.eval_freq:
+            return True
+        best = self.best_mean_reward
+        self.eval_env.unwrapped._seeds = list(self._seeds)
+        goes_on = super()._on_step()
+        self.returns.append(float(np.mean(self.evaluations_results[-1], dtype=np.float64)))
+        if self.best_mean_reward > best:
+            save(self._best, self._setup, self.model)
+        return goes_on
+
+
+class _Watch(BaseCallback):
+    """Tell how far it is, save checkpoints, and end on Ctrl-C."""
+
+    def __init__(self, setup: Setup, folder: Path, count: int, evaluation: _Evaluation, interrupted, on_progress):
+        super().__init__()
+        self._setup, self._folder = setup, folder / CHECKPOINTS
+        self._every = max(1, setup.steps // (count * setup.num_envs))
+        self._evaluation, self._interrupted, self._on_progress = evaluation, interrupted, on_progress
+
+    def _on_step(self) -> bool:
+        if self.n_calls % self._every == 0:
+            self.save()
+        returns = self._evaluation.returns
+        self._on_progress(self.num_timesteps, returns[-1] if returns else float("nan"))
+        return not self._interrupted()
+
+    def save(self) -> None:
+        """Save a checkpoint, and remove those before the last ones."""
+        save(self._folder / f"{self.model.num_timesteps:09d}", self._setup, self.model, replay=True)
+        for old in sorted(path for path in self._folder.glob("*") if path.name.isdigit())[:-KEPT]:
+            shutil.rmtree(old)

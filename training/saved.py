@@ -1,0 +1,149 @@
+"""Saved policies: a folder with the network, the normalisation of its observations, and the whole setup.
+
+    setup.json  policy.zip  normalisation.pkl  [replay.pkl]
+
+Such a folder is written aside and renamed, so a reader finds all of one moment or none. Files that are not one's
+own should not be loaded: Stable-Baselines3 and this module use pickle.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import shutil
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+
+from training.algorithms import find_algorithm
+from training.setup import Setup, setup_from_json
+
+SETUP, POLICY, NORMALISATION, REPLAY = "setup.json", "policy.zip", "normalisation.pkl", "replay.pkl"
+FINAL, BEST, CHECKPOINTS = "final", "best", "checkpoints"
+
+
+class SavedPolicy(NamedTuple):
+    """A policy that predicts from observations as the env gives them."""
+
+    setup: Setup
+    model: BaseAlgorithm
+    normalisation: VecNormalize
+
+    def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
+        """Actions (n, 1) in [-1, 1] for observations (n, d), and what the policy remembers."""
+        seen = self.normalisation.normalize_obs(np.asarray(observation))
+        return self.model.predict(seen, state, episode_start, deterministic)
+
+
+def save(folder: Path, setup: Setup, model: BaseAlgorithm, replay: bool = False) -> None:
+    """Save a model with its normalisation and setup; `replay` keeps the replay buffer, if there is one."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    aside = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
+    try:
+        aside.chmod(0o755)
+        (aside / SETUP).write_text(setup.as_json())
+        model.save(aside / POLICY)
+        model.get_vec_normalize_env().save(str(aside / NORMALISATION))
+        if replay and hasattr(model, "save_replay_buffer"):
+            model.save_replay_buffer(aside / REPLAY)
+        if folder.exists():
+            old = folder.with_name(f".{folder.name}.old")
+            shutil.rmtree(old, ignore_errors=True)
+            os.replace(folder, old)
+            os.replace(aside, folder)
+            shutil.rmtree(old, ignore_errors=True)
+        else:
+            os.replace(aside, folder)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def find_saved(path: str | Path) -> Path:
+    """The folder of a saved policy: itself, or the final policy of a training, else its latest checkpoint.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    folder = Path(path)
+    for candidate in (folder, folder / FINAL, latest_checkpoint(folder)):
+        if candidate is not None and (candidate / POLICY).is_file():
+            return candidate
+    raise ValueError(f"a policy must be a folder that `thruster train` made, but {folder} holds none")
+
+
+def latest_checkpoint(folder: Path) -> Path | None:
+    """The checkpoint with the most steps in a training's folder."""
+    found = [path for path in (folder / CHECKPOINTS).glob("*") if path.name.isdigit()]
+    return max(found, key=lambda path: int(path.name), default=None)
+
+
+def reopen(folder: Path, steps: int) -> None:
+    """Make the final policy of a training, which learnt from some steps, its latest checkpoint, to go on from."""
+    checkpoint = folder / CHECKPOINTS / f"{steps:09d}"
+    checkpoint.parent.mkdir(exist_ok=True)
+    if checkpoint.exists():  # the same policy, perhaps with its replay buffer
+        shutil.rmtree(folder / FINAL)
+    else:
+        os.replace(folder / FINAL, checkpoint)
+
+
+def read_setup(folder: Path) -> Setup:
+    """The setup in a folder; raises ValueError if there is none, or it is damaged."""
+    path = folder / SETUP
+    try:
+        return setup_from_json(path.read_text(), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"a policy must come with its setup, but {path} is not readable: {error}") from None
+
+
+def load(folder: Path, venv: VecEnv, training: bool = False) -> SavedPolicy:
+    """Load a saved policy for envs that observe what it was trained on.
+
+    Args:
+        folder: from `find_saved`.
+        venv: the envs.
+        training: whether it is to learn on; then the envs are the model's, and normalised.
+
+    Raises:
+        ValueError: if a file is damaged, or was made with other observations or actions.
+    """
+    setup = read_setup(folder)
+    kind = find_algorithm(setup.algo).load_class()
+    normalisation: VecNormalize = _whole(folder / NORMALISATION, _normalisation)
+    shape = normalisation.observation_space.shape
+    if shape != venv.observation_space.shape:
+        rule = f"a policy trained on observe={setup.observe!r} must see {shape[0]} numbers"
+        raise ValueError(f"{rule}, but the env shows {venv.observation_space.shape[0]}")
+    normalisation.set_venv(venv)
+    normalisation.training, normalisation.norm_reward = training, training
+    model = _whole(
+        folder / POLICY, lambda path: kind.load(path, env=normalisation if training else None, device="cpu")
+    )
+    if model.observation_space.shape != shape or model.action_space.shape != venv.action_space.shape:
+        raise ValueError(f"policy and normalisation must belong together, but those of {folder} differ in size")
+    if training and (folder / REPLAY).is_file():
+        _whole(folder / REPLAY, model.load_replay_buffer)
+    return SavedPolicy(setup, model, normalisation)
+
+
+def _normalisation(path: Path) -> VecNormalize:
+    """As `VecNormalize.load` does, but for the envs, whose observations may turn out to be others."""
+    found = pickle.loads(path.read_bytes())
+    if not isinstance(found, VecNormalize):
+        raise ValueError(f"it holds {type(found).__name__}")
+    return found
+
+
+def _whole(path: Path, read):
+    """What `read` makes of a file; ValueError whatever goes wrong in a damaged one."""
+    try:
+        return read(path)
+    except FileNotFoundError:
+        raise ValueError(f"a saved policy must have a {path.name}, but {path} is not there") from None
+    except (pickle.UnpicklingError, Exception) as error:  # a damaged zip or pickle raises nearly anything
+        said = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise ValueError(f"{path} must be a whole file as it was saved, but cannot be read: {said}") from None

@@ -1,0 +1,94 @@
+"""What a policy sees of an env, in number: the thrust of a state, or the last measurements and voltages."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+from filters.model import StateSpaceModel
+from filters.thruster import thrusts_of
+
+
+class ShowThrust(VecEnvWrapper):
+    """Put the thrust [N] that a model has at a state in front of an observation that begins with the state.
+
+    Args:
+        venv: envs whose observations begin with omega_m and U_a.
+        model: of the thruster, as the one who observes it believes it to be.
+    """
+
+    def __init__(self, venv: VecEnv, model: StateSpaceModel):
+        """Wrap the envs; see the class."""
+        self._model = model
+        super().__init__(venv, _space(venv.observation_space.shape[0] + 1))
+
+    def reset(self) -> np.ndarray:
+        """Reset the envs."""
+        return self._with_thrust(self.venv.reset())
+
+    def step_wait(self):
+        """Step the envs."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        for i in np.flatnonzero(dones):
+            infos[i]["terminal_observation"] = self._with_thrust(infos[i]["terminal_observation"])
+        return self._with_thrust(observations), rewards, dones, infos
+
+    def _with_thrust(self, observations: np.ndarray) -> np.ndarray:
+        thrusts = thrusts_of(self._model, observations[..., :2].astype(np.float64))
+        return np.concatenate([thrusts[..., None].astype(np.float32), observations], axis=-1)
+
+
+class ShowHistory(VecEnvWrapper):
+    """Show the last measurements, each with the action before it, latest first; what the env appends stays last.
+
+    At the start of an episode there is one measurement; what came before counts as zero.
+
+    Args:
+        venv: envs whose observations are a measurement, then `appended` entries.
+        pairs: number of measurements.
+        appended: entries after the measurement, such as the reference.
+    """
+
+    def __init__(self, venv: VecEnv, pairs: int, appended: int):
+        """Wrap the envs; see the class."""
+        self._measured = venv.observation_space.shape[0] - appended
+        width = self._measured + venv.action_space.shape[0]
+        self._past = np.zeros((venv.num_envs, pairs, width), dtype=np.float32)
+        super().__init__(venv, _space(pairs * width + appended))
+
+    def reset(self) -> np.ndarray:
+        """Reset the envs; nothing has been seen or done before."""
+        observations = self.venv.reset()
+        return self._begin(np.ones(self.num_envs, dtype=bool), observations)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions as the env takes them, clipped."""
+        self._actions = np.clip(actions, self.action_space.low, self.action_space.high)
+        self.venv.step_async(actions)
+
+    def step_wait(self):
+        """Step the envs."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        last = observations.copy()
+        for i in np.flatnonzero(dones):
+            last[i] = infos[i]["terminal_observation"]
+        self._past[:, 1:] = self._past[:, :-1].copy()
+        self._past[:, 0] = np.concatenate([last[:, : self._measured], self._actions], axis=1)
+        shown = self._shown(last)
+        for i in np.flatnonzero(dones):
+            infos[i]["terminal_observation"] = shown[i].copy()
+        return (self._begin(dones, observations) if dones.any() else shown), rewards, dones, infos
+
+    def _begin(self, which: np.ndarray, observations: np.ndarray) -> np.ndarray:
+        self._past[which] = 0.0
+        self._past[which, 0, : self._measured] = observations[which, : self._measured]
+        return self._shown(observations)
+
+    def _shown(self, observations: np.ndarray) -> np.ndarray:
+        appended = observations[:, self._measured :]
+        return np.concatenate([self._past.reshape(self.num_envs, -1), appended], axis=1)
+
+
+def _space(size: int) -> gym.spaces.Box:
+    return gym.spaces.Box(-np.inf, np.inf, (size,), np.float32)
