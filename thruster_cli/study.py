@@ -15,7 +15,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from thruster_cli.output import announce_compilation, console, progress_console, table
+from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
 from thruster_env.files import check_target
 
 app = typer.Typer(help="Comparisons that take their time.", no_args_is_help=True)
@@ -44,6 +44,7 @@ def policies(
         Path | None,
         typer.Option(metavar="FILE.md", help="Page whose tables are written anew, with the pictures beside it."),
     ] = None,
+    json: JsonOption = None,
 ) -> None:
     """Train policies on raw, filtered and true state, and compare them with PI and LQG.
 
@@ -83,10 +84,12 @@ def policies(
             lambda run, done, count: progress.update(task, description=run.name, completed=done, total=count),
         )
     written = write_report(results, comparison, target)
-    for noise in comparison.noises:
-        console.print(
-            table(f"{noise} noise of the thrust sensor; thrust errors in N", HEADER, rows_of(results, noise))
-        )
-    for sentence in answers(results):
-        console.print(sentence)
-    console.print("\n".join(f"wrote {path}" for path in written))
+    rows = {noise: rows_of(results, noise) for noise in comparison.noises}
+    said, files = answers(results), [str(path) for path in written]
+    tables = [table(f"{noise} noise; thrust errors in N", HEADER, rows[noise]) for noise in rows]
+    data = {
+        "policies": {noise: [dict(zip(HEADER, row, strict=True)) for row in rows[noise]] for noise in rows},
+        "answers": said,
+        "files": files,
+    }
+    emit([*tables, *said, *[f"wrote {path}" for path in files]], data, json)

@@ -8,7 +8,6 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
-import thruster_env
 from filters import EstimateState, EstimateStates
 from filters.thruster import model_of_env
 from thruster_env.observe import ObserveState, ObserveStateVector
@@ -16,8 +15,6 @@ from training.arms import find_arm
 from training.setup import Setup
 from training.vec_env import NativeVecEnv
 from training.views import ShowHistory, ShowThrust
-
-assert thruster_env.__version__  # importing it registers the envs
 
 
 def make_environments(

@@ -21,6 +21,7 @@ COLOURS = {
     "belief": "#009e73",
     "true": DARK,
 }
+GREY = "#666666"
 MARKERS = {"low": "o", "medium": "s", "high": "^"}
 COST = "cost of an episode: minus the return [-]"
 
@@ -44,7 +45,8 @@ def learning_curves(results: Sequence[Result], path: str | Path) -> Path:
         for kind, label, name, dashes in (("pi", "raw", "PI, raw", ":"), ("lqr", "true", "LQR, true", "--")):
             if group := groups.get((noise, kind, label)):
                 axis.axhline(-typical_return(group)[0], color=DARK, linestyle=dashes, lw=1, label=name)
-        axis.set(xlabel="steps [thousand]", title=f"{noise} noise", yscale="log")
+        axis.set(xlabel="steps [thousand]", title=f"{noise} noise")
+        _make_logarithmic(axis)
     axes[0].set_ylabel(COST)
     tidy(axes)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=9, frameon=False)
@@ -56,27 +58,38 @@ def cost_against_error(results: Sequence[Result], path: str | Path) -> Path:
     groups = by_policy(results)
     figure = new_figure((8.4, 5.0))
     axis = figure.subplots()
+    lines: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for (noise, kind, _), group in groups.items():
-        arm = group[0].run.setup.observe
-        colour, learnt = COLOURS.get(arm, "#8c564b"), kind == "ppo"
+        run = group[0].run
+        arm, learnt = run.setup.observe, kind == "ppo"
         if kind == "recurrent-ppo" or arm not in COLOURS:
             continue
-        axis.plot(
-            typical_error(group, "observed")[0],
-            -typical_return(group)[0],
-            MARKERS[noise],
-            color=colour,
-            markerfacecolor=colour if learnt else "none",
-            markersize=7 if learnt else 6,
-            alpha=0.5 if group[0].run.variant else 1.0,
-        )
+        point = typical_error(group, "observed")[0], -typical_return(group)[0]
+        face = COLOURS[arm] if learnt else "none"
+        faint = 0.4 if run.variant else 1.0
+        axis.plot(*point, MARKERS[noise], color=COLOURS[arm], markerfacecolor=face, alpha=faint, zorder=3)
+        if not run.variant:
+            lines.setdefault((kind, arm), []).append(point)
+    for (_, arm), points in lines.items():
+        axis.plot(*zip(*points, strict=True), color=COLOURS[arm], linewidth=0.8, alpha=0.6)
     for arm, colour in COLOURS.items():
-        axis.plot([], [], "o", color=colour, label=arm)
+        axis.plot([], [], "-", color=colour, linewidth=4, label=arm)
     for noise, marker in MARKERS.items():
-        axis.plot([], [], marker, color=DARK, markerfacecolor=DARK, label=f"{noise} noise")
-    axis.plot([], [], "o", color=DARK, markerfacecolor="none", label="PI or LQG")
-    axis.plot([], [], "o", color=DARK, alpha=0.5, label="another filter setting")
-    axis.set(xlabel="RMSE of the thrust that the policy observes [N]", ylabel=COST, yscale="log")
+        axis.plot([], [], marker, color=GREY, label=f"{noise} noise")
+    axis.plot([], [], "o", color=GREY, markerfacecolor="none", label="PI, LQG or LQR")
+    axis.plot([], [], "o", color=GREY, alpha=0.4, label="wrong model, or\nother Q and R")
+    axis.set(xlabel="RMSE of the thrust that the policy observes [N]", ylabel=COST)
+    _make_logarithmic(axis)
     tidy([axis])
     figure.legend(*axis.get_legend_handles_labels(), loc="outside right center", frameon=False)
     return save_figure(figure, path)
+
+
+def _make_logarithmic(axis) -> None:
+    """A logarithmic axis of costs, with plain numbers."""
+    from matplotlib.ticker import LogLocator, NullLocator
+
+    axis.set_yscale("log")
+    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.yaxis.set_minor_locator(NullLocator())
+    axis.yaxis.set_major_formatter("{x:g}")
