@@ -18,6 +18,8 @@ from rich.progress import (
 from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
 from thruster_env.files import check_target
 
+RESULTS = Path("out") / "comparison"
+
 app = typer.Typer(help="Comparisons that take their time.", no_args_is_help=True)
 
 
@@ -37,9 +39,7 @@ def policies(
         bool, typer.Option("--recurrent", help="Also PPO with an LSTM on raw measurements: many hours.")
     ] = False,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores.")] = None,
-    out: Annotated[Path, typer.Option(help="Folder of results; what is there is not done again.")] = Path(
-        "out/policies"
-    ),
+    out: Annotated[Path, typer.Option(help="Folder of results; what is there is not done again.")] = RESULTS,
     page: Annotated[
         Path | None,
         typer.Option(metavar="FILE.md", help="Page whose tables are written anew, with the pictures beside it."),
