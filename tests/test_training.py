@@ -143,3 +143,13 @@ def test_a_setup_survives_its_text():
         setup = setup_of(observe)
         again = setup_from_json(setup.as_json(), "setup.json")
         assert again == setup and not setup.differences(again)
+
+
+@pytest.mark.parametrize("observe", ["stack", "ekf"])
+def test_native_envs_and_single_ones_give_the_same_learning_curve(observe, tmp_path):
+    setup = setup_of(observe, steps=512)
+    native, single = (
+        learn(setup, tmp_path / str(native), native=native, evaluations=4).curve for native in (True, False)
+    )
+    assert len(native) == 4 and native[0][1] != native[-1][1]
+    assert np.array(single) == pytest.approx(np.array(native), rel=1e-3)
