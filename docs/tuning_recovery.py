@@ -24,7 +24,7 @@ from tuning.scenarios import Scenario, find_scenario
 from tuning.space import Choice, parameters_of, true_choice
 from tuning.study import open_study, quiet_optuna, run_study
 
-STUDIES = ("ekf", "nominal", 100), ("ekf", "nominal", 200), ("kf", "published_tunnel", 100)
+STUDIES = ("ekf", "nominal", 100), ("kf", "published_tunnel", 100), ("kf", "published_open_bladed", 100)
 SEEDS = range(8)  # of studies
 EQUAL = 0.005  # a score this close to the true filter's is as good
 

@@ -50,7 +50,7 @@ def policies(
 
     PPO at three noises of the thrust sensor; the same network, steps and held-out episodes for all. Writes a page
     with tables and two pictures. Ctrl-C keeps what is done, and the same command goes on. On two cores it takes
-    an hour.
+    three quarters of an hour.
 
     Example: thruster study policies --quick
     """

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table in Markdown."""
     lines = [header, ["---"] * len(header), *rows]
-    return "\n".join(f"| {' | '.join(line)} |".replace("|  |", "| |") for line in lines)
+    return "\n".join("".join(f"| {cell} " if cell else "| " for cell in line) + "|" for line in lines)
 
 
 def with_tables(page: str, tables: Mapping[str, Callable[[], str]]) -> str:

@@ -30,7 +30,7 @@ def learning_curves(results: Sequence[Result], path: str | Path) -> Path:
     """Cost over training steps, one panel a noise: interquartile mean over seeds, and the range of all of them."""
     groups = by_policy(results)
     noises = noises_of(groups)
-    figure = new_figure((3.6 * len(noises) + 0.8, 3.9))
+    figure = new_figure((3.2 * len(noises) + 0.8, 3.7))
     axes = figure.subplots(1, len(noises), sharey=True, squeeze=False)[0]
     for axis, noise in zip(axes, noises, strict=True):
         for label, colour in COLOURS.items():

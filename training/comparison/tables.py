@@ -56,7 +56,11 @@ def rows_of(results: Sequence[Result], noise: str) -> list[list[str]]:
 def answers(results: Sequence[Result]) -> list[str]:
     """Sentences that answer the questions of the comparison, as far as its runs allow."""
     groups = by_policy(results)
-    return [sentence for question in (_gaps, _tuned, _wrong_model, _classical) for sentence in question(groups)]
+    return [
+        sentence
+        for question in (_gaps, _memory, _tuned, _wrong_model, _classical)
+        for sentence in question(groups)
+    ]
 
 
 def _gaps(groups: Groups) -> Iterator[str]:
@@ -77,6 +81,14 @@ def _gaps(groups: Groups) -> Iterator[str]:
             said = "is reached" if reached else "is not reached by all, intervals counted"
             sentence += f" The goal of {GOAL:.0%} for filtered state {said}.".replace("%", " %")
         yield sentence
+
+
+def _memory(groups: Groups) -> Iterator[str]:
+    for noise in noises_of(groups):
+        found = [groups.get((noise, "ppo", arm)) for arm in ("stack", "ekf")]
+        if all(found):
+            value = as_interval(typical_return(found[0]) / typical_return(found[1]))
+            yield f"At {noise} noise the policy on the stack costs {_shown(value, '.2f')} of that on the ekf."
 
 
 def _tuned(groups: Groups) -> Iterator[str]:
