@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq -c constraints.txt
 TEST_EXTRAS := rl,render,peers,db,dev
-BENCH_EXTRAS := peers,bench
+BENCH_EXTRAS := rl,peers,bench
 ARGS :=
 
 # Stamps: present only after a complete install, so a second run needs no network and an interrupted one starts over.

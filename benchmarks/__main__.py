@@ -10,6 +10,7 @@ import typer
 
 from benchmarks.rows import COLUMNS, machine, machine_lines
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
+from training.extras import check_installed
 
 CAPTION = (
     "A step's time counts env, filter and fresh info arrays; FilterPy's, one predict and update and no env. "
@@ -38,13 +39,14 @@ def command(
         raise ValueError(
             "FilterPy must be installed to compare with: `make bench` does it, or pip install -e '.[peers]'"
         )
-    # After the check: they import FilterPy.
-    from benchmarks import batches, processes, steps, studies, trajectories, vector_filters, vectors
+    check_installed()
+    # After the checks: they import FilterPy, or Stable-Baselines3.
+    from benchmarks import batches, policies, processes, steps, studies, trajectories, vector_filters, vectors
 
     announce_compilation()
     rows = []
     with progress_console.status("measuring ...") as status:
-        for part in (steps, vectors, vector_filters, batches, trajectories, studies, processes):
+        for part in (steps, vectors, vector_filters, batches, trajectories, studies, policies, processes):
             for row in part.rows(seed, quick):
                 rows.append(row)
                 status.update(f"measured: {row.what} ...")

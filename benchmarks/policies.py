@@ -22,8 +22,8 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     timing = side_by_side(ours, peer, rounds)
     yield Row(f"a step of PPO on an EKF, {COPIES} copies", "DummyVecEnv", timing, ratio_goal=GOAL)
     stepping = side_by_side(*(acting(seed, "ekf", native) for native in (True, False)), rounds)
-    yield Row("  of it env and EKF", "DummyVecEnv", stepping)
-    yield Row("  of it env alone", None, alone(acting(seed, "raw", True), rounds))
+    yield Row("of it env and EKF", "DummyVecEnv", stepping)
+    yield Row("of it env alone", None, alone(acting(seed, "raw", True), rounds))
 
 
 def learning(seed: int, native: bool, rollouts: int) -> Measure:

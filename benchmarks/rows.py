@@ -12,7 +12,7 @@ from typing import NamedTuple
 from benchmarks.timing import Timing
 
 COLUMNS = ["what; peer", "ours", "peer", "ratio", "goal", "met?"]
-PACKAGES = ("numba", "gymnasium", "numpy", "filterpy", "jax")
+PACKAGES = ("numba", "gymnasium", "numpy", "filterpy", "jax", "stable_baselines3", "torch")
 
 
 class Row(NamedTuple):

@@ -11,7 +11,7 @@ from docs.page import with_tables
 from docs.ranking_tables import TABLES, main, scenarios
 from tuning.compare import compare, contender
 from tuning.excitation import EXCITATIONS
-from tuning.scenarios import find_scenario, held_out_seeds
+from tuning.scenarios import SCENARIOS, find_scenario, held_out_seeds
 
 
 def ranked(name, contenders, seeds=24):
@@ -94,7 +94,7 @@ def test_the_page_has_every_table_and_they_show_the_claims_on_200_seeds():
     assert max(upper(table("outliers")["ekf-robust"][i]) for i in (1, 3)) < 0.7
     assert max(upper(table("ambient")["ekf + U_0"][i]) for i in (1, 3)) < 1
     assert upper(table("reference")["pf 1000"][3]) < 1.02
-    assert len(table("scores")) == 15
+    assert len(table("scores")) == len(SCENARIOS)
 
 
 def test_only_the_tables_that_are_asked_for_are_made_anew(tmp_path):
