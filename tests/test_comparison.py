@@ -15,7 +15,7 @@ from training.comparison import runs
 from training.comparison.plan import QUICK, Comparison, Run, runs_of
 from training.comparison.runs import Result, run_comparison
 from training.comparison.statistics import as_interval, interquartile_mean, typical_error, typical_return
-from training.comparison.tables import HEADER, answers, rows_of
+from training.comparison.tables import HEADER, answers, rows_of, summary_rows
 from training.environments import make_environments
 from training.score import FIRST_SCORED_STEP, Part, Scores, run_episodes, score
 from training.setup import make_setup
@@ -83,9 +83,15 @@ def test_the_table_tells_what_part_of_the_gap_is_closed():
     assert rows["PPO: ekf"]["gap closed"] == "67 %" and rows["PI: ekf"]["gap closed"] == "33 %"
     assert rows["PPO: raw"]["gap closed"] == "0 %" and rows["PPO: true"]["gap closed"] == "100 %"
     assert rows["PI: ekf"]["steady"] == "2.00"
-    said = " ".join(answers(made))
-    assert "ekf 67 % [67 %, 67 %]" in said and "is not reached" in said
-    assert "reversal is 0.50 [0.50, 0.50] of PI's" in said and "its cost 0.50 [" in said
+    said = dict(summary_rows(made))
+    assert said["gap closed by ekf"] == "67 % [67 %, 67 %]" and said["gap closed by enkf"] == ""
+    assert said["cost on ekf / on true"].startswith("2.00 [") and said["cost on stack / on ekf"] == ""
+    assert said["reversal error of PPO / of PI, both on ekf"] == "0.50 [0.50, 0.50]"
+    assert said["cost of PPO / of LQG, both on ekf"].startswith("0.50 [")
+    (aim,) = answers(made)
+    assert "at least 67 % [67 %, 67 %] of the gap" in aim and aim.endswith(
+        "70 % is not reached by all, intervals counted."
+    )
 
 
 def test_nothing_is_said_of_a_gap_that_is_not_there():
@@ -206,3 +212,17 @@ def test_the_quick_form_compares_every_arm_and_writes_a_page(thruster, tmp_path)
     assert thruster(*command[:-2]).returncode == 0
     assert {path: path.stat().st_mtime_ns for path in times} == times
     assert (tmp_path / "found" / "policies.md").read_text().startswith("# Policies")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "line"),
+    [
+        ("page.txt", "", "a page must be a file that ends in .md, but got 'page.txt'"),
+        ("page.md", "nothing here", "a page that is there must have a place for a table"),
+    ],
+)
+def test_a_page_without_a_place_for_tables_is_refused_before_the_work(name, text, line, thruster, tmp_path):
+    (tmp_path / name).write_text(text)
+    done = thruster("study", "policies", "--quick", "--page", name)
+    assert done.returncode == 2 and line in done.stderr and "Traceback" not in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == [name] and (tmp_path / name).read_text() == text

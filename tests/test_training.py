@@ -153,3 +153,10 @@ def test_native_envs_and_single_ones_give_the_same_learning_curve(observe, tmp_p
     )
     assert len(native) == 4 and native[0][1] != native[-1][1]
     assert np.array(single) == pytest.approx(np.array(native), rel=1e-3)
+
+
+def test_the_learning_rate_never_falls_below_zero(tmp_path):
+    setup = setup_of(steps=200)  # whole rollouts end at 256
+    model = load(learn(setup, tmp_path / "ekf").folder / FINAL, make_environments(setup, [0])).model
+    assert model.num_timesteps == 256 and model.lr_schedule(1.0) == setup.hyperparameters["learning_rate"]
+    assert model.policy.optimizer.param_groups[0]["lr"] == 0.0 == model.lr_schedule(-0.1)

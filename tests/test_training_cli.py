@@ -60,10 +60,12 @@ def test_the_commands_train_score_and_play(thruster, monkeypatch, tmp_path):
     assert other.returncode == 0, other.stderr
     before = contents(tmp_path / "out")
     raw = folder.with_name("tracking-medium_noise-raw-ppo-seed0")
-    scored = thruster("score", folder, raw, "--seeds", 5, "--classical", "pi", "--json", "score.json")
+    scored = thruster(
+        "score", folder, raw, "--seeds", 5, "--classical", "pi", "--classical", "lqr", "--json", "score.json"
+    )
     assert scored.returncode == 0, scored.stderr
     rows = json.loads((tmp_path / "score.json").read_text())["policies"]
-    assert [row["policy"] for row in rows] == ["ekf ppo", "raw ppo", "ekf pi", "raw pi"]
+    assert [row["policy"] for row in rows] == ["ekf ppo", "raw ppo", "ekf pi", "raw pi", "ekf lqr"]
     assert rows[0]["over_the_first"]["value"] == 0.0 and len(rows[1]["returns"]) == 5
     assert rows[2]["mean_return"]["value"] > rows[0]["mean_return"]["value"]
     elsewhere = thruster("score", folder, "--seeds", 5, "--scenario", "ambient")

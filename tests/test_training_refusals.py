@@ -55,6 +55,17 @@ def test_a_damaged_checkpoint_is_refused(copied):
     assert contents(copied) == before
 
 
+@pytest.mark.parametrize("how", ["cut", "noise"])
+def test_damaged_evaluations_are_refused_and_left_alone(how, copied):
+    damage(copied / "evaluations.npz", how)
+    before = contents(copied)
+    with pytest.raises(
+        ValueError, match=r"evaluations.npz must be a whole file as it was saved, but cannot be read"
+    ):
+        learn(replace(setup_of(), steps=2048), copied)
+    assert contents(copied) == before
+
+
 @pytest.mark.parametrize(
     ("change", "named"),
     [

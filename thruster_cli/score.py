@@ -13,6 +13,7 @@ from thruster_cli.output import JsonOption, SeedOption, announce_compilation, em
 from thruster_cli.tables import about, unless_blank
 from thruster_cli.train import LEARNABLE
 from thruster_env.checks import one_of
+from training.arms import find_arm
 from training.extras import check_installed
 from training.setup import Setup, in_scenario
 from tuning.plan import HELD_OUT_SEEDS
@@ -41,7 +42,9 @@ def command(
     ] = None,
     classical: Annotated[
         list[str] | None,
-        typer.Option(help="pi or lqr; may be repeated. A controller that observes what each policy does."),
+        typer.Option(
+            help="pi or lqr; may be repeated. A controller that observes what each policy does; lqr a state only."
+        ),
     ] = None,
     seeds: Annotated[int, typer.Option(help="Number of held-out episodes.")] = HELD_OUT_SEEDS,
     seed: SeedOption = 0,
@@ -79,6 +82,8 @@ def command(
             scored.append(_learnt(model, folder, setups[model], plant, held_out))
         for name in classical or []:
             for setup in _each_arm(setups.values()):
+                if name == "lqr" and not find_arm(setup.observe).shows_state:
+                    continue
                 status.update(f"scoring {name} on {setup.observe} ...")
                 scored.append(_classical(name, setup, plant, held_out))
     emit(report(scored, held_out), as_json(scored, held_out), json)

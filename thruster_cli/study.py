@@ -16,7 +16,6 @@ from rich.progress import (
 )
 
 from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
-from thruster_env.files import check_target
 
 RESULTS = Path("out") / "comparison"
 
@@ -58,15 +57,15 @@ def policies(
 
     check_installed()
     from training.comparison.plan import QUICK, Comparison
-    from training.comparison.report import PAGE, write_report
+    from training.comparison.report import PAGE, check_page, write_report
     from training.comparison.runs import run_comparison
-    from training.comparison.tables import HEADER, answers, rows_of
+    from training.comparison.tables import HEADER, answers, rows_of, summary_rows
 
     comparison = QUICK if quick else Comparison()
     given = {"seeds": seeds, "steps": steps, "recurrent": recurrent or None}
     comparison = comparison._replace(**{name: value for name, value in given.items() if value is not None})
     target = page or out / PAGE
-    check_target(target)
+    check_page(target)
     announce_compilation()
     columns = [
         TextColumn("{task.description}"),
@@ -75,21 +74,28 @@ def policies(
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     ]
-    with Progress(*columns, console=progress_console) as progress:
-        task = progress.add_task("policies", total=None)
-        results = run_comparison(
-            comparison,
-            out,
-            jobs,
-            lambda run, done, count: progress.update(task, description=run.name, completed=done, total=count),
-        )
+    try:
+        with Progress(*columns, console=progress_console) as progress:
+            task = progress.add_task("policies", total=None)
+            results = run_comparison(
+                comparison,
+                out,
+                jobs,
+                lambda run, done, count: progress.update(task, description=run.name, completed=done, total=count),
+            )
+    except KeyboardInterrupt:
+        progress_console.print(f"Interrupted: what is done is in {out}, and the same command goes on.")
+        raise
     written = write_report(results, comparison, target)
     rows = {noise: rows_of(results, noise) for noise in comparison.noises}
     said, files = answers(results), [str(path) for path in written]
+    summary = summary_rows(results)
     tables = [table(f"{noise} noise; thrust errors in N", HEADER, rows[noise]) for noise in rows]
     data = {
         "policies": {noise: [dict(zip(HEADER, row, strict=True)) for row in rows[noise]] for noise in rows},
+        "summary": summary,
         "answers": said,
         "files": files,
     }
+    tables.append(table("in short, with 95 % intervals", ["", *comparison.noises], summary))
     emit([*tables, *said, *[f"wrote {path}" for path in files]], data, json)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from filters.registry import read_tuned_file
 from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
 from thruster_env.checks import at_least
 from training.algorithms import ALGORITHMS
@@ -68,6 +69,9 @@ def command(
     --tuned or --untuned says otherwise. The return that is shown is that of 32 episodes, the same each time and
     none of them held out; `thruster score` has those.
 
+    Whole rollouts are learnt, so it may end some steps later. In FOLDER, final/ is the policy that score and play
+    take (before it is there, the latest checkpoint), best/ the one with the highest return on the way.
+
     Ctrl-C saves a checkpoint, and the same command goes on from it; so it does after a crash, or with more steps.
 
     Needs the extra rl: pip install 'thruster-env[rl]'. To watch it learn: tensorboard --logdir out/policies
@@ -91,6 +95,8 @@ def command(
     evaluations, checkpoints = at_least("evaluations", evaluations, 1), at_least("checkpoints", checkpoints, 1)
     check_installed()
     folder = out or POLICIES / name_of(setup, tuned, untuned)
+    if tuned is not None and (meant := read_tuned_file(tuned)["scenario"]) != scenario:
+        progress_console.print(f"{tuned} was tuned on {meant}, and its filter assumes what it did there.")
     with progress_console.status("loading torch ..."):
         from training.learn import train
     announce_compilation()

@@ -13,6 +13,7 @@ from typing import NamedTuple
 from thruster_env.checks import one_of
 from training.extras import check_installed
 
+PPO_STEPS = 98 * 64 * 64  # whole rollouts of 64 steps of 64 copies: the learning rate ends at zero
 LAYERS = {"net_arch": [64, 64]}
 ON_POLICY = {"gamma": 0.95, "gae_lambda": 0.9, "n_epochs": 10, "policy_kwargs": {**LAYERS, "log_std_init": -1.0}}
 OFF_POLICY = {
@@ -55,7 +56,7 @@ ALGORITHMS: dict[str, Algorithm] = {
         "proximal policy optimisation, on-policy; the fastest by the clock",
         "stable_baselines3:PPO",
         "MlpPolicy",
-        400_000,
+        PPO_STEPS,
         64,
         {**ON_POLICY, "n_steps": 64, "batch_size": 512, "learning_rate": 1e-3},
         True,
@@ -82,7 +83,7 @@ ALGORITHMS: dict[str, Algorithm] = {
         "PPO with an LSTM, which may learn a filter of its own; very slow",
         "sb3_contrib:RecurrentPPO",
         "MlpLstmPolicy",
-        400_000,
+        PPO_STEPS,
         64,
         {
             **ON_POLICY,

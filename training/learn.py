@@ -30,6 +30,7 @@ from training.saved import (
     read_setup,
     reopen,
     save,
+    whole,
 )
 from training.setup import Setup
 from tuning.interruption import stop_on_interrupt
@@ -155,13 +156,19 @@ def _model(setup: Setup, envs: VecEnv, start: Path | None, tensorboard: Path | N
     numbers = dict(setup.hyperparameters)
     if algorithm.falls:
         rate = numbers["learning_rate"]
-        numbers["learning_rate"] = lambda remaining: rate * remaining
+        # The last rollout may reach beyond the steps that were asked for: what remains is then negative.
+        numbers["learning_rate"] = lambda remaining: rate * max(remaining, 0.0)
     if "noise_std" in numbers:
         deviation = numbers.pop("noise_std")
         numbers["action_noise"] = NormalActionNoise(np.zeros(1), np.full(1, deviation))
     normalised = VecNormalize(envs, gamma=numbers["gamma"])
     log = None if tensorboard is None else str(tensorboard)
     return kind(algorithm.policy, normalised, seed=setup.seed, tensorboard_log=log, device="cpu", **numbers)
+
+
+def _evaluations_in(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path) as file:
+        return {name: file[name] for name in ("timesteps", "results", "ep_lengths")}
 
 
 class _Evaluation(EvalCallback):
@@ -175,11 +182,11 @@ class _Evaluation(EvalCallback):
         super().__init__(normalised, n_eval_episodes=len(seeds), eval_freq=every, log_path=str(folder), verbose=0)
         path = folder / f"{EVALUATIONS}.npz"
         if steps and path.is_file():
-            with np.load(path) as before:
-                kept = before["timesteps"] <= steps
-                self.evaluations_timesteps = before["timesteps"][kept].tolist()
-                self.evaluations_results = before["results"][kept].tolist()
-                self.evaluations_length = before["ep_lengths"][kept].tolist()
+            before = whole(path, _evaluations_in)
+            kept = before["timesteps"] <= steps
+            self.evaluations_timesteps = before["timesteps"][kept].tolist()
+            self.evaluations_results = before["results"][kept].tolist()
+            self.evaluations_length = before["ep_lengths"][kept].tolist()
             self.returns = [float(np.mean(row)) for row in self.evaluations_results]
             self.best_mean_reward = max(self.returns, default=-np.inf)
 

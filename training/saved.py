@@ -12,8 +12,9 @@ import os
 import pickle
 import shutil
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -113,20 +114,20 @@ def load(folder: Path, venv: VecEnv, training: bool = False) -> SavedPolicy:
     """
     setup = read_setup(folder)
     kind = find_algorithm(setup.algo).load_class()
-    normalisation: VecNormalize = _whole(folder / NORMALISATION, _normalisation)
+    normalisation: VecNormalize = whole(folder / NORMALISATION, _normalisation)
     shape = normalisation.observation_space.shape
     if shape != venv.observation_space.shape:
         rule = f"a policy trained on observe={setup.observe!r} must see {shape[0]} numbers"
         raise ValueError(f"{rule}, but the env shows {venv.observation_space.shape[0]}")
     normalisation.set_venv(venv)
     normalisation.training, normalisation.norm_reward = training, training
-    model = _whole(
+    model = whole(
         folder / POLICY, lambda path: kind.load(path, env=normalisation if training else None, device="cpu")
     )
     if model.observation_space.shape != shape or model.action_space.shape != venv.action_space.shape:
         raise ValueError(f"policy and normalisation must belong together, but those of {folder} differ in size")
     if training and (folder / REPLAY).is_file():
-        _whole(folder / REPLAY, model.load_replay_buffer)
+        whole(folder / REPLAY, model.load_replay_buffer)
     return SavedPolicy(setup, model, normalisation)
 
 
@@ -138,8 +139,8 @@ def _normalisation(path: Path) -> VecNormalize:
     return found
 
 
-def _whole(path: Path, read):
-    """What `read` makes of a file; ValueError whatever goes wrong in a damaged one."""
+def whole(path: Path, read: Callable[[Path], Any]) -> Any:
+    """What `read` makes of a file's path; ValueError whatever goes wrong in a damaged one."""
     try:
         return read(path)
     except FileNotFoundError:

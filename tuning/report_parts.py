@@ -167,10 +167,12 @@ def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
     columns = ["filter", "trials", "ended early", "over budget", f"best {objective}", "µs a step"]
     rows = [
         [kind.name, f"{kind.trials}", f"{kind.pruned}", f"{kind.over_budget}"]
-        + ["" if value is None else f"{value:.4g}" for value in (kind.value, kind.microseconds)]
+        + ["" if kind.value is None else f"{kind.value:.4g}{'' if kind.consistent else '*'}"]
+        + ["" if kind.microseconds is None else f"{kind.microseconds:.4g}"]
         for kind in kinds_tried(trials)
     ]
-    return Table("Filters that were tried, on the training seeds; the slices are those of the best", columns, rows)
+    caption = "Filters that were tried, on the training seeds; the slices are those of the best"
+    return Table(f"{caption}. *: mean NIS outside its band, so not to be chosen", columns, rows)
 
 
 def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) -> Section:

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from thruster_env.files import write_whole
+from thruster_env.files import check_target, write_whole
 from thruster_env.markdown import table, with_tables
 from training.comparison.figures import cost_against_error, learning_curves
 from training.comparison.plan import Comparison
 from training.comparison.runs import Result
-from training.comparison.tables import HEADER, answers, rows_of
+from training.comparison.tables import HEADER, answers, rows_of, summary_rows
 
 PAGE = "policies.md"
 CURVES, ERRORS = "policies_curves.png", "policies_errors.png"
+
+
+def check_page(page: Path) -> None:
+    """Raise ValueError unless the tables can be written there: into a new page, or one with a place for them."""
+    if page.suffix != ".md":
+        raise ValueError(f"a page must be a file that ends in .md, but got {str(page)!r}")
+    check_target(page)
+    if page.is_file() and not re.search(r"<!-- table (summary|answers|policies_\w+) -->", page.read_text()):
+        rule = "a page that is there must have a place for a table, such as <!-- table summary --> <!-- end -->"
+        raise ValueError(f"{rule}, but {page} has none")
 
 
 def write_report(results: Sequence[Result], comparison: Comparison, page: Path) -> list[Path]:
@@ -25,6 +36,7 @@ def write_report(results: Sequence[Result], comparison: Comparison, page: Path) 
         f"policies_{noise}": lambda noise=noise: table(HEADER, rows_of(results, noise))
         for noise in comparison.noises
     }
+    tables["summary"] = lambda: table(["", *comparison.noises], summary_rows(results))
     tables["answers"] = lambda: "\n".join(f"- {sentence}" for sentence in answers(results))
     text = page.read_text() if page.is_file() else _new_page(comparison, list(tables))
     curves = learning_curves(results, page.with_name(CURVES))
