@@ -17,7 +17,7 @@ GOAL = 1 / 1.5  # of the time that PPO takes with DummyVecEnv
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
     """Measure, one row after the other."""
-    rounds, rollouts = (1, 1) if quick else (5, 4)
+    rounds, rollouts = (1, 1) if quick else (9, 2)
     ours, peer = (learning(seed, native, rollouts) for native in (True, False))
     timing = side_by_side(ours, peer, rounds)
     yield Row(f"a step of PPO on an EKF, {COPIES} copies", "DummyVecEnv", timing, ratio_goal=GOAL)
