@@ -99,7 +99,10 @@ def _check_identity(name: str, wanted: dict, found: dict) -> None:
     if found != wanted:
         differing = [key for key in {**wanted, **found} if wanted.get(key) != found.get(key)]
         wanted, found = ({key: part.get(key) for key in differing} for part in (wanted, found))
-        raise ValueError(f"study {name!r} must be for {wanted}, but it was made for {found}")
+        changed = "; a scenario is not what it was" if list(wanted) == ["scenario_digests"] else ""
+        raise ValueError(
+            f"study {name!r} must be for {wanted}, but it was made for {found}{changed}: give it another name"
+        )
 
 
 def finished_trials(study: optuna.Study) -> int:
