@@ -59,4 +59,6 @@ def test_two_hosts_work_on_one_study(hosts, server):
     # Each worker proposes what is its own. Each host may queue the first trial, which then has a twin for each.
     proposed = [tuple(trial.params.values()) for trial in done if "fixed_params" not in trial.system_attrs]
     assert len(proposed) > TRIALS / 2 and len(set(proposed)) == len(proposed)
+    points = [tuple(trial.params.values()) for trial in done]
+    assert len(points) - len(set(points)) <= 2
     assert all((host.home / "out" / "s.json").exists() for host in hosts)

@@ -46,8 +46,13 @@ def make_environments(
         venv = ShowHistory(venv, arm.pairs, one.unwrapped.appended_entries)
     if arm.shows_state:
         venv = ShowThrust(venv, model_of_env(one) if arm.is_true else one.filter.model)
-    venv.unwrapped._seeds = list(seeds)  # as `seed` does, which knows consecutive ones only
+    seed_episodes(venv, seeds)
     return VecMonitor(venv)
+
+
+def seed_episodes(venv: VecEnv, seeds: Sequence[int]) -> None:
+    """Give each env the seed of the episode that its next reset begins; `VecEnv.seed` gives consecutive ones."""
+    venv.unwrapped._seeds = list(seeds)
 
 
 def make_single(setup: Setup, render_mode: str | None = None) -> gym.Env:

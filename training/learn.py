@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from thruster_env.files import write_whole
 from training.algorithms import find_algorithm
-from training.environments import make_environments
+from training.environments import make_environments, seed_episodes
 from training.saved import (
     BEST,
     CHECKPOINTS,
@@ -88,7 +88,7 @@ def train(
     validation = make_environments(setup, seeds[:VALIDATION_EPISODES])
     model = _model(setup, envs, start, folder / "tensorboard" if tensorboard else None)
     # A model seeds its envs anew, all by its own seed; and one that goes on has seen the first episodes.
-    envs.unwrapped._seeds = _episodes_after(setup, model.num_timesteps)
+    seed_episodes(envs, _episodes_after(setup, model.num_timesteps))
     evaluation = _Evaluation(
         setup, folder, validation, seeds[:VALIDATION_EPISODES], evaluations, model.num_timesteps
     )
@@ -194,7 +194,7 @@ class _Evaluation(EvalCallback):
         if self.n_calls % self.eval_freq:
             return True
         best = self.best_mean_reward
-        self.eval_env.unwrapped._seeds = list(self._seeds)
+        seed_episodes(self.eval_env, self._seeds)
         goes_on = super()._on_step()
         self.returns.append(float(np.mean(self.evaluations_results[-1], dtype=np.float64)))
         if self.best_mean_reward > best:

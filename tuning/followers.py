@@ -62,7 +62,7 @@ def _enqueue_consistent_twin(study: optuna.Study, plan: Plan, last: FrozenTrial)
         if name in ("R", "P0") or name.startswith("Q")
     }
     twin = {TWIN: last.user_attrs.get(TWIN, 0) + 1, f"{TWIN} of": last.number}
-    study.enqueue_trial({**last.params, **scaled}, user_attrs=twin)
+    study.enqueue_trial({**last.params, **scaled}, user_attrs=twin, skip_if_exists=True)
 
 
 def _enqueue_smaller_ensemble(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from training.setup import Setup, make_setup
 from tuning.plan import Plan
-from tuning.scenarios import find_scenario
+from tuning.scenarios import Scenario, find_scenario
 from tuning.study import open_study, quiet_optuna, run_study
 
 TASK = "manoeuvre"
@@ -91,9 +91,7 @@ VARIANTS = (
 
 
 def _run(comparison: Comparison, noise: str, kind: str, arm: str, variant: str = "", seed: int = 0) -> Run:
-    scenario = find_scenario(NOISES[noise])
-    if variant.startswith("wrong model"):
-        scenario = scenario.replace(parameter_factors=find_scenario("mismatch").parameter_factors)
+    scenario = _scenario(noise, wrong=variant.startswith("wrong model"))
     arguments: Mapping = {}
     if variant.endswith("untuned"):
         arguments = scenario.untuned
@@ -106,13 +104,18 @@ def _run(comparison: Comparison, noise: str, kind: str, arm: str, variant: str =
     return Run(noise, kind, variant, setup)
 
 
+def _scenario(noise: str, wrong: bool) -> Scenario:
+    """The scenario of a noise; with the wrong model of `mismatch` if asked for."""
+    scenario = find_scenario(NOISES[noise])
+    factors = find_scenario("mismatch").parameter_factors
+    return scenario.replace(parameter_factors=factors) if wrong else scenario
+
+
 @cache
 def _tuned(filter_name: str, noise: str, wrong: bool) -> Mapping:
     """Q and R that a study finds on the noise's scenario, where voltages are held at random levels."""
     quiet_optuna()
-    scenario = find_scenario(NOISES[noise])
-    if wrong:
-        scenario = scenario.replace(parameter_factors=find_scenario("mismatch").parameter_factors)
+    scenario = _scenario(noise, wrong)
     plan = Plan(filter_name, (scenario,))
     study = open_study("policies", plan, None)
     return run_study(study, plan, TUNING_TRIALS).choice.model

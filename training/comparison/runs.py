@@ -6,7 +6,7 @@ import json
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -16,8 +16,12 @@ import numpy as np
 
 from thruster_env.files import write_whole
 from thruster_env.threads import cores
+from training.classical import classical_policy
 from training.comparison.plan import Comparison, Run, runs_of
-from training.score import Part, Scores
+from training.environments import make_environments
+from training.learn import one_thread, train
+from training.saved import FINAL, load
+from training.score import Part, Scores, score
 from tuning.scenarios import held_out_seeds
 
 RUNS = "runs"
@@ -92,12 +96,6 @@ def _prepare(counter) -> None:
 
 def _do(run: Run, folder: Path, episodes: int) -> None:
     """Train and score one policy; write its results."""
-    from training.classical import classical_policy
-    from training.environments import make_environments
-    from training.learn import one_thread, train
-    from training.saved import FINAL, load
-    from training.score import score
-
     curve, seconds = [], 0.0
     with one_thread():
         if run.kind in ("pi", "lqr"):
@@ -140,8 +138,3 @@ def _file(folder: Path, run: Run) -> Path:
 
 def _parts(scores: Scores) -> dict[str, Part]:
     return {name: part for name, part in scores._asdict().items() if isinstance(part, Part)}
-
-
-def done_runs(results: Sequence[Result], kind: str) -> list[Result]:
-    """Results of one kind of policy."""
-    return [result for result in results if result.run.kind == kind]
