@@ -14,7 +14,7 @@ BASE := $(VENV)/.base
 TEST := $(VENV)/.test
 BENCH := $(VENV)/.bench
 
-.PHONY: help demo test bench lint clean
+.PHONY: help demo test bench fuzz lint clean
 .NOTPARALLEL:
 
 help: ## this list
@@ -28,6 +28,9 @@ test: $(TEST) ## install what tests need (once) and run all tests; ARGS="-k name
 
 bench: $(BENCH) ## install what benchmarks need (once) and time it against other packages, side by side
 	@$(BIN)/python -m benchmarks $(ARGS)
+
+fuzz: $(TEST) ## attack everything at random for ten minutes; ARGS="--seconds 60 --seed 1"
+	@$(BIN)/python -m tests.fuzz $(ARGS)
 
 lint: $(TEST) ## check style and formatting
 	@$(BIN)/ruff check .

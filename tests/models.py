@@ -151,6 +151,15 @@ def simulated(model, steps=100, *, count=1, seed=1, level=3.0, missing=0.0, comp
     return inputs, np.where(gone, np.nan, drawn.measurements)
 
 
+def varying_noise(model, steps):
+    """Q of every step and R of every measurement, the model's times changing factors, as arguments of `run`."""
+    factors = np.resize([2.0, 0.5, 1.0, 3.0, 0.3], steps + 1)[:, None, None]
+    return {
+        "process_noise_covs": factors[:steps] * model.process_noise_cov,
+        "measurement_noise_covs": factors[::-1] * model.measurement_noise_cov,
+    }
+
+
 def held_voltages(count, levels, hold=25, seed=20, limit=12.0):
     """Inputs (count, levels * hold, 1) for thrusters: uniform within +-limit, each held for `hold` steps."""
     drawn = np.random.default_rng(seed).uniform(-limit, limit, size=(count, levels, 1))

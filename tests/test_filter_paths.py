@@ -5,7 +5,7 @@ import pytest
 
 from filters import FILTERS, make_filter, run, thruster_model
 from filters.session import Session
-from tests.models import KEY, MODELS, scalar_model, simulated, small
+from tests.models import KEY, MODELS, scalar_model, simulated, small, varying_noise
 from tests.oracles import equal
 from thruster_env.compiled import interpreted
 from thruster_env.streams import filter_keys
@@ -88,11 +88,11 @@ def test_a_diverging_filter_restarts_and_counts_and_is_never_nan(name):
     assert all(np.isfinite(innovation.value).all() for _, innovation in found)
 
 
-def assert_compiled_as_python(filter_, *data):
+def assert_compiled_as_python(filter_, *data, **noise):
     """Compiled and as Python, a batch is the same."""
-    compiled = run(filter_, *data)
+    compiled = run(filter_, *data, **noise)
     with interpreted():
-        as_python = run(filter_, *data)
+        as_python = run(filter_, *data, **noise)
     for one, other in zip(compiled, as_python, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
 
@@ -103,7 +103,10 @@ def test_compiled_and_interpreted_agree(name, kind):
     filter_ = small(name, model)
     inputs, measurements = simulated(model, 25)
     measurements[0, 3] = measurements[0, 7, 0] = np.nan
-    assert_compiled_as_python(filter_, np.array([KEY]), inputs, measurements)
+    data = np.array([KEY]), inputs, measurements
+    assert_compiled_as_python(filter_, *data)
+    if filter_.varying_noise:
+        assert_compiled_as_python(filter_, *data, **varying_noise(model, 25))
 
 
 @pytest.mark.parametrize("name", ["enkf", "ienkf"])

@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 from filters import FILTERS, StateSpaceModel, run
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.particles.weighted import WeightedFilter
-from tests.models import KEY, MODELS, simulated, small, wide_model
+from tests.models import KEY, MODELS, simulated, small, varying_noise, wide_model
 from tests.oracles import equal
 from thruster_env.streams import filter_keys
 
@@ -243,14 +243,15 @@ class TestNoiseThatVaries:
         np.testing.assert_allclose(one.cov, two.cov, rtol=1e-10, atol=1e-14)
 
     @pytest.mark.parametrize("name", VARYING)
+    @pytest.mark.usefixtures("as_python")
     def test_a_batch_with_varying_noise_is_the_loop(self, name):
         model = wide_model()
         inputs, measurements = simulated(model, 4, count=2)
-        qs = np.array([scale * model.process_noise_cov for scale in (1.0, 4.0, 0.5, 2.0)])
-        rs = np.array([scale * model.measurement_noise_cov for scale in (2.0, 0.5, 1.0, 3.0, 0.3)])
+        noise = varying_noise(model, 4)
+        qs, rs = noise.values()
         filter_ = small(name, model)
         keys = filter_keys(range(2))
-        found = run(filter_, keys, inputs, measurements, process_noise_covs=qs, measurement_noise_covs=rs)
+        found = run(filter_, keys, inputs, measurements, **noise)
         for b in range(2):
             belief = filter_.init(tuple(int(k) for k in keys[b]))
             for k in range(5):

@@ -105,6 +105,7 @@ SCRIPT = np.random.default_rng(1).normal(size=(6, 2))
 
 class TestGymnasium:
     @quiet
+    @pytest.mark.usefixtures("as_python")
     @pytest.mark.parametrize("filter", FILTERS)
     @pytest.mark.parametrize("observation", FORMS)
     def test_both_checkers_accept_every_filter_and_observation(self, filter, observation):
@@ -128,6 +129,7 @@ class TestGymnasium:
                 np.testing.assert_array_equal(observation, np.concatenate(parts[form]).astype(np.float32))
                 assert observation.dtype == np.float32
 
+    @pytest.mark.usefixtures("as_python")
     @pytest.mark.parametrize("filter", FILTERS)
     def test_info_gains_fresh_arrays_of_constant_shape(self, filter):
         env = wrapped(filter)

@@ -1,0 +1,41 @@
+"""The attacks of `make fuzz`: each for a moment here, with a fixed seed; and one that must find what is wrong."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from tests.fuzz import commands, files
+from tests.fuzz.__main__ import ROOMS, attacks
+from tests.models import TUNED
+
+SLOW = ("processes.", "checkpoints.")  # which start processes; tests of their own show what they attack
+QUICK = [name for name in attacks() if not name.startswith(SLOW)]
+
+
+def test_every_room_has_attacks():
+    assert {name.partition(".")[0] for name in attacks()} == set(ROOMS)
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_an_attack_of_a_moment_is_withstood(name):
+    assert attacks()[name](np.random.default_rng(1), 0.5)
+
+
+def test_a_traceback_is_found():
+    ended = commands.Ended(2, False, "", "Traceback (most recent call last):\nValueError: x")
+    with pytest.raises(AssertionError, match="Traceback"):
+        commands._judge(["tune"], ended)
+
+
+def test_code_that_a_file_names_is_found(tmp_path):
+    def careless(path):
+        module, _, name = json.loads(path.read_text())["model"].partition(":")
+        getattr(sys.modules[module], name)()
+
+    def write(path):
+        path.write_text(json.dumps({**TUNED, "model": f"{files.TRAP}:spring"}))
+
+    with pytest.raises(AssertionError, match="SystemExit"):
+        files._attack(np.random.default_rng(0), 0.0, write, careless)
