@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from filters.derivatives import complex_step
+from filters.made import as_function, as_made
 from thruster_env.checks import at_least, covariance, covariance_root, vector
 
 
@@ -23,6 +24,9 @@ class StateSpaceModel:
     `transition(x, u, c)`, `observe(x, c)` and, if known, their Jacobians as tuples of rows
     (n rows of n, m rows of n). Written with arithmetic and `math` or `numpy` scalar functions they compile;
     others run as Python, slower, with the same results.
+
+    Models, and filters and wrapped envs with them, can be copied and pickled. Pickle holds functions by name, so
+    those of a user must stand in a module; functions within functions, and lambdas, need cloudpickle.
 
     Attributes:
         transition: f, or one of its `substeps` equal parts: the function is applied `substeps` times a step.
@@ -86,6 +90,14 @@ class StateSpaceModel:
             checked["observe_jacobian"] = self._exact("observe", len(checked["measurement_noise_cov"]), n, "c")
         for name, value in checked.items():
             object.__setattr__(self, name, value)
+
+    def __getstate__(self) -> dict:
+        """The fields, with how to make functions that this package wrote out in place of these."""
+        return {name: as_made(value) for name, value in vars(self).items()}
+
+    def __setstate__(self, state: dict) -> None:
+        """The fields, functions made anew."""
+        vars(self).update({name: as_function(value) for name, value in state.items()})
 
     def _exact(self, name: str, rows: int, columns: int, arguments: str) -> Callable:
         """The Jacobian given, or one by complex steps; one that was made before `replace` is made anew."""

@@ -28,6 +28,7 @@ class Session:
 
     def __init__(self, filter_: Filter):
         """Allocate the memory of a filter; `start` or `load` comes next."""
+        self._filter = filter_
         kernels, model, size = filter_.kernels(), filter_.kernel_model, filter_.size
         n, m = kernels.n, kernels.m
         places = memory_places(n, m)
@@ -46,6 +47,18 @@ class Session:
         self.cov = self._row[places.cov : places.cov + n * n].reshape(n, n)
         self.innovation = self._row[places.innovation : places.innovation + m]
         self.innovation_cov = self._row[places.innovation_cov : places.innovation_cov + m * m].reshape(m, m)
+
+    def __getstate__(self) -> tuple:
+        """The filter and all numbers; machine code and views are made anew from these."""
+        return self._filter, self.divergences, (*self._memory, self._values, self._numbers)
+
+    def __setstate__(self, state: tuple) -> None:
+        """Go on where the belief was."""
+        filter_, divergences, arrays = state
+        self.__init__(filter_)
+        for own, kept in zip((*self._memory, self._values, self._numbers), arrays, strict=True):
+            own[...] = kept
+        self.divergences, self._operate = divergences, self._operate.direct
 
     def _do(self, task: int) -> None:
         self.divergences = self._operate(*self._given, task)

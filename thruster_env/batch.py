@@ -36,8 +36,20 @@ class Copies:
         self.plant, self.task, self.count = plant, task, count
         self.numbers, self._extra_rows = encode(plant, task)
         self.memory = new_memory(count, self._extra_rows)
-        effects = known_effects(plant, task), is_plain(plant, task)
+        self._find_machine_code()
+
+    def _find_machine_code(self) -> None:
+        effects = known_effects(self.plant, self.task), is_plain(self.plant, self.task)
         self.advance, self._advance_in_parts = advance(*effects), advance_in_parts(*effects)
+
+    def __getstate__(self) -> dict:
+        """All but the machine code, which pickle cannot hold and every process finds for itself."""
+        return {key: value for key, value in vars(self).items() if key not in ("advance", "_advance_in_parts")}
+
+    def __setstate__(self, state: dict) -> None:
+        """Find the machine code for the memory that was kept."""
+        vars(self).update(state)
+        self._find_machine_code()
 
     @property
     def bytes_per_copy(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 
@@ -35,6 +36,9 @@ from thruster_env.rendering.env import RenderedEnv
 from thruster_env.streams import draw_key
 from thruster_env.task import DEFAULT_WEIGHTS, half_thrust, make_task, thrust_scale
 from thruster_env.uncertainty import LogNormal, Uniform, as_mapping, drawn_parameters
+
+# What `_set_views` makes.
+VIEWS = ("_memory", "_numbers", "_advance", "_report", "_state_view", "_measurement_view")
 
 
 class BowThrusterEnv(RenderedEnv):
@@ -135,12 +139,32 @@ class BowThrusterEnv(RenderedEnv):
             -np.inf, np.inf, shape=(size + len(self._appended),), dtype=np.float32
         )
         self._copies = Copies(plant, self.task, 1)
-        self._memory, self._numbers = self._copies.memory, self._copies.numbers
         self._out = np.zeros((REPORTED, 1, 1))
-        self._report = self._out.reshape(-1)  # a view
-        self._state_view, self._measurement_view = self._report[:2], self._report[self._readings]
         self._observation_buffer = np.zeros(1, dtype=np.float32)
-        self._advance = self._copies.advance
+        self._set_views()
+
+    def _set_views(self) -> None:
+        """Short ways into the memory of the one copy, for a step has to be quick."""
+        self._memory, self._numbers, self._advance = (
+            self._copies.memory,
+            self._copies.numbers,
+            self._copies.advance,
+        )
+        self._report = self._out.reshape(-1)
+        self._state_view, self._measurement_view = self._report[:2], self._report[self._readings]
+
+    def __getstate__(self) -> dict:
+        """The state without its views, for copies and pickles, which go on with the same numbers."""
+        return {key: value for key, value in vars(self).items() if key not in VIEWS}
+
+    def __setstate__(self, state: dict) -> None:
+        """Make the views on the memory that was kept."""
+        vars(self).update(state)
+        self._set_views()
+
+    def __copy__(self) -> BowThrusterEnv:
+        """A deep copy: two envs with one memory would move one another."""
+        return copy.deepcopy(self)
 
     def _reference_signals(self, reference):
         return [Constant(thrust=half_thrust(self.plant) if reference is None else finite("reference", reference))]

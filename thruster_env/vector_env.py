@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import gymnasium as gym
@@ -61,6 +62,10 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
         self._copies = Copies(self.plant, self.task, self.num_envs)
         self._keys = EpisodeKeys(self.num_envs)
         self._done = np.zeros(self.num_envs, dtype=bool)
+
+    def __copy__(self) -> BowThrusterVectorEnv:
+        """A deep copy: two envs with one memory would move one another."""
+        return copy.deepcopy(self)
 
     @property
     def bytes_per_copy(self) -> int:

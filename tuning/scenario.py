@@ -124,6 +124,15 @@ class Scenario:
         for entry in fields(self):
             object.__setattr__(self, entry.name, frozen(checked.get(entry.name, getattr(self, entry.name))))
 
+    def __getstate__(self) -> dict:
+        """The fields as dictionaries and lists, for copies and pickles: a mapping that cannot change has none."""
+        return {entry.name: plain(getattr(self, entry.name)) for entry in fields(self)}
+
+    def __setstate__(self, state: dict) -> None:
+        """The fields, so that they cannot be changed again."""
+        for name, value in state.items():
+            object.__setattr__(self, name, frozen(value))
+
     @property
     def plant_arguments(self) -> dict:
         """Arguments of the env of the same plant, `BowThruster-v0`, or `BowThrusterLinear-v0` of a linear one."""
