@@ -11,6 +11,7 @@ import numpy as np
 
 from filters.derivatives import complex_step
 from filters.made import as_function, as_made
+from filters.model_check import check_functions, checked_constants
 from thruster_env.checks import at_least, covariance, covariance_root, vector
 
 
@@ -69,7 +70,7 @@ class StateSpaceModel:
     state_high: Any = None
 
     def __post_init__(self):
-        """Check shapes and signs; raise ValueError that states the rule and the value."""
+        """Check shapes and signs, and try the functions; raise ValueError that states the rule and the value."""
         mean = vector("prior_mean", self.prior_mean)
         n, r = len(mean), self.measurement_noise_cov
         m = len(r) if isinstance(r, (list, tuple, np.ndarray)) and np.ndim(r) else 1
@@ -80,6 +81,7 @@ class StateSpaceModel:
             "measurement_noise_cov": covariance("measurement_noise_cov", r, m, positive_definite=True),
             "substeps": at_least("substeps", self.substeps, 1),
             "inputs": at_least("inputs", self.inputs, 0),
+            "constants": checked_constants(self.constants),
         }
         sizes = {"operating_state": n, "operating_input": checked["inputs"], "state_low": n, "state_high": n}
         for name, size in sizes.items():
@@ -90,6 +92,7 @@ class StateSpaceModel:
             checked["observe_jacobian"] = self._exact("observe", len(checked["measurement_noise_cov"]), n, "c")
         for name, value in checked.items():
             object.__setattr__(self, name, value)
+        check_functions(self)
 
     def __getstate__(self) -> dict:
         """The fields, with how to make functions that this package wrote out in place of these."""

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
+from thruster_env.checks import options as checked_options
 from thruster_env.checks import vector
 from thruster_env.copies import advance, advance_in_parts
 from thruster_env.encoding import encode, is_plain, known_effects
@@ -72,11 +75,12 @@ class Copies:
             scatter(memory, self.memory, which)
         return out[:, : len(keys)]
 
-    def numbers_from(self, options: dict | None) -> np.ndarray | None:
+    def numbers_from(self, options: Mapping | None) -> np.ndarray | None:
         """Numbers for `begin` with the initial state that a reset's options fix in "state", or None."""
-        if options is None or options.get("state") is None:
+        state = checked_options(options).get("state")
+        if state is None:
             return None
-        state = vector("the state of options", options["state"], 2)
+        state = vector("the state of options", state, 2)
         return encode(self.plant._replace(initial_mean=state, initial_cov=np.zeros((2, 2))), self.task)[0]
 
     def step(self, voltages: np.ndarray) -> np.ndarray:

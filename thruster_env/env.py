@@ -10,7 +10,8 @@ import gymnasium as gym
 import numpy as np
 
 from thruster_env.batch import Copies
-from thruster_env.checks import finite
+from thruster_env.checks import finite, shown
+from thruster_env.checks import seed as checked_seed
 from thruster_env.effects import Effect
 from thruster_env.memory import (
     COMMAND,
@@ -209,8 +210,8 @@ class BowThrusterEnv(RenderedEnv):
 
         `options={"state": [omega_m, U_a]}` fixes the initial state of this episode.
         """
-        super().reset(seed=seed)
         numbers = self._copies.numbers_from(options)
+        super().reset(seed=checked_seed(seed))
         self._report[:] = self._copies.begin(draw_key(self.np_random)[None], numbers=numbers)[:, 0]
         report = self._report.tolist()
         if self.render_mode is not None:
@@ -269,10 +270,11 @@ def _as_json(value):
 
 def _as_voltage(action) -> float:
     try:
-        item = action.item if hasattr(action, "item") else np.asarray(action, dtype=np.float64).item
-        voltage = float(item())
+        item = action.item if hasattr(action, "item") else np.asarray(action).item
+        given = item()
+        voltage = math.nan if isinstance(given, (str, bytes)) else float(given)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: a torch tensor of several numbers
         voltage = math.nan
     if voltage != voltage:
-        raise ValueError(f"an action must be one voltage [V] and not NaN, but got {action!r}")
+        raise ValueError(f"an action must be one voltage [V] and not NaN, but got {shown(action)}")
     return voltage
