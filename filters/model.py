@@ -79,7 +79,7 @@ class StateSpaceModel:
             "prior_cov": covariance("prior_cov", self.prior_cov, n),
             "process_noise_cov": covariance("process_noise_cov", self.process_noise_cov, n),
             "measurement_noise_cov": covariance("measurement_noise_cov", r, m, positive_definite=True),
-            "substeps": at_least("substeps", self.substeps, 1),
+            "substeps": at_least("substeps", self.substeps, 1, 10_000),
             "inputs": at_least("inputs", self.inputs, 0),
             "constants": checked_constants(self.constants),
         }

@@ -238,7 +238,7 @@ def fails(x, c):
     [
         (
             {"measurement_noise_cov": [0.1]},
-            "observe must return a tuple of 1 measurement, as measurement_noise_cov is 1 x 1, but returned 2 entries",
+            "observe must return a tuple of 1 measurement, as measurement_noise_cov is 1 x 1, but returned 2",
         ),
         (
             {"transition": one_entry},

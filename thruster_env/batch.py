@@ -7,7 +7,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from thruster_env.checks import options as checked_options
-from thruster_env.checks import vector
 from thruster_env.copies import advance, advance_in_parts
 from thruster_env.encoding import encode, is_plain, known_effects
 from thruster_env.memory import (
@@ -24,6 +23,7 @@ from thruster_env.memory import (
 )
 from thruster_env.parameters import derive_constants
 from thruster_env.plant import Plant
+from thruster_env.plant import state as checked_state
 from thruster_env.task import Task
 from thruster_env.threads import crew
 from thruster_env.uncertainty import drawn_parameters
@@ -77,10 +77,10 @@ class Copies:
 
     def numbers_from(self, options: Mapping | None) -> np.ndarray | None:
         """Numbers for `begin` with the initial state that a reset's options fix in "state", or None."""
-        state = checked_options(options).get("state")
-        if state is None:
+        given = checked_options(options).get("state")
+        if given is None:
             return None
-        state = vector("the state of options", state, 2)
+        state = checked_state("the state of options", given)
         return encode(self.plant._replace(initial_mean=state, initial_cov=np.zeros((2, 2))), self.task)[0]
 
     def step(self, voltages: np.ndarray) -> np.ndarray:

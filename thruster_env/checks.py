@@ -11,7 +11,10 @@ import numpy as np
 
 def shown(value) -> str:
     """A value for an error message, on one line and not too long."""
-    text = " ".join(repr(value).split())
+    try:
+        text = " ".join(repr(value).split())
+    except RecursionError:
+        text = f"a {type(value).__name__} nested too deeply to be shown"
     return text if len(text) <= 200 else text[:197] + "..."
 
 
@@ -27,12 +30,7 @@ def as_floats(value) -> np.ndarray:
         if array.dtype.kind not in "biufO":
             raise TypeError
         return array.astype(np.float64, copy=False)
-    except (
-        TypeError,
-        ValueError,
-        OverflowError,
-        RuntimeError,
-    ):  # RuntimeError: a torch tensor that needs gradients
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last of tensors, and of endless lists
         raise ValueError(f"an array must be one of numbers, but got {shown(value)}") from None
 
 
@@ -121,7 +119,13 @@ def vector(name: str, value, size: int | None = None) -> np.ndarray:
 
 
 def covariance(
-    name: str, value, size: int, *, positive_definite: bool = False, rounding: float = 1e-12
+    name: str,
+    value,
+    size: int,
+    *,
+    positive_definite: bool = False,
+    rounding: float = 1e-12,
+    largest: float = np.inf,
 ) -> np.ndarray:
     """Return a covariance, shape (size, size), from a matrix, `size` variances or one variance if size is 1.
 
@@ -136,6 +140,8 @@ def covariance(
         array = np.diag(array)
     if array.shape != (size, size) or not np.isfinite(array).all() or not np.allclose(array, array.T):
         raise ValueError(f"{rule} of finite numbers, but got {shown(value)}")
+    if np.abs(array).max() > largest:
+        raise ValueError(f"{name} must have variances of at most {largest:g}, but got {shown(value)}")
     eigenvalues = np.linalg.eigvalsh(array)
     if eigenvalues[0] < -rounding * max(1e-300, abs(eigenvalues[-1])) or np.diag(array).min() < 0:
         raise ValueError(f"{name} must be positive semidefinite (no negative variance), but got {shown(value)}")

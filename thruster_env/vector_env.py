@@ -18,6 +18,8 @@ from thruster_env.keys import EpisodeKeys, reset_mask
 from thruster_env.memory import AMBIENT, READINGS, REFERENCE, REWARD, TERMINATED, THRUST, TIME, VALID
 from thruster_env.tasks import BowThrusterLinearEnv, BowThrusterReversalEnv, BowThrusterTrackingEnv
 
+MOST_ENVS = 1_000_000  # of some kilobytes each
+
 
 class BowThrusterVectorEnv(gym.vector.VectorEnv):
     """N copies of an env, native: copy i of `reset(seed=s)` equals a single env with `reset(seed=s + i)`.
@@ -46,7 +48,7 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
         **arguments,
     ):
         """Build one env, for its plant and spaces, and the memory of all copies."""
-        self.num_envs = at_least("num_envs", num_envs, 1)
+        self.num_envs = at_least("num_envs", num_envs, 1, MOST_ENVS)
         self._mode = _autoreset_mode(autoreset_mode)
         if arguments.get("render_mode") is not None:
             raise ValueError(f"render_mode must be None in number, but got {arguments['render_mode']!r}")
