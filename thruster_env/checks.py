@@ -141,7 +141,7 @@ def covariance(
     if array.shape != (size, size) or not np.isfinite(array).all() or not np.allclose(array, array.T):
         raise ValueError(f"{rule} of finite numbers, but got {shown(value)}")
     if np.abs(array).max() > largest:
-        raise ValueError(f"{name} must have variances of at most {largest:g}, but got {shown(value)}")
+        raise ValueError(f"{name} must be at most {largest:g} in every entry, but got {shown(value)}")
     eigenvalues = np.linalg.eigvalsh(array)
     if eigenvalues[0] < -rounding * max(1e-300, abs(eigenvalues[-1])) or np.diag(array).min() < 0:
         raise ValueError(f"{name} must be positive semidefinite (no negative variance), but got {shown(value)}")
