@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from filters.derivatives import RELATIVE_STEP
+from filters.made import makes_functions
 from filters.model import StateSpaceModel
 from filters.rows import constants_form
 from thruster_env.checks import finite, positive
@@ -95,7 +95,7 @@ def _block_diagonal(cov: np.ndarray, variances: list[float]) -> np.ndarray:
     return whole
 
 
-@cache
+@makes_functions
 def _augmented_functions(
     transition, observe, transition_jacobian, observe_jacobian, n, m, form, places
 ) -> dict[str, Callable | None]:

@@ -9,7 +9,7 @@ import numpy as np
 from filters.engine import batch, lanes, new_memory
 from filters.filter import Filter
 from filters.rows import LANES, with_root
-from thruster_env.checks import covariance
+from thruster_env.checks import as_floats, covariance, shown
 from thruster_env.threads import spread
 
 
@@ -99,7 +99,8 @@ def trajectories(
     model = filter_.kernel_model
     # Arrays that may be written to: others are another type to numba, which compiles once more for them.
     requirements = "C_CONTIGUOUS", "WRITEABLE"
-    keys, inputs, z = (np.require(value, np.float64, requirements) for value in (keys, inputs, measurements))
+    given = {"keys": keys, "inputs": inputs, "measurements": measurements}
+    keys, inputs, z = (np.require(_floats(name, value), np.float64, requirements) for name, value in given.items())
     if z.ndim != 3 or inputs.ndim != 3 or keys.shape != (len(z), 2):
         raise ValueError(
             "keys, inputs, measurements must have shapes (B, 2), (B, K, p), (B, K + 1, m), "
@@ -113,13 +114,23 @@ def trajectories(
         )
     if not np.isfinite(inputs).all() or np.isinf(z).any():
         raise ValueError("inputs must be finite, and measurements finite or NaN, but some are not")
+    if not ((keys >= 0) & (keys < 2**32) & (keys == np.floor(keys))).all():
+        raise ValueError("keys must be whole numbers from 0 to 2^32 - 1, but some are not")
     return keys, inputs, z
+
+
+def _floats(name: str, value) -> np.ndarray:
+    try:
+        return as_floats(value)
+    except ValueError:
+        raise ValueError(f"{name} must be an array of numbers, but got {shown(value)}") from None
 
 
 def _noise_rows(name: str, given, count: int, size: int) -> np.ndarray:
     if given is None:
         return np.empty((0, 2 * size * size))
-    if np.shape(given) != (count, size, size):
-        raise ValueError(f"{name} must have shape {(count, size, size)}, but got {np.shape(given)}")
+    given = _floats(name, given)
+    if given.shape != (count, size, size):
+        raise ValueError(f"{name} must have shape {(count, size, size)}, but got {given.shape}")
     definite = name.startswith("measurement")
     return np.array([with_root(covariance(name, cov, size, positive_definite=definite)) for cov in given])

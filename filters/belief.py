@@ -21,6 +21,12 @@ class Belief(NamedTuple):
     extras: np.ndarray = np.empty(0)  # whatever else a kind of filter remembers, such as an estimate of R
 
 
+class LostBelief(Belief):
+    """What `predict` returns where a belief is no longer finite; the next update restarts from the prior."""
+
+    __slots__ = ()
+
+
 class Innovation(NamedTuple):
     """What a measurement said beyond the prediction."""
 

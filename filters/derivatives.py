@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
+from filters.made import makes_functions
 from thruster_env.compiled import inlined
 from thruster_env.components import matrix_of, tuple_of, written_out
 
@@ -12,7 +13,7 @@ RELATIVE_STEP = 6e-6  # cube root of the float64 resolution balances truncation 
 COMPLEX_STEP = 1e-100  # nothing is subtracted, so it may be as small as one likes
 
 
-@cache
+@makes_functions
 def complex_step(function: Callable, rows: int, columns: int, arguments: str) -> Callable:
     """Return `jacobian(x, <arguments>)`: df/dx_j = Im f(x + i h e_j) / h, to the last digit.
 

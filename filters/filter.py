@@ -56,7 +56,7 @@ class Filter:
         return 0
 
     def init(self, key: tuple[int, int] = (0, 0)) -> Belief:
-        """The prior as a belief; key is two integers below 2^32."""
+        """The prior as a belief; key is two integers from 0 to 2^32 - 1, else it raises ValueError."""
         session = self._session()
         session.set_key(key)
         session.run("start")
@@ -65,8 +65,11 @@ class Filter:
     def predict(self, belief: Belief, u, *, process_noise_cov=None) -> Belief:
         """The belief one step later under input u (p,).
 
-        If it is not finite, the next update restarts from the prior and counts that. A `process_noise_cov`,
-        (n, n) or n variances, stands in for the model's Q in this step.
+        If it is not finite it is a `LostBelief`, and the next update restarts from the prior and counts that. A
+        `process_noise_cov`, (n, n) or n variances, stands in for the model's Q in this step.
+
+        Raises ValueError for an input that is not p finite numbers, and for a belief that is none: of another kind
+        of filter, not finite, or with a covariance that is not positive semidefinite.
         """
         session = self._session()
         session.load(belief)
@@ -79,6 +82,8 @@ class Filter:
         """The belief after measurement z (m,), and the innovation; a NaN in z leaves that channel out.
 
         A `measurement_noise_cov`, (m, m) or m variances, stands in for the model's R in this update.
+
+        Raises ValueError for a measurement that is not m numbers, finite or NaN, and as `predict` for a belief.
         """
         session = self._session()
         session.load(belief)

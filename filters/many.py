@@ -22,6 +22,7 @@ class Beliefs:
 
     def __init__(self, filter_: Filter, count: int):
         """Allocate the memory of `count` beliefs; `start` comes next."""
+        self._filter = filter_
         self._kernels, self._size, self._numbers = filter_.kernels(), filter_.size, filter_.numbers
         self._places = memory_places(self._kernels.n, self._kernels.m)
         row, table, _ = self._own = new_memory(self._kernels, self._size)
@@ -29,6 +30,16 @@ class Beliefs:
         self._tables = np.zeros((count, self._kernels.kept_rows, table.shape[1]))
         self._u, self._z = np.zeros((count, filter_.kernel_model.inputs)), np.zeros((count, self._kernels.m))
         self._operate = _operation(self._kernels, is_interpreting())
+
+    def __getstate__(self) -> tuple:
+        """The filter and the beliefs; machine code is found anew."""
+        return self._filter, self._rows, self._tables
+
+    def __setstate__(self, state: tuple) -> None:
+        """Go on where the beliefs were."""
+        filter_, rows, tables = state
+        self.__init__(filter_, len(rows))
+        self._rows[:], self._tables[:] = rows, tables
 
     def start(self, which: np.ndarray, keys: np.ndarray, z: np.ndarray) -> None:
         """Set the prior in some copies with keys (len(which), 2), and update it with measurements z (N, m)."""

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from filters.derivatives import complex_step
+from filters.made import as_function, as_made
+from filters.model_check import check_functions, checked_constants
 from thruster_env.checks import at_least, covariance, covariance_root, vector
 
 
@@ -23,6 +25,9 @@ class StateSpaceModel:
     `transition(x, u, c)`, `observe(x, c)` and, if known, their Jacobians as tuples of rows
     (n rows of n, m rows of n). Written with arithmetic and `math` or `numpy` scalar functions they compile;
     others run as Python, slower, with the same results.
+
+    Models, and filters and wrapped envs with them, can be copied and pickled. Pickle holds functions by name, so
+    those of a user must stand in a module; functions within functions, and lambdas, need cloudpickle.
 
     Attributes:
         transition: f, or one of its `substeps` equal parts: the function is applied `substeps` times a step.
@@ -65,7 +70,7 @@ class StateSpaceModel:
     state_high: Any = None
 
     def __post_init__(self):
-        """Check shapes and signs; raise ValueError that states the rule and the value."""
+        """Check shapes and signs, and try the functions; raise ValueError that states the rule and the value."""
         mean = vector("prior_mean", self.prior_mean)
         n, r = len(mean), self.measurement_noise_cov
         m = len(r) if isinstance(r, (list, tuple, np.ndarray)) and np.ndim(r) else 1
@@ -74,8 +79,9 @@ class StateSpaceModel:
             "prior_cov": covariance("prior_cov", self.prior_cov, n),
             "process_noise_cov": covariance("process_noise_cov", self.process_noise_cov, n),
             "measurement_noise_cov": covariance("measurement_noise_cov", r, m, positive_definite=True),
-            "substeps": at_least("substeps", self.substeps, 1),
+            "substeps": at_least("substeps", self.substeps, 1, 10_000),
             "inputs": at_least("inputs", self.inputs, 0),
+            "constants": checked_constants(self.constants),
         }
         sizes = {"operating_state": n, "operating_input": checked["inputs"], "state_low": n, "state_high": n}
         for name, size in sizes.items():
@@ -86,6 +92,15 @@ class StateSpaceModel:
             checked["observe_jacobian"] = self._exact("observe", len(checked["measurement_noise_cov"]), n, "c")
         for name, value in checked.items():
             object.__setattr__(self, name, value)
+        check_functions(self)
+
+    def __getstate__(self) -> dict:
+        """The fields, with how to make functions that this package wrote out in place of these."""
+        return {name: as_made(value) for name, value in vars(self).items()}
+
+    def __setstate__(self, state: dict) -> None:
+        """The fields, functions made anew."""
+        vars(self).update({name: as_function(value) for name, value in state.items()})
 
     def _exact(self, name: str, rows: int, columns: int, arguments: str) -> Callable:
         """The Jacobian given, or one by complex steps; one that was made before `replace` is made anew."""

@@ -96,7 +96,7 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
         content = json.loads(Path(path).read_text())
     except OSError as error:
         raise ValueError(f"a tuned file must be readable, but {path} is not: {error.strerror}") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"a tuned file must be whole JSON, but {path} is not: {error}") from None
     if not isinstance(content, dict) or content.get("format") != FILE_FORMAT:
         raise ValueError(f"a tuned file must say format: {FILE_FORMAT!r}, but {path} does not")

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from filters.belief import Belief, Innovation
+from filters.belief import Belief, Innovation, LostBelief
 from filters.engine import PREDICT, START, UPDATE, new_memory, operation
+from filters.given import check_belief, checked_key, vector_like
 from filters.rows import memory_places, number_places, with_root
 from thruster_env.checks import covariance
 
@@ -28,6 +29,7 @@ class Session:
 
     def __init__(self, filter_: Filter):
         """Allocate the memory of a filter; `start` or `load` comes next."""
+        self._filter = filter_
         kernels, model, size = filter_.kernels(), filter_.kernel_model, filter_.size
         n, m = kernels.n, kernels.m
         places = memory_places(n, m)
@@ -47,12 +49,24 @@ class Session:
         self.innovation = self._row[places.innovation : places.innovation + m]
         self.innovation_cov = self._row[places.innovation_cov : places.innovation_cov + m * m].reshape(m, m)
 
+    def __getstate__(self) -> tuple:
+        """The filter and all numbers; machine code and views are made anew from these."""
+        return self._filter, self.divergences, (*self._memory, self._values, self._numbers)
+
+    def __setstate__(self, state: tuple) -> None:
+        """Go on where the belief was."""
+        filter_, divergences, arrays = state
+        self.__init__(filter_)
+        for own, kept in zip((*self._memory, self._values, self._numbers), arrays, strict=True):
+            own[...] = kept
+        self.divergences, self._operate = divergences, self._operate.direct
+
     def _do(self, task: int) -> None:
         self.divergences = self._operate(*self._given, task)
 
     def set_key(self, key) -> None:
-        """Set the key (2,) on which the belief's randomness depends."""
-        self._row[self._places.key_0], self._row[self._places.key_1] = key
+        """Set the key (2,) on which the belief's randomness depends: two whole numbers below 2^32."""
+        self._row[self._places.key_0], self._row[self._places.key_1] = checked_key(key)
 
     def set_noise(self, *, process_noise_cov=None, measurement_noise_cov=None) -> None:
         """Put another Q or R, with its root, in place of the model's."""
@@ -73,22 +87,26 @@ class Session:
 
     def step(self, u, z) -> None:
         """Predict with input u (p,), then update with measurement z (m,); NaN marks a missing channel."""
-        if self._scalar:  # the frequent case: an assignment to a slice takes twice as long
-            self._values[0], self._values[1] = u[0], z[0]
-        else:
-            self._u[:], self._z[:] = u, z
+        try:
+            if self._scalar:  # the frequent case: an assignment to a slice takes twice as long
+                self._values[0], self._values[1] = u[0], z[0]
+            else:
+                self._u[:], self._z[:] = u, z
+        except (TypeError, ValueError, LookupError):  # they are not looked at before: a step has to be quick
+            self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
+            self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
         self.divergences = self._operate(*self._given, STEP)
 
     def run(self, operation: str, u=None, z=None) -> None:
         """Do one of "start", "predict" or "update" alone, arguments checked."""
-        if u is not None:
+        if operation == "predict":
             self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
-        if z is not None:
+        if operation == "update":
             self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
         self._do(TASKS[operation])
 
     def load(self, belief: Belief) -> None:
-        """Put a belief into the memory; ValueError for one of another model or kind of filter."""
+        """Put a belief into the memory; ValueError for one of another model or kind of filter, or none at all."""
         shapes = {
             "mean": self.mean.shape,
             "cov": self.cov.shape,
@@ -100,6 +118,7 @@ class Session:
             if given != shape:
                 whose = f"a belief that the filter {self._name!r} can take"
                 raise ValueError(f"{name} of {whose} must have shape {shape}, but got {given}")
+        check_belief(belief)
         self.mean[:], self.cov[:] = belief.mean, belief.cov
         if self._size:
             self._table[: self._kept_rows] = belief.members[:, :1]  # the padding follows a real member
@@ -115,19 +134,12 @@ class Session:
         key = int(row[places.key_0]), int(row[places.key_1])
         members = self._table[: self._kept_rows, : self._size].copy()
         step, extras = int(row[places.step]), self._extras.copy()
-        return Belief(self.mean.copy(), self.cov.copy(), members, key, step, self.divergences, extras)
+        # Compared with the sum: it is NaN or infinite where one of the numbers is.
+        total = np.abs(row[: places.key_0]).sum() + np.abs(members[: len(self.mean)]).sum()
+        kind = Belief if total < np.inf else LostBelief
+        return kind(self.mean.copy(), self.cov.copy(), members, key, step, self.divergences, extras)
 
     def innovation_copy(self) -> Innovation:
         """A copy of what the last update found."""
         log_likelihood = float(self._row[self._places.log_likelihood])
         return Innovation(self.innovation.copy(), self.innovation_cov.copy(), log_likelihood)
-
-
-def vector_like(name: str, value, like: np.ndarray, *, missing_allowed: bool) -> np.ndarray:
-    """Return value as float64 of the shape of `like`; raise ValueError for a wrong shape or infinite entries."""
-    array = np.atleast_1d(np.asarray(value, dtype=np.float64))
-    wrong = np.isinf(array) if missing_allowed else ~np.isfinite(array)
-    if array.shape != like.shape or wrong.any():
-        rule = "finite or NaN" if missing_allowed else "finite"
-        raise ValueError(f"{name} must be {like.size} numbers, each {rule}, but got {value!r}")
-    return array

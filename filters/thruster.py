@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 
 from filters.gaussian.affine import affine_model
+from filters.made import makes_functions
 from filters.model import StateSpaceModel
 from thruster_env.checks import covariance, finite, positive
 from thruster_env.compiled import inlined
@@ -53,7 +54,7 @@ def observe_jacobian(x, c):
     return ((by_speed, by_flow),)
 
 
-@cache
+@makes_functions
 def _channel_functions(channels: tuple[str, ...]) -> tuple[Callable, Callable]:
     """`observe` and its Jacobian for some measured quantities."""
     if channels == ("thrust",):

@@ -10,10 +10,11 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from filters.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for
+from filters.given import checked_actions
 from filters.many import Beliefs
 from filters.model import StateSpaceModel
 from thruster_env.checks import one_of, shown
-from thruster_env.keys import EpisodeKeys
+from thruster_env.keys import EpisodeKeys, reset_mask
 from thruster_env.streams import filter_generator
 
 
@@ -67,9 +68,10 @@ class EstimateStates(gym.vector.VectorWrapper):
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict | None = None):
         """Reset the env and the beliefs of the copies that it resets."""
+        mask = reset_mask(options, self._keys)
+        self._keys.seeds(seed)  # a wrong one changes nothing
         observations, info = self.env.reset(seed=seed, options=options)
-        mask = None if options is None else options.get("reset_mask")
-        which = np.ones(self.num_envs, dtype=bool) if mask is None else np.asarray(mask)
+        which = np.ones(self.num_envs, dtype=bool) if mask is None else mask
         self._keys.seed(seed, which)
         z = self._measurements(observations, info)
         self._start(which, z)
@@ -77,9 +79,13 @@ class EstimateStates(gym.vector.VectorWrapper):
         return self._observe(observations, z, info), info
 
     def step(self, actions):
-        """Step the env, then predict with the clipped actions and update with the measurements."""
+        """Step the env, then predict with the clipped actions and update with the measurements.
+
+        Raises ValueError, before the envs are stepped, for actions that are not numbers, or too few or many.
+        """
+        ignored = self._done if self._mode == AutoresetMode.NEXT_STEP else False
+        u = np.clip(checked_actions(actions, self.num_envs, len(self._low), ignored), self._low, self._high)
         observations, rewards, terminated, truncated, info = self.env.step(actions)
-        u = np.clip(np.asarray(actions, dtype=np.float64).reshape(self.num_envs, -1), self._low, self._high)
         z = self._measurements(observations, info)
         done = terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP and done.any():

@@ -8,10 +8,12 @@ import gymnasium as gym
 import numpy as np
 
 from filters.arguments import APPENDED, OBSERVATIONS, ModelInSpec, check_spaces, filter_for
+from filters.given import checked_actions
 from filters.model import StateSpaceModel
 from filters.session import Session
 from filters.thruster import overlay_of
 from thruster_env.checks import one_of, shown
+from thruster_env.checks import seed as checked_seed
 from thruster_env.streams import draw_key, filter_generator
 
 FLOAT32 = np.dtype(np.float32)  # a cast to a dtype is quicker than one to its type
@@ -83,6 +85,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Reset env and filter; the belief is the prior, updated with the first measurement."""
+        seed = checked_seed(seed)
         observation, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._generator = filter_generator(seed)
@@ -95,19 +98,24 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         return self._observe(observation, z, info), info
 
     def step(self, action):
-        """Step the env, then predict with the clipped action and update with the measurement."""
+        """Step the env, then predict with the clipped action and update with the measurement.
+
+        Raises ValueError, before the env is stepped, for an action that is not numbers, or too few or many.
+        """
+        u = self._clipped(action)
         observation, reward, terminated, truncated, info = self.env.step(action)
         z = info.get("measurement")
         if z is None or "measurement_valid" in info:
             z = _measurement(observation, info)
-        self._session.step(self._clipped(action), z)
+        self._session.step(u, z)
         return self._observe(observation, z, info), reward, terminated, truncated, info
 
     def _clipped(self, action) -> Sequence[float]:
-        if self._has_one_input and type(action) is np.ndarray:  # the frequent case has to be quick
-            value, (low, high) = action.item(), self._bounds[0]
-            return (low if value < low else high if value > high else value,)
-        values = np.asarray(action).ravel().tolist()
+        if self._has_one_input and type(action) is np.ndarray and action.size == 1:
+            value, (low, high) = action.item(), self._bounds[0]  # the frequent case has to be quick
+            if type(value) is float and value == value:
+                return (low if value < low else high if value > high else value,)
+        values = checked_actions(action, 1, len(self._bounds))[0].tolist()
         return [min(max(v, low), high) for v, (low, high) in zip(values, self._bounds, strict=True)]
 
     def _overlay(self):

@@ -193,7 +193,7 @@ def test_a_state_a_hundred_times_beyond_its_range_terminates(direction):
         assert terminated is ends
 
 
-@pytest.mark.parametrize("x", [[1e6, 0.0], [0.0, 1e12], [1e200, 1e200]])
+@pytest.mark.parametrize("x", [[1e6, 0.0], [0.0, 1e12], [1e50, 1e50]])
 def test_a_state_that_is_not_finite_terminates(x):
     env = BowThrusterEnv(initial_state=x)
     env.reset(seed=0)

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from studies import STUDIES
-from studies.comparison import MEMBERS, RUNS, compare_all
+from studies.comparison import LARGEST_ENSEMBLE, MEMBERS, MOST_RUNS, RUNS, compare_all
 from studies.findings import findings, general_statements, study_statements
 from thruster_cli.output import (
     JsonOption,
@@ -51,7 +51,9 @@ def command(
     Example: thruster reproduce nurhadi2022 --json table.json
     """
     names = tuple(STUDIES) if one_of("study", study, (*STUDIES, ALL)) == ALL else (study,)
-    shown, data = reproduce(names, at_least("runs", runs, 2), at_least("members", members, 2), seed)
+    shown, data = reproduce(
+        names, at_least("runs", runs, 2, MOST_RUNS), at_least("members", members, 2, LARGEST_ENSEMBLE), seed
+    )
     emit(shown, data, json)
 
 

@@ -22,6 +22,7 @@ from thruster_env.simulation import simulate
 from thruster_env.streams import episode_keys
 from tuning.scenarios import held_levels
 
+MOST_STEPS = 10_000_000  # which take a gigabyte
 COLUMNS = ("time_s", "voltage_V", "omega_m_rad_per_s", "U_a_m_per_s", "thrust_N", "measured_thrust_N")
 
 
@@ -49,14 +50,16 @@ def command(
     """
     if out.suffix not in (".csv", ".npz"):
         raise ValueError(f"--out must end in .csv or .npz, but got {str(out)!r}")
-    steps = at_least("steps", steps, 1)
+    steps = at_least("steps", steps, 1, MOST_STEPS)
     plant = make_plant(preset, dt, process_noise_cov=process_noise, measurement_noise_cov=measurement_noise)
     keys = episode_keys([seed])
     if voltage is not None:
         voltages = np.full((1, steps), within("voltage", voltage, plant.max_voltage))
     else:
         amplitude = positive("amplitude", amplitude, zero_allowed=True)
-        voltages = held_levels(keys, min(amplitude, plant.max_voltage), at_least("hold", hold, 1), steps)
+        voltages = held_levels(
+            keys, min(amplitude, plant.max_voltage), at_least("hold", hold, 1, MOST_STEPS), steps
+        )
     announce_compilation()
     run = simulate(plant, keys, voltages)
     values = np.column_stack(

@@ -32,12 +32,16 @@ def policies(
     quick: Annotated[
         bool, typer.Option("--quick", help="One noise, two seeds, few steps: whether it works, not what it says.")
     ] = False,
-    seeds: Annotated[int | None, typer.Option(min=1, help="Training seeds of each learnt policy; 5.")] = None,
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps that each learns from; 400000.")] = None,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, max=1000, help="Training seeds of each learnt policy; 5.")
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=1, max=10**12, help="Steps that each learns from; 400000.")
+    ] = None,
     recurrent: Annotated[
         bool, typer.Option("--recurrent", help="Also PPO with an LSTM on raw measurements: many hours.")
     ] = False,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; as many as cores.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, max=1000, help="Processes; as many as cores.")] = None,
     out: Annotated[Path, typer.Option(help="Folder of results; what is there is not done again.")] = RESULTS,
     page: Annotated[
         Path | None,

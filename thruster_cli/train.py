@@ -92,7 +92,10 @@ def command(
         tuned=tuned,
         num_envs=envs,
     )
-    evaluations, checkpoints = at_least("evaluations", evaluations, 1), at_least("checkpoints", checkpoints, 1)
+    evaluations, checkpoints = (
+        at_least("evaluations", evaluations, 1, 10_000),
+        at_least("checkpoints", checkpoints, 1, 10_000),
+    )
     check_installed()
     folder = out or POLICIES / name_of(setup, tuned, untuned)
     if tuned is not None and (meant := read_tuned_file(tuned)["scenario"]) != scenario:

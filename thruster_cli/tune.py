@@ -30,6 +30,8 @@ from tuning.tuned import write_tuned
 from tuning.workers import run_in_workers
 
 DEFAULT_STORAGE = "out/studies.journal"
+MOST_TRIALS = 1_000_000
+MOST_WORKERS = 1000
 METHODS = ("optuna", "gradient")
 TUNED_FILTER_HELP = f"{FILTER_HELP} Or auto: the best of all within --budget."
 
@@ -119,7 +121,7 @@ def tune(
     workers: int = 1,
 ) -> Tuning:
     """Run or resume a study with a progress bar, prove its choice and write the tuned file."""
-    trials, workers = at_least("trials", trials, 1), at_least("workers", workers, 1)
+    trials, workers = at_least("trials", trials, 1, MOST_TRIALS), at_least("workers", workers, 1, MOST_WORKERS)
     if by_gradient:
         one_of("a filter whose likelihood has a gradient", plan.filter, DIFFERENTIABLE)
         if plan.hold_r:

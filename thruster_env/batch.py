@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from thruster_env.checks import vector
+from thruster_env.checks import options as checked_options
 from thruster_env.copies import advance, advance_in_parts
 from thruster_env.encoding import encode, is_plain, known_effects
 from thruster_env.memory import (
@@ -21,6 +23,7 @@ from thruster_env.memory import (
 )
 from thruster_env.parameters import derive_constants
 from thruster_env.plant import Plant
+from thruster_env.plant import state as checked_state
 from thruster_env.task import Task
 from thruster_env.threads import crew
 from thruster_env.uncertainty import drawn_parameters
@@ -36,8 +39,20 @@ class Copies:
         self.plant, self.task, self.count = plant, task, count
         self.numbers, self._extra_rows = encode(plant, task)
         self.memory = new_memory(count, self._extra_rows)
-        effects = known_effects(plant, task), is_plain(plant, task)
+        self._find_machine_code()
+
+    def _find_machine_code(self) -> None:
+        effects = known_effects(self.plant, self.task), is_plain(self.plant, self.task)
         self.advance, self._advance_in_parts = advance(*effects), advance_in_parts(*effects)
+
+    def __getstate__(self) -> dict:
+        """All but the machine code, which pickle cannot hold and every process finds for itself."""
+        return {key: value for key, value in vars(self).items() if key not in ("advance", "_advance_in_parts")}
+
+    def __setstate__(self, state: dict) -> None:
+        """Find the machine code for the memory that was kept."""
+        vars(self).update(state)
+        self._find_machine_code()
 
     @property
     def bytes_per_copy(self) -> int:
@@ -60,11 +75,12 @@ class Copies:
             scatter(memory, self.memory, which)
         return out[:, : len(keys)]
 
-    def numbers_from(self, options: dict | None) -> np.ndarray | None:
+    def numbers_from(self, options: Mapping | None) -> np.ndarray | None:
         """Numbers for `begin` with the initial state that a reset's options fix in "state", or None."""
-        if options is None or options.get("state") is None:
+        given = checked_options(options).get("state")
+        if given is None:
             return None
-        state = vector("the state of options", options["state"], 2)
+        state = checked_state("the state of options", given)
         return encode(self.plant._replace(initial_mean=state, initial_cov=np.zeros((2, 2))), self.task)[0]
 
     def step(self, voltages: np.ndarray) -> np.ndarray:

@@ -3,15 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import NoneType
 
 import numpy as np
 
 
 def shown(value) -> str:
     """A value for an error message, on one line and not too long."""
-    text = " ".join(repr(value).split())
+    try:
+        text = " ".join(repr(value).split())
+    except RecursionError:
+        text = f"a {type(value).__name__} nested too deeply to be shown"
     return text if len(text) <= 200 else text[:197] + "..."
+
+
+def as_floats(value) -> np.ndarray:
+    """Return value as a float64 array, NaN and infinity included; raise ValueError unless it is real numbers.
+
+    Text that looks like a number is none, and neither are None and complex numbers.
+    """
+    try:
+        array = np.asarray(value)
+        if array.dtype == object and any(isinstance(entry, (str, bytes, NoneType)) for entry in array.flat):
+            raise TypeError
+        if array.dtype.kind not in "biufO":
+            raise TypeError
+        return array.astype(np.float64, copy=False)
+    except (TypeError, ValueError, OverflowError, RuntimeError):  # the last of tensors, and of endless lists
+        raise ValueError(f"an array must be one of numbers, but got {shown(value)}") from None
 
 
 def finite(name: str, value) -> float:
@@ -42,12 +62,39 @@ def within(name: str, value, limit: float) -> float:
     return number
 
 
-def at_least(name: str, value, least: int) -> int:
-    """Return value as an int; raise ValueError unless it is a whole number of at least `least`."""
+def between(name: str, value, low: float, high: float, unit: str = "") -> float:
+    """Return value as a float; raise ValueError unless it is a number from low to high [unit]."""
+    number = finite(name, value)
+    if not low <= number <= high:
+        rule = f"from {low:g} to {high:g}" + (f" {unit}" if unit else "")
+        raise ValueError(f"{name} must be {rule}, but got {shown(value)}")
+    return number
+
+
+def at_least(name: str, value, least: int, most: int | None = None) -> int:
+    """Return value as an int; raise ValueError unless it is a whole number from `least` to `most`, if given."""
     number = finite(name, value)
     if number != int(number) or number < least:
         raise ValueError(f"{name} must be a whole number of at least {least}, but got {shown(value)}")
+    if most is not None and number > most:
+        raise ValueError(f"{name} must be at most {most}, but got {shown(value)}")
     return int(number)
+
+
+def seed(value) -> int | None:
+    """Return a reset's seed as an int or None; raise ValueError unless it is a whole number or None."""
+    if value is None:
+        return None
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 0:
+        raise ValueError(f"a seed must be None or a whole number of at least 0, but got {shown(value)}")
+    return int(value)
+
+
+def options(value) -> Mapping:
+    """Return the options of a reset, {} for None; raise ValueError unless they are a mapping or None."""
+    if value is not None and not isinstance(value, Mapping):
+        raise ValueError(f"options must be None or a mapping, but got {shown(value)}")
+    return {} if value is None else value
 
 
 def one_of(name: str, value, choices: Iterable[str]) -> str:
@@ -60,8 +107,8 @@ def one_of(name: str, value, choices: Iterable[str]) -> str:
 def vector(name: str, value, size: int | None = None) -> np.ndarray:
     """Return value as a float64 array of shape (size,), of any size if None; raise ValueError otherwise."""
     try:
-        array = np.atleast_1d(np.array(value, dtype=np.float64))
-    except (TypeError, ValueError, OverflowError):
+        array = np.atleast_1d(as_floats(value).copy())
+    except ValueError:
         array = np.full(0, np.nan)
     if array.ndim != 1 or not array.size or array.size != (size or array.size) or not np.isfinite(array).all():
         count = size or array.size or "some"
@@ -71,22 +118,32 @@ def vector(name: str, value, size: int | None = None) -> np.ndarray:
     return array
 
 
-def covariance(name: str, value, size: int, *, positive_definite: bool = False) -> np.ndarray:
+def covariance(
+    name: str,
+    value,
+    size: int,
+    *,
+    positive_definite: bool = False,
+    rounding: float = 1e-12,
+    largest: float = np.inf,
+) -> np.ndarray:
     """Return a covariance, shape (size, size), from a matrix, `size` variances or one variance if size is 1.
 
     Raises ValueError unless it is symmetric and positive semidefinite (or definite, where that is asked).
     """
     rule = f"{name} must be {size} variances or a symmetric {size} x {size} matrix"
     try:
-        array = np.atleast_1d(np.array(value, dtype=np.float64))
-    except (TypeError, ValueError, OverflowError):
+        array = np.atleast_1d(as_floats(value))
+    except ValueError:
         raise ValueError(f"{rule}, but got {shown(value)}") from None
     if array.shape == (size,):
         array = np.diag(array)
     if array.shape != (size, size) or not np.isfinite(array).all() or not np.allclose(array, array.T):
         raise ValueError(f"{rule} of finite numbers, but got {shown(value)}")
+    if np.abs(array).max() > largest:
+        raise ValueError(f"{name} must be at most {largest:g} in every entry, but got {shown(value)}")
     eigenvalues = np.linalg.eigvalsh(array)
-    if eigenvalues[0] < -1e-12 * max(1e-300, abs(eigenvalues[-1])):
+    if eigenvalues[0] < -rounding * max(1e-300, abs(eigenvalues[-1])) or np.diag(array).min() < 0:
         raise ValueError(f"{name} must be positive semidefinite (no negative variance), but got {shown(value)}")
     if positive_definite and eigenvalues[0] <= 1e-14 * eigenvalues[-1]:
         raise ValueError(f"{name} must be positive definite, but got {shown(value)}")

@@ -16,10 +16,15 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from typing import ClassVar, NamedTuple
 
+import numpy as np
+
 from thruster_env.checks import shown
 from thruster_env.compiled import inlined
 from thruster_env.memory import KEY_0, KEY_1, STEP
 from thruster_env.streams import CHANCE, DISTURBANCE, normal_block, uniform_block
+
+MAGNITUDES = (1e-100, 1e100)  # of an effect's arguments and of what follows from them
+LONGEST = 1e9  # [s], and in steps: what an effect may hold
 
 
 class Surroundings(NamedTuple):
@@ -122,11 +127,26 @@ def encoded(effects, kinds: tuple[type[Effect], ...], target: int, first_row: in
     numbers: list[float] = []
     rows = 0
     for number, effect in enumerate(effects, first_number):
-        parameters = effect.parameters(around)
+        parameters = _representable(effect, effect.parameters(around))
         header = [5 + len(parameters), kinds.index(type(effect)), target, first_row + rows, number]
         numbers += [*header, *parameters]
         rows += effect.rows(around)
     return numbers, rows
+
+
+def _representable(effect: Effect, parameters: list[float]) -> list[float]:
+    """What an effect comes to, as floats; ValueError where floating point would make infinity or zero of it."""
+    smallest, largest = MAGNITUDES
+    given = [abs(value) for value in np.hstack([*_numbers(dataclasses.astuple(effect)), 0.0]) if value]
+    if min(given, default=1.0) < smallest or not all(abs(value) <= largest for value in (*given, *parameters)):
+        rule = f"arguments of {effect.name!r} must be zero, or from {smallest:g} to {largest:g} in magnitude"
+        raise ValueError(f"{rule}, and so must what follows from them, but got {shown(effect)}")
+    return [float(value) for value in parameters]
+
+
+def _numbers(values: tuple) -> list:
+    """Those that are numbers, or tuples of numbers."""
+    return [value for value in values if isinstance(value, (int, float, tuple)) and value]
 
 
 def set_field(effect: Effect, name: str, value) -> None:

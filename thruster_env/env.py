@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 
@@ -9,7 +10,8 @@ import gymnasium as gym
 import numpy as np
 
 from thruster_env.batch import Copies
-from thruster_env.checks import finite
+from thruster_env.checks import finite, shown
+from thruster_env.checks import seed as checked_seed
 from thruster_env.effects import Effect
 from thruster_env.memory import (
     COMMAND,
@@ -35,6 +37,9 @@ from thruster_env.rendering.env import RenderedEnv
 from thruster_env.streams import draw_key
 from thruster_env.task import DEFAULT_WEIGHTS, half_thrust, make_task, thrust_scale
 from thruster_env.uncertainty import LogNormal, Uniform, as_mapping, drawn_parameters
+
+# What `_set_views` makes.
+VIEWS = ("_memory", "_numbers", "_advance", "_report", "_state_view", "_measurement_view")
 
 
 class BowThrusterEnv(RenderedEnv):
@@ -135,12 +140,32 @@ class BowThrusterEnv(RenderedEnv):
             -np.inf, np.inf, shape=(size + len(self._appended),), dtype=np.float32
         )
         self._copies = Copies(plant, self.task, 1)
-        self._memory, self._numbers = self._copies.memory, self._copies.numbers
         self._out = np.zeros((REPORTED, 1, 1))
-        self._report = self._out.reshape(-1)  # a view
-        self._state_view, self._measurement_view = self._report[:2], self._report[self._readings]
         self._observation_buffer = np.zeros(1, dtype=np.float32)
-        self._advance = self._copies.advance
+        self._set_views()
+
+    def _set_views(self) -> None:
+        """Short ways into the memory of the one copy, for a step has to be quick."""
+        self._memory, self._numbers, self._advance = (
+            self._copies.memory,
+            self._copies.numbers,
+            self._copies.advance,
+        )
+        self._report = self._out.reshape(-1)
+        self._state_view, self._measurement_view = self._report[:2], self._report[self._readings]
+
+    def __getstate__(self) -> dict:
+        """The state without its views, for copies and pickles, which go on with the same numbers."""
+        return {key: value for key, value in vars(self).items() if key not in VIEWS}
+
+    def __setstate__(self, state: dict) -> None:
+        """Make the views on the memory that was kept."""
+        vars(self).update(state)
+        self._set_views()
+
+    def __copy__(self) -> BowThrusterEnv:
+        """A deep copy: two envs with one memory would move one another."""
+        return copy.deepcopy(self)
 
     def _reference_signals(self, reference):
         return [Constant(thrust=half_thrust(self.plant) if reference is None else finite("reference", reference))]
@@ -185,8 +210,8 @@ class BowThrusterEnv(RenderedEnv):
 
         `options={"state": [omega_m, U_a]}` fixes the initial state of this episode.
         """
-        super().reset(seed=seed)
         numbers = self._copies.numbers_from(options)
+        super().reset(seed=checked_seed(seed))
         self._report[:] = self._copies.begin(draw_key(self.np_random)[None], numbers=numbers)[:, 0]
         report = self._report.tolist()
         if self.render_mode is not None:
@@ -245,10 +270,11 @@ def _as_json(value):
 
 def _as_voltage(action) -> float:
     try:
-        item = action.item if hasattr(action, "item") else np.asarray(action, dtype=np.float64).item
-        voltage = float(item())
+        item = action.item if hasattr(action, "item") else np.asarray(action).item
+        given = item()
+        voltage = math.nan if isinstance(given, (str, bytes)) else float(given)
     except (TypeError, ValueError, OverflowError, RuntimeError):  # RuntimeError: a torch tensor of several numbers
         voltage = math.nan
     if voltage != voltage:
-        raise ValueError(f"an action must be one voltage [V] and not NaN, but got {action!r}")
+        raise ValueError(f"an action must be one voltage [V] and not NaN, but got {shown(action)}")
     return voltage

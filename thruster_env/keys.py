@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from thruster_env.checks import options as checked_options
+from thruster_env.checks import seed as checked_seed
 from thruster_env.checks import shown
 from thruster_env.streams import draw_keys
 
@@ -29,23 +31,32 @@ class EpisodeKeys:
         self._used = np.full(count, KEYS_AHEAD)
 
     @property
+    def count(self) -> int:
+        """Number of copies."""
+        return len(self._generators)
+
+    @property
     def seeded(self) -> bool:
         """Whether the copies have generators."""
-        return self._generators[0] is not None
+        return all(generator is not None for generator in self._generators)
 
     def seed(self, seed: int | list[int | None] | None, mask: np.ndarray) -> None:
         """Give copy i of those in the mask a generator from seed + i, or seed[i]; None keeps the one it has."""
-        count = len(self._generators)
-        if seed is None or isinstance(seed, (int, np.integer)):
-            seeds = [None if seed is None else int(seed) + i for i in range(count)]
-        elif len(seed) == count:
-            seeds = list(seed)
-        else:
-            raise ValueError(f"seed must be None, a number or {count} of these, but got {shown(seed)}")
+        seeds = self.seeds(seed)
         for i in np.flatnonzero(mask):
             if seeds[i] is not None or self._generators[i] is None:
                 self._generators[i] = self._make_generator(seeds[i])
                 self._used[i] = KEYS_AHEAD
+
+    def seeds(self, seed) -> list[int | None]:
+        """The seed of each copy; ValueError unless a reset's seed is None, a number, or one of these a copy."""
+        count = self.count
+        if isinstance(seed, (list, tuple, np.ndarray)) and np.ndim(seed) == 1:
+            if len(seed) != count:
+                raise ValueError(f"seed must be None, a number or {count} of these, but got {shown(seed)}")
+            return [checked_seed(entry) for entry in seed]
+        first = checked_seed(seed)
+        return [None if first is None else first + i for i in range(count)]
 
     def draw(self, which: np.ndarray) -> np.ndarray:
         """The next key (len(which), 2) of some copies."""
@@ -55,3 +66,19 @@ class EpisodeKeys:
         keys = self._ahead[which, self._used[which]]
         self._used[which] += 1
         return keys
+
+
+def reset_mask(options: Mapping | None, keys: EpisodeKeys) -> np.ndarray | None:
+    """The copies that a reset's options begin anew, (count,) of booleans; None for all.
+
+    Raises ValueError for other options, and for a mask that leaves out copies that have never been reset.
+    """
+    mask, count = checked_options(options).get("reset_mask"), keys.count
+    if mask is None:
+        return None
+    given = np.asarray(mask) if np.ndim(mask) == 1 else np.empty(0)
+    if given.shape != (count,) or given.dtype != np.bool_ or not given.any():
+        raise ValueError(f"reset_mask must be {count} booleans, at least one of them true, but got {shown(mask)}")
+    if not keys.seeded and not given.all():
+        raise ValueError(f"reset_mask must have all copies at the first reset, but got {shown(mask)}")
+    return given.copy()

@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.checks import finite, one_of, positive, within
+from thruster_env.checks import between, one_of, positive, within
 from thruster_env.dynamics import Constants
 
+LARGEST = 1e12  # of a parameter, and one over it the smallest positive one: floating point overflows far beyond
 ANGLES = ("as-printed", "rotor-plane", "shaft-axis")
 
 
@@ -52,13 +53,13 @@ def checked(parameters: ThrusterParameters) -> ThrusterParameters:
         if name == "angles":
             values[name] = one_of("angles", value, ANGLES)
         elif name in ("drag_coefficient", "load_gain", "momentum_drag"):
-            values[name] = positive(name, value, zero_allowed=True)
+            values[name] = within(name, positive(name, value, zero_allowed=True), LARGEST)
         elif name == "blade_angle":
-            values[name] = finite(name, value)
+            values[name] = within(name, value, LARGEST)
         elif name == "thrust_asymmetry":
             values[name] = within(name, value, 0.9)
         else:
-            values[name] = positive(name, value)
+            values[name] = between(name, positive(name, value), 1.0 / LARGEST, LARGEST)
     return ThrusterParameters(**values)
 
 

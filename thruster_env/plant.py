@@ -9,7 +9,7 @@ import numpy as np
 
 from thruster_env.amplifier import AMPLIFIER_EFFECTS
 from thruster_env.analysis import LinearModel
-from thruster_env.checks import at_least, covariance, finite, one_of, positive, shown, vector
+from thruster_env.checks import at_least, between, covariance, finite, one_of, positive, shown, vector, within
 from thruster_env.dynamics import Constants
 from thruster_env.effects import Effect
 from thruster_env.flow import FLOW_SIGNALS
@@ -24,6 +24,11 @@ DEFAULT_MAX_VOLTAGE = 24.0  # [V]
 # 1.15 rad/s and 0.035 m/s at 12 V); v is 0.5 N, 4 % of the thrust at 12 V, 16 % at 6 V and 65 % at 3 V.
 DEFAULT_PROCESS_NOISE = (1.0, 4e-4)  # variances a step, [(rad/s)^2, (m/s)^2]
 DEFAULT_MEASUREMENT_NOISE = CHANNELS["thrust"][1]  # variance, [N^2]
+# Beyond these limits there is no ship, and floating point may overflow.
+SAMPLE_TIMES = (1e-9, 10.0)  # [s]
+VOLTAGES = (1e-3, 1e6)  # [V]
+FASTEST_FLOW = 1e3  # [m/s]
+LARGEST_STATE = 1e50  # [rad/s], [m/s]; its square of a variance
 DEFAULT_INITIAL_VARIANCES = (1.0, 0.01)  # about rest, [(rad/s)^2, (m/s)^2]
 
 
@@ -99,8 +104,9 @@ def make_plant(
         ValueError: states the rule and the value.
     """
     parameters = preset_parameters(preset)
-    dt, max_voltage = positive("dt", dt), positive("max_voltage", max_voltage)
-    ambient_velocity = finite("ambient_velocity", ambient_velocity)
+    dt = between("dt", positive("dt", dt), *SAMPLE_TIMES, "s")
+    max_voltage = between("max_voltage", positive("max_voltage", max_voltage), *VOLTAGES, "V")
+    ambient_velocity = within("ambient_velocity", ambient_velocity, FASTEST_FLOW)
     mean, cov = _initial_distribution(initial_state, parameters, ambient_velocity)
     sensors = _sensors(sensors)
     if "current" in sensors and parameters.load_gain == 0:
@@ -115,15 +121,15 @@ def make_plant(
     if substeps is None:
         substeps = max(required_substeps(corner, dt, max_voltage, u_0) for corner in corners for u_0 in flows)
     else:
-        substeps = at_least("substeps", substeps, 1)
+        substeps = at_least("substeps", substeps, 1, 10_000)
     return Plant(
         parameters,
         dt,
         max_voltage,
         ambient_velocity,
         substeps,
-        covariance("process_noise_cov", process_noise_cov, 2),
-        covariance("measurement_noise_cov", measurement_noise_cov, len(sensors)),
+        covariance("process_noise_cov", process_noise_cov, 2, largest=LARGEST_STATE**2),
+        covariance("measurement_noise_cov", measurement_noise_cov, len(sensors), largest=LARGEST_STATE**2),
         mean,
         cov,
         sensors,
@@ -155,14 +161,22 @@ def _initial_distribution(initial_state, parameters, ambient_velocity) -> tuple[
     if initial_state is None:
         return np.zeros(2), np.diag(DEFAULT_INITIAL_VARIANCES)
     if not isinstance(initial_state, Mapping):
-        return vector("initial_state", initial_state, 2), np.zeros((2, 2))
+        return state("initial_state", initial_state), np.zeros((2, 2))
     if set(initial_state) == {"voltage"}:
         voltage = finite("the voltage of initial_state", initial_state["voltage"])
         return np.array(steady_state(parameters, voltage, ambient_velocity)[:2]), np.zeros((2, 2))
     if set(initial_state) == {"mean", "cov"}:
-        mean = vector("the mean of initial_state", initial_state["mean"], 2)
-        return mean, covariance("the cov of initial_state", initial_state["cov"], 2)
+        mean = state("the mean of initial_state", initial_state["mean"])
+        return mean, covariance("the cov of initial_state", initial_state["cov"], 2, largest=LARGEST_STATE**2)
     raise ValueError(
         "initial_state must be None, two numbers, {'voltage': V} or {'mean': [..], 'cov': [..]}, "
-        f"but got {initial_state!r}"
+        f"but got {shown(initial_state)}"
     )
+
+
+def state(name: str, value) -> np.ndarray:
+    """Return a state (2,); raise ValueError unless it is two numbers from which finite ones can follow."""
+    given = vector(name, value, 2)
+    if np.abs(given).max() > LARGEST_STATE:
+        raise ValueError(f"{name} must be within plus and minus {LARGEST_STATE:g}, but got {shown(value)}")
+    return given

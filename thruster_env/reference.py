@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thruster_env.checks import finite, positive, vector
+from thruster_env.checks import finite, positive, shown, vector
 from thruster_env.compiled import inlined
-from thruster_env.effects import Effect, Registry, Surroundings, set_field
+from thruster_env.effects import LONGEST, Effect, Registry, Surroundings, set_field
 from thruster_env.memory import KEY_0, KEY_1, SAMPLE_TIME, STEP
 from thruster_env.recorded import RecordedSeries, recorded_value
 from thruster_env.streams import REFERENCE_SIGNAL, normal_block, uniform_block
@@ -128,6 +128,13 @@ class Constant(Effect):
         return [self.level * around.thrust_scale if self.thrust is None else self.thrust]
 
 
+def held_time(name: str, value) -> float:
+    """Return a time for which a level is held [s]; raise ValueError unless it is positive and at most LONGEST."""
+    if (time := positive(name, value)) > LONGEST:
+        raise ValueError(f"{name} must be at most {LONGEST:g} s, but got {shown(value)}")
+    return time
+
+
 @dataclass(frozen=True)
 class _Levels(Effect):
     """Levels between `low` and `high` [T_max], a new one every `hold_time` [s]."""
@@ -143,7 +150,7 @@ class _Levels(Effect):
             raise ValueError(f"low must be at most high, but got {self.low!r} and {self.high!r}")
         set_field(self, "low", low)
         set_field(self, "high", high)
-        set_field(self, "hold_time", positive("hold_time", self.hold_time))
+        set_field(self, "hold_time", held_time("hold_time", self.hold_time))
 
     def parameters(self, around: Surroundings) -> list[float]:
         """Lowest and highest level [N], steps between two levels."""

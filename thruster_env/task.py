@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 
 from thruster_env.analysis import equilibrium
-from thruster_env.checks import positive
+from thruster_env.checks import positive, within
 from thruster_env.effects import Effect
 from thruster_env.linear import state_range, steady_state
 from thruster_env.plant import Plant
 from thruster_env.reference import REFERENCE_SIGNALS
 
 DEFAULT_WEIGHTS = (1.0, 0.0, 0.01)  # tracking, energy, voltage rate
+LARGEST_WEIGHT = 1e9
 ABSURD = 100.0  # a state this many times its range away from rest ends the episode
 
 
@@ -31,6 +32,9 @@ def make_task(reference, tracking_weight: float, energy_weight: float, voltage_r
     """Make a task from plain arguments; raises ValueError that states the rule and the value."""
     weights = {"tracking": tracking_weight, "energy": energy_weight, "voltage_rate": voltage_rate_weight}
     checked = (positive(f"{name}_weight", value, zero_allowed=True) for name, value in weights.items())
+    checked = [
+        within(f"{name}_weight", value, LARGEST_WEIGHT) for name, value in zip(weights, checked, strict=True)
+    ]
     return Task(REFERENCE_SIGNALS.make(reference), tuple(checked))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from thruster_env.checks import positive
 from thruster_env.env import BowThrusterEnv
 from thruster_env.linear_plant import PUBLISHED_NOISE, make_linear_plant
 from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE
@@ -83,7 +82,7 @@ class BowThrusterLinearEnv(BowThrusterEnv):
         """Build the plant; see the class for the arguments."""
         plant = make_linear_plant(
             system,
-            dt=positive("dt", dt),
+            dt=dt,
             max_voltage=max_voltage,
             ambient_velocity=ambient_velocity,
             process_noise_cov=process_noise_cov,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import gymnasium as gym
@@ -11,11 +12,13 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from thruster_env.batch import Copies
-from thruster_env.checks import at_least, shown
+from thruster_env.checks import as_floats, at_least, shown
 from thruster_env.env import BowThrusterEnv
-from thruster_env.keys import EpisodeKeys
+from thruster_env.keys import EpisodeKeys, reset_mask
 from thruster_env.memory import AMBIENT, READINGS, REFERENCE, REWARD, TERMINATED, THRUST, TIME, VALID
 from thruster_env.tasks import BowThrusterLinearEnv, BowThrusterReversalEnv, BowThrusterTrackingEnv
+
+MOST_ENVS = 1_000_000  # of some kilobytes each
 
 
 class BowThrusterVectorEnv(gym.vector.VectorEnv):
@@ -45,7 +48,7 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
         **arguments,
     ):
         """Build one env, for its plant and spaces, and the memory of all copies."""
-        self.num_envs = at_least("num_envs", num_envs, 1)
+        self.num_envs = at_least("num_envs", num_envs, 1, MOST_ENVS)
         self._mode = _autoreset_mode(autoreset_mode)
         if arguments.get("render_mode") is not None:
             raise ValueError(f"render_mode must be None in number, but got {arguments['render_mode']!r}")
@@ -62,6 +65,10 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
         self._keys = EpisodeKeys(self.num_envs)
         self._done = np.zeros(self.num_envs, dtype=bool)
 
+    def __copy__(self) -> BowThrusterVectorEnv:
+        """A deep copy: two envs with one memory would move one another."""
+        return copy.deepcopy(self)
+
     @property
     def bytes_per_copy(self) -> int:
         """Memory that one copy takes while it is stepped [bytes]; its generator and next keys come on top."""
@@ -72,10 +79,11 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
 
         `options={"state": [omega_m, U_a]}` fixes the initial state of these episodes.
         """
-        if isinstance(seed, int):
-            self._np_random, self._np_random_seed = np_random(seed)
-        mask = _reset_mask(options, self.num_envs)
         numbers = self._copies.numbers_from(options)
+        mask = reset_mask(options, self._keys)
+        self._keys.seeds(seed)  # a wrong one changes nothing
+        if isinstance(seed, (int, np.integer)):
+            self._np_random, self._np_random_seed = np_random(int(seed))
         self._keys.seed(seed, np.ones(self.num_envs, dtype=bool) if mask is None else mask)
         report = self._copies.report()
         which = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
@@ -121,8 +129,8 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
 
     def _voltages(self, actions) -> np.ndarray:
         try:
-            voltages = np.asarray(actions, dtype=np.float64)
-        except (TypeError, ValueError):
+            voltages = as_floats(actions)
+        except ValueError:
             voltages = np.empty(0)
         if voltages.shape not in ((self.num_envs,), (self.num_envs, 1)):
             raise ValueError(f"actions must be {self.num_envs} voltages [V], but got {shown(actions)}")
@@ -183,13 +191,3 @@ def _autoreset_mode(given) -> AutoresetMode:
     except ValueError:
         names = ", ".join(repr(mode.value) for mode in AutoresetMode)
         raise ValueError(f"autoreset_mode must be one of {names}, but got {given!r}") from None
-
-
-def _reset_mask(options: dict | None, count: int) -> np.ndarray | None:
-    mask = None if options is None else options.get("reset_mask")
-    if mask is None:
-        return None
-    mask = np.asarray(mask)
-    if mask.shape != (count,) or mask.dtype != np.bool_ or not mask.any():
-        raise ValueError(f"reset_mask must be {count} booleans, at least one of them true, but got {shown(mask)}")
-    return mask.copy()

@@ -17,6 +17,8 @@ from training.arms import find_arm
 from tuning.scenario import Scenario, plain
 
 VERSION = 1
+MOST_ENVS = 100_000  # whose experience, of 100 steps each, takes a gigabyte
+MOST_STEPS = 10**12
 
 
 class Task(NamedTuple):
@@ -120,9 +122,9 @@ def make_setup(
         env_id=chosen.env_id,
         env_arguments={**scenario.plant_arguments, **chosen.arguments},
         filter_arguments=given,
-        steps=at_least("steps", algorithm.steps if steps is None else steps, 1),
+        steps=at_least("steps", algorithm.steps if steps is None else steps, 1, MOST_STEPS),
         seed=at_least("seed", seed, 0),
-        num_envs=at_least("num_envs", algorithm.num_envs if num_envs is None else num_envs, 1),
+        num_envs=at_least("num_envs", algorithm.num_envs if num_envs is None else num_envs, 1, MOST_ENVS),
         hyperparameters={**algorithm.hyperparameters, **(hyperparameters or {})},
     )
 
@@ -167,5 +169,5 @@ def setup_from_json(text: str, name: str) -> Setup:
         if version > VERSION:
             raise ValueError(f"{name} must be of version {VERSION} or before, but is of version {version}")
         return Setup(**entries)
-    except (json.JSONDecodeError, TypeError, KeyError, AttributeError):
+    except (json.JSONDecodeError, TypeError, KeyError, AttributeError, RecursionError):
         raise ValueError(f"{name} must hold the setup of a policy, but got {shown(text)}") from None

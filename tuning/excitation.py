@@ -14,7 +14,7 @@ import numpy as np
 from thruster_env.batch import Copies
 from thruster_env.checks import at_least, finite, positive, vector
 from thruster_env.control import PIController
-from thruster_env.effects import Effect, Registry, set_field
+from thruster_env.effects import LONGEST, Effect, Registry, set_field
 from thruster_env.gains import lambda_gains
 from thruster_env.memory import NEXT_REFERENCE, READINGS
 from thruster_env.operating import operating_points
@@ -46,7 +46,7 @@ class Steps(Excitation):
     def __post_init__(self):
         """Check the arguments."""
         set_field(self, "amplitude", positive("amplitude", self.amplitude, zero_allowed=True))
-        set_field(self, "hold", at_least("hold", self.hold, 1))
+        set_field(self, "hold", at_least("hold", self.hold, 1, LONGEST))
 
     def voltages(self, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
         """Voltages (B, steps) [V]."""
@@ -104,8 +104,8 @@ class Dwells(Excitation):
     def __post_init__(self):
         """Check the arguments."""
         set_field(self, "amplitude", positive("amplitude", self.amplitude, zero_allowed=True))
-        set_field(self, "ramp", at_least("ramp", self.ramp, 1))
-        set_field(self, "dwell", at_least("dwell", self.dwell, 0))
+        set_field(self, "ramp", at_least("ramp", self.ramp, 1, LONGEST))
+        set_field(self, "dwell", at_least("dwell", self.dwell, 0, LONGEST))
         set_field(self, "zeros", probability("zeros", self.zeros))
 
     def voltages(self, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:

@@ -25,6 +25,8 @@ from thruster_env.simulation import simulate
 from thruster_env.streams import episode_keys, filter_keys
 from tuning.excitation import EXCITATIONS, Excitation, Steps
 
+DEEPEST = 10  # levels of mappings and lists in a scenario
+MOST_STEPS = 1_000_000
 FIRST_SCORED_STEP = 50  # RMSE counts steps 50 to 500; start-up is reported apart
 UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as part of each state's range
 
@@ -113,7 +115,7 @@ class Scenario:
             "process_noise_cov": vector("process_noise_cov", self.process_noise_cov, 2).tolist(),
             "measurement_noise_cov": positive("measurement_noise_cov", self.measurement_noise_cov),
             "scale": scale.tolist(),
-            "steps": at_least("steps", self.steps, FIRST_SCORED_STEP + 1),
+            "steps": at_least("steps", self.steps, FIRST_SCORED_STEP + 1, MOST_STEPS),
             "first_scored_step": at_least("first_scored_step", self.first_scored_step, 0),
         }
         if checked["first_scored_step"] >= checked["steps"]:
@@ -123,6 +125,15 @@ class Scenario:
             )
         for entry in fields(self):
             object.__setattr__(self, entry.name, frozen(checked.get(entry.name, getattr(self, entry.name))))
+
+    def __getstate__(self) -> dict:
+        """The fields as dictionaries and lists, for copies and pickles: a mapping that cannot change has none."""
+        return {entry.name: plain(getattr(self, entry.name)) for entry in fields(self)}
+
+    def __setstate__(self, state: dict) -> None:
+        """The fields, so that they cannot be changed again."""
+        for name, value in state.items():
+            object.__setattr__(self, name, frozen(value))
 
     @property
     def plant_arguments(self) -> dict:
@@ -223,11 +234,13 @@ def _range(plant: Plant) -> np.ndarray:
     return np.abs(np.subtract(*ends))[:2]
 
 
-def frozen(value):
-    """A value of mappings and lists as one that cannot be changed."""
+def frozen(value, depth: int = 0):
+    """A value of mappings and lists as one that cannot be changed; ValueError if it is nested without end."""
+    if depth > DEEPEST:
+        raise ValueError(f"mappings and lists must be nested at most {DEEPEST} deep, but got {shown(value)}")
     if isinstance(value, Mapping):
-        return MappingProxyType({key: frozen(part) for key, part in value.items()})
-    return tuple(frozen(part) for part in value) if isinstance(value, list | tuple) else value
+        return MappingProxyType({key: frozen(part, depth + 1) for key, part in value.items()})
+    return tuple(frozen(part, depth + 1) for part in value) if isinstance(value, list | tuple) else value
 
 
 def plain(value):

@@ -38,7 +38,7 @@ def read_scenario(path: str | Path, find_base: Callable[[str], Scenario]) -> Sce
         content = tomllib.loads(Path(path).read_text())
     except OSError as error:
         raise ValueError(f"a scenario file must be readable, but {path} is not: {error.strerror}") from None
-    except ValueError as error:  # not TOML, or not even text
+    except (ValueError, RecursionError) as error:  # not TOML, nested too deeply, or not even text
         raise ValueError(f"a scenario file must be TOML, but {path} is not: {error}") from None
     unknown = sorted(set(content) - set(KEYS))
     if unknown:

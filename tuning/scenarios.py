@@ -21,6 +21,7 @@ __all__ = [
     "training_seeds",
 ]
 
+MOST_SEEDS = 20_000  # 500 steps of so many take a gigabyte
 SEEDS_APART = 1_000_000  # training seeds of study seed s start at s times this, held-out seeds half-way on
 
 
@@ -41,10 +42,10 @@ def find_scenario(name: str) -> Scenario:
 def training_seeds(seed: int, count: int) -> range:
     """Seeds that a study with a given seed learns from."""
     first = at_least("seed", seed, 0) * SEEDS_APART
-    return range(first, first + at_least("the number of training seeds", count, 2))
+    return range(first, first + at_least("the number of training seeds", count, 2, MOST_SEEDS))
 
 
 def held_out_seeds(seed: int, count: int) -> range:
     """Seeds that a study with a given seed never sees."""
     first = at_least("seed", seed, 0) * SEEDS_APART + SEEDS_APART // 2
-    return range(first, first + at_least("the number of held-out seeds", count, 2))
+    return range(first, first + at_least("the number of held-out seeds", count, 2, MOST_SEEDS))

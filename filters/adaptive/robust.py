@@ -17,6 +17,8 @@ from thruster_env.checks import at_least, positive
 from thruster_env.compiled import inlined
 from thruster_env.components import matrix_of, matrix_reader, vector_reader, written_out
 
+MOST_ITERATIONS = 1000
+
 
 @lru_cache(maxsize=64)
 def robust_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form) -> Kernels:
@@ -101,7 +103,7 @@ class RobustExtendedKalmanFilter(Filter):
     def __post_init__(self):
         """Check the numbers; raise ValueError that states the rule and the value."""
         object.__setattr__(self, "degrees_of_freedom", positive("degrees_of_freedom", self.degrees_of_freedom))
-        object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1))
+        object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1, MOST_ITERATIONS))
 
     @property
     def own_numbers(self) -> tuple[float, ...]:

@@ -20,6 +20,8 @@ from thruster_env.checks import at_least, positive
 from thruster_env.compiled import inlined
 from thruster_env.components import matrix_reader, matrix_writer, vector_reader
 
+MOST_ITERATIONS = 1000
+
 
 @lru_cache(maxsize=64)
 def variational_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form) -> Kernels:
@@ -109,7 +111,7 @@ class VariationalBayesFilter(Filter):
         factor = part_that_is_kept("forgetting_factor", self.forgetting_factor)
         object.__setattr__(self, "forgetting_factor", factor)
         object.__setattr__(self, "prior_weight", positive("prior_weight", self.prior_weight))
-        object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1))
+        object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1, MOST_ITERATIONS))
 
     @property
     def own_numbers(self) -> tuple[float, ...]:

@@ -17,6 +17,8 @@ from thruster_env.checks import at_least
 from thruster_env.compiled import inlined
 from thruster_env.components import column_writer, tuple_of, vector_reader, written_out
 
+MOST_ITERATIONS = 1000
+
 
 @cache
 def transform_undone(n: int, m: int) -> Callable:
@@ -122,7 +124,7 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     def __post_init__(self):
         """Check the numbers; raise ValueError that states the rule and the value."""
         super().__post_init__()
-        object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1))
+        object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1, MOST_ITERATIONS))
 
     @property
     def own_numbers(self) -> tuple[float, ...]:

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from filters.derivatives import jacobian
+from filters.made import makes_functions
 from filters.model import StateSpaceModel
 from thruster_env.checks import covariance, vector
 from thruster_env.components import tuple_of, written_out
 
 
-@cache
+@makes_functions
 def affine_functions(n: int, m: int, p: int) -> dict[str, Callable]:
     """Functions of an affine model whose constants c are, by rows and in this order, A, B, a, C, d."""
     places = iter(range(n * (n + p + 1) + m * (n + 1)))

@@ -22,7 +22,7 @@ from thruster_env.checks import at_least
 from thruster_env.compiled import inlined
 from thruster_env.components import matrix_reader, scaled_sum, tuple_of, vector_reader, written_out
 
-FEWEST_PARTS = 7
+FEWEST_PARTS, MOST_PARTS = 7, 1000
 REACH = 4.5  # of the outermost parts, in standard deviations of the split component
 OVERLAP = 0.6  # standard deviation of a part, over the distance from one to the next
 
@@ -146,7 +146,7 @@ class GaussianSumFilter(Filter):
 
     def __post_init__(self):
         """Check the numbers; raise ValueError that states the rule and the value."""
-        object.__setattr__(self, "parts", at_least("parts", self.parts, FEWEST_PARTS))
+        object.__setattr__(self, "parts", at_least("parts", self.parts, FEWEST_PARTS, MOST_PARTS))
         object.__setattr__(self, "component", place_of("component", self.component, self.model.n))
 
     @cached_property

@@ -93,9 +93,7 @@ class IteratedExtendedKalmanFilter(Filter):
 
     def __post_init__(self):
         """Check the number of iterations."""
-        iterations = at_least("iterations", self.iterations, 1)
-        if iterations > MOST_ITERATIONS:
-            raise ValueError(f"iterations must be at most {MOST_ITERATIONS}, but got {iterations}")
+        iterations = at_least("iterations", self.iterations, 1, MOST_ITERATIONS)
         object.__setattr__(self, "iterations", iterations)
 
     def kernels(self) -> Kernels:

@@ -17,6 +17,7 @@ from filters.gaussian.schedule import scheduled_kernels
 from filters.gaussian.square_root import square_root_kernels
 from thruster_env.checks import at_least, covariance, one_of
 
+MOST_POINTS = 200  # of a schedule; the source is written out for them
 FORMS = {
     "covariance": extended_kernels,
     "information": information_kernels,
@@ -78,7 +79,7 @@ class KalmanFilter(AffineFilter):
         """Check the model, the form and the schedule."""
         super().__post_init__()
         one_of("form", self.form, tuple(FORMS))
-        object.__setattr__(self, "schedule", at_least("schedule", self.schedule, 1))
+        object.__setattr__(self, "schedule", at_least("schedule", self.schedule, 1, MOST_POINTS))
         if self.form == "information":
             covariance("prior_cov", self.model.prior_cov, self.model.n, positive_definite=True)
         if self.schedule > 1 and (self.model.operating_points is None or self.form != "covariance"):

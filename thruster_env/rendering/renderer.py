@@ -11,6 +11,15 @@ from thruster_env.checks import one_of, positive
 from thruster_env.rendering.history import ABSURD, History, Moment, Overlay
 
 MODES = ("human", "rgb_array")
+# What a renderer keeps of an episode.
+REMEMBERED = (
+    "_history",
+    "_angle",
+    "_angle_of_frame",
+    "_angle_of_last_frame",
+    "_count_of_frame",
+    "_omega_m",
+)
 
 
 class Renderer:
@@ -46,6 +55,17 @@ class Renderer:
             ValueError: for a mode that is not one of the two, or a number that is not positive.
             DependencyNotInstalled: if pygame is missing.
         """
+        self._made_with = {
+            "mode": mode,
+            "gear_ratio": gear_ratio,
+            "diameter": diameter,
+            "max_voltage": max_voltage,
+            "thrust_scale": thrust_scale,
+            "speed_scale": speed_scale,
+            "flow_scale": flow_scale,
+            "dt": dt,
+            "frames_per_second": frames_per_second,
+        }
         self.mode = one_of("mode", mode, MODES)
         self._dt = positive("dt", dt)
         self._gear_ratio = positive("gear_ratio", gear_ratio)
@@ -84,6 +104,16 @@ class Renderer:
         self._window = Window(frame_time) if mode == "human" else None
         self._history = History()
         self.begin()
+
+    def __getstate__(self) -> tuple[dict, dict]:
+        """Its arguments and what it remembers; pygame's surfaces cannot be copied."""
+        return self._made_with, {name: getattr(self, name) for name in REMEMBERED}
+
+    def __setstate__(self, state: tuple[dict, dict]) -> None:
+        """Make the pictures anew, for what was remembered."""
+        made_with, remembered = state
+        self.__init__(**made_with)
+        vars(self).update(remembered)
 
     @property
     def blade_angle(self) -> float:
