@@ -23,7 +23,7 @@ from tuning.storage import PROCESS, retry_orphans, this_process
 from tuning.trials import cost_of, make_pruner, measure, run_trial
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
-BEST = "best trial"  # attribute of a study: number of its best trial, for programs that know no constraints
+BEST = "best trial under the constraints"  # attribute of a study, for programs that know no constraints
 OnTrial = Callable[[optuna.Study, int], None]
 
 
