@@ -81,13 +81,12 @@ def kill_comparison(rng: np.random.Generator, kills: int, seconds: float) -> str
         command = [sys.executable, "-m", "thruster_cli.main", "study", "policies", "--quick", "--seeds", "1"]
         command += ["--steps", "4096", "--jobs", "2", "--out", str(found), "--json", str(found / "result.json")]
         while done < kills and time.monotonic() < deadline:
-            wait = float(rng.uniform(3.0, 12.0))  # the first seconds are Python's, for imports
+            news, delay = int(rng.integers(0, 5)), float(rng.uniform(0.0, 1.0))
             process = _start(command)
-            try:
-                process.wait(wait)
-            except subprocess.TimeoutExpired:
-                process.kill()
-            code, moment = process.wait(), f"kill {done + 1}, after {wait:.3f} s"
+            _wait_for_news(process, found, news)
+            time.sleep(delay)
+            process.kill()
+            code, moment = process.wait(), f"kill {done + 1}, {delay:.4f} s after {news} new files"
             _wait_for_end_of(process.pid, moment)
             if code == 0:
                 break
@@ -117,6 +116,17 @@ def _start(command: list[str]) -> subprocess.Popen:
     """A process in a session of its own."""
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     return subprocess.Popen(command, start_new_session=True, **quiet)
+
+
+def _wait_for_news(process: subprocess.Popen, folder: Path, count: int) -> None:
+    """Wait until there are so many results and checkpoints more, or a process has ended."""
+
+    def there() -> set[Path]:
+        return {*folder.glob("runs/*.json"), *folder.glob("runs/*/checkpoints/[0-9]*")}
+
+    before = there()
+    while len(there() - before) < count and process.poll() is None:
+        time.sleep(0.01)
 
 
 def _wait_for_end_of(session: int, moment: str) -> None:
