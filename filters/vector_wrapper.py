@@ -59,7 +59,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         shape = (length + self._appended,)
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, shape=shape, dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self._mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+        self.autoreset_mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         self._beliefs = Beliefs(self.filter, self.num_envs)
         self._keys = EpisodeKeys(self.num_envs, filter_generator)
         self._held = np.zeros((self.num_envs, self._m))
@@ -88,10 +88,10 @@ class EstimateStates(gym.vector.VectorWrapper):
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         z = self._measurements(observations, info)
         done = terminated | truncated
-        if self._mode == AutoresetMode.SAME_STEP and done.any():
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and done.any():
             self._end(u, z, done, info)
             self._start(done, z)
-        elif self._mode == AutoresetMode.NEXT_STEP and self._done.any():
+        elif self.autoreset_mode == AutoresetMode.NEXT_STEP and self._done.any():
             self._beliefs.step(u, z, idle=self._done)
             self._start(self._done, z)
         else:

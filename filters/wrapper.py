@@ -128,7 +128,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         info["estimate_cov"] = cov
         info["innovation"] = session.innovation.copy()
         info["innovation_cov"] = session.innovation_cov.copy()
-        info["estimate_divergences"] = session.divergences
+        info["estimate_divergences"] = np.int64(session.divergences)  # clients may ask for a dtype
         if self._form == "estimate" and not self._appended:
             return mean.astype(FLOAT32)
         parts = [mean]

@@ -8,12 +8,13 @@ import numpy as np
 import optuna
 import pytest
 from optuna.trial import TrialState
+from rich.progress import Progress
 
 from filters.registry import FILTERS
 from thruster_cli.main import main
-from tuning import trials
+from tuning import trials as tuning_trials
 from tuning.cost import BUDGET, COST, microseconds_a_step, over_budget
-from tuning.followers import HEIR, SMALLER, _ends_a_round
+from tuning.followers import HEIR, SMALLER, TWIN, UNTUNED, _ends_a_round
 from tuning.kinds import kinds_tried, trials_of_kind
 from tuning.outcome import best_trial, is_over_budget, violation
 from tuning.plan import Plan
@@ -45,7 +46,9 @@ def quiet():
 def priced(monkeypatch):
     """Few kinds, and costs that do not depend on the machine."""
     monkeypatch.setattr("tuning.plan.AUTO_KINDS", FEW)
-    monkeypatch.setattr(trials, "microseconds_a_step", lambda filter_, data: COSTS[filter_.name](filter_.size))
+    monkeypatch.setattr(
+        tuning_trials, "microseconds_a_step", lambda filter_, data: COSTS[filter_.name](filter_.size)
+    )
 
 
 def studied(plan, count):
@@ -75,10 +78,22 @@ def test_numbers_of_a_kind_are_chosen_for_that_kind_alone_and_noise_for_all(pric
         assert (f"{kind} N" in own) == (kind in ("enkf", "pf"))
 
 
-def test_a_study_of_kinds_begins_with_the_untuned_filter_of_each(priced):
-    result = studied(PLAN, len(FEW))
-    found = [choice_of("auto", trial.params, MISMATCH) for trial in result.trials[: len(FEW)]]
+def test_each_kind_is_tried_untuned_and_then_rescaled_before_the_next_one_is_begun(priced):
+    trials = studied(PLAN, 12).trials
+    untuned = [trial for trial in trials if UNTUNED in trial.user_attrs]
+    found = [choice_of("auto", trial.params, MISMATCH) for trial in untuned]
     assert found == [untuned_choice(kind, MISMATCH) for kind in FEW]
+    kinds = [trial.params[KIND] for trial in trials[: untuned[-1].number]]
+    assert kinds == sorted(kinds, key=FEW.index) and kinds.count("ekf") == 2  # the rescaled one is the other
+    assert trials[1].user_attrs[TWIN] == 1
+
+
+def test_kinds_that_were_not_begun_are_begun_by_whoever_goes_on(priced):
+    storage = optuna.storages.InMemoryStorage()
+    for count in range(1, 9):
+        trials = run_study(open_study("s", PLAN, storage), PLAN, count).trials
+    assert [trial.user_attrs[UNTUNED] for trial in trials if UNTUNED in trial.user_attrs] == list(FEW)
+    assert TWIN in trials[1].user_attrs
 
 
 def test_what_is_over_the_budget_ends_at_once_and_never_wins(priced):
@@ -188,8 +203,12 @@ def test_the_command_says_which_filters_it_tried_and_reports_on_the_winner(price
         assert not stop.value.code
         return capsys.readouterr().out
 
+    shown = []
+    monkeypatch.setattr(Progress, "update", lambda *given, **named: shown.append(named))
     tune = ("tune", "--filter", "auto", "--budget", "1", "--trials", "12")
     said = run(*tune)
+    titles = [named["description"] for named in shown if "description" in named]
+    assert len(titles) == 12 and {f"tuning auto ({kind}) on mismatch" for kind in FEW} == set(titles)
     assert "Filters that were tried" in said and "the budget is 1." in said
     name = "auto-mismatch-seed0-budget1"
     content = json.loads((tmp_path / "out" / f"{name}.json").read_text())

@@ -88,7 +88,7 @@ def test_results_have_the_types_of_the_interface():
         assert set(told) == INFO
         assert told["state"].shape == (2,) and told["state"].dtype == np.float64
         assert told["measurement"].shape == (1,) and told["measurement"].dtype == np.float64
-        assert all(type(told[key]) is float for key in ("thrust", "reference", "time"))
+        assert all(type(told[key]) is np.float64 for key in ("thrust", "reference", "time"))
         assert seen[0] == np.float32(told["measurement"][0])
     assert (type(step[1]), type(step[2]), type(step[3])) == (float, bool, bool)
 

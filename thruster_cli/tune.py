@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from thruster_env.checks import at_least, one_of
 from thruster_env.files import check_target
 from tuning.gradient import DIFFERENTIABLE, maximise_likelihood
 from tuning.identifiability import identify
+from tuning.kinds import kinds_running
 from tuning.objectives import OBJECTIVES
 from tuning.outcome import best_trial
 from tuning.plan import Plan
@@ -25,7 +26,7 @@ from tuning.proof import prove
 from tuning.samplers import SAMPLERS
 from tuning.scenarios import SCENARIOS, find_scenario
 from tuning.storage import open_storage
-from tuning.study import finished_trials, open_study, quiet_optuna, run_study, run_trials
+from tuning.study import OnTrial, finished_trials, open_study, quiet_optuna, run_study, run_trials
 from tuning.tuned import write_tuned
 from tuning.workers import run_in_workers
 
@@ -33,6 +34,7 @@ DEFAULT_STORAGE = "out/studies.journal"
 MOST_TRIALS = 1_000_000
 MOST_WORKERS = 1000
 METHODS = ("optuna", "gradient")
+NONE_CONSISTENT = 3  # exit code
 TUNED_FILTER_HELP = f"{FILTER_HELP} Or auto: the best of all within --budget."
 
 
@@ -83,7 +85,8 @@ def command(
     the study. The report is on 200 seeds that no trial saw.
 
     RMSE alone hardly tells Q and R: only their ratio matters to the estimate. So the mean NIS is held in a band
-    unless --no-consistency is given, and the report says what that costs.
+    unless --no-consistency is given, and the report says what that costs. Where no trial is in the band, the one
+    with the least error is written, the report and the file say so, and the exit code is 3.
 
     Example: thruster tune --filter ekf --scenario mismatch --scenario outliers --trials 100
 
@@ -108,6 +111,8 @@ def command(
     emit(report(tuning), as_json(tuning), json)
     if tuning.result.interrupted:
         sys.exit(130)
+    if tuning.result.consistent is False:
+        sys.exit(NONE_CONSISTENT)
 
 
 def tune(
@@ -141,15 +146,18 @@ def tune(
     already = finished_trials(study)
     if already:
         progress_console.print(f"study {name!r} goes on after {already} finished trials")
-    run = run_trials if workers == 1 else partial(run_in_workers, storage=storage, workers=workers)
-    with _bar(f"tuning {plan.filter} on {_scenarios(plan)}", trials, already) as advance:
+    with _bar(plan, trials, already) as (advance, show_kinds):
+        if workers == 1:
+            run = partial(run_trials, on_choice=lambda choice: show_kinds([choice.name]))
+        else:
+            run = partial(run_in_workers, storage=storage, workers=workers)
         result = run_study(study, plan, trials, advance, run)
     gradient = rival = None
     if by_gradient:
         with progress_console.status("maximising the likelihood ..."):
             gradient = maximise_likelihood(plan.filter, plan.scenarios[0], plan.training_data()[0])
         rival = prove(result.choice, plan.scenarios[0], plan.seed)
-        result = result._replace(choice=gradient.choice)
+        result = result._replace(choice=gradient.choice, consistent=None, nis=())
     with progress_console.status("proving the choice on held-out seeds ..."):
         proofs = tuple(prove(result.choice, scenario, plan.seed) for scenario in plan.scenarios)
     write_tuned(file, plan, result, proofs, name, METHODS[by_gradient])
@@ -172,7 +180,9 @@ def _scenarios(plan: Plan) -> str:
 
 
 @contextmanager
-def _bar(title: str, total: int, done: int) -> Iterator:
+def _bar(plan: Plan, total: int, done: int) -> Iterator[tuple[OnTrial, Callable[[Sequence[str]], None]]]:
+    """What is called after each trial, and with the kinds of filters that are under trial."""
+    title = f"tuning {{}} on {_scenarios(plan)}"
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -181,10 +191,18 @@ def _bar(title: str, total: int, done: int) -> Iterator:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=progress_console) as progress:
-        task = progress.add_task(title, total=total, completed=min(done, total), best="-")
+        shown = title.format(plan.filter)
+        task = progress.add_task(shown, total=total, completed=min(done, total), best="-")
+
+        def show_kinds(kinds: Sequence[str]) -> None:
+            if len(plan.kinds) > 1:
+                progress.update(task, description=title.format(f"{plan.filter} ({', '.join(kinds)})"))
 
         def advance(study, finished: int) -> None:
-            best = best_trial(study.get_trials(deepcopy=False))
+            trials = study.get_trials(deepcopy=False)
+            best = best_trial(trials)
             progress.update(task, completed=finished, best="-" if best is None else f"{best.values[0]:.3f}")
+            if running := kinds_running(trials):
+                show_kinds(running)
 
-        yield advance
+        yield advance, show_kinds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,13 +19,14 @@ from tuning.evaluate import Evaluation, Interval, score_ratio
 from tuning.gradient import GradientResult
 from tuning.identifiability import Identifiability, as_data, sentences
 from tuning.kinds import kinds_tried
+from tuning.objectives import NIS_BAND
 from tuning.outcome import is_over_budget
 from tuning.plan import Plan
 from tuning.proof import Comparison
 from tuning.scenarios import Scenario
 from tuning.space import size_ladder, true_choice, untuned_choice
 from tuning.study import StudyResult
-from tuning.tuned import summary
+from tuning.tuned import consistency, summary
 
 
 class Tuning(NamedTuple):
@@ -105,7 +107,9 @@ def _search_sentences(tuning: Tuning) -> list:
             f"Score over the best by ensemble size, on the training seeds: {ratios}. "
             f"N = {kept} is the smallest within 1 %."
         )
-    if result.free_value is not None:
+    if result.consistent is False:
+        shown.append(_none_consistent(result, plan))
+    elif result.free_value is not None:
         price = 100 * (result.best_value / result.free_value - 1)
         shown.append(
             f"Consistency costs {price:.1f} % of the score on the training seeds: the best trial has "
@@ -120,6 +124,15 @@ def _search_sentences(tuning: Tuning) -> list:
     if result.front:
         shown.append(front_table(plan, result.front))
     return shown
+
+
+def _none_consistent(result: StudyResult, plan: Plan) -> str:
+    ratios = [f"{ratio:.3g}" if isfinite(ratio) else "beyond all numbers" for ratio in result.nis]
+    return (
+        f"No trial was consistent: a mean NIS must lie between {NIS_BAND[0]:g} and {NIS_BAND[1]:g} of what is "
+        f"right, but the tuned filter's is {' and '.join(ratios)} on the training seeds. It is the trial with the "
+        f"least {plan.objectives[0]}; do not rely on its covariance."
+    )
 
 
 def _gradient_sentences(tuning: Tuning) -> list[str]:
@@ -166,6 +179,7 @@ def as_json(tuning: Tuning) -> dict:
         "kinds": [kind._asdict() for kind in kinds_tried(result.trials)],
         "best_training_value": result.best_value,
         "best_training_value_without_consistency": result.free_value,
+        **consistency(result),
         "interrupted": result.interrupted,
         "sizes": [{"N": r.size, "ratio": r.ratio, "score": r.evaluation.score.value} for r in result.sizes],
         "front": [{"values": trial.values, "parameters": trial.params} for trial in result.front],

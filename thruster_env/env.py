@@ -14,14 +14,18 @@ from thruster_env.checks import finite, shown
 from thruster_env.checks import seed as checked_seed
 from thruster_env.effects import Effect
 from thruster_env.memory import (
+    AMBIENT,
     COMMAND,
     KEY_0,
     KEY_1,
     NEXT_REFERENCE,
     READINGS,
+    REFERENCE,
     REPORTED,
     REWARD,
     TERMINATED,
+    THRUST,
+    TIME,
     VALID,
 )
 from thruster_env.parameters import ThrusterParameters
@@ -216,7 +220,7 @@ class BowThrusterEnv(RenderedEnv):
         report = self._report.tolist()
         if self.render_mode is not None:
             self._show(report, begin=True)
-        return self._observation(report), self._info(report)
+        return self._observation(report), self._info()
 
     def step(self, action):
         """Apply a voltage for one sample time.
@@ -228,7 +232,7 @@ class BowThrusterEnv(RenderedEnv):
         report = self._report.tolist()
         if self.render_mode is not None:
             self._show(report)
-        return self._observation(report), report[REWARD], report[TERMINATED] > 0.0, False, self._info(report)
+        return self._observation(report), report[REWARD], report[TERMINATED] > 0.0, False, self._info()
 
     def _observation(self, report: list[float]) -> np.ndarray:
         if self._single and -3e38 < report[READINGS] < 3e38:
@@ -239,18 +243,18 @@ class BowThrusterEnv(RenderedEnv):
         values = [value if abs(value) < 3e38 else -math.inf if value < 0 else math.inf for value in values]
         return np.array(values, dtype=np.float32)
 
-    def _info(self, report: list[float]) -> dict:
-        _, _, thrust, ambient, reference, _, _, time = report[:8]
+    def _info(self) -> dict:
+        report = self._report  # of which NumPy's scalars come: clients ask every value for its dtype
         info = {
             "state": self._state_view.copy(),
-            "thrust": thrust,
+            "thrust": report[THRUST],
             "measurement": self._measurement_view.copy(),
-            "reference": reference,
-            "ambient_velocity": ambient,
-            "time": time,
+            "reference": report[REFERENCE],
+            "ambient_velocity": report[AMBIENT],
+            "time": report[TIME],
         }
         if self._drops:
-            info["measurement_valid"] = np.array(report[self._valid]) > 0.0
+            info["measurement_valid"] = report[self._valid] > 0.0
         return info
 
 

@@ -49,11 +49,11 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
     ):
         """Build one env, for its plant and spaces, and the memory of all copies."""
         self.num_envs = at_least("num_envs", num_envs, 1, MOST_ENVS)
-        self._mode = _autoreset_mode(autoreset_mode)
+        self.autoreset_mode = _autoreset_mode(autoreset_mode)
         if arguments.get("render_mode") is not None:
             raise ValueError(f"render_mode must be None in number, but got {arguments['render_mode']!r}")
         env = self.single_env(**arguments)
-        self.metadata = {**env.metadata, "autoreset_mode": self._mode}
+        self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
         self.plant, self.task, self._observed = env.plant, env.task, env.observed_rows
         self.appended_entries = env.appended_entries  # of an observation, after the measurement
         self.single_action_space, self.single_observation_space = env.action_space, env.observation_space
@@ -98,13 +98,13 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
         if not self._keys.seeded:
             raise gym.error.ResetNeeded("call reset() before step()")
         report = self._copies.step(self._voltages(actions))
-        if self._mode == AutoresetMode.NEXT_STEP and self._done.any():
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP and self._done.any():
             self._restart(np.flatnonzero(self._done), report)
         terminated, truncated = report[TERMINATED] > 0.0, report[TIME] >= self._last_time
         rewards = report[REWARD]
         self._done = terminated | truncated
         ends = {}
-        if self._mode == AutoresetMode.SAME_STEP and self._done.any():
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and self._done.any():
             rewards = rewards.copy()
             ends = self._endings(report)
             self._restart(np.flatnonzero(self._done), report)
@@ -136,7 +136,7 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
             raise ValueError(f"actions must be {self.num_envs} voltages [V], but got {shown(actions)}")
         voltages = voltages.reshape(-1)
         if np.isnan(voltages).any():
-            ignored = self._done if self._mode == AutoresetMode.NEXT_STEP else False
+            ignored = self._done if self.autoreset_mode == AutoresetMode.NEXT_STEP else False
             wrong = np.flatnonzero(np.isnan(voltages) & ~np.asarray(ignored))
             if len(wrong):
                 raise ValueError(f"actions must be voltages [V] and not NaN, but got NaN in copy {wrong[0]}")

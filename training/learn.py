@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,12 +22,15 @@ from training.environments import make_environments, seed_episodes
 from training.saved import (
     BEST,
     CHECKPOINTS,
+    EVALUATIONS,
     FINAL,
     POLICY,
     SETUP,
     latest_checkpoint,
     load,
+    mend,
     read_setup,
+    remove,
     reopen,
     save,
     whole,
@@ -38,7 +41,6 @@ from tuning.scenarios import SEEDS_APART, training_seeds
 
 VALIDATION_EPISODES = 32  # of an evaluation in the course of training; always the same ones
 KEPT = 2  # checkpoints
-EVALUATIONS = "evaluations"
 OnProgress = Callable[[int, float], None]  # steps, and the mean return of the last evaluation (NaN before it)
 
 
@@ -128,6 +130,7 @@ def one_thread() -> Iterator[None]:
 
 def _start(folder: Path, setup: Setup) -> Path | None:
     """The saved policy to go on from, if any."""
+    mend(folder)
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return None
     if not (folder / SETUP).is_file():
@@ -176,13 +179,14 @@ class _Evaluation(EvalCallback):
 
     def __init__(self, setup: Setup, folder: Path, envs: VecEnv, seeds, count: int, steps: int):
         self._seeds, self._setup, self._best = seeds, setup, folder / BEST
+        self._file = folder / f"{EVALUATIONS}.npz"
         self.returns: list[float] = []
         normalised = VecNormalize(envs, training=False, norm_reward=False)
         every = max(1, setup.steps // (count * setup.num_envs))
         super().__init__(normalised, n_eval_episodes=len(seeds), eval_freq=every, log_path=str(folder), verbose=0)
-        path = folder / f"{EVALUATIONS}.npz"
-        if steps and path.is_file():
-            before = whole(path, _evaluations_in)
+        self.log_path = str(folder / f".{EVALUATIONS}")  # aside, for NumPy writes in place
+        if steps and self._file.is_file():
+            before = whole(self._file, _evaluations_in)
             kept = before["timesteps"] <= steps
             self.evaluations_timesteps = before["timesteps"][kept].tolist()
             self.evaluations_results = before["results"][kept].tolist()
@@ -196,6 +200,7 @@ class _Evaluation(EvalCallback):
         best = self.best_mean_reward
         seed_episodes(self.eval_env, self._seeds)
         goes_on = super()._on_step()
+        os.replace(f"{self.log_path}.npz", self._file)
         self.returns.append(float(np.mean(self.evaluations_results[-1], dtype=np.float64)))
         if self.best_mean_reward > best:
             save(self._best, self._setup, self.model)
@@ -222,4 +227,4 @@ class _Watch(BaseCallback):
         """Save a checkpoint, and remove those before the last ones."""
         save(self._folder / f"{self.model.num_timesteps:09d}", self._setup, self.model, replay=True)
         for old in sorted(path for path in self._folder.glob("*") if path.name.isdigit())[:-KEPT]:
-            shutil.rmtree(old)
+            remove(old)

@@ -2,14 +2,16 @@
 
     setup.json  policy.zip  normalisation.pkl  [replay.pkl]
 
-Such a folder is written aside and renamed, so a reader finds all of one moment or none. Files that are not one's
-own should not be loaded: Stable-Baselines3 and this module use pickle.
+Such a folder is written aside and renamed, so a reader finds all of one moment or none. What a killed process
+leaves aside has a name that begins with a dot, and `mend` clears it away. Files that are not one's own should not
+be loaded: Stable-Baselines3 and this module use pickle.
 """
 
 from __future__ import annotations
 
 import os
 import pickle
+import re
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -25,6 +27,10 @@ from training.setup import Setup, setup_from_json
 
 SETUP, POLICY, NORMALISATION, REPLAY = "setup.json", "policy.zip", "normalisation.pkl", "replay.pkl"
 FINAL, BEST, CHECKPOINTS = "final", "best", "checkpoints"
+EVALUATIONS = "evaluations"
+# Names of what is being written: the final one, and what `tempfile` and others put behind it.
+ASIDE = re.compile(rf"\.({re.escape(SETUP)}|{EVALUATIONS}|{FINAL}|{BEST}|\d+)\.(.+)")
+REPLACED, REMOVED = "old", "gone"  # how they end where something is replaced or removed
 
 
 class SavedPolicy(NamedTuple):
@@ -52,7 +58,7 @@ def save(folder: Path, setup: Setup, model: BaseAlgorithm, replay: bool = False)
         if replay and hasattr(model, "save_replay_buffer"):
             model.save_replay_buffer(aside / REPLAY)
         if folder.exists():
-            old = folder.with_name(f".{folder.name}.old")
+            old = folder.with_name(f".{folder.name}.{REPLACED}")
             shutil.rmtree(old, ignore_errors=True)
             os.replace(folder, old)
             os.replace(aside, folder)
@@ -61,6 +67,35 @@ def save(folder: Path, setup: Setup, model: BaseAlgorithm, replay: bool = False)
             os.replace(aside, folder)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
+
+
+def remove(folder: Path) -> None:
+    """Remove a saved policy, at once for whoever looks for it."""
+    gone = folder.with_name(f".{folder.name}.{REMOVED}")
+    shutil.rmtree(gone, ignore_errors=True)
+    os.replace(folder, gone)
+    shutil.rmtree(gone)
+
+
+def mend(folder: Path) -> None:
+    """Clear away what a killed process left half done in a training's folder; anything else stays as it is.
+
+    A policy that was about to be replaced is put back if its successor did not come into its place.
+    """
+    if not folder.is_dir():
+        return
+    ours = (folder / SETUP).is_file() or all(ASIDE.fullmatch(path.name) for path in folder.iterdir())
+    for path in [*folder.iterdir(), *(folder / CHECKPOINTS).glob(".*")] if ours else []:
+        match = ASIDE.fullmatch(path.name)
+        if match is None:
+            continue
+        name, end = match.groups()
+        if end == REPLACED and not path.with_name(name).exists():
+            os.replace(path, path.with_name(name))
+        elif path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
 
 
 def find_saved(path: str | Path) -> Path:
@@ -87,7 +122,7 @@ def reopen(folder: Path, steps: int) -> None:
     checkpoint = folder / CHECKPOINTS / f"{steps:09d}"
     checkpoint.parent.mkdir(exist_ok=True)
     if checkpoint.exists():  # the same policy, perhaps with its replay buffer
-        shutil.rmtree(folder / FINAL)
+        remove(folder / FINAL)
     else:
         os.replace(folder / FINAL, checkpoint)
 

@@ -11,7 +11,7 @@ from optuna.trial import FrozenTrial, TrialState
 from filters.batch import run
 from filters.filter import Filter
 from thruster_env.figures import BLUE, DARK, RUST, STATES, new_figure, save_figure, tidy
-from tuning.outcome import violation
+from tuning.outcome import is_consistent
 from tuning.proof import Comparison
 from tuning.scenarios import Data
 
@@ -67,8 +67,8 @@ def estimates_figure(
 def history_figure(path: Path, trials: Sequence[FrozenTrial], title: str, label: str = SCORE) -> Path:
     """First objective of every trial of a study and the best so far; the first trial is the untuned filter.
 
-    Hollow circles are trials whose mean NIS is outside its band: they are not among the best. Crosses are trials
-    that ended early: the mean of the seeds that they came to.
+    Hollow circles are trials whose mean NIS is outside its band: they are not among the best, unless all are.
+    Crosses are trials that ended early: the mean of the seeds that they came to.
     """
     figure, axes = _new(1, 1, (6.4, 4.4))
     axis = axes[0, 0]
@@ -79,13 +79,14 @@ def history_figure(path: Path, trials: Sequence[FrozenTrial], title: str, label:
         x, y = [trial.number + 1 for trial, _ in early], [value for _, value in early]
         axis.plot(x, y, "x", color=COLOURS["untuned"], markersize=4, label="ended early: mean of its seeds")
     for inside, face, name in ((True, COLOURS["untuned"], "trial"), (False, "none", "NIS outside its band")):
-        some = [trial for trial in done[1:] if (violation(trial) <= 0) == inside]
+        some = [trial for trial in done[1:] if is_consistent(trial) == inside]
         if some:
             x, y = [trial.number + 1 for trial in some], [trial.values[0] for trial in some]
             axis.plot(x, y, "o", color=COLOURS["untuned"], markerfacecolor=face, markersize=4, label=name)
     if done:
         axis.plot(done[0].number + 1, values[0], "s", color=BOUND, markersize=7, label="first trial")
-        counted = [value if violation(trial) <= 0 else np.inf for trial, value in zip(done, values, strict=True)]
+        kept = [is_consistent(trial) for trial in done]
+        counted = np.where(kept, values, np.inf) if any(kept) else values
         best = np.minimum.accumulate(counted)
         best[np.isinf(best)] = np.nan
         axis.step([t.number + 1 for t in done], best, where="post", color=ESTIMATE, label="best so far")

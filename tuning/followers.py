@@ -8,11 +8,12 @@ from optuna.trial import FrozenTrial, TrialState
 
 from tuning.cost import COST
 from tuning.gradient import maximise_likelihood
-from tuning.outcome import best_trial, is_over_budget, violation
+from tuning.outcome import best_trial, is_consistent, is_over_budget
 from tuning.plan import Plan
-from tuning.space import KIND
+from tuning.space import KIND, trial_parameters, untuned_choice
 from tuning.trials import NIS
 
+UNTUNED = "untuned"  # attribute: the filter whose numbers before any tuning these are
 TWIN = "consistent twin"  # attribute: how often a trial's Q and R have been scaled
 TWINS = 2  # so often at most: nonlinear filters may need a second time
 SMALLER = "smaller ensemble of"  # attribute: number of the trial that was over the budget
@@ -23,19 +24,49 @@ LIKELIEST = "likeliest noise"  # attribute of the trial whose Q and R make the i
 LIKELIEST_AFTER = 20  # trials
 
 
+def enqueue_what_is_left(study: optuna.Study, plan: Plan) -> None:
+    """Ask for what an end of the study left out: the last trial's twin, and the next kind."""
+    finished = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    if finished and _asks_for_twins(plan):
+        _enqueue_consistent_twin(study, plan, finished[-1])
+    _enqueue_untuned(study, plan)
+
+
 def enqueue_followers(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:
     """Ask for what the last trial calls for.
 
-    That is a consistent twin, a smaller ensemble, the likeliest noise, its own noise for other kinds.
+    That is a consistent twin, a smaller ensemble, the likeliest noise, its own noise for other kinds; and the next
+    kind when that is done.
     """
-    if plan.is_constrained and not plan.hold_r:
+    if _asks_for_twins(plan):
         _enqueue_consistent_twin(study, plan, last)
-    if plan.budget is not None and last.number < len(plan.kinds):
+    if plan.budget is not None and (last.number == 0 or UNTUNED in last.user_attrs):
         _enqueue_smaller_ensemble(study, plan, last)
     if last.number == LIKELIEST_AFTER - 1 and not plan.hold_r:
         _enqueue_likeliest(study, plan)
     if len(plan.kinds) > 1 and _ends_a_round(last.number + 1, len(plan.kinds)):
         _enqueue_heirs(study, plan)
+    _enqueue_untuned(study, plan)
+
+
+def _asks_for_twins(plan: Plan) -> bool:
+    return plan.is_constrained and not plan.hold_r
+
+
+def _enqueue_untuned(study: optuna.Study, plan: Plan) -> None:
+    """Ask for the next untuned filter of the plan's kinds, when nothing else that was asked for is left to run.
+
+    So each kind is tried with its Q and R scaled before the next one is begun: untuned filters of different kinds
+    can be compared only where their innovations are consistent.
+    """
+    trials = study.get_trials(deepcopy=False)
+    begun = [trial.user_attrs.get(UNTUNED) for trial in trials]
+    if begun[:1] == [None] or any(trial.state == TrialState.WAITING for trial in trials):
+        return  # a study that begins with something else has asked for all at once
+    kind = next((kind for kind in plan.kinds if kind not in begun), None)
+    if kind is not None:
+        choice = untuned_choice(kind, plan.scenarios[0])
+        study.enqueue_trial(trial_parameters(choice, plan.space()), user_attrs={UNTUNED: kind})
 
 
 def _enqueue_consistent_twin(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:
@@ -47,13 +78,13 @@ def _enqueue_consistent_twin(study: optuna.Study, plan: Plan, last: FrozenTrial)
     """
     if (
         last.state != TrialState.COMPLETE
-        or violation(last) <= 0
+        or is_consistent(last)
         or NIS not in last.user_attrs
         or last.user_attrs.get(TWIN) == TWINS
     ):
         return
     best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
-    if violation(best) <= 0 and best.values[0] < last.values[0]:
+    if is_consistent(best) and best.values[0] < last.values[0]:
         return
     space, factor = plan.space(), last.user_attrs[NIS]
     scaled = {

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from optuna.trial import FrozenTrial, TrialState
 
 from tuning.cost import COST
-from tuning.outcome import best_trial, is_over_budget, violation
+from tuning.outcome import best_trial, is_consistent, is_over_budget
 from tuning.space import KIND
 
 
@@ -34,6 +34,12 @@ def kinds_tried(trials: Sequence[FrozenTrial]) -> list[Kind]:
     return sorted(rows, key=lambda row: (row.value is None, not row.consistent, row.value or 0.0))
 
 
+def kinds_running(trials: Sequence[FrozenTrial]) -> list[str]:
+    """The kinds of filters that are under trial, in alphabetical order; empty in a study of one kind."""
+    running = (trial for trial in trials if trial.state == TrialState.RUNNING)
+    return sorted({trial.params[KIND] for trial in running if KIND in trial.params})
+
+
 def trials_of_kind(trials: Sequence[FrozenTrial], name: str) -> list[FrozenTrial]:
     """Trials that chose a kind; all of them in a study of one kind."""
     return [trial for trial in trials if trial.params.get(KIND, name) == name]
@@ -48,6 +54,6 @@ def _kind(name: str, trials: list[FrozenTrial]) -> Kind:
         sum(trial.state == TrialState.PRUNED for trial in trials) - over,
         over,
         None if best is None else best.values[0],
-        best is not None and violation(best) <= 0,
+        best is not None and is_consistent(best),
         min(costs, default=None),
     )

@@ -52,10 +52,15 @@ def penalised(value: float, evaluation: Evaluation) -> float:
     return value + DIVERGENCE_PENALTY * evaluation.divergences
 
 
+def nis_ratio(evaluation: Evaluation) -> float:
+    """The mean NIS over the number of channels: 1 is right, NaN without a covariance."""
+    return evaluation.nis.value / evaluation.channels
+
+
 def nis_violation(evaluation: Evaluation) -> float:
     """How far the mean NIS is outside its band, in logarithms; at most zero inside, as Optuna wants it."""
     low, high = NIS_BAND
-    ratio = evaluation.nis.value / evaluation.channels
+    ratio = nis_ratio(evaluation)
     if not ratio > 0.0 or not math.isfinite(ratio):
         return LARGEST
     return max(math.log(low / ratio), math.log(ratio / high))

@@ -11,14 +11,18 @@ from tuning.trials import CONSISTENCY
 
 
 def best_trial(trials: Sequence[FrozenTrial]) -> FrozenTrial | None:
-    """The complete, consistent trial with the least first objective; else the least inconsistent one.
+    """The complete trial with the least first objective, of consistent ones wherever there are any.
 
-    A trial over the budget is never complete.
+    A trial over the budget is never complete. Where none is consistent, a mean NIS nearer to its band would be
+    no better a reason to choose: an estimate that is many times worse can have it.
     """
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    if not complete:
-        return None
-    return min(complete, key=lambda trial: (max(violation(trial), 0.0), trial.values[0]))
+    return min(complete, key=lambda trial: (not is_consistent(trial), trial.values[0]), default=None)
+
+
+def is_consistent(trial: FrozenTrial) -> bool:
+    """Whether a trial's mean NIS is inside its band; true without a band."""
+    return violation(trial) <= 0
 
 
 def violation(trial: FrozenTrial) -> float:

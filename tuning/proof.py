@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tuning.evaluate import Evaluation, evaluate, score_ratio
+from tuning.objectives import nis_violation
 from tuning.plan import HELD_OUT_SEEDS, Plan
 from tuning.scenarios import Data, Scenario, held_out_seeds
 from tuning.space import Choice, size_ladder, true_choice, untuned_choice
@@ -31,6 +32,7 @@ class SizeRow(NamedTuple):
     size: int
     evaluation: Evaluation
     ratio: float  # score over the best score on the same seeds
+    outside: float = 0.0  # how far the mean NIS is outside its band, as in `nis_violation`; of several the most
 
 
 def ensemble_sizes(choice: Choice, plan: Plan, data: Sequence[Data]) -> list[SizeRow]:
@@ -45,11 +47,19 @@ def ensemble_sizes(choice: Choice, plan: Plan, data: Sequence[Data]) -> list[Siz
     tables = [[evaluate(choice.with_size(n).filter(one), part, one.scale) for n in sizes] for one, part in pairs]
     best = [min(evaluations, key=lambda e: e.score.value) for evaluations in tables]
     ratios = [[score_ratio(e, least).value for e in found] for found, least in zip(tables, best, strict=True)]
-    return [SizeRow(n, tables[0][i], max(column[i] for column in ratios)) for i, n in enumerate(sizes)]
+    outside = [[nis_violation(e) if plan.is_constrained else 0.0 for e in found] for found in tables]
+    return [
+        SizeRow(n, tables[0][i], max(column[i] for column in ratios), max(column[i] for column in outside))
+        for i, n in enumerate(sizes)
+    ]
 
 
-def sufficient_size(sizes: Sequence[SizeRow]) -> int:
-    """The smallest size that is as good as the best one; with several scenarios no size is best on all of them."""
+def sufficient_size(sizes: Sequence[SizeRow], consistent: bool = False) -> int:
+    """The smallest size that is as good as the best one; with several scenarios no size is best on all of them.
+
+    Where it has to be consistent, sizes whose mean NIS is outside its band do not count.
+    """
+    sizes = [row for row in sizes if row.outside <= 0 or not consistent] or sizes
     least = min(row.ratio for row in sizes)
     return next(row.size for row in sizes if row.ratio <= (1.0 + SIZE_TOLERANCE) * least)
 

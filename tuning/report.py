@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from thruster_env.files import check_target, write_whole
 from tuning.identifiability import identify, sentences
+from tuning.objectives import nis_ratio
 from tuning.proof import ensemble_sizes, prove, sufficient_size
 from tuning.report_page import Section, Words, html_page, markdown_page
 from tuning.report_parts import (
@@ -24,6 +25,7 @@ from tuning.report_parts import (
 )
 from tuning.report_subject import find_subject, is_file
 from tuning.space import has_ensemble
+from tuning.trials import measure
 
 
 class Report(NamedTuple):
@@ -52,14 +54,16 @@ def write_report(source: str | Path, storage: str, out: str | Path | None = None
     page, tables = folder / f"{name}.html", folder / f"{name}.md"
     for target in (page, tables):
         check_target(target)
-    sizes = ensemble_sizes(choice, plan, plan.training_data()) if has_ensemble(choice.name) else []
+    data = plan.training_data()
+    sizes = ensemble_sizes(choice, plan, data) if has_ensemble(choice.name) else []
     if sizes and not subject.chosen:
-        choice = choice.with_size(sufficient_size(sizes))
+        choice = choice.with_size(sufficient_size(sizes, subject.consistent))
         subject = subject._replace(choice=choice)
     proofs = [prove(choice, scenario, plan.seed, subject.seeds) for scenario in plan.scenarios]
     title = f"{choice.name} tuned on {', '.join(Path(scenario.name).stem for scenario in plan.scenarios)}"
     said = advice(choice, plan, proofs)
-    known = identify(choice, plan.scenarios, plan.training_data(), plan.space())
+    known = identify(choice, plan.scenarios, data, plan.space())
+    nis = [nis_ratio(found) for found in measure(choice, plan, data)]
     numbers = [numbers_table(choice, plan.scenarios[0]), *([known_table(known)] if known else [])]
     with tempfile.TemporaryDirectory() as scratch:
         book = Sketchbook(Path(scratch))
@@ -69,7 +73,7 @@ def write_report(source: str | Path, storage: str, out: str | Path | None = None
             search_section(book, subject),
             *([sizes_section(book, subject, sizes)] if sizes else []),
             *run_sections(book, subject, proofs[0]),
-            facts_section(subject),
+            facts_section(subject, nis),
         ]
     write_whole(page, html_page(title, said, sections))
     errors = [errors_table(scenario, proof) for scenario, proof in zip(plan.scenarios, proofs, strict=True)]

@@ -12,7 +12,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from thruster_env.figures import BLUE, RUST, STATES, new_figure, save_figure, tidy
 from tuning.figures import COLOURS, early_trials, limit_values
-from tuning.outcome import best_trial, violation
+from tuning.outcome import best_trial, is_consistent
 from tuning.proof import SizeRow
 from tuning.space import KIND
 
@@ -65,7 +65,7 @@ def slices_figure(path: Path, trials: Sequence[FrozenTrial], label: str) -> Path
     axes = figure.subplots(rows, columns, squeeze=False, sharey=True)
     tidy(axes.flat)
     best, values = best_trial(done), [trial.values[0] for trial in done]
-    faces = [BLUE if violation(trial) <= 0 else "white" for trial in done]
+    faces = [BLUE if is_consistent(trial) else "white" for trial in done]
     for axis, name in zip(axes.flat, names, strict=False):
         places = [trial.params[name] for trial in done]
         axis.scatter(places, values, s=16, facecolors=faces, edgecolors=BLUE, linewidths=0.8, alpha=0.7)

@@ -17,7 +17,7 @@ from tuning.evaluate import check_consistency, score_ratio
 from tuning.figures import SCORE, comparison_figure, estimates_figure, history_figure
 from tuning.identifiability import Identifiability
 from tuning.kinds import kinds_tried, trials_of_kind
-from tuning.objectives import find_objective
+from tuning.objectives import NIS_BAND, find_objective
 from tuning.plan import TRAINING_SEEDS, Plan
 from tuning.proof import Comparison, SizeRow
 from tuning.report_figures import (
@@ -172,7 +172,7 @@ def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
         for kind in kinds_tried(trials)
     ]
     caption = "Filters that were tried, on the training seeds; the slices are those of the best"
-    return Table(f"{caption}. *: mean NIS outside its band, so not to be chosen", columns, rows)
+    return Table(f"{caption}. *: mean NIS outside its band, to be chosen only where all are", columns, rows)
 
 
 def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) -> Section:
@@ -206,8 +206,8 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
     return sections
 
 
-def facts_section(subject: Subject) -> Section:
-    """What was tuned, on what and with what."""
+def facts_section(subject: Subject, nis: Sequence[float]) -> Section:
+    """What was tuned, on what and with what; `nis` is the choice's on training seeds, over the channels."""
     plan, training = subject.plan, training_seeds(subject.plan.seed, TRAINING_SEEDS)
     about = [f"{one.name}: {one.about}" if one.about else one.name for one in plan.scenarios]
     rows = [
@@ -215,7 +215,7 @@ def facts_section(subject: Subject) -> Section:
         *([["budget", f"{plan.budget:g} µs a step of one core"]] if plan.budget is not None else []),
         ["scenarios" if len(about) > 1 else "scenario", "; ".join(about)],
         ["made small", "; ".join(f"{name}: {find_objective(name).about}" for name in plan.objectives)],
-        ["mean NIS", "held in its band" if plan.is_constrained else "free"],
+        ["mean NIS", _nis_words(nis) if plan.is_constrained else "free"],
         ["sampler", plan.sampler],
         ["training seeds", f"{training.start} to {training.stop - 1}"],
         ["study", subject.name],
@@ -226,6 +226,13 @@ def facts_section(subject: Subject) -> Section:
         rows.append(["finished trials", f"{complete + early}, {early} of them ended early"])
     rows.append(["computed here with", ", ".join(f"{name} {version}" for name, version in versions().items())])
     return Section("What was done", [Table("", [], rows)])
+
+
+def _nis_words(nis: Sequence[float]) -> str:
+    low, high = NIS_BAND
+    place = "inside" if all(low <= ratio <= high for ratio in nis) else "outside"
+    found = " and ".join(f"{ratio:.3g}" for ratio in nis)
+    return f"to lie between {low:g} and {high:g} of what is right; it is {found}, {place}, on the training seeds"
 
 
 def _span(value: Interval) -> str:

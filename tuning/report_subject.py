@@ -9,7 +9,7 @@ import optuna
 
 from filters.registry import read_tuned_file
 from thruster_env.checks import at_least, shown
-from tuning.outcome import best_trial
+from tuning.outcome import best_trial, is_consistent
 from tuning.plan import HELD_OUT_SEEDS, Plan
 from tuning.scenarios import find_scenario
 from tuning.space import Choice, choice_of
@@ -25,7 +25,8 @@ class Subject(NamedTuple):
     choice: Choice
     study: optuna.Study | None  # None where it is not in the storage
     seeds: int  # number of held-out seeds
-    chosen: bool  # whether the ensemble size is that of a tuned file, or still to be chosen
+    chosen: bool  # whether the ensemble size is that of a tuned file, or still to be chosen ...
+    consistent: bool = False  # ... so that the mean NIS stays in its band
 
 
 def find_subject(source: str | Path, storage: str) -> Subject:
@@ -69,7 +70,8 @@ def _of_study(name: str, storage: str) -> Subject:
     if best is None:
         raise ValueError(f"a study must have a complete trial for a report, but {name!r} has none")
     choice = choice_of(plan.filter, best.params, plan.scenarios[0])
-    return Subject(name, plan, choice, study, HELD_OUT_SEEDS, chosen=len(plan.objectives) > 1)
+    consistent = plan.is_constrained and is_consistent(best)
+    return Subject(name, plan, choice, study, HELD_OUT_SEEDS, len(plan.objectives) > 1, consistent)
 
 
 def _load(name: str, storage: str) -> optuna.Study | None:

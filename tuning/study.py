@@ -10,18 +10,20 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from tuning.cost import COST
-from tuning.followers import enqueue_followers
+from tuning.followers import enqueue_followers, enqueue_what_is_left
 from tuning.interruption import stop_on_interrupt
-from tuning.outcome import best_trial
+from tuning.objectives import nis_ratio
+from tuning.outcome import best_trial, is_consistent
 from tuning.plan import Plan
 from tuning.proof import SizeRow, ensemble_sizes, sufficient_size
 from tuning.samplers import make_sampler
 from tuning.scenarios import Data
-from tuning.space import Choice, choice_of, has_ensemble, trial_parameters, untuned_choice
+from tuning.space import Choice, choice_of, has_ensemble, trial_parameters
 from tuning.storage import PROCESS, retry_orphans, this_process
-from tuning.trials import cost_of, make_pruner, run_trial
+from tuning.trials import cost_of, make_pruner, measure, run_trial
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+BEST = "best trial under the constraints"  # attribute of a study, for programs that know no constraints
 OnTrial = Callable[[optuna.Study, int], None]
 
 
@@ -42,6 +44,8 @@ class StudyResult(NamedTuple):
     free_value: float | None = None  # first objective of the best trial, consistent or not; None where all count
     front: tuple[FrozenTrial, ...] = ()  # trials that no other beats in both of two objectives
     microseconds: float | None = None  # that a step of the choice takes, where the plan asks for it
+    consistent: bool | None = None  # whether any trial's mean NIS is in its band; None where all count
+    nis: tuple[float, ...] = ()  # the choice's, over the number of channels, on each scenario's training seeds
 
     @property
     def finished(self) -> int:
@@ -59,7 +63,7 @@ def open_study(
 ) -> optuna.Study:
     """Create a study or load it to go on; its first trial is `start`, by default the untuned filter.
 
-    A study over several kinds begins with the untuned filter of every kind.
+    A study over several kinds tries the untuned filter of every kind, one after the other.
 
     Args:
         name: of the study.
@@ -73,7 +77,6 @@ def open_study(
             version of Optuna.
     """
     plan = plan.checked()
-    scenario = plan.scenarios[0]
     space = plan.space()
     make_sampler(plan.sampler, plan.seed, 0, space)  # a clear error before anything is stored
     study = optuna.create_study(
@@ -89,8 +92,9 @@ def open_study(
     study.sampler = make_sampler(plan.sampler, plan.seed, present, space, worker)
     if not present:
         study.set_user_attr("identity", plan.identity)
-        for choice in [start] if start else [untuned_choice(kind, scenario) for kind in plan.kinds]:
-            study.enqueue_trial(trial_parameters(choice, space))
+        if start is not None:
+            study.enqueue_trial(trial_parameters(start, space))
+    enqueue_what_is_left(study, plan)
     return study
 
 
@@ -145,10 +149,12 @@ def run_study(
             f"budget must be at least what the cheapest trial takes, {min(costs):.3g} microseconds a step, "
             f"but got {plan.budget:g}"
         )
+    if study.user_attrs.get(BEST) != best.number:  # another worker's last word may have been an older one
+        study.set_user_attr(BEST, best.number)
     choice = choice_of(plan.filter, best.params, plan.scenarios[0])
     sizes = ensemble_sizes(choice, plan, data) if has_ensemble(choice.name) and len(plan.objectives) == 1 else []
     if sizes:
-        choice = choice.with_size(sufficient_size(sizes))
+        choice = choice.with_size(sufficient_size(sizes, plan.is_constrained and is_consistent(best)))
     complete = [trial.values[0] for trial in present if trial.state == TrialState.COMPLETE]
     return StudyResult(
         choice,
@@ -161,6 +167,8 @@ def run_study(
         tuple(study.best_trials) if len(plan.objectives) > 1 else (),
         # A smaller ensemble takes no longer than the trial's.
         min(cost_of(choice, plan, data), best.user_attrs[COST]) if plan.asks_for_cost else None,
+        is_consistent(best) if plan.is_constrained else None,
+        tuple(map(nis_ratio, measure(choice, plan, data))) if plan.is_constrained else (),
     )
 
 
@@ -171,6 +179,7 @@ def run_trials(
     trials: int,
     on_trial: OnTrial = lambda study, finished: None,
     stop: Callable[[], bool] = lambda: False,
+    on_choice: Callable[[Choice], None] = lambda choice: None,
 ) -> bool:
     """Run trials in this process until the study has `trials` finished ones; return whether Ctrl-C ended it.
 
@@ -181,15 +190,17 @@ def run_trials(
         trials: finished trials that the study shall have in total.
         on_trial: called after each trial with the study and the number of finished trials.
         stop: asked before the first and after each trial whether to end.
+        on_choice: called with what each trial tries.
     """
     if stop() or finished_trials(study) >= trials:
         return False
 
     def objective(trial: optuna.Trial) -> list[float]:
         trial.set_user_attr(PROCESS, this_process())
-        return run_trial(trial, plan, data)
+        return run_trial(trial, plan, data, on_choice)
 
     def after(study: optuna.Study, trial: FrozenTrial) -> None:
+        _note_best(study, trial)
         finished = finished_trials(study)
         if finished < trials:
             enqueue_followers(study, plan, trial)
@@ -203,3 +214,10 @@ def run_trials(
         return interrupted()
     except KeyboardInterrupt:
         return True
+
+
+def _note_best(study: optuna.Study, last: FrozenTrial) -> None:
+    """Write down the last trial's number if it is the best one."""
+    best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
+    if best is not None and best.number == last.number:
+        study.set_user_attr(BEST, last.number)

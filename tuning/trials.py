@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from statistics import geometric_mean
 
 import numpy as np
@@ -13,7 +13,7 @@ import optuna
 from filters.batch import Estimates, run
 from tuning.cost import BUDGET, COST, microseconds_a_step, over_budget
 from tuning.evaluate import Evaluation, judge, run_scores
-from tuning.objectives import LARGEST, nis_violation, penalised
+from tuning.objectives import LARGEST, nis_ratio, nis_violation, penalised
 from tuning.plan import Plan
 from tuning.scenarios import Data
 from tuning.space import Choice, suggest
@@ -33,14 +33,20 @@ def make_pruner(plan: Plan) -> optuna.pruners.BasePruner:
         return optuna.pruners.WilcoxonPruner(p_threshold=P_THRESHOLD, n_startup_steps=BLOCK)
 
 
-def run_trial(trial: optuna.Trial, plan: Plan, data: Sequence[Data]) -> list[float]:
-    """Values of a trial, one for each objective.
+def run_trial(
+    trial: optuna.Trial,
+    plan: Plan,
+    data: Sequence[Data],
+    on_choice: Callable[[Choice], None] = lambda choice: None,
+) -> list[float]:
+    """Values of a trial, one for each objective; `on_choice` is told what it tries.
 
     Raises:
         optuna.TrialPruned: if it is over the plan's budget, or significantly worse than the best one on the seeds
             so far.
     """
     choice = suggest(trial, plan.filter, plan.scenarios[0], plan.space())
+    on_choice(choice)
     microseconds = math.nan
     if plan.asks_for_cost:
         microseconds = cost_of(choice, plan, data)
@@ -55,7 +61,7 @@ def run_trial(trial: optuna.Trial, plan: Plan, data: Sequence[Data]) -> list[flo
         outside = max(map(nis_violation, evaluations))
         trial.set_constraint(CONSISTENCY, outside)
         if outside < LARGEST:  # else there is no finite NIS to speak of
-            trial.set_user_attr(NIS, geometric_mean([e.nis.value / e.channels for e in evaluations]))
+            trial.set_user_attr(NIS, geometric_mean(map(nis_ratio, evaluations)))
     return [
         float(np.mean([penalised(objective.value(e, microseconds), e) for e in evaluations]))
         for objective in plan.found_objectives()

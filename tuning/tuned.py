@@ -15,6 +15,7 @@ from filters.registry import FILE_FORMAT, FILE_VERSION, read_tuned_file, sealed
 from thruster_env.checks import at_least, covariance, positive, shown
 from thruster_env.files import write_whole
 from tuning.evaluate import Evaluation
+from tuning.objectives import NIS_BAND
 from tuning.plan import Plan
 from tuning.proof import Comparison
 from tuning.scenario import frozen
@@ -64,6 +65,7 @@ def write_tuned(
             "trials": result.finished,
             "best_training_value": result.best_value if method == "optuna" else None,
             "microseconds_a_step": result.microseconds,
+            **consistency(result),
         },
         "held_out": {one.name: metrics(proof) for one, proof in zip(plan.scenarios, proofs, strict=True)},
     }
@@ -109,6 +111,12 @@ def metrics(proof: Comparison) -> dict:
         "bound": [None if math.isnan(part) else part for part in proof.bound.tolist()],
         **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
     }
+
+
+def consistency(result: StudyResult) -> dict:
+    """Whether any trial of a study was consistent, and the mean NIS of its choice, as plain numbers for JSON."""
+    nis = [ratio if math.isfinite(ratio) else None for ratio in result.nis]
+    return {"any_trial_consistent": result.consistent, "mean_nis": nis, "nis_band": list(NIS_BAND)}
 
 
 def versions() -> dict[str, str]:

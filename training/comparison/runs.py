@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -85,13 +86,22 @@ def run_comparison(
 
 
 def _prepare(counter) -> None:
-    """Give a process one core, and leave Ctrl-C to its parent."""
+    """Give a process one core, leave Ctrl-C to its parent, and end where that is no more.
+
+    Else it would go on with its run, and the same command once more would start a second one in the same folder.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     with counter.get_lock():
         place, counter.value = counter.value, counter.value + 1
     if hasattr(os, "sched_setaffinity"):
         available = sorted(os.sched_getaffinity(0))
         os.sched_setaffinity(0, {available[place % len(available)]})
+
+
+def _end_with_parent() -> None:
+    multiprocessing.parent_process().join()
+    os._exit(1)
 
 
 def _do(run: Run, folder: Path, episodes: int) -> None:
