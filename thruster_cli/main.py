@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from _signal import SIGINT, getsignal, signal  # `signal` itself takes milliseconds, in which Ctrl-C may come
 
 INTERRUPTED, BROKEN_PIPE = 130, 141
@@ -20,6 +21,7 @@ def run() -> None:
     signal(SIGINT, leave)
     try:
         _open_standard_streams()
+        warnings.formatwarning = _as_one_line
         main()
     except KeyboardInterrupt:  # between two lines of `main`
         leave()
@@ -128,6 +130,11 @@ def _open_standard_streams() -> None:
             os.open(os.devnull, flags)  # takes the lowest number that is free
     sys.stdout = sys.stdout or open(1, "w", encoding="utf-8", closefd=False)
     sys.stderr = sys.stderr or open(2, "w", encoding="utf-8", closefd=False)
+
+
+def _as_one_line(message, category, *where) -> str:
+    """A warning, without the line of code that gave it."""
+    return f"thruster: {message}\n" if category is UserWarning else f"thruster: {category.__name__}: {message}\n"
 
 
 def _loads_a_package(frame) -> bool:

@@ -42,9 +42,13 @@ def table(
     out = Table(title=title, caption=caption, title_justify="left", caption_justify="left", box=SIMPLE_HEAD)
     out.padding, out.pad_edge = (0, 1, 0, 0), False  # five figures with their intervals fit into 80 columns
     for index, column in enumerate(columns):
-        out.add_column(Text(showable(column, console.encoding)), justify="left" if index == 0 or words else "right")
+        out.add_column(
+            Text(showable(column, console.encoding)), justify="left" if index == 0 or words else "right"
+        )
     for row in rows:  # Text: units in brackets are no markup
-        out.add_row(*[cell if isinstance(cell, Text) else Text(showable(str(cell), console.encoding)) for cell in row])
+        out.add_row(
+            *[cell if isinstance(cell, Text) else Text(showable(str(cell), console.encoding)) for cell in row]
+        )
     return out
 
 

@@ -15,7 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-READY = "import os; from thruster_cli import main; main.signal(2, main.leave); os.write(2, b'ready\\n'); main.run()"
+READY = (
+    "import os; from thruster_cli import main; main.signal(2, main.leave); os.write(2, b'ready\\n'); main.run()"
+)
 TUNE = "tune --filter ekf --scenario nominal --no-pruning --storage j --study s --out s.json --trials"
 COMMANDS = ("filters", "inspect", "simulate --steps 2000 --out run.csv", f"{TUNE} 8")
 LIMIT_SECONDS = 120  # after which a command counts as one that hangs
@@ -94,7 +96,15 @@ def full_disks(rng: np.random.Generator, seconds: float) -> str:
 def outputs_that_take_nothing(rng: np.random.Generator, seconds: float) -> str:
     """Closed, full and abandoned standard output and error: no traceback, and no code 0 where output is lost."""
     deadline, tried = time.monotonic() + seconds, 0
-    redirections = (">&-", ">/dev/full", "2>&-", "2>/dev/full", ">&- 2>&-", "<&- >&- 2>&-", "| head -c 0; exit ${PIPESTATUS[0]}")
+    redirections = (
+        ">&-",
+        ">/dev/full",
+        "2>&-",
+        "2>/dev/full",
+        ">&- 2>&-",
+        "<&- >&- 2>&-",
+        "| head -c 0; exit ${PIPESTATUS[0]}",
+    )
     with tempfile.TemporaryDirectory() as folder:
         while time.monotonic() < deadline:
             command = str(rng.choice([*COMMANDS[:3], "filters --json -"]))
