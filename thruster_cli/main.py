@@ -22,6 +22,7 @@ def run() -> None:
     try:
         _open_standard_streams()
         warnings.formatwarning = _as_one_line
+        _leave_full_disks_to_the_main_thread()
         main()
     except KeyboardInterrupt:  # between two lines of `main`
         leave()
@@ -130,6 +131,19 @@ def _open_standard_streams() -> None:
             os.open(os.devnull, flags)  # takes the lowest number that is free
     sys.stdout = sys.stdout or open(1, "w", encoding="utf-8", closefd=False)
     sys.stderr = sys.stderr or open(2, "w", encoding="utf-8", closefd=False)
+
+
+def _leave_full_disks_to_the_main_thread() -> None:
+    """Say nothing of an OSError in a thread that writes a log: who fills the log finds out, and says it."""
+    import threading
+
+    before = threading.excepthook
+
+    def say(arguments):
+        if not issubclass(arguments.exc_type, OSError):
+            before(arguments)
+
+    threading.excepthook = say
 
 
 def _as_one_line(message, category, *where) -> str:
