@@ -83,7 +83,7 @@ class EstimateStates(gym.vector.VectorWrapper):
 
         Raises ValueError, before the envs are stepped, for actions that are not numbers, or too few or many.
         """
-        ignored = self._done if self._mode == AutoresetMode.NEXT_STEP else False
+        ignored = self._done if self.autoreset_mode == AutoresetMode.NEXT_STEP else False
         u = np.clip(checked_actions(actions, self.num_envs, len(self._low), ignored), self._low, self._high)
         observations, rewards, terminated, truncated, info = self.env.step(actions)
         z = self._measurements(observations, info)

@@ -109,7 +109,7 @@ def test_a_package_says_that_it_is_typed(room):
 
 
 def test_the_command_line_starts_without_packages_that_learn_policies():
-    code = f"import sys, thruster_cli.main; print([name for name in {sorted(LEARNING)} if name in sys.modules])"
+    code = f"import sys, thruster_cli.app; print([name for name in {sorted(LEARNING)} if name in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
 

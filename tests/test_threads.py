@@ -1,16 +1,20 @@
 """Work shared by threads: all of it done once, whoever else asks, whatever goes wrong."""
 
+import contextlib
 import multiprocessing
 import os
+import sys
 import threading
 import time
+from contextlib import contextmanager
+from queue import SimpleQueue
 
 import numpy as np
 import pytest
 
 from thruster_env.compiled import interpreted
-from thruster_env.signals import LINE
-from thruster_env.threads import Crew, crew, in_parts, spread
+from thruster_env.signals import LINE, TAKEN, take
+from thruster_env.threads import BEHIND, CALLER, Crew, crew, in_parts, spread
 
 COUNT = 1000
 
@@ -69,31 +73,90 @@ def test_many_threads_may_ask_at_once(part):
     assert all(np.array_equal(values, 200.0 * np.arange(COUNT)) for values in results)
 
 
-class Failing:
-    """Stands in for a compiled part, and fails in some places."""
+class Rehearsed:
+    """Stands in for a compiled part: the caller begins when all helpers have, and some places fail."""
 
-    def __init__(self, part, places):
-        self.part, self.places = part, places
+    def __init__(self, part, helpers, failing=()):
+        self.part, self.begun, self.failing = part, threading.Barrier(helpers + 1), failing
 
     @property
     def direct(self):
         return self._fail_or_do
 
-    def _fail_or_do(self, signals, place, *arguments):
-        if place in self.places:
-            raise KeyboardInterrupt
-        self.part(signals, place, *arguments)
+    def _fail_or_do(self, signals, marks, place, helpers, call, count, arguments):
+        if count > 0:  # else it only makes sure that no helper is at work
+            if place != CALLER and place in self.failing:
+                take(marks, LINE * place, TAKEN)
+            self.begun.wait(30)
+            if place in self.failing:
+                raise KeyboardInterrupt
+        self.part(signals, marks, place, helpers, call, count, arguments)
 
 
-@pytest.mark.parametrize("places", [{0}, {1}, {2}, {1, 2}])
-def test_after_a_failure_in_any_thread_no_helper_is_at_work_and_the_next_call_is_right(part, places):
+@pytest.mark.parametrize("failing", [{0}, {1}, {2}, {1, 2}])
+def test_after_a_failure_in_any_thread_the_next_call_is_right(part, failing):
     team, values = Crew(2), np.zeros(COUNT)
     with pytest.raises(KeyboardInterrupt):
-        team.run(Failing(part, places), COUNT, values)
-    assert (team._signals[::LINE] == 1).all()
+        team.run(Rehearsed(part, 2, failing), COUNT, values)
     values[:] = 0.0
     team.run(part, COUNT, values)
     assert np.array_equal(values, np.arange(COUNT))
+
+
+@contextmanager
+def interrupted_at(moment):
+    """Raise KeyboardInterrupt before the byte code of this number in what the crew does in this thread."""
+    passed = 0
+
+    def count(frame, event, argument):
+        nonlocal passed
+        frame.f_trace_opcodes = True
+        if event == "opcode":
+            passed += 1
+            if passed == moment:
+                raise KeyboardInterrupt
+        return count
+
+    def trace(frame, event, argument):
+        return count(frame, event, argument) if frame.f_code in OF_THE_CREW else None
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        yield lambda: passed
+    finally:
+        sys.settrace(before)
+
+
+OF_THE_CREW = (Crew.run.__code__, Crew._share.__code__)
+
+
+def test_ctrl_c_at_any_moment_leaves_a_crew_whose_helpers_help(part):
+    team, moment = Crew(2), 0
+    while True:
+        moment, values = moment + 1, np.zeros(COUNT)
+        with interrupted_at(moment) as passed:
+            with contextlib.suppress(KeyboardInterrupt):
+                team.run(part, COUNT, values)
+        done = values.copy()
+        while not all(jobs.empty() for jobs in team._jobs):
+            time.sleep(1e-4)
+        expected = values + np.arange(COUNT)
+        team.run(Rehearsed(part, 2), COUNT, values)  # would wait in vain for a helper that does not come
+        assert np.array_equal(values, expected)
+        assert np.isin(done - np.arange(COUNT) * (done != 0), 0).all()  # what is done is done once
+        if passed() < moment:
+            break
+    assert moment > 80
+
+
+def test_a_helper_that_never_comes_is_not_waited_for(part):
+    team, values = Crew(2), np.zeros(COUNT)
+    team._jobs[1] = SimpleQueue()  # nobody looks into this one
+    for _ in range(5):
+        team.run(part, COUNT, values)
+    assert np.array_equal(values, 5.0 * np.arange(COUNT))
+    assert team._jobs[1].qsize() == BEHIND
 
 
 def _ask_in_child(part, results):

@@ -1,85 +1,175 @@
-"""The `thruster` command."""
+"""The `thruster` command: how it starts and how it ends, whatever happens.
+
+Exit codes: 0 done; 1 a file that `verify` does not find to hold; 2 what is asked for cannot be done, one line says
+why; 130 Ctrl-C; 141 nobody reads the output any more, as a shell reports of other programs.
+
+No package is imported before Ctrl-C has its one line.
+"""
 
 from __future__ import annotations
 
-import signal
+import os
 import sys
+import warnings
+from _signal import SIGINT, getsignal, signal  # `signal` itself takes milliseconds, in which Ctrl-C may come
 
-import typer
-
-from thruster_cli import (
-    compare,
-    demo,
-    evaluate,
-    filters,
-    inspect,
-    play,
-    report,
-    reproduce,
-    score,
-    simulate,
-    study,
-    train,
-    tune,
-    verify,
-)
-
-app = typer.Typer(
-    help="A ship's bow thruster, the filters that estimate its hidden state, and the tuning that makes them good.",
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode="markdown",
-    pretty_exceptions_enable=False,
-)
-app.command("demo")(demo.command)
-app.command("inspect")(inspect.command)
-app.command("simulate")(simulate.command)
-app.command("tune")(tune.command)
-app.command("evaluate")(evaluate.command)
-app.command("report")(report.command)
-app.command("verify")(verify.command)
-app.command("compare")(compare.command)
-app.command("filters")(filters.command)
-app.command("reproduce")(reproduce.command)
-app.command("train")(train.command)
-app.command("play")(play.command)
-app.command("score")(score.command)
-app.add_typer(study.app, name="study")
+INTERRUPTED, BROKEN_PIPE = 130, 141
 
 
-@app.callback()
-def _callback() -> None:
-    pass
+def run() -> None:
+    """Run the command line as a process of its own."""
+    signal(SIGINT, leave)
+    try:
+        _open_standard_streams()
+        warnings.formatwarning = _as_one_line
+        _leave_full_disks_to_the_main_thread()
+        main()
+    except KeyboardInterrupt:  # between two lines of `main`
+        leave()
 
 
 def main() -> None:
-    """Run the command line; a user's mistake is one line and exit code 2, never a traceback."""
-    caught, before = [], signal.getsignal(signal.SIGINT)
+    """Run the command line; a user's mistake is one line and exit code 2, never a traceback.
+
+    The first Ctrl-C is a KeyboardInterrupt, so that what is done can be kept; the next one ends the process.
+    """
+    caught: list[int] = []
+    before, unraisable = getsignal(SIGINT), sys.unraisablehook
 
     def interrupt(number, frame):
+        if caught or _loads_a_package(frame):
+            leave()
         caught.append(number)
         raise KeyboardInterrupt
 
-    signal.signal(signal.SIGINT, interrupt)
+    def lost(error):  # in a callback, where Python cannot raise it
+        if not issubclass(error.exc_type, KeyboardInterrupt):
+            return unraisable(error)
+        import _thread
+        import threading
+
+        caught.clear()
+        threading.Timer(0.05, _thread.interrupt_main).start()
+
     try:
-        code, message = app(standalone_mode=False) or 0, ""
-    except (KeyboardInterrupt, typer.Abort):
-        code, message = 130, "interrupted"
-    except typer.TyperException as error:  # without a command its message is empty: the help has been shown
-        code, message = 2, " ".join(error.format_message().split())
-    except Exception as error:
-        if caught:  # a package that was interrupted while it loaded says so in ways of its own
-            code, message = 130, "interrupted"
-        elif isinstance(error, ValueError):
-            code, message = 2, str(error)
-        else:
-            raise
+        from thruster_cli.characters import adapt_standard_streams
+
+        adapt_standard_streams()
+        from thruster_cli.app import app
+
+        sys.unraisablehook = lost
+        signal(SIGINT, interrupt)
+        code, message = _outcome(app, caught)
+        _say(message)
     finally:
-        signal.signal(signal.SIGINT, before)
-    if message:
-        print(f"thruster: {message}", file=sys.stderr)
+        signal(SIGINT, before)
+        sys.unraisablehook = unraisable
     sys.exit(code)
 
 
+def _outcome(app, caught: list) -> tuple[int, str]:
+    """Exit code of the command line, and what there is to say about it."""
+    import typer
+
+    try:
+        try:
+            code, message = app(standalone_mode=False) or 0, ""
+        except SystemExit as end:
+            if isinstance(end.__context__, BrokenPipeError):  # rich has noticed, and has put the output nowhere
+                return BROKEN_PIPE, ""
+            code, message = (end.code, "") if isinstance(end.code, int) else (2 if end.code else 0, end.code or "")
+        sys.stdout.flush()
+        return code, message
+    except (KeyboardInterrupt, typer.Abort):
+        return INTERRUPTED, "interrupted"
+    except typer.TyperException as error:  # without a command its message is empty: the help has been shown
+        return 2, " ".join(error.format_message().split())
+    except Exception as error:
+        if caught:  # a package that was interrupted says so in ways of its own
+            return INTERRUPTED, "interrupted"
+        if isinstance(error, ValueError):
+            return 2, str(error)
+        if isinstance(error, OSError):
+            return _system_says(error)
+        raise
+
+
+def _system_says(error: OSError) -> tuple[int, str]:
+    """Exit code and message for what the system refuses, such as room on a disk."""
+    if isinstance(error, BrokenPipeError):
+        return BROKEN_PIPE, ""
+    reason = error.strerror or str(error)
+    if error.filename is None:  # it was open already
+        return 2, f"files and standard output must take what is written, but the system says: {reason}"
+    return 2, f"a file must be one that can be read and written, but got {error.filename}: {reason}"
+
+
+def _say(message: str) -> None:
+    """Say on standard error why the command ends, and forget what cannot be written.
+
+    Python would try to write it once more at its end, and say that it cannot.
+    """
+    for stream, text in ((sys.stdout, ""), (sys.stderr, f"thruster: {message}\n" if message else "")):
+        try:
+            stream.write(text)
+            stream.flush()
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
+
+
+def _open_standard_streams() -> None:
+    """Open those that are closed, or the next file that is opened would stand in for one of them.
+
+    What is written to standard output is then refused, as other programs do; what goes to standard error is lost.
+    """
+    for number, flags in enumerate((os.O_WRONLY, os.O_RDONLY, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, flags)  # takes the lowest number that is free
+    sys.stdout = sys.stdout or open(1, "w", encoding="utf-8", closefd=False)
+    sys.stderr = sys.stderr or open(2, "w", encoding="utf-8", closefd=False)
+
+
+def _leave_full_disks_to_the_main_thread() -> None:
+    """Say nothing of an OSError in a thread that writes a log: who fills the log finds out, and says it."""
+    import threading
+
+    before = threading.excepthook
+
+    def say(arguments):
+        if not issubclass(arguments.exc_type, OSError):
+            before(arguments)
+
+    threading.excepthook = say
+
+
+def _as_one_line(message, category, *where) -> str:
+    """A warning, without the line of code that gave it."""
+    return f"thruster: {message}\n" if category is UserWarning else f"thruster: {category.__name__}: {message}\n"
+
+
+def _loads_a_package(frame) -> bool:
+    """Whether an import is under way, in which an exception may get lost or leave a package in pieces."""
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
+
+
+def leave(*_) -> None:
+    """End the process now, as an interrupted one, with the cursor that a progress bar may have hidden."""
+    try:
+        if "multiprocessing.process" in sys.modules:
+            for child in sys.modules["multiprocessing.process"].active_children():
+                child.kill()
+        os.write(2, b"\x1b[?25h\n" * os.isatty(2) + b"thruster: interrupted\n")
+    finally:
+        os._exit(INTERRUPTED)
+
+
 if __name__ == "__main__":
-    main()
+    run()

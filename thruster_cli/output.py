@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from thruster_cli.characters import showable
 from thruster_env.compiled import tell_when_compiling
 from thruster_env.files import write_whole
 from thruster_env.parameters import PRESETS
@@ -37,12 +38,17 @@ def table(
     title: str, columns: list[str], rows: list[list[Any]], *, caption: str | None = None, words: bool = False
 ) -> Table:
     """A table for the terminal; the first column is left-aligned, others to the right unless they hold words."""
+    title, caption = (part and showable(part, console.encoding) for part in (title, caption))
     out = Table(title=title, caption=caption, title_justify="left", caption_justify="left", box=SIMPLE_HEAD)
     out.padding, out.pad_edge = (0, 1, 0, 0), False  # five figures with their intervals fit into 80 columns
     for index, column in enumerate(columns):
-        out.add_column(Text(column), justify="left" if index == 0 or words else "right")
+        out.add_column(
+            Text(showable(column, console.encoding)), justify="left" if index == 0 or words else "right"
+        )
     for row in rows:  # Text: units in brackets are no markup
-        out.add_row(*[cell if isinstance(cell, Text) else Text(str(cell)) for cell in row])
+        out.add_row(
+            *[cell if isinstance(cell, Text) else Text(showable(str(cell), console.encoding)) for cell in row]
+        )
     return out
 
 
@@ -51,10 +57,10 @@ def emit(shown: list, data: dict, json_target: str | None) -> None:
     if json_target == "-":
         sys.stdout.write(as_text(data))
         return
+    if json_target is not None:  # first: there may be nobody left who reads what is printed
+        write_whole(json_target, as_text(data))
     for part in shown:
         console.print(part)
-    if json_target is not None:
-        write_whole(json_target, as_text(data))
 
 
 @cache

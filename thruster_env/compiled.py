@@ -20,6 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
+from thruster_env.code_cache import keep_code
+
 # No "nnan" and "ninf": with them isfinite and isnan are compiled away, and failures would pass unseen.
 FASTMATH = frozenset({"contract", "reassoc", "arcp", "nsz", "afn"})
 
@@ -85,7 +87,7 @@ def compiled(function: Callable) -> Callable:
     while _waiting:
         # By itself LLVM inlines small functions only.
         register_jitable(forceinline=True)(_waiting.pop())
-    return numba.njit(cache=True, nogil=True, fastmath=set(FASTMATH), error_model="numpy")(function)
+    return keep_code(numba.njit(nogil=True, fastmath=set(FASTMATH), error_model="numpy")(function))
 
 
 def tell_when_compiling(tell: Callable[[], None]) -> None:

@@ -1,7 +1,8 @@
 """Numbers by which compiled code in several threads tells one another how far it is.
 
-The first says which call is on; each helper has one that says which call it has done. Every one has a cache line
-of its own, so that writing one does not slow the reading of another.
+One number, for all calls, says which call is on. Each call has for each part that a helper may do a number that
+says whether anybody has taken it, and whether it is done. Every number has a cache line of its own, so that
+writing one does not slow the reading of another.
 """
 
 from __future__ import annotations
@@ -14,13 +15,14 @@ from thruster_env.compiled import inlined, overloaded
 
 LINE = 16  # integers of 8 bytes: two cache lines, for processors that fetch pairs
 CALL = 0  # place of the current call's number
+OPEN, TAKEN, DONE = 0, 1, 2  # what a part of a call may be
 LOOKS = 64  # at a number between two moments in which another thread may have the core
 PATIENCE = 1000  # such moments, of about half a microsecond each
 
 
-def new_signals(helpers: int) -> np.ndarray:
-    """Signals of a caller and some helpers."""
-    return np.zeros(LINE * (helpers + 1), np.int64)
+def new_signals(places: int) -> np.ndarray:
+    """Zeros, a line for each of some places."""
+    return np.zeros(LINE * places, np.int64)
 
 
 @overloaded
@@ -36,31 +38,32 @@ def post(signals, place, value):
 
 
 @overloaded
+def take(marks, place, mark):
+    """Put a mark on a part that is open; return whether it was."""
+    was_open = marks[place] == OPEN
+    if was_open:
+        marks[place] = mark
+    return was_open
+
+
+@overloaded
 def give_way():
     """Let another thread have the core if one wants it."""
 
 
 @inlined
-def announce(signals, call):
-    """Tell the helpers that a call has begun."""
-    post(signals, CALL, call)
+def wait_for(marks, place):
+    """Wait until a part that another thread has taken is done."""
+    looks = 0
+    while read(marks, place) != DONE:
+        looks += 1
+        if looks % LOOKS == 0:
+            give_way()
 
 
 @inlined
-def wait_for_helpers(signals, helpers, call):
-    """Wait until all helpers have done a call."""
-    for place in range(1, helpers + 1):
-        looks = 0
-        while read(signals, LINE * place) < call:
-            looks += 1
-            if looks % LOOKS == 0:
-                give_way()
-
-
-@inlined
-def finish(signals, place, call):
-    """Tell that a helper has done a call, then look out for the next for a while."""
-    post(signals, LINE * place, call)
+def look_out(signals, call):
+    """Look out for a call after this one for a while."""
     for _ in range(PATIENCE):
         for _ in range(LOOKS):
             if read(signals, CALL) > call:
@@ -70,7 +73,7 @@ def finish(signals, place, call):
 
 @cache
 def teach_numba() -> None:
-    """Have numba compile `read`, `post` and `give_way` to what the processor has for it."""
+    """Have numba compile `read`, `post`, `take` and `give_way` to what the processor has for it."""
     from numba import types
     from numba.extending import intrinsic, overload
 
@@ -91,6 +94,15 @@ def teach_numba() -> None:
 
         return types.void(signals, types.intp, types.int64), generate
 
+    @intrinsic
+    def exchange(context, marks, place, mark):
+        def generate(context, builder, signature, arguments):
+            array = context.make_array(signature.args[0])(context, builder, arguments[0])
+            where, before = builder.gep(array.data, [arguments[1]]), context.get_constant(types.int64, OPEN)
+            return builder.extract_value(builder.cmpxchg(where, before, arguments[2], "acq_rel", "acquire"), 1)
+
+        return types.boolean(marks, types.intp, types.int64), generate
+
     sched_yield = types.ExternalFunction("sched_yield", types.int32())
 
     @overload(read)
@@ -100,6 +112,10 @@ def teach_numba() -> None:
     @overload(post)
     def post_compiled(signals, place, value):
         return lambda signals, place, value: store(signals, place, value)
+
+    @overload(take)
+    def take_compiled(marks, place, mark):
+        return lambda marks, place, mark: exchange(marks, place, mark)
 
     @overload(give_way)
     def give_way_compiled():

@@ -6,9 +6,9 @@ for the next call during half a millisecond, in compiled code that holds no lock
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -17,9 +17,10 @@ from queue import SimpleQueue
 import numpy as np
 
 from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined
-from thruster_env.signals import CALL, LINE, announce, finish, new_signals, teach_numba, wait_for_helpers
+from thruster_env.signals import CALL, DONE, LINE, TAKEN, look_out, new_signals, post, take, teach_numba, wait_for
 
-ALONE, CALLER = -1, 0  # places of a thread that works by itself, and of one that has helpers 1, 2, ...
+CALLER = 0  # place of the thread that makes a call; helpers are 1, 2, ...
+BEHIND = 2  # calls that wait for a helper, with which it gets no more
 
 
 @cache
@@ -40,20 +41,26 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def in_parts(work: Callable) -> CompiledOrPython:
-    """Return the call that `Crew.run` makes: work(first, last, *arguments), compiled, with the crew's signals."""
+    """Return the call that `Crew.run` makes: work(first, last, *arguments), compiled, shared out over places."""
     teach_numba()
     inlined(work)
     fingerprint = function_fingerprint(work)
 
-    def part(signals, place, helpers, call, first, last, arguments):
+    def part(signals, marks, place, helpers, call, count, arguments):
         fingerprint  # noqa: B018 - part of the cache's key
-        if place == CALLER:
-            announce(signals, call)
-        work(first, last, *arguments)
-        if place == CALLER:
-            wait_for_helpers(signals, helpers, call)
-        elif place > CALLER:
-            finish(signals, place, call)
+        if place == CALLER and helpers > 0:
+            post(signals, CALL, call)
+        # The caller does its own part, then each that no helper has taken; a helper does its own if it is open.
+        last, mark = (helpers, DONE) if place == CALLER else (place, TAKEN)
+        for p in range(place, last + 1):
+            if p == CALLER or take(marks, LINE * p, mark):
+                if count > 0:
+                    work(p * count // (helpers + 1), (p + 1) * count // (helpers + 1), *arguments)
+                post(marks, LINE * p, DONE)
+            elif place == CALLER:
+                wait_for(marks, LINE * p)
+        if place != CALLER:
+            look_out(signals, call)
 
     return CompiledOrPython(part)
 
@@ -70,15 +77,18 @@ if hasattr(os, "register_at_fork"):  # a forked child has none of the threads
 
 
 class Crew:
-    """Threads that share the work of a call with the thread that makes it."""
+    """Threads that share the work of a call with the thread that makes it.
+
+    A call owns nothing of the crew: its parts, and who has taken them, are its own. Whoever makes it does what no
+    helper has begun, so that it never waits for a helper that is late, busy with another call, or not told. And an
+    exception at any moment, such as Ctrl-C brings, leaves the crew as it was.
+    """
 
     def __init__(self, helpers: int):
         """Start `helpers` threads."""
-        self._signals = new_signals(helpers)
-        self._calls = 0
-        self._busy = threading.Lock()
+        self._signals, self._nothing = new_signals(1), new_signals(1)
+        self._calls = itertools.count(1)
         self._jobs = [SimpleQueue() for _ in range(helpers)]
-        self._errors: list[BaseException] = []
         for place, jobs in enumerate(self._jobs, 1):
             name, arguments = f"thruster-crew-{place}", (place, jobs)
             threading.Thread(target=self._help, args=arguments, name=name, daemon=True).start()
@@ -86,44 +96,34 @@ class Crew:
     def run(self, part: CompiledOrPython, count: int, *arguments, alone: bool = False) -> None:
         """Cover 0 ... count with calls of a part made by `in_parts`.
 
-        The caller does all of it if `alone`, while another thread has the crew, and if numba has refused the part.
+        The caller does all of it if `alone`, and while it is not known whether numba takes the part.
         """
         direct = part.direct
-        alone = alone or direct is part or not self._jobs
-        if not alone and self._busy.acquire(blocking=False):
-            try:
-                self._share(direct, count, arguments)
-            finally:
-                self._busy.release()
+        if alone or direct is part or not self._jobs:
+            part(self._signals, self._nothing, CALLER, 0, 0, count, arguments)
         else:
-            part(self._signals, ALONE, 0, 0, 0, count, arguments)
+            self._share(direct, count, arguments)
 
     def _share(self, part: Callable, count: int, arguments: tuple) -> None:
-        signals, helpers = self._signals, len(self._jobs)
-        self._calls = call = self._calls + 1
-        edges = [i * count // (helpers + 1) for i in range(helpers + 2)]
-        given = 0
+        signals, helpers, call = self._signals, len(self._jobs), next(self._calls)
+        marks, errors = new_signals(helpers + 1), []
         try:
-            for jobs in self._jobs:
-                given += 1
-                first, last = edges[given], edges[given + 1]
-                jobs.put((part, (signals, given, helpers, call, first, last, arguments)))
-            part(signals, CALLER, helpers, call, 0, edges[1], arguments)
+            for place, jobs in enumerate(self._jobs, 1):
+                if jobs.qsize() < BEHIND:  # else it would keep the arguments of calls that are over
+                    jobs.put((part, (signals, marks, place, helpers, call, count, arguments), errors))
+            part(signals, marks, CALLER, helpers, call, count, arguments)
         except BaseException:  # no helper may be at work when the caller goes on
-            signals[CALL] = call
-            while any(signals[LINE * place] < call for place in range(1, given + 1)):
-                time.sleep(1e-5)
+            part(signals, marks, CALLER, helpers, call, 0, arguments)
             raise
-        if self._errors:
-            errors, self._errors = self._errors, []
+        if errors:
             raise errors[0]
 
     def _help(self, place: int, jobs: SimpleQueue) -> None:
         while True:
-            part, arguments = jobs.get()
+            part, arguments, errors = jobs.get()
             try:
                 part(*arguments)
             except BaseException as error:
-                self._errors.append(error)
-                self._signals[LINE * place] = arguments[3]
-            del part, arguments  # an env that is not stepped again can be freed
+                errors.append(error)
+                arguments[1][LINE * place] = DONE
+            del part, arguments, errors  # an env that is not stepped again can be freed

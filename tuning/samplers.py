@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import optuna
+from optuna.trial import FrozenTrial, TrialState
 
 from thruster_env.checks import one_of
 from tuning.space import KIND
@@ -58,6 +59,34 @@ def make_sampler(
         "random": optuna.samplers.RandomSampler,
     }
     return makers[name](seed=seed)
+
+
+def give_sampler(study: optuna.Study, make: Callable[[int], optuna.samplers.BaseSampler], present: int) -> None:
+    """Give a study the sampler of place 0, or, if another process works on it too, that of a place of its own.
+
+    Processes that open a study at the same number of trials would propose alike. But no two trials have the same
+    number: of all that they sample, only the first finds none before it that its process has not run itself. Who
+    finds one takes the number of its own trial as its place.
+
+    Args:
+        study: which this process runs trials of.
+        make: makes the sampler of a place.
+        present: trials that the study had before the process added any.
+    """
+    first, own = make(0), set()
+    proceed = first.before_trial
+
+    def look(_, trial: FrozenTrial) -> None:
+        own.add(trial.number)
+        if "fixed_params" not in trial.system_attrs:  # of what is queued nothing is sampled
+            first.before_trial = proceed
+            begun = (t.number for t in study.get_trials(deepcopy=False)[present:] if t.state != TrialState.WAITING)
+            if any(number < trial.number and number not in own for number in begun):
+                study.sampler = make(trial.number)
+        (proceed if study.sampler is first else study.sampler.before_trial)(study, trial)
+
+    first.before_trial = look
+    study.sampler = first
 
 
 def _grid(distribution: optuna.distributions.BaseDistribution) -> list:

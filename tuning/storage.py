@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import contextlib
 import os
 import re
 import time
@@ -18,14 +18,18 @@ from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
 from optuna.storages import BaseStorage, GrpcStorageProxy, JournalStorage, RDBStorage
 from optuna.storages._cached_storage import _CachedStorage
 from optuna.storages._heartbeat import BaseHeartbeat
-from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+from optuna.storages.journal import JournalFileOpenLock
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import DBAPIError, OperationalError
+
+from tuning.journal import JournalFile, cut_unfinished_line
 
 LOCK_SECONDS = 5  # after which a lock counts as left behind
 SIGNATURE_SECONDS = 2 * LOCK_SECONDS  # by which a living process has signed its trial
 TABLE_TRIES = 5  # to make the tables of a database, or to find them made
 PATIENCE_SECONDS = 60  # for which a database may be away
+CONNECT_SECONDS = 10  # for which to try to reach one, where its driver can be told
+WITH_TIMEOUT = re.compile(r"(postgresql(\+psycopg2?)?|(mysql|mariadb)(\+(pymysql|mysqldb))?)://")
 HEARTBEAT_SECONDS = 10  # between two signs of life of a running trial in a database
 GRACE_SECONDS = 180  # without one, after which it counts as lost; an outage is shorter
 PROXY_PORT, PROXY_SECONDS = 13000, 10  # where a proxy listens by default, and how soon it has to answer
@@ -59,10 +63,10 @@ def open_storage(storage: str) -> BaseStorage:
         lock.acquire()
         try:
             if path.exists():
-                _cut_unfinished_line(path)
+                cut_unfinished_line(path)
         finally:
             lock.release()
-        return JournalStorage(JournalFileBackend(str(path), lock_obj=lock))
+        return JournalStorage(JournalFile(path, lock))
     except (OSError, ValueError, KeyError) as error:
         raise ValueError(
             f"storage must be a journal file that can be written, but got {storage}: {error}"
@@ -88,6 +92,9 @@ def _connected(url: str) -> RDBStorage:
             url,
             heartbeat_interval=HEARTBEAT_SECONDS,
             grace_period=GRACE_SECONDS,
+            engine_kwargs={"connect_args": {"connect_timeout": CONNECT_SECONDS}}
+            if WITH_TIMEOUT.match(url)
+            else None,
             heartbeat_stale_trial_callback=retry_once,
         )
 
@@ -101,31 +108,66 @@ def _proxy(url: str) -> BaseStorage:
     return proxy
 
 
+class Outage:
+    """A database that does not answer, as all threads of this process see it: one deadline for all their calls."""
+
+    def __init__(self):
+        """Begin with a database that answers."""
+        self._since: float | None = None
+        self._failing: set[str] = set()
+        self._told = False
+
+    def answered(self, name: str) -> None:
+        """Note that a call was answered; one that writes has certainly been so by the database, not by a cache."""
+        if self._failing:
+            self._failing = set() if not name.startswith(("get", "_get")) else self._failing - {name}
+            if not self._failing:
+                self._since, self._told = None, False
+
+    def noticed(self, name: str, reason: str) -> None:
+        """Note that a call was not answered.
+
+        Raises:
+            ValueError: if the database has been away for more than PATIENCE_SECONDS.
+        """
+        now = time.monotonic()
+        since = self._since = now if self._since is None else self._since
+        self._failing = self._failing | {name}
+        if now > since + PATIENCE_SECONDS:
+            raise ValueError(f"a database must answer within {PATIENCE_SECONDS} s, but got: {reason}")
+
+    def tell(self, reason: str) -> None:
+        """Say once that there is one."""
+        if not self._told:
+            self._told = True
+            warnings.warn(f"no answer from the database, trying for {PATIENCE_SECONDS} s: {reason}", stacklevel=3)
+
+
 def _patient(method: Callable) -> Callable:
     """The same method of a storage, called again until the database answers.
 
     Raises:
-        ValueError: if that takes more than PATIENCE_SECONDS.
+        ValueError: if the database is away for more than PATIENCE_SECONDS, whichever call noticed it first.
     """
+    name = method.__name__
 
     @wraps(method)
     def patient(self, *args, **kwargs):
-        began = time.monotonic()
         for attempt in count():
             try:
-                return method(self, *args, **kwargs)
+                answer = method(self, *args, **kwargs)
+                self.outage.answered(name)
+                return answer
             except UpdateFinishedTrialError:
+                self.outage.answered(name)
                 if not attempt:
                     raise
                 return True  # the attempt whose answer got lost has done its work
             except StorageInternalError as error:
                 reason = str(error.__cause__ or error).strip().splitlines()[0]
-            if time.monotonic() > began + PATIENCE_SECONDS:
-                raise ValueError(f"a database must answer within {PATIENCE_SECONDS} s, but got: {reason}")
+            self.outage.noticed(name, reason)
             if attempt == 1:  # the first may have met a connection from before an outage
-                warnings.warn(
-                    f"no answer from the database, trying for {PATIENCE_SECONDS} s: {reason}", stacklevel=2
-                )
+                self.outage.tell(reason)
             time.sleep(0.5)
 
     return patient
@@ -133,7 +175,8 @@ def _patient(method: Callable) -> Callable:
 
 def _all_patient(storage: type) -> type:
     for name in BaseStorage.__abstractmethods__ | BaseHeartbeat.__abstractmethods__:
-        setattr(storage, name, _patient(getattr(storage, name)))
+        if name not in vars(storage):
+            setattr(storage, name, _patient(getattr(storage, name)))
     return storage
 
 
@@ -141,24 +184,18 @@ def _all_patient(storage: type) -> type:
 class _PatientStorage(_CachedStorage):
     """What Optuna makes of a database, in no hurry."""
 
+    def __init__(self, database: RDBStorage):
+        super().__init__(database)
+        self.outage = Outage()
 
-def _cut_unfinished_line(path: Path) -> None:
-    content = path.read_bytes()
-    lines = content.splitlines(keepends=True)
-    for number, line in enumerate(lines, start=1):
+    def record_heartbeat(self, trial_id: int) -> None:
+        """Give one sign of life; where it gets lost the next one follows soon, and other calls find out why."""
         try:
-            whole = line.endswith(b"\n") and isinstance(json.loads(line), dict)
-        except ValueError:
-            whole = False
-        if whole:
-            continue
-        if number < len(lines):
-            raise ValueError(f"line {number} is no journal entry")
-        if number == 1:
-            raise ValueError("it is no journal")
-        warnings.warn(f"{path}: cut off its last line, which a process left unfinished", stacklevel=4)
-        with path.open("r+b") as stream:
-            stream.truncate(len(content) - len(line))
+            super().record_heartbeat(trial_id)
+            self.outage.answered("record_heartbeat")
+        except StorageInternalError as error:
+            with contextlib.suppress(ValueError):  # it is for the thread that runs the trial to end
+                self.outage.noticed("record_heartbeat", str(error))
 
 
 def this_process() -> str:

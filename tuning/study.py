@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import optuna
@@ -16,7 +17,7 @@ from tuning.objectives import nis_ratio
 from tuning.outcome import best_trial, is_consistent
 from tuning.plan import Plan
 from tuning.proof import SizeRow, ensemble_sizes, sufficient_size
-from tuning.samplers import make_sampler
+from tuning.samplers import give_sampler, make_sampler
 from tuning.scenarios import Data
 from tuning.space import Choice, choice_of, has_ensemble, trial_parameters
 from tuning.storage import PROCESS, retry_orphans, this_process
@@ -70,7 +71,7 @@ def open_study(
         plan: what the study is for.
         storage: from `open_storage`.
         start: the first trial, in place of untuned ones.
-        worker: place of this process among those that share the study.
+        worker: place of this process among those that share the study; 0 if it may be the only one.
 
     Raises:
         ValueError: if the plan cannot work, or a study of this name was made for something else or by another
@@ -89,7 +90,10 @@ def open_study(
     _check_identity(name, plan.identity, study.user_attrs.get("identity", plan.identity))
     retry_orphans(study)
     present = len(study.get_trials(deepcopy=False))
-    study.sampler = make_sampler(plan.sampler, plan.seed, present, space, worker)
+    if worker:
+        study.sampler = make_sampler(plan.sampler, plan.seed, present, space, worker)
+    else:
+        give_sampler(study, partial(make_sampler, plan.sampler, plan.seed, present, space), present)
     if not present:
         study.set_user_attr("identity", plan.identity)
         if start is not None:
@@ -214,6 +218,16 @@ def run_trials(
         return interrupted()
     except KeyboardInterrupt:
         return True
+    except (AssertionError, UnboundLocalError) as error:  # of Optuna's, when its storage fails it
+        raise _first_cause(error) from None
+
+
+def _first_cause(error: BaseException) -> BaseException:
+    """What a storage said before Optuna's own assertions hid it."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, (OSError, ValueError)):
+        cause = cause.__context__
+    return cause or error
 
 
 def _note_best(study: optuna.Study, last: FrozenTrial) -> None:

@@ -16,11 +16,12 @@ import time
 import warnings
 import zlib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import optuna
 
 from thruster_env.threads import cores
-from tuning.interruption import stop_on_interrupt
+from tuning.interruption import stop_on_interrupt, without_interrupts
 from tuning.plan import Plan
 from tuning.scenarios import Data, find_scenario
 from tuning.storage import open_storage, retry_orphans, this_process
@@ -71,15 +72,18 @@ def run_in_workers(
         for process in processes.values():
             process.kill()
             process.wait()
-            process.stdin.close()
+            with suppress(BrokenPipeError):
+                process.stdin.close()
         retry_orphans(study)
 
 
 def _start(orders: dict) -> subprocess.Popen:
     command = [sys.executable, "-m", "tuning.workers"]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True)
-    process.stdin.write(json.dumps(orders) + "\n")
-    process.stdin.flush()
+    with without_interrupts():
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True)
+    with suppress(BrokenPipeError):  # it has died already, which its exit code tells
+        process.stdin.write(json.dumps(orders) + "\n")
+        process.stdin.flush()
     return process
 
 
@@ -91,7 +95,8 @@ def _watch(
         time.sleep(POLL_SECONDS)
         if interrupted():
             for process in living.values():
-                process.stdin.close()
+                with suppress(BrokenPipeError):
+                    process.stdin.close()
         for worker, process in list(living.items()):
             if process.poll() is not None:
                 del living[worker]
@@ -131,7 +136,7 @@ def main() -> None:
         plan = plan._replace(scenarios=scenarios, objectives=objectives)
         study = open_study(orders["study"], plan, open_storage(orders["storage"]), worker=orders["place"])
         run_trials(study, plan, plan.training_data(), orders["trials"], stop=_parent_says_stop)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         sys.exit(f"thruster: worker {orders['worker']}: {error}")
 
 

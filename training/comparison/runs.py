@@ -23,6 +23,7 @@ from training.environments import make_environments
 from training.learn import one_thread, train
 from training.saved import FINAL, load
 from training.score import Part, Scores, score
+from tuning.interruption import without_interrupts
 from tuning.scenarios import held_out_seeds
 
 RUNS = "runs"
@@ -66,7 +67,10 @@ def run_comparison(
     workers = min(jobs or cores(), max(1, len(missing)))
     pool = ProcessPoolExecutor(workers, context, _prepare, (context.Value("i", 0),))
     try:
-        futures: dict[Future, Run] = {pool.submit(_do, run, folder, comparison.episodes): run for run in missing}
+        with without_interrupts():
+            futures: dict[Future, Run] = {
+                pool.submit(_do, run, folder, comparison.episodes): run for run in missing
+            }
         for future in as_completed(futures):
             future.result()
             run, done = futures[future], done + 1
