@@ -1,4 +1,4 @@
-"""Files that are whole or not there: write aside, then rename. Links are followed; devices and pipes are written to."""
+"""Files that are whole or not there: write aside, then rename; links are followed, devices written to."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
     """Write a file aside, then rename it into place: a reader sees the old file or the new one.
 
     A file that is there keeps its mode; a new one has what the umask leaves. A link stays, and what it leads to is
-    written. What is no regular file (a device, a pipe), or is this process's own standard output, cannot be replaced
-    and is written to as it is.
+    written. What is no regular file (a device, a pipe), or is this process's own standard output, is written to as
+    it is.
 
     Args:
         path: where; missing folders are made.

@@ -205,7 +205,7 @@ def _data(scenario: Scenario, seeds: tuple[int, ...]) -> Data:
     keys, plant = episode_keys(seeds), scenario.plant
     voltages = scenario.excitation.voltages(plant, keys, scenario.steps)
     voltages = np.clip(voltages, -plant.max_voltage, plant.max_voltage)  # as the env does
-    simulation = simulate(plant, keys, voltages)
+    simulation = simulate(plant, keys, voltages).checked(f"the plant of scenario {scenario.name}")
     measurements = np.where(simulation.valid, simulation.measurements, np.nan)  # as filters take missing ones
     truth = simulation.states, simulation.thrusts
     first = np.full(len(seeds), scenario.first_scored_step)
