@@ -14,6 +14,7 @@ from tuning.plan import HELD_OUT_SEEDS, Plan
 from tuning.scenarios import find_scenario
 from tuning.space import Choice, choice_of
 from tuning.storage import open_storage
+from tuning.storage_url import shown_storage
 from tuning.tuned import read_tuned
 
 
@@ -63,7 +64,8 @@ def _of_file(path: str | Path, storage: str) -> Subject:
 def _of_study(name: str, storage: str) -> Subject:
     study = _load(name, storage)
     if study is None:
-        raise ValueError(f"a report must be of a tuned file or of a study in {storage}, but got {name!r}")
+        where = shown_storage(storage)
+        raise ValueError(f"a report must be of a tuned file or of a study in {where}, but got {name!r}")
     plan = _plan(study.user_attrs.get("identity"), f"study {name!r}")
     best = best_trial(study.get_trials(deepcopy=False))
     if best is None:
