@@ -9,6 +9,7 @@ import numpy as np
 import optuna
 
 from thruster_env.checks import one_of
+from tuning.cma_es import CmaEsSampler
 from tuning.space import KIND
 
 SAMPLERS = {
@@ -53,7 +54,7 @@ def make_sampler(
     makers = {
         "tpe": optuna.samplers.TPESampler,
         "gp": optuna.samplers.GPSampler,
-        "cma-es": optuna.samplers.CmaEsSampler,
+        "cma-es": CmaEsSampler,
         "nsga-ii": optuna.samplers.NSGAIISampler,
         "random": optuna.samplers.RandomSampler,
     }

@@ -52,7 +52,8 @@ def without_secrets(text: str, storage: str) -> str:
     if rest.startswith("/"):
         login, place = "", rest
     elif shown.endswith(HIDDEN):  # any part may be a password
-        login, place = f":{storage}", rest
+        place = storage if shown == HIDDEN else storage.partition(":")[2]
+        login = f":{place}"
     else:
         login, _, place = rest.rpartition("@")
     options = [option.partition("=")[2] for option in re.split(r"[?#&;]", place)[1:]]
