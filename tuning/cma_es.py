@@ -20,7 +20,7 @@ _ARRAYS = {("numpy", "ndarray"), ("numpy", "dtype")} | {
 class CmaEsSampler(optuna.samplers.CmaEsSampler):
     """`optuna.samplers.CmaEsSampler` that takes from a journal or database its own state and nothing else.
 
-    Optuna unpickles the state that it finds in a study's trials, so that a study of somebody else's could run any code.
+    Optuna unpickles the state that it finds in a study's trials, so that a study by somebody else could run code.
     """
 
     def _restore_optimizer(self, completed_trials: list[FrozenTrial]):
