@@ -10,8 +10,9 @@ import numpy as np
 
 from filters.filter import Filter
 from filters.model import StateSpaceModel
-from filters.registry import make_filter, read_tuned_file, tunable_numbers
-from filters.thruster import model_of_env
+from filters.registry import make_filter, tunable_numbers
+from filters.thruster import check_plant_of_env, model_of_env
+from filters.tuned_file import read_tuned_file
 from thruster_env.checks import shown
 
 OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
@@ -21,13 +22,19 @@ APPENDED = "appended_entries"  # attribute of an env: entries of its observation
 def filter_for(env, filter: str | None, model, tuned: str | None, numbers: dict) -> Filter:
     """The filter that a wrapper of env is told to run; its class says what the arguments mean.
 
+    A tuned file is data: nothing in it becomes a model or another argument of the wrapper. Where no `model` is
+    given it has to be for the env's plant.
+
     Raises ValueError if an argument is unknown or off.
     """
     if tuned is not None:
         if filter is not None or numbers:
             raise ValueError("tuned must come without filter and numbers, for its file holds them")
-        entry = read_tuned_file(tuned)["filter"]
-        filter, numbers = entry["name"], {**entry["numbers"], **entry["model"]}
+        content = read_tuned_file(tuned)
+        if model is None:
+            check_plant_of_env(env, content.get("plant"), tuned)
+        entry = content["filter"]
+        return make_filter(entry["name"], _model_for(env, model, entry["model"], ()), **entry["numbers"])
     filter = "ekf" if filter is None else filter
     numbers = dict(numbers)
     known = tunable_numbers(filter)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 
@@ -23,6 +24,7 @@ from thruster_env.dynamics import (
 from thruster_env.linear import steady_state, zero_order_hold
 from thruster_env.parameters import ThrusterParameters, checked
 from thruster_env.plant import Plant, make_plant
+from thruster_env.plant_data import check_same_plant
 from thruster_env.rendering import Overlay
 
 ENV_IDS = tuple(f"BowThruster{task}-v0" for task in ("", "Tracking", "Reversal", "Linear"))
@@ -170,6 +172,18 @@ def model_of_env(env, known: tuple[str, ...] = (), /, **changes) -> StateSpaceMo
         names = ", ".join((*known, *MODEL_ARGUMENTS))
         raise ValueError(f"arguments must be among {names}, but got {', '.join(map(repr, unknown))}")
     return model_of_plant(plant, **changes)
+
+
+def check_plant_of_env(env, tuned_for: Mapping | None, file: str) -> None:
+    """Raise ValueError if a tuned file is for another plant than the env's; warn where it is for other noise.
+
+    A file that does not tell (None), and an env that is no bow thruster, are not compared.
+    """
+    plant = getattr(env.unwrapped, "plant", None)
+    if tuned_for is not None and isinstance(plant, Plant):
+        others = check_same_plant(tuned_for, plant, file)
+        if others:
+            warnings.warn(f"{file} was tuned for {', '.join(others)}", stacklevel=4)
 
 
 def thrusts_of(model: StateSpaceModel, states: np.ndarray) -> np.ndarray:

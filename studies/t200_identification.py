@@ -35,6 +35,7 @@ from studies.bollard_fit import (
     relative_errors,
 )
 from studies.bollard_table import BollardTable, read_table
+from thruster_env.files import write_whole
 from thruster_env.parameters import T200
 
 HELD_OUT = (14.0, 18.0)  # between others, so that nothing is extrapolated [V]
@@ -164,7 +165,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         result = study(options.table, options.held_out)
         text = json.dumps(result, indent=2) + "\n"
         if options.json and options.json != "-":
-            Path(options.json).write_text(text)
+            write_whole(options.json, text)
     except (ValueError, OSError) as error:
         print(f"t200_identification: {error}", file=sys.stderr)
         return 2

@@ -6,7 +6,8 @@ from contextlib import nullcontext
 import numpy as np
 
 from filters import StateSpaceModel, affine_model, make_filter, thruster_model, truth
-from filters.registry import sealed, tunable_numbers
+from filters.registry import tunable_numbers
+from filters.tuned_file import sealed
 from thruster_env.compiled import interpreted
 from thruster_env.streams import episode_keys
 

@@ -9,7 +9,7 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
-from filters.registry import read_tuned_file, sealed
+from filters.tuned_file import read_tuned_file, sealed
 from thruster_cli.tables import choice_table
 from thruster_cli.tune import tune
 from tuning.correlations import correlations_of, full_covariance

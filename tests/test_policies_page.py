@@ -13,7 +13,8 @@ from training.classical import classical_policy
 from training.comparison.plan import FOR_LQR, FOR_PI, LEARNT, NOISES, TASK, VARIANTS
 from training.comparison.tables import GOAL, HEADER
 from training.score import score
-from training.setup import TASKS, make_setup
+from training.setup import make_setup
+from training.tasks import TASKS
 from tuning.scenarios import find_scenario, held_out_seeds
 
 DOCS = Path(__file__).parents[1] / "docs"

@@ -12,12 +12,17 @@ from filters import (
     make_filter,
     thruster_model,
 )
-from filters.registry import filter_class, read_tuned_file, sealed, tunable_numbers
+from filters.registry import filter_class, tunable_numbers
+from filters.tuned_file import read_tuned_file, sealed
 from tests.models import TUNED
 
 
 def changed(**entries):
     return sealed({**TUNED, "filter": {**TUNED["filter"], **entries}})
+
+
+def with_model(**entries):
+    return changed(model={**TUNED["filter"]["model"], **entries})
 
 
 @pytest.fixture
@@ -67,10 +72,11 @@ def test_a_tuned_file_is_read_as_it_was_written(write):
         ("", "whole JSON"),
         ([TUNED], "format"),
         ({**TUNED, "format": "something else"}, "format"),
-        ({**TUNED, "version": 3}, "version 2, but .*tuned.json is of version 3: update thruster-env"),
-        ({**TUNED, "version": 1}, "version 2, but .*tuned.json is of version 1: tune again"),
-        ({**TUNED, "version": [2]}, r"version 2, but .*tuned.json is of version \[2\]$"),
-        ({key: TUNED[key] for key in ("format", "filter")}, "version 2, but .*tuned.json is of version None"),
+        ({**TUNED, "version": 4}, "version 2 or 3, but .*tuned.json is of version 4: update thruster-env"),
+        ({**TUNED, "version": 1}, "version 2 or 3, but .*tuned.json is of version 1: tune again"),
+        ({**TUNED, "version": [2]}, r"version 2 or 3, but .*tuned.json is of version \[2\]$"),
+        ({**TUNED, "version": True}, "version 2 or 3, but .*tuned.json is of version True"),
+        ({key: TUNED[key] for key in ("format", "filter")}, "version 2 or 3, but .*tuned.json is of version None"),
         ({**TUNED, "filter": {**TUNED["filter"], "name": "ekf"}}, f"was edited: its hash is '{TUNED['hash']}'"),
         ({**TUNED, "note": "mine"}, "was edited"),
         ({**TUNED, "hash": 3}, "with the hash of its content, but .*tuned.json was edited: its hash is 3"),
@@ -82,6 +88,35 @@ def test_a_tuned_file_is_read_as_it_was_written(write):
         (changed(numbers=3), "numbers"),
         (changed(numbers=[20]), "numbers"),
         (changed(model=None), "model"),
+        (
+            changed(numbers={"size": 3}),
+            "a number of filter 'enkf' must be one of ensemble_size, .* but got 'size'",
+        ),
+        (changed(numbers={"ensemble_size": "20"}), "ensemble_size must be made of finite numbers, but got '20'"),
+        (changed(numbers={"ensemble_size": True}), "ensemble_size must be made of finite numbers, but got True"),
+        (changed(numbers={"inflation": float("nan")}), "inflation must be a finite number, but got nan"),
+        (
+            with_model(model="os:system"),
+            "an argument of the model of a tuned file must be one of .*but got 'model'",
+        ),
+        (with_model(operating_voltage=3.0), "an argument of the model .*, but got 'operating_voltage'"),
+        (
+            with_model(process_noise_cov=[1.0, float("inf")]),
+            "process_noise_cov must be a finite number, but got inf",
+        ),
+        (with_model(process_noise_cov=[[[1.0]]]), "process_noise_cov must be made of finite numbers"),
+        (with_model(process_noise_cov=[]), r"process_noise_cov must be made of finite numbers, but got \[\]"),
+        (
+            with_model(measurement_noise_cov="1"),
+            "measurement_noise_cov must be made of finite numbers, but got '1'",
+        ),
+        (with_model(measurement_noise_cov=None), "must have a measurement_noise_cov, but got"),
+        (with_model(prior_cov_factor=0), "prior_cov_factor must be positive, but got 0"),
+        (with_model(parameter_factors=[2.0]), "the parameter_factors of a tuned file must be a mapping"),
+        (with_model(parameter_factors={"area": "2"}), "parameter_factors, area must be made of finite numbers"),
+        (with_model(parameter_factors={"area": -2}), "parameter_factors, area must be positive, but got -2"),
+        (sealed({**TUNED, "version": 3}), "the plant of a tuned file must be a mapping, but got None"),
+        (sealed({**TUNED, "version": 3, "plant": {}, "scenarios": []}), "the scenarios of a tuned file must be"),
     ],
 )
 def test_a_damaged_tuned_file_is_refused_in_one_line(write, content, rule):

@@ -54,15 +54,6 @@ def test_tables_that_another_host_is_making_are_found_in_the_end(tmp_path, monke
     assert len(tries) == 3
 
 
-def test_a_password_is_not_told():
-    pytest.importorskip("psycopg2")
-    with pytest.raises(
-        ValueError, match="database that can be reached, but got .*//tuner:...@localhost:1/s:"
-    ) as e:
-        open_storage("postgresql+psycopg2://tuner:secret@localhost:1/s")
-    assert "secret" not in str(e.value)
-
-
 @pytest.fixture
 def flaky(tmp_path, monkeypatch):
     """Makes a database do its work and fail to say so, as often as told."""

@@ -8,7 +8,7 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from filters.registry import sealed
+from filters.tuned_file import sealed
 from tuning.plan import Plan
 from tuning.proof import SizeRow, prove, sufficient_size
 from tuning.scenarios import find_scenario
@@ -179,7 +179,7 @@ def test_the_first_ctrl_c_lets_the_running_trial_finish(tmp_path):
     ("change", "rule"),
     [
         ({"parameter_factors": {"voltage_gain": 3.0}}, "must be that of its scenario"),
-        ({"preset": "rubbish"}, "must be that of its scenario"),
+        ({"preset": "rubbish"}, "an argument of the model of a tuned file must be one of"),
         ({"measurement_noise_cov": None}, "must have a measurement_noise_cov"),
         ({"process_noise_cov": [1.0]}, "process_noise_cov must be 2 variances or a symmetric 2 x 2 matrix"),
     ],

@@ -6,7 +6,7 @@ import sys
 import optuna
 import pytest
 
-from filters.registry import sealed
+from filters.tuned_file import sealed
 from thruster_cli.main import main
 from tuning.plan import Plan
 from tuning.proof import prove

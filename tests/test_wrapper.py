@@ -11,8 +11,8 @@ from gymnasium.utils.env_checker import check_env
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import FILTERS, EstimateState, StateSpaceModel, affine_model, make_filter, run, thruster_model
-from filters.registry import sealed
 from filters.thruster import model_of_env
+from filters.tuned_file import sealed
 from tests.models import TUNED
 from thruster_env.parameters import TUNNEL, derive_constants
 from thruster_env.plant import make_plant

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +22,7 @@ from tuning.evaluate import STATES
 from tuning.plan import HELD_OUT_SEEDS
 from tuning.scenarios import SCENARIOS, Scenario, find_scenario, held_out_seeds
 from tuning.space import has_ensemble
-from tuning.tuned import read_tuned, summary
+from tuning.tuned import check_plant, read_tuned, summary
 
 DEFAULT_FILTERS = ("ekf", "enkf", "pf")
 
@@ -69,7 +70,9 @@ def command(
     Example: thruster compare --filter ekf --augment ambient_velocity --scenario ambient
     """
     contenders, default = _contenders(files or [], filters or [], knows, augment or [], ensemble_size or [])
-    chosen = [find_scenario(name) for name in scenarios or [default]]
+    chosen = [find_scenario(name) for name in scenarios] if scenarios else [default]
+    for file, scenario in product(files or [], chosen):
+        check_plant(file, scenario)
     held_out = held_out_seeds(seed, seeds)
     announce_compilation()
     with _bar(len(contenders) * len(chosen)) as on_row:
@@ -82,15 +85,15 @@ def command(
         sys.exit(130)
 
 
-def _contenders(files, filters, knows, augment, sizes) -> tuple[list[Contender], str]:
+def _contenders(files, filters, knows, augment, sizes) -> tuple[list[Contender], Scenario]:
     """The filters that take part, and the scenario where none is named: that of the first file, or nominal."""
     wanted = dict(_size(text) for text in sizes)
     unknown = dict(_unknown(text) for text in augment)
-    out, default = [], "nominal"
+    out, default = [], find_scenario("nominal")
     for place, file in enumerate(files):
         choice, scenario, _ = read_tuned(file)
         if place == 0:
-            default = scenario.name
+            default = scenario
         choice = sized(choice, wanted.get(choice.name, wanted.get(None)))
         out.append(Contender(file.stem, lambda scenario, choice=choice: choice))
     for name in filters or ([] if files else DEFAULT_FILTERS):

@@ -14,7 +14,7 @@ from tuning.plan import HELD_OUT_SEEDS
 from tuning.proof import prove
 from tuning.scenarios import find_scenario
 from tuning.space import true_choice, untuned_choice
-from tuning.tuned import read_tuned, summary
+from tuning.tuned import check_plant, read_tuned, summary
 
 
 def command(
@@ -46,6 +46,7 @@ def command(
     if tuned is not None:
         choice, default, _ = read_tuned(tuned)
         chosen = default if scenario is None else find_scenario(scenario)
+        check_plant(tuned, chosen)
     else:
         chosen = find_scenario(scenario or "nominal")
         choice = untuned_choice(filter_name, chosen)

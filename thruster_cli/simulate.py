@@ -46,7 +46,8 @@ def command(
     """Simulate a thruster and write time, voltage, true state, true thrust and measured thrust to a file.
 
     Row k holds the state at time k dt and the voltage that acts from then on; the last row has none. The
-    numbers are those of BowThruster-v0 after reset(seed=SEED) under the same voltages.
+    numbers are those of BowThruster-v0 after reset(seed=SEED) under the same voltages. A simulation that does not
+    stay finite is refused, and nothing is written.
     """
     if out.suffix not in (".csv", ".npz"):
         raise ValueError(f"--out must end in .csv or .npz, but got {str(out)!r}")
@@ -61,7 +62,7 @@ def command(
             keys, min(amplitude, plant.max_voltage), at_least("hold", hold, 1, MOST_STEPS), steps
         )
     announce_compilation()
-    run = simulate(plant, keys, voltages)
+    run = simulate(plant, keys, voltages).checked()
     values = np.column_stack(
         [
             plant.dt * np.arange(steps + 1),

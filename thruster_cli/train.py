@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from filters.registry import read_tuned_file
+from filters.tuned_file import read_tuned_file
 from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
 from thruster_env.checks import at_least
 from training.algorithms import ALGORITHMS
 from training.arms import ARMS
 from training.extras import check_installed
-from training.setup import TASKS, Setup, make_setup
+from training.setup import Setup, make_setup
+from training.tasks import TASKS
 from tuning.scenario import plain
 from tuning.scenarios import SCENARIOS, find_scenario
 

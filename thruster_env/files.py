@@ -1,52 +1,113 @@
-"""Files that are whole or not there: write aside, then rename."""
+"""Files that are whole or not there: write aside, then rename; links are followed, devices written to."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
+import secrets
+import stat
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
+STREAMS = (1, 2)  # descriptors of standard output and standard error
+
 
 def check_target(path: str | Path) -> None:
     """Raise ValueError if a file could not be written there, before long work is done for it."""
     path = Path(path)
-    if path.is_dir():
-        raise ValueError(f"a file must be where it can be written, but {path} is a folder")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path.parent):
+        found = _found(path)
+        if found is not None and not _is_replaced(found):
+            return
+        target = _target(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=target.parent):
             pass
     except OSError as error:
-        raise ValueError(f"a file must be where it can be written, but {path} is not: {error.strerror}") from None
+        raise _refusal(path, error) from None
 
 
 def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], None]) -> None:
     """Write a file aside, then rename it into place: a reader sees the old file or the new one.
+
+    A file that is there keeps its mode; a new one has what the umask leaves. A link stays, and what it leads to is
+    written. What is no regular file (a device, a pipe), or is this process's own standard output, is written to as
+    it is.
 
     Args:
         path: where; missing folders are made.
         content: text, bytes, or a function that writes to a binary stream.
 
     Raises:
-        ValueError: if the folder cannot be written.
+        ValueError: if it cannot be written there.
     """
+    if callable(content):  # into memory first: pipes cannot be sought, and an error leaves nothing half-written
+        stream = io.BytesIO()
+        content(stream)
+        content = stream.getvalue()
+    content = content.encode() if isinstance(content, str) else content
     path = Path(path)
-    aside = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, aside = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        with os.fdopen(descriptor, "wb") as stream:
-            if callable(content):
-                content(stream)
-            else:
-                stream.write(content.encode() if isinstance(content, str) else content)
-        os.chmod(aside, 0o644)
-        os.replace(aside, path)
-        aside = None
+        found = _found(path)
+        if found is None or _is_replaced(found):
+            _replace(_target(path), content, found)
+        else:
+            with open(path, "ab") as stream:
+                stream.write(content)
     except OSError as error:
-        raise ValueError(f"a file must be where it can be written, but {path} is not: {error.strerror}") from None
-    finally:
-        if aside is not None:
-            Path(aside).unlink(missing_ok=True)
+        raise _refusal(path, error) from None
+
+
+def _found(path: Path) -> os.stat_result | None:
+    """What is at a path, links followed, if anything; OSError if it is nothing that can be written."""
+    try:
+        found = os.stat(path)
+    except FileNotFoundError:
+        return None
+    if stat.S_ISDIR(found.st_mode):
+        raise IsADirectoryError(None, "it is a folder")
+    if not os.access(path, os.W_OK):  # a rename would replace it even so
+        raise PermissionError(None, "it is read-only")
+    return found
+
+
+def _is_replaced(found: os.stat_result) -> bool:
+    """Whether what is there is a regular file, and not where this process's own output goes."""
+    return stat.S_ISREG(found.st_mode) and not any(_is_open_as(stream, found) for stream in STREAMS)
+
+
+def _is_open_as(descriptor: int, found: os.stat_result) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), found)
+    except OSError:  # closed
+        return False
+
+
+def _target(path: Path) -> Path:
+    """The path behind all links; OSError where they lead in a circle."""
+    return Path(os.path.realpath(path))
+
+
+def _replace(target: Path, content: bytes, before: os.stat_result | None) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    aside = target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}")
+    # Unlike `tempfile`, this leaves the mode of a new file to the umask.
+    descriptor = os.open(aside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    try:
+        with os.fdopen(descriptor, "wb") as stream:
+            stream.write(content)
+        if before is not None:
+            with contextlib.suppress(OSError):  # for root, or a group of one's own
+                os.chown(aside, before.st_uid, before.st_gid)
+            os.chmod(aside, before.st_mode & 0o777)
+        os.replace(aside, target)
+    except BaseException:
+        aside.unlink(missing_ok=True)
+        raise
+
+
+def _refusal(path: Path, error: OSError) -> ValueError:
+    return ValueError(f"a file must be where it can be written, but {path} is not: {error.strerror}")

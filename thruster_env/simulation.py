@@ -20,6 +20,17 @@ class Simulation(NamedTuple):
     measurements: np.ndarray  # (B, K + 1, m)
     valid: np.ndarray  # (B, K + 1, m), false where a measurement is missing and the last one repeated
 
+    def checked(self, what: str = "a simulation") -> Simulation:
+        """The same; ValueError that names the first step at which a number is not finite."""
+        parts = (self.states, self.thrusts[..., None], self.measurements)
+        finite = np.all([np.isfinite(part).all(axis=(0, 2)) for part in parts], axis=0)
+        if not finite.all():
+            raise ValueError(
+                f"{what} must stay finite, but it is not from step {np.argmin(finite)} of {len(finite) - 1} on: "
+                "mind dt and the noise covariances"
+            )
+        return self
+
 
 def simulate(plant: Plant, keys: np.ndarray, voltages: np.ndarray) -> Simulation:
     """Run a plant from its initial state for every key (B, 2) under voltages (B, K) [V].

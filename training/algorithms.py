@@ -27,6 +27,27 @@ OFF_POLICY = {
     "policy_kwargs": LAYERS,
 }
 
+# What else may be said of an algorithm, all of it numbers; not where it writes, nor classes and functions.
+HYPERPARAMETERS = (
+    *("learning_rate", "gamma", "gae_lambda", "n_steps", "n_epochs", "batch_size", "policy_kwargs", "noise_std"),
+    *("clip_range", "clip_range_vf", "normalize_advantage", "ent_coef", "vf_coef", "max_grad_norm", "target_kl"),
+    *("use_sde", "sde_sample_freq", "use_sde_at_warmup", "buffer_size", "learning_starts", "tau", "train_freq"),
+    *("gradient_steps", "target_update_interval", "target_entropy", "policy_delay", "stats_window_size"),
+    *("target_policy_noise", "target_noise_clip", "optimize_memory_usage"),
+)
+POLICY_ARGUMENTS = (
+    *(
+        "net_arch",
+        "log_std_init",
+        "ortho_init",
+        "full_std",
+        "use_expln",
+        "squash_output",
+        "n_critics",
+    ),
+    *("share_features_extractor", "lstm_hidden_size", "n_lstm_layers", "shared_lstm", "enable_critic_lstm"),
+)
+
 
 class Algorithm(NamedTuple):
     """An algorithm and what it is given by default."""

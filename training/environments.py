@@ -9,7 +9,8 @@ import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from filters import EstimateState, EstimateStates
-from filters.thruster import model_of_env
+from filters.registry import tunable_numbers
+from filters.thruster import model_of_env, thruster_model
 from thruster_env.observe import ObserveState, ObserveStateVector
 from training.arms import find_arm
 from training.setup import Setup
@@ -62,8 +63,19 @@ def make_single(setup: Setup, render_mode: str | None = None) -> gym.Env:
     if arm.is_true:
         env = ObserveState(env)
     elif arm.filter is not None:
-        env = EstimateState(env, arm.filter, arm.form, **setup.filter_arguments)
+        env = EstimateState(env, arm.filter, arm.form, **_filter_arguments(setup))
     return gym.wrappers.RescaleAction(env, np.float32(-1.0), np.float32(1.0))
+
+
+def _filter_arguments(setup: Setup) -> dict:
+    """Arguments of the wrapper; where the filter assumes another plant than the env's, a model of that one."""
+    arguments = dict(setup.filter_arguments)
+    if setup.assumed_plant is None:
+        return arguments
+    own = {
+        name: arguments.pop(name) for name in tunable_numbers(find_arm(setup.observe).filter) if name in arguments
+    }
+    return {"model": thruster_model(**{**setup.assumed_plant, **arguments}), **own}
 
 
 def _vector_env(setup: Setup, count: int, endless: bool) -> gym.vector.VectorEnv:
@@ -74,5 +86,5 @@ def _vector_env(setup: Setup, count: int, endless: bool) -> gym.vector.VectorEnv
     if arm.is_true:
         return ObserveStateVector(env)
     if arm.filter is not None:
-        return EstimateStates(env, arm.filter, arm.form, **setup.filter_arguments)
+        return EstimateStates(env, arm.filter, arm.form, **_filter_arguments(setup))
     return env

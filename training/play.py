@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.files import check_target
+from thruster_env.files import check_target, write_whole
 from training.environments import make_environments
 from training.saved import load, read_setup
 
@@ -84,14 +83,14 @@ def play(folder: Path, film: Path | None, seed: int, on_step: OnStep = lambda st
 
 
 def _write(film: Path, frames: list[np.ndarray], rate: float) -> None:
-    """Write a film aside, then rename it."""
+    """Write a film whole or not at all."""
     from moviepy import ImageSequenceClip
 
     clip = ImageSequenceClip(frames, fps=rate)
-    with tempfile.TemporaryDirectory(dir=film.parent, prefix=".film") as aside:
+    with tempfile.TemporaryDirectory() as aside:
         path = Path(aside) / film.name
         if film.suffix == ".gif":
             clip.write_gif(str(path), logger=None)
         else:
             clip.write_videofile(str(path), audio=False, logger=None)
-        os.replace(path, film)
+        write_whole(film, path.read_bytes())

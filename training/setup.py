@@ -7,37 +7,20 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import NamedTuple
 
-from filters.registry import read_tuned_file
+from filters.tuned_file import read_tuned_file
 from thruster_env.checks import at_least, one_of, shown
 from thruster_env.plant import make_plant
+from thruster_env.plant_data import check_same_plant
 from training.algorithms import find_algorithm
 from training.arms import find_arm
+from training.checks import check_setup
+from training.tasks import TASKS
 from tuning.scenario import Scenario, plain
 
 VERSION = 1
 MOST_ENVS = 100_000  # whose experience, of 100 steps each, takes a gigabyte
 MOST_STEPS = 10**12
-
-
-class Task(NamedTuple):
-    """An env and what it is asked to follow."""
-
-    about: str
-    env_id: str
-    arguments: dict
-
-
-TASKS: dict[str, Task] = {
-    "tracking": Task("steps of thrust ahead, as the env has them", "BowThrusterTracking-v0", {}),
-    "reversal": Task("ramps of thrust through zero, as the env has them", "BowThrusterReversal-v0", {}),
-    "manoeuvre": Task(
-        "steps of thrust ahead and astern, every half second",
-        "BowThrusterTracking-v0",
-        {"reference": [{"name": "steps", "low": -0.6, "high": 0.6, "hold_time": 0.5}]},
-    ),
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +39,11 @@ class Setup:
         seed: of training, and of the held-out data that belong to it.
         num_envs: copies of the env.
         hyperparameters: of the algorithm.
+        assumed_plant: arguments of the plant that the filter assumes; None for the env's own. No file has one.
+
+    Raises:
+        ValueError: if a name is unknown, or an argument is none that env, filter or algorithm have: whatever comes
+            from a file is data, and can name no code.
     """
 
     observe: str
@@ -69,10 +57,17 @@ class Setup:
     seed: int = 0
     num_envs: int
     hyperparameters: Mapping = field(default_factory=dict)
+    assumed_plant: Mapping | None = None
+
+    def __post_init__(self):
+        """Check names, and that all arguments are known."""
+        check_setup(self)
 
     def as_json(self) -> str:
         """The setup as text."""
-        return json.dumps({"version": VERSION, **asdict(self)}, indent=2) + "\n"
+        content = asdict(self)
+        del content["assumed_plant"]
+        return json.dumps({"version": VERSION, **content}, indent=2) + "\n"
 
     def differences(self, other: Setup) -> list[str]:
         """Names of what differs, apart from the steps: a longer run goes on where a shorter one ended."""
@@ -110,8 +105,11 @@ def make_setup(
     assumed = {"parameter_factors": plain(scenario.parameter_factors)} if scenario.parameter_factors else {}
     given = {**arm.numbers, **assumed} if arm.filter is not None else {}
     if tuned is not None:
-        found = read_tuned_file(tuned)["filter"]
+        content = read_tuned_file(tuned)
+        found = content["filter"]
         one_of("filter of the tuned file", found["name"], (arm.filter,))
+        if "plant" in content:
+            check_same_plant(content["plant"], scenario.plant, tuned)
         given |= {**found["numbers"], **found["model"]}
     given |= filter_arguments or {}
     return Setup(
@@ -141,14 +139,11 @@ def in_scenario(setup: Setup, scenario: Scenario) -> Setup:
     of_plant = inspect.signature(make_plant).parameters
     plant = {name: value for name, value in setup.env_arguments.items() if name in of_plant}
     task = {name: value for name, value in setup.env_arguments.items() if name not in of_plant}
-    assumed = setup.filter_arguments
-    if find_arm(setup.observe).filter is not None:
-        assumed = {"model": "filters.thruster:thruster_model", **plant, **assumed}
     return replace(
         setup,
         scenario=scenario.name,
         env_arguments={**scenario.plant_arguments, **task},
-        filter_arguments=assumed,
+        assumed_plant=plant if setup.assumed_plant is None else setup.assumed_plant,
     )
 
 
@@ -168,6 +163,13 @@ def setup_from_json(text: str, name: str) -> Setup:
         version = entries.pop("version")
         if version > VERSION:
             raise ValueError(f"{name} must be of version {VERSION} or before, but is of version {version}")
-        return Setup(**entries)
-    except (json.JSONDecodeError, TypeError, KeyError, AttributeError, RecursionError):
+        if "assumed_plant" in entries:
+            raise KeyError("assumed_plant")
+    except (json.JSONDecodeError, RecursionError, TypeError, KeyError, AttributeError):
         raise ValueError(f"{name} must hold the setup of a policy, but got {shown(text)}") from None
+    try:
+        return Setup(**entries)
+    except TypeError:  # an entry too many or too few
+        raise ValueError(f"{name} must hold the setup of a policy, but got {shown(text)}") from None
+    except ValueError as error:
+        raise ValueError(f"{error} (in {name})") from None

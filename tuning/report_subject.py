@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import optuna
 
-from filters.registry import read_tuned_file
+from filters.tuned_file import read_tuned_file
 from thruster_env.checks import at_least, shown
 from tuning.outcome import best_trial, is_consistent
 from tuning.plan import HELD_OUT_SEEDS, Plan
-from tuning.scenarios import find_scenario
+from tuning.scenarios import Scenario, find_scenario
 from tuning.space import Choice, choice_of
 from tuning.storage import open_storage
-from tuning.tuned import read_tuned
+from tuning.storage_url import shown_storage
+from tuning.tuned import read_tuned, scenario_in
 
 
 class Subject(NamedTuple):
@@ -49,7 +52,10 @@ def is_file(source: str | Path) -> bool:
 
 def _of_file(path: str | Path, storage: str) -> Subject:
     content, (choice, scenario, _) = read_tuned_file(path), read_tuned(path)
-    name, plan = str(content["study"].get("name")), _plan(content["study"], path)
+    name, plan = (
+        str(content["study"].get("name")),
+        _plan(content["study"], path, partial(scenario_in, content, path=path)),
+    )
     study = _load(name, storage)
     if study is not None and study.user_attrs.get("identity") != plan.identity:
         study = None  # another study of the same name
@@ -64,7 +70,8 @@ def _of_file(path: str | Path, storage: str) -> Subject:
 def _of_study(name: str, storage: str) -> Subject:
     study = _load(name, storage)
     if study is None:
-        raise ValueError(f"a report must be of a tuned file or of a study in {storage}, but got {name!r}")
+        where = shown_storage(storage)
+        raise ValueError(f"a report must be of a tuned file or of a study in {where}, but got {name!r}")
     plan = _plan(study.user_attrs.get("identity"), f"study {name!r}")
     best = best_trial(study.get_trials(deepcopy=False))
     if best is None:
@@ -84,10 +91,10 @@ def _load(name: str, storage: str) -> optuna.Study | None:
         return None
 
 
-def _plan(identity, where: str | Path) -> Plan:
-    """The plan of which an identity tells."""
+def _plan(identity, where: str | Path, find: Callable[[str], Scenario] = find_scenario) -> Plan:
+    """The plan of which an identity tells, its scenarios found by name."""
     try:
-        scenarios = tuple(find_scenario(name) for name in identity["scenarios"])
+        scenarios = tuple(find(name) for name in identity["scenarios"])
         objectives, seed = tuple(identity["objectives"]), at_least("seed", identity["seed"], 0)
         plan = Plan(
             identity["filter"],

@@ -10,6 +10,7 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from thruster_env.checks import one_of
+from tuning.cma_es import CmaEsSampler
 from tuning.space import KIND
 
 SAMPLERS = {
@@ -54,7 +55,7 @@ def make_sampler(
     makers = {
         "tpe": optuna.samplers.TPESampler,
         "gp": optuna.samplers.GPSampler,
-        "cma-es": optuna.samplers.CmaEsSampler,
+        "cma-es": CmaEsSampler,
         "nsga-ii": optuna.samplers.NSGAIISampler,
         "random": optuna.samplers.RandomSampler,
     }

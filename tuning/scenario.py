@@ -187,6 +187,13 @@ class Scenario:
         del content["name"], content["about"]
         return hashlib.sha256(json.dumps(content, sort_keys=True, default=repr).encode()).hexdigest()[:12]
 
+    def as_mapping(self) -> dict:
+        """All that it says but for its name, as JSON can hold it; `scenario_files.scenario_of` reads it."""
+        content = {
+            entry.name: as_data(getattr(self, entry.name)) for entry in fields(self) if entry.name != "name"
+        }
+        return {**content, "excitation": self.excitation.as_mapping()}
+
     def replace(self, **changes) -> Scenario:
         """The same scenario with some fields changed."""
         return replace(self, **changes)
@@ -216,7 +223,7 @@ def _data(scenario: Scenario, seeds: tuple[int, ...]) -> Data:
     keys, plant = episode_keys(seeds), scenario.plant
     voltages = scenario.excitation.voltages(plant, keys, scenario.steps)
     voltages = np.clip(voltages, -plant.max_voltage, plant.max_voltage)  # as the env does
-    simulation = simulate(plant, keys, voltages)
+    simulation = simulate(plant, keys, voltages).checked(f"the plant of scenario {scenario.name}")
     measurements = np.where(simulation.valid, simulation.measurements, np.nan)  # as filters take missing ones
     truth = simulation.states, simulation.thrusts
     first = np.full(len(seeds), scenario.first_scored_step)
@@ -241,6 +248,17 @@ def frozen(value, depth: int = 0):
     if isinstance(value, Mapping):
         return MappingProxyType({key: frozen(part, depth + 1) for key, part in value.items()})
     return tuple(frozen(part, depth + 1) for part in value) if isinstance(value, list | tuple) else value
+
+
+def as_data(value):
+    """As `plain`, with effects and parameters as mappings."""
+    if hasattr(value, "_asdict"):
+        return value._asdict()
+    if hasattr(value, "as_mapping"):
+        return value.as_mapping()
+    if isinstance(value, Mapping):
+        return {key: as_data(part) for key, part in value.items()}
+    return [as_data(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def plain(value):

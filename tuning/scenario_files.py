@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
 
@@ -44,14 +44,46 @@ def read_scenario(path: str | Path, find_base: Callable[[str], Scenario]) -> Sce
     if unknown:
         raise ValueError(f"keys of a scenario must be among {', '.join(KEYS)}, but {path} has {unknown}")
     scale = content.pop("scale", None)
-    try:
+
+    def make() -> Scenario:
         base = find_base(content.pop("base", "nominal"))
         changes = {"about": "", **content, "name": str(path)}
-        scenario = base.replace(**changes, scale=base.scale if scale is None else scale)
-        scenario.model()  # which makes the plant: the rest is checked there
+        scenario = _checked(base.replace(**changes, scale=base.scale if scale is None else scale))
         return (
             scenario.replace(scale=tuple(computed_scale(scenario, FILE_SEQUENCES))) if scale is None else scenario
         )
+
+    return _made(make, content, path)
+
+
+def scenario_of(content, name: str, file: str | Path) -> Scenario:
+    """The scenario of which `Scenario.as_mapping` is the content, as a tuned file keeps it.
+
+    Args:
+        content: the mapping.
+        name: of the scenario.
+        file: where the content comes from, for errors.
+
+    Raises:
+        ValueError: states the rule and the value, with the file.
+    """
+    known = [key for key in KEYS if key != "base"]
+    if not isinstance(content, Mapping) or not set(content) <= set(known):
+        raise ValueError(
+            f"a scenario in a file must be a mapping of {', '.join(known)}, but {file} has {shown(content)}"
+        )
+    return _made(lambda: _checked(Scenario(name=name, **content)), content, file)
+
+
+def _checked(scenario: Scenario) -> Scenario:
+    scenario.model()  # which makes the plant: the rest is checked there
+    return scenario
+
+
+def _made(make: Callable[[], Scenario], content: Mapping, path: str | Path) -> Scenario:
+    """What `make` makes of a file's content; a ValueError with the path where that cannot be."""
+    try:
+        return make()
     except ValueError as error:
         raise ValueError(f"{error} (in {path})") from None
     except (TypeError, AttributeError) as error:  # a value of another kind than the plant takes

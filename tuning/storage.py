@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import time
 import warnings
 from collections.abc import Callable
@@ -23,6 +22,7 @@ from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import DBAPIError, OperationalError
 
 from tuning.journal import JournalFile, cut_unfinished_line
+from tuning.storage_url import is_misspelt, shown_storage, without_secrets
 
 LOCK_SECONDS = 5  # after which a lock counts as left behind
 SIGNATURE_SECONDS = 2 * LOCK_SECONDS  # by which a living process has signed its trial
@@ -50,13 +50,16 @@ def open_storage(storage: str) -> BaseStorage:
         try:
             return _proxy(storage) if storage.startswith("grpc://") else _PatientStorage(_database(storage))
         except Exception as error:  # SQLAlchemy, its drivers and the network raise whatever they like
-            reason = str(error).strip().splitlines()[0]
-            shown = re.sub(r"(?<=://)([^:/@]*):[^/]*@", r"\1:***@", storage)  # without the password
+            reason = without_secrets(_first_line(error), storage)
             raise ValueError(
-                f"storage must be a database that can be reached, but got {shown}: {reason}"
+                f"storage must be a database that can be reached, but got {shown_storage(storage)}: {reason}"
             ) from None
-    path = Path(storage).absolute()
+    path = Path(storage).resolve()  # one lock, whichever link leads to a journal
     try:
+        if is_misspelt(storage):  # which would become folders, its password their name
+            raise ValueError("a URL has :// after its first word")
+        if path.exists() and not path.is_file():
+            raise ValueError("it is no regular file")
         path.parent.mkdir(parents=True, exist_ok=True)
         # A killed process may leave its lock behind; locks are held for milliseconds.
         lock = JournalFileOpenLock(str(path), grace_period=LOCK_SECONDS)
@@ -69,8 +72,13 @@ def open_storage(storage: str) -> BaseStorage:
         return JournalStorage(JournalFile(path, lock))
     except (OSError, ValueError, KeyError) as error:
         raise ValueError(
-            f"storage must be a journal file that can be written, but got {storage}: {error}"
+            f"storage must be a journal file that can be written, but got {shown_storage(storage)}: {error}"
         ) from None
+
+
+def _first_line(error: BaseException) -> str:
+    """What an error says first, or what it is called."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 def _database(url: str) -> RDBStorage:
@@ -164,7 +172,7 @@ def _patient(method: Callable) -> Callable:
                     raise
                 return True  # the attempt whose answer got lost has done its work
             except StorageInternalError as error:
-                reason = str(error.__cause__ or error).strip().splitlines()[0]
+                reason = without_secrets(_first_line(error.__cause__ or error), self._backend.url)
             self.outage.noticed(name, reason)
             if attempt == 1:  # the first may have met a connection from before an outage
                 self.outage.tell(reason)

@@ -5,21 +5,24 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from filters.registry import FILE_FORMAT, FILE_VERSION, read_tuned_file, sealed
+from filters.tuned_file import FILE_FORMAT, FILE_VERSION, read_tuned_file, sealed
 from thruster_env.checks import at_least, covariance, positive, shown
 from thruster_env.files import write_whole
+from thruster_env.plant_data import check_same_plant, plant_data
 from tuning.evaluate import Evaluation
 from tuning.objectives import NIS_BAND
 from tuning.plan import Plan
 from tuning.proof import Comparison
 from tuning.scenario import frozen
-from tuning.scenarios import Scenario, find_scenario
+from tuning.scenario_files import scenario_of
+from tuning.scenarios import SCENARIOS, Scenario, find_scenario
 from tuning.space import Choice
 from tuning.study import StudyResult
 
@@ -58,6 +61,8 @@ def write_tuned(
             "model": {**choice.model, "parameter_factors": dict(scenario.parameter_factors)},
         },
         "scenario": scenario.name,
+        "plant": plant_data(scenario.plant),
+        "scenarios": {one.name: _kept(one) for one in plan.scenarios if one.name not in SCENARIOS},
         "study": {
             "name": study_name,
             **plan.identity,
@@ -72,12 +77,66 @@ def write_tuned(
     write_whole(Path(path), json.dumps(sealed(content), indent=2) + "\n")
 
 
+def _kept(scenario: Scenario) -> dict:
+    """A scenario as a tuned file keeps it, to do without the file that it comes from."""
+    return {"digest": scenario.digest, "content": scenario.as_mapping()}
+
+
+def scenario_in(content: Mapping, name, path: str | Path) -> Scenario:
+    """A scenario that a tuned file names: of the package, or as the file keeps it.
+
+    A file without it (version 2) has only the path of a scenario's own file, which is then read.
+
+    Args:
+        content: of the tuned file, from `read_tuned_file`.
+        name: of the scenario.
+        path: of the tuned file, for errors.
+
+    Raises:
+        ValueError: if there is no such scenario, or what is kept is none.
+    """
+    kept = content.get("scenarios", {}).get(name) if isinstance(name, str) and name not in SCENARIOS else None
+    if kept is None:
+        return find_scenario(name)
+    return scenario_of(kept.get("content") if isinstance(kept, Mapping) else kept, name, path)
+
+
+def _warn_of_changes(content: Mapping, path: str | Path) -> None:
+    """Warn of each scenario file that says something else now than what the tuned file keeps."""
+    for name in content.get("scenarios", {}):
+        if not name.endswith(".toml") or not Path(name).is_file():
+            continue
+        then = scenario_in(content, name, path).digest
+        try:
+            now = find_scenario(name).digest
+        except ValueError:
+            now = "none that can be read"
+        if now != then:
+            warnings.warn(
+                f"{name} is not the scenario that {path} was tuned on (digest {then} then, {now} now): "
+                "what was tuned on is what counts here",
+                stacklevel=3,
+            )
+
+
+def check_plant(path: str | Path, scenario: Scenario) -> None:
+    """Raise ValueError if a tuned file is for another plant than a scenario's: another thruster, dt or sensor."""
+    tuned_for = read_tuned_file(path).get("plant")
+    if tuned_for is not None:
+        check_same_plant(tuned_for, scenario.plant, path)
+
+
 def read_tuned(path: str | Path) -> tuple[Choice, Scenario, int]:
-    """Choice, scenario and study seed of a tuned file; ValueError that says what is wrong with a bad one."""
+    """Choice, scenario and study seed of a tuned file; ValueError that says what is wrong with a bad one.
+
+    A scenario of a file of its own is that of the time of tuning; a warning says if the file has changed since.
+    """
     content = read_tuned_file(path)
     entry = content["filter"]
     try:
-        scenario, seed = find_scenario(content["scenario"]), at_least("seed", content["study"]["seed"], 0)
+        seed = at_least("seed", content["study"]["seed"], 0)
+        scenario = scenario_in(content, content["scenario"], path)
+        _warn_of_changes(content, path)
         given = dict(entry["model"])
         factors = given.pop("parameter_factors", {})
         model = {

@@ -6,11 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from filters.registry import read_tuned_file
+from filters.tuned_file import read_tuned_file
 from thruster_env.checks import shown
 from tuning.proof import prove
-from tuning.scenarios import find_scenario
-from tuning.tuned import metrics, read_tuned, versions
+from tuning.tuned import metrics, read_tuned, scenario_in, versions
 
 TOLERANCE = 1e-9  # relative: what the order of a sum may change
 
@@ -58,7 +57,7 @@ def verify(path: str | Path) -> Verification:
         raise ValueError(f"a tuned file must have held-out metrics to verify, but {path} has {shown(held_out)}")
     places, differences = 0, []
     for name, stored in held_out.items():
-        proof = prove(choice, find_scenario(name), seed, _count(stored, path))
+        proof = prove(choice, scenario_in(content, name, path), seed, _count(stored, path))
         pairs = _numbers(stored), _numbers(metrics(proof))
         names = list(dict.fromkeys([*pairs[0], *pairs[1]]))
         found = [Difference(f"{name}: {place}", *(part.get(place) for part in pairs)) for place in names]

@@ -1,0 +1,71 @@
+"""What a setup may hold: names that are known, and arguments that env, filter and algorithm have, all data.
+
+A setup is read from a policy's folder, where somebody else may have written it. So no entry of it reaches
+Gymnasium, a filter or Stable-Baselines3 that has not been looked at here, before any other file is opened.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
+
+from filters.registry import tunable_numbers
+from filters.thruster import MODEL_ARGUMENTS
+from thruster_env.checks import at_least, one_of, shown
+from thruster_env.env import BowThrusterEnv
+from training.algorithms import HYPERPARAMETERS, POLICY_ARGUMENTS, find_algorithm
+from training.arms import find_arm
+from training.tasks import TASKS
+
+if TYPE_CHECKING:
+    from training.setup import Setup
+
+ENV_ARGUMENTS = tuple(
+    name for name in inspect.signature(BowThrusterEnv.__init__).parameters if name not in ("self", "render_mode")
+)
+
+
+def check_setup(setup: Setup) -> None:
+    """Raise ValueError, with rule and value, if a setup holds anything that is no data or that nobody knows."""
+    task = TASKS[one_of("task", setup.task, tuple(TASKS))]
+    one_of("env_id", setup.env_id, (task.env_id,))
+    arm, algorithm = find_arm(setup.observe), find_algorithm(setup.algo)
+    if not isinstance(setup.scenario, str):
+        raise ValueError(f"scenario must be a name, but got {shown(setup.scenario)}")
+    for name, least in (("steps", 1), ("seed", 0), ("num_envs", 1)):
+        at_least(name, getattr(setup, name), least)
+    own = () if arm.filter is None else (*tunable_numbers(arm.filter), *MODEL_ARGUMENTS)
+    _check_known("env_arguments", setup.env_arguments, ENV_ARGUMENTS)
+    _check_known(f"filter_arguments of observe={setup.observe!r}", setup.filter_arguments, own)
+    if setup.assumed_plant is not None:
+        _check_known("assumed_plant", setup.assumed_plant, ENV_ARGUMENTS)
+    known = (*HYPERPARAMETERS, *algorithm.hyperparameters)
+    _check_known("hyperparameters", setup.hyperparameters, known)
+    _check_known("policy_kwargs", setup.hyperparameters.get("policy_kwargs", {}), POLICY_ARGUMENTS)
+
+
+def _check_known(name: str, given, known: Iterable[str]) -> None:
+    if not isinstance(given, Mapping):
+        raise ValueError(f"{name} must be a mapping, but got {shown(given)}")
+    unknown = [key for key in given if key not in known]
+    if unknown:
+        raise ValueError(
+            f"{name} must be among {', '.join(known) or 'none'}, but got {', '.join(map(repr, unknown))}"
+        )
+    for key, value in given.items():
+        _check_data(f"{name}, {key}", value)
+
+
+def _check_data(name: str, value) -> None:
+    """Raise ValueError unless a value is made of text, finite numbers, lists and mappings, as JSON has them."""
+    if isinstance(value, Mapping):
+        parts = [*value.keys(), *value.values()]
+    else:
+        parts = value if isinstance(value, list | tuple) else ()
+    for part in parts:
+        _check_data(name, part)
+    plain = value is None or isinstance(value, str | int | float | list | tuple | Mapping)
+    if not plain or (isinstance(value, float) and not math.isfinite(value)):
+        raise ValueError(f"{name} must be data: text, finite numbers, lists and mappings, but got {shown(value)}")
