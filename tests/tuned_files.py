@@ -1,0 +1,33 @@
+"""Tuned files for tests, of filters that no study had to find."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from filters.tuned_file import sealed
+from tuning.plan import Plan
+from tuning.proof import prove
+from tuning.scenarios import Scenario, find_scenario
+from tuning.space import untuned_choice
+from tuning.study import StudyResult
+from tuning.tuned import write_tuned
+
+
+def write_untuned(
+    path: Path | str, scenario: Scenario | str = "nominal", name: str = "ekf", seeds: int = 2
+) -> Path:
+    """A tuned file of the untuned filter on a scenario."""
+    found = find_scenario(scenario) if isinstance(scenario, str) else scenario
+    choice = untuned_choice(name, found)
+    result = StudyResult(choice, 1.0, [], [], 0.0, False)
+    write_tuned(path, Plan(name, (found,)), result, [prove(choice, found, 0, seeds)], "s")
+    return Path(path)
+
+
+def rewrite(path: Path, change) -> Path:
+    """Change what a tuned file holds, and seal it anew, as anyone can."""
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(sealed(content)))
+    return path
