@@ -172,6 +172,13 @@ def run_study(
     )
 
 
+def _note_best(study: optuna.Study, last: FrozenTrial) -> None:
+    """Write down the last trial's number if it is the best one."""
+    best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
+    if best is not None and best.number == last.number:
+        study.set_user_attr(BEST, last.number)
+
+
 def run_trials(
     study: optuna.Study,
     plan: Plan,
@@ -214,10 +221,3 @@ def run_trials(
         return interrupted()
     except KeyboardInterrupt:
         return True
-
-
-def _note_best(study: optuna.Study, last: FrozenTrial) -> None:
-    """Write down the last trial's number if it is the best one."""
-    best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
-    if best is not None and best.number == last.number:
-        study.set_user_attr(BEST, last.number)
