@@ -116,7 +116,7 @@ def _work(work: Work, storage: str, workers: int, place: int, ready) -> None:
         run_trials(study, plan, data, MANY, stop=lambda: time.monotonic() > end)
 
 
-def _trial(work: Work, trial: optuna.Trial, plan: Plan, data: Sequence[Data]) -> list[float]:
+def _trial(work: Work, trial: optuna.Trial, plan: Plan, data: Sequence[Data], *_) -> list[float]:
     """A trial that tells the storage as much as one of `thruster tune`, without pruning."""
     choice = suggest(trial, plan.filter, plan.scenarios[0], plan.space())
     score = float(trial.number)

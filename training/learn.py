@@ -179,14 +179,14 @@ class _Evaluation(EvalCallback):
 
     def __init__(self, setup: Setup, folder: Path, envs: VecEnv, seeds, count: int, steps: int):
         self._seeds, self._setup, self._best = seeds, setup, folder / BEST
-        self._file = folder / f"{EVALUATIONS}.npz"
         self.returns: list[float] = []
         normalised = VecNormalize(envs, training=False, norm_reward=False)
         every = max(1, setup.steps // (count * setup.num_envs))
         super().__init__(normalised, n_eval_episodes=len(seeds), eval_freq=every, log_path=str(folder), verbose=0)
-        self.log_path = str(folder / f".{EVALUATIONS}")  # aside, for NumPy writes in place
-        if steps and self._file.is_file():
-            before = whole(self._file, _evaluations_in)
+        path = self._path = folder / f"{EVALUATIONS}.npz"
+        self.log_path = str(path.with_name(f".{EVALUATIONS}"))  # written aside: a full disk costs no earlier ones
+        if steps and path.is_file():
+            before = whole(path, _evaluations_in)
             kept = before["timesteps"] <= steps
             self.evaluations_timesteps = before["timesteps"][kept].tolist()
             self.evaluations_results = before["results"][kept].tolist()
@@ -200,7 +200,7 @@ class _Evaluation(EvalCallback):
         best = self.best_mean_reward
         seed_episodes(self.eval_env, self._seeds)
         goes_on = super()._on_step()
-        os.replace(f"{self.log_path}.npz", self._file)
+        os.replace(f"{self.log_path}.npz", self._path)
         self.returns.append(float(np.mean(self.evaluations_results[-1], dtype=np.float64)))
         if self.best_mean_reward > best:
             save(self._best, self._setup, self.model)

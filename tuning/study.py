@@ -176,6 +176,13 @@ def run_study(
     )
 
 
+def _note_best(study: optuna.Study, last: FrozenTrial) -> None:
+    """Write down the last trial's number if it is the best one."""
+    best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
+    if best is not None and best.number == last.number:
+        study.set_user_attr(BEST, last.number)
+
+
 def run_trials(
     study: optuna.Study,
     plan: Plan,
@@ -228,10 +235,3 @@ def _first_cause(error: BaseException) -> BaseException:
     while cause is not None and not isinstance(cause, (OSError, ValueError)):
         cause = cause.__context__
     return cause or error
-
-
-def _note_best(study: optuna.Study, last: FrozenTrial) -> None:
-    """Write down the last trial's number if it is the best one."""
-    best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
-    if best is not None and best.number == last.number:
-        study.set_user_attr(BEST, last.number)
