@@ -1,0 +1,1 @@
+"""Attacks on the whole, bounded in time: `python -m tests.fuzz`."""
