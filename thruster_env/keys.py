@@ -51,7 +51,7 @@ class EpisodeKeys:
     def seeds(self, seed) -> list[int | None]:
         """The seed of each copy; ValueError unless a reset's seed is None, a number, or one of these a copy."""
         count = self.count
-        if isinstance(seed, (list, tuple, np.ndarray)) and np.ndim(seed) == 1:
+        if isinstance(seed, (list, tuple)) or (isinstance(seed, np.ndarray) and seed.ndim == 1):
             if len(seed) != count:
                 raise ValueError(f"seed must be None, a number or {count} of these, but got {shown(seed)}")
             return [checked_seed(entry) for entry in seed]
@@ -76,7 +76,10 @@ def reset_mask(options: Mapping | None, keys: EpisodeKeys) -> np.ndarray | None:
     mask, count = checked_options(options).get("reset_mask"), keys.count
     if mask is None:
         return None
-    given = np.asarray(mask) if np.ndim(mask) == 1 else np.empty(0)
+    try:
+        given = np.asarray(mask)
+    except ValueError:  # rows of different lengths
+        given = np.empty(0)
     if given.shape != (count,) or given.dtype != np.bool_ or not given.any():
         raise ValueError(f"reset_mask must be {count} booleans, at least one of them true, but got {shown(mask)}")
     if not keys.seeded and not given.all():
