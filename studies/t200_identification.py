@@ -164,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         result = study(options.table, options.held_out)
         text = json.dumps(result, indent=2) + "\n"
         if options.json and options.json != "-":
-            Path(options.json).write_text(text)
+            Path(options.json).write_text(text, encoding="utf-8")
     except (ValueError, OSError) as error:
         print(f"t200_identification: {error}", file=sys.stderr)
         return 2

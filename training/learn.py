@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -180,7 +181,8 @@ class _Evaluation(EvalCallback):
         normalised = VecNormalize(envs, training=False, norm_reward=False)
         every = max(1, setup.steps // (count * setup.num_envs))
         super().__init__(normalised, n_eval_episodes=len(seeds), eval_freq=every, log_path=str(folder), verbose=0)
-        path = folder / f"{EVALUATIONS}.npz"
+        path = self._path = folder / f"{EVALUATIONS}.npz"
+        self.log_path = str(path.with_name(f".{EVALUATIONS}"))  # written aside: a full disk costs no earlier ones
         if steps and path.is_file():
             before = whole(path, _evaluations_in)
             kept = before["timesteps"] <= steps
@@ -196,6 +198,7 @@ class _Evaluation(EvalCallback):
         best = self.best_mean_reward
         seed_episodes(self.eval_env, self._seeds)
         goes_on = super()._on_step()
+        os.replace(f"{self.log_path}.npz", self._path)
         self.returns.append(float(np.mean(self.evaluations_results[-1], dtype=np.float64)))
         if self.best_mean_reward > best:
             save(self._best, self._setup, self.model)
