@@ -45,11 +45,11 @@ def main() -> None:
     def lost(error):  # in a callback, where Python cannot raise it
         if not issubclass(error.exc_type, KeyboardInterrupt):
             return unraisable(error)
-        import _thread
-        import threading
+        from signal import pthread_kill
+        from threading import Timer, main_thread
 
         caught.clear()
-        threading.Timer(0.05, _thread.interrupt_main).start()
+        Timer(0.05, pthread_kill, (main_thread().ident, SIGINT)).start()  # which also wakes it up
 
     try:
         from thruster_cli.characters import adapt_standard_streams
@@ -73,7 +73,8 @@ def _outcome(app, caught: list) -> tuple[int, str]:
 
     try:
         try:
-            code, message = app(standalone_mode=False) or 0, ""
+            code = app(standalone_mode=False) or 0
+            message = "interrupted" if code == INTERRUPTED else ""  # typer keeps the KeyboardInterrupt
         except SystemExit as end:
             if isinstance(end.__context__, BrokenPipeError):  # rich has noticed, and has put the output nowhere
                 return BROKEN_PIPE, ""

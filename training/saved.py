@@ -52,7 +52,7 @@ def save(folder: Path, setup: Setup, model: BaseAlgorithm, replay: bool = False)
     aside = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
     try:
         aside.chmod(0o755)
-        (aside / SETUP).write_text(setup.as_json())
+        (aside / SETUP).write_text(setup.as_json(), encoding="utf-8")
         model.save(aside / POLICY)
         model.get_vec_normalize_env().save(str(aside / NORMALISATION))
         if replay and hasattr(model, "save_replay_buffer"):
@@ -131,7 +131,7 @@ def read_setup(folder: Path) -> Setup:
     """The setup in a folder; raises ValueError if there is none, or it is damaged."""
     path = folder / SETUP
     try:
-        return setup_from_json(path.read_text(), str(path))
+        return setup_from_json(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"a policy must come with its setup, but {path} is not readable: {error}") from None
 

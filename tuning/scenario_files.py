@@ -35,7 +35,7 @@ def read_scenario(path: str | Path, find_base: Callable[[str], Scenario]) -> Sce
         ValueError: states the rule and the value, with the path.
     """
     try:
-        content = tomllib.loads(Path(path).read_text())
+        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(f"a scenario file must be readable, but {path} is not: {error.strerror}") from None
     except (ValueError, RecursionError) as error:  # not TOML, nested too deeply, or not even text

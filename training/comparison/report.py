@@ -22,7 +22,9 @@ def check_page(page: Path) -> None:
     if page.suffix != ".md":
         raise ValueError(f"a page must be a file that ends in .md, but got {str(page)!r}")
     check_target(page)
-    if page.is_file() and not re.search(r"<!-- table (summary|answers|policies_\w+) -->", page.read_text()):
+    if page.is_file() and not re.search(
+        r"<!-- table (summary|answers|policies_\w+) -->", page.read_text(encoding="utf-8")
+    ):
         rule = "a page that is there must have a place for a table, such as <!-- table summary --> <!-- end -->"
         raise ValueError(f"{rule}, but {page} has none")
 
@@ -38,7 +40,7 @@ def write_report(results: Sequence[Result], comparison: Comparison, page: Path) 
     }
     tables["summary"] = lambda: table(["", *comparison.noises], summary_rows(results))
     tables["answers"] = lambda: "\n".join(f"- {sentence}" for sentence in answers(results))
-    text = page.read_text() if page.is_file() else _new_page(comparison, list(tables))
+    text = page.read_text(encoding="utf-8") if page.is_file() else _new_page(comparison, list(tables))
     curves = learning_curves(results, page.with_name(CURVES))
     errors = cost_against_error(results, page.with_name(ERRORS))
     write_whole(page, with_tables(text, tables))

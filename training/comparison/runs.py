@@ -136,7 +136,7 @@ def _read(folder: Path, run: Run, episodes: int) -> Result | None:
     if not path.is_file():
         return None
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
         if content["setup"] != json.loads(run.setup.as_json()) or content["episodes"] != episodes:
             return None
         parts = {name: Part(*map(np.array, pair)) for name, pair in content["parts"].items()}
