@@ -41,7 +41,7 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
             what no tuned file has.
     """
     try:
-        content = json.loads(Path(path).read_text())
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(f"a tuned file must be readable, but {path} is not: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
