@@ -9,7 +9,7 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
 from filters import make_filter, thruster_model
-from filters.registry import read_tuned_file
+from filters.tuned_file import read_tuned_file
 from studies.comparison import compare
 from thruster_cli.simulate import command
 from thruster_env.checks import as_floats, shown, vector

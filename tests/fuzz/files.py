@@ -18,7 +18,7 @@ import optuna
 
 import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState
-from filters.registry import sealed
+from filters.tuned_file import sealed
 from tests.models import TUNED
 from training.setup import make_setup, setup_from_json
 from tuning.plan import Plan
