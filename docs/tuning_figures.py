@@ -72,7 +72,7 @@ def studied(name: str, scenario: Scenario, start: Choice | None = None, trials: 
     """A study in memory."""
     quiet_optuna()
     plan = Plan(name, (scenario,), SEED)
-    return run_study(open_study("page", plan, None, start), plan, trials)
+    return run_study(open_study("page", plan, None, start), plan, trials).or_interrupted()
 
 
 def earned(scenarios: Sequence[str] = EARNING, trials: int = TRIALS) -> str:

@@ -53,7 +53,8 @@ def found_again(kind: str, name: str, trials: int, seeds: Sequence[int] = SEEDS)
     true, found = parameters_of(true_choice(kind, scenario)), []
     for seed in seeds:
         plan = Plan(kind, (scenario,), seed)
-        choice = run_study(open_study("page", plan, None, bad_start(kind, scenario)), plan, trials).choice
+        study = open_study("page", plan, None, bad_start(kind, scenario))
+        choice = run_study(study, plan, trials).or_interrupted().choice
         proof = prove(choice, scenario, seed)
         known = identify(choice, plan.scenarios, plan.training_data(), plan.space())
         ratios = known.tuned / [true[number] for number in known.names]

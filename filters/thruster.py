@@ -11,7 +11,7 @@ import numpy as np
 from filters.gaussian.affine import affine_model
 from filters.made import makes_functions
 from filters.model import StateSpaceModel
-from thruster_env.checks import covariance, finite, positive
+from thruster_env.checks import covariance, finite, positive, shown
 from thruster_env.compiled import inlined
 from thruster_env.components import tuple_of, written_out
 from thruster_env.dynamics import (
@@ -126,7 +126,8 @@ def model_of_plant(
     """The model of a plant, exact unless told otherwise; see `thruster_model` for the arguments."""
     if plant.linear is not None and parameter_factors:
         raise ValueError(f"parameter_factors must be none for a linear plant, but got {parameter_factors}")
-    plant = plant._replace(parameters=_scaled(plant.parameters, parameter_factors or {}))
+    if parameter_factors is not None:
+        plant = plant._replace(parameters=_scaled(plant.parameters, parameter_factors))
     if process_noise_cov is not None:
         plant = plant._replace(process_noise_cov=covariance("process_noise_cov", process_noise_cov, 2))
     if measurement_noise_cov is not None:
@@ -242,7 +243,9 @@ def _operating_range(plant: Plant) -> dict[str, np.ndarray]:
 
 def _scaled(parameters: ThrusterParameters, factors: Mapping[str, float]) -> ThrusterParameters:
     names = [name for name in ThrusterParameters._fields if name != "angles"]
-    unknown = sorted(set(factors) - set(names))
+    if not isinstance(factors, Mapping):
+        raise ValueError(f"parameter_factors must map names to factors, but got {shown(factors)}")
+    unknown = [name for name in factors if name not in names]
     if unknown:
         raise ValueError(f"parameter_factors must name fields of {', '.join(names)}, but got {unknown}")
     scaled = {name: getattr(parameters, name) * positive(name, factor) for name, factor in factors.items()}

@@ -58,6 +58,12 @@ class StudyResult(NamedTuple):
         """Trials that ended early."""
         return sum(trial.state == TrialState.PRUNED for trial in self.trials)
 
+    def or_interrupted(self) -> StudyResult:
+        """This result; KeyboardInterrupt instead if Ctrl-C ended the study, for work of which it is a part."""
+        if self.interrupted:
+            raise KeyboardInterrupt
+        return self
+
 
 def open_study(
     name: str, plan: Plan, storage: optuna.storages.BaseStorage, start: Choice | None = None, worker: int = 0

@@ -118,7 +118,7 @@ def _tuned(filter_name: str, noise: str, wrong: bool) -> Mapping:
     scenario = _scenario(noise, wrong)
     plan = Plan(filter_name, (scenario,))
     study = open_study("policies", plan, None)
-    return run_study(study, plan, TUNING_TRIALS).choice.model
+    return run_study(study, plan, TUNING_TRIALS).or_interrupted().choice.model
 
 
 def _plain(arguments: Mapping) -> dict:
