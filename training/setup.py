@@ -10,13 +10,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 from filters.registry import read_tuned_file
-from thruster_env.checks import at_least, one_of, shown
+from thruster_env.checks import at_least, one_of, positive, shown
 from thruster_env.plant import make_plant
+from thruster_env.predictive import HORIZONS
 from training.algorithms import find_algorithm
 from training.arms import find_arm
 from tuning.scenario import Scenario, plain
 
 VERSION = 1
+SHARE = 0.2  # of the maximum voltage, by which a policy may correct a controller
 
 
 class Task(NamedTuple):
@@ -54,6 +56,8 @@ class Setup:
         seed: of training, and of the held-out data that belong to it.
         num_envs: copies of the env.
         hyperparameters: of the algorithm.
+        controller: name of the predictive controller that the policy corrects, if any.
+        share: the largest correction [V_max].
     """
 
     observe: str
@@ -67,6 +71,8 @@ class Setup:
     seed: int = 0
     num_envs: int
     hyperparameters: Mapping = field(default_factory=dict)
+    controller: str | None = None
+    share: float = SHARE
 
     def as_json(self) -> str:
         """The setup as text."""
@@ -90,6 +96,8 @@ def make_setup(
     tuned: str | Path | None = None,
     num_envs: int | None = None,
     hyperparameters: Mapping | None = None,
+    controller: str | None = None,
+    share: float = SHARE,
 ) -> Setup:
     """A setup from names; what is None is the algorithm's default.
 
@@ -103,6 +111,10 @@ def make_setup(
     chosen = TASKS[one_of("task", task, tuple(TASKS))]
     arm, algorithm = find_arm(observe), find_algorithm(algo)
     _check_plant(scenario)
+    if controller is not None:
+        one_of("controller", controller, tuple(HORIZONS))
+        if not arm.shows_state:
+            raise ValueError(f"{controller} must observe a state, but got observe={observe!r}")
     if arm.filter is None and (filter_arguments or tuned):
         raise ValueError(f"filter arguments must come with an arm that has a filter, but got {observe!r}")
     assumed = {"parameter_factors": plain(scenario.parameter_factors)} if scenario.parameter_factors else {}
@@ -124,6 +136,8 @@ def make_setup(
         seed=at_least("seed", seed, 0),
         num_envs=at_least("num_envs", algorithm.num_envs if num_envs is None else num_envs, 1),
         hyperparameters={**algorithm.hyperparameters, **(hyperparameters or {})},
+        controller=controller,
+        share=positive("share", share),
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from thruster_env.files import write_whole
 from thruster_env.threads import cores
 from training.classical import classical_policy
-from training.comparison.plan import Comparison, Run, runs_of
+from training.comparison.plan import CLASSICAL, Comparison, Run, runs_of
 from training.environments import make_environments
 from training.learn import one_thread, train
 from training.saved import FINAL, load
@@ -98,7 +98,7 @@ def _do(run: Run, folder: Path, episodes: int) -> None:
     """Train and score one policy; write its results."""
     curve, seconds = [], 0.0
     with one_thread():
-        if run.kind in ("pi", "lqr"):
+        if run.kind in CLASSICAL:
             policy = classical_policy(run.kind, run.setup)
         else:
             trained = train(run.setup, folder / RUNS / run.name, checkpoints=4, tensorboard=False)
