@@ -8,8 +8,8 @@ ratios of figures are figures, and their intervals are the jackknife's: each sou
 and the interval is f -+ t sqrt(sum_k v_k), with Student's t of (sum v_k)^2/sum (v_k^2/(n_k - 1)) degrees of
 freedom. For one mean it is Student's interval, for a difference Welch's. Episodes are one source, for they are the
 same for all policies; the training seeds of each policy are a source of their own, for two policies have no chance
-in common. With five seeds it covers 95 %, where the middle 95 % of bootstrap resamples cover less than 90 %; a
-test simulates both.
+in common. (What only one policy does in only one episode is in both sources, which is on the safe side.) With five
+seeds it covers 95 %, where the middle 95 % of bootstrap resamples cover less than 90 %; a test simulates both.
 
 Sources: B. Efron, C. Stein (1981), "The jackknife estimate of variance", Annals of Statistics 9(3), 586-596;
 B. L. Welch (1947), "The generalization of Student's problem when several different population variances are
