@@ -245,7 +245,7 @@ def test_what_is_done_is_kept_after_an_interruption_and_done_once(tmp_path, monk
 def test_the_quick_form_compares_every_arm_and_writes_a_page(thruster, tmp_path):
     page = tmp_path / "page.md"
     page.write_text("Before.\n<!-- table policies_medium -->\nold\n<!-- end -->\nAfter.\n")
-    command = "study", "policies", "--quick", "--seeds", 1, "--steps", 4096, "--out", "found", "--page", page
+    command = "study", "policies", "--quick", "--seeds", 1, "--steps", 2048, "--out", "found", "--page", page
     done = thruster(*command, "--json", "found.json")
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "found.json").read_text())

@@ -24,7 +24,7 @@ OFF_POLICY = {
     "buffer_size": 200_000,
     "learning_starts": 2_000,
     "train_freq": 1,
-    "gradient_steps": 2,
+    "gradient_steps": 8,
     "policy_kwargs": LAYERS,
 }
 
@@ -37,8 +37,7 @@ class Algorithm(NamedTuple):
     policy: str
     steps: int
     num_envs: int
-    hyperparameters: Mapping
-    falls: bool  # whether the learning rate falls linearly to zero
+    hyperparameters: Mapping  # learning_rate: at the start; it falls linearly to zero
 
     @property
     def name(self) -> str:
@@ -60,25 +59,22 @@ ALGORITHMS: dict[str, Algorithm] = {
         PPO_STEPS,
         64,
         {**ON_POLICY, "n_steps": 64, "batch_size": 256, "learning_rate": 1e-3},
-        True,
     ),
     "sac": Algorithm(
         "soft actor-critic, off-policy; few steps, each of them slow",
         "stable_baselines3:SAC",
         "MlpPolicy",
-        100_000,
+        40_000,
         16,
         OFF_POLICY,
-        False,
     ),
     "td3": Algorithm(
         "twin delayed deep deterministic policy gradient, off-policy",
         "stable_baselines3:TD3",
         "MlpPolicy",
-        100_000,
+        40_000,
         16,
         {**OFF_POLICY, "noise_std": 0.1},  # of actions, for its policy explores by nothing else
-        False,
     ),
     "recurrent-ppo": Algorithm(
         "PPO with an LSTM, which may learn a filter of its own; very slow",
@@ -93,7 +89,6 @@ ALGORITHMS: dict[str, Algorithm] = {
             "learning_rate": 1e-3,
             "policy_kwargs": {"net_arch": [64], "log_std_init": -1.0, "lstm_hidden_size": 32},
         },
-        True,
     ),
 }
 
