@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from pathlib import Path
 from typing import NamedTuple
 
@@ -153,7 +154,7 @@ def _model(setup: Setup, envs: VecEnv, start: Path | None, tensorboard: Path | N
         model = load(start, envs, training=True).model
         model.tensorboard_log = None if tensorboard is None else str(tensorboard)
         return model
-    numbers = dict(setup.hyperparameters)
+    numbers = deepcopy(dict(setup.hyperparameters))  # off-policy algorithms write into policy_kwargs
     rate = numbers["learning_rate"]
     # The last rollout may reach beyond the steps that were asked for: what remains is then negative.
     numbers["learning_rate"] = lambda remaining: rate * max(remaining, 0.0)

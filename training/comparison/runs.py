@@ -25,6 +25,7 @@ from training.score import Part, Scores, score
 from tuning.scenarios import held_out_seeds
 
 RUNS = "runs"
+STEPS_APART = 40_000  # points of a learning curve: an evaluation has 16 000 steps
 OnRun = Callable[[Run, int, int], None]  # a run that is done, how many are, of how many
 
 
@@ -101,7 +102,9 @@ def _do(run: Run, folder: Path, episodes: int) -> None:
         if run.kind in CLASSICAL:
             policy = classical_policy(run.kind, run.setup)
         else:
-            trained = train(run.setup, folder / RUNS / run.name, checkpoints=4, tensorboard=False)
+            points = max(1, run.setup.steps // STEPS_APART)
+            folder_of_run = folder / RUNS / run.name
+            trained = train(run.setup, folder_of_run, evaluations=points, checkpoints=4, tensorboard=False)
             curve, seconds = trained.curve, trained.seconds
             policy = load(trained.folder / FINAL, make_environments(run.setup, range(1)))
         scores = score(policy, run.setup, held_out_seeds(0, episodes))
