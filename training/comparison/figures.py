@@ -31,7 +31,7 @@ def learning_curves(results: Sequence[Result], path: str | Path) -> Path:
     """Cost over training steps, one panel a noise: mean over seeds, and the range of all of them."""
     groups = by_policy(results)
     noises = noises_of(groups)
-    figure = new_figure((3.2 * len(noises) + 0.8, 3.7))
+    figure = new_figure((3.2 * len(noises) + 0.8, 4.2))
     axes = figure.subplots(1, len(noises), sharey=True, squeeze=False)[0]
     for axis, noise in zip(axes, noises, strict=True):
         for label, colour in COLOURS.items():
@@ -56,7 +56,8 @@ def learning_curves(results: Sequence[Result], path: str | Path) -> Path:
         _make_logarithmic(axis)
     axes[0].set_ylabel(COST)
     tidy(axes)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=9, frameon=False)
+    named = axes[0].get_legend_handles_labels()
+    figure.legend(*named, loc="outside lower center", ncols=2 * len(noises), frameon=False)
     return save_figure(figure, path)
 
 
