@@ -12,10 +12,11 @@ pytest.importorskip("stable_baselines3")
 from tests.test_cli import thruster  # noqa: F401 - a fixture
 from training.classical import classical_policy
 from training.comparison import runs
-from training.comparison.plan import QUICK, Comparison, Run, runs_of
+from training.comparison.answers import answers
+from training.comparison.plan import BEST, CLASSICAL, QUICK, VARIANTS, WRONG, Comparison, Run, runs_of
 from training.comparison.runs import Result, run_comparison
-from training.comparison.statistics import as_interval, interquartile_mean, typical_error, typical_return
-from training.comparison.tables import HEADER, answers, rows_of, summary_rows
+from training.comparison.statistics import as_interval, typical_error, typical_return
+from training.comparison.tables import HEADER, rows_of, summary_rows
 from training.environments import make_environments
 from training.score import FIRST_SCORED_STEP, Part, Scores, run_episodes, score
 from training.setup import make_setup
@@ -36,66 +37,87 @@ def result(observe, returns, kind="ppo", errors=1.0, seed=0):
     return Result(Run("medium", kind, "", setup(observe, seed)), Scores(returns, *[part] * 5), [], 1.0)
 
 
-def test_the_interquartile_mean_leaves_out_the_outer_quarters():
-    values = np.array([100.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, -50.0])
-    assert interquartile_mean(values) == np.mean([2, 3, 4, 5])
-    assert interquartile_mean(np.array([1.0, 2.0, 9.0])) == 4.0
-    assert interquartile_mean(np.array([-100.0, 1.0, 2.0, 3.0, 100.0])) == 2.0
-
-
 def test_the_interval_of_a_return_is_that_of_the_mean_over_episodes():
     returns = np.random.default_rng(3).normal(-2.0, 0.5, 400)
     interval = as_interval(typical_return([result("ekf", returns)]))
     assert interval.value == pytest.approx(returns.mean())
-    half = 1.96 * returns.std() / 20
-    assert (interval.high - interval.low) / 2 == pytest.approx(half, rel=0.1)
+    half = 1.966 * returns.std(ddof=1) / 20
+    assert (interval.high - interval.low) / 2 == pytest.approx(half, rel=1e-3)
 
 
-def test_training_seeds_widen_the_interval_and_one_bad_one_does_not_move_the_estimate():
+def test_training_seeds_widen_the_interval_of_a_return_and_of_an_error():
     noise = np.random.default_rng(3).normal(0.0, 0.01, (5, 100))
-    levels = np.array([-1.0, -1.1, -1.2, -1.3, -50.0])
-    figure = typical_return([result("ekf", level + row) for level, row in zip(levels, noise, strict=True)])
-    assert figure[0] == pytest.approx(-1.2, abs=0.01)
-    assert np.ptp(figure[1:]) > 0.2
+    levels = np.array([-1.0, -1.1, -1.2, -1.3, -1.4])
+    made = [result("ekf", level + row, errors=-level) for level, row in zip(levels, noise, strict=True)]
+    half = 2.776 * levels.std(ddof=1) / 5**0.5
+    for found in (as_interval(typical_return(made)), as_interval(typical_error(made, "steady"))):
+        assert abs(found.value) == pytest.approx(1.2, abs=0.01)
+        assert (found.high - found.low) / 2 == pytest.approx(half, rel=0.02)
 
 
-def test_episodes_are_drawn_jointly_so_a_constant_difference_is_certain():
+def test_episodes_are_shared_so_a_constant_difference_is_certain():
     hard = np.random.default_rng(0).normal(-5.0, 3.0, 50)
     difference = typical_return([result("ekf", hard + 0.25)]) - typical_return([result("raw", hard)])
-    assert np.allclose(difference, 0.25)
+    assert as_interval(difference) == pytest.approx((0.25, 0.25, 0.25))
 
 
 def test_thrust_errors_are_pooled_before_the_root():
     two = Part(np.array([3.0, 1.0]), np.array([1, 3]))
     made = result("ekf", [0.0, 0.0])
     made = made._replace(scores=made.scores._replace(steady=two))
-    assert typical_error([made], "steady")[0] == pytest.approx(1.0)
+    assert typical_error([made], "steady").value == pytest.approx(1.0)
     none = made._replace(scores=made.scores._replace(reversal=Part(np.zeros(2), np.zeros(2, dtype=int))))
-    assert np.isnan(typical_error([none], "reversal")[0])
+    assert np.isnan(typical_error([none], "reversal").value)
 
 
-def test_the_table_tells_what_part_of_the_gap_is_closed():
+def test_the_table_tells_what_part_of_the_gap_to_the_best_controller_is_closed():
     noise = np.random.default_rng(1).normal(0.0, 0.01, 60)
-    made = [result(arm, level + noise) for arm, level in (("raw", -4.0), ("ekf", -2.0), ("true", -1.0))]
+    made = [result(arm, level + noise) for arm, level in (("raw", -4.0), ("ekf", -2.0), ("true", -1.5))]
+    made += [result(arm, level + noise, kind=BEST) for arm, level in (("ekf", -1.6), ("true", -1.0))]
     made.append(result("ekf", -3.0 + noise, kind="pi", errors=2.0))
     made.append(result("ekf", -4.0 + noise, kind="lqr"))
     rows = {row[0]: dict(zip(HEADER, row, strict=True)) for row in rows_of(made, "medium")}
     assert rows["PPO: ekf"]["gap closed"] == "67 %" and rows["PI: ekf"]["gap closed"] == "33 %"
-    assert rows["PPO: raw"]["gap closed"] == "0 %" and rows["PPO: true"]["gap closed"] == "100 %"
-    assert rows["PI: ekf"]["steady"] == "2.00"
+    assert rows["PPO: raw"]["gap closed"] == "0 %" and rows["MPC: true"]["gap closed"] == "100 %"
+    assert rows["PPO: true"]["gap closed"] == "83 %" and rows["PI: ekf"]["steady"] == "2.00"
     said = dict(summary_rows(made))
-    assert said["gap closed by ekf"] == "67 % [67 %, 67 %]" and said["gap closed by enkf"] == ""
-    assert said["cost on ekf / on true"].startswith("2.00 [") and said["cost on stack / on ekf"] == ""
-    assert said["reversal error of PPO / of PI, both on ekf"] == "0.50 [0.50, 0.50]"
-    assert said["cost of PPO / of LQG, both on ekf"].startswith("0.50 [")
-    (aim,) = answers(made)
-    assert "at least 67 % [67 %, 67 %] of the gap" in aim and aim.endswith(
+    assert said["gap closed by PPO: ekf"].startswith("66.7 % [66.") and said["gap closed by PPO: enkf"] == ""
+    assert said["cost of MPC: ekf / of MPC: true"].startswith("1.600 [")
+    assert said["cost of PPO: stack / of PPO: ekf"] == ""
+    assert said["cost of PPO: ekf / of MPC: ekf"].startswith("1.250 [")
+    assert said["cost of LQG: ekf / of MPC: ekf"].startswith("2.500 [")
+    found = answers(made)
+    assert "at least 66.7 % [66." in found[0] and found[0].endswith(
         "70 % is not reached by all, intervals counted."
     )
+    assert "knowing the true state is worth +0.6000 [+0.6000, +0.6000]: better." in found[1]
+    assert found[2].startswith("PPO: true costs 1.500 [") and found[2].endswith("MPC does: not within 2 %.")
+
+
+@pytest.mark.parametrize(
+    ("level", "said"),
+    [(-0.99, "better"), (-1.01, "within 2 %"), (-1.02, "perhaps within 2 %"), (-1.1, "not within")],
+)
+def test_near_the_best_controller_means_with_the_whole_interval(level, said):
+    noise = np.random.default_rng(1).normal(0.0, 0.1, 60)
+    own = np.random.default_rng(2).normal(0.0, 0.003, 60)
+    made = [result("true", level + noise + own), result("true", -1.0 + noise, kind=BEST)]
+    (found,) = answers(made)
+    assert f"MPC does: {said}" in found
+
+
+def test_a_situation_that_the_model_does_not_know_is_judged_against_the_controller():
+    made = [
+        result("ekf", [-1.0, -1.1])._replace(run=Run("medium", kind, "dead band", setup("ekf")))
+        for kind in ("ppo",)
+    ]
+    made.append(result("ekf", [-1.5, -1.6])._replace(run=Run("medium", BEST, "dead band", setup("ekf"))))
+    assert answers(made) == ["PPO: ekf, dead band returns +0.500 [+0.500, +0.500] more than MPC: better."]
 
 
 def test_nothing_is_said_of_a_gap_that_is_not_there():
-    made = [result(arm, np.full(20, -1.0)) for arm in ("raw", "ekf", "true")]
+    made = [result(arm, np.full(20, -1.0)) for arm in ("raw", "ekf")]
+    made.append(result("true", np.full(20, -1.0), kind=BEST))
     assert {row[2] for row in rows_of(made, "medium")} == {""} and answers(made) == []
 
 
@@ -133,19 +155,39 @@ def test_pi_has_gains_that_do_better_than_the_usual_ones_on_held_out_episodes():
 
 
 def test_a_controller_of_states_refuses_raw_measurements():
-    with pytest.raises(ValueError, match="LQR must observe a state, but got observe='raw'"):
-        classical_policy("lqr", setup("raw"))
-    with pytest.raises(ValueError, match="controller must be one of pi, lqr, but got 'pid'"):
+    for name in ("lqr", "one-step", "mpc"):
+        with pytest.raises(ValueError, match=f"{name} must observe a state, but got observe='raw'"):
+            classical_policy(name, setup("raw"))
+    with pytest.raises(ValueError, match="controller must be one of pi, lqr, one-step, mpc, but got 'pid'"):
         classical_policy("pid", setup("raw"))
+
+
+def test_predictive_control_beats_lqr_and_a_horizon_changes_little():
+    chosen, seeds = setup("true"), held_out_seeds(0, 40)
+    lqr, one, best = (score(classical_policy(name, chosen), chosen, seeds) for name in ("lqr", "one-step", "mpc"))
+    assert one.returns.mean() > 0.25 * lqr.returns.mean()
+    assert best.returns.mean() == pytest.approx(one.returns.mean(), abs=1e-3)
+
+
+def test_a_predictive_controller_believes_in_what_its_filter_does():
+    assumed = find_scenario("mismatch").parameter_factors
+    wrong = make_setup("manoeuvre", MEDIUM.replace(parameter_factors=assumed), "ekf")
+    told, right = (
+        classical_policy("mpc", chosen).controller.problem.constants for chosen in (wrong, setup("ekf"))
+    )
+    assert told.voltage_gain == pytest.approx(0.95 * right.voltage_gain)
 
 
 def test_the_plan_has_every_arm_at_every_noise_with_equal_networks_and_steps():
     planned = runs_of(Comparison(seeds=2, variants=False))
-    learnt = [run for run in planned if run.kind == "ppo"]
-    assert len(learnt) == 2 * 3 * 7 and len({run.name for run in planned}) == len(planned)
-    assert (
-        len({json.dumps([run.setup.steps, run.setup.num_envs, run.setup.hyperparameters]) for run in learnt}) == 1
-    )
+    assert len({run.name for run in planned}) == len(planned)
+    for kind, count in (("ppo", 2 * 3 * 7), ("ppo+mpc", 2 * 4), ("sac", 2 * 2), ("sac+mpc", 2 * 2)):
+        learnt = [run for run in planned if run.kind == kind]
+        numbers = {json.dumps([run.setup.steps, run.setup.num_envs, run.setup.hyperparameters]) for run in learnt}
+        assert len(learnt) == count and len(numbers) == 1
+        assert {run.setup.controller for run in learnt} == {BEST if kind.endswith("+mpc") else None}
+    classical = [(run.kind, run.setup.observe) for run in planned if run.noise == "low" and run.kind in CLASSICAL]
+    assert classical == [(kind, arm) for kind, arms in CLASSICAL.items() for arm in arms]
     variances = {run.noise: run.setup.env_arguments["measurement_noise_cov"] for run in planned}
     assert variances == {"low": 0.25, "medium": 4.0, "high": 16.0}
     assert {tuple(run.setup.env_arguments["process_noise_cov"]) for run in planned} == {(4.0, 0.01)}
@@ -155,7 +197,15 @@ def test_the_plan_has_every_arm_at_every_noise_with_equal_networks_and_steps():
 
 @pytest.mark.slow
 def test_variants_change_what_the_filter_assumes_and_nothing_else():
-    planned = {run.label: run.setup for run in runs_of(Comparison(noises=("medium",), arms=("ekf",), seeds=1))}
+    runs_there = runs_of(Comparison(noises=("medium",), arms=("ekf",), seeds=1))
+    planned = {run.label: run.setup for run in runs_there if run.kind == "ppo"}
+    best = {run.label: run.setup for run in runs_there if run.kind == BEST}
+    for arm, variant in VARIANTS:
+        assert best[f"{arm}, {variant}"].filter_arguments == planned[f"{arm}, {variant}"].filter_arguments
+    assert {run.variant for run in runs_there if run.kind == "ppo+mpc"} == {"", *WRONG}
+    (dead,) = planned["ekf, dead band"].env_arguments["amplifier"]
+    (flow,) = planned["ekf, unknown flow"].env_arguments["flow"]
+    assert dead["name"] == "dead-band" and flow["name"] == "gauss-markov"
     exact, wrong = planned["ekf"], planned["ekf, wrong model"]
     assert exact.filter_arguments == {}
     assert wrong.filter_arguments == {"parameter_factors": {"lift_coefficient": 1.15, "voltage_gain": 0.95}}
@@ -195,13 +245,21 @@ def test_what_is_done_is_kept_after_an_interruption_and_done_once(tmp_path, monk
 def test_the_quick_form_compares_every_arm_and_writes_a_page(thruster, tmp_path):
     page = tmp_path / "page.md"
     page.write_text("Before.\n<!-- table policies_medium -->\nold\n<!-- end -->\nAfter.\n")
-    command = "study", "policies", "--quick", "--seeds", 1, "--steps", 4096, "--out", "found", "--page", page
+    command = "study", "policies", "--quick", "--seeds", 1, "--steps", 2048, "--out", "found", "--page", page
     done = thruster(*command, "--json", "found.json")
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "found.json").read_text())
     named = {row[HEADER[0]] for row in found["policies"]["medium"]}
     assert {f"PPO: {arm}" for arm in QUICK.arms} < named
-    assert {"PI: raw", "PI: ekf", "LQG: kf", "LQG: enkf", "LQR: true"} < named
+    assert {
+        "PI: raw",
+        "LQG: kf",
+        "LQR: true",
+        "one step: enkf",
+        "MPC: true",
+        "SAC: ekf",
+        "PPO + MPC: true",
+    } < named
     text = page.read_text()
     assert text.startswith("Before.\n<!-- table policies_medium -->\n| policy") and text.endswith("\nAfter.\n")
     assert "| PPO: belief | " in text and "old" not in text

@@ -11,6 +11,7 @@ from thruster_env.control import LQRController, PIController
 from thruster_env.gains import lambda_gains, quadratic_gain
 from thruster_env.linear import steady_state
 from thruster_env.observe import ObserveState, ObserveStateVector
+from thruster_env.predictive import PredictiveController
 from thruster_env.task import make_task, thrust_scale
 
 NOISE_FREE = {"process_noise_cov": (0.0, 0.0), "measurement_noise_cov": 0.0, "initial_state": (0.0, 0.0)}
@@ -19,7 +20,7 @@ NOISE_FREE = {"process_noise_cov": (0.0, 0.0), "measurement_noise_cov": 0.0, "in
 TURNING = [name for name in PRESETS if name != "open_bladed"]
 TASK = make_task([{"name": "constant", "level": 0.5}], 1.0, 0.0, 0.01)
 turning_preset = pytest.mark.parametrize("preset", TURNING)
-both = pytest.mark.parametrize("controller", [PIController, LQRController])
+every = pytest.mark.parametrize("controller", [PIController, LQRController, PredictiveController])
 
 
 class NoAction:
@@ -33,7 +34,7 @@ def envs(task, count, **arguments):
 
 def observing(controller, env):
     """The env as a controller observes it."""
-    return ObserveStateVector(env) if controller is LQRController else env
+    return env if controller is PIController else ObserveStateVector(env)
 
 
 def closed_loop(env, policy, steps=500, references=None):
@@ -66,6 +67,7 @@ def returns(task, **arguments):
         "feed-forward": (PIController.for_env(env, 0.0, 0.0), env),
         "PI": (PIController.for_env(env), env),
         "LQR": (LQRController.for_env(env), ObserveStateVector(env)),
+        "MPC": (PredictiveController.for_env(env), ObserveStateVector(env)),
     }
     return {name: closed_loop(env, policy)[0] for name, (policy, env) in policies.items()}
 
@@ -79,11 +81,11 @@ def better(one, other):
 # Closed loops
 
 
-@both
+@every
 @turning_preset
 def test_a_constant_thrust_is_held_without_an_error(preset, controller):
     env = envs("Tracking", 1, preset=preset, **NOISE_FREE)
-    scale, accuracy = thrust_scale(env.plant), 1e-5 if controller is PIController else 2.6e-4  # of `POINTS`
+    scale, accuracy = thrust_scale(env.plant), 2.6e-4 if controller is LQRController else 1e-5  # of `POINTS`
     for level in (-0.6, 0.3, 0.9):
         references = np.full(450, level * scale)
         _, thrusts, _ = closed_loop(observing(controller, env), made(controller, preset), 450, references)
@@ -162,10 +164,11 @@ def test_the_integral_does_not_wind_up(preset):
 
 
 @pytest.mark.parametrize("preset", ["tunnel", "tunnel_physical", "open_bladed_corrected"])
-@both
+@every
 def test_symmetric_thrusters_are_driven_symmetrically(preset, controller):
-    policy, generator = made(controller, preset), np.random.default_rng(1)
-    observations = generator.normal(size=(40, 3)) * [100.0, 2.0, 0.5 * thrust_scale(policy.plant)]
+    policy, scale = made(controller, preset), thrust_scale(made(PIController, preset).plant)
+    generator = np.random.default_rng(1)
+    observations = generator.normal(size=(40, 3)) * [100.0, 2.0, 0.5 * scale]
     if controller is PIController:
         observations = observations[:, ::2]
     state = other = None
@@ -197,7 +200,7 @@ def test_the_controllers_feedback_is_the_gain_to_first_order(preset):
 # The interface
 
 
-@both
+@every
 def test_a_batch_is_driven_as_each_env_alone(controller):
     env, policy = observing(controller, envs("Reversal", 3)), made(controller, "tunnel")
     observation, _ = env.reset(seed=4)
@@ -212,7 +215,7 @@ def test_a_batch_is_driven_as_each_env_alone(controller):
         observation = env.step(actions)[0]
 
 
-@both
+@every
 def test_an_episode_start_forgets(controller):
     env, policy = observing(controller, envs("Tracking", 3)), made(controller, "tunnel")
     observation, _ = env.reset(seed=4)
@@ -255,11 +258,11 @@ def test_further_channels_and_flags_do_not_disturb():
     np.testing.assert_array_equal(action, plain.predict([9.0, 12.0])[0])
 
 
-@both
+@every
 def test_voltages_stay_within_the_range(controller):
     policy = controller.for_env(gym.make("BowThrusterTracking-v0", max_voltage=10.0))
     observations = np.random.default_rng(0).normal(size=(200, 3)) * [100.0, 3.0, 20.0]
-    actions, _ = policy.predict(observations if controller is LQRController else observations[:, 1:])
+    actions, _ = policy.predict(observations[:, 1:] if controller is PIController else observations)
     assert actions.min() == -10.0 and actions.max() == 10.0
 
 
@@ -280,11 +283,11 @@ def test_lqr_wants_the_state():
 
 
 @pytest.mark.parametrize("task", ["", "Tracking"])
-@both
+@every
 def test_stable_baselines_evaluates_the_controllers(task, controller):
     evaluation = pytest.importorskip("stable_baselines3.common.evaluation")
     env = gym.make(f"BowThruster{task}-v0")
-    env = ObserveState(env) if controller is LQRController else env
+    env = env if controller is PIController else ObserveState(env)
     policy = controller.for_env(env)
     env.reset(seed=7)
     with warnings.catch_warnings():
@@ -302,7 +305,7 @@ def test_feedback_pays(task, preset):
     got = returns(task, preset=preset)
     assert better(got["PI"], got["nothing"])
     assert better(got["PI"], got["feed-forward"])
-    assert better(got["LQR"], got["PI"])
+    assert better(got["LQR"], got["PI"]) and better(got["MPC"], got["LQR"])
 
 
 def test_feed_forward_may_be_worse_than_nothing():

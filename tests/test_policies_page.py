@@ -10,8 +10,9 @@ pytest.importorskip("stable_baselines3")
 from thruster_cli.study import app
 from training.arms import ARMS
 from training.classical import classical_policy
-from training.comparison.plan import FOR_LQR, FOR_PI, LEARNT, NOISES, TASK, VARIANTS
-from training.comparison.tables import GOAL, HEADER
+from training.comparison.answers import GOAL
+from training.comparison.plan import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
+from training.comparison.tables import HEADER, name_of
 from training.score import score
 from training.setup import make_setup
 from training.tasks import TASKS
@@ -36,13 +37,19 @@ def returned(row):
     return float(row["return"].split(" ± ")[0])
 
 
-@pytest.mark.parametrize("noise", NOISES)
+@pytest.mark.parametrize("noise", ["low", "high"])
 def test_the_tables_have_every_policy(noise):
-    learnt = {f"PPO: {arm}" for arm in LEARNT}
-    if noise == "medium":
-        learnt |= {f"PPO: {arm}, {variant}" for arm, variant in VARIANTS}
-    lqg = {f"LQG: {arm}" for arm in FOR_LQR if arm != "true"} | {"LQR: true"}
-    assert set(rows_at(noise)) == learnt | {f"PI: {arm}" for arm in FOR_PI} | lqg
+    planned = runs_of(Comparison(noises=(noise,), seeds=1, variants=False))
+    assert list(rows_at(noise)) == [name_of(run.kind, run.label) for run in planned]
+
+
+def test_the_table_of_medium_noise_has_every_variant_too():
+    planned = runs_of(Comparison(noises=("medium",), seeds=1, variants=False))
+    expected = {name_of(run.kind, run.label) for run in planned}
+    expected |= {name_of(kind, f"{arm}, {variant}") for kind in ("ppo", BEST) for arm, variant in VARIANTS}
+    expected |= {name_of("ppo+mpc", f"ekf, {variant}") for variant in WRONG}
+    expected |= {name_of(BEST, f"true, {variant}") for variant in WRONG if variant != "wrong model"}
+    assert set(rows_at("medium")) == expected
 
 
 def test_the_page_tells_every_arm_and_the_task():
@@ -69,15 +76,42 @@ def test_filtered_state_closes_the_gap_and_noise_costs():
         for arm in ("ekf", "enkf", "belief"):
             assert int(rows[f"PPO: {arm}"]["gap closed"].split()[0]) >= 100 * GOAL
             assert float(rows[f"PPO: {arm}"]["observed"]) < float(rows["PPO: raw"]["observed"])
-        for arm in ("ekf", "enkf"):
-            assert float(rows[f"PPO: {arm}"]["reversal"]) < 0.5 * float(rows[f"PI: {arm}"]["reversal"])
-    ekf = [returned(rows_at(noise)["PPO: ekf"]) for noise in ("low", "medium", "high")]
-    assert ekf == sorted(ekf, reverse=True)
-    assert "the tuned EKF returns +" in ANSWERS and ": better." in ANSWERS and "is reached" in ANSWERS
+    for policy in ("PPO: ekf", "MPC: ekf", "one step: enkf"):
+        costs = [-returned(rows_at(noise)[policy]) for noise in ("low", "medium", "high")]
+        assert costs == sorted(costs)
+    assert "is reached" in ANSWERS
+
+
+def test_the_nonlinear_controller_is_what_a_policy_is_measured_by():
+    for noise in NOISES:
+        rows = rows_at(noise)
+        assert rows["MPC: true"]["gap closed"] == "100 %" and returned(rows["MPC: true"]) == -0.445
+        for arm in ("ekf", "enkf", "true"):
+            best = returned(rows[f"MPC: {arm}"])
+            assert best == pytest.approx(returned(rows[f"one step: {arm}"]), abs=1.1e-3)
+            assert best > 0.3 * returned(rows[f"{'LQR' if arm == 'true' else 'LQG'}: {arm}"])
+        # A policy that corrects the controller is within 2 % of it.
+        assert returned(rows["PPO + MPC: ekf"]) > 1.02 * returned(rows["MPC: ekf"])
+    assert returned(rows_at("medium")["PPO + MPC: true"]) > 1.02 * returned(rows_at("medium")["MPC: true"])
+
+
+def test_where_the_model_is_wrong_a_policy_that_corrects_it_beats_the_controller():
+    rows = rows_at("medium")
+    for variant in WRONG:
+        assert returned(rows[f"PPO + MPC: ekf, {variant}"]) > returned(rows[f"MPC: ekf, {variant}"])
+        assert f"PPO + MPC: ekf, {variant} returns +" in ANSWERS
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "kind", "arm"), [("LQG: ekf", "lqr", "ekf"), ("PI: raw", "pi", "raw")])
+@pytest.mark.parametrize(
+    ("name", "kind", "arm"),
+    [
+        ("LQG: ekf", "lqr", "ekf"),
+        ("PI: raw", "pi", "raw"),
+        ("one step: ekf", "one-step", "ekf"),
+        ("MPC: true", "mpc", "true"),
+    ],
+)
 def test_classical_rows_are_those_of_the_code(name, kind, arm):
     setup = make_setup(TASK, find_scenario("medium_noise"), arm)
     found = score(classical_policy(kind, setup), setup, held_out_seeds(0, 200))

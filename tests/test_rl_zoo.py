@@ -27,8 +27,7 @@ def test_the_numbers_are_those_of_thruster_train(name):
     told.pop("env_wrapper")
     assert told.pop("normalize") is True and told.pop("policy") == algorithm.policy
     assert (told.pop("n_envs"), told.pop("n_timesteps")) == (algorithm.num_envs, algorithm.steps)
-    if algorithm.falls:
-        told["learning_rate"] = float(told["learning_rate"].removeprefix("lin_"))
+    told["learning_rate"] = float(told["learning_rate"].removeprefix("lin_"))
     if "noise_std" in told:
         assert told.pop("noise_type") == "normal"
     assert told == algorithm.hyperparameters

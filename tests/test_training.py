@@ -38,7 +38,9 @@ def test_a_policy_learns_on_every_arm_and_is_scored(observe, tmp_path):
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_a_policy_learns_by_every_algorithm_goes_on_and_acts_the_same_when_loaded(algo, tmp_path):
     setup = setup_of(algo=algo, steps=128)
+    told = setup.as_json()
     folder = learn(setup, tmp_path / "policy").folder
+    assert setup.as_json() == told, "else another process finds another setup in the folder"
     longer = replace(setup, steps=256)
     run = learn(longer, folder)
     assert (run.steps, run.learnt) == (256, 128)

@@ -61,11 +61,11 @@ def test_the_commands_train_score_and_play(thruster, monkeypatch, tmp_path):
     before = contents(tmp_path / "out")
     raw = folder.with_name("tracking-medium_noise-raw-ppo-seed0")
     scored = thruster(
-        "score", folder, raw, "--seeds", 5, "--classical", "pi", "--classical", "lqr", "--json", "score.json"
+        "score", folder, raw, "--seeds", 5, "--classical", "pi", "--classical", "mpc", "--json", "score.json"
     )
     assert scored.returncode == 0, scored.stderr
     rows = json.loads((tmp_path / "score.json").read_text())["policies"]
-    assert [row["policy"] for row in rows] == ["ekf ppo", "raw ppo", "ekf pi", "raw pi", "ekf lqr"]
+    assert [row["policy"] for row in rows] == ["ekf ppo", "raw ppo", "ekf pi", "raw pi", "ekf mpc"]
     assert rows[0]["over_the_first"]["value"] == 0.0 and len(rows[1]["returns"]) == 5
     assert rows[2]["mean_return"]["value"] > rows[0]["mean_return"]["value"]
     elsewhere = thruster("score", folder, "--seeds", 5, "--scenario", "ambient")
@@ -100,3 +100,4 @@ def test_folders_are_named_after_what_is_learnt(tmp_path):
     assert name_of(setup_of("raw+action", seed=2)) == "tracking-medium_noise-raw+action-ppo-seed2"
     assert name_of(setup_of(), tmp_path / "mine.json") == "tracking-medium_noise-ekf-mine-ppo-seed0"
     assert name_of(setup_of(), untuned=True) == "tracking-medium_noise-ekf-untuned-ppo-seed0"
+    assert name_of(setup_of(controller="mpc")) == "tracking-medium_noise-ekf-mpc-ppo-seed0"

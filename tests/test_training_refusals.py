@@ -154,6 +154,8 @@ def test_drawing_names_its_extra(package, monkeypatch, copied):
 BAD = [
     (("train", "--observe", "none"), "observe must be one of raw, raw+action"),
     (("train", "--algo", "none"), "algo must be one of ppo"),
+    (("train", "--controller", "pi"), "controller must be one of one-step, mpc, but got 'pi'"),
+    (("train", "--observe", "raw", "--controller", "mpc"), "mpc must observe a state, but got observe='raw'"),
     (("train", "--task", "none"), "task must be one of tracking"),
     (("train", "--scenario", "none"), "scenario must be one of nominal"),
     (("train", "--steps", "0"), "steps must be"),
@@ -165,7 +167,7 @@ BAD = [
     (("play", "ekf", "--out", "x.avi"), "--out must end in .mp4 or .gif, but got 'x.avi'"),
     (("play", "ekf", "--out", "x.gif", "--window"), "give either --window or --out FILE, but got both"),
     (("score", "ekf", "full"), "a policy must be a folder that `thruster train` made, but full holds none"),
-    (("score", "ekf", "--classical", "pid"), "classical must be one of pi, lqr, but got 'pid'"),
+    (("score", "ekf", "--classical", "pid"), "classical must be one of pi, lqr, one-step, mpc, but got 'pid'"),
     (
         ("score", "ekf", "--scenario", "dropout"),
         "trained on observe='ekf' must see 4 numbers, but the env shows 5",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -43,7 +44,8 @@ def command(
     classical: Annotated[
         list[str] | None,
         typer.Option(
-            help="pi or lqr; may be repeated. A controller that observes what each policy does; lqr a state only."
+            help="pi, lqr, one-step or mpc; may be repeated. A controller that observes what each policy does; "
+            "all but pi a state only."
         ),
     ] = None,
     seeds: Annotated[int, typer.Option(help="Number of held-out episodes.")] = HELD_OUT_SEEDS,
@@ -61,13 +63,15 @@ def command(
 
     Needs the extra rl: pip install 'thruster-env[rl]'
 
-    Example: thruster score out/policies/* --classical pi --scenario ambient
+    mpc plans a few steps ahead by the thruster's equations, one-step a single one; lqr is linear.
+
+    Example: thruster score out/policies/* --classical mpc --scenario ambient
     """
     check_installed()
     held_out = held_out_seeds(seed, seeds)
     plant = None if scenario is None else find_scenario(scenario)
     with progress_console.status("loading torch ..."):
-        from training.classical import CONTROLLERS
+        from training.classical import CONTROLLERS, FOR_STATES
         from training.saved import find_saved, read_setup
     for name in classical or []:
         one_of("classical", name, CONTROLLERS)
@@ -82,7 +86,7 @@ def command(
             scored.append(_learnt(model, folder, setups[model], plant, held_out))
         for name in classical or []:
             for setup in _each_arm(setups.values()):
-                if name == "lqr" and not find_arm(setup.observe).shows_state:
+                if name in FOR_STATES and not find_arm(setup.observe).shows_state:
                     continue
                 status.update(f"scoring {name} on {setup.observe} ...")
                 scored.append(_classical(name, setup, plant, held_out))
@@ -107,13 +111,15 @@ def _learnt(model: Path, folder: Path, setup: Setup, plant: Scenario | None, see
 
     met = setup if plant is None else in_scenario(setup, plant)
     policy = load(folder, make_environments(met, seeds[:1]))
-    return Scored(f"{setup.observe} {setup.algo}", model, setup, score(policy, met, seeds))
+    name = setup.algo if setup.controller is None else f"{setup.algo}+{setup.controller}"
+    return Scored(f"{setup.observe} {name}", model, setup, score(policy, met, seeds))
 
 
 def _classical(name: str, setup: Setup, plant: Scenario | None, seeds: Sequence[int]) -> Scored:
     from training.classical import classical_policy
     from training.score import score
 
+    setup = replace(setup, controller=None)  # there is no policy to correct it
     met = setup if plant is None else in_scenario(setup, plant)
     return Scored(f"{setup.observe} {name}", None, setup, score(classical_policy(name, setup), met, seeds))
 

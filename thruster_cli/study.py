@@ -36,7 +36,8 @@ def policies(
         int | None, typer.Option(min=1, max=1000, help="Training seeds of each learnt policy; 5.")
     ] = None,
     steps: Annotated[
-        int | None, typer.Option(min=1, max=10**12, help="Steps that each learns from; 400000.")
+        int | None,
+        typer.Option(min=1, max=10**12, help="Steps that each learns from; as many as `thruster train` takes."),
     ] = None,
     recurrent: Annotated[
         bool, typer.Option("--recurrent", help="Also PPO with an LSTM on raw measurements: many hours.")
@@ -49,21 +50,22 @@ def policies(
     ] = None,
     json: JsonOption = None,
 ) -> None:
-    """Train policies on raw, filtered and true state, and compare them with PI and LQG.
+    """Train policies on raw, filtered and true state, and compare them with model-predictive control, PI and LQG.
 
-    PPO at three noises of the thrust sensor; the same network, steps and held-out episodes for all. Writes a page
-    with tables and two pictures. Ctrl-C keeps what is done, and the same command goes on. On two cores it takes
-    three quarters of an hour.
+    PPO at three noises of the thrust sensor, SAC and policies that correct the controller; the same held-out
+    episodes for all. Writes a page with tables and two pictures. Ctrl-C keeps what is done, and the same command
+    goes on. On two cores it takes an hour or more.
 
     Example: thruster study policies --quick
     """
     from training.extras import check_installed
 
     check_installed()
+    from training.comparison.answers import answers
     from training.comparison.plan import QUICK, Comparison
     from training.comparison.report import PAGE, check_page, write_report
     from training.comparison.runs import run_comparison
-    from training.comparison.tables import HEADER, answers, rows_of, summary_rows
+    from training.comparison.tables import HEADER, rows_of, summary_rows
 
     comparison = QUICK if quick else Comparison()
     given = {"seeds": seeds, "steps": steps, "recurrent": recurrent or None}

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from filters.tuned_file import read_tuned_file
 from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
 from thruster_env.checks import at_least
+from thruster_env.predictive import HORIZONS
 from training.algorithms import ALGORITHMS
 from training.arms import ARMS
 from training.extras import check_installed
@@ -51,6 +52,10 @@ def command(
         bool,
         typer.Option("--untuned", help="Give the filter R by the sensor's sheet and Q by a rule of thumb."),
     ] = False,
+    controller: Annotated[
+        str | None,
+        typer.Option(help=f"Let the policy correct one of {', '.join(HORIZONS)}, in place of acting alone."),
+    ] = None,
     envs: Annotated[int | None, typer.Option(metavar="N", help="Copies of the env, stepped together.")] = None,
     evaluations: Annotated[
         int, typer.Option(metavar="N", help="How often the policy is tried out meanwhile.")
@@ -73,6 +78,9 @@ def command(
     Whole rollouts are learnt, so it may end some steps later. In FOLDER, final/ is the policy that score and play
     take (before it is there, the latest checkpoint), best/ the one with the highest return on the way.
 
+    With --controller the policy adds up to a fifth of the maximum voltage to what a predictive controller does,
+    which it is shown. It needs an estimate, or the true state.
+
     Ctrl-C saves a checkpoint, and the same command goes on from it; so it does after a crash, or with more steps.
 
     Needs the extra rl: pip install 'thruster-env[rl]'. To watch it learn: tensorboard --logdir out/policies
@@ -92,6 +100,7 @@ def command(
         filter_arguments={name: plain(value) for name, value in chosen.untuned.items()} if untuned else None,
         tuned=tuned,
         num_envs=envs,
+        controller=controller,
     )
     evaluations, checkpoints = (
         at_least("evaluations", evaluations, 1, 10_000),
@@ -122,6 +131,7 @@ def name_of(setup: Setup, tuned: Path | None = None, untuned: bool = False) -> s
     """Name of the folder of a training: what it learns, from what, by what."""
     parts = [setup.task, Path(setup.scenario).stem, setup.observe]
     parts += ["untuned"] * untuned + ([] if tuned is None else [tuned.stem])
+    parts += [] if setup.controller is None else [setup.controller]
     return "-".join([*parts, setup.algo, f"seed{setup.seed}"])
 
 

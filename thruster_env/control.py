@@ -78,14 +78,14 @@ class PIController:
             finite("proportional_gain", proportional_gain),
             finite("integral_gain", integral_gain),
             plant.channels.index("thrust"),
-            _constant_reference(env),
+            constant_reference(env),
         )
 
     def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
         """Voltage (..., 1) for an observation (..., d), and state (..., 2): I_{k+1} [V] and r_{k+1} [N]."""
-        observation, reference = _read(observation, self.reference)
+        observation, reference = read(observation, self.reference)
         at_start = np.stack([np.zeros_like(reference), reference], axis=-1)
-        integral, present_reference = np.moveaxis(_remembered(state, episode_start, at_start), -1, 0)
+        integral, present_reference = np.moveaxis(remembered(state, episode_start, at_start), -1, 0)
         error = present_reference - observation[..., self.thrust_entry]
         steady = self.points.interpolate(self.points.voltage, reference)
         wanted = steady + self.proportional_gain * error + integral
@@ -132,31 +132,29 @@ class LQRController:
         of_speed, of_flow = np.array([slopes(plant, v)[2][0] for v in points.voltage]).T
         by_thrust = by_speed / of_speed
         gains = np.stack([by_thrust, by_flow - by_thrust * of_flow, by_voltage])
-        return cls(plant, points, gains, _constant_reference(env))
+        return cls(plant, points, gains, constant_reference(env))
 
     def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
         """Voltage (..., 1) for an observation (..., d), and state (..., 1): the same voltage, V_k [V].
 
         Raises ValueError for an observation that is too short to hold the state.
         """
-        observation, reference = _read(observation, self.reference)
-        if observation.shape[-1] < 2 + (self.reference is None):
-            rule = "an observation must begin with the state"
-            raise ValueError(f"{rule}, but has {observation.shape[-1]} entries: see observe.ObserveState")
-        last_voltage = _remembered(state, episode_start, np.zeros((*reference.shape, 1)))[..., 0]
+        observation, reference = read(observation, self.reference)
+        states = read_state(observation, self.reference)
+        last_voltage = remembered(state, episode_start, np.zeros((*reference.shape, 1)))[..., 0]
         thrust, voltage, flow = (self.points.interpolate(values, reference) for values in self.points)
         by_thrust, by_flow, by_voltage = (self.points.interpolate(gain, reference) for gain in self.gains)
         wanted = (
             voltage
-            - by_thrust * (thrust_of(self.plant, observation[..., :2]) - thrust)
-            - by_flow * (observation[..., 1] - flow)
+            - by_thrust * (thrust_of(self.plant, states) - thrust)
+            - by_flow * (states[..., 1] - flow)
             - by_voltage * (last_voltage - voltage)
         )
         voltage = np.clip(wanted, -self.plant.max_voltage, self.plant.max_voltage)[..., None]
         return voltage.astype(np.float32), voltage
 
 
-def _constant_reference(env) -> float | None:
+def constant_reference(env) -> float | None:
     """The reference [N] of an env that does not observe it; None if it does."""
     base = env.unwrapped
     if getattr(base, "single_env", base).observes_reference:
@@ -164,7 +162,7 @@ def _constant_reference(env) -> float | None:
     return float(base.task.reference[0].thrust)
 
 
-def _read(observation, reference: float | None) -> tuple[np.ndarray, np.ndarray]:
+def read(observation, reference: float | None) -> tuple[np.ndarray, np.ndarray]:
     """Observation (..., d) in float64 and the reference (...) [N]."""
     observation = np.asarray(observation, dtype=np.float64)
     if reference is None:
@@ -172,7 +170,15 @@ def _read(observation, reference: float | None) -> tuple[np.ndarray, np.ndarray]
     return observation, np.full(observation.shape[:-1], reference)
 
 
-def _remembered(state, episode_start, at_start: np.ndarray) -> np.ndarray:
+def read_state(observation: np.ndarray, reference: float | None) -> np.ndarray:
+    """The state (..., 2) that an observation (..., d) begins with; ValueError if it is too short to hold one."""
+    if observation.shape[-1] < 2 + (reference is None):
+        rule = "an observation must begin with the state"
+        raise ValueError(f"{rule}, but has {observation.shape[-1]} entries: see observe.ObserveState")
+    return observation[..., :2]
+
+
+def remembered(state, episode_start, at_start: np.ndarray) -> np.ndarray:
     """The state (..., k) of the last call; where an episode starts, what it is at the start."""
     if state is None:
         return at_start

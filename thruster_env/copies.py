@@ -62,6 +62,7 @@ from thruster_env.motion import (
     move_thruster,
 )
 from thruster_env.streams import MEASUREMENT, normal_block
+from thruster_env.task import step_cost
 from thruster_env.threads import in_parts
 
 LARGEST_ERROR = 1e6  # of thrust over T_max: a reward stays finite when a state does not
@@ -113,7 +114,7 @@ def _reward(memory, b, numbers):
         error = error if abs(error) < LARGEST_ERROR else LARGEST_ERROR  # NaN, too, as the episode ends
         voltage = memory[b, COMMAND, j] * per_volt
         change = voltage - memory[b, LAST_COMMAND, j] * per_volt
-        memory[b, REWARD, j] = -(tracking * error * error + energy * voltage * voltage + rate * change * change)
+        memory[b, REWARD, j] = -step_cost(error, voltage, change, tracking, energy, rate)
 
 
 @inlined

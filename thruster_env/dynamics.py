@@ -127,11 +127,21 @@ def variational_rates(y, u, c):
     return rates(x, u, c) + rates_tangent(x, (y[2], y[3]), u, c)
 
 
+@inlined
+def driven_rates(y, u, c):
+    """Rates of the state and of what a change dV of the voltage makes of it, y = (.., d omega_m, d U_a, dV)."""
+    d_omega, d_flow = rates_tangent((y[0], y[1]), (y[2], y[3]), u, c)
+    return rates((y[0], y[1]), u, c) + (d_omega + c.voltage_gain * y[4], d_flow, 0.0 * y[4])
+
+
 substep = runge_kutta(rates, 2)
 """`substep(x, u, c)`: the state after c.substep seconds of constant input, by one Runge-Kutta step."""
 
 variational_substep = runge_kutta(variational_rates, 4)
 """`variational_substep(y, u, c)`: the same with a perturbation; exactly the derivative of `substep`."""
+
+driven_substep = runge_kutta(driven_rates, 5)
+"""`driven_substep(y, u, c)`: the same with a perturbation of the voltage, which is held."""
 
 
 @inlined

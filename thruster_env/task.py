@@ -8,6 +8,7 @@ import numpy as np
 
 from thruster_env.analysis import equilibrium
 from thruster_env.checks import positive, within
+from thruster_env.compiled import inlined
 from thruster_env.effects import Effect
 from thruster_env.linear import state_range, steady_state
 from thruster_env.plant import Plant
@@ -21,11 +22,17 @@ ABSURD = 100.0  # a state this many times its range away from rest ends the epis
 class Task(NamedTuple):
     """A reference, and a reward from the true thrust T after the step, whatever the sensors say.
 
-    -(tracking ((T - r)/T_max)^2 + energy (V_s/V_max)^2 + voltage_rate (change of V_s/V_max)^2)
+    -(tracking ((T - r)/T_max)^2 + energy (V_s/V_max)^2 + voltage_rate (change of V_s/V_max)^2), see `step_cost`
     """
 
     reference: tuple[Effect, ...] = ()
     weights: tuple[float, float, float] = DEFAULT_WEIGHTS
+
+
+@inlined
+def step_cost(error, voltage, change, tracking, energy, rate):
+    """Cost of a step, minus its reward: of a thrust error [T_max], a voltage and its change [V_max]."""
+    return tracking * error * error + energy * voltage * voltage + rate * change * change
 
 
 def make_task(reference, tracking_weight: float, energy_weight: float, voltage_rate_weight: float) -> Task:

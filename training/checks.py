@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 
 from filters.registry import tunable_numbers
 from filters.thruster import MODEL_ARGUMENTS
-from thruster_env.checks import at_least, one_of, shown
+from thruster_env.checks import at_least, one_of, positive, shown
 from thruster_env.env import BowThrusterEnv
+from thruster_env.predictive import HORIZONS
 from training.algorithms import HYPERPARAMETERS, POLICY_ARGUMENTS, find_algorithm
 from training.arms import find_arm
 from training.tasks import TASKS
@@ -36,6 +37,11 @@ def check_setup(setup: Setup) -> None:
         raise ValueError(f"scenario must be a name, but got {shown(setup.scenario)}")
     for name, least in (("steps", 1), ("seed", 0), ("num_envs", 1)):
         at_least(name, getattr(setup, name), least)
+    if setup.controller is not None:
+        one_of("controller", setup.controller, tuple(HORIZONS))
+        if not arm.shows_state:
+            raise ValueError(f"{setup.controller} must observe a state, but got observe={setup.observe!r}")
+    positive("share", setup.share)
     own = () if arm.filter is None else (*tunable_numbers(arm.filter), *MODEL_ARGUMENTS)
     _check_known("env_arguments", setup.env_arguments, ENV_ARGUMENTS)
     _check_known(f"filter_arguments of observe={setup.observe!r}", setup.filter_arguments, own)

@@ -1,51 +1,33 @@
-"""Classical policies for the same table: PI on raw or estimated thrust, LQG with each estimator, LQR.
+"""Classical policies for the same table: PI, LQR (LQG with an estimator), and the predictive controllers.
 
 Each observes what an arm of `training.arms` does, so it stands beside the policy that learnt on that arm.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
 from thruster_env.checks import one_of
 from thruster_env.control import LQRController, PIController
+from thruster_env.predictive import HORIZONS
 from training.arms import find_arm
+from training.controllers import ClassicalPolicy, predictive
 from training.environments import make_single
 from training.score import score
 from training.setup import Setup
 from tuning.scenarios import training_seeds
 
-CONTROLLERS = ("pi", "lqr")
+CONTROLLERS = ("pi", "lqr", *HORIZONS)
+FOR_STATES = CONTROLLERS[1:]  # those that must observe one, true or estimated
 GAINS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0)  # factors on the gains of `gains.lambda_gains`, tried for each arm
 GAIN_SEEDS = 16
 
 
-@dataclass(frozen=True)
-class ClassicalPolicy:
-    """A controller of `thruster_env.control` with the observations and actions of learnt policies."""
-
-    controller: PIController | LQRController
-    skipped: int  # entries in front of what the controller reads
-    max_voltage: float
-
-    def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
-        """Actions (n, 1) in [-1, 1] for observations (n, d), and what the controller remembers."""
-        seen = np.asarray(observation)[..., self.skipped :]
-        voltage, state = self.controller.predict(seen, state, episode_start)
-        return voltage / self.max_voltage, state
-
-
 def lqr(setup: Setup) -> ClassicalPolicy:
-    """LQR on the true state, or on an estimate: certainty equivalence, so LQG.
-
-    Raises:
-        ValueError: if the setup observes no state.
-    """
-    if not find_arm(setup.observe).shows_state:
-        raise ValueError(f"LQR must observe a state, but got observe={setup.observe!r}")
+    """LQR on the true state, or on an estimate: certainty equivalence, so LQG."""
     env = make_single(setup)
     return ClassicalPolicy(LQRController.for_env(env), 1, env.unwrapped.plant.max_voltage)
 
@@ -71,5 +53,14 @@ def _with_gains(controller: PIController, proportional, integral) -> PIControlle
 
 
 def classical_policy(name: str, setup: Setup) -> ClassicalPolicy:
-    """A classical policy by the name of its controller; raises ValueError for an unknown one."""
-    return {"pi": pi, "lqr": lqr}[one_of("controller", name, CONTROLLERS)](setup)
+    """A classical policy by the name of its controller.
+
+    Raises:
+        ValueError: for an unknown name, or where a controller of states observes none.
+    """
+    one_of("controller", name, CONTROLLERS)
+    if name in FOR_STATES and not find_arm(setup.observe).shows_state:
+        raise ValueError(f"{name} must observe a state, but got observe={setup.observe!r}")
+    if name in HORIZONS:
+        return predictive(name, make_single(setup).env)
+    return {"pi": pi, "lqr": lqr}[name](setup)

@@ -13,6 +13,7 @@ from filters.registry import tunable_numbers
 from filters.thruster import model_of_env, thruster_model
 from thruster_env.observe import ObserveState, ObserveStateVector
 from training.arms import find_arm
+from training.controllers import CorrectController, predictive
 from training.setup import Setup
 from training.vec_env import NativeVecEnv
 from training.views import ShowHistory, ShowThrust
@@ -47,6 +48,8 @@ def make_environments(
         venv = ShowHistory(venv, arm.pairs, one.unwrapped.appended_entries)
     if arm.shows_state:
         venv = ShowThrust(venv, model_of_env(one) if arm.is_true else one.filter.model)
+    if setup.controller is not None:
+        venv = CorrectController(venv, predictive(setup.controller, one), setup.share)
     seed_episodes(venv, seeds)
     return VecMonitor(venv)
 

@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from pathlib import Path
 from typing import NamedTuple
 
@@ -156,11 +157,10 @@ def _model(setup: Setup, envs: VecEnv, start: Path | None, tensorboard: Path | N
         model = load(start, envs, training=True).model
         model.tensorboard_log = None if tensorboard is None else str(tensorboard)
         return model
-    numbers = dict(setup.hyperparameters)
-    if algorithm.falls:
-        rate = numbers["learning_rate"]
-        # The last rollout may reach beyond the steps that were asked for: what remains is then negative.
-        numbers["learning_rate"] = lambda remaining: rate * max(remaining, 0.0)
+    numbers = deepcopy(dict(setup.hyperparameters))  # off-policy algorithms write into policy_kwargs
+    rate = numbers["learning_rate"]
+    # The last rollout may reach beyond the steps that were asked for: what remains is then negative.
+    numbers["learning_rate"] = lambda remaining: rate * max(remaining, 0.0)
     if "noise_std" in numbers:
         deviation = numbers.pop("noise_std")
         numbers["action_noise"] = NormalActionNoise(np.zeros(1), np.full(1, deviation))

@@ -21,6 +21,7 @@ from tuning.scenario import Scenario, plain
 VERSION = 1
 MOST_ENVS = 100_000  # whose experience, of 100 steps each, takes a gigabyte
 MOST_STEPS = 10**12
+SHARE = 0.2  # of the maximum voltage, by which a policy may correct a controller
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +40,8 @@ class Setup:
         seed: of training, and of the held-out data that belong to it.
         num_envs: copies of the env.
         hyperparameters: of the algorithm.
+        controller: name of the predictive controller that the policy corrects, if any.
+        share: the largest correction [V_max].
         assumed_plant: arguments of the plant that the filter assumes; None for the env's own. No file has one.
 
     Raises:
@@ -57,6 +60,8 @@ class Setup:
     seed: int = 0
     num_envs: int
     hyperparameters: Mapping = field(default_factory=dict)
+    controller: str | None = None
+    share: float = SHARE
     assumed_plant: Mapping | None = None
 
     def __post_init__(self):
@@ -87,6 +92,8 @@ def make_setup(
     tuned: str | Path | None = None,
     num_envs: int | None = None,
     hyperparameters: Mapping | None = None,
+    controller: str | None = None,
+    share: float = SHARE,
 ) -> Setup:
     """A setup from names; what is None is the algorithm's default.
 
@@ -124,6 +131,8 @@ def make_setup(
         seed=at_least("seed", seed, 0),
         num_envs=at_least("num_envs", algorithm.num_envs if num_envs is None else num_envs, 1, MOST_ENVS),
         hyperparameters={**algorithm.hyperparameters, **(hyperparameters or {})},
+        controller=controller,
+        share=share,
     )
 
 

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from thruster_env.figures import DARK, new_figure, save_figure, tidy
+from training.comparison.plan import BEST
 from training.comparison.runs import Result
-from training.comparison.statistics import interquartile_mean, typical_error, typical_return
-from training.comparison.tables import by_policy, noises_of
+from training.comparison.statistics import typical_error, typical_return
+from training.comparison.tables import by_policy, name_of, noises_of
 
 COLOURS = {
     "raw": "#999999",
@@ -27,10 +28,10 @@ COST = "cost of an episode: minus the return [-]"
 
 
 def learning_curves(results: Sequence[Result], path: str | Path) -> Path:
-    """Cost over training steps, one panel a noise: interquartile mean over seeds, and the range of all of them."""
+    """Cost over training steps, one panel a noise: mean over seeds, and the range of all of them."""
     groups = by_policy(results)
     noises = noises_of(groups)
-    figure = new_figure((3.2 * len(noises) + 0.8, 3.7))
+    figure = new_figure((3.2 * len(noises) + 0.8, 4.2))
     axes = figure.subplots(1, len(noises), sharey=True, squeeze=False)[0]
     for axis, noise in zip(axes, noises, strict=True):
         for label, colour in COLOURS.items():
@@ -40,16 +41,23 @@ def learning_curves(results: Sequence[Result], path: str | Path) -> Path:
                 continue
             length = min(map(len, curves))
             steps, costs = curves[0][:length, 0] / 1e3, -np.stack([curve[:length, 1] for curve in curves])
-            axis.plot(steps, interquartile_mean(costs), color=colour, label=label, linewidth=1.5)
+            axis.plot(steps, costs.mean(axis=0), color=colour, label=label, linewidth=1.5)
             axis.fill_between(steps, costs.min(axis=0), costs.max(axis=0), color=colour, alpha=0.15, linewidth=0)
-        for kind, label, name, dashes in (("pi", "raw", "PI, raw", ":"), ("lqr", "true", "LQR, true", "--")):
+        for kind, label, dashes in (
+            ("pi", "raw", ":"),
+            ("lqr", "true", "-."),
+            (BEST, "ekf", "--"),
+            (BEST, "true", "--"),
+        ):
             if group := groups.get((noise, kind, label)):
-                axis.axhline(-typical_return(group)[0], color=DARK, linestyle=dashes, lw=1, label=name)
+                cost, colour = -typical_return(group).value, COLOURS["ekf"] if label == "ekf" else DARK
+                axis.axhline(cost, color=colour, linestyle=dashes, lw=1, label=name_of(kind, label))
         axis.set(xlabel="steps [thousand]", title=f"{noise} noise")
         _make_logarithmic(axis)
     axes[0].set_ylabel(COST)
     tidy(axes)
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=9, frameon=False)
+    named = axes[0].get_legend_handles_labels()
+    figure.legend(*named, loc="outside lower center", ncols=2 * len(noises), frameon=False)
     return save_figure(figure, path)
 
 
@@ -61,12 +69,12 @@ def cost_against_error(results: Sequence[Result], path: str | Path) -> Path:
     lines: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for (noise, kind, _), group in groups.items():
         run = group[0].run
-        arm, learnt = run.setup.observe, kind == "ppo"
-        if kind == "recurrent-ppo" or arm not in COLOURS:
+        arm = run.setup.observe
+        if kind not in ("ppo", BEST, "pi", "lqr") or arm not in COLOURS:
             continue
-        point = typical_error(group, "observed")[0], -typical_return(group)[0]
-        face = COLOURS[arm] if learnt else "none"
-        faint = 0.4 if run.variant else 1.0
+        point = typical_error(group, "observed").value, -typical_return(group).value
+        face = COLOURS[arm] if kind == "ppo" else "none"
+        faint = 0.4 if run.variant or kind in ("pi", "lqr") else 1.0
         axis.plot(*point, MARKERS[noise], color=COLOURS[arm], markerfacecolor=face, alpha=faint, zorder=3)
         if not run.variant:
             lines.setdefault((kind, arm), []).append(point)
@@ -76,7 +84,9 @@ def cost_against_error(results: Sequence[Result], path: str | Path) -> Path:
         axis.plot([], [], "-", color=colour, linewidth=4, label=arm)
     for noise, marker in MARKERS.items():
         axis.plot([], [], marker, color=GREY, label=f"{noise} noise")
-    axis.plot([], [], "o", color=GREY, markerfacecolor="none", label="PI, LQG or LQR")
+    axis.plot([], [], "o", color=GREY, label="PPO")
+    axis.plot([], [], "o", color=GREY, markerfacecolor="none", label="MPC")
+    axis.plot([], [], "o", color=GREY, markerfacecolor="none", alpha=0.4, label="PI, LQG or LQR")
     axis.plot([], [], "o", color=GREY, alpha=0.4, label="wrong model, or\nother Q and R")
     axis.set(xlabel="RMSE of the thrust that the policy observes [N]", ylabel=COST)
     _make_logarithmic(axis)

@@ -1,4 +1,8 @@
-"""Which policies are compared, at which noise: a list of runs, each one training or one classical policy."""
+"""Which policies are compared, at which noise: a list of runs, each one training or one classical policy.
+
+Beside the three noises, all at medium noise: filters with other Q and R (`untuned`, `tuned`), and three situations
+in which filter and controller believe in a model that is wrong (`WRONG`). A policy learns in the situation itself.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +21,28 @@ TASK = "manoeuvre"
 NOISES = {"low": "low_noise", "medium": "medium_noise", "high": "high_noise"}  # names of scenarios
 LEARNT = ("raw", "raw+action", "stack", "ekf", "enkf", "belief", "true")
 FOR_PI = ("raw", "lowpass", "ekf", "enkf", "true")
-FOR_LQR = ("lowpass", "kf", "ekf", "ukf", "enkf", "true")
+FOR_STATES = ("lowpass", "kf", "ekf", "ukf", "enkf", "true")
+CLASSICAL = {"pi": FOR_PI, "lqr": FOR_STATES, "one-step": FOR_STATES, "mpc": FOR_STATES}
+BEST = (
+    "mpc"  # the best controller known: on the true state what "gap closed" is measured to, and what is corrected
+)
+CORRECTING = {"ppo+mpc": "ppo", "sac+mpc": "sac"}  # kinds that correct it, and the algorithm
+OF_MEDIUM = {"sac": ("ekf", "true"), "ppo+mpc": ("true",), "sac+mpc": ("ekf", "true")}  # at medium noise only
 VARIANT_NOISE = "medium"
+WRONG = {
+    "wrong model": "mismatch",
+    "dead band": "deadband",
+    "unknown flow": "ambient",
+}  # and the scenario it is of
+VARIANTS = (
+    ("ekf", "untuned"),
+    ("ekf", "tuned"),
+    ("ekf", "wrong model"),
+    ("ekf", "wrong model tuned"),
+    ("enkf", "wrong model"),
+    ("ekf", "dead band"),
+    ("ekf", "unknown flow"),
+)
 TUNING_TRIALS = 60
 
 
@@ -28,9 +52,9 @@ class Comparison(NamedTuple):
     noises: tuple[str, ...] = tuple(NOISES)
     arms: tuple[str, ...] = LEARNT
     seeds: int = 5  # of each learnt policy
-    steps: int = 400_000  # that it learns from
+    steps: int | None = None  # that it learns from; None for what its algorithm takes
     episodes: int = 200  # held out, the same for all
-    variants: bool = True  # filters with a wrong model, tuned and untuned ones
+    variants: bool = True  # filters with other Q and R, and wrong models
     recurrent: bool = False  # PPO with memory of its own on raw measurements, which is slow
 
 
@@ -41,7 +65,7 @@ class Run(NamedTuple):
     """One policy, trained with one seed."""
 
     noise: str
-    kind: str  # "ppo", "recurrent-ppo", "pi" or "lqr"
+    kind: str  # an algorithm, one of `CORRECTING`, or a controller of `CLASSICAL`
     variant: str  # what is special about the filter, or nothing
     setup: Setup
 
@@ -59,63 +83,70 @@ class Run(NamedTuple):
 
 def runs_of(comparison: Comparison) -> list[Run]:
     """All runs of a comparison; seed by seed, so that an early look has something of each arm."""
-    classical = [
-        _run(comparison, noise, kind, arm)
-        for noise in comparison.noises
-        for kind, arms in (("pi", FOR_PI), ("lqr", FOR_LQR))
-        for arm in arms
+    variants = VARIANTS if comparison.variants else ()
+    cases = [
+        (noise, kind, arm, "") for noise in comparison.noises for kind in CLASSICAL for arm in CLASSICAL[kind]
     ]
-    cases = [(noise, arm, "") for noise in comparison.noises for arm in comparison.arms]
+    cases += [(VARIANT_NOISE, BEST, arm, variant) for arm, variant in variants]
+    cases += [(VARIANT_NOISE, BEST, "true", variant) for variant in WRONG if variants and variant != "wrong model"]
+    classical = [_run(comparison, *case) for case in cases]
+    return classical + [
+        _run(comparison, *case, seed) for seed in range(comparison.seeds) for case in _learnt(comparison)
+    ]
+
+
+def _learnt(comparison: Comparison) -> list[tuple[str, str, str, str]]:
+    """Noise, kind, arm and variant of what is learnt."""
+    cases = []
+    for noise in comparison.noises:
+        cases += [(noise, "ppo", arm, "") for arm in comparison.arms]
+        cases.append((noise, "ppo+mpc", "ekf", ""))
+        if noise == VARIANT_NOISE:
+            cases += [(noise, kind, arm, "") for kind, arms in OF_MEDIUM.items() for arm in arms]
+        if comparison.recurrent:
+            cases.append((noise, "recurrent-ppo", "raw", ""))
     if comparison.variants:
-        cases += [(VARIANT_NOISE, arm, variant) for arm, variant in VARIANTS]
-    learnt = [
-        _run(comparison, noise, "ppo", arm, variant, seed)
-        for seed in range(comparison.seeds)
-        for noise, arm, variant in cases
-    ]
-    recurrent = [
-        _run(comparison, noise, "recurrent-ppo", "raw", "", seed)
-        for seed in range(comparison.seeds if comparison.recurrent else 0)
-        for noise in comparison.noises
-    ]
-    return classical + learnt + recurrent
-
-
-VARIANTS = (
-    ("ekf", "untuned"),
-    ("ekf", "tuned"),
-    ("ekf", "wrong model"),
-    ("ekf", "wrong model tuned"),
-    ("enkf", "wrong model"),
-)
+        cases += [(VARIANT_NOISE, "ppo", arm, variant) for arm, variant in VARIANTS]
+        cases += [(VARIANT_NOISE, "ppo+mpc", "ekf", variant) for variant in WRONG]
+    return cases
 
 
 def _run(comparison: Comparison, noise: str, kind: str, arm: str, variant: str = "", seed: int = 0) -> Run:
-    scenario = _scenario(noise, wrong=variant.startswith("wrong model"))
+    scenario = _scenario(noise, variant)
     arguments: Mapping = {}
     if variant.endswith("untuned"):
         arguments = scenario.untuned
     elif variant.endswith("tuned"):
-        arguments = _tuned(arm, noise, variant.startswith("wrong model"))
-    algo = kind if kind == "recurrent-ppo" else "ppo"
+        arguments = _tuned(arm, noise, variant)
+    algo = "ppo" if kind in CLASSICAL else CORRECTING.get(kind, kind)
     setup = make_setup(
-        TASK, scenario, arm, algo, steps=comparison.steps, seed=seed, filter_arguments=_plain(arguments)
+        TASK,
+        scenario,
+        arm,
+        algo,
+        steps=comparison.steps,
+        seed=seed,
+        filter_arguments=_plain(arguments),
+        controller=BEST if kind in CORRECTING else None,
     )
     return Run(noise, kind, variant, setup)
 
 
-def _scenario(noise: str, wrong: bool) -> Scenario:
-    """The scenario of a noise; with the wrong model of `mismatch` if asked for."""
+def _scenario(noise: str, variant: str) -> Scenario:
+    """The scenario of a noise, with what a variant takes from another one."""
     scenario = find_scenario(NOISES[noise])
-    factors = find_scenario("mismatch").parameter_factors
-    return scenario.replace(parameter_factors=factors) if wrong else scenario
+    if (name := variant.removesuffix(" tuned")) in WRONG:
+        other = find_scenario(WRONG[name])
+        parts = {part: getattr(other, part) for part in ("parameter_factors", "amplifier", "flow")}
+        return scenario.replace(**parts)
+    return scenario
 
 
 @cache
-def _tuned(filter_name: str, noise: str, wrong: bool) -> Mapping:
+def _tuned(filter_name: str, noise: str, variant: str) -> Mapping:
     """Q and R that a study finds on the noise's scenario, where voltages are held at random levels."""
     quiet_optuna()
-    scenario = _scenario(noise, wrong)
+    scenario = _scenario(noise, variant)
     plan = Plan(filter_name, (scenario,))
     study = open_study("policies", plan, None)
     return run_study(study, plan, TUNING_TRIALS).or_interrupted().choice.model

@@ -8,10 +8,11 @@ from pathlib import Path
 
 from thruster_env.files import check_target, write_whole
 from thruster_env.markdown import table, with_tables
+from training.comparison.answers import answers
 from training.comparison.figures import cost_against_error, learning_curves
 from training.comparison.plan import Comparison
 from training.comparison.runs import Result
-from training.comparison.tables import HEADER, answers, rows_of, summary_rows
+from training.comparison.tables import HEADER, rows_of, summary_rows
 
 PAGE = "policies.md"
 CURVES, ERRORS = "policies_curves.png", "policies_errors.png"
@@ -48,7 +49,7 @@ def write_report(results: Sequence[Result], comparison: Comparison, page: Path) 
 
 
 def _new_page(comparison: Comparison, names: Sequence[str]) -> str:
-    said = f"PPO, {comparison.steps} steps, {comparison.seeds} seeds; {comparison.episodes} held-out episodes."
+    said = f"{comparison.seeds} training seeds; {comparison.episodes} held-out episodes."
     parts = [f"# Policies on raw, filtered and true state\n\n{said} Thrust errors are in N."]
     parts += [f"<!-- table {name} -->\n<!-- end -->" for name in names]
     parts += [f"![Learning curves]({CURVES})", f"![Cost against the error of what is observed]({ERRORS})"]

@@ -18,7 +18,7 @@ import numpy as np
 from thruster_env.files import write_whole
 from thruster_env.threads import cores
 from training.classical import classical_policy
-from training.comparison.plan import Comparison, Run, runs_of
+from training.comparison.plan import CLASSICAL, Comparison, Run, runs_of
 from training.environments import make_environments
 from training.learn import one_thread, train
 from training.saved import FINAL, load
@@ -27,6 +27,7 @@ from tuning.interruption import without_interrupts
 from tuning.scenarios import held_out_seeds
 
 RUNS = "runs"
+STEPS_APART = 40_000  # points of a learning curve: an evaluation has 16 000 steps
 OnRun = Callable[[Run, int, int], None]  # a run that is done, how many are, of how many
 
 
@@ -112,10 +113,12 @@ def _do(run: Run, folder: Path, episodes: int) -> None:
     """Train and score one policy; write its results."""
     curve, seconds = [], 0.0
     with one_thread():
-        if run.kind in ("pi", "lqr"):
+        if run.kind in CLASSICAL:
             policy = classical_policy(run.kind, run.setup)
         else:
-            trained = train(run.setup, folder / RUNS / run.name, checkpoints=4, tensorboard=False)
+            points = max(1, run.setup.steps // STEPS_APART)
+            folder_of_run = folder / RUNS / run.name
+            trained = train(run.setup, folder_of_run, evaluations=points, checkpoints=4, tensorboard=False)
             curve, seconds = trained.curve, trained.seconds
             policy = load(trained.folder / FINAL, make_environments(run.setup, range(1)))
         scores = score(policy, run.setup, held_out_seeds(0, episodes))

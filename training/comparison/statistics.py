@@ -1,62 +1,113 @@
-"""Interquartile means over training seeds, and their bootstrap over episodes and training seeds.
+"""Means over training seeds, with intervals that count both how policies and how episodes vary.
 
-A figure is an array of 1 + RESAMPLES values: the estimate, then the same from resampled data. So differences and
-ratios of figures are figures. Episodes are the same for all policies and are drawn jointly.
+A figure is a number with what it becomes when one training seed, or one episode, is left out. So differences and
+ratios of figures are figures, and their intervals are the jackknife's: each source of chance k has a variance
 
-The interquartile mean is less at the mercy of one bad seed than the mean, and wastes less than the median. Source:
-R. Agarwal, M. Schwarzer, P. S. Castro, A. Courville, M. Bellemare (2021), "Deep reinforcement learning at the edge
-of the statistical precipice", NeurIPS 34.
+    v_k = (n_k - 1)/n_k sum_i (f_(i) - mean f_(i))^2,    f_(i) the figure without its i-th seed or episode
+
+and the interval is f -+ t sqrt(sum_k v_k), with Student's t of (sum v_k)^2/sum (v_k^2/(n_k - 1)) degrees of
+freedom. For one mean it is Student's interval, for a difference Welch's. Episodes are one source, for they are the
+same for all policies; the training seeds of each policy are a source of their own, for two policies have no chance
+in common. (What only one policy does in only one episode is in both sources, which is on the safe side.) With five
+seeds it covers 95 %, where the middle 95 % of bootstrap resamples cover less than 90 %; a test simulates both.
+
+Sources: B. Efron, C. Stein (1981), "The jackknife estimate of variance", Annals of Statistics 9(3), 586-596;
+B. L. Welch (1947), "The generalization of Student's problem when several different population variances are
+involved", Biometrika 34, 28-35.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import trim_mean
+from scipy.stats import t as student
 
-from filters.consistency.intervals import RESAMPLES, Interval, interval, resampled_means
+from filters.consistency.intervals import Interval
 from training.comparison.runs import Result
 
-
-def typical_return(results: Sequence[Result]) -> np.ndarray:
-    """Interquartile mean over seeds of the mean return of one policy, as a figure."""
-    return _over_seeds(_over_episodes(np.stack([result.scores.returns for result in results], axis=1)))
+EPISODES = "episodes"  # the source of chance that all figures share
 
 
-def typical_error(results: Sequence[Result], part: str) -> np.ndarray:
-    """Interquartile mean over seeds of the pooled thrust error in a part of `Scores`, RMS [N], as a figure.
+@dataclass(frozen=True)
+class Figure:
+    """A number, and by source of chance its values (n_k,) with one seed or episode left out each."""
 
-    NaN where no step counts.
+    value: float
+    without: Mapping[Hashable, np.ndarray] = field(default_factory=dict)
+
+    def __sub__(self, other: Figure) -> Figure:
+        """The difference of two figures."""
+        return combined(lambda a, b: a - b, self, other)
+
+    def __truediv__(self, other: Figure) -> Figure:
+        """The ratio of two figures."""
+        return combined(lambda a, b: a / b, self, other)
+
+
+def combined(function: Callable, *figures: Figure) -> Figure:
+    """A function of some figures, as a figure; what is left out is left out of all that know it."""
+    sources = dict.fromkeys(source for figure in figures for source in figure.without)
+    return Figure(
+        function(*(figure.value for figure in figures)),
+        {k: function(*(figure.without.get(k, figure.value) for figure in figures)) for k in sources},
+    )
+
+
+def mean_figure(of_seeds: np.ndarray, without_episode: np.ndarray, source: Hashable) -> Figure:
+    """The mean over training seeds of a quantity.
+
+    Args:
+        of_seeds: its values (S,), one a seed.
+        without_episode: the same (E, S) with each of E episodes left out.
+        source: what stands for the chance in these seeds; one seed tells nothing of it.
     """
+    count, total = len(of_seeds), of_seeds.sum()
+    without = {EPISODES: without_episode.mean(axis=1)}
+    if count > 1:
+        without[source] = (total - of_seeds) / (count - 1)
+    return Figure(float(total / count), without)
+
+
+def typical_return(results: Sequence[Result]) -> Figure:
+    """Mean over seeds and episodes of the return of one policy."""
+    returns = np.stack([result.scores.returns for result in results], axis=1)
+    return mean_figure(returns.mean(axis=0), _left_out(returns) / max(len(returns) - 1, 1), _source(results))
+
+
+def typical_error(results: Sequence[Result], part: str) -> Figure:
+    """Mean over seeds of the pooled thrust error in a part of `Scores`, RMS [N]; NaN where no step counts."""
     parts = [getattr(result.scores, part) for result in results]
     squares, steps = (np.stack(columns, axis=1) for columns in zip(*parts, strict=True))
     with np.errstate(invalid="ignore"):
-        return _over_seeds(np.sqrt(_over_episodes(squares) / _over_episodes(steps)))
+        of_seeds = np.sqrt(squares.sum(axis=0) / steps.sum(axis=0))
+        # Rounding may leave a sum of squares of which nothing is left below zero.
+        return mean_figure(
+            of_seeds, np.sqrt(np.maximum(_left_out(squares), 0) / _left_out(steps)), _source(results)
+        )
 
 
-def as_interval(figure: np.ndarray) -> Interval:
-    """The estimate with its 95 % interval."""
-    return interval(figure[0], figure[1:])
+def as_interval(figure: Figure) -> Interval:
+    """The figure with its 95 % interval."""
+    variances, freedoms = [], []
+    for values in figure.without.values():
+        if len(values) > 1:
+            variances.append((len(values) - 1) * values.var())
+            freedoms.append(len(values) - 1)
+    variance = sum(variances)
+    if not variance > 0:
+        return Interval(figure.value, figure.value, figure.value)
+    freedom = variance**2 / sum(v**2 / n for v, n in zip(variances, freedoms, strict=True))
+    half = student.ppf(0.975, freedom) * np.sqrt(variance)
+    return Interval(float(figure.value), float(figure.value - half), float(figure.value + half))
 
 
-def interquartile_mean(values: np.ndarray, axis: int = 0) -> np.ndarray:
-    """Mean of the middle half of values along an axis; of all of them if they are fewer than four."""
-    return trim_mean(values, 0.25, axis=axis)
+def _left_out(values: np.ndarray) -> np.ndarray:
+    """Sums over episodes of values (E, S) with each of them left out, (E, S)."""
+    return values.sum(axis=0) - values
 
 
-def _over_episodes(values: np.ndarray) -> np.ndarray:
-    """Means over episodes of values (episodes, seeds), then those of resamples; (1 + RESAMPLES, seeds)."""
-    return np.concatenate([values.mean(axis=0)[None], resampled_means(values)])
-
-
-def _over_seeds(values: np.ndarray) -> np.ndarray:
-    """Interquartile mean of each row of values (1 + RESAMPLES, seeds); of drawn seeds but in the first."""
-    return interquartile_mean(np.take_along_axis(values, _drawn_seeds(values.shape[1]), axis=1), axis=1)
-
-
-@lru_cache(maxsize=8)
-def _drawn_seeds(count: int) -> np.ndarray:
-    drawn = np.random.default_rng(1).integers(count, size=(RESAMPLES, count))
-    return np.concatenate([np.arange(count)[None], drawn])
+def _source(results: Sequence[Result]) -> Hashable:
+    run = results[0].run
+    return run.noise, run.kind, run.label

@@ -1,0 +1,87 @@
+"""Controllers of `thruster_env` as policies, and policies that correct a controller."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+from thruster_env.checks import one_of
+from thruster_env.control import LQRController, PIController
+from thruster_env.dynamics import Constants
+from thruster_env.predictive import HORIZONS, PredictiveController
+
+
+@dataclass(frozen=True)
+class ClassicalPolicy:
+    """A controller of `thruster_env` with the observations and actions of learnt policies."""
+
+    controller: PIController | LQRController | PredictiveController
+    skipped: int  # entries in front of what the controller reads
+    max_voltage: float
+
+    def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
+        """Actions (n, 1) in [-1, 1] for observations (n, d), and what the controller remembers."""
+        seen = np.asarray(observation)[..., self.skipped :]
+        voltage, state = self.controller.predict(seen, state, episode_start)
+        return voltage / self.max_voltage, state
+
+
+def predictive(name: str, env: gym.Env) -> ClassicalPolicy:
+    """A predictive controller by name, that believes in the thruster that the filter of an env does.
+
+    Args:
+        name: one of `HORIZONS`.
+        env: with the filter, if there is one, as its outermost wrapper.
+
+    Raises:
+        ValueError: for an unknown name.
+    """
+    horizon = HORIZONS[one_of("controller", name, tuple(HORIZONS))]
+    believed = getattr(getattr(env, "filter", None), "model", None)
+    constants = believed.constants if believed is not None and isinstance(believed.constants, Constants) else None
+    controller = PredictiveController.for_env(env, horizon, constants)
+    return ClassicalPolicy(controller, 1, env.unwrapped.plant.max_voltage)
+
+
+class CorrectController(VecEnvWrapper):
+    """Let a policy correct a controller: a = clip(a_c + share a_p) of the two actions, each in [-1, 1].
+
+    What the controller would do is shown behind the observation. A policy that does nothing is the controller.
+    Source: T. Johannink et al. (2019), "Residual reinforcement learning for robot control", ICRA, 6023-6029.
+
+    Args:
+        venv: envs that observe what the controller needs, with actions in [-1, 1].
+        controller: what is corrected.
+        share: the largest correction [V_max].
+    """
+
+    def __init__(self, venv: VecEnv, controller: ClassicalPolicy, share: float):
+        """Wrap the envs; see the class."""
+        self._controller, self._share = controller, share
+        size = venv.observation_space.shape[0] + 1
+        super().__init__(venv, gym.spaces.Box(-np.inf, np.inf, (size,), np.float32))
+
+    def reset(self) -> np.ndarray:
+        """Reset the envs."""
+        observations = self.venv.reset()
+        self._actions, self._state = self._controller.predict(observations)
+        return np.concatenate([observations, self._actions], axis=1)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Correct what the controller does."""
+        applied = np.clip(self._actions + self._share * np.clip(actions, -1.0, 1.0), -1.0, 1.0)
+        self._state[:, 0] = applied[:, 0] * self._controller.max_voltage  # the last voltage, as it really was
+        self.venv.step_async(applied.astype(np.float32))
+
+    def step_wait(self):
+        """Step the envs."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        for i in np.flatnonzero(dones):
+            last = infos[i]["terminal_observation"]
+            action, _ = self._controller.predict(last, self._state[i])
+            infos[i]["terminal_observation"] = np.concatenate([last, action])
+        self._actions, self._state = self._controller.predict(observations, self._state, dones)
+        return np.concatenate([observations, self._actions], axis=1), rewards, dones, infos
