@@ -1,4 +1,4 @@
-"""One result on every path: compiled or not, in a batch or alone, by init, predict and update or in a session."""
+"""One result on every path: compiled or not, batch or loop, by init, predict and update, in a session, wrapped."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,11 @@ from filters import FILTERS, make_filter, run, thruster_model
 from filters.session import Session
 from tests.models import KEY, MODELS, scalar_model, simulated, small, varying_noise
 from tests.oracles import equal
+from tests.test_wrapper import ADDED, infos_of, played, voltages, wrapped
 from thruster_env.compiled import interpreted
-from thruster_env.streams import filter_keys
+from thruster_env.plant import make_plant
+from thruster_env.simulation import simulate
+from thruster_env.streams import episode_keys, filter_keys
 
 
 def stepped(filter_, key, inputs, measurements):
@@ -123,6 +126,21 @@ def test_compiled_batch_loop_and_session_agree_over_500_steps(name):
     inputs, measurements = simulated(model, 500, level=8.0)
     measurements[0, 100:120] = np.nan
     assert_paths_agree(small(name, model), KEY, inputs, measurements)
+
+
+def test_a_wrapped_run_is_the_batch_run(name):
+    seed, actions = 11, voltages(500)
+    env = wrapped(name)
+    _, _, infos = played(env, actions, seed)
+    drawn = simulate(make_plant(), episode_keys([seed]), actions.T.astype(np.float64))
+    np.testing.assert_allclose(infos_of("measurement", infos), drawn.measurements[0], rtol=1e-12, atol=1e-12)
+    numbers = {"ensemble_size": 20} if name == "enkf" else {}
+    inputs = actions[None].astype(np.float64)
+    estimates = run(
+        make_filter(name, thruster_model(), **numbers), filter_keys([seed]), inputs, drawn.measurements
+    )
+    for part, estimate in zip(ADDED, estimates, strict=False):
+        np.testing.assert_allclose(infos_of(part, infos), estimate[0], rtol=1e-12, atol=1e-12, err_msg=part)
 
 
 def test_a_trajectory_does_not_depend_on_its_company(name):

@@ -15,9 +15,6 @@ from filters.thruster import model_of_env
 from filters.tuned_file import sealed
 from tests.models import TUNED
 from thruster_env.parameters import TUNNEL, derive_constants
-from thruster_env.plant import make_plant
-from thruster_env.simulation import simulate
-from thruster_env.streams import episode_keys, filter_keys
 
 # Both checkers would like a bare env with actions in [-1, 1]; volts and a wrapper are what is tested here.
 quiet = pytest.mark.filterwarnings(
@@ -171,23 +168,6 @@ class TestGymnasium:
 
 
 class TestNumbers:
-    @pytest.mark.parametrize("filter", FILTERS)
-    def test_a_wrapped_run_is_the_batch_run(self, filter):
-        seed, actions = 11, voltages(500)
-        env = wrapped(filter)
-        _, _, infos = played(env, actions, seed)
-        drawn = simulate(make_plant(), episode_keys([seed]), actions.T.astype(np.float64))
-        np.testing.assert_allclose(infos_of("measurement", infos), drawn.measurements[0], rtol=1e-12, atol=1e-12)
-        numbers = {"ensemble_size": 20} if filter == "enkf" else {}
-        estimates = run(
-            make_filter(filter, thruster_model(), **numbers),
-            filter_keys([seed]),
-            actions[None].astype(np.float64),
-            drawn.measurements,
-        )
-        for name, part in zip(ADDED, estimates, strict=False):
-            np.testing.assert_allclose(infos_of(name, infos), part[0], rtol=1e-12, atol=1e-12, err_msg=name)
-
     def test_the_filter_is_told_the_action_that_the_env_applied(self):
         env = EstimateState(Scripted(SCRIPT), filter="kf", model=two_channels())
         wild = np.array([[5.0, -7.0], [1.0, 100.0], [-3.0, 0.5], [0.0, 0.0], [2.5, -2.5]], dtype=np.float32)
