@@ -181,7 +181,7 @@ class FuzzyKalmanFilter(Filter):
         low: the smallest states (n,); the model's `state_low` if None.
         high: the largest states (n,); the model's `state_high` if None.
         blending: "weights", "moments" or "output", see above.
-        offsets: whether the rules have the offset a_r that makes them exact at their corners; the sources print none.
+        offsets: whether rules have the offset a_r that makes them exact at their corners; the sources print none.
 
     Source: Ngatini, Apriliani, Nurhadi (2017), "Ensemble and fuzzy Kalman filter for position estimation of an
     autonomous underwater vehicle", Expert Systems with Applications 68, for the recursion and the memberships of
