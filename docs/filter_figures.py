@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from docs import filter_gaussian, filter_noise, filter_sampled
-from docs.filter_tables import TABLES
+from docs import filter_fuzzy, filter_gaussian, filter_noise, filter_sampled, filter_tables
 from docs.page import make_page
 
 FIGURES = {
@@ -20,13 +19,14 @@ FIGURES = {
     "filters_points.png": filter_gaussian.sigma_points,
     "filters_ensembles.png": filter_sampled.ensembles,
     "filters_modes.png": filter_sampled.modes,
-    "filters_fuzzy.png": filter_gaussian.fuzzy,
+    "filters_fuzzy.png": filter_fuzzy.picture,
     "filters_adaptive.png": filter_noise.adaptive,
     "filters_baselines.png": filter_noise.baselines,
     "filters_smoothers.png": filter_gaussian.smoothers,
     "filters_augmented.png": filter_noise.augmented,
     "filters_varying.png": filter_noise.varying,
 }
+TABLES = filter_tables.TABLES | {"fuzzy": filter_fuzzy.fuzzy}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -10,10 +10,8 @@ from docs.filter_runs import LOOKS, PUBLISHED_NOISE, RUNS, deviations, held_runs
 from docs.page import legend_below, log_ticks
 from filters import (
     ExtendedKalmanFilter,
-    FuzzyKalmanFilter,
     GaussianSumFilter,
     KalmanFilter,
-    StateSpaceModel,
     make_filter,
     run,
     smooth,
@@ -21,8 +19,6 @@ from filters import (
 )
 from filters.bounds import posterior_bound
 from thruster_env.figures import BLUE, DARK, RUST, new_figure, save_figure, tidy
-from thruster_env.linear import steady_state
-from thruster_env.parameters import PRESETS
 from thruster_env.plant import make_plant
 from tuning.scenarios import FIRST_SCORED_STEP
 
@@ -131,37 +127,6 @@ def sigma_points(path: Path) -> Path:
     return save_figure(figure, path)
 
 
-def fuzzy(path: Path) -> Path:
-    """The fuzzy filter over the width of the range that its rules span."""
-    widths = np.array([1.0, 2.0, 4.0, 6.0, 9.0, 12.0, 16.0, 20.0, 24.0])
-    figure = new_figure((9.6, 3.6))
-    left, right = figure.subplots(1, 2, width_ratios=(2, 3))
-    tidy((left, right))
-    errors = {"fuzzy": [], "kf": [], "ekf": []}
-    for width in widths:
-        runs = held_runs(20, width / 2, 12.0, initial_state={"voltage": 12.0})
-        model = thruster_model(initial_state={"voltage": 12.0})
-        filters = {name: make_filter(name, model) for name in ("kf", "ekf")} | {"fuzzy": _fuzzy(model, width)}
-        for name, filter_ in filters.items():
-            errors[name].append(judged(filter_, runs)[1])
-        if width == 12.0:
-            for name, filter_ in filters.items():
-                estimate = run(filter_, *runs.given).means[0, :, 1]
-                right.plot(times(len(estimate)), estimate, **LOOKS[name])
-            right.plot(times(501), runs.states[0, :, 1], **LOOKS["truth"])
-    for name, values in errors.items():
-        left.plot(widths, values, label=name, **LOOKS[name])
-    left.plot([], [], label="truth", **LOOKS["truth"])
-    log_ticks(left.yaxis, (0.03, 0.1, 0.3, 1, 3))
-    left.set_xlabel("width of the voltages' range about 12 V [V]")
-    left.set_ylabel(FLOW_RMSE)
-    right.set_title("levels from 6 to 18 V", fontsize=10)
-    right.set_xlabel("time [s]")
-    right.set_ylabel(FLOW)
-    legend_below(figure, left)
-    return save_figure(figure, path)
-
-
 def smoothers(path: Path) -> Path:
     """Errors over the lag, and a gap in the measurements seen forwards and backwards."""
     model, runs = thruster_model(), held_runs()
@@ -210,11 +175,6 @@ def _over_the_bound(names: tuple[str, ...], std: float) -> list[float]:
     runs, model = held_runs(RUNS, **noise), thruster_model(**noise)
     bound = posterior_bound(model, runs.inputs)[:, FIRST_SCORED_STEP:, 1, 1].mean() ** 0.5
     return [judged(make_filter(name, model), runs)[1] / bound for name in names]
-
-
-def _fuzzy(model: StateSpaceModel, width: float) -> FuzzyKalmanFilter:
-    ends = [steady_state(PRESETS["tunnel"], 12.0 + sign * width / 2)[:2] for sign in (-1, 1)]
-    return FuzzyKalmanFilter(model=model, low=ends[0], high=ends[1])
 
 
 def _smoothed_rmse(filter_, runs, lag: int) -> float:

@@ -110,8 +110,7 @@ def compare(case: str, q: float, *, runs: int = RUNS, members: int = MEMBERS, se
     runs, members = at_least("runs", runs, 2, MOST_RUNS), at_least("members", members, 2, LARGEST_ENSEMBLE)
     seed = at_least("seed", seed, 0)
     stationary, identity = discrete_model(case, q), discrete_model(case, q, prior_cov=[1.0, 1.0])
-    generator = np.random.default_rng([seed, tuple(SYSTEMS).index(case), round(1000 * q)])
-    keys = generator.integers(0, 2**32, size=(runs, 2)).astype(np.float64)
+    keys, generator = keys_of(case, q, runs, seed)
     inputs = np.zeros((runs, STEPS, stationary.inputs))
 
     errors = []
@@ -123,6 +122,12 @@ def compare(case: str, q: float, *, runs: int = RUNS, members: int = MEMBERS, se
             free = unupdated_ensemble_means(model, truth.states, members, generator) - truth.states
     kf, enkf, kf_identity, enkf_identity, unupdated = scores([*errors, free], generator)
     return Comparison(case, q, optimum(case, q), kf, enkf, kf_identity, enkf_identity, unupdated)
+
+
+def keys_of(case: str, q: float, runs: int, seed: int) -> tuple[np.ndarray, np.random.Generator]:
+    """The keys (runs, 2) of so many runs of one case at one noise level, and the generator for what is left."""
+    generator = np.random.default_rng([seed, tuple(SYSTEMS).index(case), round(1000 * q)])
+    return generator.integers(0, 2**32, size=(runs, 2)).astype(np.float64), generator
 
 
 def _errors(filter_: Filter, truth: Truth, keys: np.ndarray, inputs: np.ndarray) -> np.ndarray:

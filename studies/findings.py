@@ -103,7 +103,11 @@ def study_statements(table: PublishedTable, found: list[Finding]) -> list[str]:
     unseen = sum(abs(f.published.omega_m / f.published.U_a / UNSEEN_RATIO - 1.0) < 0.01 for f in clean)
     right, right_std = np.mean([f.ours.run_ratio for f in clean], axis=0)
     kalman = [f for f in found if f.filter == "kf"]
-    equal = sum(abs(f.published.omega_m / f.published.U_a - 1.0) < EQUAL for f in kalman)
+    equal, as_printed = (
+        sum(abs(omega_m / flow - 1.0) < EQUAL for omega_m, flow in pairs)
+        for pairs in ([f.published.meant for f in kalman], [f.published[:2] for f in kalman])
+    )
+    corrected = "" if equal == as_printed else f" ({as_printed} by the table, which the text corrects)"
     above = ", ".join(
         f"{_span([f for f in kalman if f.case == case], state=1)} times in the {case} case"
         for case in dict.fromkeys(f.case for f in kalman)
@@ -120,7 +124,8 @@ def study_statements(table: PublishedTable, found: list[Finding]) -> list[str]:
         f"gives {right:.2f} +- {right_std:.2f} in a single run. So the published measurements seem to be "
         "noise-free, the tunnel's too.",
         f"The published KF column has errors equal in both states to {100 * EQUAL:.0f} % in {equal} of "
-        f"{len(kalman)} rows, and in U_a exceeds the optimum {above}. No mechanism for it is known to us.",
+        f"{len(kalman)} rows{corrected}, and in U_a exceeds the optimum {above}. "
+        "No mechanism for it is known to us.",
         *table.remarks,
     ]
 

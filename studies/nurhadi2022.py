@@ -34,8 +34,11 @@ TABLE = PublishedTable(
     },
     remarks=(
         "P_xz and P_z as printed use the perturbed measurements in place of the predicted ones.",
+        "The gain K as printed lacks H': it is P H' (H P H' + R)^-1.",
         "The abstract's EnKF values 0.7920 and 0.1352 stand in the table of Kiki (2020), not in this "
         "paper's. Its KF values 1.9957 and 2.0609 come from there too, from two different rows (q = 0.8 and "
-        "q = 0.6): they are no run.",
+        "q = 0.6): they are no run. And 1.9957 is most likely a slip for 2.6821, which the text there has.",
+        "The conclusion contradicts the paper's own Table 2. By the printed numbers the EnKF's error of omega_m "
+        "in the open-bladed case is 2.4 to 2.7 times the KF's.",
     ),
 )

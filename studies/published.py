@@ -25,6 +25,12 @@ class PublishedRMSE(NamedTuple):
     omega_m: float  # [rad/s]
     U_a: float  # [m/s]
     note: str = ""  # what is wrong with the print, if anything
+    in_text: tuple[float, float] | None = None  # the pair as the paper's text has it, if that is another
+
+    @property
+    def meant(self) -> tuple[float, float]:
+        """The pair that was most likely found: that of the text, where it differs from the table's."""
+        return self.in_text or (self.omega_m, self.U_a)
 
 
 class PublishedTable(NamedTuple):

@@ -1,4 +1,4 @@
-"""The fuzzy Kalman filter against the Kalman filter, a naive one with its rules, and its memberships."""
+"""The fuzzy Kalman filter against the Kalman filter, naive ones with its rules, and its memberships."""
 
 import itertools
 
@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from filters import FuzzyKalmanFilter, KalmanFilter, StateSpaceModel, run, thruster_model, truth
-from filters.gaussian.fuzzy import memberships
-from tests.models import random_affine, simulated
-from thruster_env.streams import episode_keys
+from filters import FuzzyKalmanFilter, KalmanFilter, StateSpaceModel, run, thruster_model
+from filters.gaussian.fuzzy import BLENDINGS, memberships
+from tests.models import pendulum, random_affine, simulated
+from tests.oracles import kalman_update
+from thruster_env.streams import filter_keys
 
 KEYS = np.zeros((1, 2))
 
@@ -37,15 +38,21 @@ def six_states():
     )
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 6])
-def test_with_equal_rules_it_is_the_kalman_filter(n):
+def pendulum_rules(**changes):
+    """The pendulum's four rules, in a range that it leaves now and then."""
+    return FuzzyKalmanFilter(model=pendulum(), low=[-0.8, -1.5], high=[0.9, 1.7], **changes)
+
+
+@pytest.mark.parametrize("blending", BLENDINGS)
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_with_equal_rules_it_is_the_kalman_filter(n, blending):
     model = random_affine(n, p=1, seed=n)
     inputs, z = simulated(model, 40, level=1.0)
     z[0, 5], z[0, 11, 0] = np.nan, np.nan
     exact = run(KalmanFilter(model=model), KEYS, inputs, z)
-    found = run(FuzzyKalmanFilter(model=model, low=[-3.0] * n, high=[2.0] * n), KEYS, inputs, z)
+    found = run(FuzzyKalmanFilter(model=model, low=[-3.0] * n, high=[2.0] * n, blending=blending), KEYS, inputs, z)
     for one, other in zip(found, exact, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-10)
+        np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-12)
 
 
 def test_an_affine_model_needs_no_range():
@@ -88,8 +95,9 @@ def test_six_states_have_64_rules_and_each_a_filter():
     assert len(np.unique(means.round(12), axis=0)) > 32  # rules differ
     np.testing.assert_allclose(weights @ means, belief.mean, rtol=1e-12)
     apart = means - belief.mean
-    spread = np.einsum("r,rij->ij", weights, covs + apart[:, :, None] * apart[:, None, :])
-    np.testing.assert_allclose(spread, belief.cov, rtol=1e-11)
+    within, between = np.tensordot(weights, covs, 1), np.einsum("r,ri,rj->ij", weights, apart, apart)
+    np.testing.assert_allclose(within, belief.cov, rtol=1e-11, atol=1e-15)
+    assert np.trace(between) > 0.01 * np.trace(within)  # what P leaves out
 
 
 def test_rules_are_the_model_s_tangents_in_the_corners():
@@ -109,39 +117,85 @@ def test_rules_are_the_model_s_tangents_in_the_corners():
         np.testing.assert_allclose(rule.observe(x, rule.constants), model.observe(x, model.constants), rtol=1e-10)
 
 
-def test_on_the_thruster_it_is_the_naive_one():
-    model = thruster_model()
-    filter_ = FuzzyKalmanFilter(model=model, low=[-200.0, -4.0], high=[190.0, 3.5])
-    inputs = np.random.default_rng(5).uniform(-12.0, 12.0, size=(1, 30, 1))
-    z = truth.simulate(model, episode_keys([2]), inputs).measurements
+@pytest.mark.parametrize("offsets", [True, False])
+@pytest.mark.parametrize("blending", BLENDINGS)
+def test_it_is_the_naive_recursion(blending, offsets):
+    filter_ = pendulum_rules(blending=blending, offsets=offsets)
+    model, rules = filter_.model, [rule.matrices() for rule in pendulum_rules().rules]
+    inputs, z = simulated(model, 40, level=2.0)
+    z[0, 7] = np.nan
     found = run(filter_, KEYS, inputs, z)
-    parts = [rule.matrices() for rule in filter_.rules]
-    means, covs = [model.prior_mean] * 4, [model.prior_cov] * 4
-    mean = model.prior_mean
-    weights = memberships(2)(mean, filter_.low, filter_.high)
-    q, r = model.process_noise_cov, model.measurement_noise_cov
-    for k in range(31):
+    mean, cov = model.prior_mean, model.prior_cov
+    own = [(mean, cov)] * 4
+    weights = np.array(memberships(2)(mean, filter_.low, filter_.high))
+    for k in range(41):
         if k > 0:
             weights = np.array(memberships(2)(mean, filter_.low, filter_.high))
-            for j, (a, b, offset, _, _) in enumerate(parts):
-                means[j] = a @ means[j] + b @ inputs[0, k - 1] + offset
-                covs[j] = a @ covs[j] @ a.T + q
-        innovations, spreads = [], []
-        for j, (_, _, _, c, shift) in enumerate(parts):
-            s = c @ covs[j] @ c.T + r
-            gain = covs[j] @ c.T / s
-            innovations.append((z[0, k] - c @ means[j] - shift)[0])
-            spreads.append(s[0, 0])
-            means[j] = means[j] + gain[:, 0] * innovations[-1]
-            covs[j] = covs[j] - gain @ s @ gain.T
-        mean = np.dot(weights, means)
-        innovation = np.dot(weights, innovations)
-        s = np.dot(weights, spreads + (innovations - innovation) ** 2)
-        np.testing.assert_allclose(found.means[0, k], mean, rtol=1e-8)
-        np.testing.assert_allclose(found.innovations[0, k, 0], innovation, rtol=1e-7, atol=1e-9)
-        np.testing.assert_allclose(found.innovation_covs[0, k, 0, 0], s, rtol=1e-8)
-        likelihood = multivariate_normal.logpdf(innovation, 0.0, s)
-        assert found.log_likelihoods[0, k] == pytest.approx(likelihood, rel=1e-7)
+            moved = []
+            for (a, b, offset, _, _), (x, p) in zip(rules, own, strict=True):
+                x, p = (x, p) if blending == "output" else (mean, cov)
+                x = a @ x + b @ inputs[0, k - 1] + (offset if offsets else 0.0)
+                moved.append((x, a @ p @ a.T + model.process_noise_cov))
+            own = moved
+        if k != 7:
+            seen = [z[0, k] - c @ x - shift for (_, _, _, c, shift), (x, _) in zip(rules, own, strict=True)]
+            parts = [
+                kalman_update(x, p, i, rule[3], model.measurement_noise_cov)
+                for (x, p), i, rule in zip(own, seen, rules, strict=True)
+            ]
+            own = [(x, p) for x, p, _ in parts]
+            innovation, s = mixed(seen, [s for _, _, s in parts], weights, blending)
+            np.testing.assert_allclose(found.innovations[0, k], innovation, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(found.innovation_covs[0, k], s, rtol=1e-12, atol=1e-12)
+            likelihood = multivariate_normal.logpdf(innovation, np.zeros(2), s)
+            assert found.log_likelihoods[0, k] == pytest.approx(likelihood, rel=1e-10, abs=1e-11)
+        mean, cov = mixed([x for x, _ in own], [p for _, p in own], weights, blending)
+        np.testing.assert_allclose(found.means[0, k], mean, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(found.covs[0, k], cov, rtol=1e-12, atol=1e-12)
+
+
+def mixed(means, covs, weights, blending):
+    """Mean and covariance of a mixture; by weights, the covariance is that within its parts alone."""
+    mean, cov = sum(w * x for w, x in zip(weights, means, strict=True)), 0.0
+    for w, x, p in zip(weights, means, covs, strict=True):
+        cov = cov + w * p
+        if blending != "weights":
+            cov = cov + w * np.outer(x - mean, x - mean)
+    return mean, cov
+
+
+def test_the_blendings_differ_and_the_first_is_the_default():
+    inputs, z = simulated(pendulum(), 20)
+    found = {one: run(pendulum_rules(blending=one), KEYS, inputs, z) for one in BLENDINGS}
+    for one, other in itertools.combinations(found.values(), 2):
+        assert np.abs(one.means - other.means).max() > 1e-3
+    assert BLENDINGS[0] == FuzzyKalmanFilter.blending == "weights"
+    # After the first step, from the same beliefs, P differs by the spread between the rules' means alone.
+    assert np.linalg.eigvalsh(found["moments"].covs[0, 1] - found["weights"].covs[0, 1]).max() > 0
+
+
+@pytest.mark.parametrize("blending", BLENDINGS)
+def test_a_batch_is_the_loop(blending):
+    filter_, keys = pendulum_rules(blending=blending), filter_keys(range(2))
+    inputs, z = simulated(filter_.model, 12, count=2, missing=0.2)
+    found = run(filter_, keys, inputs, z)
+    for b in range(2):
+        belief = filter_.init()
+        for k in range(13):
+            belief = belief if k == 0 else filter_.predict(belief, inputs[b, k - 1])
+            belief, innovation = filter_.update(belief, z[b, k])
+            np.testing.assert_allclose(found.means[b, k], belief.mean, rtol=1e-12, atol=1e-13)
+            np.testing.assert_allclose(found.covs[b, k], belief.cov, rtol=1e-12, atol=1e-13)
+            np.testing.assert_allclose(found.innovations[b, k], innovation.value, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("blending", BLENDINGS[1:])
+def test_without_a_measurement_a_variant_only_predicts(blending):
+    filter_ = pendulum_rules(blending=blending)
+    belief = filter_.predict(filter_.init(), [1.0])
+    updated, _ = filter_.update(belief, [np.nan, np.nan])
+    np.testing.assert_allclose(updated.mean, belief.mean, rtol=1e-15)
+    np.testing.assert_allclose(updated.cov, belief.cov, rtol=1e-15)
 
 
 def test_the_thruster_s_range_is_that_of_its_voltages():
@@ -160,9 +214,11 @@ def test_the_thruster_s_range_is_that_of_its_voltages():
         ({"low": [0.0, 1.0]}, "low must be 6 finite numbers, but got"),
         ({"high": ["a"] * 6}, "high must be 6 finite numbers, but got"),
         ({"low": [2.0] * 6}, "low must be below high in every state, but got"),
+        ({"blending": "mean"}, "blending must be one of weights, moments, output, but got 'mean'"),
+        ({"offsets": 1}, "offsets must be True or False, but got 1"),
     ],
 )
-def test_a_range_that_is_none_is_refused(numbers, rule):
+def test_a_wrong_argument_is_refused(numbers, rule):
     with pytest.raises(ValueError, match=rule):
         FuzzyKalmanFilter(model=six_states(), **numbers)
 

@@ -11,9 +11,11 @@ from filters import KalmanFilter, run
 from filters.truth import simulate
 from studies import STUDIES
 from studies.comparison import compare, compare_all, discrete_model, optimum
-from studies.findings import findings
+from studies.findings import findings, study_statements
 from studies.published import NOISE_LEVELS, STEPS, SYSTEMS, H
+from studies.series import series
 from studies.unupdated_ensemble import unupdated_ensemble_means
+from tests.oracles import kalman_update
 from thruster_cli.main import main
 
 # The Riccati values and the errors of the un-updated ensemble, computed independently of this package.
@@ -112,6 +114,58 @@ def test_published_kalman_filters_are_not_explained(comparisons, name):
     assert all("no mechanism known" in f.why for f in kalman)
 
 
+def test_the_text_corrects_cells_of_the_table():
+    cells = STUDIES["kiki2020"].kf
+    assert cells["open-bladed", 0.8][:2] == (
+        1.9957,
+        2.6939,
+    )  # as the table is printed, and both abstracts quote it
+    assert cells["open-bladed", 0.8].meant == (2.6821, 2.6939)
+    assert cells["open-bladed", 0.5].meant == (2.7061, 1.9870) and cells["tunnel", 0.5].meant == (0.8740, 0.9232)
+    assert cells["tunnel", 0.6].meant == cells["tunnel", 0.6][:2]
+    every = [value for table in STUDIES.values() for cell in table.kf.values() for value in cell[:2]]
+    assert every.count(1.9957) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "rows"),
+    [("kiki2020", "in 7 of 8 rows (6 by the table, which the text corrects)"), ("nurhadi2022", "in 7 of 8 rows,")],
+)
+def test_rows_with_equal_errors_in_both_states(comparisons, name, rows):
+    said = study_statements(STUDIES[name], findings(STUDIES[name], comparisons))
+    assert sum(rows in statement for statement in said) == 1
+    assert set(STUDIES[name].remarks) <= set(said)
+
+
+def test_by_the_article_s_own_numbers_the_ensemble_filter_is_the_worse_one_in_the_motor_speed():
+    kf, enkf = STUDIES["nurhadi2022"].kf, STUDIES["nurhadi2022"].enkf
+    ratios = [enkf["open-bladed", q].omega_m / kf["open-bladed", q].omega_m for q in NOISE_LEVELS]
+    assert f"{min(ratios):.1f} to {max(ratios):.1f} times" in " ".join(STUDIES["nurhadi2022"].remarks)
+
+
+def test_a_series_is_a_run_of_the_model_and_of_its_filters():
+    one, same, other = (
+        series("open-bladed", 0.8, seed=3),
+        series("open-bladed", 0.8, seed=3),
+        series("tunnel", 0.8),
+    )
+    np.testing.assert_array_equal(one.enkf, same.enkf)
+    assert one.time[-1] == pytest.approx(1.0) and one.truth.shape == one.kf.shape == one.enkf.shape == (101, 2)
+    assert np.abs(one.truth[-1]).max() > 5 * np.abs(other.truth[-1]).max()  # the one is unstable
+    model = discrete_model("open-bladed", 0.8)
+    a, _, _, c, _ = model.matrices()
+    noise = one.truth[1:] - one.truth[:-1] @ a.T, one.measurements - one.truth @ c.T
+    assert all(0.6 < part.var() / 0.8 < 1.5 for part in noise)
+    mean, cov = model.prior_mean, model.prior_cov
+    for k in range(101):
+        if k > 0:
+            mean, cov = a @ mean, a @ cov @ a.T + 0.8 * np.eye(2)
+        mean, cov, _ = kalman_update(mean, cov, one.measurements[k] - c @ mean, c, 0.8 * np.eye(1))
+        np.testing.assert_allclose(one.kf[k], mean, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(one.rmse("enkf"), one.rmse("kf"), rtol=0.1)
+    np.testing.assert_allclose(one.rmse("kf") ** 2, np.square(one.kf - one.truth)[1:].mean(axis=0))
+
+
 def test_a_seed_fixes_the_result():
     first, again, other = (compare("tunnel", 0.6, runs=20, members=30, seed=seed) for seed in (4, 4, 5))
     for a, b, c in zip(first[3:], again[3:], other[3:], strict=True):
@@ -142,10 +196,14 @@ def command_line(monkeypatch, *arguments):
     return stop.value.code or 0
 
 
-def test_json_on_standard_output_is_whole(monkeypatch, capsys):
+def test_json_on_standard_output_is_whole(monkeypatch, capsys, tmp_path):
     few = ("--runs", "4", "--members", "5", "--seed", "3")
-    assert command_line(monkeypatch, "all", *few, "--json", "-") == 0
+    picture = tmp_path / "series.png"
+    assert command_line(monkeypatch, "all", *few, "--series", str(picture), "--json", "-") == 0
     data = json.loads(capsys.readouterr().out)
+    assert picture.read_bytes().startswith(b"\x89PNG") and data["picture"] == str(picture)
+    assert [(s["case"], s["q"]) for s in data["series"]] == [(c, q) for c in SYSTEMS for q in NOISE_LEVELS]
+    assert all(np.shape(s[line]) == (101, 2) for s in data["series"] for line in ("truth", "kf", "enkf"))
     assert data["settings"] == {"runs": 4, "members": 5, "seed": 3}
     assert [(r["case"], r["q"]) for r in data["results"]] == [(c, q) for c in SYSTEMS for q in NOISE_LEVELS]
     for result in data["results"]:
@@ -178,7 +236,14 @@ def test_tables_fit_the_terminal(tmp_path, width):
 
 @pytest.mark.parametrize(
     "arguments",
-    [("healey1995",), ("all", "--runs", "1"), ("all", "--members", "1"), ("all", "--runs", "many"), ()],
+    [
+        ("healey1995",),
+        ("all", "--runs", "1"),
+        ("all", "--members", "1"),
+        ("all", "--runs", "many"),
+        ("all", "--series", "series.pdf"),
+        (),
+    ],
 )
 def test_a_users_mistake_ends_with_code_2(monkeypatch, capsys, arguments):
     assert command_line(monkeypatch, *arguments) == 2

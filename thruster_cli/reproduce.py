@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -12,6 +13,7 @@ from rich.text import Text
 from studies import STUDIES
 from studies.comparison import LARGEST_ENSEMBLE, MEMBERS, MOST_RUNS, RUNS, compare_all
 from studies.findings import findings, general_statements, study_statements
+from studies.series import all_series, series_figure
 from thruster_cli.output import (
     JsonOption,
     SeedOption,
@@ -21,6 +23,7 @@ from thruster_cli.output import (
     table,
 )
 from thruster_env.checks import at_least, one_of
+from thruster_env.files import check_target
 
 ALL = "all"
 LINES = "In each cell first omega_m [rad/s], below it U_a [m/s]."
@@ -32,6 +35,13 @@ def command(
         int, typer.Option(help="Independent runs of 100 steps, at least 2; below 200 the intervals are wide.")
     ] = RUNS,
     members: Annotated[int, typer.Option(help="Ensemble size N of the EnKF, at least 2.")] = MEMBERS,
+    series: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.png",
+            help="Also draw one run over time for each system and q, as the papers do; into --json, too.",
+        ),
+    ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
@@ -48,12 +58,19 @@ def command(
     distances in standard deviations of a single run, and a word on why it
     differs.
 
-    Example: thruster reproduce nurhadi2022 --json table.json
+    Example: thruster reproduce nurhadi2022 --series series.png --json table.json
     """
     names = tuple(STUDIES) if one_of("study", study, (*STUDIES, ALL)) == ALL else (study,)
-    shown, data = reproduce(
-        names, at_least("runs", runs, 2, MOST_RUNS), at_least("members", members, 2, LARGEST_ENSEMBLE), seed
-    )
+    runs, members = at_least("runs", runs, 2, MOST_RUNS), at_least("members", members, 2, LARGEST_ENSEMBLE)
+    if series is not None:
+        if series.suffix != ".png":
+            raise ValueError(f"--series must end in .png, but got {str(series)!r}")
+        check_target(series)
+    shown, data = reproduce(names, runs, members, seed)
+    if series is not None:
+        drawn = all_series(members=members, seed=seed)
+        shown += ["", f"Picture: {series_figure(series, drawn, members)}"]
+        data |= {"series": [one._asdict() for one in drawn], "picture": str(series)}
     emit(shown, data, json)
 
 
@@ -184,6 +201,7 @@ def _plain_finding(f) -> dict:
         "filter": f.filter,
         "published": list(f.published[:2]),
         "note": f.published.note,
+        "in_text": f.published.in_text,
         "sd_from_optimum": f.from_optimum,
         "sd_from_unupdated": f.from_unupdated,
         "published_over_optimum": f.over_optimum,

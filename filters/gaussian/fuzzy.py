@@ -16,11 +16,12 @@ from filters.gaussian.affine import AffineModel, affine_functions, linearize
 from filters.gaussian.extended import gaussian_update, nothing_to_summarise
 from filters.gaussian.mixture import blender, part_matrix, part_vector
 from filters.rows import constants_form, memory_places, number_places, own_place, row_access
-from thruster_env.checks import shown, vector
+from thruster_env.checks import one_of, shown, vector
 from thruster_env.compiled import inlined
 from thruster_env.components import matrix_reader, tuple_of, vector_reader, written_out
 
 MOST_STATES = 8  # 256 rules
+BLENDINGS = ("weights", "moments", "output")
 
 
 @cache
@@ -45,8 +46,8 @@ def memberships(n: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def fuzzy_kernels(n: int, m: int, inputs: int, form) -> Kernels:
-    """Kernels for sizes; the rules' models are numbers. Extras: `rule_length` numbers a rule."""
+def fuzzy_kernels(n: int, m: int, inputs: int, form, blending: str) -> Kernels:
+    """Kernels for sizes and one of `BLENDINGS`; the rules' models are numbers. Extras: `rule_length` a rule."""
     places, source, own = memory_places(n, m), number_places(n, m), own_place(n, m, form)
     step_place, likelihood_place, rules, stride = places.step, places.log_likelihood, 2**n, rule_length(n, m)
     means = places.extras
@@ -57,8 +58,9 @@ def fuzzy_kernels(n: int, m: int, inputs: int, form) -> Kernels:
         part_matrix(n, covs, stride),
     )
     (_, store_seen), (_, store_seen_cov) = part_vector(m, seen, stride), part_matrix(m, seen_covs, stride)
-    of_states = blender(n, means, covs, weights, stride)
-    of_innovations = blender(m, seen, seen_covs, weights, stride)
+    between, restarts = blending != "weights", blending != "output"
+    of_states = blender(n, means, covs, weights, stride, between)
+    of_innovations = blender(m, seen, seen_covs, weights, stride, between)
     transition, observe, transition_jacobian, observe_jacobian = affine_functions(n, m, inputs).values()
     length = n * (n + inputs + 1) + m * (n + 1)  # of an affine model's constants
     (rule_constants, _), low, high = (
@@ -72,7 +74,7 @@ def fuzzy_kernels(n: int, m: int, inputs: int, form) -> Kernels:
     )
     read_q, read_r = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r)
     prior_mean, prior_cov = vector_reader(n, source.prior_mean), matrix_reader(n, n, source.prior_cov)
-    (read_mean, _), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
     factor, likelihood = matrices.cholesky_factor(m), matrices.innovation_likelihood(m)
     control, measured, condition = vector_reader(inputs), vector_reader(m), gaussian_update(n, m)
     times, times_transposed, add = (
@@ -92,6 +94,16 @@ def fuzzy_kernels(n: int, m: int, inputs: int, form) -> Kernels:
         store_cov(row, cov)
 
     @inlined
+    def own_belief(row, j):
+        return rule_mean(row, j), rule_cov(row, j)
+
+    @inlined
+    def common_belief(row, j):
+        return read_mean(row), read_cov(row)
+
+    last_belief = common_belief if restarts else own_belief
+
+    @inlined
     def start(memory, numbers, size):
         row, _, _ = memory
         for j in range(rules):
@@ -107,10 +119,10 @@ def fuzzy_kernels(n: int, m: int, inputs: int, form) -> Kernels:
         v, q = control(u), read_q(numbers)
         take_memberships(row, numbers)
         for j in range(rules):
-            c, mean = rule_constants(numbers, j), rule_mean(row, j)
+            c, (mean, p) = rule_constants(numbers, j), last_belief(row, j)
             f = transition_jacobian(mean, v, c)
             store_rule_mean(row, j, transition(mean, v, c))
-            store_rule_cov(row, j, add(times_transposed(times(f, rule_cov(row, j)), f), q))
+            store_rule_cov(row, j, add(times_transposed(times(f, p), f), q))
         blend(row)
         row[step_place] += 1.0
 
@@ -145,14 +157,19 @@ class FuzzyKalmanFilter(Filter):
     """Takagi-Sugeno fuzzy Kalman filter: 2^n Kalman filters, one for each corner of the range of the states.
 
         rule r:  if each state i is low or high, as bit i of r says, then x' = A_r x + B_r u + a_r + w and
-                 z = C_r x + d_r + v: the model linearised at that corner, offsets kept, Q and R the model's;
-                 a Kalman filter of that model keeps mean_r and P_r (Joseph's form)
-        blend:   w_r(x) = product over i of (high_i - x_i)/(high_i - low_i) or (x_i - low_i)/(high_i - low_i),
-                 each within 0 and 1;  mean = sum of w_r mean_r,
-                 cov = sum of w_r (P_r + (mean_r - mean)(mean_r - mean)'): that within the rules and between them
+                 z = C_r x + d_r + v: the model linearised at that corner, Q and R the model's
+        w_r:     product over i of (high_i - x_i)/(high_i - low_i) or (x_i - low_i)/(high_i - low_i), each within
+                 0 and 1, of the last estimate x
+        predict: mean_r = A_r mean + B_r u + a_r,  P_r = A_r P A_r' + Q, from the common mean and P
+        update:  the Kalman filter's of each rule, with a gain of its own (Joseph's form)
+        blend:   mean = sum of w_r mean_r,  P = sum of w_r P_r, after each of the two
 
-    A prediction takes the memberships of the last estimate, and the update after it keeps them. Innovation and S
-    are blended in the same way. With equal rules, as an affine model has them, all this is the Kalman filter.
+    `blending` "weights" is this, the recursion of the sources. It leaves out that the rules' means differ, so P is
+    too small. "moments" is the same with P = sum of w_r (P_r + (mean_r - mean)(mean_r - mean)'): the first-order
+    generalised pseudo-Bayesian filter, GPB1, with memberships in place of the models' probabilities. "output" has
+    autonomous filters: each rule goes on from a mean_r and P_r of its own, which are blended, by moments, for
+    output only. Innovation and S are blended as mean and P are. With equal rules, as an affine model has them, all
+    three are the Kalman filter.
 
     A blend of tangents at the corners follows a model only as well as the range is narrow: on the thruster the
     extended filter, whose tangent moves with the estimate, is far better.
@@ -163,20 +180,29 @@ class FuzzyKalmanFilter(Filter):
     Attributes:
         low: the smallest states (n,); the model's `state_low` if None.
         high: the largest states (n,); the model's `state_high` if None.
+        blending: "weights", "moments" or "output", see above.
+        offsets: whether rules have the offset a_r that makes them exact at their corners; the sources print none.
 
-    Source: Takagi, Sugeno (1985), "Fuzzy identification of systems and its applications to modeling and control",
-    for the rules; Simon (2003), "Kalman filtering for fuzzy discrete time dynamic systems", for filters by rule;
-    the form with memberships of minima and maxima: Ngatini, Apriliani, Nurhadi (2017), "Ensemble and fuzzy Kalman
-    filter for position estimation of an autonomous underwater vehicle".
+    Source: Ngatini, Apriliani, Nurhadi (2017), "Ensemble and fuzzy Kalman filter for position estimation of an
+    autonomous underwater vehicle", Expert Systems with Applications 68, for the recursion and the memberships of
+    minima and maxima (whose names are exchanged in the authors' slides); Takagi, Sugeno (1985), "Fuzzy
+    identification of systems and its applications to modeling and control", for the rules; Simon (2003), "Kalman
+    filtering for fuzzy discrete time dynamic systems", for filters by rule; Bar-Shalom, Li, Kirubarajan (2001),
+    Estimation with Applications to Tracking and Navigation, section 11.6, for GPB1 and autonomous filters.
     """
 
     name: ClassVar[str] = "fuzzy"
     low: Any = None
     high: Any = None
+    blending: str = "weights"
+    offsets: bool = True
 
     def __post_init__(self):
-        """Check the range; raise ValueError that states the rule and the value."""
+        """Check the range and the choices; raise ValueError that states the rule and the value."""
         model = self.model
+        one_of("blending", self.blending, BLENDINGS)
+        if not isinstance(self.offsets, bool):
+            raise ValueError(f"offsets must be True or False, but got {shown(self.offsets)}")
         if model.n > MOST_STATES:
             raise ValueError(f"a fuzzy filter must have at most {MOST_STATES} states, but got {model.n}")
         low = model.state_low if self.low is None else self.low
@@ -202,7 +228,8 @@ class FuzzyKalmanFilter(Filter):
         control = np.zeros(model.inputs) if model.operating_input is None else model.operating_input
         ends = np.array([self.low, self.high])
         corners = (ends[[rule >> i & 1 for i in range(model.n)], range(model.n)] for rule in range(2**model.n))
-        return tuple(linearize(model, corner, control) for corner in corners)
+        rules = (linearize(model, corner, control) for corner in corners)
+        return tuple(rules) if self.offsets else tuple(_without_offset(rule) for rule in rules)
 
     @property
     def own_numbers(self) -> tuple[float, ...]:
@@ -212,10 +239,17 @@ class FuzzyKalmanFilter(Filter):
     def kernels(self) -> Kernels:
         """Kernels for the model's sizes; see `Filter.kernels`."""
         model = self.kernel_model
-        return fuzzy_kernels(model.n, model.m, model.inputs, constants_form(model.constants))
+        return fuzzy_kernels(model.n, model.m, model.inputs, constants_form(model.constants), self.blending)
 
     def rule_estimates(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Means (2^n, n), covariances (2^n, n, n) and memberships (2^n,) of the rules of a belief."""
         n = self.model.n
         means, covs, weights, _ = np.split(belief.extras.reshape(2**n, -1), [n, n + n * n, n + n * n + 1], axis=1)
         return means.copy(), covs.reshape(-1, n, n).copy(), weights[:, 0].copy()
+
+
+def _without_offset(rule: AffineModel) -> AffineModel:
+    """The rule x' = A x + B u, z = C x + d."""
+    before, count = rule.n * (rule.n + rule.inputs), rule.n
+    c = rule.constants
+    return rule.replace(constants=c[:before] + (0.0,) * count + c[before + count :])

@@ -29,13 +29,15 @@ def part_matrix(size: int, first: int, stride: int) -> tuple[Callable, Callable]
 
 
 @cache
-def blender(count: int, means: int, covs: int, weights: int, stride: int) -> Callable:
+def blender(count: int, means: int, covs: int, weights: int, stride: int, between: bool = True) -> Callable:
     """Return `blend(row, parts)`: mean and covariance of a mixture from those of its parts and their weights.
 
-    The covariance is that within the parts and that between them: sum of w (P + (x - mean)(x - mean)'). The means,
-    covariances and weights of the first part lie from row[means], row[covs] and row[weights] on.
+    The covariance is that within the parts and that between them: sum of w (P + (x - mean)(x - mean)'), or that
+    within them alone, sum of w P. The means, covariances and weights of the first part lie from row[means],
+    row[covs] and row[weights] on.
     """
     pairs = [(i, j) for i in range(count) for j in range(i + 1)]
+    spread = " + d{} * d{}" if between else ""
     mean_of = written_out(
         "mean_of",
         "row, parts",
@@ -53,8 +55,8 @@ def blender(count: int, means: int, covs: int, weights: int, stride: int) -> Cal
         "for part in range(parts):",
         f"    k = {stride} * part",
         f"    w = row[k + {weights}]",
-        *(f"    d{i} = row[k + {means + i}] - mean[{i}]" for i in range(count)),
-        *(f"    s{i}_{j} += w * (row[k + {covs + i * count + j}] + d{i} * d{j})" for i, j in pairs),
+        *(f"    d{i} = row[k + {means + i}] - mean[{i}]" for i in range(count) if between),
+        *(f"    s{i}_{j} += w * (row[k + {covs + i * count + j}]{spread.format(i, j)})" for i, j in pairs),
         matrix_of(count, count, lambda i, j: f"s{max(i, j)}_{min(i, j)}"),
     )
 
