@@ -225,9 +225,7 @@ def _size_sentence(kept: int, result: StudyResult) -> str:
     ends = {row.size: row.ratio.high for row in result.sizes}
     if ends[kept] < 1 + SIZE_TOLERANCE:
         return f"N = {kept} is the smallest whose upper end is below {1 + SIZE_TOLERANCE:g}."
-    return (
-        f"No N has its upper end below {1 + SIZE_TOLERANCE:g} on all scenarios; N = {kept} is a compromise."
-    )
+    return f"No N has its upper end below {1 + SIZE_TOLERANCE:g} on all scenarios; N = {kept} is a compromise."
 
 
 def _consistency_sentence(evaluation: Evaluation) -> str:

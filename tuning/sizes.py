@@ -54,8 +54,8 @@ def sufficient_size(sizes: Sequence[SizeRow], consistent: bool = False) -> int:
     """The smallest size whose 95 % interval of the score over the best one ends below 1.01.
 
     With several scenarios there may be none that is so good on all of them; then it is the smallest whose interval
-    ends within 1 % of where that of the best compromise ends. Where it has to be consistent, sizes whose mean NIS is
-    outside its band do not count.
+    ends within 1 % of where that of the best compromise ends. Where it has to be consistent, sizes whose mean NIS
+    is outside its band do not count.
     """
     rows = [sizes[i] for i in _counting([row.outside for row in sizes], consistent)]
     least, limit = min(row.ratio.high for row in rows), 1.0 + SIZE_TOLERANCE
