@@ -1,5 +1,7 @@
 """What tuning can buy where the model is wrong: the script of the table in docs/tuning.md, in a small form."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -15,7 +17,10 @@ def test_the_factor_on_the_lift_is_that_of_the_parameters():
     constants = model.constants._replace(**{LIFT: 0.8})
     state, voltage = np.array([150.0, 1.2]), np.array([7.0])
     for name, arguments in (("observe", (state,)), ("transition", (state, voltage))):
-        ours, known = getattr(model, name)(*arguments, constants), getattr(plain, name)(*arguments, plain.constants)
+        ours, known = (
+            getattr(model, name)(*arguments, constants),
+            getattr(plain, name)(*arguments, plain.constants),
+        )
         np.testing.assert_allclose(ours, known, rtol=1e-12)
     assert len(SLOPES) == 8 and model.measurement_noise_cov[0, 0] == 0.3
 
@@ -26,8 +31,8 @@ def test_lift_and_voltage_gain_as_states_buy_what_no_q_can():
     rows = [line.strip("| ").split(" | ") for line in lines]
     ratios = [float(row[1].split()[0]) for row in rows]
     assert [row[0] for row in rows] == ["`ekf`, scaled default", *names]
-    assert ratios[0] == 1.0 and 0.25 < ratios[3] < ratios[2] < 0.5 < ratios[1]
-    assert float(rows[2][4]) < 3.0 < 10.0 < float(rows[0][4])  # the NEES, too
+    assert ratios[0] == 1.0 and 0.25 < ratios[3] < ratios[2] < 0.6 < 1.0 < ratios[1]  # whose first trial is all
+    assert float(rows[2][4]) < 3.0 < 10.0 < float(rows[0][4])  # the NEES says that no covariance holds a bias
 
 
 def test_a_full_q_is_searched_where_the_table_says_so():
@@ -37,8 +42,6 @@ def test_a_full_q_is_searched_where_the_table_says_so():
 
 @pytest.mark.parametrize("name", ["`ekf`, Q and R", "`ekf` + lift and K2"])
 def test_the_page_has_the_row(name):
-    from pathlib import Path
-
     page = (Path(__file__).parents[1] / "docs" / "tuning.md").read_text(encoding="utf-8")
     (row,) = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith(f"| {name} |")]
     assert float(row[1].split()[0]) < 1
