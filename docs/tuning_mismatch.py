@@ -29,7 +29,7 @@ from tuning.space import Choice, distributions, suggest, trial_parameters
 from tuning.study import open_study, quiet_optuna, run_study
 
 SCENARIO, SEED, TRIALS = "mismatch", 0, 100
-LIFT = "lift_factor"  # on the lift coefficient, which enters seven constants of the model
+LIFT = "lift_factor"  # on the lift coefficient, which enters several constants of the model
 SLOPES = tuple(name for name in Constants._fields if name.startswith(("thrust_", "torque_")))
 LiftedConstants = namedtuple("LiftedConstants", (*Constants._fields, LIFT, *(f"slope_{name}" for name in SLOPES)))
 UNKNOWNS = {  # what a further state stands for, by how the table calls it
@@ -37,6 +37,7 @@ UNKNOWNS = {  # what a further state stands for, by how the table calls it
     "the voltage gain K2": ("voltage_gain",),
     "the load gain K_h": ("load_gain",),
     "lift and K2": (LIFT, "voltage_gain"),
+    "lift, K2 and K1": (LIFT, "voltage_gain", "motor_damping"),
 }
 SPREADS, WALKS = (0.01, 0.5), (1e-6, 0.1)  # of the prior and of a step's change, as parts of the constant
 START = 0.15, 1e-3
@@ -153,7 +154,8 @@ def _studied(plan: Plan, trials: int) -> Choice:
 def _line(name: str, found: Evaluation, base: Evaluation) -> list[str]:
     ratio, (speed, flow) = score_ratio(found, base), found.rmse
     cells = f"{ratio.value:.3f} ± {(ratio.high - ratio.low) / 2:.3f}", f"{speed.value:.3f}", f"{flow.value:.4f}"
-    return [name, *cells, f"{found.nees.value:.3g}", f"{found.nis.value:.2f}"]
+    nees = found.nees.value
+    return [name, *cells, f"{nees:.3g}" if nees < 1000 else "> 1000", f"{found.nis.value:.2f}"]
 
 
 TABLES: dict[str, Callable[[], str]] = {"bought": bought}
