@@ -59,14 +59,25 @@ def test_tune_resume_evaluate_and_wrap(thruster, as_json, tmp_path):
     assert first["trials"] == 12 and not first["interrupted"]
     again = thruster(*options, "--trials", 15, "--json", "again.json")
     assert again.returncode == 0 and "goes on after 12 finished trials" in again.stderr
-    for word in ("untuned", "tuned", "true Q, R", "bound", "rad/s", "NEES", "held-out"):
-        assert word in again.stdout
+    words = " ".join(again.stdout.split())
+    for word in (
+        "tuned",
+        "that of the scaled default, x",
+        "the rule of thumb with its Q times",
+        "bound",
+        "NEES",
+        "held-out",
+    ):
+        assert word in words
     second = json.loads((tmp_path / "again.json").read_text())
     assert second["trials"] == 15
     assert second["best_training_value"] <= first["best_training_value"]
 
     evaluated = as_json("evaluate", "--tuned", second["file"])
-    assert evaluated["tuned"] == second["held_out"]["mismatch"]["tuned"]
+    held_out = second["held_out"]["mismatch"]
+    assert all(evaluated[key] == held_out[key] for key in ("tuned", "scaled", "scaled_default"))
+    assert held_out["scaled_default"]["factor"] == 0.03248  # on 1 % of the ranges, which is far too much
+    assert held_out["tuned_over_untuned"][0] < held_out["tuned_over_scaled"][0]
 
     env = EstimateState(gym.make("BowThruster-v0"), tuned=str(tmp_path / second["file"]))
     assert env.filter.name == "ekf"
@@ -82,7 +93,12 @@ def test_evaluate_says_and_draws_whether_a_filter_is_honest(thruster, as_json, t
     options = "evaluate", "--filter", "ekf", "--seeds", 30, "--consistency"
     done = thruster(*options, "new/honest.png")
     words = " ".join(done.stdout.split())
-    for part in ("Underconfident: mean NEES", "Innovations are not white", "To try: lower Q", "untuned over true"):
+    for part in (
+        "Underconfident: mean NEES",
+        "Innovations are not white",
+        "To try: lower Q",
+        "rule of thumb over oracle",
+    ):
         assert part in words
     assert (tmp_path / "new" / "honest.png").read_bytes().startswith(b"\x89PNG")
     found = as_json(*options, "again.png")["consistency"]

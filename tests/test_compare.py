@@ -79,7 +79,7 @@ def test_a_size_is_for_filters_that_have_an_ensemble():
         (lambda: compare([], [NOMINAL], SEEDS), "a comparison must be of different filters, but got none"),
         (lambda: compare([contender("ekf")] * 2, [NOMINAL], SEEDS), "different filters, but got ekf, ekf"),
         (lambda: contender("none"), "filter must be one of"),
-        (lambda: contender("ekf", "much"), "knows must be one of true, untuned, but got 'much'"),
+        (lambda: contender("ekf", "much"), "knows must be one of true, scaled, untuned, but got 'much'"),
         (lambda: contender("enkf", ensemble_size=1).filter(NOMINAL), "ensemble_size must be"),
         (
             lambda: contender("ekf", unknown={"colour": None}).filter(NOMINAL),
@@ -174,7 +174,7 @@ def test_the_command_takes_tuned_files(thruster, tmp_path):
         (("--filter", "none"), "filter must be one of kf, "),
         (("--scenario", "none"), "scenario must be one of nominal, "),
         (("--scenario", "no.toml"), "a scenario file must be readable, but no.toml is not"),
-        (("--knows", "all"), "knows must be one of true, untuned, but got 'all'"),
+        (("--knows", "all"), "knows must be one of true, scaled, untuned, but got 'all'"),
         (("--seeds", "1"), "held-out seeds must be a whole number of at least 2, but got 1"),
         (("--ensemble-size", "many"), "--ensemble-size must be a finite number, but got 'many'"),
         (("--ensemble-size", "ekf=5"), "--ensemble-size must be for a filter with an ensemble, but got 'ekf=5'"),

@@ -210,7 +210,8 @@ def test_the_page_on_tuning_holds_what_its_script_makes():
     assert script.likeliest() in TUNING_PAGE
     lines = script.earned(["outliers"], trials=8).splitlines()[2:]
     assert [line.split(" | ")[1] for line in lines] == ["`kf`", "`ekf`", "`enkf`"]
-    assert all(float(line.split(" | ")[2].split()[0]) < 1 for line in lines)  # over untuned
+    ratios = [[float(cell.split()[0]) for cell in line.split(" | ")[2:4]] for line in lines]
+    assert all(ratio < 1 for pair in ratios for ratio in pair)  # over scaled default and rule of thumb
 
 
 def test_the_tables_on_tuning_say_what_the_page_says():
@@ -218,5 +219,9 @@ def test_the_tables_on_tuning_say_what_the_page_says():
     published = {row[0].strip("`"): float(row[2].split()[0]) for row in rows if len(row) == 3}
     assert set(published) == {"published_tunnel", "published_open_bladed"}
     assert all(abs(ratio - 1) < 0.005 for ratio in published.values())
-    earned = [[float(cell.split()[0]) for cell in row if "±" in cell] for row in rows if len(row) > 3]
-    assert len(earned) == 12 and all(ratio < 1 for row in earned for ratio in row)
+    earned = [[float(cell.split()[0]) for cell in row if "±" in cell] for row in rows if len(row) == 9]
+    assert len(earned) == 12 and all(len(row) == 3 and max(row) < 1 for row in earned)
+    bought = {row[0]: float(row[1].split()[0]) for row in rows if len(row) == 6}
+    others = [ratio for name, ratio in bought.items() if " + " not in name and " with " not in name]
+    assert bought["`ekf` + lift and K2"] < 0.4 < 0.85 < min(others) and bought["`ekf`, scaled default"] == 1.0
+    assert len(bought) == 13 and max(bought.values()) == 1.0

@@ -6,13 +6,14 @@ import sys
 import optuna
 import pytest
 
+from filters.consistency.intervals import Interval
 from thruster_cli.main import main
 from tuning.followers import TWIN
 from tuning.objectives import NIS_BAND
 from tuning.outcome import best_trial, is_consistent
 from tuning.plan import Plan
-from tuning.proof import SizeRow, sufficient_size
 from tuning.scenarios import find_scenario
+from tuning.sizes import SizeRow, sufficient_size
 from tuning.storage import open_storage
 from tuning.study import BEST, open_study, run_study
 from tuning.trials import CONSISTENCY
@@ -78,7 +79,8 @@ def test_a_study_without_a_consistent_trial_says_so_everywhere(thruster, tmp_pat
 
 
 def test_a_smaller_ensemble_of_a_consistent_trial_is_consistent_too():
-    rows = [SizeRow(5, None, 1.0, 0.2), SizeRow(10, None, 1.3, -0.1), SizeRow(20, None, 1.0, -0.1)]
+    found = (5, 1.0, 0.2), (10, 1.3, -0.1), (20, 1.0, -0.1)
+    rows = [SizeRow(n, None, Interval(ratio, ratio, ratio), outside) for n, ratio, outside in found]
     assert sufficient_size(rows) == 5 and sufficient_size(rows, consistent=True) == 20
     assert sufficient_size(rows[:1], consistent=True) == 5
 

@@ -99,7 +99,10 @@ def test_the_page_of_a_tuned_ensemble_has_all_parts_and_needs_no_network(folder)
     assert "held-out seeds 500000 to 500005" in words and "14, " in words
     assert str(folder) not in text
     tables = report.tables.read_text()
-    assert report.advice in tables and "| untuned | " in tables and "| true Q, R | " in tables
+    assert report.advice in tables and all(
+        f"| {name} | " in tables for name in ("rule of thumb", "scaled default", "oracle")
+    )
+    assert "upper end of its 95 % interval" in words and "250000 to 250099" in text
     assert write_report("s.json", STORAGE, "again").page.read_text() == text
 
 
@@ -158,12 +161,17 @@ def test_the_advice_says_when_tuning_is_worth_nothing_or_harms():
     choice = untuned_choice("ekf", MISMATCH)
     proof = prove(choice, MISMATCH, 0, 4)
     plan = Plan("ekf", (MISMATCH,))
-    assert advice(choice, plan, [proof]).startswith("Tuning makes no difference that 4 seeds can show; the cov")
+    assert advice(choice, plan, [proof]).startswith(
+        "Tuning raises the score by 10 % [4, 21] against the scaled default and makes no difference that 4 seeds "
+        "can show against the rule of thumb; the covariance is "
+    )
     worse = proof.untuned._replace(mean_squares=4 * proof.untuned.mean_squares)
     said = advice(choice, plan, [proof._replace(tuned=worse)])
-    assert said.startswith("Tuning raises the score by 100 % [100, 100]; ")
+    assert "against the scaled default and by 100 % [100, 100] against the rule of thumb; " in said
     blank = proof.tuned._replace(nees=Interval(np.nan, np.nan, np.nan))
-    assert advice(choice, plan, [Comparison(blank, blank, blank, proof.bound, range(4))]).endswith("can show.")
+    assert advice(choice, plan, [Comparison(blank, blank, blank, proof.bound, range(4))]).endswith(
+        "can show against the rule of thumb."
+    )
 
 
 def test_what_is_said_is_escaped():

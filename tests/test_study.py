@@ -10,7 +10,7 @@ from optuna.trial import TrialState
 
 from filters.tuned_file import sealed
 from tuning.plan import Plan
-from tuning.proof import SizeRow, prove, sufficient_size
+from tuning.proof import prove
 from tuning.scenarios import find_scenario
 from tuning.space import parameters_of, untuned_choice
 from tuning.storage import PROCESS, RETRY_OF, open_storage
@@ -196,11 +196,3 @@ def test_a_tuned_file_edited_by_hand_is_refused(tmp_path, change, rule):
     path.write_text(json.dumps(sealed(content)))
     with pytest.raises(ValueError, match=rule):
         read_tuned(path)
-
-
-@pytest.mark.parametrize(
-    ("ratios", "size"), [((1.2, 1.009, 1.0), 10), ((1.3, 1.06, 1.05), 10), ((1.0, 1.1, 1.1), 5)]
-)
-def test_the_smallest_size_that_suffices_need_not_be_the_best_on_every_scenario(ratios, size):
-    rows = [SizeRow(n, None, ratio) for n, ratio in zip((5, 10, 20), ratios, strict=True)]
-    assert sufficient_size(rows) == size

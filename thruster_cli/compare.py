@@ -43,7 +43,11 @@ def command(
     ] = None,
     seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,
     knows: Annotated[
-        str, typer.Option(help="What a filter named by --filter knows of the plant's noise: true or untuned.")
+        str,
+        typer.Option(
+            help="What a filter named by --filter knows of the plant's noise: true (oracle), scaled (scaled "
+            "default) or untuned (rule of thumb)."
+        ),
     ] = "true",
     augment: Annotated[
         list[str] | None,
@@ -69,7 +73,7 @@ def command(
 
     Example: thruster compare --filter ekf --augment ambient_velocity --scenario ambient
     """
-    contenders, default = _contenders(files or [], filters or [], knows, augment or [], ensemble_size or [])
+    contenders, default = _contenders(files or [], filters or [], knows, augment or [], ensemble_size or [], seed)
     chosen = [find_scenario(name) for name in scenarios] if scenarios else [default]
     for file, scenario in product(files or [], chosen):
         check_plant(file, scenario)
@@ -85,7 +89,7 @@ def command(
         sys.exit(130)
 
 
-def _contenders(files, filters, knows, augment, sizes) -> tuple[list[Contender], Scenario]:
+def _contenders(files, filters, knows, augment, sizes, seed) -> tuple[list[Contender], Scenario]:
     """The filters that take part, and the scenario where none is named: that of the first file, or nominal."""
     wanted = dict(_size(text) for text in sizes)
     unknown = dict(_unknown(text) for text in augment)
@@ -98,9 +102,9 @@ def _contenders(files, filters, knows, augment, sizes) -> tuple[list[Contender],
         out.append(Contender(file.stem, lambda scenario, choice=choice: choice))
     for name in filters or ([] if files else DEFAULT_FILTERS):
         size = wanted.get(name, wanted.get(None)) if has_ensemble(name) else None
-        out.append(contender(name, knows, ensemble_size=size))
+        out.append(contender(name, knows, seed=seed, ensemble_size=size))
         if unknown and filter_class(name).has_covariance:
-            out.append(contender(name, knows, unknown, ensemble_size=size))
+            out.append(contender(name, knows, unknown, seed, ensemble_size=size))
     return out, default
 
 

@@ -10,6 +10,7 @@ from filters.consistency.report import ConsistencyReport
 from filters.consistency.verdicts import comparison_sentence, sentences
 from filters.registry import filter_class
 from thruster_env.files import check_target
+from tuning.baselines import ORACLE
 from tuning.consistency_figures import consistency_figure
 from tuning.evaluate import check_consistency
 from tuning.proof import Comparison
@@ -32,9 +33,9 @@ def judge(choice: Choice, name: str, scenario: Scenario, proof: Comparison, path
     ratios = rmse_ratios(proof.tuned.mean_squares, proof.true.mean_squares)
     said = sentences(report)
     for state, ratio in zip(report.states, ratios, strict=True):
-        said.append(comparison_sentence(state, name, "true", ratio))
+        said.append(comparison_sentence(state, name, ORACLE, ratio))
     title = f"{choice.name}, {name}, on {report.runs} seeds of {scenario.name}"
-    consistency_figure(path, report, title, {f"{name}\nover true": ratios})
+    consistency_figure(path, report, title, {f"{name}\nover {ORACLE}": ratios})
     data = {**as_data(report), "rmse_over_true": ratios, "sentences": said, "picture": str(path)}
     return [f"Is the {name} filter honest?", *said, f"Picture: {path}"], data
 

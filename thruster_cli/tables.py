@@ -96,7 +96,7 @@ def gradient_table(found: GradientResult) -> Table:
         f"± {100 * error:.0f} %" if error < 1 else f"x/: {np.exp(error):.2g}" for error in found.standard_errors
     ]
     rows.append(["standard error", *errors, "", ""])
-    columns = ["start, factors on the untuned", *found.names, "log L", "evaluations"]
+    columns = ["start, factors on the rule of thumb", *found.names, "log L", "evaluations"]
     return table("Maximum of the innovations' likelihood on the training seeds", columns, rows)
 
 

@@ -15,6 +15,7 @@ from thruster_cli.tables import (
     kinds_table,
     span,
 )
+from tuning.baselines import ORACLE, RULE, SCALED, TUNED, baselines
 from tuning.evaluate import Evaluation, Interval, score_ratio
 from tuning.gradient import GradientResult
 from tuning.identifiability import Identifiability, as_data, sentences
@@ -24,9 +25,11 @@ from tuning.outcome import is_over_budget
 from tuning.plan import Plan
 from tuning.proof import Comparison
 from tuning.scenarios import Scenario
-from tuning.space import size_ladder, true_choice, untuned_choice
+from tuning.sizes import SIZE_TOLERANCE
+from tuning.space import size_ladder
 from tuning.study import StudyResult
-from tuning.tuned import consistency, summary
+from tuning.tuned import consistency, metrics
+from tuning.worth import scaling_sentence
 
 
 class Tuning(NamedTuple):
@@ -57,19 +60,12 @@ def report(tuning: Tuning) -> list:
     result, plan = tuning.result, tuning.plan
     shown = []
     for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True):
-        choices = {
-            "untuned": untuned_choice(result.choice.name, scenario),
-            "tuned": result.choice,
-            "true": true_choice(result.choice.name, scenario),
-        }
-        evaluations = {"untuned": proof.untuned, "tuned": proof.tuned, "true Q, R": proof.true}
+        found = {TUNED: result.choice, **baselines(result.choice.name, scenario, plan.seed)}
+        evaluations = proof.evaluations
+        choices = {name: found[name] for name in evaluations}
         title = f"RMSE on held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {scenario.name}"
         shown += [choice_table(choices, scenario), comparison_table(evaluations, proof.bound, title)]
-        ratio = score_ratio(proof.tuned, proof.untuned)
-        shown.append(
-            f"Tuned against untuned on {len(proof.seeds)} held-out seeds: score x {span(ratio, 3)} "
-            f"(paired 95 % interval). {_verdict(ratio)}"
-        )
+        shown += gains(proof)
         shown.append(_consistency_sentence(proof.tuned))
         if not scenario.has_bound:
             shown.append(
@@ -102,10 +98,12 @@ def _search_sentences(tuning: Tuning) -> list:
         )
     if result.sizes:
         kept, ladder = result.choice.numbers["ensemble_size"], size_ladder(result.choice.name)
-        ratios = ", ".join(f"{row.size}: {row.ratio:.3f}" for row in result.sizes if row.size in ladder)
+        ratios = ", ".join(
+            f"{r.size}: {r.ratio.value:.3f} [{r.ratio.high:.3f}]" for r in result.sizes if r.size in ladder
+        )
         shown.append(
-            f"Score over the best by ensemble size, on the training seeds: {ratios}. "
-            f"N = {kept} is the smallest within 1 %."
+            "Score over the best by ensemble size, on seeds that chose neither Q nor R, with the upper end of its "
+            f"95 % interval: {ratios}. {_size_sentence(kept, result)}"
         )
     if result.consistent is False:
         shown.append(_none_consistent(result, plan))
@@ -161,12 +159,7 @@ def as_json(tuning: Tuning) -> dict:
     """The result of a tuning as plain data."""
     result, plan = tuning.result, tuning.plan
     held_out = {
-        scenario.name: {
-            "seeds": [proof.seeds.start, proof.seeds.stop],
-            "bound": proof.bound,
-            **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
-            "tuned_over_untuned": score_ratio(proof.tuned, proof.untuned),
-        }
+        scenario.name: {**metrics(proof), **ratios_as_json(proof)}
         for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True)
     }
     data = {
@@ -181,7 +174,10 @@ def as_json(tuning: Tuning) -> dict:
         "best_training_value_without_consistency": result.free_value,
         **consistency(result),
         "interrupted": result.interrupted,
-        "sizes": [{"N": r.size, "ratio": r.ratio, "score": r.evaluation.score.value} for r in result.sizes],
+        "sizes": [
+            {"N": r.size, "ratio": r.ratio.value, "upper_end": r.ratio.high, "score": r.evaluation.score.value}
+            for r in result.sizes
+        ],
         "front": [{"values": trial.values, "parameters": trial.params} for trial in result.front],
         "held_out": held_out,
         "file": str(tuning.file),
@@ -201,10 +197,35 @@ def as_json(tuning: Tuning) -> dict:
     return data
 
 
-def _verdict(ratio: Interval) -> str:
+def ratios_as_json(proof: Comparison) -> dict:
+    """Score of the tuned filter over that of each baseline; None where there is no such baseline."""
+    ratios, names = proof.ratios, {"scaled": SCALED, "untuned": RULE, "true": ORACLE}
+    return {f"tuned_over_{key}": ratios.get(name) for key, name in names.items()}
+
+
+def gains(proof: Comparison) -> list[str]:
+    """What tuning is worth, over each baseline, the one that counts first, and what that one is."""
+    ratios = proof.ratios
+    parts = [f"x {span(ratio, 3)} that of the {name}" for name, ratio in ratios.items()]
+    first, place = next(iter(ratios)), f"{len(proof.seeds)} held-out seeds"
+    said = f"Score of the tuned filter on {place}: {', '.join(parts)} (paired 95 % intervals)."
+    scaling = scaling_sentence(proof)
+    return [f"{said} {_verdict(ratios[first], first)}", *([scaling] if scaling else [])]
+
+
+def _verdict(ratio: Interval, name: str) -> str:
     if ratio.high < 1:
-        return f"Tuning lowers the error by {100 * (1 - ratio.value):.0f} %."
-    return "Tuning makes it worse." if ratio.low > 1 else "No difference that these seeds can show."
+        return f"Tuning lowers the error by {100 * (1 - ratio.value):.0f} % against the {name}."
+    if ratio.low > 1:
+        return f"Tuning makes it worse than the {name}."
+    return f"No difference from the {name} that these seeds can show."
+
+
+def _size_sentence(kept: int, result: StudyResult) -> str:
+    ends = {row.size: row.ratio.high for row in result.sizes}
+    if ends[kept] < 1 + SIZE_TOLERANCE:
+        return f"N = {kept} is the smallest whose upper end is below {1 + SIZE_TOLERANCE:g}."
+    return f"No N has its upper end below {1 + SIZE_TOLERANCE:g} on all scenarios; N = {kept} is a compromise."
 
 
 def _consistency_sentence(evaluation: Evaluation) -> str:

@@ -15,12 +15,13 @@ from filters.filter import Filter
 from filters.particles.weighted import WeightedFilter
 from filters.registry import filter_class, make_filter
 from thruster_env.checks import one_of, positive
+from tuning.baselines import oracle, rule_of_thumb, scaled_default
 from tuning.evaluate import Evaluation, judge, score_ratio
 from tuning.interruption import stop_on_interrupt
 from tuning.scenarios import Data, Scenario
-from tuning.space import Choice, ensemble_sizes_of, has_ensemble, true_choice, untuned_choice
+from tuning.space import Choice, ensemble_sizes_of, has_ensemble
 
-KNOWLEDGE = {"true": true_choice, "untuned": untuned_choice}  # of the plant's Q and R
+KNOWLEDGE = ("true", "scaled", "untuned")  # of the plant's Q and R: oracle, scaled default, rule of thumb
 # What is believed of a constant by default: a flow of so many m/s, of others a part of their value.
 FLOW_STD, RELATIVE_STD, WALK_PART = 0.5, 0.2, 0.02  # the last a step, as part of the prior's
 SYMBOLS = {"ambient_velocity": "U_0"}  # for labels
@@ -75,25 +76,27 @@ class Leaderboard(NamedTuple):
 
 
 def contender(
-    name: str, knows: str = "true", unknown: Mapping[str, Unknown | None] | None = None, **numbers
+    name: str, knows: str = "true", unknown: Mapping[str, Unknown | None] | None = None, seed: int = 0, **numbers
 ) -> Contender:
     """A filter by name.
 
     Args:
         name: of the filter.
-        knows: "true" for the plant's own Q and R, "untuned" for what definitions call untuned.
+        knows: "true" for the plant's own Q and R (the oracle), "scaled" for the scaled default, whose Q the mean
+            NIS on the training runs tells, "untuned" for the rule of thumb.
         unknown: constants of the model to estimate with the states; None as a belief for `default_belief`.
-        **numbers: of the filter, such as `ensemble_size`; the untuned ones by default.
+        seed: of the study whose training runs scale the scaled default.
+        **numbers: of the filter, such as `ensemble_size`; those of the rule of thumb by default.
 
     Raises:
         ValueError: for an unknown name or knowledge. (Numbers and constants are checked as the filter is made.)
     """
     filter_class(name)
-    choose = KNOWLEDGE[one_of("knows", knows, tuple(KNOWLEDGE))]
+    one_of("knows", knows, KNOWLEDGE)
     numbers = {key: value for key, value in numbers.items() if value is not None}
 
     def chosen(scenario: Scenario) -> Choice:
-        choice = choose(name, scenario)
+        choice = _known(knows, name, scenario, seed)
         return choice._replace(numbers={**choice.numbers, **numbers})
 
     unknown = unknown or {}
@@ -101,6 +104,16 @@ def contender(
     others = [f"{key} {value:g}" for key, value in numbers.items() if key != "ensemble_size"]
     added = [f"+ {SYMBOLS.get(constant, constant)}" for constant in unknown]
     return Contender(" ".join([name, *size, *others, *added]), chosen, unknown)
+
+
+def _known(knows: str, name: str, scenario: Scenario, seed: int) -> Choice:
+    """The choice of a filter that knows so much; ValueError where there is no scaled default."""
+    if knows != "scaled":
+        return (oracle if knows == "true" else rule_of_thumb)(name, scenario)
+    found = scaled_default(name, scenario, seed)
+    if found.choice is None:
+        raise ValueError(f"{name} must have a scaled default on {scenario.name}, but {found.reason}")
+    return found.choice
 
 
 def sized(choice: Choice, ensemble_size: int | None) -> Choice:

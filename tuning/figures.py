@@ -11,13 +11,15 @@ from optuna.trial import FrozenTrial, TrialState
 from filters.batch import run
 from filters.filter import Filter
 from thruster_env.figures import BLUE, DARK, RUST, STATES, new_figure, save_figure, tidy
+from tuning.baselines import ORACLE, RULE, SCALED, TUNED
 from tuning.outcome import is_consistent
 from tuning.proof import Comparison
 from tuning.scenarios import Data
 
 SCORE = "score: mean RMSE over bound [-]"
 TRUTH, ESTIMATE, BOUND = DARK, BLUE, RUST
-COLOURS = {"untuned": "#9aa5ad", "tuned": ESTIMATE, "true Q, R": "#5a8f3c"}
+GREY = "#9aa5ad"
+COLOURS = {RULE: "#c5ccd1", SCALED: "#8a959d", TUNED: ESTIMATE, ORACLE: "#5a8f3c"}
 
 
 def _new(rows: int, columns: int, size: tuple[float, float], **options):
@@ -77,12 +79,12 @@ def history_figure(path: Path, trials: Sequence[FrozenTrial], title: str, label:
     early = early_trials(trials)
     if early:
         x, y = [trial.number + 1 for trial, _ in early], [value for _, value in early]
-        axis.plot(x, y, "x", color=COLOURS["untuned"], markersize=4, label="ended early: mean of its seeds")
-    for inside, face, name in ((True, COLOURS["untuned"], "trial"), (False, "none", "NIS outside its band")):
+        axis.plot(x, y, "x", color=GREY, markersize=4, label="ended early: mean of its seeds")
+    for inside, face, name in ((True, GREY, "trial"), (False, "none", "NIS outside its band")):
         some = [trial for trial in done[1:] if is_consistent(trial) == inside]
         if some:
             x, y = [trial.number + 1 for trial in some], [trial.values[0] for trial in some]
-            axis.plot(x, y, "o", color=COLOURS["untuned"], markerfacecolor=face, markersize=4, label=name)
+            axis.plot(x, y, "o", color=GREY, markerfacecolor=face, markersize=4, label=name)
     if done:
         axis.plot(done[0].number + 1, values[0], "s", color=BOUND, markersize=7, label="first trial")
         kept = [is_consistent(trial) for trial in done]
@@ -115,9 +117,9 @@ def limit_values(axis, values: list[float]) -> int:
 
 
 def comparison_figure(path: Path, proof: Comparison, title: str) -> Path:
-    """RMSE of the untuned, tuned and true filter on held-out seeds with 95 % intervals, and the bound."""
+    """RMSE of a tuned filter and its baselines on held-out seeds with 95 % intervals, and the bound."""
     figure, axes = _new(1, 2, (8.0, 4.0))
-    names = dict(zip(COLOURS, (proof.untuned, proof.tuned, proof.true), strict=True))
+    names = proof.evaluations
     for column, (label, unit) in enumerate(STATES):
         axis = axes[0, column]
         for place, (name, evaluation) in enumerate(names.items()):
@@ -127,7 +129,7 @@ def comparison_figure(path: Path, proof: Comparison, title: str) -> Path:
             axis.annotate(f"{rmse.value:.3g}", (place, rmse.high), (0, 4), textcoords="offset points", ha="center")
         if np.isfinite(proof.bound[column]):
             axis.axhline(proof.bound[column], color=BOUND, linestyle="--", label="posterior Cramér-Rao bound")
-        axis.set_xticks(range(len(names)), list(names))
+        axis.set_xticks(range(len(names)), [name.replace(" ", "\n", 1) for name in names])
         axis.set_ylabel(f"RMSE of {label} [{unit}]")
         axis.margins(y=0.15)
         axis.grid(axis="x", visible=False)

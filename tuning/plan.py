@@ -10,11 +10,12 @@ from optuna.distributions import BaseDistribution
 from filters.registry import filter_class
 from thruster_env.checks import positive
 from tuning.objectives import Objective, find_objective
-from tuning.scenarios import Data, Scenario, held_out_seeds, training_seeds
+from tuning.scenarios import Data, Scenario, held_out_seeds, size_seeds, training_seeds
 from tuning.space import AUTO, AUTO_KINDS, has_search_space, joint_distributions
 
 TRAINING_SEEDS = 32
 HELD_OUT_SEEDS = 200
+SIZE_SEEDS = 100  # an ensemble that is 1 % worse than the best is told from it, one of 30 from 50
 
 
 class Plan(NamedTuple):
@@ -104,6 +105,10 @@ class Plan(NamedTuple):
     def training_data(self) -> list[Data]:
         """Data that every trial shares, one for each scenario."""
         return [scenario.data(training_seeds(self.seed, TRAINING_SEEDS)) for scenario in self.scenarios]
+
+    def size_data(self) -> list[Data]:
+        """Data that choose the ensemble size once Q and R are chosen, one for each scenario."""
+        return [scenario.data(size_seeds(self.seed, SIZE_SEEDS)) for scenario in self.scenarios]
 
     def held_out_seeds(self, count: int = HELD_OUT_SEEDS) -> range:
         """Seeds that no trial sees."""

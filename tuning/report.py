@@ -9,7 +9,7 @@ from typing import NamedTuple
 from thruster_env.files import check_target, write_whole
 from tuning.identifiability import identify, sentences
 from tuning.objectives import nis_ratio
-from tuning.proof import ensemble_sizes, prove, sufficient_size
+from tuning.proof import prove
 from tuning.report_page import Section, Words, html_page, markdown_page
 from tuning.report_parts import (
     Sketchbook,
@@ -24,6 +24,7 @@ from tuning.report_parts import (
     sizes_section,
 )
 from tuning.report_subject import find_subject, is_file
+from tuning.sizes import ensemble_sizes, sufficient_size
 from tuning.space import has_ensemble
 from tuning.trials import measure
 
@@ -55,7 +56,7 @@ def write_report(source: str | Path, storage: str, out: str | Path | None = None
     for target in (page, tables):
         check_target(target)
     data = plan.training_data()
-    sizes = ensemble_sizes(choice, plan, data) if has_ensemble(choice.name) else []
+    sizes = ensemble_sizes(choice, plan, data, subject.consistent) if has_ensemble(choice.name) else []
     if sizes and not subject.chosen:
         choice = choice.with_size(sufficient_size(sizes, subject.consistent))
         subject = subject._replace(choice=choice)
@@ -64,7 +65,7 @@ def write_report(source: str | Path, storage: str, out: str | Path | None = None
     said = advice(choice, plan, proofs)
     known = identify(choice, plan.scenarios, data, plan.space())
     nis = [nis_ratio(found) for found in measure(choice, plan, data)]
-    numbers = [numbers_table(choice, plan.scenarios[0]), *([known_table(known)] if known else [])]
+    numbers = [numbers_table(choice, plan.scenarios[0], plan.seed), *([known_table(known)] if known else [])]
     with tempfile.TemporaryDirectory() as scratch:
         book = Sketchbook(Path(scratch))
         sections = [

@@ -11,14 +11,14 @@ from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.trial import FrozenTrial, TrialState
 
 from thruster_env.figures import BLUE, RUST, STATES, new_figure, save_figure, tidy
-from tuning.figures import COLOURS, early_trials, limit_values
+from tuning.figures import GREY, early_trials, limit_values
 from tuning.outcome import best_trial, is_consistent
-from tuning.proof import SizeRow
+from tuning.sizes import SizeRow
 from tuning.space import KIND
 
 FEWEST_TRIALS = 10  # complete ones, for importances to mean anything
 COLUMNS = 3
-CROSS = {"color": COLOURS["untuned"], "markersize": 4, "markeredgewidth": 0.8}
+CROSS = {"color": GREY, "markersize": 4, "markeredgewidth": 0.8}
 
 
 def importances(study: optuna.Study) -> dict[str, float]:
@@ -93,7 +93,7 @@ def front_figure(
     tidy([axis])
     done = np.array([trial.values for trial in trials if trial.state == TrialState.COMPLETE])
     best = np.array(sorted(trial.values for trial in front))
-    axis.plot(*done.T, "o", color=COLOURS["untuned"], markersize=4, label="trial")
+    axis.plot(*done.T, "o", color=GREY, markersize=4, label="trial")
     axis.plot(*best.T, "o-", color=BLUE, markersize=6, linewidth=1, drawstyle="steps-post", label="Pareto front")
     axis.plot(*best[0], "s", color=RUST, markersize=8, label="best in the first objective")
     for axis_name, column in (("x", 0), ("y", 1)):

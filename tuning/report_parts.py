@@ -12,14 +12,15 @@ from optuna.trial import FrozenTrial, TrialState
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import confidence, rounded, sentences
 from filters.registry import filter_class
+from tuning.baselines import RULE, TUNED, baselines
 from tuning.consistency_figures import consistency_figure
-from tuning.evaluate import check_consistency, score_ratio
+from tuning.evaluate import check_consistency
 from tuning.figures import SCORE, comparison_figure, estimates_figure, history_figure
 from tuning.identifiability import Identifiability
 from tuning.kinds import kinds_tried, trials_of_kind
 from tuning.objectives import NIS_BAND, find_objective
-from tuning.plan import TRAINING_SEEDS, Plan
-from tuning.proof import Comparison, SizeRow
+from tuning.plan import SIZE_SEEDS, TRAINING_SEEDS, Plan
+from tuning.proof import Comparison
 from tuning.report_figures import (
     FEWEST_TRIALS,
     front_figure,
@@ -30,12 +31,13 @@ from tuning.report_figures import (
 )
 from tuning.report_page import Picture, Section, Table, Words
 from tuning.report_subject import Subject
-from tuning.scenarios import Scenario, training_seeds
-from tuning.space import AUTO, Choice, neutral, parameters_of, true_choice, untuned_choice
+from tuning.scenarios import Scenario, size_seeds, training_seeds
+from tuning.sizes import SizeRow
+from tuning.space import AUTO, Choice, neutral, parameters_of
 from tuning.tuned import versions
+from tuning.worth import scaling_sentence, worth
 
 MANY_TRIALS = 50
-KINDS = ("untuned", "tuned", "true")
 
 
 class Sketchbook(NamedTuple):
@@ -51,8 +53,8 @@ class Sketchbook(NamedTuple):
 def advice(choice: Choice, plan: Plan, proofs: Sequence[Comparison]) -> str:
     """One sentence: what tuning is worth, the ensemble size to take, and whether the covariance is honest."""
     places = [f" on {scenario.name}" if len(proofs) > 1 else "" for scenario in plan.scenarios]
-    worth = [f"{_worth(proof)}{place}" for proof, place in zip(proofs, places, strict=True)]
-    parts = [f"Tuning {' and '.join(worth)}"]
+    gains = [f"{worth(proof)}{place}" for proof, place in zip(proofs, places, strict=True)]
+    parts = [f"Tuning {' and '.join(gains)}"]
     if "ensemble_size" in choice.numbers:
         parts.append(f"take N = {choice.numbers['ensemble_size']}")
     squares, right = [proof.tuned.nees for proof in proofs], len(proofs[0].tuned.rmse)
@@ -65,36 +67,28 @@ def advice(choice: Choice, plan: Plan, proofs: Sequence[Comparison]) -> str:
     return "; ".join(parts) + "."
 
 
-def _worth(proof: Comparison) -> str:
-    ratio = score_ratio(proof.tuned, proof.untuned)
-    if ratio.low <= 1 <= ratio.high:
-        return f"makes no difference that {len(proof.seeds)} seeds can show"
-    ends = sorted(100 * abs(1 - part) for part in (ratio.low, ratio.high))
-    verb = "lowers" if ratio.high < 1 else "raises"
-    return f"{verb} the score by {100 * abs(1 - ratio.value):.0f} % [{ends[0]:.0f}, {ends[1]:.0f}]"
-
-
 def errors_table(scenario: Scenario, proof: Comparison) -> Table:
-    """RMSE, score and consistency of the untuned, tuned and true filter on held-out seeds, and the bound."""
-    evaluations = zip(("untuned", "tuned", "true Q, R"), (getattr(proof, kind) for kind in KINDS), strict=True)
+    """RMSE, score and consistency of a tuned filter and its baselines on held-out seeds, and the bound."""
+    ratios = proof.ratios
     rows = [
         [name, *map(_span, e.rmse), _span(e.thrust_rmse), _span(e.score), _span(e.nees), _span(e.nis)]
-        for name, e in evaluations
+        + [_span(ratios[name]) if name in ratios else ""]
+        for name, e in proof.evaluations.items()
     ]
-    right = [str(len(proof.bound)), str(proof.tuned.channels)] if rows[0][-1] else ["", ""]
+    right = [str(len(proof.bound)), str(proof.tuned.channels)] if rows[0][-2] else ["", ""]
     bound = ["" if isnan(part) else rounded(part) for part in proof.bound]
-    rows.append(["bound; what is right", *bound, "", "", *right])
-    columns = [
-        "filter", "RMSE ω_m [rad/s]", "RMSE U_a [m/s]", "RMSE thrust [N]", "score", "mean NEES", "mean NIS"
-    ]  # fmt: skip
+    rows.append(["bound; what is right", *bound, "", "", *right, ""])
+    columns = ["filter", "RMSE ω_m [rad/s]", "RMSE U_a [m/s]", "RMSE thrust [N]", "score", "mean NEES", "mean NIS"]
+    columns.append("score of tuned over this")
     seeds = f"held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}"
     return Table(f"{scenario.name}, {seeds}, with 95 % intervals", columns, rows)
 
 
-def numbers_table(choice: Choice, scenario: Scenario) -> Table:
-    """The numbers of the untuned, tuned and true filter."""
-    choices = untuned_choice(choice.name, scenario), choice, true_choice(choice.name, scenario)
-    columns = [parameters_of(one._replace(numbers={**choices[0].numbers, **one.numbers})) for one in choices]
+def numbers_table(choice: Choice, scenario: Scenario, seed: int) -> Table:
+    """The numbers of a tuned filter and of its baselines."""
+    found = baselines(choice.name, scenario, seed)
+    choices, default = {TUNED: choice, **found}, found[RULE].numbers
+    columns = [parameters_of(one._replace(numbers={**default, **one.numbers})) for one in choices.values()]
     unit = "N²" if scenario.plant.channels == ("thrust",) else "(rad/s)²"
     units = {"Q11": " [(rad/s)²]", "Q22": " [(m/s)²]", "R": f" [{unit}]"}
     rows = [
@@ -102,7 +96,7 @@ def numbers_table(choice: Choice, scenario: Scenario) -> Table:
         + [f"{column.get(name, neutral(name)):.4g}" for column in columns]
         for name in dict.fromkeys(name for column in columns for name in column)
     ]
-    return Table(f"Numbers of the {choice.name} filter", ["", "untuned", "tuned", "true Q, R"], rows)
+    return Table(f"Numbers of the {choice.name} filter", ["", *choices], rows)
 
 
 def known_table(found: Identifiability) -> Table:
@@ -124,7 +118,9 @@ def proof_section(book: Sketchbook, subject: Subject, proofs: Sequence[Compariso
             f"RMSE on {len(proof.seeds)} held-out seeds of {scenario.name} with 95 % intervals, and the bound."
         )
         title = f"{subject.choice.name} on {scenario.name}"
-        parts += [errors_table(scenario, proof), book.picture(caption, comparison_figure, proof, title)]
+        said = scaling_sentence(proof)
+        parts += [errors_table(scenario, proof), *([Words([said])] if said else [])]
+        parts.append(book.picture(caption, comparison_figure, proof, title))
     return Section("Before and after, on held-out seeds", parts)
 
 
@@ -177,21 +173,26 @@ def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
 
 def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) -> Section:
     """Errors against ensemble size."""
-    caption = f"RMSE on the training seeds of {subject.plan.scenarios[0].name} with 95 % intervals; dashed is N."
+    fresh = size_seeds(subject.plan.seed, SIZE_SEEDS)
+    where = f"seeds {fresh.start} to {fresh.stop - 1} of {subject.plan.scenarios[0].name}"
+    caption = f"RMSE with 95 % intervals on {where}, which chose neither Q nor R; dashed is N."
     kept = subject.choice.numbers["ensemble_size"]
-    ratios = [[f"{row.size}", f"{row.ratio:.3f}"] for row in sizes]
-    said = "Score over the best, paired on the same seeds; of several scenarios the largest"
-    return Section(
-        "Error against ensemble size",
-        [book.picture(caption, sizes_figure, sizes, kept), Table(said, ["N", "score over the best"], ratios)],
+    ratios = [[f"{row.size}", f"{row.ratio.value:.4f}", f"{row.ratio.high:.4f}"] for row in sizes]
+    said = (
+        "Score over the best, paired on the same seeds; of several scenarios the largest. The smallest N whose "
+        "upper end is below 1.01 is sufficient"
     )
+    columns = ["N", "score over the best", "upper end of its 95 % interval"]
+    picture = book.picture(caption, sizes_figure, sizes, kept)
+    return Section("Error against ensemble size", [picture, Table(said, columns, ratios)])
 
 
 def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[Section]:
     """One held-out run over time, and whether the covariance is honest, both on the first scenario."""
     choice, scenario = subject.choice, subject.plan.scenarios[0]
     data, tuned = scenario.data(proof.seeds), choice.filter(scenario)
-    pair = {"untuned": untuned_choice(choice.name, scenario).filter(scenario), "tuned": tuned}
+    name, before = next(iter(baselines(choice.name, scenario, subject.plan.seed).items()))
+    pair = {name: before.filter(scenario), TUNED: tuned}
     caption = (
         f"Truth, estimate and 95 % band on {scenario.name}, held-out seed {proof.seeds.start}, before and after."
     )

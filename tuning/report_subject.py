@@ -28,8 +28,8 @@ class Subject(NamedTuple):
     choice: Choice
     study: optuna.Study | None  # None where it is not in the storage
     seeds: int  # number of held-out seeds
-    chosen: bool  # whether the ensemble size is that of a tuned file, or still to be chosen ...
-    consistent: bool = False  # ... so that the mean NIS stays in its band
+    chosen: bool  # whether the ensemble size is that of a tuned file, or still to be chosen
+    consistent: bool = False  # whether its mean NIS is in its band, where it has to be
 
 
 def find_subject(source: str | Path, storage: str) -> Subject:
@@ -64,7 +64,8 @@ def _of_file(path: str | Path, storage: str) -> Subject:
         count = at_least("the number of held-out seeds", beyond - first, 2)
     except (KeyError, TypeError):
         raise ValueError(f"a tuned file must tell its held-out seeds, but {path} does not") from None
-    return Subject(name, plan, choice, study, count, chosen=True)
+    consistent = plan.is_constrained and bool(content["study"].get("any_trial_consistent"))
+    return Subject(name, plan, choice, study, count, chosen=True, consistent=consistent)
 
 
 def _of_study(name: str, storage: str) -> Subject:

@@ -18,11 +18,13 @@ __all__ = [
     "find_scenario",
     "held_levels",
     "held_out_seeds",
+    "size_seeds",
     "training_seeds",
 ]
 
 MOST_SEEDS = 20_000  # 500 steps of so many take a gigabyte
-SEEDS_APART = 1_000_000  # training seeds of study seed s start at s times this, held-out seeds half-way on
+SEEDS_APART = 1_000_000  # training seeds of study seed s start at s times this, held-out seeds half-way on ...
+SIZES_FROM = SEEDS_APART // 4  # ... and those that choose the ensemble size in between
 
 
 def find_scenario(name: str) -> Scenario:
@@ -49,3 +51,9 @@ def held_out_seeds(seed: int, count: int) -> range:
     """Seeds that a study with a given seed never sees."""
     first = at_least("seed", seed, 0) * SEEDS_APART + SEEDS_APART // 2
     return range(first, first + at_least("the number of held-out seeds", count, 2, MOST_SEEDS))
+
+
+def size_seeds(seed: int, count: int) -> range:
+    """Seeds that choose the ensemble size of a study with a given seed, and nothing else."""
+    first = at_least("seed", seed, 0) * SEEDS_APART + SIZES_FROM
+    return range(first, first + at_least("the number of seeds for the ensemble size", count, 2, MOST_SEEDS))

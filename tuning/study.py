@@ -16,9 +16,9 @@ from tuning.interruption import stop_on_interrupt
 from tuning.objectives import nis_ratio
 from tuning.outcome import best_trial, is_consistent
 from tuning.plan import Plan
-from tuning.proof import SizeRow, ensemble_sizes, sufficient_size
 from tuning.samplers import give_sampler, make_sampler
 from tuning.scenarios import Data
+from tuning.sizes import SizeRow, ensemble_sizes, sufficient_size
 from tuning.space import Choice, choice_of, has_ensemble, trial_parameters
 from tuning.storage import PROCESS, retry_orphans, this_process
 from tuning.trials import cost_of, make_pruner, measure, run_trial
@@ -162,9 +162,10 @@ def run_study(
     if study.user_attrs.get(BEST) != best.number:  # another worker's last word may have been an older one
         study.set_user_attr(BEST, best.number)
     choice = choice_of(plan.filter, best.params, plan.scenarios[0])
-    sizes = ensemble_sizes(choice, plan, data) if has_ensemble(choice.name) and len(plan.objectives) == 1 else []
-    if sizes:
-        choice = choice.with_size(sufficient_size(sizes, plan.is_constrained and is_consistent(best)))
+    sizes, consistent = [], plan.is_constrained and is_consistent(best)
+    if has_ensemble(choice.name) and len(plan.objectives) == 1:
+        sizes = ensemble_sizes(choice, plan, data, consistent)
+        choice = choice.with_size(sufficient_size(sizes, consistent))
     complete = [trial.values[0] for trial in present if trial.state == TrialState.COMPLETE]
     return StudyResult(
         choice,

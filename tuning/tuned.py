@@ -169,7 +169,15 @@ def metrics(proof: Comparison) -> dict:
         "seeds": [proof.seeds.start, proof.seeds.stop],
         "bound": [None if math.isnan(part) else part for part in proof.bound.tolist()],
         **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
+        "scaled": None if proof.scaled is None else summary(proof.scaled),
+        "scaled_default": scaling(proof),
     }
+
+
+def scaling(proof: Comparison) -> dict:
+    """The factor on Q that makes the scaled default, and its mean NIS on the training runs, or None."""
+    found = proof.default
+    return {"factor": found and found.factor, "mean_nis": found and found.nis}
 
 
 def consistency(result: StudyResult) -> dict:

@@ -1,0 +1,94 @@
+"""The baselines of a tuned filter: the factor on Q that makes the mean NIS right, and where there is none."""
+
+import numpy as np
+import pytest
+
+from tuning.baselines import ORACLE, RULE, SCALED, TUNED, baselines, rule_of_thumb, scaled, scaled_default
+from tuning.compare import contender
+from tuning.evaluate import evaluate, score_ratio
+from tuning.objectives import nis_ratio
+from tuning.plan import TRAINING_SEEDS
+from tuning.proof import Comparison, prove
+from tuning.scenarios import find_scenario, held_out_seeds, training_seeds
+from tuning.space import true_choice, untuned_choice
+from tuning.worth import scaling_sentence, worth
+
+MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
+
+
+@pytest.mark.parametrize(("name", "scenario"), [("ekf", MISMATCH), ("enkf", MISMATCH), ("ekf", OUTLIERS)])
+def test_the_factor_brings_the_mean_nis_of_the_training_runs_to_one_and_leaves_r(name, scenario):
+    found, rule = scaled_default(name, scenario, 3), untuned_choice(name, scenario)
+    data = scenario.data(training_seeds(3, TRAINING_SEEDS))
+    before, after = (evaluate(c.filter(scenario), data, scenario.scale) for c in (rule, found.choice))
+    assert nis_ratio(after) == found.nis == pytest.approx(1.0, abs=2e-3)
+    assert (found.factor < 1) == (nis_ratio(before) < 1)  # a larger Q lowers the NIS
+    q = np.array(found.choice.model["process_noise_cov"])
+    np.testing.assert_allclose(q, found.factor * np.array(rule.model["process_noise_cov"]), rtol=1e-15)
+    assert found.choice._replace(model=rule.model) == rule
+    assert found.choice.model["measurement_noise_cov"] == scenario.measurement_noise_cov
+
+
+def test_it_depends_on_the_seed_of_the_study_and_on_nothing_else():
+    found = [scaled_default.__wrapped__("ekf", MISMATCH, seed).factor for seed in (0, 0, 1)]
+    assert found[0] == found[1] != found[2] == pytest.approx(found[0], rel=0.1)
+
+
+def test_where_there_is_no_scaled_default_it_says_why():
+    assert scaled_default("open-loop", MISMATCH) == (
+        None, None, None, "open-loop has no NIS by which its Q could be scaled"
+    )  # fmt: skip
+    startup = find_scenario("startup")
+    found = scaled_default("ekf", startup)
+    assert found.choice is None and found.reason.startswith(
+        "no factor on Q brings the mean NIS of ekf to 1: it is 4."
+    )
+    proof = prove(untuned_choice("ekf", startup), startup, 0, 4)
+    assert proof.scaled is None and list(proof.evaluations) == [RULE, TUNED, ORACLE]
+    assert scaling_sentence(proof).startswith(
+        "There is no scaled default, so the rule of thumb comes first: no factor"
+    )
+    assert worth(proof) == "makes no difference that 4 seeds can show against the rule of thumb"
+    with pytest.raises(ValueError, match="ekf must have a scaled default on startup, but no factor on Q brings"):
+        contender("ekf", "scaled").filter(startup)
+
+
+def test_a_nis_that_jumps_over_one_has_no_factor_either(monkeypatch):
+    import tuning.baselines as module
+
+    def jumps(filter_, data, scale, evaluate=module.evaluate):
+        nis = 0.5 if filter_.model.process_noise_cov[0, 0] > 1.0 else 2.0
+        found = evaluate(filter_, data, scale)
+        return found._replace(nis=found.nis._replace(value=nis))
+
+    monkeypatch.setattr(module, "evaluate", jumps)
+    assert "it jumps to" in scaled_default.__wrapped__("ekf", MISMATCH, 0).reason
+
+
+def test_a_proof_holds_all_baselines_on_the_same_seeds_and_names_the_one_that_counts_first():
+    choice = true_choice("ekf", MISMATCH)
+    proof = prove(choice, MISMATCH, 0, 40)
+    assert list(proof.evaluations) == [RULE, SCALED, TUNED, ORACLE] and list(proof.ratios) == [
+        SCALED,
+        RULE,
+        ORACLE,
+    ]
+    data = MISMATCH.data(held_out_seeds(0, 40))
+    default = evaluate(scaled_default("ekf", MISMATCH, 0).choice.filter(MISMATCH), data, MISMATCH.scale)
+    assert proof.ratios[SCALED] == score_ratio(proof.tuned, default) and proof.ratios[ORACLE] == (1.0, 1.0, 1.0)
+    assert proof.ratios[RULE].high < proof.ratios[SCALED].low  # the rule of thumb is the easier one to beat
+    said = worth(proof, "the error")
+    assert said.startswith("lowers the error by ") and " against the scaled default and by " in said
+    assert f"its Q times {proof.default.factor:.4g}" in scaling_sentence(proof)
+
+
+def test_what_knows_of_no_scaled_default_says_nothing_of_it():
+    found = evaluate(rule_of_thumb("ekf", MISMATCH).filter(MISMATCH), MISMATCH.data([1, 2]), MISMATCH.scale)
+    proof = Comparison(found, found, found, np.ones(2), range(2))
+    assert scaling_sentence(proof) == "" and list(proof.ratios) == [RULE, ORACLE]
+
+
+def test_a_filter_of_a_comparison_may_know_the_scaled_default():
+    choices = baselines("ekf", MISMATCH, 2)
+    assert contender("ekf", "scaled", seed=2).choose(MISMATCH) == choices[SCALED]
+    assert scaled(choices[RULE], scaled_default("ekf", MISMATCH, 2).factor) == choices[SCALED]

@@ -1,0 +1,74 @@
+"""The smallest sufficient ensemble: on seeds of its own, by the end of an interval and not by its middle."""
+
+import numpy as np
+import pytest
+
+from filters.consistency.intervals import Interval
+from tuning import sizes
+from tuning.evaluate import evaluate
+from tuning.plan import HELD_OUT_SEEDS, SIZE_SEEDS, TRAINING_SEEDS, Plan
+from tuning.scenarios import find_scenario, held_out_seeds, size_seeds, training_seeds
+from tuning.sizes import SizeRow, ensemble_sizes, sufficient_size
+from tuning.space import untuned_choice
+
+MISMATCH = find_scenario("mismatch")
+
+
+def rows_of(intervals, outside=(0.0,) * 9):
+    found = zip((5, 10, 20, 50), intervals, outside, strict=False)
+    return [SizeRow(n, None, Interval(*ratio), out) for n, ratio, out in found]
+
+
+@pytest.mark.parametrize(
+    ("intervals", "size"),
+    [
+        ([(1.02, 1.015, 1.025), (1.009, 1.006, 1.012), (1.004, 1.001, 1.007), (1.0, 1.0, 1.0)], 20),
+        ([(1.009, 1.008, 1.0099), (1.0, 1.0, 1.0)], 5),
+        ([(1.0, 0.9, 1.01), (1.0, 1.0, 1.0)], 10),  # below 1.01, not at it
+    ],
+)
+def test_an_estimate_below_1_01_is_not_enough_where_its_interval_reaches_beyond(intervals, size):
+    assert sufficient_size(rows_of(intervals)) == size
+
+
+@pytest.mark.parametrize(
+    ("ends", "size"),
+    [((1.2, 1.009, 1.0), 10), ((1.3, 1.06, 1.05), 10), ((1.0, 1.1, 1.1), 5), ((1.015, 1.006), 10)],
+)
+def test_the_smallest_size_that_suffices_need_not_be_the_best_on_every_scenario(ends, size):
+    assert sufficient_size(rows_of([(end, end, end) for end in ends])) == size
+
+
+def test_the_seeds_of_a_size_are_those_of_no_trial_and_of_no_proof():
+    for seed in (0, 3):
+        chosen = {*size_seeds(seed, SIZE_SEEDS)}
+        others = {*training_seeds(seed, TRAINING_SEEDS), *held_out_seeds(seed, HELD_OUT_SEEDS)}
+        assert len(chosen) == SIZE_SEEDS and not chosen & others
+        assert not chosen & {*training_seeds(seed + 1, 20_000), *held_out_seeds(seed, 20_000)}
+    assert MISMATCH.data(size_seeds(0, 2)).seeds == (250_000, 250_001)
+
+
+def test_the_table_is_of_those_seeds_and_paired(monkeypatch):
+    monkeypatch.setattr(sizes, "size_ladder", lambda name: (5, 40))
+    plan, choice = Plan("enkf", (MISMATCH,)), untuned_choice("enkf", MISMATCH)
+    rows = ensemble_sizes(choice, plan, plan.training_data())
+    data = MISMATCH.data(size_seeds(0, SIZE_SEEDS))
+    found = [evaluate(choice.with_size(n).filter(MISMATCH), data, MISMATCH.scale) for n in (5, 30, 40)]
+    assert [row.size for row in rows] == [5, 30, 40]
+    np.testing.assert_array_equal(rows[0].evaluation.mean_squares, found[0].mean_squares)
+    best = min(one.score.value for one in found)
+    assert [row.ratio.value for row in rows] == [one.score.value / best for one in found]
+    assert min(row.ratio.high for row in rows) == 1.0 and 1.01 < rows[0].ratio.low < rows[0].ratio.high
+    assert all(row.outside > 0 for row in rows)  # the rule of thumb's Q is far too large
+
+
+def test_where_it_has_to_be_consistent_the_best_is_that_of_the_consistent_sizes(monkeypatch):
+    monkeypatch.setattr(sizes, "size_ladder", lambda name: (5, 40))
+    monkeypatch.setattr(
+        sizes, "_outside", lambda choice, plan, data: -(choice.numbers["ensemble_size"] < 40) or 1.0
+    )
+    plan, choice = Plan("enkf", (MISMATCH,)), untuned_choice("enkf", MISMATCH)
+    free, held = (ensemble_sizes(choice, plan, plan.training_data(), consistent) for consistent in (False, True))
+    assert free[2].ratio.value == 1.0 < free[1].ratio.value
+    assert held[1].ratio == (1.0, 1.0, 1.0) and held[2].ratio.value < 1.0
+    assert sufficient_size(held, consistent=True) == 30
