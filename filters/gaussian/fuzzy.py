@@ -161,8 +161,8 @@ class FuzzyKalmanFilter(Filter):
         w_r:     product over i of (high_i - x_i)/(high_i - low_i) or (x_i - low_i)/(high_i - low_i), each within
                  0 and 1, of the last estimate x
         predict: mean_r = A_r mean + B_r u + a_r,  P_r = A_r P A_r' + Q, from the common mean and P
-        update:  the Kalman filter's of each rule, with a gain of its own (Joseph's form)
-        blend:   mean = sum of w_r mean_r,  P = sum of w_r P_r, after each of the two
+        update:  the Kalman filter's of each rule, from its mean_r and P_r, with a gain of its own (Joseph's form)
+        blend:   mean = sum of w_r mean_r,  P = sum of w_r P_r: the belief after each of the two
 
     `blending` "weights" is this, the recursion of the sources. It leaves out that the rules' means differ, so P is
     too small. "moments" is the same with P = sum of w_r (P_r + (mean_r - mean)(mean_r - mean)'): the first-order
