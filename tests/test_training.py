@@ -14,7 +14,7 @@ from tests.learners import COPIES, LIMIT, contents, copied, learn, setup_of, sho
 from training.algorithms import ALGORITHMS
 from training.arms import ARMS
 from training.environments import make_environments
-from training.learn import VALIDATION_EPISODES
+from training.learn import VALIDATION_EPISODES, _episodes_after
 from training.saved import CHECKPOINTS, FINAL, find_saved, load, read_setup
 from training.score import score
 from training.setup import setup_from_json
@@ -138,6 +138,13 @@ def test_episodes_of_training_evaluation_and_proof_differ(tmp_path, monkeypatch)
     assert not validation[0] & (learning[0] | learning[1])
     everything = set().union(*used)
     assert min(everything) >= 3_000_000 and max(everything) < held_out_seeds(3, 2)[0]
+
+
+@pytest.mark.parametrize("steps", [0, 401_408, 10**9])
+def test_a_training_goes_on_after_any_number_of_steps_with_episodes_of_its_own(steps):
+    seeds = _episodes_after(setup_of("ekf"), steps)
+    assert len(set(seeds)) == COPIES and min(seeds) >= VALIDATION_EPISODES
+    assert max(seeds) < held_out_seeds(0, 2)[0]
 
 
 def test_a_setup_survives_its_text():

@@ -44,7 +44,7 @@ def find_scenario(name: str) -> Scenario:
 def training_seeds(seed: int, count: int) -> range:
     """Seeds that a study with a given seed learns from."""
     first = at_least("seed", seed, 0) * SEEDS_APART
-    return range(first, first + at_least("the number of training seeds", count, 2, MOST_SEEDS))
+    return range(first, first + at_least("the number of training seeds", count, 2, SEEDS_APART // 2))
 
 
 def held_out_seeds(seed: int, count: int) -> range:
