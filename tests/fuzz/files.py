@@ -19,7 +19,7 @@ import optuna
 import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState
 from filters.tuned_file import sealed
-from tests.models import TUNED
+from tests.tuned_files import write_untuned
 from training.environments import make_environments
 from training.setup import make_setup, setup_from_json
 from tuning.plan import Plan
@@ -59,9 +59,13 @@ class Trap(types.ModuleType):
 def tuned_files(rng: np.random.Generator, seconds: float) -> str:
     """Tuned files with values changed, keys added and removed, and a right hash; half are damaged as text, too."""
     env = gym.make("BowThruster-v0")
+    with tempfile.TemporaryDirectory() as folder:
+        right = json.loads(write_untuned(Path(folder) / "right.json").read_text(encoding="utf-8"))
 
-    def use(path: Path) -> None:
+    def read(path: Path) -> None:
         read_tuned(path)
+
+    def wrap(path: Path) -> None:
         wrapped = EstimateState(env, tuned=path)
         wrapped.reset(seed=0)
         info = wrapped.step(np.ones(1, np.float32))[4]
@@ -72,13 +76,13 @@ def tuned_files(rng: np.random.Generator, seconds: float) -> str:
         assert TRAP not in setup.as_json()
 
     def write(path: Path) -> None:
-        content = _changed(rng, TUNED)
+        content = _changed(rng, right)
         if rng.random() < 0.9 and isinstance(content, dict):
             content = sealed(content)
         text = json.dumps(content)
         path.write_bytes(_damaged(rng, text.encode()) if rng.random() < 0.2 else text.encode())
 
-    return _attack(rng, seconds, write, use, train)
+    return _attack(rng, seconds, write, read, wrap, train)
 
 
 def setups(rng: np.random.Generator, seconds: float) -> str:
