@@ -20,10 +20,6 @@ from tuning.scenarios import find_scenario, held_out_seeds
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE = (DOCS / "policies.md").read_text()
-# Strict: with the tables of a whole run of today's study these tests pass, and this mark has to go.
-to_be_run = pytest.mark.xfail(
-    reason="the page's tables are of the study before this one, as the page says", strict=True
-)
 TABLES = {
     noise: PAGE.partition(f"<!-- table policies_{noise} -->")[2].partition("<!-- end -->")[0] for noise in NOISES
 }
@@ -41,14 +37,12 @@ def returned(row):
     return float(row["return"].split(" ± ")[0])
 
 
-@to_be_run
 @pytest.mark.parametrize("noise", ["low", "high"])
 def test_the_tables_have_every_policy(noise):
     planned = runs_of(Comparison(noises=(noise,), seeds=1, variants=False))
     assert list(rows_at(noise)) == [name_of(run.kind, run.label) for run in planned]
 
 
-@to_be_run
 def test_the_table_of_medium_noise_has_every_variant_too():
     planned = runs_of(Comparison(noises=("medium",), seeds=1, variants=False))
     expected = {name_of(run.kind, run.label) for run in planned}
@@ -75,7 +69,6 @@ def test_the_command_that_makes_the_page_is_there():
     assert [command.name for command in app.registered_commands] == ["policies"]
 
 
-@to_be_run
 def test_filtered_state_closes_the_gap_and_noise_costs():
     for noise in NOISES:
         rows = rows_at(noise)
@@ -89,7 +82,6 @@ def test_filtered_state_closes_the_gap_and_noise_costs():
     assert "is reached" in ANSWERS
 
 
-@to_be_run
 def test_the_nonlinear_controller_is_what_a_policy_is_measured_by():
     for noise in NOISES:
         rows = rows_at(noise)
@@ -103,7 +95,6 @@ def test_the_nonlinear_controller_is_what_a_policy_is_measured_by():
     assert returned(rows_at("medium")["PPO + MPC: true"]) > 1.02 * returned(rows_at("medium")["MPC: true"])
 
 
-@to_be_run
 def test_where_the_model_is_wrong_a_policy_that_corrects_it_beats_the_controller():
     rows = rows_at("medium")
     for variant in WRONG:
@@ -117,8 +108,8 @@ def test_where_the_model_is_wrong_a_policy_that_corrects_it_beats_the_controller
     [
         ("LQG: ekf", "lqr", "ekf"),
         ("PI: raw", "pi", "raw"),
-        pytest.param("one step: ekf", "one-step", "ekf", marks=to_be_run),
-        pytest.param("MPC: true", "mpc", "true", marks=to_be_run),
+        ("one step: ekf", "one-step", "ekf"),
+        ("MPC: true", "mpc", "true"),
     ],
 )
 def test_classical_rows_are_those_of_the_code(name, kind, arm):
