@@ -88,8 +88,8 @@ def test_counts_have_limits():
     refused(
         lambda: gym.make_vec("BowThruster-v0", **gym_make), "num_envs must be at most 1000000, but got 1000000000"
     )
-    for seeds in (held_out_seeds, training_seeds):
-        refused(lambda: seeds(0, HUGE), "seeds must be at most 20000, but got 1000000000000")  # noqa: B023
+    refused(lambda: held_out_seeds(0, HUGE), "seeds must be at most 20000, but got 1000000000000")
+    refused(lambda: training_seeds(0, HUGE), "seeds must be at most 500000, but got 1000000000000")
     refused(lambda: SCENARIOS["nominal"].replace(steps=HUGE), "steps must be at most 1000000, but got")
     refused(lambda: compare("tunnel", 0.5, runs=HUGE), "runs must be at most 100000, but got")
     refused(lambda: command(out=Path("x.csv"), steps=HUGE), "steps must be at most 10000000")
