@@ -11,15 +11,16 @@ import numpy as np
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, alone, side_by_side
 from filters import run
-from thruster_env.compiled import compiled, function_fingerprint
-from thruster_env.components import column_reader, column_writer, vector_reader
+from numerics.compiled import compiled, function_fingerprint
+from numerics.streams import FILTER_PROCESS, fill_normals
+from numerics.threads import spread
+from numerics.tuples import column_reader, column_writer, vector_reader
 from thruster_env.dynamics import Constants, substep
 from thruster_env.plant import Plant
-from thruster_env.streams import FILTER_PROCESS, fill_normals
-from thruster_env.threads import spread
-from tuning.evaluate import evaluate
-from tuning.scenarios import find_scenario, training_seeds
-from tuning.space import Choice, true_choice
+from tuning.evaluation.evaluate import evaluate
+from tuning.problems.find import find_scenario
+from tuning.problems.seeds import training_seeds
+from tuning.search.space import Choice, true_choice
 
 SEEDS, ENSEMBLE_SIZE = 64, 50
 NORMALS = 3  # a member and step: one for each state, one for the measurement
@@ -99,7 +100,7 @@ def floor_measures(plant: Plant, steps: int) -> dict[str, Measure]:
 
 @cache
 def _floor_functions() -> tuple[Callable, Callable]:
-    fingerprint = function_fingerprint()
+    fingerprint = function_fingerprint(within=__name__)
 
     def propagate(table, steps, substeps, numbers):
         fingerprint  # noqa: B018 - part of the cache's key

@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from thruster_env.checks import covariance_root
+from numerics.checks import covariance_root
+from numerics.threads import cores
 from thruster_env.dynamics import substep, thrust_and_torque
 from thruster_env.plant import Plant
-from thruster_env.threads import cores
 
 NORMALS = 3  # a member and step: one for each state, one for the measurement
 

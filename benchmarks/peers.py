@@ -13,9 +13,9 @@ from filterpy.kalman import (
     UnscentedKalmanFilter,
 )
 
-from filters.gaussian.affine import AffineModel
-from thruster_env.compiled import compiled, function_fingerprint
-from thruster_env.components import vector_reader
+from numerics.compiled import compiled, function_fingerprint
+from numerics.tuples import vector_reader
+from plants.affine import AffineModel
 from thruster_env.dynamics import Constants, substep, thrust_and_torque
 from thruster_env.plant import Plant
 
@@ -57,7 +57,7 @@ def compiled_model(plant: Plant) -> tuple[list[float], Callable, Callable]:
 
 @cache
 def _compiled_functions() -> tuple[Callable, Callable]:
-    fingerprint = function_fingerprint()
+    fingerprint = function_fingerprint(within=__name__)
 
     def advance(x, voltage, numbers, substeps):
         fingerprint  # noqa: B018 - part of the cache's key

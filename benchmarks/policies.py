@@ -9,7 +9,8 @@ import numpy as np
 
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, alone, side_by_side
-from tuning.scenarios import find_scenario, training_seeds
+from tuning.problems.find import find_scenario
+from tuning.problems.seeds import training_seeds
 
 COPIES = 64
 GOAL = 1 / 1.5  # of the time that PPO takes with DummyVecEnv

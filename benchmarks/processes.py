@@ -15,9 +15,10 @@ env.reset(seed=0)
 env.step(env.action_space.high)
 """
 TUNING_IMPORTS = """
-from tuning.evaluate import evaluate
-from tuning.scenarios import find_scenario, training_seeds
-from tuning.space import true_choice
+from tuning.evaluation.evaluate import evaluate
+from tuning.problems.find import find_scenario
+from tuning.problems.seeds import training_seeds
+from tuning.search.space import true_choice
 """
 FIRST_EVALUATION = """
 scenario = find_scenario("nominal")

@@ -11,7 +11,7 @@ import thruster_env  # noqa: F401 - registers BowThruster-v0
 from benchmarks.peers import EnsembleStep, KalmanStep, UnscentedStep, compiled_model, python_model
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, seconds_a_call, side_by_side
-from filters.wrapper import EstimateState
+from filters.wrappers.single import EstimateState
 from thruster_env.plant import Plant
 
 ENSEMBLE_SIZE = 50

@@ -13,14 +13,14 @@ import numpy as np
 import thruster_env  # noqa: F401 - registers BowThruster-v0
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, side_by_side
-from thruster_env.batch import Copies
-from thruster_env.compiled import compiled, function_fingerprint
+from numerics.compiled import compiled, function_fingerprint
+from numerics.threads import spread
 from thruster_env.dynamics import substep
-from thruster_env.memory import COMMAND, SUBSTEPS, VOLTAGE, set_row
-from thruster_env.motion import move_thruster
+from thruster_env.engine.copies import Copies
+from thruster_env.engine.memory import COMMAND, SUBSTEPS, VOLTAGE, set_row
+from thruster_env.engine.motion import move_thruster
 from thruster_env.plant import make_plant
 from thruster_env.task import Task
-from thruster_env.threads import spread
 
 COPIES, STEPS = 8192, 200
 PROPAGATED = 65536
@@ -81,7 +81,7 @@ def propagation() -> Measure:
 
 @cache
 def _propagate() -> Callable:
-    fingerprint = function_fingerprint()
+    fingerprint = function_fingerprint(within=__name__)
 
     def propagate(memory, numbers, calls, first, last):
         fingerprint  # noqa: B018 - part of the cache's key

@@ -13,10 +13,10 @@ from filters import FuzzyKalmanFilter, StateSpaceModel, make_filter, run, thrust
 from filters.consistency.intervals import Interval, rmse_ratios
 from filters.filter import Filter
 from filters.gaussian.fuzzy import BLENDINGS
-from thruster_env.figures import DARK, new_figure, save_figure, tidy
-from thruster_env.linear import steady_state
+from numerics.plots import DARK, new_figure, save_figure, tidy
+from thruster_env.linear.steady_state import steady_state
 from thruster_env.parameters import PRESETS
-from tuning.scenarios import FIRST_SCORED_STEP
+from tuning.problems.find import FIRST_SCORED_STEP
 
 CENTRE = 12.0  # [V]
 SHOWN_WIDTH = 12.0  # [V], of the run that is drawn

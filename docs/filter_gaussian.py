@@ -18,9 +18,9 @@ from filters import (
     thruster_model,
 )
 from filters.bounds import posterior_bound
-from thruster_env.figures import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from thruster_env.plant import make_plant
-from tuning.scenarios import FIRST_SCORED_STEP
+from tuning.problems.find import FIRST_SCORED_STEP
 
 FLOW = "flow velocity $U_a$ [m/s]"
 FLOW_RMSE = "RMSE of $U_a$ [m/s]"

@@ -18,8 +18,8 @@ from filters import (
     run,
     thruster_model,
 )
-from filters.thruster import thrusts_of
-from thruster_env.figures import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from thruster_env.model import thrusts_of
 
 FLOW = "flow velocity $U_a$ [m/s]"
 FLOW_RMSE = "RMSE of $U_a$ [m/s]"

@@ -10,11 +10,11 @@ from docs.page import MUSTARD, SKY
 from filters import Estimates, run
 from filters.consistency.nees import normalized_squares
 from filters.filter import Filter
-from thruster_env.figures import BLUE, DARK, RUST
+from numerics.plots import BLUE, DARK, RUST
+from numerics.streams import episode_keys, filter_keys
 from thruster_env.plant import Plant, make_plant
 from thruster_env.simulation import simulate
-from thruster_env.streams import episode_keys, filter_keys
-from tuning.scenarios import FIRST_SCORED_STEP, held_levels
+from tuning.problems.find import FIRST_SCORED_STEP, held_levels
 
 SEED, RUNS, STEPS, AMPLITUDE, HOLD, DT = 1, 60, 500, 12.0, 25, 0.01
 PUBLISHED_NOISE = {"process_noise_cov": (0.5, 0.5), "measurement_noise_cov": 0.5}

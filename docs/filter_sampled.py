@@ -10,7 +10,7 @@ from docs.filter_runs import LOOKS, PUBLISHED_NOISE, Runs, held_runs, judged, ru
 from docs.page import MUSTARD, log_ticks
 from filters import ParticleFilter, make_filter, run, thruster_model
 from filters.ensembles.recording import record_members
-from thruster_env.figures import DARK, RUST, new_figure, save_figure, tidy
+from numerics.plots import DARK, RUST, new_figure, save_figure, tidy
 from thruster_env.plant import make_plant
 
 SIGNLESS = {"sensors": ["speed-magnitude"], "process_noise_cov": (4.0, 4e-4), "measurement_noise_cov": [0.25]}

@@ -16,7 +16,7 @@ from docs.page import digits, table
 from filters import FILTERS, StateSpaceModel, Unknown, augmented_model, make_filter, thruster_model
 from filters.filter import Filter
 from filters.registry import tunable_numbers
-from thruster_env.compiled import interpreted
+from numerics.compiled import interpreted
 
 
 class Words(NamedTuple):

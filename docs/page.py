@@ -6,11 +6,11 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from thruster_env.files import write_whole
-from thruster_env.markdown import table as table  # for the scripts, beside what follows
-from thruster_env.markdown import with_tables
+from numerics.files import write_whole
+from numerics.markdown import table as table  # for the scripts, beside what follows
+from numerics.markdown import with_tables
 
-SKY, MUSTARD = "#56b4e9", "#b8860b"  # beside those of thruster_env.figures
+SKY, MUSTARD = "#56b4e9", "#b8860b"  # beside those of thruster_env.linear.figures
 
 
 def digits(value: float, count: int = 3) -> str:

@@ -14,10 +14,11 @@ from pathlib import Path
 
 from docs.page import with_tables
 from filters.consistency.intervals import Interval
-from thruster_env.files import write_whole
-from tuning.compare import Contender, Leaderboard, Row, compare, contender
-from tuning.excitation import Steps
-from tuning.scenarios import SCENARIOS, Scenario, find_scenario, held_out_seeds
+from numerics.files import write_whole
+from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender
+from tuning.problems.find import SCENARIOS, Scenario, find_scenario
+from tuning.problems.seeds import held_out_seeds
+from tuning.thruster.excitation import Steps
 
 SEEDS = 200
 REFERENCE_SEEDS, REFERENCE_SIZE = 20, 100_000

@@ -17,16 +17,16 @@ from docs.page import log_ticks, make_page, table
 from docs.tuning_recovery import TABLES as RECOVERY_TABLES
 from docs.tuning_recovery import bad_start
 from filters.consistency.intervals import Interval
-from thruster_env.figures import BLUE, DARK, RUST, new_figure, save_figure, tidy
-from tuning.baselines import ORACLE, RULE, SCALED
-from tuning.evaluate import Evaluation, evaluate, score_ratio
-from tuning.gradient import maximise_likelihood
-from tuning.objectives import NIS_BAND
-from tuning.plan import Plan
-from tuning.proof import prove
-from tuning.scenarios import Scenario, find_scenario
-from tuning.space import Choice
-from tuning.study import StudyResult, open_study, quiet_optuna, run_study
+from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from tuning.evaluation.baselines import ORACLE, RULE, SCALED
+from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
+from tuning.evaluation.held_out import prove
+from tuning.likelihood.gradient import maximise_likelihood
+from tuning.problems.find import Scenario, find_scenario
+from tuning.search.objectives import NIS_BAND
+from tuning.search.plan import Plan
+from tuning.search.space import Choice
+from tuning.search.study import StudyResult, open_study, quiet_optuna, run_study
 
 SEED, TRIALS = 0, 100
 COLUMNS = [

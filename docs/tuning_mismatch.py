@@ -15,18 +15,18 @@ import optuna
 from docs.page import make_page, table
 from filters.augmented import Unknown, augmented_model
 from filters.filter import Filter
-from filters.model import StateSpaceModel
 from filters.registry import make_filter
-from thruster_env.compiled import inlined
-from thruster_env.components import written_out
+from numerics.compiled import inlined
+from numerics.tuples import written_out
+from plants.state_space import StateSpaceModel
 from thruster_env.dynamics import Constants
-from tuning.baselines import scaled_default
-from tuning.evaluate import Evaluation, evaluate, score_ratio
-from tuning.objectives import nis_violation, penalised
-from tuning.plan import HELD_OUT_SEEDS, Plan
-from tuning.scenarios import Scenario, find_scenario
-from tuning.space import Choice, distributions, suggest, trial_parameters
-from tuning.study import open_study, quiet_optuna, run_study
+from tuning.evaluation.baselines import scaled_default
+from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
+from tuning.problems.find import Scenario, find_scenario
+from tuning.search.objectives import nis_violation, penalised
+from tuning.search.plan import HELD_OUT_SEEDS, Plan
+from tuning.search.space import Choice, distributions, suggest, trial_parameters
+from tuning.search.study import open_study, quiet_optuna, run_study
 
 SCENARIO, SEED, TRIALS = "mismatch", 0, 100
 LIFT = "lift_factor"  # on the lift coefficient, which enters several constants of the model

@@ -18,12 +18,12 @@ from scipy.stats import t as student
 
 from docs.page import make_page, table
 from filters.consistency.intervals import Interval
-from tuning.evaluate import evaluate, score_ratio
-from tuning.plan import TRAINING_SEEDS, Plan
-from tuning.scenarios import find_scenario
-from tuning.space import choice_of
-from tuning.study import open_study, quiet_optuna, run_study
-from tuning.trials import measure
+from tuning.evaluation.evaluate import evaluate, score_ratio
+from tuning.problems.find import find_scenario
+from tuning.search.plan import TRAINING_SEEDS, Plan
+from tuning.search.space import choice_of
+from tuning.search.study import open_study, quiet_optuna, run_study
+from tuning.search.trials import measure
 
 CASES = ("startup", "ekf"), ("startup", "enkf"), ("outliers", "ekf"), ("outliers", "enkf"), ("mismatch", "ekf")
 SEEDS, TRIALS = range(10), 60

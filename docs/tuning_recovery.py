@@ -15,14 +15,14 @@ import numpy as np
 
 from docs.page import make_page, table
 from filters.consistency.intervals import Interval
-from tuning.evaluate import score_ratio
-from tuning.gradient import BAD_START
-from tuning.identifiability import Identifiability, identify
-from tuning.plan import Plan
-from tuning.proof import prove
-from tuning.scenarios import Scenario, find_scenario
-from tuning.space import Choice, parameters_of, true_choice
-from tuning.study import open_study, quiet_optuna, run_study
+from tuning.evaluation.evaluate import score_ratio
+from tuning.evaluation.held_out import prove
+from tuning.likelihood.gradient import BAD_START
+from tuning.likelihood.identifiability import Identifiability, identify
+from tuning.problems.find import Scenario, find_scenario
+from tuning.search.plan import Plan
+from tuning.search.space import Choice, parameters_of, true_choice
+from tuning.search.study import open_study, quiet_optuna, run_study
 
 STUDIES = ("ekf", "nominal", 100), ("kf", "published_tunnel", 100), ("kf", "published_open_bladed", 100)
 SEEDS = range(8)  # of studies

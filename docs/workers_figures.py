@@ -15,8 +15,8 @@ import numpy as np
 
 from docs.page import log_ticks, make_page, table
 from docs.workers_rates import FILTERS, NOTHING, STORAGES, WAITING, WORKS, rates
-from thruster_env.figures import BLUE, RUST, new_figure, save_figure, tidy
-from thruster_env.threads import cores
+from numerics.plots import BLUE, RUST, new_figure, save_figure, tidy
+from numerics.threads import cores
 
 COLOURS = dict(zip(STORAGES, (BLUE, RUST), strict=True))
 MOST = 128  # workers in the picture

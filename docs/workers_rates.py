@@ -22,14 +22,14 @@ from unittest import mock
 import optuna
 from optuna.trial import TrialState
 
-import tuning.study
-from tuning.plan import Plan
-from tuning.scenarios import Data, find_scenario
-from tuning.space import suggest, untuned_choice
-from tuning.storage import open_storage
-from tuning.study import open_study, quiet_optuna, run_trials
-from tuning.trials import CONSISTENCY, NIS, measure
-from tuning.workers import take_share
+import tuning.search.study
+from tuning.problems.find import Data, find_scenario
+from tuning.search.plan import Plan
+from tuning.search.space import suggest, untuned_choice
+from tuning.search.storage import open_storage
+from tuning.search.study import open_study, quiet_optuna, run_trials
+from tuning.search.trials import CONSISTENCY, NIS, measure
+from tuning.search.workers import take_share
 
 STORAGES = ("journal", "PostgreSQL")
 SETTLE, WINDOW = 1.0, 3.0  # [s] after which a run is counted, and for how long
@@ -112,7 +112,7 @@ def _work(work: Work, storage: str, workers: int, place: int, ready) -> None:
         measure(untuned_choice(plan.filter, plan.scenarios[0]), plan, data)  # loads what is compiled
     ready.wait(timeout=READY_SECONDS)
     end = time.monotonic() + SETTLE + WINDOW
-    with mock.patch.object(tuning.study, "run_trial", partial(_trial, work)):
+    with mock.patch.object(tuning.search.study, "run_trial", partial(_trial, work)):
         run_trials(study, plan, data, MANY, stop=lambda: time.monotonic() > end)
 
 

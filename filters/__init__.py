@@ -4,16 +4,14 @@ from filters.adaptive.robust import RobustExtendedKalmanFilter
 from filters.adaptive.sage_husa import SageHusaFilter
 from filters.adaptive.variational import VariationalBayesFilter
 from filters.augmented import Unknown, augmented_model
-from filters.baselines import Inversion, LowPass, OpenLoop
-from filters.batch import Estimates, run
-from filters.belief import Belief, Innovation
+from filters.baselines.baselines import Inversion, LowPass, OpenLoop
+from filters.engine.batch import Estimates, run
+from filters.engine.belief import Belief, Innovation
 from filters.ensembles.deterministic import DeterministicEnsembleKalmanFilter
 from filters.ensembles.ensemble import EnsembleKalmanFilter
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
 from filters.ensembles.serial import SerialSquareRootFilter
 from filters.ensembles.transform import EnsembleTransformFilter
-from filters.envs import register_filtered_envs
-from filters.gaussian.affine import affine_model, linearize
 from filters.gaussian.cubature import CubatureKalmanFilter
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.gaussian.fuzzy import FuzzyKalmanFilter
@@ -22,14 +20,17 @@ from filters.gaussian.iterated import IteratedExtendedKalmanFilter
 from filters.gaussian.kalman import KalmanFilter
 from filters.gaussian.steady_state import SteadyStateKalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
-from filters.model import StateSpaceModel
 from filters.particles.auxiliary import AuxiliaryParticleFilter
 from filters.particles.particle import ParticleFilter
 from filters.registry import FILTERS, make_filter
 from filters.smoothers.smooth import Smoothed, smooth
-from filters.thruster import thruster_model
-from filters.vector_wrapper import EstimateStates
-from filters.wrapper import EstimateState
+from filters.wrappers.ids import register_filtered_envs
+from filters.wrappers.single import EstimateState
+from filters.wrappers.vector import EstimateStates
+from numerics.compiled import may_be_inlined
+from plants.affine import affine_model, linearize
+from plants.state_space import StateSpaceModel
+from thruster_env.model import thruster_model
 
 __all__ = [
     "FILTERS",
@@ -71,4 +72,5 @@ __all__ = [
     "thruster_model",
 ]
 
+may_be_inlined(__name__, "plants")
 register_filtered_envs()

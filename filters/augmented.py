@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.derivatives import RELATIVE_STEP
-from filters.made import makes_functions
-from filters.model import StateSpaceModel
-from filters.rows import constants_form
-from thruster_env.checks import finite, positive
-from thruster_env.compiled import inlined
-from thruster_env.components import tuple_of, written_out
+from numerics.checks import finite, positive
+from numerics.compiled import inlined
+from numerics.derivatives import RELATIVE_STEP
+from numerics.pickling import makes_functions
+from numerics.tuples import tuple_of, written_out
+from plants.layout import constants_form
+from plants.state_space import StateSpaceModel
 
 
 class Unknown(NamedTuple):

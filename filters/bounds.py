@@ -6,17 +6,17 @@ from functools import cache
 
 import numpy as np
 
-from filters.derivatives import jacobian
-from filters.gaussian.affine import AffineModel
-from filters.matrices import multiplier, quadratic_form
-from filters.model import StateSpaceModel
-from filters.rows import constants_form, constants_reader, number_places, padded
-from filters.truth import truth_steps_of
-from thruster_env.checks import at_least
-from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from thruster_env.components import matrix_reader, vector_reader, written_out
-from thruster_env.streams import GROUP
-from thruster_env.threads import spread
+from numerics.checks import at_least
+from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from numerics.derivatives import jacobian
+from numerics.matrices import multiplier, quadratic_form
+from numerics.streams import GROUP
+from numerics.threads import spread
+from numerics.tuples import matrix_reader, vector_reader, written_out
+from plants.affine import AffineModel
+from plants.layout import constants_form, constants_reader, number_places, padded
+from plants.simulate import truth_steps_of
+from plants.state_space import StateSpaceModel
 
 
 def riccati_covariances(model: AffineModel) -> tuple[np.ndarray, np.ndarray]:
@@ -137,7 +137,7 @@ def _build_gatherer(steps, transition, transition_matrix, observation_matrix, n,
         *(f"out[b, k, {i}, {j}] += a[{i}][{j}]" for i in range(n) for j in range(n)),
         "None",
     )
-    fingerprint = function_fingerprint(transition, transition_matrix, observation_matrix)
+    fingerprint = function_fingerprint(transition, transition_matrix, observation_matrix, within=__name__)
 
     @inlined
     def whole_step_matrix(x, u, numbers, c, eye):

@@ -2,7 +2,7 @@
 
 A filter is a frozen value that holds a model and its own tunable numbers. Each kind supplies three plain
 functions that work in place on one row of floats and one table of members (`Kernels`); everything else,
-single steps and whole batches, compiled or not, is made from these in `filters.engine`.
+single steps and whole batches, compiled or not, is made from these in `filters.engine.compile`.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters.belief import Belief, Innovation, Kernels
-from filters.model import StateSpaceModel
-from filters.session import Session
+from filters.engine.belief import Belief, Innovation, Kernels
+from filters.engine.session import Session
+from plants.state_space import StateSpaceModel
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

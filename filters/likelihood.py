@@ -7,13 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.derivatives import RELATIVE_STEP, jacobian
-from filters.formulas import formula
-from filters.matrices import cholesky_factor, innovation, innovation_likelihood, masked, row_solver
-from filters.model import StateSpaceModel
-from filters.rows import constants_form, constants_reader, number_places
-from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from thruster_env.components import (
+from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from numerics.derivatives import RELATIVE_STEP, jacobian
+from numerics.formulas import formula
+from numerics.matrices import cholesky_factor, innovation, innovation_likelihood, masked, row_solver
+from numerics.threads import spread
+from numerics.tuples import (
     matrix_of,
     matrix_reader,
     matrix_writer,
@@ -22,7 +21,8 @@ from thruster_env.components import (
     vector_writer,
     written_out,
 )
-from thruster_env.threads import spread
+from plants.layout import constants_form, constants_reader, number_places
+from plants.state_space import StateSpaceModel
 
 
 class Likelihood(NamedTuple):
@@ -119,7 +119,7 @@ def _build(transition, transition_matrix, observe, observation_matrix, shape, fo
     corrected_slope = formula("dx + dK v - K dy", dx=(n,), K=nm, dK=nm, v=(m,), dy=(m,))
     reduced = formula("P - K S K'", P=nn, K=nm, S=mm)
     reduced_slope = formula("dP - dK S K' - K dS K' - K S dK'", dP=nn, K=nm, dK=nm, S=mm, dS=mm)
-    fingerprint = function_fingerprint(transition, transition_matrix, observe, observation_matrix)
+    fingerprint = function_fingerprint(transition, transition_matrix, observe, observation_matrix, within=__name__)
 
     def accumulate(all_inputs, measurements, numbers, q_slopes, r_slopes, out, first, last):
         fingerprint  # noqa: B018 - part of the cache's key

@@ -7,7 +7,7 @@ import dataclasses
 from filters.adaptive.robust import RobustExtendedKalmanFilter
 from filters.adaptive.sage_husa import SageHusaFilter
 from filters.adaptive.variational import VariationalBayesFilter
-from filters.baselines import Inversion, LowPass, OpenLoop
+from filters.baselines.baselines import Inversion, LowPass, OpenLoop
 from filters.ensembles.deterministic import DeterministicEnsembleKalmanFilter
 from filters.ensembles.ensemble import EnsembleKalmanFilter
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
@@ -22,10 +22,10 @@ from filters.gaussian.iterated import IteratedExtendedKalmanFilter
 from filters.gaussian.kalman import KalmanFilter
 from filters.gaussian.steady_state import SteadyStateKalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
-from filters.model import StateSpaceModel
 from filters.particles.auxiliary import AuxiliaryParticleFilter
 from filters.particles.particle import ParticleFilter
-from thruster_env.checks import one_of
+from numerics.checks import one_of
+from plants.state_space import StateSpaceModel
 
 FILTERS: dict[str, type[Filter]] = {
     kind.name: kind

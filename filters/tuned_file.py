@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from filters.registry import FILTERS, tunable_numbers
-from thruster_env.checks import finite, one_of, positive, shown
+from numerics.checks import finite, one_of, positive, shown
 
 FILE_FORMAT = "thruster-env tuned filter"
 FILE_VERSION = 3  # 3: the plant that it is for, and scenarios of files, as data; 2: no such, still read

@@ -21,7 +21,7 @@ import numpy as np
 
 from studies.bollard_table import CENTRE, SPAN, BollardTable
 from thruster_env.dynamics import thrust_and_torque
-from thruster_env.linear import steady_state
+from thruster_env.linear.steady_state import steady_state
 from thruster_env.parameters import ThrusterParameters, derive_constants
 
 FITTED = ("lift_coefficient", "drag_coefficient", "thrust_asymmetry", "motor_damping", "voltage_gain")

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.checks import shown
+from numerics.checks import shown
 
 COLUMNS = ("pwm_us", "rpm", "current_A", "voltage_V", "force_kgf")
 CENTRE, SPAN = 1500.0, 400.0  # pulse width at rest, and from there to full throttle [us]

@@ -22,13 +22,13 @@ from filters import EnsembleKalmanFilter, KalmanFilter, affine_model, run
 from filters.bounds import riccati_covariances
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.filter import Filter
-from filters.gaussian.affine import AffineModel
-from filters.truth import Truth, simulate
+from numerics.checks import at_least, one_of, positive
+from numerics.linear_systems import zero_order_hold
+from plants.affine import AffineModel
+from plants.simulate import Truth, simulate
 from studies.published import NOISE_LEVELS, STEPS, SYSTEMS, H
 from studies.unupdated_ensemble import unupdated_ensemble_means
-from thruster_env.checks import at_least, one_of, positive
-from thruster_env.linear import zero_order_hold
-from thruster_env.published import SAMPLE_TIME
+from thruster_env.linear.published import SAMPLE_TIME
 
 RUNS = 200
 MOST_RUNS = 100_000  # which take a gigabyte

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from thruster_env.published import PUBLISHED
+from thruster_env.linear.published import PUBLISHED
 
 # The cases by the names of the papers.
 SYSTEMS = {"tunnel": PUBLISHED["tunnel"], "open-bladed": PUBLISHED["open_bladed"]}

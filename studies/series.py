@@ -9,12 +9,13 @@ import numpy as np
 
 from filters import EnsembleKalmanFilter, KalmanFilter, run
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
-from filters.truth import simulate
+from numerics.checks import at_least
+from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from plants.simulate import simulate
 from studies.comparison import MEMBERS, discrete_model, keys_of
 from studies.published import NOISE_LEVELS, STEPS, SYSTEMS
-from thruster_env.checks import at_least
-from thruster_env.figures import BLUE, DARK, RUST, STATES, new_figure, save_figure, tidy
-from thruster_env.published import SAMPLE_TIME
+from thruster_env.linear.figures import STATES
+from thruster_env.linear.published import SAMPLE_TIME
 
 LINES = {
     "truth": {"color": DARK, "linewidth": 1.8},

@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
+from numerics.files import write_whole
 from studies.bollard_fit import (
     FITTED,
     Identified,
@@ -35,7 +36,6 @@ from studies.bollard_fit import (
     relative_errors,
 )
 from studies.bollard_table import BollardTable, read_table
-from thruster_env.files import write_whole
 from thruster_env.parameters import T200
 
 HELD_OUT = (14.0, 18.0)  # between others, so that nothing is extrapolated [V]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from filters.gaussian.affine import AffineModel
-from thruster_env.checks import covariance_root
+from numerics.checks import covariance_root
+from plants.affine import AffineModel
 
 _BLOCK = 128  # runs at a time: their members stay in the processor's cache
 

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from thruster_env.compiled import interpreted
+from numerics.compiled import interpreted
 
 # Before anything imports matplotlib or pygame.
 os.environ.setdefault("MPLBACKEND", "Agg")

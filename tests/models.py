@@ -5,11 +5,12 @@ from contextlib import nullcontext
 
 import numpy as np
 
-from filters import StateSpaceModel, affine_model, make_filter, thruster_model, truth
+from filters import StateSpaceModel, affine_model, make_filter, thruster_model
 from filters.registry import tunable_numbers
 from filters.tuned_file import sealed
-from thruster_env.compiled import interpreted
-from thruster_env.streams import episode_keys
+from numerics.compiled import interpreted
+from numerics.streams import episode_keys
+from plants import simulate
 
 KEY = (123456789, 4294967295)  # of a filter's random numbers
 DT = 0.05  # of the pendulum
@@ -147,7 +148,7 @@ def simulated(model, steps=100, *, count=1, seed=1, level=3.0, missing=0.0, comp
     """
     inputs = np.random.default_rng(seed).normal(size=(count, steps, model.inputs)) * level
     with nullcontext() if compiled else interpreted():
-        drawn = truth.simulate(model, episode_keys(range(seed, seed + count)), inputs)
+        drawn = simulate.simulate(model, episode_keys(range(seed, seed + count)), inputs)
     gone = np.random.default_rng((seed, 1)).random(drawn.measurements.shape) < missing
     return inputs, np.where(gone, np.nan, drawn.measurements)
 

@@ -12,14 +12,14 @@ from filters import (
     VariationalBayesFilter,
     run,
     thruster_model,
-    truth,
 )
 from filters.adaptive.sage_husa import bounded_step
-from filters.session import Session
+from filters.engine.session import Session
+from numerics.compiled import interpreted
+from numerics.streams import episode_keys
+from plants import simulate
 from tests.models import plane_model, simulated
 from tests.oracles import kalman_update
-from thruster_env.compiled import interpreted
-from thruster_env.streams import episode_keys
 
 KEY = (1, 2)
 adaptive = pytest.mark.parametrize("kind", [SageHusaFilter, VariationalBayesFilter])
@@ -219,7 +219,7 @@ def with_outliers(model, count):
     """Inputs, states and measurements of the thruster, one measurement in twenty off by 10 N."""
     rng = np.random.default_rng(3)
     inputs = np.repeat(rng.uniform(-12.0, 12.0, size=(count, 10, 1)), 25, axis=1)
-    drawn = truth.simulate(model, episode_keys(range(count)), inputs)
+    drawn = simulate.simulate(model, episode_keys(range(count)), inputs)
     hit = rng.random(drawn.measurements.shape) < 0.05
     off = np.where(hit, rng.normal(size=hit.shape) * 10.0, 0.0)
     return inputs, drawn.states, drawn.measurements, off

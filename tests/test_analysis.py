@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from thruster_env.analysis import (
+from numerics.linear_systems import zero_order_hold
+from thruster_env.dynamics import rates, thrust_and_torque_tangent
+from thruster_env.linear.analysis import (
     INPUTS,
     LinearModel,
     analyse,
@@ -17,11 +19,10 @@ from thruster_env.analysis import (
     step_response,
     transfer_function,
 )
-from thruster_env.dynamics import rates, thrust_and_torque_tangent
-from thruster_env.figures import response_figure
-from thruster_env.linear import jacobians, state_range, steady_state, zero_order_hold
+from thruster_env.linear.figures import response_figure
+from thruster_env.linear.published import PUBLISHED, SAMPLE_TIME, published_for
+from thruster_env.linear.steady_state import jacobians, state_range, steady_state
 from thruster_env.parameters import ANGLES, PRESETS, TUNNEL, derive_constants
-from thruster_env.published import PUBLISHED, SAMPLE_TIME, published_for
 
 every_preset = pytest.mark.parametrize("p", PRESETS.values(), ids=PRESETS.keys())
 every_print = pytest.mark.parametrize("name", PUBLISHED)

@@ -15,12 +15,12 @@ from filters import (
     augmented_model,
     run,
     thruster_model,
-    truth,
 )
-from filters.derivatives import jacobian
+from numerics.compiled import interpreted
+from numerics.derivatives import jacobian
+from numerics.streams import episode_keys, filter_keys
+from plants import simulate
 from tests.models import held_voltages, scalar_model
-from thruster_env.compiled import interpreted
-from thruster_env.streams import episode_keys, filter_keys
 
 
 def test_the_new_states_stand_in_for_the_constants():
@@ -77,7 +77,7 @@ def test_constants_of_a_tuple_go_by_number():
 def test_it_recovers_an_unknown_ambient_flow_and_beats_the_filter_that_ignores_it():
     runs, actual = 40, 0.6
     inputs = held_voltages(runs, 30)
-    drawn = truth.simulate(thruster_model(ambient_velocity=actual), episode_keys(range(runs)), inputs)
+    drawn = simulate.simulate(thruster_model(ambient_velocity=actual), episode_keys(range(runs)), inputs)
     assumed = thruster_model()  # still water
 
     def estimates(kind, model, **numbers):
@@ -102,7 +102,7 @@ def test_it_recovers_the_load_gain_of_the_physical_tunnel():
     runs, plant = 40, thruster_model(preset="tunnel_physical")
     actual = plant.constants.load_gain
     inputs = held_voltages(runs, 30)
-    drawn = truth.simulate(plant, episode_keys(range(runs)), inputs)
+    drawn = simulate.simulate(plant, episode_keys(range(runs)), inputs)
     assumed = plant.replace(constants=plant.constants._replace(load_gain=0.7 * actual))
     joint = augmented_model(assumed, {"load_gain": Unknown(std=0.5 * actual)})
     found = run(ExtendedKalmanFilter(model=joint), np.zeros((runs, 2)), inputs, drawn.measurements)

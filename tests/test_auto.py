@@ -12,15 +12,16 @@ from rich.progress import Progress
 
 from filters.registry import FILTERS
 from thruster_cli.main import main
-from tuning import trials as tuning_trials
-from tuning.cost import BUDGET, COST, microseconds_a_step, over_budget
-from tuning.followers import HEIR, SMALLER, TWIN, UNTUNED, _ends_a_round
-from tuning.kinds import kinds_tried, trials_of_kind
-from tuning.outcome import best_trial, is_over_budget, violation
-from tuning.plan import Plan
-from tuning.proof import prove
-from tuning.scenarios import find_scenario
-from tuning.space import (
+from tuning.evaluation.held_out import prove
+from tuning.evaluation.tuned import write_tuned
+from tuning.problems.find import find_scenario
+from tuning.search import trials as tuning_trials
+from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
+from tuning.search.enqueued import HEIR, SMALLER, TWIN, UNTUNED, _ends_a_round
+from tuning.search.filter_types import kinds_tried, trials_of_kind
+from tuning.search.outcome import best_trial, is_over_budget, violation
+from tuning.search.plan import Plan
+from tuning.search.space import (
     AUTO_KINDS,
     KIND,
     choice_of,
@@ -28,8 +29,7 @@ from tuning.space import (
     trial_parameters,
     untuned_choice,
 )
-from tuning.study import open_study, run_study
-from tuning.tuned import write_tuned
+from tuning.search.study import open_study, run_study
 
 MISMATCH = find_scenario("mismatch")
 PLAN = Plan("auto", (MISMATCH,), budget=1.0)
@@ -45,7 +45,7 @@ def quiet():
 @pytest.fixture
 def priced(monkeypatch):
     """Few kinds, and costs that do not depend on the machine."""
-    monkeypatch.setattr("tuning.plan.AUTO_KINDS", FEW)
+    monkeypatch.setattr("tuning.search.plan.AUTO_KINDS", FEW)
     monkeypatch.setattr(
         tuning_trials, "microseconds_a_step", lambda filter_, data: COSTS[filter_.name](filter_.size)
     )
@@ -178,7 +178,7 @@ def test_budget_and_kinds_belong_to_the_identity(monkeypatch):
     open_study("s", PLAN, storage)
     with pytest.raises(ValueError, match="must be for {'budget': 2.0}, but it was made for {'budget': 1.0}"):
         open_study("s", PLAN._replace(budget=2.0), storage)
-    monkeypatch.setattr("tuning.plan.AUTO_KINDS", FEW)
+    monkeypatch.setattr("tuning.search.plan.AUTO_KINDS", FEW)
     with pytest.raises(ValueError, match="must be for {'kinds': .*'pf'"):
         open_study("s", PLAN, storage)
 
@@ -194,7 +194,7 @@ def test_cost_is_of_one_core_and_grows_with_the_ensemble():
 
 def test_the_command_says_which_filters_it_tried_and_reports_on_the_winner(priced, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("tuning.proof.HELD_OUT_SEEDS", 8)
+    monkeypatch.setattr("tuning.evaluation.held_out.HELD_OUT_SEEDS", 8)
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["thruster", *arguments])

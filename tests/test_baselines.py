@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from filters import Inversion, LowPass, OpenLoop, StateSpaceModel, run, thruster_model, truth
-from filters.inverse import component_solver
-from thruster_env.streams import episode_keys
+from filters import Inversion, LowPass, OpenLoop, StateSpaceModel, run, thruster_model
+from filters.baselines.inverse import component_solver
+from numerics.streams import episode_keys
+from plants import simulate
 
 KEYS = np.zeros((1, 2))
 KINDS = [OpenLoop, Inversion, LowPass]
@@ -52,7 +53,7 @@ def open_loop(model, inputs):
 def test_a_baseline_says_nothing_of_its_error(kind, make):
     model = make()
     inputs = np.random.default_rng(3).uniform(-5.0, 5.0, size=(1, 12, 1))
-    z = truth.simulate(model, episode_keys([4]), inputs).measurements
+    z = simulate.simulate(model, episode_keys([4]), inputs).measurements
     estimates = run(kind(model=model), KEYS, inputs, z)
     assert not kind.has_covariance
     for part in (estimates.covs, estimates.innovation_covs, estimates.log_likelihoods, estimates.divergences):
@@ -83,7 +84,7 @@ def inverted(model, x, z):
 def test_inversion_finds_the_nearest_root_and_else_the_extremum():
     model = bumpy_model()
     inputs = np.random.default_rng(1).normal(size=(1, 60, 1))
-    z = truth.simulate(model, episode_keys([4]), inputs).measurements
+    z = simulate.simulate(model, episode_keys([4]), inputs).measurements
     z[0, 10::7] += 6.0  # above the top
     states = open_loop(model, inputs)
     expected = np.array([inverted(model, x, v[0]) for x, v in zip(states, z[0], strict=True)])
@@ -96,7 +97,7 @@ def test_inversion_finds_the_nearest_root_and_else_the_extremum():
 def test_on_the_thruster_the_flow_is_what_the_thrust_says():
     model = thruster_model()
     inputs = np.repeat(np.random.default_rng(2).uniform(-12.0, 12.0, size=(1, 5, 1)), 20, axis=1)
-    z = truth.simulate(model, episode_keys([2]), inputs).measurements
+    z = simulate.simulate(model, episode_keys([2]), inputs).measurements
     found = run(Inversion(model=model), KEYS, inputs, z).means[0]
     states = open_loop(model, inputs)
     np.testing.assert_allclose(found[:, 0], states[:, 0], rtol=1e-12)
@@ -128,7 +129,7 @@ def test_the_low_pass_filters_the_measurement_before_it_is_inverted():
 def test_a_short_time_constant_makes_it_the_inversion():
     model = thruster_model()
     inputs = np.full((1, 20, 1), 6.0)
-    z = truth.simulate(model, episode_keys([2]), inputs).measurements
+    z = simulate.simulate(model, episode_keys([2]), inputs).measurements
     one = run(LowPass(model=model, time_constant=1e-3), KEYS, inputs, z)
     other = run(Inversion(model=model), KEYS, inputs, z)
     np.testing.assert_allclose(one.means, other.means, rtol=1e-12)

@@ -10,9 +10,9 @@ from benchmarks.jax_enkf import NORMALS, array_filter
 from benchmarks.rows import Row
 from benchmarks.timing import Timing
 from filters import EnsembleKalmanFilter, thruster_model
-from thruster_env.compiled import interpreted
+from numerics.compiled import interpreted
+from numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
 from thruster_env.plant import make_plant
-from thruster_env.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
 
 
 def test_the_quick_benchmark_measures_every_row():

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState
-from filters.vector_wrapper import EstimateStates
+from filters.wrappers.vector import EstimateStates
 
 DROPOUT = {"sensors": {"thrust": [{"name": "dropout", "probability": 0.5}]}}
 
@@ -42,4 +42,4 @@ def test_a_vector_env_says_how_it_resets_where_gymnasiums_own_do(mode):
     sync = envs_of("sync", vector_kwargs={"autoreset_mode": mode})
     assert isinstance(sync, SyncVectorEnv) and native.autoreset_mode == sync.autoreset_mode == mode
     assert EstimateStates(native, filter="ekf").autoreset_mode == mode
-    assert EstimateStates(sync, filter="ekf", model="filters.thruster:thruster_model").autoreset_mode == mode
+    assert EstimateStates(sync, filter="ekf", model="thruster_env.model:thruster_model").autoreset_mode == mode

@@ -6,8 +6,8 @@ import numpy as np
 import optuna
 import pytest
 
-from tuning.cma_es import read_state
-from tuning.samplers import NEEDS, make_sampler
+from tuning.search.cma_es import read_state
+from tuning.search.samplers import NEEDS, make_sampler
 
 
 class Attack:

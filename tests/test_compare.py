@@ -8,14 +8,15 @@ import pytest
 
 from filters.augmented import Unknown
 from thruster_cli.main import main
-from tuning.compare import compare, contender, default_belief, sized
-from tuning.evaluate import evaluate, score_ratio
-from tuning.plan import Plan
-from tuning.proof import Comparison
-from tuning.scenarios import find_scenario, held_out_seeds
-from tuning.space import true_choice, untuned_choice
-from tuning.study import StudyResult
-from tuning.tuned import write_tuned
+from tuning.evaluation.compare import compare, contender, default_belief, sized
+from tuning.evaluation.evaluate import evaluate, score_ratio
+from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.tuned import write_tuned
+from tuning.problems.find import find_scenario
+from tuning.problems.seeds import held_out_seeds
+from tuning.search.plan import Plan
+from tuning.search.space import true_choice, untuned_choice
+from tuning.search.study import StudyResult
 
 NOMINAL, SEEDS = find_scenario("nominal"), held_out_seeds(0, 12)
 

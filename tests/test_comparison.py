@@ -20,7 +20,8 @@ from training.comparison.tables import HEADER, rows_of, summary_rows
 from training.environments import make_environments
 from training.score import FIRST_SCORED_STEP, Part, Scores, run_episodes, score
 from training.setup import make_setup
-from tuning.scenarios import find_scenario, held_out_seeds
+from tuning.problems.find import find_scenario
+from tuning.problems.seeds import held_out_seeds
 
 MEDIUM = find_scenario("medium_noise")
 SEEDS = held_out_seeds(0, 3)

@@ -1,8 +1,10 @@
+from functools import partial
+
 import numpy as np
 import pytest
 
-from thruster_env.compiled import compiled, function_fingerprint, inlined, interpreted, is_interpreting
-from thruster_env.components import (
+from numerics.compiled import compiled, function_fingerprint, inlined, interpreted, is_interpreting
+from numerics.tuples import (
     column_reader,
     column_writer,
     matrix_of,
@@ -100,7 +102,7 @@ store_column, store_vector, store_matrix = column_writer(2, 1), vector_writer(2)
 
 
 def test_compiled_readers_and_writers_do_what_the_python_ones_do():
-    fingerprint = function_fingerprint(shuffle)
+    fingerprint = function_fingerprint(shuffle, within=__name__)
 
     def run(row, table):
         fingerprint  # noqa: B018 - part of the cache's key
@@ -137,5 +139,15 @@ def test_a_fingerprint_tells_functions_apart_and_is_stable():
     def other(x):
         return x + 2.0
 
-    assert function_fingerprint(one) == function_fingerprint(one, None)
-    assert len({function_fingerprint(), function_fingerprint(one), function_fingerprint(other)}) == 3
+    fingerprint = partial(function_fingerprint, within=__name__)
+    assert fingerprint(one) == fingerprint(one, None)
+    assert (
+        len(
+            {
+                function_fingerprint(within=__name__),
+                function_fingerprint(one, within=__name__),
+                function_fingerprint(other, within=__name__),
+            }
+        )
+        == 3
+    )

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, run, truth
-from filters.batch import Estimates
+from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, run
 from filters.consistency.intervals import Interval, mean_interval, rmse_ratios
 from filters.consistency.nees import normalized_squares
 from filters.consistency.report import consistency_report
@@ -20,12 +19,15 @@ from filters.consistency.verdicts import (
     rounded,
     sentences,
 )
+from filters.engine.batch import Estimates
 from filters.ensembles.recording import Members, record_members
+from numerics.compiled import interpreted
+from numerics.streams import episode_keys
+from plants import simulate
 from tests.models import scalar_model
-from thruster_env.compiled import interpreted
-from thruster_env.streams import episode_keys
-from tuning.consistency_figures import consistency_figure
-from tuning.scenarios import find_scenario, held_out_seeds
+from tuning.problems.find import find_scenario
+from tuning.problems.seeds import held_out_seeds
+from tuning.report.consistency_figures import consistency_figure
 
 
 def scalar(**changes):
@@ -38,7 +40,7 @@ def scalar(**changes):
 @pytest.fixture(scope="module")
 def scalar_truth():
     with interpreted():
-        return truth.simulate(scalar(), episode_keys(range(40)), np.zeros((40, 150, 0)))
+        return simulate.simulate(scalar(), episode_keys(range(40)), np.zeros((40, 150, 0)))
 
 
 def scalar_report(drawn, **assumed):

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from thruster_env import PRESETS
-from thruster_env.control import LQRController, PIController
-from thruster_env.gains import lambda_gains, quadratic_gain
-from thruster_env.linear import steady_state
+from thruster_env.control.controllers import LQRController, PIController
+from thruster_env.control.gains import lambda_gains, quadratic_gain
+from thruster_env.control.predictive import PredictiveController
+from thruster_env.linear.steady_state import steady_state
 from thruster_env.observe import ObserveState, ObserveStateVector
-from thruster_env.predictive import PredictiveController
 from thruster_env.task import make_task, thrust_scale
 
 NOISE_FREE = {"process_noise_cov": (0.0, 0.0), "measurement_noise_cov": 0.0, "initial_state": (0.0, 0.0)}

@@ -14,7 +14,7 @@ from training.environments import make_environments
 from training.saved import find_saved, load
 from training.score import score
 from training.setup import setup_from_json
-from tuning.scenarios import held_out_seeds
+from tuning.problems.seeds import held_out_seeds
 
 SEEDS = list(range(10, 10 + COPIES))
 SHARE = 0.2

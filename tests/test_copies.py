@@ -13,13 +13,13 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from filters import FILTERS, EstimateState, EstimateStates, StateSpaceModel, make_filter, thruster_model
 from filters.augmented import Unknown, augmented_model
-from filters.session import Session
+from filters.engine.session import Session
 from tests.models import pendulum, scalar_model, small, wide_model
 from tests.test_robustness import AMPLIFIER, FLOW, REFERENCE, SENSORS, UNCERTAINTY
-from tuning.evaluate import evaluate
-from tuning.plan import Plan
-from tuning.scenarios import SCENARIOS
-from tuning.space import untuned_choice
+from tuning.evaluation.evaluate import evaluate
+from tuning.problems.find import SCENARIOS
+from tuning.search.plan import Plan
+from tuning.search.space import untuned_choice
 
 pytestmark = pytest.mark.usefixtures("as_python")
 
@@ -215,7 +215,7 @@ def test_a_pickle_loads_in_a_fresh_process():
     env = gym.make("filters:BowThruster-EKF-v0")
     env.reset(seed=1)
     source = (
-        "import pickle, sys; from thruster_env.compiled import interpreted\n"
+        "import pickle, sys; from numerics.compiled import interpreted\n"
         "with interpreted():\n"
         "    env = pickle.load(sys.stdin.buffer); print(env.step([3.0])[0].tobytes().hex())"
     )

@@ -16,17 +16,18 @@ import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
-from filters.arguments import OBSERVATIONS
 from filters.registry import FILTERS
-from filters.thruster import thruster_model
-from thruster_env.amplifier import AMPLIFIER_EFFECTS
+from filters.wrappers.arguments import OBSERVATIONS
+from plants.disturbances.sensors import SENSOR_EFFECTS
+from thruster_env.channels import CHANNELS
+from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
+from thruster_env.effects.flow import FLOW_SIGNALS
+from thruster_env.effects.reference import REFERENCE_SIGNALS
+from thruster_env.effects.uncertainty import DISTRIBUTIONS
 from thruster_env.env import BowThrusterEnv
-from thruster_env.flow import FLOW_SIGNALS
+from thruster_env.model import thruster_model
 from thruster_env.parameters import PRESETS
-from thruster_env.reference import REFERENCE_SIGNALS
-from thruster_env.sensors import CHANNELS, SENSOR_EFFECTS
 from thruster_env.tasks import BowThrusterLinearEnv
-from thruster_env.uncertainty import DISTRIBUTIONS
 from thruster_env.vector_env import BowThrusterVectorEnv
 
 ROOT = Path(__file__).parents[1]

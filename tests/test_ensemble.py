@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, run, thruster_model, truth
+from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, run, thruster_model
+from numerics.compiled import interpreted
+from numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys, filter_keys
+from plants import simulate
 from tests.models import KEY, held_voltages, line_model, plane_model, simulated
 from tests.oracles import assert_normal, convergence, normals, relative_errors
-from thruster_env.compiled import interpreted
-from thruster_env.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys, filter_keys
 
 
 def test_one_cycle_is_the_naive_one_with_the_same_normals():
@@ -90,7 +91,7 @@ def test_it_converges_to_the_kalman_filter_like_one_over_root_n():
 def test_on_the_thruster_a_hundred_members_are_as_good_as_the_extended_filter():
     model = thruster_model(process_noise_cov=[1.0, 4e-4], measurement_noise_cov=0.25)
     inputs = held_voltages(100, 20)
-    drawn = truth.simulate(model, episode_keys(range(100)), inputs)
+    drawn = simulate.simulate(model, episode_keys(range(100)), inputs)
 
     def rmse(filter_):
         estimates = run(filter_, filter_keys(range(100)), inputs, drawn.measurements)

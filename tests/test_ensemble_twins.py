@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from filters import StateSpaceModel, make_filter, run
-from thruster_env.streams import filter_keys
+from numerics.streams import filter_keys
 
 TWINS = json.loads((Path(__file__).parent / "data" / "dapper_twins.json").read_text())
 RUNS = 16

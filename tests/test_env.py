@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 
 import thruster_env
 from thruster_env import PRESETS, BowThrusterEnv
-from thruster_env.linear import run_substeps, state_range, steady_state
+from thruster_env.linear.steady_state import run_substeps, state_range, steady_state
 from thruster_env.parameters import TUNNEL, TUNNEL_PHYSICAL
 
 every_preset = pytest.mark.parametrize("preset", PRESETS)

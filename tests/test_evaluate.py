@@ -1,14 +1,16 @@
 import numpy as np
 import pytest
 
-from filters import affine_model, make_filter, thruster_model, truth
+from filters import affine_model, make_filter, thruster_model
 from filters.bounds import posterior_bound, riccati_covariances
 from filters.consistency.nees import normalized_squares
-from thruster_env.compiled import interpreted
-from tuning.evaluate import evaluate, score_ratio
-from tuning.scenarios import find_scenario, held_out_seeds
-from tuning.space import choice_of, parameters_of, true_choice, untuned_choice
-from tuning.tuned import summary
+from numerics.compiled import interpreted
+from plants import simulate
+from tuning.evaluation.evaluate import evaluate, score_ratio
+from tuning.evaluation.tuned import summary
+from tuning.problems.find import find_scenario
+from tuning.problems.seeds import held_out_seeds
+from tuning.search.space import choice_of, parameters_of, true_choice, untuned_choice
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +63,7 @@ def test_the_untuned_ekf_is_worse_and_the_paired_interval_says_so(ekf, untuned_e
 
 def test_rmse_of_thrust_is_that_of_the_model_s_thrust_at_the_estimate(nominal, data, ekf):
     from filters import run
-    from filters.thruster import observe
+    from thruster_env.model import observe
 
     filter_ = true_choice("ekf", nominal).filter(nominal)
     estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
@@ -155,7 +157,7 @@ def test_on_the_thruster_the_bound_is_the_naive_recursion_on_the_same_truths():
         return chain
 
     for b in range(2):
-        drawn = truth.simulate(model, keys[b], np.repeat(inputs[b : b + 1], truths, axis=0)).states
+        drawn = simulate.simulate(model, keys[b], np.repeat(inputs[b : b + 1], truths, axis=0)).states
         j = np.linalg.inv(model.prior_cov) + information_of(drawn[:, 0])  # equation 21 with no motion yet
         np.testing.assert_allclose(bound[b, 0], np.linalg.inv(j), rtol=1e-9)
         for k in range(30):

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
-from thruster_env.control import PIController
+from numerics.streams import episode_keys
+from thruster_env.control.controllers import PIController
 from thruster_env.plant import make_plant
-from thruster_env.streams import episode_keys
-from tuning.excitation import EXCITATIONS, BinarySequence, ClosedLoop, Dwells, MultiSine, Steps
-from tuning.scenarios import find_scenario
+from tuning.problems.find import find_scenario
+from tuning.thruster.excitation import EXCITATIONS, BinarySequence, ClosedLoop, Dwells, MultiSine, Steps
 
 PLANT = make_plant()
 KEYS = episode_keys(range(40))

@@ -5,12 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from filters import ExtendedKalmanFilter, KalmanFilter, linearize, run, thruster_model, truth
+from filters import ExtendedKalmanFilter, KalmanFilter, linearize, run, thruster_model
+from numerics.compiled import interpreted
+from numerics.streams import episode_keys
+from plants import simulate
 from tests import models
 from tests.models import DT, held_voltages, line_model, look, simulated, swing
 from tests.oracles import kalman_update
-from thruster_env.compiled import interpreted
-from thruster_env.streams import episode_keys
 
 
 def swing_jacobian(x, u, c):
@@ -113,7 +114,7 @@ def nominal():
     """The thruster with its default noise: 100 truths under voltages held for 0.25 s, with what the EKF says."""
     model = thruster_model(process_noise_cov=[1.0, 4e-4], measurement_noise_cov=0.25)
     inputs = held_voltages(100, 20)
-    drawn = truth.simulate(model, episode_keys(range(100)), inputs)
+    drawn = simulate.simulate(model, episode_keys(range(100)), inputs)
     return drawn, run(ExtendedKalmanFilter(model=model), np.zeros((100, 2)), inputs, drawn.measurements)
 
 

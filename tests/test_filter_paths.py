@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from filters import FILTERS, make_filter, run, thruster_model
-from filters.session import Session
+from filters.engine.session import Session
+from numerics.compiled import interpreted
+from numerics.streams import episode_keys, filter_keys
 from tests.models import KEY, MODELS, scalar_model, simulated, small, varying_noise
 from tests.oracles import equal
 from tests.test_wrapper import ADDED, infos_of, played, voltages, wrapped
-from thruster_env.compiled import interpreted
 from thruster_env.plant import make_plant
 from thruster_env.simulation import simulate
-from thruster_env.streams import episode_keys, filter_keys
 
 
 def stepped(filter_, key, inputs, measurements):

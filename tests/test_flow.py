@@ -8,14 +8,14 @@ import pytest
 from scipy import stats
 
 import thruster_env  # noqa: F401 - registers the envs
-from thruster_env.batch import Copies
-from thruster_env.flow import FLOW_SIGNALS
-from thruster_env.linear import run_substeps, state_range
-from thruster_env.memory import AMBIENT, row
+from numerics.streams import episode_keys
+from plants.disturbances.recorded import RecordedSeries
+from thruster_env.effects.flow import FLOW_SIGNALS
+from thruster_env.engine.copies import Copies
+from thruster_env.engine.memory import AMBIENT, row
+from thruster_env.linear.steady_state import run_substeps, state_range
 from thruster_env.parameters import PRESETS, TUNNEL
 from thruster_env.plant import make_plant
-from thruster_env.recorded import RecordedSeries
-from thruster_env.streams import episode_keys
 from thruster_env.task import Task
 
 DT = 0.01

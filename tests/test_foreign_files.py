@@ -12,10 +12,10 @@ from filters import EstimateState, EstimateStates
 from tests.test_cli import thruster  # noqa: F401 - a fixture
 from tests.tuned_files import rewrite, write_untuned
 from training.setup import in_scenario, make_setup, setup_from_json
-from tuning.report import write_report
-from tuning.scenarios import find_scenario
-from tuning.tuned import read_tuned
-from tuning.verify import verify
+from tuning.evaluation.tuned import read_tuned
+from tuning.evaluation.verify import verify
+from tuning.problems.find import find_scenario
+from tuning.report.report import write_report
 
 TRAP = f"{__name__}:trap"
 SPRUNG = []

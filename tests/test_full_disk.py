@@ -12,10 +12,10 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from tuning.plan import Plan
-from tuning.scenarios import find_scenario
-from tuning.storage import open_storage
-from tuning.study import finished_trials, open_study, run_trials
+from tuning.problems.find import find_scenario
+from tuning.search.plan import Plan
+from tuning.search.storage import open_storage
+from tuning.search.study import finished_trials, open_study, run_trials
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 
@@ -68,7 +68,7 @@ def test_a_worker_says_in_a_line_that_the_disk_is_full(tmp_path, data):
     orders = {"study": "s", "storage": str(path), "trials": 3, "workers": 1, "worker": 0, "place": 5, "plan": plan}
     with room_for(path.stat().st_size + 10):
         done = subprocess.run(
-            [sys.executable, "-m", "tuning.workers"],
+            [sys.executable, "-m", "tuning.search.workers"],
             input=json.dumps(orders) + "\n",
             capture_output=True,
             text=True,

@@ -4,12 +4,12 @@ import pytest
 from scipy.linalg import solve_discrete_lyapunov
 
 from thruster_env import PRESETS
-from thruster_env.analysis import equilibrium
-from thruster_env.control import LQRController
-from thruster_env.gains import lambda_gains, quadratic_gain, quadratic_problem
-from thruster_env.linear import steady_state
-from thruster_env.linear_plant import make_linear_plant
-from thruster_env.operating import operating_points, sampled_plant
+from thruster_env.control.controllers import LQRController
+from thruster_env.control.gains import lambda_gains, quadratic_gain, quadratic_problem
+from thruster_env.linear.analysis import equilibrium
+from thruster_env.linear.linear_plant import make_linear_plant
+from thruster_env.linear.operating import operating_points, sampled_plant
+from thruster_env.linear.steady_state import steady_state
 from thruster_env.plant import make_plant
 from thruster_env.task import make_task, thrust_scale
 

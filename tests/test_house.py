@@ -89,7 +89,7 @@ def test_filters_know_the_thruster_through_one_bridge():
         known = modules_of(path, "thruster_env") - {"thruster_env"}
         return known - SHARED_TOOLS or "thruster_env" in imported_as_a_whole(path)
 
-    assert those(lambda path: room_of(path) == "filters" and knows_more(path)) == ["filters/thruster.py"]
+    assert those(lambda path: room_of(path) == "filters" and knows_more(path)) == ["thruster_env/model.py"]
 
 
 def imported_as_a_whole(path):

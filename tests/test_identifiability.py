@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from filters import KalmanFilter, affine_model, run, truth
+from filters import KalmanFilter, affine_model, run
+from numerics.streams import episode_keys
+from plants import simulate
 from thruster_cli.tune import tune
 from thruster_cli.tuning_report import as_json, report
-from thruster_env.streams import episode_keys
-from tuning.gradient import maximise_likelihood
-from tuning.identifiability import (
+from tuning.likelihood.gradient import maximise_likelihood
+from tuning.likelihood.identifiability import (
     Identifiability,
     as_data,
     covariance,
@@ -17,9 +18,9 @@ from tuning.identifiability import (
     maximum,
     sentences,
 )
-from tuning.plan import Plan
-from tuning.scenarios import find_scenario
-from tuning.space import choice_of, parameters_of, true_choice, untuned_choice
+from tuning.problems.find import find_scenario
+from tuning.search.plan import Plan
+from tuning.search.space import choice_of, parameters_of, true_choice, untuned_choice
 
 BOUNDS = np.log([(1e-4, 1e4)] * 3)
 TRUE = np.log([0.3, 0.2, 0.5])  # Q11, Q22, R
@@ -42,7 +43,7 @@ def likelihood_of(c, seed=0, count=24, steps=100):
 
     keys = episode_keys(range(seed, seed + count))
     inputs = np.random.default_rng(seed).normal(size=(count, steps, 1))
-    measurements = truth.simulate(model(TRUE), keys, inputs).measurements
+    measurements = simulate.simulate(model(TRUE), keys, inputs).measurements
     return lambda logarithms: run(
         KalmanFilter(model=model(logarithms)), keys, inputs, measurements
     ).log_likelihoods.sum(axis=1)

@@ -3,9 +3,9 @@
 import optuna
 import pytest
 
-from tuning.plan import Plan
-from tuning.scenarios import find_scenario
-from tuning.study import open_study
+from tuning.problems.find import find_scenario
+from tuning.search.plan import Plan
+from tuning.search.study import open_study
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from filters import ExtendedKalmanFilter, KalmanFilter, linearize, run, thruster_model, truth
+from filters import ExtendedKalmanFilter, KalmanFilter, linearize, run, thruster_model
+from numerics.streams import episode_keys
+from plants import simulate
 from tests.models import held_voltages, random_affine, simulated
 from tests.oracles import kalman_update
-from thruster_env.streams import episode_keys
 
 KEYS = np.zeros((1, 2))
 
@@ -66,7 +67,7 @@ def test_the_extended_filter_is_filterpy_s_on_the_thruster():
     peer = pytest.importorskip("filterpy.kalman")
     model = thruster_model()
     inputs = held_voltages(1, 8, seed=3)
-    drawn = truth.simulate(model, episode_keys([3]), inputs)
+    drawn = simulate.simulate(model, episode_keys([3]), inputs)
     estimates = run(ExtendedKalmanFilter(model=model), KEYS, inputs, drawn.measurements)
     constants = model.constants
 
@@ -111,7 +112,7 @@ def test_its_steady_covariance_solves_riccati_s_equation():
 def test_its_errors_are_as_large_as_it_says():
     model = random_affine(seed=4)
     inputs = np.zeros((100, 20, 2))
-    drawn = truth.simulate(model, episode_keys(range(100)), inputs)
+    drawn = simulate.simulate(model, episode_keys(range(100)), inputs)
     estimates = run(KalmanFilter(model=model), np.zeros((100, 2)), inputs, drawn.measurements)
     errors = drawn.states[:, -1] - estimates.means[:, -1]
     nees = np.einsum("bi,bij,bj->b", errors, np.linalg.inv(estimates.covs[:, -1]), errors)

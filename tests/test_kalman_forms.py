@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from filters import KalmanFilter, affine_model, run, thruster_model
-from filters.session import Session
+from filters.engine.session import Session
+from numerics.compiled import interpreted
 from tests.models import rescaled, simulated, wide_model
-from thruster_env.compiled import interpreted
 
 KEYS = np.zeros((1, 2))
 FORMS = ["information", "square-root"]

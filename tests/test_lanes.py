@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from filters import ExtendedKalmanFilter, SageHusaFilter, UnscentedKalmanFilter, run, thruster_model, truth
-from filters.lanes import BLOCK
-from filters.rows import LANES
-from thruster_env.compiled import interpreted
-from thruster_env.streams import episode_keys
+from filters import ExtendedKalmanFilter, SageHusaFilter, UnscentedKalmanFilter, run, thruster_model
+from filters.engine.simd import BLOCK
+from numerics.compiled import interpreted
+from numerics.streams import episode_keys
+from plants import simulate
+from plants.layout import LANES
 
 COUNTS = [1, LANES - 1, LANES, LANES + 1, BLOCK, BLOCK + 1, 3 * BLOCK + 5]
 
@@ -16,7 +17,7 @@ def simulated(count, steps=12):
     model = thruster_model()
     inputs = np.random.default_rng(4).uniform(-12, 12, size=(count, steps, 1))
     with interpreted():
-        drawn = truth.simulate(model, episode_keys(range(count)), inputs)
+        drawn = simulate.simulate(model, episode_keys(range(count)), inputs)
     return model, (np.zeros((count, 2)), inputs, drawn.measurements)
 
 

@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 
-from filters import ExtendedKalmanFilter, KalmanFilter, affine_model, run, truth
-from filters.formulas import formula
+from filters import ExtendedKalmanFilter, KalmanFilter, affine_model, run
 from filters.likelihood import likelihood
-from thruster_env.compiled import interpreted
-from thruster_env.streams import episode_keys
-from tuning.gradient import BAD_START, maximise_likelihood
-from tuning.scenarios import find_scenario, training_seeds
+from numerics.compiled import interpreted
+from numerics.formulas import formula
+from numerics.streams import episode_keys
+from plants import simulate
+from tuning.likelihood.gradient import BAD_START, maximise_likelihood
+from tuning.problems.find import find_scenario
+from tuning.problems.seeds import training_seeds
 
 RNG = np.random.default_rng(0)
 
@@ -66,7 +68,7 @@ CASES = {"affine": (two_channels, KalmanFilter, 1e-6), "thruster": (thruster, Ex
 def data_of(model, count=3, steps=40):
     keys = episode_keys(range(count))
     inputs = RNG.uniform(-10, 10, size=(count, steps, 1))
-    measurements = truth.simulate(model, keys, inputs).measurements
+    measurements = simulate.simulate(model, keys, inputs).measurements
     measurements[0, 5, 0] = np.nan
     measurements[1, 0] = np.nan
     return keys, inputs, measurements

@@ -10,13 +10,14 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from filters import make_filter, thruster_model
 from filters.tuned_file import read_tuned_file
+from numerics.checks import as_floats, shown, vector
 from studies.comparison import compare
 from thruster_cli.simulate import command
-from thruster_env.checks import as_floats, shown, vector
 from thruster_env.parameters import TUNNEL
 from training.setup import setup_from_json
-from tuning.scenario_files import read_scenario
-from tuning.scenarios import SCENARIOS, held_out_seeds, training_seeds
+from tuning.problems.find import SCENARIOS
+from tuning.problems.seeds import held_out_seeds, training_seeds
+from tuning.thruster.files import read_scenario
 
 pytestmark = pytest.mark.usefixtures("as_python")
 HUGE = 10**12

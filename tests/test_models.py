@@ -10,11 +10,12 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from filters import ExtendedKalmanFilter, StateSpaceModel, affine_model, make_filter, run, thruster_model, truth
-from thruster_env.compiled import interpreted
+from filters import ExtendedKalmanFilter, StateSpaceModel, affine_model, make_filter, run, thruster_model
+from numerics.compiled import interpreted
+from numerics.streams import episode_keys
+from plants import simulate
 from thruster_env.plant import make_plant
 from thruster_env.simulation import simulate as simulate_plant
-from thruster_env.streams import episode_keys
 
 
 class Spring(NamedTuple):
@@ -159,7 +160,7 @@ class TestTruth:
         arguments = {"initial_state": initial_state, "process_noise_cov": [[1.0, 0.008], [0.008, 4e-4]]}
         keys = episode_keys(range(5))
         inputs = np.random.default_rng(0).uniform(-24, 24, size=(5, 200, 1))
-        of_model = truth.simulate(thruster_model(**arguments), keys, inputs)
+        of_model = simulate.simulate(thruster_model(**arguments), keys, inputs)
         of_plant = simulate_plant(make_plant(**arguments), keys, inputs[..., 0])
         close = {"rtol": 1e-12, "atol": 1e-12}
         np.testing.assert_allclose(of_model.states, of_plant.states, **close)
@@ -169,7 +170,7 @@ class TestTruth:
         model = spring(measurement_noise_cov=[[0.5, -0.3], [-0.3, 0.4]], observe=both_parts)
         inputs = np.ones((1, 2000, 1))
         with interpreted():
-            states, measurements = truth.simulate(model, episode_keys([0]), inputs)
+            states, measurements = simulate.simulate(model, episode_keys([0]), inputs)
         after = np.array([spring_step(x, (1.0,), model.constants) for x in states[0, :-1]])
         w, v = states[0, 1:] - after, measurements[0] - states[0]
         for sample, cov in ((w, model.process_noise_cov), (v, model.measurement_noise_cov)):
@@ -181,7 +182,7 @@ class TestTruth:
     def test_the_initial_state_has_the_prior_s_covariance(self):
         model = spring(prior_mean=[3.0, -2.0], prior_cov=[[0.5, 0.3], [0.3, 0.4]])
         with interpreted():
-            states, _ = truth.simulate(model, episode_keys(range(1000)), np.zeros((1000, 0, 1)))
+            states, _ = simulate.simulate(model, episode_keys(range(1000)), np.zeros((1000, 0, 1)))
         error = np.abs(states[:, 0].mean(axis=0) - model.prior_mean)
         assert (error < 4 * np.sqrt(np.diag(model.prior_cov) / 1000)).all()
         assert np.abs(np.cov(states[:, 0].T) - model.prior_cov).max() < 4 * 0.5 * np.sqrt(2 / 1000)
@@ -191,7 +192,7 @@ class TestTruth:
     )
     def test_shapes_that_do_not_fit_are_refused(self, keys, inputs):
         with interpreted(), pytest.raises(ValueError, match="shapes"):
-            truth.simulate(spring(), np.zeros(keys), np.zeros(inputs))
+            simulate.simulate(spring(), np.zeros(keys), np.zeros(inputs))
 
 
 def both_parts(x, c):
@@ -251,9 +252,9 @@ class TestModelsThatNumbaRefuses:
     def test_their_truths_are_drawn_all_the_same(self, transition):
         keys, inputs = episode_keys(range(2)), np.ones((2, 5, 1))
         with interpreted():
-            expected = truth.simulate(spring(), keys, inputs)
+            expected = simulate.simulate(spring(), keys, inputs)
         with pytest.warns(UserWarning, match="runs as Python"):
-            found = truth.simulate(spring(transition=transition), keys, inputs)
+            found = simulate.simulate(spring(transition=transition), keys, inputs)
         np.testing.assert_allclose(found.states, expected.states, rtol=1e-12, atol=1e-12)
 
 
@@ -320,7 +321,7 @@ def swinging(**changes):
 @pytest.mark.parametrize("plainly", [False, True])
 def test_complex_steps_give_an_analytic_model_exact_jacobians(plainly):
     keys, inputs = episode_keys(range(3)), np.random.default_rng(0).normal(size=(3, 30, 1))
-    measurements = truth.simulate(swinging(), keys, inputs).measurements
+    measurements = simulate.simulate(swinging(), keys, inputs).measurements
     exact, declared = swinging(transition_jacobian=swing_jacobian), swinging(analytic=True)
     x, u = (0.7, -1.3), (0.4,)
     assert declared.transition_jacobian(x, u, ()) == pytest.approx(np.array(swing_jacobian(x, u, ())), rel=1e-15)

@@ -6,8 +6,9 @@ from scipy.stats import chi2
 
 from filters import make_filter, run
 from filters.consistency.nees import normalized_squares
-from tuning.evaluate import evaluate
-from tuning.scenarios import FIRST_SCORED_STEP, find_scenario, held_out_seeds
+from tuning.evaluation.evaluate import evaluate
+from tuning.problems.find import FIRST_SCORED_STEP, find_scenario
+from tuning.problems.seeds import held_out_seeds
 
 RUNS = 200
 

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
+from numerics.streams import episode_keys
 from tests.test_cli import thruster  # noqa: F401 - a fixture
 from thruster_env.plant import make_plant
 from thruster_env.simulation import Simulation, simulate
-from thruster_env.streams import episode_keys
 
 WILD = 'base = "nominal"\nprocess_noise_cov = [1e8, 1e8]\nscale = [1.0, 0.05]\n'
 

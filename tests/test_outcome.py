@@ -8,15 +8,15 @@ import pytest
 
 from filters.consistency.intervals import Interval
 from thruster_cli.main import main
-from tuning.followers import TWIN
-from tuning.objectives import NIS_BAND
-from tuning.outcome import best_trial, is_consistent
-from tuning.plan import Plan
-from tuning.scenarios import find_scenario
-from tuning.sizes import SizeRow, sufficient_size
-from tuning.storage import open_storage
-from tuning.study import BEST, open_study, run_study
-from tuning.trials import CONSISTENCY
+from tuning.evaluation.sizes import SizeRow, sufficient_size
+from tuning.problems.find import find_scenario
+from tuning.search.enqueued import TWIN
+from tuning.search.objectives import NIS_BAND
+from tuning.search.outcome import best_trial, is_consistent
+from tuning.search.plan import Plan
+from tuning.search.storage import open_storage
+from tuning.search.study import BEST, open_study, run_study
+from tuning.search.trials import CONSISTENCY
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),))  # whose untuned filter has a mean NIS of 0.2
 
@@ -24,7 +24,7 @@ PLAN = Plan("ekf", (find_scenario("mismatch"),))  # whose untuned filter has a m
 @pytest.fixture
 def thruster(monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("tuning.proof.HELD_OUT_SEEDS", 8)
+    monkeypatch.setattr("tuning.evaluation.held_out.HELD_OUT_SEEDS", 8)
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["thruster", *map(str, arguments)])

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tuning.samplers import NEEDS
+from tuning.search.samplers import NEEDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

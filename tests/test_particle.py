@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from filters import AuxiliaryParticleFilter, KalmanFilter, ParticleFilter, run, thruster_model, truth
-from filters.session import Session
-from tests.models import KEY, held_voltages, line_model, plane_model, simulated
-from tests.oracles import convergence, normals, relative_errors
-from thruster_env.compiled import interpreted
-from thruster_env.streams import (
+from filters import AuxiliaryParticleFilter, KalmanFilter, ParticleFilter, run, thruster_model
+from filters.engine.session import Session
+from numerics.compiled import interpreted
+from numerics.streams import (
     FILTER_MEASUREMENT,
     FILTER_PRIOR,
     FILTER_PROCESS,
@@ -19,6 +17,9 @@ from thruster_env.streams import (
     filter_keys,
     uniform_block,
 )
+from plants import simulate
+from tests.models import KEY, held_voltages, line_model, plane_model, simulated
+from tests.oracles import convergence, normals, relative_errors
 
 both_kinds = pytest.mark.parametrize("kind", [ParticleFilter, AuxiliaryParticleFilter])
 
@@ -146,7 +147,7 @@ def test_it_converges_to_the_kalman_filter_like_one_over_root_n(kind):
 def test_the_likelihood_is_right_on_average_however_few_particles(kind):
     model, runs = line_model(), 4000
     inputs = np.random.default_rng(3).normal(size=(1, 6, 1))
-    z = truth.simulate(model, episode_keys([5]), inputs).measurements
+    z = simulate.simulate(model, episode_keys([5]), inputs).measurements
     keys = np.random.default_rng(8).integers(0, 2**32, size=(runs, 2)).astype(float)
     exact = run(KalmanFilter(model=model), keys[:1], inputs, z).log_likelihoods.sum()
     data = np.repeat(inputs, runs, axis=0), np.repeat(z, runs, axis=0)
@@ -213,7 +214,7 @@ def test_batch_and_session_agree_bit_for_bit_over_500_steps(kind):
     model = thruster_model()
     filter_ = kind(model=model, ensemble_size=1000)
     inputs = held_voltages(1, 20, seed=2)
-    z = truth.simulate(model, episode_keys([1]), inputs).measurements
+    z = simulate.simulate(model, episode_keys([1]), inputs).measurements
     z[0, 100:120] = np.nan
     means = run(filter_, np.array([KEY]), inputs, z).means[0]
     session = Session(filter_)
@@ -226,7 +227,7 @@ def test_batch_and_session_agree_bit_for_bit_over_500_steps(kind):
 def test_a_million_particles_are_enough_for_any_moment():
     model = line_model()
     inputs, keys = np.ones((1, 4, 1)), np.array([KEY], dtype=float)
-    z = truth.simulate(model, episode_keys([1]), inputs).measurements
+    z = simulate.simulate(model, episode_keys([1]), inputs).measurements
     exact = run(KalmanFilter(model=model), keys, inputs, z)
     found = run(ParticleFilter(model=model, ensemble_size=1_000_000), keys, inputs, z)
     spread = np.sqrt(np.einsum("bkii->bki", exact.covs))

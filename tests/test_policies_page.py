@@ -8,15 +8,16 @@ import pytest
 pytest.importorskip("stable_baselines3")
 
 from thruster_cli.study import app
-from training.arms import ARMS
 from training.classical import classical_policy
 from training.comparison.answers import GOAL
 from training.comparison.plan import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
 from training.comparison.tables import HEADER, name_of
+from training.observations import ARMS
 from training.score import score
 from training.setup import make_setup
 from training.tasks import TASKS
-from tuning.scenarios import find_scenario, held_out_seeds
+from tuning.problems.find import find_scenario
+from tuning.problems.seeds import held_out_seeds
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE = (DOCS / "policies.md").read_text()

@@ -8,12 +8,12 @@ import pytest
 from scipy.optimize import minimize
 
 import thruster_env  # noqa: F401 - registers the envs
-from thruster_env import planning
-from thruster_env.compiled import interpreted
+from numerics.compiled import interpreted
+from thruster_env.control import planning
+from thruster_env.control.planning import Problem, best_voltages, improve_plans
+from thruster_env.control.predictive import HORIZONS, PredictiveController
 from thruster_env.parameters import preset_parameters
-from thruster_env.planning import Problem, best_voltages, improve_plans
 from thruster_env.plant import make_plant
-from thruster_env.predictive import HORIZONS, PredictiveController
 
 WEIGHTS = {"tracking_weight": 1.0, "energy_weight": 0.05, "voltage_rate_weight": 0.1}  # so that each one counts
 QUIET = {"process_noise_cov": (0.0, 0.0), "measurement_noise_cov": 0.0}

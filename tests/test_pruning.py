@@ -5,8 +5,8 @@ import pytest
 from scipy import stats
 
 from docs.tuning_pruning import TOP_RUNS, over_studies, pair
-from tuning.plan import TRAINING_SEEDS
-from tuning.study import quiet_optuna
+from tuning.search.plan import TRAINING_SEEDS
+from tuning.search.study import quiet_optuna
 
 
 def test_with_pruning_a_study_ends_at_the_score_that_it_has_without():

@@ -12,10 +12,10 @@ from filters import (
     ParticleFilter,
     run,
     thruster_model,
-    truth,
 )
+from numerics.streams import episode_keys, filter_keys
+from plants import simulate
 from tests.models import held_voltages
-from thruster_env.streams import episode_keys, filter_keys
 
 RUNS = 30
 
@@ -27,7 +27,7 @@ def published():
         thruster_model(process_noise_cov=[0.5, 0.5], measurement_noise_cov=0.5),
         held_voltages(RUNS, 10),
     )
-    return model, inputs, truth.simulate(model, episode_keys(range(RUNS)), inputs)
+    return model, inputs, simulate.simulate(model, episode_keys(range(RUNS)), inputs)
 
 
 @pytest.mark.parametrize(

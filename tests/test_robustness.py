@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import thruster_env
-from thruster_env.compiled import interpreted
+from numerics.compiled import interpreted
+from thruster_env.effects.uncertainty import UNCERTAIN
 from thruster_env.parameters import PRESETS
-from thruster_env.uncertainty import UNCERTAIN
 from thruster_env.vector_env import BowThrusterTrackingVectorEnv, BowThrusterVectorEnv
 
 IDS = ["BowThruster-v0", "BowThrusterTracking-v0", "BowThrusterReversal-v0", "BowThrusterLinear-v0"]

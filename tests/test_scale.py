@@ -6,15 +6,15 @@ import numpy as np
 import optuna
 import pytest
 
-from tuning.evaluate import evaluate
-from tuning.plan import Plan
-from tuning.proof import prove
-from tuning.scale import is_stable
-from tuning.scenarios import SCENARIOS, computed_scale, find_scenario
-from tuning.space import untuned_choice
-from tuning.study import open_study, run_study
-from tuning.tuned import write_tuned
-from tuning.verify import verify
+from tuning.evaluation.evaluate import evaluate
+from tuning.evaluation.held_out import prove
+from tuning.evaluation.tuned import write_tuned
+from tuning.evaluation.verify import verify
+from tuning.problems.find import SCENARIOS, computed_scale, find_scenario
+from tuning.problems.scale import is_stable
+from tuning.search.plan import Plan
+from tuning.search.space import untuned_choice
+from tuning.search.study import open_study, run_study
 
 
 @pytest.fixture

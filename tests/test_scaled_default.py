@@ -3,15 +3,25 @@
 import numpy as np
 import pytest
 
-from tuning.baselines import ORACLE, RULE, SCALED, TUNED, baselines, rule_of_thumb, scaled, scaled_default
-from tuning.compare import contender
-from tuning.evaluate import evaluate, score_ratio
-from tuning.objectives import nis_ratio
-from tuning.plan import TRAINING_SEEDS
-from tuning.proof import Comparison, prove
-from tuning.scenarios import find_scenario, held_out_seeds, training_seeds
-from tuning.space import true_choice, untuned_choice
-from tuning.worth import scaling_sentence, worth
+from tuning.evaluation.baselines import (
+    ORACLE,
+    RULE,
+    SCALED,
+    TUNED,
+    baselines,
+    rule_of_thumb,
+    scaled,
+    scaled_default,
+)
+from tuning.evaluation.compare import contender
+from tuning.evaluation.evaluate import evaluate, score_ratio
+from tuning.evaluation.held_out import Comparison, prove
+from tuning.evaluation.worth import scaling_sentence, worth
+from tuning.problems.find import find_scenario
+from tuning.problems.seeds import held_out_seeds, training_seeds
+from tuning.search.objectives import nis_ratio
+from tuning.search.plan import TRAINING_SEEDS
+from tuning.search.space import true_choice, untuned_choice
 
 MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
 
@@ -54,7 +64,7 @@ def test_where_there_is_no_scaled_default_it_says_why():
 
 
 def test_a_nis_that_jumps_over_one_has_no_factor_either(monkeypatch):
-    import tuning.baselines as module
+    import tuning.evaluation.baselines as module
 
     def jumps(filter_, data, scale, evaluate=module.evaluate):
         nis = 0.5 if filter_.model.process_noise_cov[0, 0] > 1.0 else 2.0

@@ -1,14 +1,14 @@
 import numpy as np
 import pytest
 
-from tuning.evaluate import evaluate
-from tuning.excitation import BinarySequence, Steps
-from tuning.plan import Plan
-from tuning.proof import Comparison
-from tuning.scenarios import computed_scale, find_scenario
-from tuning.space import untuned_choice
-from tuning.study import StudyResult
-from tuning.tuned import read_tuned, write_tuned
+from tuning.evaluation.evaluate import evaluate
+from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.tuned import read_tuned, write_tuned
+from tuning.problems.find import computed_scale, find_scenario
+from tuning.search.plan import Plan
+from tuning.search.space import untuned_choice
+from tuning.search.study import StudyResult
+from tuning.thruster.excitation import BinarySequence, Steps
 
 
 @pytest.fixture

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from filters import KalmanFilter, StateSpaceModel, linearize, run, thruster_model, truth
+from filters import KalmanFilter, StateSpaceModel, linearize, run, thruster_model
+from numerics.compiled import interpreted
+from numerics.streams import episode_keys
+from plants import simulate
 from tests.models import held_voltages
-from thruster_env.compiled import interpreted
-from thruster_env.linear import steady_state
+from thruster_env.linear.steady_state import steady_state
 from thruster_env.plant import make_plant
-from thruster_env.streams import episode_keys
 
 KEYS = np.zeros((1, 2))
 
@@ -16,7 +17,7 @@ KEYS = np.zeros((1, 2))
 def simulated(model, steps=100):
     inputs = held_voltages(1, steps // 10, hold=10, seed=1, limit=30.0)
     with interpreted():
-        return truth.simulate(model, episode_keys([1]), inputs).measurements, inputs
+        return simulate.simulate(model, episode_keys([1]), inputs).measurements, inputs
 
 
 @pytest.mark.parametrize("count", [2, 5])
@@ -70,7 +71,7 @@ def test_compiled_batch_loop_and_python_agree():
 def test_on_the_thruster_it_is_much_better_than_the_filter_of_one_point():
     model = thruster_model()
     inputs = held_voltages(40, 20)
-    drawn = truth.simulate(model, episode_keys(range(40)), inputs)
+    drawn = simulate.simulate(model, episode_keys(range(40)), inputs)
 
     def rmse(filter_):
         errors = (run(filter_, np.zeros((40, 2)), inputs, drawn.measurements).means - drawn.states)[:, 50:]

@@ -7,19 +7,19 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from tuning import trials
-from tuning.evaluate import evaluate, score_ratio
-from tuning.followers import LIKELIEST, LIKELIEST_AFTER, TWIN
-from tuning.gradient import BAD_START, maximise_likelihood
-from tuning.objectives import LARGEST, NIS_BAND, nis_violation
-from tuning.outcome import best_trial, violation
-from tuning.plan import Plan
-from tuning.proof import prove
-from tuning.samplers import SAMPLERS, make_sampler
-from tuning.scenarios import find_scenario
-from tuning.space import choice_of, distributions, true_choice, untuned_choice
-from tuning.study import open_study, run_study
-from tuning.trials import BLOCK, measure
+from tuning.evaluation.evaluate import evaluate, score_ratio
+from tuning.evaluation.held_out import prove
+from tuning.likelihood.gradient import BAD_START, maximise_likelihood
+from tuning.problems.find import find_scenario
+from tuning.search import trials
+from tuning.search.enqueued import LIKELIEST, LIKELIEST_AFTER, TWIN
+from tuning.search.objectives import LARGEST, NIS_BAND, nis_violation
+from tuning.search.outcome import best_trial, violation
+from tuning.search.plan import Plan
+from tuning.search.samplers import SAMPLERS, make_sampler
+from tuning.search.space import choice_of, distributions, true_choice, untuned_choice
+from tuning.search.study import open_study, run_study
+from tuning.search.trials import BLOCK, measure
 
 MISMATCH, NOMINAL, OUTLIERS = map(find_scenario, ("mismatch", "nominal", "outliers"))
 PLAN = Plan("ekf", (MISMATCH,))

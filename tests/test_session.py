@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from filters import affine_model, make_filter, thruster_model
-from filters.session import Session
-from thruster_env.compiled import interpreted
+from filters.engine.session import Session
+from numerics.compiled import interpreted
 
 
 def of_three_states():

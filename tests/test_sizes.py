@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from filters.consistency.intervals import Interval
-from tuning import sizes
-from tuning.evaluate import evaluate
-from tuning.plan import HELD_OUT_SEEDS, SIZE_SEEDS, TRAINING_SEEDS, Plan
-from tuning.scenarios import find_scenario, held_out_seeds, size_seeds, training_seeds
-from tuning.sizes import SizeRow, ensemble_sizes, sufficient_size
-from tuning.space import untuned_choice
+from tuning.evaluation import sizes
+from tuning.evaluation.evaluate import evaluate
+from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
+from tuning.problems.find import find_scenario
+from tuning.problems.seeds import held_out_seeds, size_seeds, training_seeds
+from tuning.search.plan import HELD_OUT_SEEDS, SIZE_SEEDS, TRAINING_SEEDS, Plan
+from tuning.search.space import untuned_choice
 
 MISMATCH = find_scenario("mismatch")
 

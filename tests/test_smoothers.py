@@ -13,15 +13,16 @@ from filters import (
     KalmanFilter,
     UnscentedKalmanFilter,
     run,
-    truth,
 )
 from filters.consistency.intervals import mean_interval, rmse_ratios
 from filters.consistency.nees import normalized_squares
 from filters.smoothers.smooth import smooth
+from numerics.compiled import interpreted
+from numerics.streams import episode_keys
+from plants import simulate
 from tests.models import KEY, held_voltages, pendulum, scalar_model, simulated, swing, wide_model
-from thruster_env.compiled import interpreted
-from thruster_env.streams import episode_keys
-from tuning.scenarios import find_scenario, held_out_seeds
+from tuning.problems.find import find_scenario
+from tuning.problems.seeds import held_out_seeds
 
 KEYS = np.array([KEY])
 with_gaps = partial(simulated, level=1.0, missing=0.25)
@@ -182,7 +183,7 @@ def test_a_scheduled_filter_is_smoothed_with_the_model_of_each_input():
     filter_ = KalmanFilter(model=model, schedule=5)
     inputs = held_voltages(1, 5, hold=4, seed=2)
     with interpreted():
-        measurements = truth.simulate(model, episode_keys([2]), inputs).measurements
+        measurements = simulate.simulate(model, episode_keys([2]), inputs).measurements
         filtered = run(filter_, KEYS, inputs, measurements)
         found = smooth(filter_, KEYS, inputs, measurements)
         x, p = filtered.means[0, -1], filtered.covs[0, -1]

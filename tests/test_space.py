@@ -2,10 +2,10 @@ import optuna
 import pytest
 
 from filters.registry import FILTERS
-from tuning.plan import Plan
-from tuning.scenarios import find_scenario
-from tuning.space import choice_of, parameters_of, size_ladder, untuned_choice
-from tuning.study import open_study
+from tuning.problems.find import find_scenario
+from tuning.search.plan import Plan
+from tuning.search.space import choice_of, parameters_of, size_ladder, untuned_choice
+from tuning.search.study import open_study
 
 NOMINAL = find_scenario("nominal")
 

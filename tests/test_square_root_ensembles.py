@@ -13,12 +13,13 @@ from filters import (
     run,
 )
 from filters.ensembles.transform import geometric_mean
+from numerics.compiled import interpreted
+from numerics.streams import filter_keys
 from tests.models import KEY, simulated, wide_model
 from tests.oracles import convergence
-from thruster_env.compiled import interpreted
-from thruster_env.streams import filter_keys
-from tuning.evaluate import evaluate
-from tuning.scenarios import find_scenario, held_out_seeds
+from tuning.evaluation.evaluate import evaluate
+from tuning.problems.find import find_scenario
+from tuning.problems.seeds import held_out_seeds
 
 SIZE = 9
 SQUARE_ROOTS = EnsembleTransformFilter, SerialSquareRootFilter

@@ -7,15 +7,15 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
-from filters.thruster import thruster_model
-from tuning.evaluate import evaluate
-from tuning.followers import TWIN
-from tuning.plan import Plan
-from tuning.proof import prove
-from tuning.scenarios import find_scenario
-from tuning.space import untuned_choice
-from tuning.study import open_study, run_study
-from tuning.tuned import read_tuned, write_tuned
+from thruster_env.model import thruster_model
+from tuning.evaluation.evaluate import evaluate
+from tuning.evaluation.held_out import prove
+from tuning.evaluation.tuned import read_tuned, write_tuned
+from tuning.problems.find import find_scenario
+from tuning.search.enqueued import TWIN
+from tuning.search.plan import Plan
+from tuning.search.space import untuned_choice
+from tuning.search.study import open_study, run_study
 
 STARTUP, NOMINAL = find_scenario("startup"), find_scenario("nominal")
 PLAN = Plan("ekf", (STARTUP,))

@@ -6,10 +6,10 @@ import optuna
 import pytest
 import sqlalchemy
 
-from tuning import storage as storages
-from tuning.report_subject import find_subject
-from tuning.storage import open_storage
-from tuning.storage_url import shown_storage, without_secrets
+from tuning.report.subject import find_subject
+from tuning.search import storage as storages
+from tuning.search.storage import open_storage
+from tuning.search.storage_url import shown_storage, without_secrets
 
 SHOWN = {
     "postgresql+psycopg2://tuner:secret@host:5432/studies": "postgresql+psycopg2://host:5432/studies",
@@ -113,6 +113,6 @@ def test_an_outage_tells_no_password(tmp_path, monkeypatch):
 
 
 def test_a_report_of_a_study_that_is_not_there_tells_no_password(monkeypatch):
-    monkeypatch.setattr("tuning.report_subject._load", lambda name, storage: None)
+    monkeypatch.setattr("tuning.report.subject._load", lambda name, storage: None)
     with pytest.raises(ValueError, match="of a study in postgresql://host/s, but got 'none'"):
         find_subject("none", "postgresql://tuner:secret@host/s")

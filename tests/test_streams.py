@@ -7,8 +7,8 @@ from gymnasium.utils.seeding import np_random
 from scipy import stats
 
 import thruster_env  # noqa: F401 - registers the env
-from thruster_env import streams
-from thruster_env.compiled import compiled, function_fingerprint
+from numerics import streams
+from numerics.compiled import compiled, function_fingerprint
 from thruster_env.plant import make_plant
 from thruster_env.simulation import simulate
 
@@ -155,7 +155,7 @@ def test_channels_are_filled_in_the_order_of_the_blocks(count):
 
 
 def test_compiled_normals_are_the_interpreted_ones():
-    fingerprint = function_fingerprint()
+    fingerprint = function_fingerprint(within=__name__)
 
     def fill(out, count, key_0, key_1):
         fingerprint  # noqa: B018 - part of the cache's key

@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from filters import KalmanFilter, run
-from filters.truth import simulate
+from plants.simulate import simulate
 from studies import STUDIES
 from studies.comparison import compare, compare_all, discrete_model, optimum
 from studies.findings import findings, study_statements

@@ -9,13 +9,13 @@ import pytest
 from optuna.trial import TrialState
 
 from filters.tuned_file import sealed
-from tuning.plan import Plan
-from tuning.proof import prove
-from tuning.scenarios import find_scenario
-from tuning.space import parameters_of, untuned_choice
-from tuning.storage import PROCESS, RETRY_OF, open_storage
-from tuning.study import finished_trials, open_study, run_study
-from tuning.tuned import read_tuned, write_tuned
+from tuning.evaluation.held_out import prove
+from tuning.evaluation.tuned import read_tuned, write_tuned
+from tuning.problems.find import find_scenario
+from tuning.search.plan import Plan
+from tuning.search.space import parameters_of, untuned_choice
+from tuning.search.storage import PROCESS, RETRY_OF, open_storage
+from tuning.search.study import finished_trials, open_study, run_study
 
 SCENARIO = find_scenario("mismatch")
 PLAN = Plan("ekf", (SCENARIO,))
@@ -122,10 +122,10 @@ def test_a_killed_process_loses_its_running_trial_only(tmp_path):
     path = tmp_path / "j"
     program = (
         "import optuna; optuna.logging.set_verbosity(optuna.logging.WARNING)\n"
-        "from tuning.scenarios import find_scenario\n"
-        "from tuning.storage import open_storage\n"
-        "from tuning.plan import Plan\n"
-        "from tuning.study import open_study, run_study\n"
+        "from tuning.problems.find import find_scenario\n"
+        "from tuning.search.storage import open_storage\n"
+        "from tuning.search.plan import Plan\n"
+        "from tuning.search.study import open_study, run_study\n"
         f"s = find_scenario('mismatch'); storage = open_storage({str(path)!r})\n"
         "plan = Plan('ekf', (s,))\n"
         "study = open_study('s', plan, storage)\n"

@@ -9,7 +9,7 @@ from studies.bollard_fit import Identified, PulseWidthMap, identify, predict, re
 from studies.bollard_table import read_table
 from studies.t200_identification import PRESET, T200_PULSE_WIDTHS, coefficients, identified_numbers, main, study
 from thruster_env.dynamics import thrust_and_torque
-from thruster_env.linear import jacobians, required_substeps, steady_state
+from thruster_env.linear.steady_state import jacobians, required_substeps, steady_state
 from thruster_env.parameters import PRESETS, T200, checked, derive_constants
 
 OTHER = Identified(

@@ -13,16 +13,16 @@ from scipy.linalg import expm
 
 from filters import KalmanFilter, run
 from filters.consistency.nees import normalized_squares
-from filters.thruster import model_of_env
-from thruster_env.flow import Sinusoid
-from thruster_env.linear_plant import make_linear_plant
+from numerics.streams import episode_keys
+from plants.disturbances.sensors import Dropout
+from thruster_env.effects.flow import Sinusoid
+from thruster_env.effects.uncertainty import LogNormal
+from thruster_env.linear.linear_plant import make_linear_plant
+from thruster_env.linear.published import PUBLISHED
+from thruster_env.model import model_of_env
 from thruster_env.parameters import TUNNEL_PHYSICAL
-from thruster_env.published import PUBLISHED
-from thruster_env.sensors import Dropout
 from thruster_env.simulation import simulate
-from thruster_env.streams import episode_keys
 from thruster_env.tasks import BowThrusterLinearEnv
-from thruster_env.uncertainty import LogNormal
 
 SURELY = 1e-4  # the probability with which a right program fails such a test, once for all seeds
 IDS = ["BowThruster-v0", "BowThrusterTracking-v0", "BowThrusterReversal-v0", "BowThrusterLinear-v0"]

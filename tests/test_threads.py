@@ -12,9 +12,9 @@ from queue import SimpleQueue
 import numpy as np
 import pytest
 
-from thruster_env.compiled import interpreted
-from thruster_env.signals import LINE, TAKEN, take
-from thruster_env.threads import BEHIND, CALLER, Crew, crew, in_parts, spread
+from numerics.atomics import LINE, TAKEN, take
+from numerics.compiled import interpreted
+from numerics.threads import BEHIND, CALLER, Crew, crew, in_parts, spread
 
 COUNT = 1000
 

@@ -12,13 +12,13 @@ pytest.importorskip("sb3_contrib")
 
 from tests.learners import COPIES, LIMIT, contents, copied, learn, setup_of, short_episodes, steps_of, trained  # noqa: F401 - some are fixtures
 from training.algorithms import ALGORITHMS
-from training.arms import ARMS
 from training.environments import make_environments
 from training.learn import VALIDATION_EPISODES, _episodes_after
+from training.observations import ARMS
 from training.saved import CHECKPOINTS, FINAL, find_saved, load, read_setup
 from training.score import score
 from training.setup import setup_from_json
-from tuning.scenarios import held_out_seeds
+from tuning.problems.seeds import held_out_seeds
 
 
 @pytest.mark.parametrize("observe", ARMS)

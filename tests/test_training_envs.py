@@ -12,13 +12,13 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormalize, VecVideoRecorder
 
 import thruster_env  # noqa: F401 - registers the envs
-from filters.thruster import model_of_env, thrusts_of
+from thruster_env.model import model_of_env, thrusts_of
 from thruster_env.vector_env import BowThrusterTrackingVectorEnv
-from training.arms import ARMS, STACKED
 from training.environments import make_environments, make_single
+from training.observations import ARMS, STACKED
 from training.setup import in_scenario, make_setup
 from training.vec_env import NativeVecEnv
-from tuning.scenarios import find_scenario
+from tuning.problems.find import find_scenario
 
 COPIES, LIMIT, STEPS = 3, 12, 30
 SEEDS = [7, 107, 5]

@@ -14,16 +14,16 @@ import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState, EstimateStates, thruster_model
 from tests.test_cli import thruster  # noqa: F401 - a fixture
 from tests.tuned_files import rewrite, write_untuned
-from thruster_env.flow import Gusts
+from thruster_env.effects.flow import Gusts
 from thruster_env.parameters import PRESETS
 from thruster_env.plant import make_plant
 from thruster_env.plant_data import differences, plant_data
 from training.setup import make_setup
-from tuning.report_subject import find_subject
-from tuning.scenario_files import scenario_of
-from tuning.scenarios import SCENARIOS, find_scenario
-from tuning.tuned import read_tuned
-from tuning.verify import verify
+from tuning.evaluation.tuned import read_tuned
+from tuning.evaluation.verify import verify
+from tuning.problems.find import SCENARIOS, find_scenario
+from tuning.report.subject import find_subject
+from tuning.thruster.files import scenario_of
 
 TOML = 'base = "nominal"\nscale = [1.0, 0.05]\nsteps = 60\nflow = [{name = "gusts", std = 0.5}]\n'
 
@@ -88,7 +88,7 @@ def test_a_linear_system_is_another_plant(nominal):
 
 def test_a_model_of_one_s_own_and_a_file_of_before_are_not_compared(nominal, tmp_path):
     env = gym.make("BowThruster-v0", dt=0.02)
-    model = "filters.thruster:thruster_model"
+    model = "thruster_env.model:thruster_model"
     assert EstimateState(env, tuned=str(nominal), model=model).filter.model.substeps == thruster_model().substeps
 
     def older(content):

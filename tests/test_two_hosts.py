@@ -9,7 +9,7 @@ import pytest
 from optuna.trial import TrialState
 
 from tests.hosts import Refused, database, two_hosts
-from tuning.storage import PROCESS
+from tuning.search.storage import PROCESS
 
 WORKERS, TRIALS, SECONDS = 2, 80, 120
 TUNE = "from thruster_cli.main import run; run()"

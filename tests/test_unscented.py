@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from filters import CubatureKalmanFilter, KalmanFilter, UnscentedKalmanFilter, run, thruster_model, truth
+from filters import CubatureKalmanFilter, KalmanFilter, UnscentedKalmanFilter, run, thruster_model
+from numerics.streams import episode_keys
+from plants import simulate
 from tests.models import held_voltages, pendulum, random_affine, simulated
-from thruster_env.streams import episode_keys
 
 KEYS = np.zeros((1, 2))
 NUMBERS = [(1.0, 2.0, 0.0), (0.1, 2.0, 1.0), (0.5, 0.0, 0.0), (1.3, 1.0, 2.0)]  # alpha, beta, kappa
@@ -90,7 +91,7 @@ def test_it_is_filterpy_s_unscented_filter_on_the_thruster(numbers):
     alpha, beta, kappa = numbers
     model = thruster_model()
     inputs = held_voltages(1, 8, seed=3)
-    drawn = truth.simulate(model, episode_keys([3]), inputs)
+    drawn = simulate.simulate(model, episode_keys([3]), inputs)
     filter_ = UnscentedKalmanFilter(model=model, alpha=alpha, beta=beta, kappa=kappa)
     estimates = run(filter_, KEYS, inputs, drawn.measurements)
 

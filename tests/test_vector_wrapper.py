@@ -7,7 +7,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 from filters import FILTERS, EstimateState, EstimateStates
-from filters.envs import filtered_id
+from filters.wrappers.ids import filtered_id
 
 COPIES, STEPS = 3, 30
 MODES = ["NextStep", "SameStep", "Disabled"]

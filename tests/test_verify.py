@@ -8,12 +8,12 @@ import pytest
 
 from filters.tuned_file import sealed
 from thruster_cli.main import main
-from tuning.plan import Plan
-from tuning.proof import prove
-from tuning.scenarios import find_scenario
-from tuning.study import open_study, run_study
-from tuning.tuned import write_tuned
-from tuning.verify import Difference, verify
+from tuning.evaluation.held_out import prove
+from tuning.evaluation.tuned import write_tuned
+from tuning.evaluation.verify import Difference, verify
+from tuning.problems.find import find_scenario
+from tuning.search.plan import Plan
+from tuning.search.study import open_study, run_study
 
 PLAN = Plan("ekf", (find_scenario("mismatch"), find_scenario("nominal")))
 

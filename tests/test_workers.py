@@ -18,13 +18,13 @@ import typer
 from optuna.trial import TrialState
 
 from thruster_cli.app import app
-from tuning.plan import Plan
-from tuning.samplers import make_sampler
-from tuning.scenarios import find_scenario
-from tuning.space import distributions
-from tuning.storage import PROCESS, RETRY_OF, open_storage
-from tuning.study import finished_trials, open_study
-from tuning.workers import run_in_workers
+from tuning.problems.find import find_scenario
+from tuning.search.plan import Plan
+from tuning.search.samplers import make_sampler
+from tuning.search.space import distributions
+from tuning.search.storage import PROCESS, RETRY_OF, open_storage
+from tuning.search.study import finished_trials, open_study
+from tuning.search.workers import run_in_workers
 
 PLAN = Plan("enkf", (find_scenario("mismatch"),), prune=False)
 WORKERS = 3

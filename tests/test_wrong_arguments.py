@@ -8,8 +8,8 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState, EstimateStates, make_filter, run, smooth, thruster_model
-from filters.belief import LostBelief
-from filters.session import Session
+from filters.engine.belief import LostBelief
+from filters.engine.session import Session
 from tests.models import DT, KEY, pendulum, scalar_model, small
 
 pytestmark = pytest.mark.usefixtures("as_python")

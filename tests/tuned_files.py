@@ -6,12 +6,12 @@ import json
 from pathlib import Path
 
 from filters.tuned_file import sealed
-from tuning.plan import Plan
-from tuning.proof import prove
-from tuning.scenarios import Scenario, find_scenario
-from tuning.space import untuned_choice
-from tuning.study import StudyResult
-from tuning.tuned import write_tuned
+from tuning.evaluation.held_out import prove
+from tuning.evaluation.tuned import write_tuned
+from tuning.problems.find import Scenario, find_scenario
+from tuning.search.plan import Plan
+from tuning.search.space import untuned_choice
+from tuning.search.study import StudyResult
 
 
 def write_untuned(

@@ -14,15 +14,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from filters.augmented import Unknown
 from filters.registry import FILTERS, filter_class
+from numerics.checks import at_least
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
 from thruster_cli.tables import about, unless_blank
-from thruster_env.checks import at_least
-from tuning.compare import Contender, Leaderboard, Row, compare, contender, sized
-from tuning.evaluate import STATES
-from tuning.plan import HELD_OUT_SEEDS
-from tuning.scenarios import SCENARIOS, Scenario, find_scenario, held_out_seeds
-from tuning.space import has_ensemble
-from tuning.tuned import check_plant, read_tuned, summary
+from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender, sized
+from tuning.evaluation.evaluate import STATES
+from tuning.evaluation.tuned import check_plant, read_tuned, summary
+from tuning.problems.find import SCENARIOS, Scenario, find_scenario
+from tuning.problems.seeds import held_out_seeds
+from tuning.search.plan import HELD_OUT_SEEDS
+from tuning.search.space import has_ensemble
 
 DEFAULT_FILTERS = ("ekf", "enkf", "pf")
 

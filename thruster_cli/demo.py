@@ -13,11 +13,12 @@ from thruster_cli.output import JsonOption, SeedOption, emit, progress_console
 from thruster_cli.reproduce import reproduce
 from thruster_cli.tune import tune
 from thruster_cli.tuning_report import Tuning, as_json, report
-from tuning.figures import comparison_figure, estimates_figure, history_figure
-from tuning.plan import Plan
-from tuning.scenarios import find_scenario, held_out_seeds
-from tuning.space import true_choice
-from tuning.worth import worth
+from tuning.evaluation.worth import worth
+from tuning.problems.find import find_scenario
+from tuning.problems.seeds import held_out_seeds
+from tuning.report.figures import comparison_figure, estimates_figure, history_figure
+from tuning.search.plan import Plan
+from tuning.search.space import true_choice
 
 FILTER, SCENARIO = "enkf", "mismatch"  # where tuning earns its keep
 STUDY = "nurhadi2022"
@@ -77,6 +78,8 @@ def draw(tuning: Tuning, out: Path, seed: int) -> list[Path]:
         estimates_figure(out / "estimates.png", filters, data, 0, nominal.plant.dt),
         history_figure(out / "history.png", tuning.result.trials, f"Study of {label}"),
         comparison_figure(
-            out / "rmse.png", tuning.proof, f"{label}: RMSE on {len(tuning.proof.seeds)} held-out seeds"
+            out / "rmse.png",
+            tuning.proof,
+            f"{label}: RMSE on {len(tuning.proof.seeds)} held-out seeds",
         ),
     ]

@@ -7,16 +7,16 @@ from typing import Annotated
 
 import typer
 
-from thruster_cli.honesty import check_request, judge
+from thruster_cli.consistency import check_request, judge
 from thruster_cli.output import FILTER_HELP, JsonOption, SeedOption, announce_compilation, emit, progress_console
 from thruster_cli.tables import choice_table, comparison_table
 from thruster_cli.tuning_report import gains
-from tuning.baselines import RULE, TUNED, baselines, rule_of_thumb
-from tuning.plan import HELD_OUT_SEEDS
-from tuning.proof import prove
-from tuning.scenarios import find_scenario
-from tuning.tuned import check_plant, metrics, read_tuned
-from tuning.worth import scaling_sentence
+from tuning.evaluation.baselines import RULE, TUNED, baselines, rule_of_thumb
+from tuning.evaluation.held_out import prove
+from tuning.evaluation.tuned import check_plant, metrics, read_tuned
+from tuning.evaluation.worth import scaling_sentence
+from tuning.problems.find import find_scenario
+from tuning.search.plan import HELD_OUT_SEEDS
 
 
 def command(

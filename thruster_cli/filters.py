@@ -15,7 +15,7 @@ from rich.text import Text
 from filters.filter import Filter
 from filters.registry import FILTERS, filter_class, tunable_numbers
 from thruster_cli.output import JsonOption, console, emit, table
-from tuning.space import has_ensemble
+from tuning.search.space import has_ensemble
 
 ATTRIBUTES, ERRORS = "Attributes:", "Raises:"  # what these sections of a docstring begin with
 OWNERS_WIDTH = 27  # of the longest number, so that the names of filters take no room from what it means

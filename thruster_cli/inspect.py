@@ -8,8 +8,9 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from numerics.checks import within
 from thruster_cli.output import JsonOption, PresetOption, SeedOption, emit, table
-from thruster_env.analysis import (
+from thruster_env.linear.analysis import (
     GAIN_UNITS,
     INPUTS,
     Analysis,
@@ -20,11 +21,10 @@ from thruster_env.analysis import (
     response_grids,
     step_response,
 )
-from thruster_env.checks import within
-from thruster_env.figures import response_figure
-from thruster_env.linear import SteadyState, state_range, steady_state
+from thruster_env.linear.figures import response_figure
+from thruster_env.linear.published import NO_LINEARISATION, SAMPLE_TIME, PublishedLinearModel, published_for
+from thruster_env.linear.steady_state import SteadyState, state_range, steady_state
 from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, Plant, make_plant
-from thruster_env.published import NO_LINEARISATION, SAMPLE_TIME, PublishedLinearModel, published_for
 
 OUTPUTS = ("omega_m [rad/s]", "U_a [m/s]", "T [N]")
 

@@ -15,9 +15,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from numerics.compiled import tell_when_compiling
+from numerics.files import write_whole
 from thruster_cli.characters import showable
-from thruster_env.compiled import tell_when_compiling
-from thruster_env.files import write_whole
 from thruster_env.parameters import PRESETS
 
 JsonOption = Annotated[

@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from thruster_cli.output import announce_compilation, emit, progress_console
 from training.extras import check_installed
-from tuning.scenarios import held_out_seeds
+from tuning.problems.seeds import held_out_seeds
 
 
 def command(

@@ -9,8 +9,8 @@ import typer
 
 from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console
 from thruster_cli.tune import DEFAULT_STORAGE
-from tuning.report import write_report
-from tuning.study import quiet_optuna
+from tuning.report.report import write_report
+from tuning.search.study import quiet_optuna
 
 
 def command(

@@ -10,6 +10,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from numerics.checks import at_least, one_of
+from numerics.files import check_target
 from studies import STUDIES
 from studies.comparison import LARGEST_ENSEMBLE, MEMBERS, MOST_RUNS, RUNS, compare_all
 from studies.findings import findings, general_statements, study_statements
@@ -22,8 +24,6 @@ from thruster_cli.output import (
     progress_console,
     table,
 )
-from thruster_env.checks import at_least, one_of
-from thruster_env.files import check_target
 
 ALL = "all"
 LINES = "In each cell first omega_m [rad/s], below it U_a [m/s]."

@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from filters.consistency.intervals import mean_interval
+from numerics.checks import one_of
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
 from thruster_cli.tables import about, unless_blank
 from thruster_cli.train import LEARNABLE
-from thruster_env.checks import one_of
-from training.arms import find_arm
 from training.extras import check_installed
+from training.observations import find_arm
 from training.setup import Setup, in_scenario
-from tuning.plan import HELD_OUT_SEEDS
-from tuning.scenarios import Scenario, find_scenario, held_out_seeds
+from tuning.problems.find import Scenario, find_scenario
+from tuning.problems.seeds import held_out_seeds
+from tuning.search.plan import HELD_OUT_SEEDS
 
 if TYPE_CHECKING:
     from training.score import Scores

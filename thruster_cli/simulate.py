@@ -9,9 +9,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from numerics.checks import at_least, positive, within
+from numerics.files import write_whole
+from numerics.streams import episode_keys
 from thruster_cli.output import JsonOption, PresetOption, SeedOption, announce_compilation, emit
-from thruster_env.checks import at_least, positive, within
-from thruster_env.files import write_whole
 from thruster_env.plant import (
     DEFAULT_DT,
     DEFAULT_MEASUREMENT_NOISE,
@@ -19,8 +20,7 @@ from thruster_env.plant import (
     make_plant,
 )
 from thruster_env.simulation import simulate
-from thruster_env.streams import episode_keys
-from tuning.scenarios import held_levels
+from tuning.problems.find import held_levels
 
 MOST_STEPS = 10_000_000  # which take a gigabyte
 COLUMNS = ("time_s", "voltage_V", "omega_m_rad_per_s", "U_a_m_per_s", "thrust_N", "measured_thrust_N")

@@ -9,12 +9,12 @@ import numpy as np
 from rich.table import Table
 
 from thruster_cli.output import table
-from tuning.evaluate import Evaluation, Interval
-from tuning.gradient import GradientResult
-from tuning.kinds import Kind
-from tuning.plan import Plan
-from tuning.scenarios import Scenario
-from tuning.space import Choice, neutral, parameters_of
+from tuning.evaluation.evaluate import Evaluation, Interval
+from tuning.likelihood.gradient import GradientResult
+from tuning.problems.find import Scenario
+from tuning.search.filter_types import Kind
+from tuning.search.plan import Plan
+from tuning.search.space import Choice, neutral, parameters_of
 
 
 def choice_table(choices: Mapping[str, Choice], scenario: Scenario) -> Table:

@@ -14,16 +14,16 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from filters.tuned_file import read_tuned_file
+from numerics.checks import at_least
 from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
-from thruster_env.checks import at_least
-from thruster_env.predictive import HORIZONS
+from thruster_env.control.predictive import HORIZONS
 from training.algorithms import ALGORITHMS
-from training.arms import ARMS
 from training.extras import check_installed
+from training.observations import ARMS
 from training.setup import Setup, make_setup
 from training.tasks import TASKS
-from tuning.scenario import plain
-from tuning.scenarios import SCENARIOS, find_scenario
+from tuning.problems.find import SCENARIOS, find_scenario
+from tuning.thruster.scenario import plain
 
 if TYPE_CHECKING:
     from training.learn import Trained

@@ -12,23 +12,23 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from numerics.checks import at_least, one_of
+from numerics.files import check_target
 from thruster_cli.output import FILTER_HELP, JsonOption, SeedOption, announce_compilation, emit, progress_console
 from thruster_cli.tuning_report import Tuning, as_json, report
-from thruster_env.checks import at_least, one_of
-from thruster_env.files import check_target
-from tuning.gradient import DIFFERENTIABLE, maximise_likelihood
-from tuning.identifiability import identify
-from tuning.kinds import kinds_running
-from tuning.objectives import OBJECTIVES
-from tuning.outcome import best_trial
-from tuning.plan import Plan
-from tuning.proof import prove
-from tuning.samplers import SAMPLERS
-from tuning.scenarios import SCENARIOS, find_scenario
-from tuning.storage import open_storage
-from tuning.study import OnTrial, finished_trials, open_study, quiet_optuna, run_study, run_trials
-from tuning.tuned import write_tuned
-from tuning.workers import run_in_workers
+from tuning.evaluation.held_out import prove
+from tuning.evaluation.tuned import write_tuned
+from tuning.likelihood.gradient import DIFFERENTIABLE, maximise_likelihood
+from tuning.likelihood.identifiability import identify
+from tuning.problems.find import SCENARIOS, find_scenario
+from tuning.search.filter_types import kinds_running
+from tuning.search.objectives import OBJECTIVES
+from tuning.search.outcome import best_trial
+from tuning.search.plan import Plan
+from tuning.search.samplers import SAMPLERS
+from tuning.search.storage import open_storage
+from tuning.search.study import OnTrial, finished_trials, open_study, quiet_optuna, run_study, run_trials
+from tuning.search.workers import run_in_workers
 
 DEFAULT_STORAGE = "out/studies.journal"
 MOST_TRIALS = 1_000_000

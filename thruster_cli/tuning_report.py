@@ -15,21 +15,21 @@ from thruster_cli.tables import (
     kinds_table,
     span,
 )
-from tuning.baselines import ORACLE, RULE, SCALED, TUNED, baselines
-from tuning.evaluate import Evaluation, Interval, score_ratio
-from tuning.gradient import GradientResult
-from tuning.identifiability import Identifiability, as_data, sentences
-from tuning.kinds import kinds_tried
-from tuning.objectives import NIS_BAND
-from tuning.outcome import is_over_budget
-from tuning.plan import Plan
-from tuning.proof import Comparison
-from tuning.scenarios import Scenario
-from tuning.sizes import SIZE_TOLERANCE
-from tuning.space import size_ladder
-from tuning.study import StudyResult
-from tuning.tuned import consistency, metrics
-from tuning.worth import scaling_sentence
+from tuning.evaluation.baselines import ORACLE, RULE, SCALED, TUNED, baselines
+from tuning.evaluation.evaluate import Evaluation, Interval, score_ratio
+from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.sizes import SIZE_TOLERANCE
+from tuning.evaluation.tuned import consistency, metrics
+from tuning.evaluation.worth import scaling_sentence
+from tuning.likelihood.gradient import GradientResult
+from tuning.likelihood.identifiability import Identifiability, as_data, sentences
+from tuning.problems.find import Scenario
+from tuning.search.filter_types import kinds_tried
+from tuning.search.objectives import NIS_BAND
+from tuning.search.outcome import is_over_budget
+from tuning.search.plan import Plan
+from tuning.search.space import size_ladder
+from tuning.search.study import StudyResult
 
 
 class Tuning(NamedTuple):

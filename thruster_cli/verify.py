@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
-from tuning.verify import TOLERANCE, Verification, verify
+from tuning.evaluation.verify import TOLERANCE, Verification, verify
 
 LISTED = 10  # differences in the table; --json has all
 

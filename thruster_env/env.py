@@ -9,16 +9,20 @@ from collections.abc import Mapping
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.batch import Copies
-from thruster_env.checks import finite, shown
-from thruster_env.checks import seed as checked_seed
-from thruster_env.effects import Effect
-from thruster_env.memory import (
+from numerics.checks import finite, shown
+from numerics.checks import seed as checked_seed
+from numerics.streams import draw_key
+from plants.disturbances.effects import Effect
+from plants.disturbances.layout import KEY_0, KEY_1
+from thruster_env.effects.reference import Constant
+from thruster_env.effects.uncertainty import LogNormal, Uniform, as_mapping, drawn_parameters
+from thruster_env.engine.copies import Copies
+from thruster_env.engine.memory import (
     AMBIENT,
     COMMAND,
-    KEY_0,
-    KEY_1,
+    FLOW,
     NEXT_REFERENCE,
+    OMEGA,
     READINGS,
     REFERENCE,
     REPORTED,
@@ -36,11 +40,8 @@ from thruster_env.plant import (
     Plant,
     make_plant,
 )
-from thruster_env.reference import Constant
 from thruster_env.rendering.env import RenderedEnv
-from thruster_env.streams import draw_key
 from thruster_env.task import DEFAULT_WEIGHTS, half_thrust, make_task, thrust_scale
-from thruster_env.uncertainty import LogNormal, Uniform, as_mapping, drawn_parameters
 
 # What `_set_views` makes.
 VIEWS = ("_memory", "_numbers", "_advance", "_report", "_state_view", "_measurement_view")
@@ -156,7 +157,7 @@ class BowThrusterEnv(RenderedEnv):
             self._copies.advance,
         )
         self._report = self._out.reshape(-1)
-        self._state_view, self._measurement_view = self._report[:2], self._report[self._readings]
+        self._state_view, self._measurement_view = self._report[OMEGA : FLOW + 1], self._report[self._readings]
 
     def __getstate__(self) -> dict:
         """The state without its views, for copies and pickles, which go on with the same numbers."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.checks import between, one_of, positive, within
+from numerics.checks import between, one_of, positive, within
 from thruster_env.dynamics import Constants
 
 LARGEST = 1e12  # of a parameter, and one over it the smallest positive one: floating point overflows far beyond

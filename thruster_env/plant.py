@@ -7,16 +7,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.amplifier import AMPLIFIER_EFFECTS
-from thruster_env.analysis import LinearModel
-from thruster_env.checks import at_least, between, covariance, finite, one_of, positive, shown, vector, within
+from numerics.checks import at_least, between, covariance, finite, one_of, positive, shown, vector, within
+from plants.disturbances.effects import Effect
+from plants.disturbances.sensors import SENSOR_EFFECTS
+from thruster_env.channels import CHANNELS
 from thruster_env.dynamics import Constants
-from thruster_env.effects import Effect
-from thruster_env.flow import FLOW_SIGNALS
-from thruster_env.linear import required_substeps, steady_state
+from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
+from thruster_env.effects.flow import FLOW_SIGNALS
+from thruster_env.effects.uncertainty import LogNormal, Uniform, extreme_parameters, make_uncertainty
+from thruster_env.linear.analysis import LinearModel
+from thruster_env.linear.steady_state import required_substeps, steady_state
 from thruster_env.parameters import ThrusterParameters, derive_constants, preset_parameters
-from thruster_env.sensors import CHANNELS, SENSOR_EFFECTS
-from thruster_env.uncertainty import LogNormal, Uniform, extreme_parameters, make_uncertainty
 
 DEFAULT_DT = 0.01  # [s], the sample time of the published experiments
 DEFAULT_MAX_VOLTAGE = 24.0  # [V]

@@ -7,11 +7,11 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
-from thruster_env.checks import shown
-from thruster_env.effects import Effect
+from numerics.checks import shown
+from plants.disturbances.effects import Effect
+from thruster_env.effects.uncertainty import as_mapping
 from thruster_env.parameters import PRESETS, ThrusterParameters
 from thruster_env.plant import Plant
-from thruster_env.uncertainty import as_mapping
 
 # What makes it another plant, on which Q and R mean nothing. The rest disturbs or bounds the same plant.
 ESSENTIAL = ("preset", "system", "dt", "sensors")

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.batch import Copies
-from thruster_env.memory import READINGS, REPORTED, THRUST, VALID
+from thruster_env.engine.copies import Copies
+from thruster_env.engine.memory import FLOW, OMEGA, READINGS, REPORTED, THRUST, VALID
 from thruster_env.plant import Plant
 from thruster_env.task import Task
 
@@ -55,4 +55,4 @@ def simulate(plant: Plant, keys: np.ndarray, voltages: np.ndarray) -> Simulation
     record = np.ascontiguousarray(record.transpose(2, 0, 1))
     readings = record[..., READINGS : READINGS + m]
     valid = record[..., VALID : VALID + m] > 0 if plant.dropping_channels else np.ones(readings.shape, dtype=bool)
-    return Simulation(record[..., :2], record[..., THRUST], readings, valid)
+    return Simulation(record[..., OMEGA : FLOW + 1], record[..., THRUST], readings, valid)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from thruster_env.env import BowThrusterEnv
-from thruster_env.linear_plant import PUBLISHED_NOISE, make_linear_plant
+from thruster_env.linear.linear_plant import PUBLISHED_NOISE, make_linear_plant
 from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE
 from thruster_env.task import DEFAULT_WEIGHTS
 
@@ -24,10 +24,9 @@ class BowThrusterTrackingEnv(BowThrusterEnv):
     ## Reward
     That of step k compares T with r of time k + 1, the one that the action saw.
 
-    ## Arguments
-    `reference` is a list of signals of `thruster_env.reference.REFERENCE_SIGNALS`, which are added, each a mapping
-    with its `name` ("constant", "steps", "ramps", "prbs", "multi-sine", "band-limited-noise", "recorded"); levels
-    are fractions of the steady thrust at max_voltage. By default steps between 0.1 and 0.8, held for 1 s.
+    ## Arguments `reference` is a list of signals of `effects.reference.REFERENCE_SIGNALS`, which are added, each a
+    mapping with its `name` ("constant", "steps", "ramps", "prbs", "multi-sine", "band-limited-noise", "recorded");
+    levels are fractions of the steady thrust at max_voltage. By default steps between 0.1 and 0.8, held for 1 s.
     """
 
     observes_reference = True

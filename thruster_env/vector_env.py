@@ -11,11 +11,22 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from thruster_env.batch import Copies
-from thruster_env.checks import as_floats, at_least, shown
+from numerics.checks import as_floats, at_least, shown
+from numerics.keys import EpisodeKeys, reset_mask
+from thruster_env.engine.copies import Copies
+from thruster_env.engine.memory import (
+    AMBIENT,
+    FLOW,
+    OMEGA,
+    READINGS,
+    REFERENCE,
+    REWARD,
+    TERMINATED,
+    THRUST,
+    TIME,
+    VALID,
+)
 from thruster_env.env import BowThrusterEnv
-from thruster_env.keys import EpisodeKeys, reset_mask
-from thruster_env.memory import AMBIENT, READINGS, REFERENCE, REWARD, TERMINATED, THRUST, TIME, VALID
 from thruster_env.tasks import BowThrusterLinearEnv, BowThrusterReversalEnv, BowThrusterTrackingEnv
 
 MOST_ENVS = 1_000_000  # of some kilobytes each
@@ -154,7 +165,7 @@ class BowThrusterVectorEnv(gym.vector.VectorEnv):
     def _info(self, report: np.ndarray, mask: np.ndarray | None = None) -> dict[str, Any]:
         m = len(self.plant.channels)
         info = {
-            "state": report[:2].T,
+            "state": report[OMEGA : FLOW + 1].T,
             "thrust": report[THRUST],
             "measurement": report[READINGS : READINGS + m].T,
             "reference": report[REFERENCE],

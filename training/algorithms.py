@@ -11,7 +11,7 @@ import importlib
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from thruster_env.checks import one_of
+from numerics.checks import one_of
 from training.extras import check_installed
 
 PPO_STEPS = 98 * 64 * 64  # whole rollouts of 64 steps of 64 copies: the learning rate ends at zero

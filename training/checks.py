@@ -12,12 +12,12 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from filters.registry import tunable_numbers
-from filters.thruster import MODEL_ARGUMENTS
-from thruster_env.checks import at_least, one_of, positive, shown
+from numerics.checks import at_least, one_of, positive, shown
+from thruster_env.control.predictive import HORIZONS
 from thruster_env.env import BowThrusterEnv
-from thruster_env.predictive import HORIZONS
+from thruster_env.model import MODEL_ARGUMENTS
 from training.algorithms import HYPERPARAMETERS, POLICY_ARGUMENTS, find_algorithm
-from training.arms import find_arm
+from training.observations import find_arm
 from training.tasks import TASKS
 
 if TYPE_CHECKING:

@@ -1,6 +1,6 @@
 """Classical policies for the same table: PI, LQR (LQG with an estimator), and the predictive controllers.
 
-Each observes what an arm of `training.arms` does, so it stands beside the policy that learnt on that arm.
+Each observes what an arm of `training.observations` does, so it stands beside the policy that learnt on that arm.
 """
 
 from __future__ import annotations
@@ -10,15 +10,15 @@ from itertools import product
 
 import numpy as np
 
-from thruster_env.checks import one_of
-from thruster_env.control import LQRController, PIController
-from thruster_env.predictive import HORIZONS
-from training.arms import find_arm
+from numerics.checks import one_of
+from thruster_env.control.controllers import LQRController, PIController
+from thruster_env.control.predictive import HORIZONS
 from training.controllers import ClassicalPolicy, predictive
 from training.environments import make_single
+from training.observations import find_arm
 from training.score import score
 from training.setup import Setup
-from tuning.scenarios import training_seeds
+from tuning.problems.seeds import training_seeds
 
 CONTROLLERS = ("pi", "lqr", *HORIZONS)
 FOR_STATES = CONTROLLERS[1:]  # those that must observe one, true or estimated

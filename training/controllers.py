@@ -8,10 +8,10 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from thruster_env.checks import one_of
-from thruster_env.control import LQRController, PIController
+from numerics.checks import one_of
+from thruster_env.control.controllers import LQRController, PIController
+from thruster_env.control.predictive import HORIZONS, PredictiveController
 from thruster_env.dynamics import Constants
-from thruster_env.predictive import HORIZONS, PredictiveController
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from filters import EstimateState, EstimateStates
 from filters.registry import tunable_numbers
-from filters.thruster import model_of_env, thruster_model
+from thruster_env.model import model_of_env, thruster_model
 from thruster_env.observe import ObserveState, ObserveStateVector
-from training.arms import find_arm
 from training.controllers import CorrectController, predictive
+from training.observations import find_arm
 from training.setup import Setup
 from training.vec_env import NativeVecEnv
 from training.views import ShowHistory, ShowThrust

@@ -17,7 +17,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from thruster_env.files import write_whole
+from numerics.files import write_whole
 from training.algorithms import find_algorithm
 from training.environments import make_environments, seed_episodes
 from training.saved import (
@@ -37,8 +37,8 @@ from training.saved import (
     whole,
 )
 from training.setup import Setup
-from tuning.interruption import stop_on_interrupt
-from tuning.scenarios import SEEDS_APART, training_seeds
+from tuning.problems.seeds import SEEDS_APART, training_seeds
+from tuning.search.interruption import stop_on_interrupt
 
 VALIDATION_EPISODES = 32  # of an evaluation in the course of training; always the same ones
 KEPT = 2  # checkpoints

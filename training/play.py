@@ -11,7 +11,7 @@ from typing import NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.files import check_target, write_whole
+from numerics.files import check_target, write_whole
 from training.environments import make_environments
 from training.saved import load, read_setup
 

@@ -9,14 +9,14 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
 from filters.tuned_file import read_tuned_file
-from thruster_env.checks import at_least, one_of, shown
+from numerics.checks import at_least, one_of, shown
 from thruster_env.plant import make_plant
 from thruster_env.plant_data import check_same_plant
 from training.algorithms import find_algorithm
-from training.arms import find_arm
 from training.checks import check_setup
+from training.observations import find_arm
 from training.tasks import TASKS
-from tuning.scenario import Scenario, plain
+from tuning.thruster.scenario import Scenario, plain
 
 VERSION = 1
 MOST_ENVS = 100_000  # whose experience, of 100 steps each, takes a gigabyte
@@ -29,7 +29,7 @@ class Setup:
     """What is learnt, from what, by what.
 
     Attributes:
-        observe: name of an arm, see `training.arms`.
+        observe: name of an arm, see `training.observations`.
         algo: name of an algorithm, see `training.algorithms`.
         task: name of the task.
         scenario: name of the scenario, which says what the plant and its noise are.

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
-from thruster_env.checks import one_of
+from numerics.checks import one_of
 
 
 class NativeVecEnv(VecEnv):

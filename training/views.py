@@ -6,8 +6,8 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from filters.model import StateSpaceModel
-from filters.thruster import thrusts_of
+from plants.state_space import StateSpaceModel
+from thruster_env.model import thrusts_of
 
 
 class ShowThrust(VecEnvWrapper):

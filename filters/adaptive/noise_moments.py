@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache, lru_cache
 
-from filters import matrices
 from filters.gaussian.extended import silenced
-from thruster_env.compiled import inlined
-from thruster_env.components import matrix_of, written_out
+from numerics import matrices
+from numerics.compiled import inlined
+from numerics.tuples import matrix_of, written_out
 
 
 @lru_cache(maxsize=64)

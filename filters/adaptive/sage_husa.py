@@ -9,10 +9,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters import matrices
 from filters.adaptive.noise_moments import mixer, outer
-from filters.belief import Belief, Kernels
-from filters.derivatives import jacobian
+from filters.engine.belief import Belief, Kernels
+from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
 from filters.gaussian.extended import (
     extended_prediction,
@@ -21,10 +20,12 @@ from filters.gaussian.extended import (
     kernels_of,
     nothing_to_summarise,
 )
-from filters.rows import constants_reader, memory_places, number_places, own_place, row_access
-from thruster_env.checks import finite
-from thruster_env.compiled import inlined
-from thruster_env.components import matrix_of, matrix_reader, matrix_writer, scaled_sum, vector_reader, written_out
+from numerics import matrices
+from numerics.checks import finite
+from numerics.compiled import inlined
+from numerics.derivatives import jacobian
+from numerics.tuples import matrix_of, matrix_reader, matrix_writer, scaled_sum, vector_reader, written_out
+from plants.layout import constants_reader, number_places
 
 
 @lru_cache(maxsize=64)

@@ -10,15 +10,16 @@ import numpy as np
 
 from filters.adaptive.noise_moments import measurement_noise_moment, mixer
 from filters.adaptive.sage_husa import part_that_is_kept
-from filters.belief import Belief, Kernels
-from filters.derivatives import jacobian
+from filters.engine.belief import Belief, Kernels
+from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
 from filters.gaussian.extended import extended_kernels, gaussian_update, kernels_of, nothing_to_summarise
 from filters.particles.weighted import anything_measured
-from filters.rows import constants_reader, memory_places, number_places, own_place, row_access
-from thruster_env.checks import at_least, positive
-from thruster_env.compiled import inlined
-from thruster_env.components import matrix_reader, matrix_writer, vector_reader
+from numerics.checks import at_least, positive
+from numerics.compiled import inlined
+from numerics.derivatives import jacobian
+from numerics.tuples import matrix_reader, matrix_writer, vector_reader
+from plants.layout import constants_reader, number_places
 
 MOST_ITERATIONS = 1000
 

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.batch import Estimates
 from filters.consistency.intervals import Interval, mean_interval
 from filters.consistency.nees import SquaresCheck, check_squares
 from filters.consistency.scores import (
@@ -20,6 +19,7 @@ from filters.consistency.scores import (
 )
 from filters.consistency.uniformity import Uniformity, uniformity
 from filters.consistency.whiteness import LAGS, Whiteness, whiteness
+from filters.engine.batch import Estimates
 from filters.ensembles.recording import Members
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from filters.consistency.nees import whitened
-from thruster_env.checks import at_least
+from numerics.checks import at_least
 
 LAGS = 20
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import ClassVar
 
-from filters import matrices
 from filters.ensembles.ensemble import EnsembleFilter, measurement_moments
-from thruster_env.compiled import inlined
-from thruster_env.components import column_writer, matrix_of, tuple_of, written_out
+from numerics import matrices
+from numerics.compiled import inlined
+from numerics.tuples import column_writer, matrix_of, tuple_of, written_out
 
 
 @cache

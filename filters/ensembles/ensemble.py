@@ -7,15 +7,16 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
 
-from filters import matrices
-from filters.belief import Kernels
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places, row_access
 from filters.ensembles.inflation import with_spread_control
 from filters.ensembles.members import add_noise, drawer, ensemble_motion, row_covariances, row_means
 from filters.filter import Filter
-from filters.rows import constants_form, constants_reader, memory_places, number_places, row_access
-from thruster_env.checks import at_least, positive, shown
-from thruster_env.compiled import inlined
-from thruster_env.components import (
+from numerics import matrices
+from numerics.checks import at_least, positive, shown
+from numerics.compiled import inlined
+from numerics.streams import FILTER_MEASUREMENT
+from numerics.tuples import (
     column_reader,
     column_writer,
     matrix_reader,
@@ -23,7 +24,7 @@ from thruster_env.components import (
     vector_reader,
     written_out,
 )
-from thruster_env.streams import FILTER_MEASUREMENT
+from plants.layout import constants_form, constants_reader, number_places
 
 LARGEST_ENSEMBLE = 1_000_000
 

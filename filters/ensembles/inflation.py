@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache, lru_cache
 
-from filters.belief import Kernels
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places, own_place
 from filters.ensembles.members import row_covariances, row_means
-from filters.rows import memory_places, own_place
-from thruster_env.compiled import inlined
-from thruster_env.components import tuple_of, vector_reader, written_out
+from numerics.compiled import inlined
+from numerics.tuples import tuple_of, vector_reader, written_out
 
 
 @cache

@@ -7,15 +7,16 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import ClassVar
 
-from filters import matrices
+from filters.engine.layout import own_place
 from filters.ensembles.deterministic import moved_member
 from filters.ensembles.ensemble import EnsembleFilter, measurement_moments, silence
 from filters.ensembles.members import row_covariances, row_means
 from filters.ensembles.transform import geometric_mean, transform_gain
-from filters.rows import constants_reader, own_place
-from thruster_env.checks import at_least
-from thruster_env.compiled import inlined
-from thruster_env.components import column_writer, tuple_of, vector_reader, written_out
+from numerics import matrices
+from numerics.checks import at_least
+from numerics.compiled import inlined
+from numerics.tuples import column_writer, tuple_of, vector_reader, written_out
+from plants.layout import constants_reader
 
 MOST_ITERATIONS = 1000
 

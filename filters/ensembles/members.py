@@ -6,10 +6,11 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import NamedTuple
 
-from filters.rows import constants_reader, memory_places, number_places, row_access
-from thruster_env.compiled import inlined
-from thruster_env.components import column_reader, column_writer, matrix_of, tuple_of, vector_reader, written_out
-from thruster_env.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
+from filters.engine.layout import memory_places, row_access
+from numerics.compiled import inlined
+from numerics.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
+from numerics.tuples import column_reader, column_writer, matrix_of, tuple_of, vector_reader, written_out
+from plants.layout import constants_reader, number_places
 
 
 @inlined

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from filters.engine.session import Session
 from filters.filter import Filter
-from filters.session import Session
-from thruster_env.checks import at_least
+from numerics.checks import at_least
 
 
 class Members(NamedTuple):

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from functools import cache
 from typing import ClassVar
 
-from filters import matrices
 from filters.ensembles.deterministic import deterministic_analysis
 from filters.ensembles.ensemble import EnsembleFilter
-from thruster_env.compiled import inlined
-from thruster_env.components import matrix_of, written_out
+from numerics import matrices
+from numerics.compiled import inlined
+from numerics.tuples import matrix_of, written_out
 
 
 @cache

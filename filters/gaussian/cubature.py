@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from filters.belief import Kernels
+from filters.engine.belief import Kernels
 from filters.filter import Filter
 from filters.gaussian.sigma_points import PointSet, kernels_of
 

@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import ClassVar
 
-from filters import matrices
-from filters.belief import Kernels
-from filters.derivatives import jacobian
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places, row_access
 from filters.filter import Filter
-from filters.model import StateSpaceModel
-from filters.rows import constants_form, constants_reader, memory_places, number_places, row_access
-from thruster_env.compiled import inlined
-from thruster_env.components import matrix_of, matrix_reader, matrix_writer, scaled_sum, vector_reader, written_out
+from numerics import matrices
+from numerics.compiled import inlined
+from numerics.derivatives import jacobian
+from numerics.tuples import matrix_of, matrix_reader, matrix_writer, scaled_sum, vector_reader, written_out
+from plants.layout import constants_form, constants_reader, number_places
+from plants.state_space import StateSpaceModel
 
 
 @lru_cache(maxsize=64)

@@ -9,16 +9,17 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from filters import matrices
-from filters.belief import Belief, Kernels
+from filters.engine.belief import Belief, Kernels
+from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
-from filters.gaussian.affine import AffineModel, affine_functions, linearize
 from filters.gaussian.extended import gaussian_update, nothing_to_summarise
 from filters.gaussian.mixture import blender, part_matrix, part_vector
-from filters.rows import constants_form, memory_places, number_places, own_place, row_access
-from thruster_env.checks import one_of, shown, vector
-from thruster_env.compiled import inlined
-from thruster_env.components import matrix_reader, tuple_of, vector_reader, written_out
+from numerics import matrices
+from numerics.checks import one_of, shown, vector
+from numerics.compiled import inlined
+from numerics.tuples import matrix_reader, tuple_of, vector_reader, written_out
+from plants.affine import AffineModel, affine_functions, linearize
+from plants.layout import constants_form, number_places
 
 MOST_STATES = 8  # 256 rules
 BLENDINGS = ("weights", "moments", "output")

@@ -10,17 +10,18 @@ from typing import ClassVar
 import numpy as np
 
 from filters.adaptive.noise_moments import mixer, outer
-from filters.baselines import place_of
-from filters.belief import Belief, Kernels
-from filters.derivatives import jacobian
+from filters.baselines.baselines import place_of
+from filters.engine.belief import Belief, Kernels
+from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
 from filters.gaussian.extended import extended_kernels, gaussian_update, kernels_of
 from filters.gaussian.mixture import blender, part_matrix, part_vector
 from filters.particles.weighted import anything_measured
-from filters.rows import constants_reader, memory_places, number_places, own_place, row_access
-from thruster_env.checks import at_least
-from thruster_env.compiled import inlined
-from thruster_env.components import matrix_reader, scaled_sum, tuple_of, vector_reader, written_out
+from numerics.checks import at_least
+from numerics.compiled import inlined
+from numerics.derivatives import jacobian
+from numerics.tuples import matrix_reader, scaled_sum, tuple_of, vector_reader, written_out
+from plants.layout import constants_reader, number_places
 
 FEWEST_PARTS, MOST_PARTS = 7, 1000
 REACH = 4.5  # of the outermost parts, in standard deviations of the split component

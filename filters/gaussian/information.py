@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from filters import matrices
-from filters.belief import Kernels
-from filters.derivatives import jacobian
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places, row_access
 from filters.gaussian.extended import extended_kernels, gaussian_innovation
-from filters.rows import constants_reader, memory_places, number_places, row_access
-from thruster_env.compiled import inlined
-from thruster_env.components import matrix_of, matrix_reader, scaled_sum, vector_reader, written_out
+from numerics import matrices
+from numerics.compiled import inlined
+from numerics.derivatives import jacobian
+from numerics.tuples import matrix_of, matrix_reader, scaled_sum, vector_reader, written_out
+from plants.layout import constants_reader, number_places
 
 
 @lru_cache(maxsize=64)

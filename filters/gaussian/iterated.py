@@ -6,14 +6,15 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import ClassVar
 
-from filters.belief import Kernels
-from filters.derivatives import jacobian
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places, row_access
 from filters.filter import Filter
 from filters.gaussian.extended import extended_kernels, gaussian_update, kernels_of
-from filters.rows import constants_reader, memory_places, number_places, row_access
-from thruster_env.checks import at_least
-from thruster_env.compiled import inlined
-from thruster_env.components import matrix_reader, tuple_of, vector_reader, written_out
+from numerics.checks import at_least
+from numerics.compiled import inlined
+from numerics.derivatives import jacobian
+from numerics.tuples import matrix_reader, tuple_of, vector_reader, written_out
+from plants.layout import constants_reader, number_places
 
 MOST_ITERATIONS = 20
 

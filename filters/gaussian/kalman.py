@@ -8,14 +8,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters.belief import Kernels
+from filters.engine.belief import Kernels
 from filters.filter import Filter
-from filters.gaussian.affine import AffineModel, linearize
 from filters.gaussian.extended import extended_kernels, kernels_of
 from filters.gaussian.information import information_kernels
 from filters.gaussian.schedule import scheduled_kernels
 from filters.gaussian.square_root import square_root_kernels
-from thruster_env.checks import at_least, covariance, one_of
+from numerics.checks import at_least, covariance, one_of
+from plants.affine import AffineModel, linearize
 
 MOST_POINTS = 200  # of a schedule; the source is written out for them
 FORMS = {

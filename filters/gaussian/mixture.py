@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
-from thruster_env.compiled import inlined
-from thruster_env.components import matrix_of, tuple_of, written_out
+from numerics.compiled import inlined
+from numerics.tuples import matrix_of, tuple_of, written_out
 
 
 @cache

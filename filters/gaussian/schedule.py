@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache, lru_cache
 
-from filters.belief import Kernels
-from filters.gaussian.affine import affine_functions
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places, own_place, row_access
 from filters.gaussian.extended import (
     gaussian_correction,
     gaussian_start,
@@ -14,10 +14,11 @@ from filters.gaussian.extended import (
     noise_added,
     nothing_to_summarise,
 )
-from filters.matrices import multiplier, transposed_multiplier
-from filters.rows import memory_places, number_places, own_place, row_access
-from thruster_env.compiled import inlined
-from thruster_env.components import matrix_reader, tuple_of, vector_reader, vector_writer, written_out
+from numerics.compiled import inlined
+from numerics.matrices import multiplier, transposed_multiplier
+from numerics.tuples import matrix_reader, tuple_of, vector_reader, vector_writer, written_out
+from plants.affine import affine_functions
+from plants.layout import number_places
 
 
 def constants_of_affine(n: int, m: int, p: int) -> int:

@@ -6,13 +6,12 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import NamedTuple
 
-from filters import matrices
-from filters.belief import Kernels
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places, own_place, row_access
 from filters.gaussian.extended import gaussian_start, in_stages, nothing_to_summarise
-from filters.model import StateSpaceModel
-from filters.rows import constants_form, constants_reader, memory_places, number_places, own_place, row_access
-from thruster_env.compiled import inlined
-from thruster_env.components import (
+from numerics import matrices
+from numerics.compiled import inlined
+from numerics.tuples import (
     matrix_of,
     matrix_reader,
     matrix_writer,
@@ -21,6 +20,8 @@ from thruster_env.components import (
     vector_reader,
     written_out,
 )
+from plants.layout import constants_form, constants_reader, number_places
+from plants.state_space import StateSpaceModel
 
 
 class PointSet(NamedTuple):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from filters import matrices
-from filters.belief import Kernels
-from filters.derivatives import jacobian
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places, row_access
 from filters.gaussian.extended import gaussian_start, in_stages, nothing_at_first, nothing_to_summarise, silenced
-from filters.rows import constants_reader, memory_places, number_places, row_access
-from thruster_env.compiled import inlined
-from thruster_env.components import (
+from numerics import matrices
+from numerics.compiled import inlined
+from numerics.derivatives import jacobian
+from numerics.tuples import (
     matrix_of,
     matrix_reader,
     matrix_writer,
@@ -19,6 +19,7 @@ from thruster_env.components import (
     vector_writer,
     written_out,
 )
+from plants.layout import constants_reader, number_places
 
 
 @lru_cache(maxsize=64)

@@ -8,14 +8,15 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters import matrices
-from filters.belief import Kernels
 from filters.bounds import riccati_covariances
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places, own_place, row_access
 from filters.gaussian.extended import extended_kernels, gaussian_innovation, joseph_form, kernels_of
 from filters.gaussian.kalman import AffineFilter
-from filters.rows import constants_reader, memory_places, number_places, own_place, row_access
-from thruster_env.compiled import inlined
-from thruster_env.components import matrix_of, matrix_reader, scaled_sum, vector_reader, written_out
+from numerics import matrices
+from numerics.compiled import inlined
+from numerics.tuples import matrix_of, matrix_reader, scaled_sum, vector_reader, written_out
+from plants.layout import constants_reader, number_places
 
 STABLE = 1.0 - 1e-7  # magnitude of an eigenvalue of A (I - K C): an error lasts for less than ten million steps
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from filters.belief import Kernels
+from filters.engine.belief import Kernels
 from filters.filter import Filter
 from filters.gaussian.sigma_points import PointSet, kernels_of
-from thruster_env.checks import finite, positive
+from numerics.checks import finite, positive
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

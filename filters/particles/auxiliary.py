@@ -7,15 +7,16 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
 
-from filters import matrices
-from filters.belief import Kernels
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places
 from filters.ensembles.members import add_noise, ensemble_motion
 from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
 from filters.particles.weights import normalise, read_weights, systematic_resampler, weighted_squares
-from filters.rows import constants_form, constants_reader, memory_places, number_places
-from thruster_env.compiled import inlined
-from thruster_env.components import column_reader, column_writer, matrix_reader, scaled_sum
-from thruster_env.streams import FILTER_MEASUREMENT, uniform_block
+from numerics import matrices
+from numerics.compiled import inlined
+from numerics.streams import FILTER_MEASUREMENT, uniform_block
+from numerics.tuples import column_reader, column_writer, matrix_reader, scaled_sum
+from plants.layout import constants_form, constants_reader, number_places
 
 
 @lru_cache(maxsize=64)

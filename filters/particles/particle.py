@@ -6,15 +6,16 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
 
-from filters.belief import Kernels
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places, own_place
 from filters.ensembles.members import ensemble_motion
 from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
 from filters.particles.weights import read_weights, systematic_resampler
-from filters.rows import constants_form, memory_places, number_places, own_place
-from thruster_env.checks import finite
-from thruster_env.compiled import inlined
-from thruster_env.components import column_reader, matrix_reader
-from thruster_env.streams import FILTER_MEASUREMENT, uniform_block
+from numerics.checks import finite
+from numerics.compiled import inlined
+from numerics.streams import FILTER_MEASUREMENT, uniform_block
+from numerics.tuples import column_reader, matrix_reader
+from plants.layout import constants_form, number_places
 
 
 @lru_cache(maxsize=64)

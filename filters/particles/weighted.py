@@ -8,15 +8,16 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar, NamedTuple
 
-from filters import matrices
-from filters.belief import Belief
+from filters.engine.belief import Belief
+from filters.engine.layout import memory_places, row_access
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.filter import Filter
 from filters.particles.weights import log_density, normalise, read_weights, weighted_covariances, weighted_means
-from filters.rows import constants_reader, memory_places, number_places, row_access
-from thruster_env.checks import at_least
-from thruster_env.compiled import inlined
-from thruster_env.components import column_reader, column_writer, matrix_reader, vector_reader
+from numerics import matrices
+from numerics.checks import at_least
+from numerics.compiled import inlined
+from numerics.tuples import column_reader, column_writer, matrix_reader, vector_reader
+from plants.layout import constants_reader, number_places
 
 
 class ParticleParts(NamedTuple):

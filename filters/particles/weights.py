@@ -8,8 +8,8 @@ from functools import cache
 
 import numpy as np
 
-from thruster_env.compiled import inlined
-from thruster_env.components import column_reader, column_writer, matrix_of, tuple_of, written_out
+from numerics.compiled import inlined
+from numerics.tuples import column_reader, column_writer, matrix_of, tuple_of, written_out
 
 _LOWEST = -46.0  # e^-46 = 1e-20 is nothing beside 1, and still tells how far the others are off
 _LN_2, _PER_LN_2 = math.log(2.0), 1.0 / math.log(2.0)

@@ -8,16 +8,17 @@ from functools import cache, lru_cache
 
 import numpy as np
 
-from filters.belief import Kernels
-from filters.engine import new_memory
+from filters.engine.belief import Kernels
+from filters.engine.compile import new_memory
+from filters.engine.layout import memory_places
+from filters.engine.restart import restart_if_lost
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.ensembles.members import row_covariances, row_means
-from filters.model import StateSpaceModel
-from filters.restart import restart_if_lost
-from filters.rows import constants_form, memory_places
-from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from thruster_env.components import tuple_of, written_out
-from thruster_env.threads import spread
+from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from numerics.threads import spread
+from numerics.tuples import tuple_of, written_out
+from plants.layout import constants_form
+from plants.state_space import StateSpaceModel
 
 
 def smooth_ensembles(
@@ -85,7 +86,7 @@ def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> C
     write_mean = written_out("write", "out, b, k, x", *(f"out[b, k, {i}] = x[{i}]" for i in range(n)), "None")
     entries = (f"out[b, k, {i}, {j}] = p[{i}][{j}]" for i in range(n) for j in range(n))
     write_cov = written_out("write", "out, b, k, p", *entries, "None")
-    fingerprint = function_fingerprint(start, predict, update, analyse_pair)
+    fingerprint = function_fingerprint(start, predict, update, analyse_pair, within=__name__)
 
     @inlined
     def copy(target, first, source):

@@ -7,16 +7,17 @@ from functools import cache, lru_cache
 
 import numpy as np
 
-from filters import matrices
-from filters.batch import Estimates
-from filters.derivatives import jacobian
+from filters.engine.batch import Estimates
+from filters.engine.layout import own_place
 from filters.filter import Filter
-from filters.gaussian.affine import affine_functions
 from filters.gaussian.schedule import constants_of_affine, interpolator
-from filters.rows import constants_reader, number_places, own_place
-from thruster_env.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from thruster_env.components import matrix_of, matrix_reader, tuple_of, vector_reader, written_out
-from thruster_env.threads import spread
+from numerics import matrices
+from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from numerics.derivatives import jacobian
+from numerics.threads import spread
+from numerics.tuples import matrix_of, matrix_reader, tuple_of, vector_reader, written_out
+from plants.affine import affine_functions
+from plants.layout import constants_reader, number_places
 
 NEGLIGIBLE = 1e-13  # a pivot of a predicted covariance below this part of its variance counts as zero
 
@@ -144,7 +145,7 @@ def _smoother(relate: Callable, n: int, interpreting: bool) -> CompiledOrPython:
     )
     sums = (" + ".join([f"x[{i}]", *(f"g[{i}][{j}] * (s[{j}] - e[{j}])" for j in range(n))]) for i in range(n))
     corrected = written_out("corrected", "x, g, s, e", tuple_of(sums))
-    fingerprint = function_fingerprint(relate)
+    fingerprint = function_fingerprint(relate, within=__name__)
 
     @inlined
     def connect(given, inputs, numbers, links, u, b):

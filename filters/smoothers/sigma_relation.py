@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 
-from filters import matrices
+from filters.engine.layout import own_place
 from filters.gaussian.sigma_points import PointSet, cross_scatter, deviations, points_around, residuals, scatter
-from filters.rows import constants_reader, number_places, own_place
 from filters.smoothers.rts import careful_factor
-from thruster_env.compiled import inlined
-from thruster_env.components import matrix_reader, tuple_of, vector_reader, written_out
+from numerics import matrices
+from numerics.compiled import inlined
+from numerics.tuples import matrix_reader, tuple_of, vector_reader, written_out
+from plants.layout import constants_reader, number_places
 
 
 @lru_cache(maxsize=64)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.batch import run, trajectories
+from filters.engine.batch import run, trajectories
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.filter import Filter
 from filters.gaussian.cubature import CubatureKalmanFilter
@@ -15,12 +15,12 @@ from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.gaussian.iterated import IteratedExtendedKalmanFilter
 from filters.gaussian.kalman import KalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
-from filters.rows import constants_form
 from filters.smoothers.ensemble import smooth_ensembles
 from filters.smoothers.rts import extended_relation, scheduled_relation, smooth_backwards
 from filters.smoothers.sigma_relation import sigma_relation
-from thruster_env.checks import at_least
-from thruster_env.compiled import inlined
+from numerics.checks import at_least
+from numerics.compiled import inlined
+from plants.layout import constants_form
 
 LINEARISED = (KalmanFilter, ExtendedKalmanFilter, IteratedExtendedKalmanFilter)
 WITH_POINTS = {UnscentedKalmanFilter: True, CubatureKalmanFilter: False}  # whether the mean is a point

@@ -22,11 +22,11 @@ from filters.tuned_file import sealed
 from tests.tuned_files import write_untuned
 from training.environments import make_environments
 from training.setup import make_setup, setup_from_json
-from tuning.plan import Plan
-from tuning.scenarios import find_scenario
-from tuning.storage import open_storage
-from tuning.study import open_study
-from tuning.tuned import read_tuned
+from tuning.evaluation.tuned import read_tuned
+from tuning.problems.find import find_scenario
+from tuning.search.plan import Plan
+from tuning.search.storage import open_storage
+from tuning.search.study import open_study
 
 TRAP = "tests_fuzz_trap"  # a module that nothing may import, with a function that nothing may call
 VALUES = (

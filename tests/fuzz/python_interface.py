@@ -18,11 +18,11 @@ import gymnasium as gym
 import numpy as np
 
 from filters import FILTERS, EstimateState, EstimateStates, make_filter, run, thruster_model
-from filters.belief import Belief, LostBelief
+from filters.engine.belief import Belief, LostBelief
 from filters.registry import tunable_numbers
+from numerics.compiled import interpreted
 from tests.test_copies import assert_alike
 from tests.test_robustness import random_arguments, run_random_episode
-from thruster_env.compiled import interpreted
 
 WAYS = (
     copy.deepcopy,

@@ -9,8 +9,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from thruster_env.linear import state_range
-from thruster_env.memory import COMMAND, READINGS
+from thruster_env.engine.memory import COMMAND, READINGS
+from thruster_env.linear.steady_state import state_range
 from thruster_env.rendering.history import Moment, Overlay
 from thruster_env.rendering.renderer import MODES, Renderer
 from thruster_env.task import thrust_scale

@@ -7,7 +7,7 @@ import os
 import numpy as np
 from gymnasium.error import DependencyNotInstalled
 
-from thruster_env.checks import one_of, positive
+from numerics.checks import one_of, positive
 from thruster_env.rendering.history import ABSURD, History, Moment, Overlay
 
 MODES = ("human", "rgb_array")

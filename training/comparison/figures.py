@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thruster_env.figures import DARK, new_figure, save_figure, tidy
+from numerics.plots import DARK, new_figure, save_figure, tidy
 from training.comparison.plan import BEST
 from training.comparison.runs import Result
 from training.comparison.statistics import typical_error, typical_return

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from training.setup import Setup, make_setup
-from tuning.plan import Plan
-from tuning.scenarios import Scenario, find_scenario
-from tuning.study import open_study, quiet_optuna, run_study
+from tuning.problems.find import Scenario, find_scenario
+from tuning.search.plan import Plan
+from tuning.search.study import open_study, quiet_optuna, run_study
 
 TASK = "manoeuvre"
 NOISES = {"low": "low_noise", "medium": "medium_noise", "high": "high_noise"}  # names of scenarios

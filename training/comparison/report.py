@@ -6,8 +6,8 @@ import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from thruster_env.files import check_target, write_whole
-from thruster_env.markdown import table, with_tables
+from numerics.files import check_target, write_whole
+from numerics.markdown import table, with_tables
 from training.comparison.answers import answers
 from training.comparison.figures import cost_against_error, learning_curves
 from training.comparison.plan import Comparison

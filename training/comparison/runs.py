@@ -15,16 +15,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.files import write_whole
-from thruster_env.threads import cores
+from numerics.files import write_whole
+from numerics.threads import cores
 from training.classical import classical_policy
 from training.comparison.plan import CLASSICAL, Comparison, Run, runs_of
 from training.environments import make_environments
 from training.learn import one_thread, train
 from training.saved import FINAL, load
 from training.score import Part, Scores, score
-from tuning.interruption import without_interrupts
-from tuning.scenarios import held_out_seeds
+from tuning.problems.seeds import held_out_seeds
+from tuning.search.interruption import without_interrupts
 
 RUNS = "runs"
 STEPS_APART = 40_000  # points of a learning curve: an evaluation has 16 000 steps

@@ -1,0 +1,1 @@
+"""What a filter has to beat: open loop, low-pass and inversion."""

@@ -1,0 +1,204 @@
+"""Baselines that any filter should beat: the open loop, the raw inversion of the measurement, and a low-pass."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import ClassVar
+
+from filters.baselines.inverse import component_solver
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places, own_place, row_access
+from filters.filter import Filter
+from filters.gaussian.extended import nothing_to_summarise
+from numerics import matrices
+from numerics.checks import at_least, positive
+from numerics.compiled import inlined
+from numerics.tuples import vector_reader, vector_writer
+from plants.layout import constants_form, constants_reader, number_places
+
+
+@lru_cache(maxsize=64)
+def baseline_kernels(transition, observe, n, m, inputs, form, inverted) -> Kernels:
+    """Kernels of all baselines for model functions and sizes.
+
+    Args:
+        transition: f.
+        observe: h.
+        n: number of states.
+        m: number of measurements.
+        inputs: number of inputs.
+        form: that of `rows.constants_form`.
+        inverted: (component, channel) that are inverted, or None for the open loop.
+
+    Extras: the open loop's state (n,), the low-passed measurement, and 1 once it has a value.
+    """
+    places, source, own = memory_places(n, m), number_places(n, m), own_place(n, m, form)
+    substeps_place, step_place, likelihood_place = source.substeps, places.step, places.log_likelihood
+    smooth_place, known_place, reach_place, kept_place = places.extras + n, places.extras + n + 1, own, own + 1
+    read_open, store_open = vector_reader(n, places.extras), vector_writer(n, places.extras)
+    (read_mean, _), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    prior_mean, constants, control = (
+        vector_reader(n, source.prior_mean),
+        constants_reader(n, m, form),
+        vector_reader(inputs),
+    )
+    measured, difference = vector_reader(m), matrices.innovation(m)
+    component, channel = inverted or (0, 0)
+    solve, inverts = component_solver(observe, n, component, channel), inverted is not None
+    no_cov, no_s = ((0.0,) * n,) * n, ((0.0,) * m,) * m
+
+    @inlined
+    def estimate(row, numbers):
+        """The open loop's state, with the component at which the model gives the low-passed measurement."""
+        x = read_open(row)
+        if inverts and row[known_place] > 0.0:
+            x = solve(x, row[smooth_place], constants(numbers), numbers[reach_place])
+        store_mean(row, x)
+
+    @inlined
+    def start(memory, numbers, size):
+        row, _, _ = memory
+        store_open(row, prior_mean(numbers))
+        row[smooth_place] = row[known_place] = 0.0
+        estimate(row, numbers)
+        store_cov(row, no_cov)
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        row, _, _ = memory
+        x, v, c = read_open(row), control(u), constants(numbers)
+        for _ in range(int(numbers[substeps_place])):
+            x = transition(x, v, c)
+        store_open(row, x)
+        estimate(row, numbers)
+        row[step_place] += 1.0
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, _, _ = memory
+        store_innovation(row, difference(measured(z), observe(read_mean(row), constants(numbers))))
+        store_s(row, no_s)
+        row[likelihood_place] = 0.0
+        if inverts and z[channel] == z[channel]:
+            kept = numbers[kept_place] * row[known_place]
+            row[smooth_place] = kept * row[smooth_place] + (1.0 - kept) * z[channel]
+            row[known_place] = 1.0
+            estimate(row, numbers)
+
+    return Kernels(n, m, n, 0, start, predict, update, nothing_to_summarise, extras=n + 2)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OpenLoop(Filter):
+    """The model alone, from the mean of the prior: x = f(x, u). No measurement changes it.
+
+    It has no covariance (zeros) and no likelihood; the innovation is z - h(x).
+    """
+
+    name: ClassVar[str] = "open-loop"
+    has_covariance: ClassVar[bool] = False
+    gaussian_likelihood: ClassVar[bool] = False
+
+    def kernels(self) -> Kernels:
+        """Kernels for the model's functions; see `Filter.kernels`."""
+        model, pair = self.kernel_model, self.inverted_pair
+        functions = inlined(model.transition), inlined(model.observe)
+        return baseline_kernels(*functions, model.n, model.m, model.inputs, constants_form(model.constants), pair)
+
+    @property
+    def inverted_pair(self) -> tuple[int, int] | None:
+        """The component of the state that is solved for, and the channel that it is solved from."""
+        return None
+
+    @property
+    def own_numbers(self) -> tuple[float, ...]:
+        """How far a root is looked for, and how much of the last measurement is kept in the next."""
+        return 0.0, 0.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Inversion(OpenLoop):
+    """The measurement inverted: one component x_i of the state, as it must be for the model to give it.
+
+        x = f(x, u), the open loop;  the estimate is x with x_i replaced by the root v of
+        h(x with x_i = v) = z nearest to x_i, else by the v at which h comes nearest to z, an extremum
+
+    One channel of z is used, with the component that it tells of: for the thruster the flow velocity U_a from the
+    thrust, with the open loop's motor speed. While no measurement comes, the last one is inverted; before the
+    first, the estimate is the open loop. There is no covariance (zeros) and no likelihood; the innovation is z
+    less what the estimate before gives.
+
+    Attributes:
+        inverted: number i of the component that is solved for; -1 is the last.
+        channel: number of the channel of z.
+        reach: how far from the open loop's x_i a root is looked for; if None, as far as the range of x_i is wide
+            in the model (`state_high` less `state_low`), or else 20 times its spread in prior and process noise.
+    """
+
+    name: ClassVar[str] = "inversion"
+    inverted: int = -1
+    channel: int = 0
+    reach: float | None = None
+
+    def __post_init__(self):
+        """Check the numbers; raise ValueError that states the rule and the value."""
+        model = self.model
+        i = place_of("inverted", self.inverted, model.n)
+        object.__setattr__(self, "inverted", i)
+        object.__setattr__(self, "channel", place_of("channel", self.channel, model.m))
+        if self.reach is not None:
+            reach = self.reach
+        elif model.state_low is not None and model.state_high is not None:
+            reach = model.state_high[i] - model.state_low[i]
+        else:
+            reach = 20.0 * model.scales[i]
+        object.__setattr__(self, "reach", positive("reach", reach))
+
+    @property
+    def inverted_pair(self) -> tuple[int, int] | None:
+        """The component of the state that is solved for, and the channel that it is solved from."""
+        return self.inverted, self.channel
+
+    @property
+    def own_numbers(self) -> tuple[float, ...]:
+        """How far a root is looked for, and how much of the last measurement is kept in the next."""
+        return self.reach, 0.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LowPass(Inversion):
+    """The measurement behind an exponential low-pass filter, then inverted as in `Inversion`.
+
+        y = a y + (1 - a) z,  a = exp(-1/time_constant), from the first measurement on;  h(x with x_i = v) = y
+
+    A missing measurement leaves y as it is.
+
+    Attributes:
+        time_constant: of the low-pass filter, in steps; positive.
+        inverted: number i of the component that is solved for; -1 is the last.
+        channel: number of the channel of z.
+        reach: how far from the open loop's x_i a root is looked for; see `Inversion`.
+    """
+
+    name: ClassVar[str] = "low-pass"
+    time_constant: float = 2.0
+
+    def __post_init__(self):
+        """Check the numbers; raise ValueError that states the rule and the value."""
+        super().__post_init__()
+        object.__setattr__(self, "time_constant", positive("time_constant", self.time_constant))
+
+    @property
+    def own_numbers(self) -> tuple[float, ...]:
+        """How far a root is looked for, and how much of the last measurement is kept in the next."""
+        return self.reach, math.exp(-1.0 / self.time_constant)
+
+
+def place_of(name: str, value, count: int) -> int:
+    """Return a place 0 ... count - 1, counted from the end if negative; raise ValueError if there is none."""
+    place = at_least(name, value, -count)
+    if place >= count:
+        raise ValueError(f"{name} must be a whole number from {-count} to {count - 1}, but got {value!r}")
+    return place % count

@@ -1,0 +1,1 @@
+"""How filters run: their memory, compiled steps, batches and sessions."""

@@ -1,0 +1,136 @@
+"""A filter over many trajectories in one compiled call that uses all cores."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.engine.compile import batch, lanes, new_memory
+from filters.filter import Filter
+from numerics.checks import as_floats, covariance, shown
+from numerics.threads import spread
+from plants.layout import LANES, with_root
+
+
+class Estimates(NamedTuple):
+    """A filter's output over a batch of B trajectories of K steps; index 0 is after the first measurement."""
+
+    means: np.ndarray  # (B, K + 1, n)
+    covs: np.ndarray  # (B, K + 1, n, n)
+    innovations: np.ndarray  # (B, K + 1, m)
+    innovation_covs: np.ndarray  # (B, K + 1, m, m)
+    log_likelihoods: np.ndarray  # (B, K + 1)
+    divergences: np.ndarray  # (B,), restarts after an estimate that was not finite
+
+
+def run(
+    filter_: Filter,
+    keys: np.ndarray,
+    inputs: np.ndarray,
+    measurements: np.ndarray,
+    *,
+    process_noise_covs: np.ndarray | None = None,
+    measurement_noise_covs: np.ndarray | None = None,
+) -> Estimates:
+    """Filter many trajectories in one compiled call that uses all cores.
+
+    Args:
+        filter_: any filter.
+        keys: random keys, one a trajectory, (B, 2).
+        inputs: u, (B, K, p); the filter predicts with u[:, k] ...
+        measurements: ... and updates with z[:, k + 1]; (B, K + 1, m), NaN where missing.
+        process_noise_covs: Q of every step, (K, n, n), in place of the model's.
+        measurement_noise_covs: R of every measurement, (K + 1, m, m), in place of the model's.
+
+    Returns:
+        `Estimates`, the same whatever the number of cores.
+
+    Raises:
+        ValueError: if shapes do not fit or an input is not finite.
+    """
+    filter_.check_noise(process_noise_covs)
+    filter_.check_noise(measurement_noise_covs)
+    keys, inputs, z = trajectories(filter_, keys, inputs, measurements)
+    n, (count, times, m) = filter_.kernel_model.n, z.shape
+    out = Estimates(
+        np.empty((count, times, n)),
+        np.empty((count, times, n, n)),
+        np.empty((count, times, m)),
+        np.empty((count, times, m, m)),
+        np.empty((count, times)),
+        np.empty(count),
+    )
+    noise = (
+        _noise_rows("process_noise_covs", process_noise_covs, times - 1, n),
+        _noise_rows("measurement_noise_covs", measurement_noise_covs, times, m),
+    )
+    run_all = _run_one_by_one if filter_.size else _run_side_by_side
+    run_all(filter_, (keys, inputs, z), noise, out)
+    return out
+
+
+def _run_one_by_one(filter_: Filter, data: tuple, noise: tuple, out: Estimates) -> None:
+    kernels, numbers, size = filter_.kernels(), filter_.numbers, filter_.size
+    run_part = batch(kernels)
+
+    def part(first: int, last: int) -> None:
+        memory = new_memory(kernels, size)  # serves the part's trajectories one after the other
+        run_part(*memory, size, *data, numbers.copy(), noise, tuple(out), first, last)
+
+    spread(part, len(out.means))
+
+
+def _run_side_by_side(filter_: Filter, data: tuple, noise: tuple, out: Estimates) -> None:
+    count, numbers, run_part = len(out.means), filter_.numbers, lanes(filter_.kernels())
+    together = 1 if run_part.in_python else LANES
+
+    def part(first: int, last: int) -> None:
+        last = min(last * together, count)
+        run_part(together, *data, numbers, noise, tuple(out), first * together, last)
+
+    spread(part, -(-count // together))
+
+
+def trajectories(
+    filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The arguments of `run` as the arrays that compiled code takes; ValueError if something is off."""
+    model = filter_.kernel_model
+    # Arrays that may be written to: others are another type to numba, which compiles once more for them.
+    requirements = "C_CONTIGUOUS", "WRITEABLE"
+    given = {"keys": keys, "inputs": inputs, "measurements": measurements}
+    keys, inputs, z = (np.require(_floats(name, value), np.float64, requirements) for name, value in given.items())
+    if z.ndim != 3 or inputs.ndim != 3 or keys.shape != (len(z), 2):
+        raise ValueError(
+            "keys, inputs, measurements must have shapes (B, 2), (B, K, p), (B, K + 1, m), "
+            f"but got {keys.shape}, {inputs.shape}, {z.shape}"
+        )
+    count, times, m = z.shape
+    if inputs.shape != (count, times - 1, model.inputs) or m != model.m:
+        raise ValueError(
+            f"inputs and measurements must have shapes {(count, times - 1, model.inputs)} and "
+            f"{(count, times, model.m)}, but got {inputs.shape} and {z.shape}"
+        )
+    if not np.isfinite(inputs).all() or np.isinf(z).any():
+        raise ValueError("inputs must be finite, and measurements finite or NaN, but some are not")
+    if not ((keys >= 0) & (keys < 2**32) & (keys == np.floor(keys))).all():
+        raise ValueError("keys must be whole numbers from 0 to 2^32 - 1, but some are not")
+    return keys, inputs, z
+
+
+def _floats(name: str, value) -> np.ndarray:
+    try:
+        return as_floats(value)
+    except ValueError:
+        raise ValueError(f"{name} must be an array of numbers, but got {shown(value)}") from None
+
+
+def _noise_rows(name: str, given, count: int, size: int) -> np.ndarray:
+    if given is None:
+        return np.empty((0, 2 * size * size))
+    given = _floats(name, given)
+    if given.shape != (count, size, size):
+        raise ValueError(f"{name} must have shape {(count, size, size)}, but got {given.shape}")
+    definite = name.startswith("measurement")
+    return np.array([with_root(covariance(name, cov, size, positive_definite=definite)) for cov in given])

@@ -1,0 +1,67 @@
+"""Beliefs, innovations, and the plain functions that a kind of filter is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Belief(NamedTuple):
+    """What a filter believes of the state at one time."""
+
+    mean: np.ndarray  # (n,)
+    cov: np.ndarray  # (n, n)
+    members: np.ndarray  # (n, N) ensemble, one row a state component; N = 0 for Gaussian filters. Particle
+    # filters add a row of log weights.
+    key: tuple[int, int]  # what all its randomness depends on, together with ...
+    step: int  # ... the number of steps predicted so far
+    divergences: int  # restarts from the prior after an estimate that was not finite
+    extras: np.ndarray = np.empty(0)  # whatever else a kind of filter remembers, such as an estimate of R
+
+
+class LostBelief(Belief):
+    """What `predict` returns where a belief is no longer finite; the next update restarts from the prior."""
+
+    __slots__ = ()
+
+
+class Innovation(NamedTuple):
+    """What a measurement said beyond the prediction."""
+
+    value: np.ndarray  # (m,), z - E[z]; zero in missing channels
+    cov: np.ndarray  # (m, m), S
+    log_likelihood: float  # log N(value; 0, S) of the channels that were there
+
+
+class Kernels(NamedTuple):
+    """A kind of filter for one shape of model, as plain functions on its memory.
+
+    `row` is laid out by `filters.engine.layout`, `numbers` by `plants.layout`; `table` is (table_rows, padded
+    size), its first n rows the members, without columns for filters without an ensemble; `draws` has room for
+    `draws_per_member` normals a member. What a belief keeps beside mean and covariance are the first `kept_rows`
+    rows of the table and `extras` numbers of the row, from `memory_places(n, m).extras` on; `scratch` numbers that
+    nothing keeps follow.
+
+    `stages`, where given, are what `predict` does before its substeps, in each of them, and after them, as
+    functions of the same arguments: batches then run every stage over many beliefs at once (`engine.simd`).
+    """
+
+    n: int
+    m: int
+    table_rows: int
+    draws_per_member: int
+    start: Callable  # start(memory, numbers, size): belief = prior; memory = (row, table, draws)
+    predict: Callable  # predict(memory, u, numbers, size)
+    update: Callable  # update(memory, z, numbers, size); a NaN in z is a missing channel
+    summarise: Callable  # summarise(memory, size): mean and cov from the members; `update` does it itself
+    extras: int = 0
+    extra_kept_rows: int = 0  # rows of the table, after the n of members, that belong to the belief
+    scratch: int = 0
+    stages: tuple[Callable, Callable, Callable] | None = None
+
+    @property
+    def kept_rows(self) -> int:
+        """Rows of the table that belong to the belief."""
+        return self.n + self.extra_kept_rows

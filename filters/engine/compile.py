@@ -1,0 +1,132 @@
+"""From kernels to compiled code: steps of one belief, or whole trajectories of many."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places
+from filters.engine.restart import restart_if_lost
+from filters.engine.simd import build_lanes
+from numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from numerics.streams import GROUP
+from plants.layout import LANES, number_places, padded
+
+START, PREDICT, UPDATE = 1, 2, 4  # what an operation does, to be added
+
+
+def build_operation(kernels: Kernels) -> Callable:
+    """`operation`, not yet compiled."""
+    start, predict, update, summarise = kernels.start, kernels.predict, kernels.update, kernels.summarise
+    places, m = memory_places(kernels.n, kernels.m), kernels.m
+    step, divergences = places.step, places.divergences
+    restart = restart_if_lost(kernels)
+    fingerprint = function_fingerprint(start, predict, update, within=__name__)
+
+    def operate(row, table, draws, size, given, numbers, task):
+        fingerprint  # noqa: B018 - part of the cache's key
+        memory, inputs = (row, table, draws), given.shape[0] - m
+        if task & START:
+            row[step] = 0.0
+            row[divergences] = 0.0
+            start(memory, numbers, size)
+        if task & PREDICT:
+            predict(memory, given[:inputs], numbers, size)
+        if task & UPDATE:
+            update(memory, given[inputs:], numbers, size)
+            restart(memory, numbers, size)
+        else:
+            summarise(memory, size)
+        return int(row[divergences])
+
+    return operate
+
+
+def _build_batch(kernels: Kernels) -> Callable:
+    n, m, start, predict, update = kernels.n, kernels.m, kernels.start, kernels.predict, kernels.update
+    places = memory_places(n, m)
+    mean, cov, innovation, s = places.mean, places.cov, places.innovation, places.innovation_cov
+    key_0, key_1, step, divergences = places.key_0, places.key_1, places.step, places.divergences
+    log_likelihood = places.log_likelihood
+    q_place, r_place = number_places(n, m).q, number_places(n, m).r
+    restart = restart_if_lost(kernels)
+    fingerprint = function_fingerprint(start, predict, update, within=__name__)
+
+    def batch(row, table, draws, size, keys, inputs, measurements, numbers, noise, out, first, last):
+        fingerprint  # noqa: B018 - part of the cache's key
+        qs, rs = noise
+        means, covs, innovations, innovation_covs, log_likelihoods, counts = out
+        memory = (row, table, draws)
+        u, z = np.zeros(inputs.shape[2]), np.zeros(m)
+        for b in range(first, last):
+            row[key_0] = keys[b, 0]
+            row[key_1] = keys[b, 1]
+            row[step] = 0.0
+            row[divergences] = 0.0
+            start(memory, numbers, size)
+            for k in range(measurements.shape[1]):
+                # Entry by entry: a slice of an array that threads share costs a contended reference count.
+                if k > 0:
+                    for i in range(u.shape[0]):
+                        u[i] = inputs[b, k - 1, i]
+                    if qs.shape[0] > 0:
+                        for i in range(qs.shape[1]):
+                            numbers[q_place + i] = qs[k - 1, i]
+                    predict(memory, u, numbers, size)
+                for i in range(m):
+                    z[i] = measurements[b, k, i]
+                if rs.shape[0] > 0:
+                    for i in range(rs.shape[1]):
+                        numbers[r_place + i] = rs[k, i]
+                update(memory, z, numbers, size)
+                restart(memory, numbers, size)
+                for i in range(n):
+                    means[b, k, i] = row[mean + i]
+                    for j in range(n):
+                        covs[b, k, i, j] = row[cov + i * n + j]
+                for i in range(m):
+                    innovations[b, k, i] = row[innovation + i]
+                    for j in range(m):
+                        innovation_covs[b, k, i, j] = row[s + i * m + j]
+                log_likelihoods[b, k] = row[log_likelihood]
+            counts[b] = row[divergences]
+
+    return batch
+
+
+def operation(kernels: Kernels) -> Callable:
+    """`operate(*memory, size, given, numbers, task)` on one belief; it returns how often that diverged.
+
+    given = (u, z) in one array, for each costs some 80 ns a call; task is a sum of START, PREDICT and UPDATE.
+    """
+    return _runner(build_operation, kernels, is_interpreting())
+
+
+def batch(kernels: Kernels) -> Callable:
+    """`batch(*memory, size, keys, inputs, measurements, numbers, noise, out, first, last)` on trajectories.
+
+    noise = (qs, rs) has a row (Q, its root) for each step and a row (R, its root) for each measurement that stand
+    in for the model's, or no rows. Those are written into numbers, which threads must thus not share.
+    """
+    return _runner(_build_batch, kernels, is_interpreting())
+
+
+def lanes(kernels: Kernels) -> Callable:
+    """The same for filters without an ensemble, many trajectories at a time; see `engine.simd.build_lanes`."""
+    return _runner(build_lanes, kernels, is_interpreting())
+
+
+@lru_cache(maxsize=128)
+def _runner(build: Callable, kernels: Kernels, interpreting: bool) -> CompiledOrPython:
+    return CompiledOrPython(build(kernels))
+
+
+def new_memory(kernels: Kernels, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Row, table and draws for one belief with `size` members, zeros."""
+    width = padded(size, LANES)
+    length = memory_places(kernels.n, kernels.m).extras + kernels.extras + kernels.scratch
+    draws = padded(kernels.draws_per_member * width, GROUP)
+    return np.zeros(length), np.zeros((kernels.table_rows, width)), np.zeros(draws)

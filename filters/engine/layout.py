@@ -1,0 +1,61 @@
+"""Where things stand in the memory of a filter.
+
+A filter's memory is a row of small parts (belief, innovation, scratch), a table with one column an ensemble
+member, and a vector of random draws. Rows are cheap to hand to compiled code, to copy and to stack. The row of a
+model's numbers, behind which a filter has its own, is laid out by `plants.layout`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+from numerics.tuples import matrix_reader, matrix_writer, vector_reader, vector_writer
+from plants.layout import number_places, starts_of
+
+
+class MemoryPlaces(NamedTuple):
+    """First places of the parts of a filter's row, for n states and m measurements."""
+
+    mean: int  # (n,)
+    cov: int  # (n, n)
+    key_0: int
+    key_1: int
+    step: int  # steps taken
+    divergences: int  # restarts after an estimate that was not finite
+    innovation: int  # (m,)
+    innovation_cov: int  # (m, m)
+    log_likelihood: int
+    gain: int  # (n, m), scratch
+    extras: int  # what a kind of filter keeps beside; the row ends with these
+
+
+@cache
+def memory_places(n: int, m: int) -> MemoryPlaces:
+    """Places in the row of a filter."""
+    return MemoryPlaces(*starts_of(n, n * n, 1, 1, 1, 1, m, m * m, 1, n * m))
+
+
+@cache
+def row_access(n: int, m: int) -> tuple[tuple[Callable, Callable], ...]:
+    """Functions that read and write a filter's row, as pairs: a vector's, then that of its covariance.
+
+    Vectors are tuples, covariances tuples of rows.
+
+    Returns:
+        `read(row)` of the mean (n,) and its covariance (n, n).
+        `write(row, value)` of the same.
+        `write(row, value)` of the innovation (m,) and its covariance (m, m).
+    """
+    places = memory_places(n, m)
+    return (
+        (vector_reader(n, places.mean), matrix_reader(n, n, places.cov)),
+        (vector_writer(n, places.mean), matrix_writer(n, n, places.cov)),
+        (vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)),
+    )
+
+
+def own_place(n: int, m: int, form: type | int) -> int:
+    """First place of a filter's own numbers, behind those of its model; form is that of `constants_form`."""
+    return number_places(n, m).constants + (form if isinstance(form, int) else len(form._fields))

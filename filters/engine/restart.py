@@ -1,0 +1,52 @@
+"""What happens to a belief that is lost, not finite or with a negative variance: the prior takes its place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places
+from numerics.compiled import inlined
+from numerics.tuples import written_out
+from plants.layout import number_places
+
+LARGEST = 1e300  # what the numbers of a belief may add up to
+
+
+@cache
+def row_magnitude(n: int, m: int) -> Callable:
+    """Return `magnitude(row)`: the sum of the absolute values of the numbers of a belief and its innovation.
+
+    A negative variance, which rounding leaves of a covariance of very unequal numbers, counts as a number beyond
+    LARGEST, and so does NaN.
+    """
+    places = memory_places(n, m)
+    variances = [places.cov + i * (n + 1) for i in range(n)]
+    terms = [f"abs(row[{i}])" for i in range(places.gain) if i not in variances]
+    terms += [f"(row[{i}] if row[{i}] >= 0.0 else {10 * LARGEST})" for i in variances]
+    return written_out("magnitude", "row", " + ".join(terms))
+
+
+@cache
+def restart_if_lost(kernels: Kernels) -> Callable:
+    """Return `restart(memory, numbers, size)`: put the prior in place of a belief that is lost, and count."""
+    n, m, start, summarise = kernels.n, kernels.m, kernels.start, kernels.summarise
+    places, r_place = memory_places(n, m), number_places(n, m).r
+    innovation, s_place, log_likelihood = places.innovation, places.innovation_cov, places.log_likelihood
+    divergences, magnitude = places.divergences, row_magnitude(n, m)
+
+    @inlined
+    def restart(memory, numbers, size):
+        row, _, _ = memory
+        if not magnitude(row) < LARGEST:
+            start(memory, numbers, size)
+            summarise(memory, size)
+            row[divergences] += 1.0
+            row[log_likelihood] = 0.0
+            for i in range(m):
+                row[innovation + i] = 0.0
+            for i in range(m * m):
+                row[s_place + i] = numbers[r_place + i]
+
+    return restart

@@ -1,0 +1,146 @@
+"""One belief at work in place: what a wrapper steps, and what a filter's pure functions borrow."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from filters.engine.belief import Belief, Innovation, LostBelief
+from filters.engine.checks import check_belief, checked_key, vector_like
+from filters.engine.compile import PREDICT, START, UPDATE, new_memory, operation
+from filters.engine.layout import memory_places
+from numerics.checks import covariance
+from plants.layout import number_places, with_root
+
+if TYPE_CHECKING:
+    from filters.filter import Filter
+
+STEP = PREDICT + UPDATE
+TASKS = {"start": START, "predict": PREDICT, "update": UPDATE}
+
+
+class Session:
+    """One filter at work in place on its own memory: what a wrapper steps and `Filter.predict` borrows.
+
+    Attributes:
+        mean, cov, innovation, innovation_cov: views on the memory, (n,), (n, n), (m,), (m, m).
+        divergences: restarts from the prior, so far, after an estimate that was not finite.
+    """
+
+    def __init__(self, filter_: Filter):
+        """Allocate the memory of a filter; `start` or `load` comes next."""
+        self._filter = filter_
+        kernels, model, size = filter_.kernels(), filter_.kernel_model, filter_.size
+        n, m = kernels.n, kernels.m
+        places = memory_places(n, m)
+        self._name, self._kernels, self._operate = filter_.name, kernels, operation(kernels)
+        self._numbers, self._size, self._places = filter_.numbers, size, places
+        self._kept_rows, self._noise_places = kernels.kept_rows, number_places(n, m)
+        self._memory = new_memory(kernels, size)
+        self._row, self._table, _ = self._memory
+        self._extras = self._row[places.extras : places.extras + kernels.extras]
+        values = np.append(np.zeros(model.inputs), np.full(m, np.nan))
+        self._u, self._z, self._values = values[: model.inputs], values[model.inputs :], values
+        self._scalar = len(self._u) == m == 1
+        self.divergences = 0
+        self._given = (*self._memory, size, values, self._numbers)
+        self.mean = self._row[places.mean : places.mean + n]
+        self.cov = self._row[places.cov : places.cov + n * n].reshape(n, n)
+        self.innovation = self._row[places.innovation : places.innovation + m]
+        self.innovation_cov = self._row[places.innovation_cov : places.innovation_cov + m * m].reshape(m, m)
+
+    def __getstate__(self) -> tuple:
+        """The filter and all numbers; machine code and views are made anew from these."""
+        return self._filter, self.divergences, (*self._memory, self._values, self._numbers)
+
+    def __setstate__(self, state: tuple) -> None:
+        """Go on where the belief was."""
+        filter_, divergences, arrays = state
+        self.__init__(filter_)
+        for own, kept in zip((*self._memory, self._values, self._numbers), arrays, strict=True):
+            own[...] = kept
+        self.divergences, self._operate = divergences, self._operate.direct
+
+    def _do(self, task: int) -> None:
+        self.divergences = self._operate(*self._given, task)
+
+    def set_key(self, key) -> None:
+        """Set the key (2,) on which the belief's randomness depends: two whole numbers below 2^32."""
+        self._row[self._places.key_0], self._row[self._places.key_1] = checked_key(key)
+
+    def set_noise(self, *, process_noise_cov=None, measurement_noise_cov=None) -> None:
+        """Put another Q or R, with its root, in place of the model's."""
+        n, m, at = len(self.mean), len(self.innovation), self._noise_places
+        if process_noise_cov is not None:
+            q = covariance("process_noise_cov", process_noise_cov, n)
+            self._numbers[at.q : at.q + 2 * n * n] = with_root(q)
+        if measurement_noise_cov is not None:
+            r = covariance("measurement_noise_cov", measurement_noise_cov, m, positive_definite=True)
+            self._numbers[at.r : at.r + 2 * m * m] = with_root(r)
+
+    def start(self, key, z) -> None:
+        """Set the prior with a random key (2,) and update it with a first measurement z (m,)."""
+        self.set_key(key)
+        self._z[:] = z
+        self._do(START + UPDATE)
+        self._operate = operation(self._kernels).direct  # `step` has to be quick
+
+    def step(self, u, z) -> None:
+        """Predict with input u (p,), then update with measurement z (m,); NaN marks a missing channel."""
+        try:
+            if self._scalar:  # the frequent case: an assignment to a slice takes twice as long
+                self._values[0], self._values[1] = u[0], z[0]
+            else:
+                self._u[:], self._z[:] = u, z
+        except (TypeError, ValueError, LookupError):  # they are not looked at before: a step has to be quick
+            self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
+            self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
+        self.divergences = self._operate(*self._given, STEP)
+
+    def run(self, operation: str, u=None, z=None) -> None:
+        """Do one of "start", "predict" or "update" alone, arguments checked."""
+        if operation == "predict":
+            self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
+        if operation == "update":
+            self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
+        self._do(TASKS[operation])
+
+    def load(self, belief: Belief) -> None:
+        """Put a belief into the memory; ValueError for one of another model or kind of filter, or none at all."""
+        shapes = {
+            "mean": self.mean.shape,
+            "cov": self.cov.shape,
+            "members": (self._kept_rows, self._size),
+            "extras": self._extras.shape,
+        }
+        for name, shape in shapes.items():
+            given = np.shape(getattr(belief, name))
+            if given != shape:
+                whose = f"a belief that the filter {self._name!r} can take"
+                raise ValueError(f"{name} of {whose} must have shape {shape}, but got {given}")
+        check_belief(belief)
+        self.mean[:], self.cov[:] = belief.mean, belief.cov
+        if self._size:
+            self._table[: self._kept_rows] = belief.members[:, :1]  # the padding follows a real member
+            self._table[: self._kept_rows, : self._size] = belief.members
+        self._extras[:] = belief.extras
+        self.set_key(belief.key)
+        self._row[self._places.step] = belief.step
+        self._row[self._places.divergences] = belief.divergences
+
+    def belief(self) -> Belief:
+        """A copy of the belief in the memory."""
+        row, places = self._row, self._places
+        key = int(row[places.key_0]), int(row[places.key_1])
+        members = self._table[: self._kept_rows, : self._size].copy()
+        step, extras = int(row[places.step]), self._extras.copy()
+        # Compared with the sum: it is NaN or infinite where one of the numbers is.
+        total = np.abs(row[: places.key_0]).sum() + np.abs(members[: len(self.mean)]).sum()
+        kind = Belief if total < np.inf else LostBelief
+        return kind(self.mean.copy(), self.cov.copy(), members, key, step, self.divergences, extras)
+
+    def innovation_copy(self) -> Innovation:
+        """A copy of what the last update found."""
+        log_likelihood = float(self._row[self._places.log_likelihood])
+        return Innovation(self.innovation.copy(), self.innovation_cov.copy(), log_likelihood)

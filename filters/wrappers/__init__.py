@@ -1,0 +1,1 @@
+"""Filters around Gymnasium envs, single and in number."""

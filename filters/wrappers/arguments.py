@@ -1,0 +1,85 @@
+"""From a wrapper's plain arguments to a filter and the model that it assumes."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+
+import gymnasium as gym
+import numpy as np
+
+from filters.filter import Filter
+from filters.registry import make_filter, tunable_numbers
+from filters.tuned_file import read_tuned_file
+from numerics.checks import shown
+from plants.state_space import StateSpaceModel
+from thruster_env.model import check_plant_of_env, model_of_env
+
+OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
+APPENDED = "appended_entries"  # attribute of an env: entries of its observation after the measurement
+
+
+def filter_for(env, filter: str | None, model, tuned: str | None, numbers: dict) -> Filter:
+    """The filter that a wrapper of env is told to run; its class says what the arguments mean.
+
+    A tuned file is data: nothing in it becomes a model or another argument of the wrapper. Where no `model` is
+    given it has to be for the env's plant.
+
+    Raises ValueError if an argument is unknown or off.
+    """
+    if tuned is not None:
+        if filter is not None or numbers:
+            raise ValueError("tuned must come without filter and numbers, for its file holds them")
+        content = read_tuned_file(tuned)
+        if model is None:
+            check_plant_of_env(env, content.get("plant"), tuned)
+        entry = content["filter"]
+        return make_filter(entry["name"], _model_for(env, model, entry["model"], ()), **entry["numbers"])
+    filter = "ekf" if filter is None else filter
+    numbers = dict(numbers)
+    known = tunable_numbers(filter)
+    own = {name: numbers.pop(name) for name in known if name in numbers}
+    return make_filter(filter, _model_for(env, model, numbers, known), **own)
+
+
+def _model_for(env, model, arguments: dict, known: tuple[str, ...]) -> StateSpaceModel:
+    if model is None:
+        return model_of_env(env, known, **arguments)
+    if isinstance(model, StateSpaceModel):
+        if arguments:
+            raise ValueError(f"a StateSpaceModel must come without arguments of its own, but got {arguments!r}")
+        return model
+    module, _, name = str(model).partition(":")
+    try:
+        factory: Callable = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError):
+        raise ValueError(
+            f"model must be 'module:factory' that can be imported, or a StateSpaceModel, but got {model!r}"
+        ) from None
+    try:
+        made = factory(**arguments)
+    except TypeError as error:
+        raise ValueError(f"model {model!r} must take the given arguments: {error}") from None
+    if not isinstance(made, StateSpaceModel):
+        raise ValueError(f"model {model!r} must return a StateSpaceModel, but it returned {shown(made)}")
+    return made
+
+
+class ModelInSpec:
+    """A model as an env's spec keeps it. JSON refuses it by its class's name, which says what to do."""
+
+    def __init__(self, content: StateSpaceModel):
+        self.content = content
+
+
+ModelInSpec.__name__ = "StateSpaceModel (give model='module:factory' instead)"
+
+
+def check_spaces(action_space: gym.Space, observation_space: gym.Space, model: StateSpaceModel) -> None:
+    """Raise ValueError unless both spaces are Box and the actions are the model's inputs."""
+    spaces = {"action": (action_space, model.inputs), "observation": (observation_space, model.m)}
+    for name, (space, size) in spaces.items():
+        if not isinstance(space, gym.spaces.Box):
+            raise ValueError(f"the {name} space must be a Box, but got {space}")
+        if name == "action" and int(np.prod(space.shape)) != size:
+            raise ValueError(f"the {name} space must have the model's {size} entries, but got {space}")

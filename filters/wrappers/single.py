@@ -1,0 +1,150 @@
+"""`EstimateState`: a filter around any Gymnasium env, its estimate in the observation and in info."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gymnasium as gym
+import numpy as np
+
+from filters.engine.checks import checked_actions
+from filters.engine.session import Session
+from filters.wrappers.arguments import APPENDED, OBSERVATIONS, ModelInSpec, check_spaces, filter_for
+from numerics.checks import one_of, shown
+from numerics.checks import seed as checked_seed
+from numerics.streams import draw_key, filter_generator
+from plants.state_space import StateSpaceModel
+from thruster_env.model import overlay_of
+
+FLOAT32 = np.dtype(np.float32)  # a cast to a dtype is quicker than one to its type
+
+
+class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
+    """Run a filter beside an env: predict with the action, update with the measurement.
+
+    The observation becomes, in float32,
+
+    - "estimate": the mean of the state, (n,);
+    - "measurement+estimate": the measurement, then the mean, (m + n,);
+    - "belief": the mean, then the standard deviations, (2 n,).
+
+    What the env appends to its measurement (validity flags, a reference) stays at the end of the observation.
+
+    Info gains `estimate` (n,), `estimate_cov` (n, n), `innovation` (m,), `innovation_cov` (m, m) and
+    `estimate_divergences`, the restarts from the prior after an estimate that was not finite. The measurement
+    is `info["measurement"]` where the env reports it (NaN where `measurement_valid` is false), else the
+    observation. The action is clipped to the action space before the filter sees it. The filter's
+    randomness comes from the reset seed by a stream of its own; the env's generator is never touched. Where a
+    measurement is missing, the observation repeats the last one that was there (0 at first).
+
+    Args:
+        env: any env with Box actions and observations.
+        filter: name of a filter in `filters.FILTERS`, which `thruster filters` lists; "ekf" if None.
+        observation: one of the three forms above.
+        model: None for the model of a bow thruster env, "module:factory" of a function that returns a
+            `StateSpaceModel`, or a `StateSpaceModel` (which JSON cannot hold).
+        tuned: path of a tuned file; it gives filter, numbers and model arguments.
+        **numbers: the filter's own numbers, such as `ensemble_size`, and arguments of the model: for a bow
+            thruster `process_noise_cov`, `measurement_noise_cov`, `prior_cov_factor`, `parameter_factors`,
+            `operating_voltage`.
+
+    Raises:
+        ValueError: if an argument is unknown or off, or spaces and model do not fit.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env,
+        filter: str | None = None,
+        observation: str = "estimate",
+        model: str | StateSpaceModel | None = None,
+        tuned: str | None = None,
+        **numbers,
+    ):
+        """Build model and filter; see the class for the arguments."""
+        model = model.content if isinstance(model, ModelInSpec) else model
+        held = ModelInSpec(model) if isinstance(model, StateSpaceModel) else model
+        recorded = {"filter": filter, "observation": observation, "model": held, "tuned": tuned, **numbers}
+        gym.utils.RecordConstructorArgs.__init__(self, **recorded)
+        gym.Wrapper.__init__(self, env)
+        self._form = one_of("observation", observation, OBSERVATIONS)
+        self.filter = filter_for(env, filter, model, tuned, numbers)
+        check_spaces(env.action_space, env.observation_space, self.filter.model)
+        n, m = self.filter.model.n, self.filter.model.m
+        # What an env appends to its measurement, validity flags and the reference, stays in the observation.
+        self._appended = env.get_wrapper_attr(APPENDED) if env.has_wrapper_attr(APPENDED) else 0
+        length = {"estimate": n, "measurement+estimate": m + n, "belief": 2 * n}[observation] + self._appended
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
+        self._session = Session(self.filter)
+        self._generator = filter_generator(None)
+        if hasattr(env.unwrapped, "render_overlay"):  # a bow thruster draws the estimate beside the truth
+            env.unwrapped.render_overlay = self._overlay
+        low, high = env.action_space.low.ravel(), env.action_space.high.ravel()
+        self._bounds = list(zip(low.tolist(), high.tolist(), strict=True))
+        self._has_one_input = len(self._bounds) == 1
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Reset env and filter; the belief is the prior, updated with the first measurement."""
+        seed = checked_seed(seed)
+        observation, info = self.env.reset(seed=seed, options=options)
+        if seed is not None:
+            self._generator = filter_generator(seed)
+        z = _measurement(observation, info)
+        m = self.filter.model.m
+        if np.shape(z) != (m,):
+            raise ValueError(f"a measurement must have the model's {m} entries, but got {shown(z)}")
+        self._held = np.zeros(m)
+        self._session.start(draw_key(self._generator), z)
+        return self._observe(observation, z, info), info
+
+    def step(self, action):
+        """Step the env, then predict with the clipped action and update with the measurement.
+
+        Raises ValueError, before the env is stepped, for an action that is not numbers, or too few or many.
+        """
+        u = self._clipped(action)
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        z = info.get("measurement")
+        if z is None or "measurement_valid" in info:
+            z = _measurement(observation, info)
+        self._session.step(u, z)
+        return self._observe(observation, z, info), reward, terminated, truncated, info
+
+    def _clipped(self, action) -> Sequence[float]:
+        if self._has_one_input and type(action) is np.ndarray and action.size == 1:
+            value, (low, high) = action.item(), self._bounds[0]  # the frequent case has to be quick
+            if type(value) is float and value == value:
+                return (low if value < low else high if value > high else value,)
+        values = checked_actions(action, 1, len(self._bounds))[0].tolist()
+        return [min(max(v, low), high) for v, (low, high) in zip(values, self._bounds, strict=True)]
+
+    def _overlay(self):
+        return overlay_of(self.filter.name, self.filter.model, self._session.mean, self._session.cov)
+
+    def _observe(self, observation, z, info) -> np.ndarray:
+        session = self._session
+        mean, cov = session.mean.copy(), session.cov.copy()
+        info["estimate"] = mean
+        info["estimate_cov"] = cov
+        info["innovation"] = session.innovation.copy()
+        info["innovation_cov"] = session.innovation_cov.copy()
+        info["estimate_divergences"] = np.int64(session.divergences)  # clients may ask for a dtype
+        if self._form == "estimate" and not self._appended:
+            return mean.astype(FLOAT32)
+        parts = [mean]
+        if self._form == "belief":
+            parts.append(np.sqrt(np.diag(cov)))
+        elif self._form == "measurement+estimate":
+            self._held = np.where(np.isnan(z), self._held, z)
+            parts.insert(0, self._held)
+        if self._appended:
+            parts.append(observation[-self._appended :])
+        return np.concatenate(parts).astype(np.float32)
+
+
+def _measurement(observation, info) -> np.ndarray:
+    z = info.get("measurement")
+    if z is None:
+        return np.asarray(observation, dtype=np.float64).ravel()
+    valid = info.get("measurement_valid")
+    return z if valid is None else np.where(valid, z, np.nan)

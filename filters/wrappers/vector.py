@@ -1,0 +1,153 @@
+"""`EstimateStates`: a filter on every copy of a vector env, one compiled call for all."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from filters.engine.batch_session import Beliefs
+from filters.engine.checks import checked_actions
+from filters.wrappers.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for
+from numerics.checks import one_of, shown
+from numerics.keys import EpisodeKeys, reset_mask
+from numerics.streams import filter_generator
+from plants.state_space import StateSpaceModel
+
+
+class EstimateStates(gym.vector.VectorWrapper):
+    """Run a filter beside every copy of a vector env; what `EstimateState` is to a single env.
+
+    Copy i of `reset(seed=s)` equals an `EstimateState` around a single env with `reset(seed=s + i)`, later
+    episodes too. A copy whose episode begins starts from the prior, updated with the first measurement: in the
+    mode NEXT_STEP at the step after the end, whose action is ignored; in SAME_STEP within the step, and then
+    `final_obs` and `final_info` hold the last estimate; in DISABLED where `options["reset_mask"]` is true.
+
+    Info gains, with one row a copy, `estimate` (N, n), `estimate_cov` (N, n, n), `innovation` (N, m),
+    `innovation_cov` (N, m, m) and `estimate_divergences` (N,).
+
+    Args:
+        env: any vector env with Box actions and observations.
+        filter, observation, model, tuned, **numbers: those of `EstimateState`.
+
+    Raises:
+        ValueError: if an argument is unknown or off, or spaces and model do not fit.
+    """
+
+    def __init__(
+        self,
+        env: gym.vector.VectorEnv,
+        filter: str | None = None,
+        observation: str = "estimate",
+        model: str | StateSpaceModel | None = None,
+        tuned: str | None = None,
+        **numbers,
+    ):
+        """Build model and filter; see the class for the arguments."""
+        super().__init__(env)
+        self._form = one_of("observation", observation, OBSERVATIONS)
+        self.filter = filter_for(env, filter, model, tuned, numbers)
+        check_spaces(env.single_action_space, env.single_observation_space, self.filter.model)
+        self._n, self._m = self.filter.model.n, self.filter.model.m
+        self._appended = getattr(env.unwrapped, APPENDED, 0)
+        length = {"estimate": self._n, "measurement+estimate": self._m + self._n, "belief": 2 * self._n}[
+            observation
+        ]
+        shape = (length + self._appended,)
+        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, shape=shape, dtype=np.float32)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.autoreset_mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
+        self._beliefs = Beliefs(self.filter, self.num_envs)
+        self._keys = EpisodeKeys(self.num_envs, filter_generator)
+        self._held = np.zeros((self.num_envs, self._m))
+        self._done = np.zeros(self.num_envs, dtype=bool)
+        self._low, self._high = env.single_action_space.low.ravel(), env.single_action_space.high.ravel()
+
+    def reset(self, *, seed: int | list[int | None] | None = None, options: dict | None = None):
+        """Reset the env and the beliefs of the copies that it resets."""
+        mask = reset_mask(options, self._keys)
+        self._keys.seeds(seed)  # a wrong one changes nothing
+        observations, info = self.env.reset(seed=seed, options=options)
+        which = np.ones(self.num_envs, dtype=bool) if mask is None else mask
+        self._keys.seed(seed, which)
+        z = self._measurements(observations, info)
+        self._start(which, z)
+        self._done[which] = False
+        return self._observe(observations, z, info), info
+
+    def step(self, actions):
+        """Step the env, then predict with the clipped actions and update with the measurements.
+
+        Raises ValueError, before the envs are stepped, for actions that are not numbers, or too few or many.
+        """
+        ignored = self._done if self.autoreset_mode == AutoresetMode.NEXT_STEP else False
+        u = np.clip(checked_actions(actions, self.num_envs, len(self._low), ignored), self._low, self._high)
+        observations, rewards, terminated, truncated, info = self.env.step(actions)
+        z = self._measurements(observations, info)
+        done = terminated | truncated
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and done.any():
+            self._end(u, z, done, info)
+            self._start(done, z)
+        elif self.autoreset_mode == AutoresetMode.NEXT_STEP and self._done.any():
+            self._beliefs.step(u, z, idle=self._done)
+            self._start(self._done, z)
+        else:
+            self._beliefs.step(u, z)
+        self._done = done
+        return self._observe(observations, z, info), rewards, terminated, truncated, info
+
+    def _start(self, mask: np.ndarray, z: np.ndarray) -> None:
+        which = np.flatnonzero(mask)
+        self._held[which] = 0.0
+        self._beliefs.start(which, self._keys.draw(which), z)
+
+    def _end(self, u, z, done, info) -> None:
+        """Update with the last measurements of episodes that end; put these estimates into final_obs and info."""
+        final = np.full(self.num_envs, None, dtype=object) if "final_obs" not in info else info["final_obs"]
+        observations = np.zeros((self.num_envs, *self.env.single_observation_space.shape), dtype=np.float32)
+        for i in np.flatnonzero(done):
+            observations[i] = final[i]
+        final_info = info.setdefault("final_info", {})
+        last = np.where(done[:, None], self._measurements(observations, final_info), z)
+        self._beliefs.step(u, last)
+        seen = self._observe(observations, last, final_info, done)
+        info["final_obs"] = final.copy()
+        for i in np.flatnonzero(done):
+            info["final_obs"][i] = seen[i]
+
+    def _measurements(self, observations, info) -> np.ndarray:
+        z = info.get("measurement")
+        if z is None:
+            z = np.asarray(observations, dtype=np.float64).reshape(self.num_envs, -1)
+        if z.shape != (self.num_envs, self._m):
+            raise ValueError(
+                f"measurements must have shape {(self.num_envs, self._m)}, but got {shown(np.shape(z))}"
+            )
+        valid = info.get("measurement_valid")
+        return z if valid is None else np.where(valid, z, np.nan)
+
+    def _observe(self, observations, z, info: dict[str, Any], mask: np.ndarray | None = None) -> np.ndarray:
+        n, m, beliefs = self._n, self._m, self._beliefs
+        mean, cov = beliefs.part("mean", n), beliefs.part("cov", n, n)
+        there = np.ones(self.num_envs, dtype=bool) if mask is None else mask.copy()
+        added = {
+            "estimate": mean,
+            "estimate_cov": cov,
+            "innovation": beliefs.part("innovation", m),
+            "innovation_cov": beliefs.part("innovation_cov", m, m),
+            "estimate_divergences": beliefs.part("divergences").astype(np.int64),
+        }
+        info |= added
+        info |= {f"_{key}": there for key in added}
+        parts = [mean]
+        if self._form == "belief":
+            parts.append(np.sqrt(np.diagonal(cov, axis1=1, axis2=2)))
+        elif self._form == "measurement+estimate":
+            self._held = np.where(np.isnan(z), self._held, z)
+            parts.insert(0, self._held)
+        if self._appended:
+            parts.append(observations[:, -self._appended :])
+        return np.concatenate(parts, axis=1).astype(np.float32)

@@ -1,0 +1,230 @@
+"""Compilation: plain Python functions in, cached machine code out, one source for both.
+
+Functions marked `inlined` stay ordinary Python and may be called by any function given to `compiled`.
+numba is imported at the first compilation only, which keeps `import thruster_env` light. With the
+environment variable NUMBA_DISABLE_JIT=1 everything runs as Python.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import importlib.util
+import inspect
+import threading
+import types
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from numerics.code_cache import keep_code
+
+# No "nnan" and "ninf": with them isfinite and isnan are compiled away, and failures would pass unseen.
+FASTMATH = frozenset({"contract", "reassoc", "arcp", "nsz", "afn"})
+
+_packages: dict[str, tuple[str, ...]] = {}  # see `may_be_inlined`
+
+_waiting: list[Callable] = []
+_marked: set[Callable] = set()
+_interpreting = False
+
+
+def inlined(function: Callable) -> Callable:
+    """Mark a plain function so that compiled functions may call it; it is inlined into all of them.
+
+    So are functions that it calls by name. Inside a loop over members or copies this makes vector code, which
+    no call may interrupt.
+    """
+    if function not in _marked:
+        _marked.add(function)
+        _waiting.append(function)
+        for callee in _callees(function):  # a user's model may call helpers of its own
+            inlined(callee)
+    return function
+
+
+def overloaded(function: Callable) -> Callable:
+    """Mark a plain function in whose place compiled functions have machine code, by `numba.extending.overload`."""
+    _marked.add(function)
+    return function
+
+
+def _callees(function: Callable) -> list[Callable]:
+    """Plain functions that a function has in its closure or calls by a global name."""
+    if not isinstance(function, types.FunctionType):
+        return []
+    cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    called = [function.__globals__.get(name) for name in function.__code__.co_names]
+    return [part for part in (*cells, *called) if isinstance(part, types.FunctionType)]
+
+
+@contextlib.contextmanager
+def interpreted():
+    """Within this context nothing is compiled: the same sources run as Python, for tests and debugging."""
+    global _interpreting
+    before, _interpreting = _interpreting, True
+    try:
+        yield
+    finally:
+        _interpreting = before
+
+
+def is_interpreting() -> bool:
+    """Whether `compiled` leaves functions as they are."""
+    return _interpreting
+
+
+def compiled(function: Callable) -> Callable:
+    """Compile a function with numba, cached on disk, releasing the interpreter lock while it runs."""
+    if _interpreting:
+        return function
+    import numba
+    from numba.extending import register_jitable
+
+    while _waiting:
+        # By itself LLVM inlines small functions only.
+        register_jitable(forceinline=True)(_waiting.pop())
+    return keep_code(numba.njit(nogil=True, fastmath=set(FASTMATH), error_model="numpy")(function))
+
+
+def tell_when_compiling(tell: Callable[[], None]) -> None:
+    """Call `tell` once, at the first real compilation; loading from the cache does not count."""
+    from numba.core import event
+
+    class Once(event.Listener):
+        waiting = True
+
+        def on_start(self, event):
+            if self.waiting:
+                self.waiting = False
+                tell()
+
+        def on_end(self, event):
+            pass
+
+    event.register("numba:compile", Once())
+
+
+def may_be_inlined(package: str, *below: str) -> None:
+    """Say, from a package's `__init__`, that its functions inline one another, and those of packages below it.
+
+    Machine code made of one of them is then found again only as long as no source of these packages changed. Of
+    packages that do not say so the files of the functions that are called by name are looked at.
+    """
+    _packages[package] = below
+
+
+@functools.cache
+def _package_hash(package: str) -> str:
+    digest = hashlib.sha256(package.encode())
+    for below in _packages.get(package, ()):
+        digest.update(_package_hash(below).encode())
+    spec = importlib.util.find_spec(package)
+    for folder in (spec.submodule_search_locations or []) if spec else []:
+        for path in sorted(Path(folder).rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def function_fingerprint(*functions: Callable | None, within: str) -> str:
+    """Hash of what a compiled function inlines; numba's cache looks at the source of the outermost only.
+
+    It is made of the byte code of `functions` and of all they call by name, and of the sources of their packages,
+    of this one, and of the package of the module `within` which the compiled function is written.
+    """
+    digest = hashlib.sha256()
+    packages = {_package(__name__), _package(within)}
+    seen: set[Callable] = set()
+    waiting = [function for function in functions if function is not None]
+    while waiting:
+        function = waiting.pop()
+        if function in seen:
+            continue
+        seen.add(function)
+        digest.update(_code_text(function.__code__).encode())
+        waiting += _callees(function)
+        package = _package(function.__module__ or "")
+        if package in _packages:
+            packages.add(package)
+            continue
+        try:
+            digest.update(Path(inspect.getsourcefile(function) or "").read_bytes())
+        except (OSError, TypeError):
+            pass  # from a notebook or a prompt: the byte code tells changes apart
+    for package in sorted(packages):
+        digest.update(_package_hash(package).encode())
+    return digest.hexdigest()
+
+
+def _package(module: str) -> str:
+    return module.partition(".")[0]
+
+
+def _code_text(code: types.CodeType) -> str:
+    constants = [_code_text(c) if isinstance(c, types.CodeType) else repr(c) for c in code.co_consts]
+    return " ".join([code.co_name, code.co_code.hex(), *constants, *code.co_names])
+
+
+class CompiledOrPython:
+    """A function compiled at its first call, or run as Python, with one warning, if numba refuses it."""
+
+    def __init__(self, function: Callable):
+        """Take a plain function; nothing is compiled yet."""
+        self._python, self._run = function, compiled(function)
+        self._proven = self._run is function
+        self._first = threading.Lock()  # one thread compiles, or finds out that numba refuses
+
+    def __call__(self, *arguments):
+        """Call the function."""
+        if not self._proven:
+            with self._first:
+                return self._call_first(*arguments)
+        if self._run is self._python:
+            with np.errstate(all="ignore"):  # compiled code does not warn of overflow either
+                return self._run(*arguments)
+        return self._run(*arguments)
+
+    @property
+    def in_python(self) -> bool:
+        """Whether calls run as Python, as far as is known before the first."""
+        return self._run is self._python
+
+    @property
+    def direct(self) -> Callable:
+        """What a call comes to: machine code, once it has run, without the detour through this object."""
+        return self._run if self._proven and self._run is not self._python else self
+
+    def _call_first(self, *arguments):
+        if not self._proven:
+            try:
+                return self._run(*arguments)
+            except Exception as error:  # numba's, of many classes: compiled code itself raises nothing
+                warnings.warn(
+                    f"the model runs as Python, slowly, for numba refuses it: {_reason(error)}", stacklevel=3
+                )
+                self._run = self._python
+            finally:
+                self._proven = True
+        return self(*arguments)
+
+
+def _reason(error: Exception) -> str:
+    # numba frames its reason with lines on where it was; the first that is none of those says what is wrong.
+    frames = (
+        "Failed in",
+        "TypingError",
+        "During",
+        "There are",
+        "- Of which",
+        "Overload",
+        "With argument",
+        "Rejected",
+    )
+    lines = [line.strip() for line in str(error).splitlines()]
+    telling = [
+        line for line in lines if len(line) > 3 and not line.startswith((*frames, "File", ">>>", "No impl"))
+    ]
+    return telling[0] if telling else type(error).__name__

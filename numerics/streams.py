@@ -1,0 +1,179 @@
+"""Randomness as a function: Philox4x32-10 keyed by an episode, indexed by stream, step and channel.
+
+The same key gives the same numbers in a single env, a vector env, a batch and on any number of threads,
+because a draw depends on its index only and never on what was drawn before. Every expression works on
+scalars, on NumPy arrays and inside numba. Source: Salmon, Moraes, Dror, Shaw (2011), "Parallel random
+numbers: as easy as 1, 2, 3"; normals by Box and Muller (1958).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from numerics.compiled import inlined
+
+# Streams: what a draw is for. Two streams of one key are independent.
+PROCESS, MEASUREMENT, INITIAL, EXCITATION, FILTER_PROCESS, FILTER_MEASUREMENT, FILTER_PRIOR = range(1, 8)
+DISTURBANCE, CHANCE, REFERENCE_SIGNAL, PARAMETERS = range(8, 12)
+
+GROUP = 32  # normals that one pass of vector code makes: four from each of eight blocks
+
+_MULTIPLIER_0, _MULTIPLIER_1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
+_WEYL_0, _WEYL_1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
+_LOW, _SHIFT, _NONE = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(0)
+_SQRT_HALF_BITS = int(np.float64(np.sqrt(0.5)).view(np.int64))
+_LN_2, _PI, _TWO_TO_MINUS_32 = float(np.log(2.0)), float(np.pi), 2.0**-32
+
+
+@inlined
+def _round(counter, key):
+    c0, c1, c2, c3 = counter
+    product_0 = _MULTIPLIER_0 * c0
+    product_1 = _MULTIPLIER_1 * c2
+    return (
+        (product_1 >> _SHIFT) ^ c1 ^ key[0],
+        product_1 & _LOW,
+        (product_0 >> _SHIFT) ^ c3 ^ key[1],
+        product_0 & _LOW,
+    )
+
+
+@inlined
+def _bump(key):
+    return (key[0] + _WEYL_0) & _LOW, (key[1] + _WEYL_1) & _LOW
+
+
+@inlined
+def philox(counter, key):
+    """Four 32-bit words, held in uint64, from a counter of four words and a key of two.
+
+    Ten rounds, written out: a loop here would keep the compiler from vectorising the caller's loop.
+    """
+    key_1 = _bump(key)
+    key_2 = _bump(key_1)
+    key_3 = _bump(key_2)
+    key_4 = _bump(key_3)
+    counter = _round(_round(_round(_round(_round(counter, key), key_1), key_2), key_3), key_4)
+    key_5 = _bump(key_4)
+    key_6 = _bump(key_5)
+    key_7 = _bump(key_6)
+    key_8 = _bump(key_7)
+    return _round(_round(_round(_round(_round(counter, key_5), key_6), key_7), key_8), _bump(key_8))
+
+
+@inlined
+def uniform_block(block, step, stream, key_0, key_1):
+    """Four uniform numbers in (0, 1), multiples of 2^-32 plus 2^-33, for one block of one step."""
+    counter = (np.uint64(block), np.uint64(step), np.uint64(stream), _NONE)
+    w0, w1, w2, w3 = philox(counter, (np.uint64(key_0), np.uint64(key_1)))
+    return (
+        (np.float64(np.int64(w0)) + 0.5) * _TWO_TO_MINUS_32,
+        (np.float64(np.int64(w1)) + 0.5) * _TWO_TO_MINUS_32,
+        (np.float64(np.int64(w2)) + 0.5) * _TWO_TO_MINUS_32,
+        (np.float64(np.int64(w3)) + 0.5) * _TWO_TO_MINUS_32,
+    )
+
+
+@inlined
+def logarithm(x):
+    """Natural logarithm of a positive, normal float64 to 1e-15, without a branch or a library call.
+
+    x = 2^e m with m in [sqrt(1/2), sqrt(2)); log m = 2 artanh((m - 1)/(m + 1)) by its series.
+    """
+    bits = np.float64(x).view(np.int64)
+    exponent = (bits - _SQRT_HALF_BITS) >> 52
+    m = np.int64(bits - (exponent << 52)).view(np.float64)
+    s = (m - 1.0) / (m + 1.0)
+    t = s * s
+    series = 1.0 / 21.0
+    series = series * t + 1.0 / 19.0
+    series = series * t + 1.0 / 17.0
+    series = series * t + 1.0 / 15.0
+    series = series * t + 1.0 / 13.0
+    series = series * t + 1.0 / 11.0
+    series = series * t + 1.0 / 9.0
+    series = series * t + 1.0 / 7.0
+    series = series * t + 1.0 / 5.0
+    series = series * t + 1.0 / 3.0
+    series = series * t + 1.0
+    return np.float64(exponent) * _LN_2 + 2.0 * s * series
+
+
+@inlined
+def cosine_and_sine_of_turns(turns):
+    """cos(2 pi turns) and sin(2 pi turns) for |turns| <= 1/2: Taylor series at half the angle, doubled."""
+    a = _PI * turns
+    q = a * a
+    s = -1.0 / 121645100408832000.0
+    s = s * q + 1.0 / 355687428096000.0
+    s = s * q - 1.0 / 1307674368000.0
+    s = s * q + 1.0 / 6227020800.0
+    s = s * q - 1.0 / 39916800.0
+    s = s * q + 1.0 / 362880.0
+    s = s * q - 1.0 / 5040.0
+    s = s * q + 1.0 / 120.0
+    s = s * q - 1.0 / 6.0
+    s = (s * q + 1.0) * a
+    c = -1.0 / 6402373705728000.0
+    c = c * q + 1.0 / 20922789888000.0
+    c = c * q - 1.0 / 87178291200.0
+    c = c * q + 1.0 / 479001600.0
+    c = c * q - 1.0 / 3628800.0
+    c = c * q + 1.0 / 40320.0
+    c = c * q - 1.0 / 720.0
+    c = c * q + 1.0 / 24.0
+    c = c * q - 0.5
+    c = c * q + 1.0
+    return 1.0 - 2.0 * s * s, 2.0 * s * c
+
+
+@inlined
+def normal_block(block, step, stream, key_0, key_1):
+    """Four independent standard normals (|value| < 6.8) for one block of one step of one stream."""
+    u0, u1, u2, u3 = uniform_block(block, step, stream, key_0, key_1)
+    radius_0 = (-2.0 * logarithm(u0)) ** 0.5
+    radius_1 = (-2.0 * logarithm(u2)) ** 0.5
+    cosine_0, sine_0 = cosine_and_sine_of_turns(u1 - 0.5)
+    cosine_1, sine_1 = cosine_and_sine_of_turns(u3 - 0.5)
+    return radius_0 * cosine_0, radius_0 * sine_0, radius_1 * cosine_1, radius_1 * sine_1
+
+
+@inlined
+def fill_normals(out, count, step, stream, key_0, key_1):
+    """Fill a vector with the normals of channels 0, 1, 2, ..., at least `count` of them.
+
+    It fills whole groups of GROUP, so that the compiled loop has no remainder; out must have room for them.
+    """
+    for block in range((count + GROUP - 1) // GROUP * (GROUP // 4)):
+        z0, z1, z2, z3 = normal_block(block, step, stream, key_0, key_1)
+        out[4 * block] = z0
+        out[4 * block + 1] = z1
+        out[4 * block + 2] = z2
+        out[4 * block + 3] = z3
+
+
+def draw_key(generator: np.random.Generator) -> np.ndarray:
+    """Draw an episode's key from a NumPy generator: two 32-bit words as float64, shape (2,)."""
+    return generator.integers(0, 2**32, size=2).astype(np.float64)
+
+
+def draw_keys(generator: np.random.Generator, count: int) -> np.ndarray:
+    """Draw the keys (count, 2) that so many calls of `draw_key` would give."""
+    return generator.integers(0, 2**32, size=(count, 2)).astype(np.float64)
+
+
+def episode_keys(seeds) -> np.ndarray:
+    """Keys, shape (len(seeds), 2), that envs draw at their first `reset(seed=s)` for s in seeds."""
+    from gymnasium.utils.seeding import np_random
+
+    return np.array([draw_key(np_random(int(seed))[0]) for seed in seeds])
+
+
+def filter_generator(seed: int | None) -> np.random.Generator:
+    """Generator of the keys that a filter wrapper draws, one an episode, after `reset(seed=seed)`."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(FILTER_PRIOR,)))
+
+
+def filter_keys(seeds) -> np.ndarray:
+    """Keys, shape (len(seeds), 2), of a filter wrapper's first episode after `reset(seed=s)` for s in seeds."""
+    return np.array([draw_key(filter_generator(int(seed))) for seed in seeds])

@@ -1,0 +1,1 @@
+"""What disturbs any plant: effects as frozen values, sensors and recorded series."""

@@ -1,0 +1,154 @@
+"""What disturbs a thruster: immutable descriptions, registered by name, that JSON can hold.
+
+An effect is a frozen dataclass of plain numbers with the function that acts on a block of copies,
+
+    act(memory, b, target, rows, number, numbers, at, begin)
+
+where `memory[b, target, j]` is what it changes for copy j, `memory[b, rows + i, j]` are its own states,
+`numbers[at + i]` its parameters, `number` tells its random draws from those of other effects, and `begin` is true
+at the start of an episode. The same function serves a single env, a batch and a vector env. Anyone may register
+further effects before the first env is made.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+from numerics.checks import shown
+from numerics.compiled import inlined
+from numerics.streams import CHANCE, DISTURBANCE, normal_block, uniform_block
+from plants.disturbances.layout import KEY_0, KEY_1, STEP
+
+MAGNITUDES = (1e-100, 1e100)  # of an effect's arguments and of what follows from them
+LONGEST = 1e9  # [s], and in steps: what an effect may hold
+
+
+class Surroundings(NamedTuple):
+    """What an effect may need to turn its arguments into numbers."""
+
+    dt: float  # [s]
+    thrust_scale: float  # steady thrust at max_voltage [N]
+    back_emf: float  # motor speed to back-EMF, K1/K2 [V s/rad]
+
+
+class Effect:
+    """Base of all effects; fields of the dataclass are the arguments."""
+
+    act: ClassVar[Callable]  # the function above, a staticmethod
+    name: ClassVar[str]
+
+    def parameters(self, around: Surroundings) -> list[float]:
+        """Numbers that `act` finds from `numbers[at]` on: the fields in order, unless overridden."""
+        return [float(value) for value in dataclasses.astuple(self)]
+
+    def rows(self, around: Surroundings) -> int:
+        """Number of states that a copy keeps for this effect."""
+        return 0
+
+    def largest(self) -> float:
+        """Largest magnitude that a signal comes to, at four standard deviations of what is random."""
+        return 0.0
+
+    def as_mapping(self) -> dict:
+        """The effect as JSON can hold it: its name and its arguments."""
+        return {"name": self.name, **dataclasses.asdict(self)}
+
+
+class Registry:
+    """Effects of one kind by name, and how to make them from mappings."""
+
+    def __init__(self, argument: str):
+        """Name the env's argument for which this registry makes effects."""
+        self.argument = argument
+        self.effects: dict[str, type[Effect]] = {}
+
+    def register(self, name: str) -> Callable[[type], type]:
+        """Return a class decorator that makes a frozen dataclass an effect of this name."""
+
+        def decorate(cls: type) -> type:
+            cls.name = name
+            self.effects[name] = cls
+            return cls
+
+        return decorate
+
+    def make(self, given) -> tuple[Effect, ...]:
+        """Effects from None, one effect or a sequence of them, each an object or a mapping with its `name`.
+
+        Raises ValueError that states the rule and the value.
+        """
+        if given is None:
+            return ()
+        if isinstance(given, (Mapping, Effect)):
+            given = [given]
+        if isinstance(given, str) or not hasattr(given, "__iter__"):
+            raise ValueError(f"{self.argument} must be a list of mappings with a name, but got {shown(given)}")
+        return tuple(self._make_one(one) for one in given)
+
+    def _make_one(self, given) -> Effect:
+        if isinstance(given, tuple(self.effects.values())):
+            return given
+        names = ", ".join(self.effects)
+        if not isinstance(given, Mapping) or given.get("name") not in tuple(self.effects):
+            rule = f"each entry of {self.argument} must be a mapping whose name is one of {names}"
+            raise ValueError(f"{rule}, but got {shown(given)}")
+        cls = self.effects[given["name"]]
+        arguments = {key: value for key, value in given.items() if key != "name"}
+        fields = [field.name for field in dataclasses.fields(cls)]
+        unknown = sorted(set(arguments) - set(fields), key=str)
+        if unknown:
+            rule = f"arguments of {given['name']!r} must be among {', '.join(fields)}"
+            raise ValueError(f"{rule}, but got {unknown}")
+        try:
+            return cls(**arguments)
+        except TypeError:  # a field without a default is missing
+            rule = f"{given['name']!r} must be given {', '.join(fields)}"
+            raise ValueError(f"{rule}, but got {shown(arguments)}") from None
+
+
+@inlined
+def normals(memory, b, j, number):
+    """Four standard normals of one effect, copy and step."""
+    return normal_block(number, memory[b, STEP, j], DISTURBANCE, memory[b, KEY_0, j], memory[b, KEY_1, j])
+
+
+@inlined
+def uniforms(memory, b, j, number):
+    """Four uniform numbers in (0, 1) of one effect, copy and step."""
+    return uniform_block(number, memory[b, STEP, j], CHANCE, memory[b, KEY_0, j], memory[b, KEY_1, j])
+
+
+def encoded(effects, kinds: tuple[type[Effect], ...], target: int, first_row: int, first_number: int, around):
+    """Numbers of some effects on one target row, and the number of rows that they take."""
+    numbers: list[float] = []
+    rows = 0
+    for number, effect in enumerate(effects, first_number):
+        parameters = _representable(effect, effect.parameters(around))
+        header = [5 + len(parameters), kinds.index(type(effect)), target, first_row + rows, number]
+        numbers += [*header, *parameters]
+        rows += effect.rows(around)
+    return numbers, rows
+
+
+def _representable(effect: Effect, parameters: list[float]) -> list[float]:
+    """What an effect comes to, as floats; ValueError where floating point would make infinity or zero of it."""
+    smallest, largest = MAGNITUDES
+    given = [abs(value) for value in np.hstack([*_numbers(dataclasses.astuple(effect)), 0.0]) if value]
+    if min(given, default=1.0) < smallest or not all(abs(value) <= largest for value in (*given, *parameters)):
+        rule = f"arguments of {effect.name!r} must be zero, or from {smallest:g} to {largest:g} in magnitude"
+        raise ValueError(f"{rule}, and so must what follows from them, but got {shown(effect)}")
+    return [float(value) for value in parameters]
+
+
+def _numbers(values: tuple) -> list:
+    """Those that are numbers, or tuples of numbers."""
+    return [value for value in values if isinstance(value, (int, float, tuple)) and value]
+
+
+def set_field(effect: Effect, name: str, value) -> None:
+    """Set a checked value on a frozen effect, from its __post_init__."""
+    object.__setattr__(effect, name, value)

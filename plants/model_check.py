@@ -1,0 +1,95 @@
+"""Whether a model's functions take and return what its numbers say, tried once, as Python, at the prior mean."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+
+import numpy as np
+
+from numerics.checks import as_floats, shown
+
+
+def checked_constants(given) -> tuple:
+    """Return constants as a NamedTuple, as it is given, or a tuple of floats; raise ValueError for others."""
+    try:
+        if isinstance(given, (dict, set, str)):
+            raise ValueError
+        values = as_floats(tuple(given))
+        if values.ndim != 1 or not np.isfinite(values).all():
+            raise ValueError
+    except (TypeError, ValueError):
+        rule = "constants must be a NamedTuple or a tuple of finite numbers"
+        raise ValueError(f"{rule}, but got {shown(given)}") from None
+    return given if hasattr(given, "_fields") else tuple(values.tolist())
+
+
+def check_functions(model) -> None:
+    """Raise ValueError unless a model's f and h, and their Jacobians if given, have the shapes of its numbers."""
+    n, m = model.n, model.m
+    states, measured = _count(n, "state"), _count(m, "measurement")
+    by_states, by_noise = f"as prior_mean has {n}", f"as measurement_noise_cov is {m} x {m}"
+    rules = {
+        "transition": ("x, u, c", (n,), f"a tuple of {states}, {by_states}"),
+        "observe": ("x, c", (m,), f"a tuple of {measured}, {by_noise}"),
+        "transition_jacobian": ("x, u, c", (n, n), f"{_count(n, 'row')} of {n}, {by_states}"),
+        "observe_jacobian": ("x, c", (m, n), f"{_count(m, 'row')} of {n}, {by_noise}"),
+    }
+    for name, (arguments, shape, rule) in rules.items():
+        function = getattr(model, name)
+        if function is not None:
+            _check_arguments(name, function, arguments)
+            _check_result(name, function, model, arguments, shape, rule)
+
+
+def _check_arguments(name: str, function: Callable, arguments: str) -> None:
+    if not callable(function):
+        raise ValueError(f"{name} must be a function of ({arguments}), but got {shown(function)}")
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # some are written in C
+        return
+    try:
+        signature.bind(*arguments.split(", "))
+    except TypeError:
+        raise ValueError(f"{name} must be a function of ({arguments}), but takes {signature}") from None
+
+
+def _check_result(name: str, function: Callable, model, arguments: str, shape: tuple, rule: str) -> None:
+    for point in (model.prior_mean, model.prior_mean + model.scales):
+        given = {"x": tuple(point.tolist()), "u": (0.0,) * model.inputs, "c": model.constants}
+        try:
+            with np.errstate(all="ignore"):
+                result = function(*(given[argument] for argument in arguments.split(", ")))
+        except ArithmeticError:  # machine code has infinity there
+            continue
+        except Exception as error:
+            if str(error).startswith("math "):  # "math domain error", where machine code has NaN
+                continue
+            sizes = f"{_count(model.n, 'state')} and {_count(model.inputs, 'input')}"
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            raise ValueError(f"{name} must work for {sizes}, but raised {reason}") from error
+        found = _shape(result)
+        if found != shape:
+            raise ValueError(f"{name} must return {rule}, but returned {_said(found, result)}")
+        return
+
+
+def _shape(result) -> tuple[int, ...] | None:
+    """Shape of a result; None if it is not made of real numbers."""
+    try:
+        return as_floats(result).shape
+    except ValueError:
+        return None
+
+
+def _said(shape: tuple[int, ...] | None, result) -> str:
+    if shape is None or len(shape) > 2:
+        return shown(result)
+    if len(shape) == 1:
+        return _count(shape[0], "entry").replace("entrys", "entries")
+    return f"{shape[0]} x {shape[1]} numbers" if shape else f"the number {shown(result)}"
+
+
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

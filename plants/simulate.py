@@ -1,0 +1,118 @@
+"""Truth drawn from a model: states and measurements of many trajectories with the model's own noise."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from numerics.streams import GROUP, INITIAL, MEASUREMENT, PROCESS, fill_normals
+from numerics.tuples import vector_reader, vector_writer
+from plants.layout import constants_form, constants_reader, number_places, padded
+from plants.state_space import StateSpaceModel
+
+
+class Truth(NamedTuple):
+    """Trajectories of B truths over K steps."""
+
+    states: np.ndarray  # (B, K + 1, n)
+    measurements: np.ndarray  # (B, K + 1, m)
+
+
+@inlined
+def add_correlated(out, numbers, root, count, draws):
+    """Out += L draws, the lower triangular L (count, count) lying by rows at numbers[root]."""
+    for i in range(count):
+        for k in range(i + 1):
+            out[i] += numbers[root + i * count + k] * draws[k]
+
+
+@cache
+def truth_steps(transition, observe, n: int, m: int, inputs: int, form):
+    """Functions begin(x, draws, key, numbers), advance(x, u, draws, step, key, numbers), measure(z, x, ...).
+
+    They work on arrays x (n,), u (inputs,), z (m,), draws with room for GROUP multiples, key (2,).
+    """
+    source = number_places(n, m)
+    prior_mean, prior_root, substeps = source.prior_mean, source.prior_root, source.substeps
+    q_root, r_root = source.q_root, source.r_root
+    state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)
+    control, constants = vector_reader(inputs), constants_reader(n, m, form)
+
+    @inlined
+    def begin(x, draws, key_0, key_1, numbers):
+        fill_normals(draws, n, 0, INITIAL, key_0, key_1)
+        for i in range(n):
+            x[i] = numbers[prior_mean + i]
+        add_correlated(x, numbers, prior_root, n, draws)
+
+    @inlined
+    def advance(x, u, draws, step, key_0, key_1, numbers):
+        v, c = control(u), constants(numbers)
+        for _ in range(int(numbers[substeps])):
+            store_state(x, transition(state(x), v, c))
+        fill_normals(draws, n, step, PROCESS, key_0, key_1)
+        add_correlated(x, numbers, q_root, n, draws)
+
+    @inlined
+    def measure(z, x, draws, step, key_0, key_1, numbers):
+        store_measurement(z, observe(state(x), constants(numbers)))
+        fill_normals(draws, m, step, MEASUREMENT, key_0, key_1)
+        add_correlated(z, numbers, r_root, m, draws)
+
+    return begin, advance, measure
+
+
+def truth_steps_of(model: StateSpaceModel):
+    """`truth_steps` for a model."""
+    functions = inlined(model.transition), inlined(model.observe)
+    return truth_steps(*functions, model.n, model.m, model.inputs, constants_form(model.constants))
+
+
+@cache
+def _simulation(begin, advance, measure, n: int, m: int, interpreting: bool):
+    fingerprint = function_fingerprint(begin, advance, measure, within=__name__)
+    room = padded(max(n, m), GROUP)
+
+    def simulate(keys, inputs, numbers, states, measurements):
+        fingerprint  # noqa: B018 - part of the cache's key
+        x, z, u, draws = np.zeros(n), np.zeros(m), np.zeros(inputs.shape[2]), np.zeros(room)
+        for b in range(keys.shape[0]):
+            key_0, key_1 = keys[b, 0], keys[b, 1]
+            begin(x, draws, key_0, key_1, numbers)
+            for k in range(states.shape[1]):
+                if k > 0:
+                    for i in range(u.shape[0]):
+                        u[i] = inputs[b, k - 1, i]
+                    advance(x, u, draws, k, key_0, key_1, numbers)
+                measure(z, x, draws, k, key_0, key_1, numbers)
+                for i in range(n):
+                    states[b, k, i] = x[i]
+                for i in range(m):
+                    measurements[b, k, i] = z[i]
+
+    return CompiledOrPython(simulate)
+
+
+def simulate(model: StateSpaceModel, keys: np.ndarray, inputs: np.ndarray) -> Truth:
+    """Draw truths from a model, one for every key (B, 2), under inputs (B, K, p).
+
+    The numbers are those of the plant with the same key, where the model is exact.
+
+    Raises:
+        ValueError: if shapes do not fit.
+    """
+    inputs = np.ascontiguousarray(inputs, dtype=np.float64)
+    keys = np.ascontiguousarray(keys, dtype=np.float64)
+    if inputs.ndim != 3 or inputs.shape[2] != model.inputs or keys.shape != (len(inputs), 2):
+        raise ValueError(
+            f"keys and inputs must have shapes (B, 2) and (B, K, {model.inputs}), "
+            f"but got {keys.shape} and {inputs.shape}"
+        )
+    count, steps, _ = inputs.shape
+    truth = Truth(np.empty((count, steps + 1, model.n)), np.empty((count, steps + 1, model.m)))
+    run = _simulation(*truth_steps_of(model), model.n, model.m, is_interpreting())
+    run(keys, inputs, model.numbers, truth.states, truth.measurements)
+    return truth

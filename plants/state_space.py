@@ -1,0 +1,150 @@
+"""`StateSpaceModel`: what a filter believes of a plant."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from numerics.checks import at_least, covariance, covariance_root, vector
+from numerics.derivatives import complex_step
+from numerics.pickling import as_function, as_made
+from plants.model_check import check_functions, checked_constants
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StateSpaceModel:
+    """A discrete-time model with additive Gaussian noise, for n states, p inputs and m measurements.
+
+        x_{k+1} = f(x_k, u_k) + w,  w ~ N(0, Q);   z_k = h(x_k) + v,  v ~ N(0, R);   x_0 ~ N(mean, cov)
+
+    The functions take and return tuples of components and may use `constants` c, the model's numbers:
+    `transition(x, u, c)`, `observe(x, c)` and, if known, their Jacobians as tuples of rows
+    (n rows of n, m rows of n). Written with arithmetic and `math` or `numpy` scalar functions they compile;
+    others run as Python, slower, with the same results.
+
+    Models, and filters and wrapped envs with them, can be copied and pickled. Pickle holds functions by name, so
+    those of a user must stand in a module; functions within functions, and lambdas, need cloudpickle.
+
+    Attributes:
+        transition: f, or one of its `substeps` equal parts: the function is applied `substeps` times a step.
+        observe: h.
+        process_noise_cov: Q, (n, n) or n variances, per step.
+        measurement_noise_cov: R, (m, m) or m variances; positive definite.
+        prior_mean: mean of the initial state, (n,).
+        prior_cov: covariance of the initial state, (n, n) or n variances; zero allowed.
+        inputs: number p of inputs.
+        constants: a NamedTuple (or tuple) of floats that is passed to every function.
+        transition_jacobian: df/dx(x, u, c) of one application; central differences if None.
+        observe_jacobian: dh/dx(x, c); central differences if None.
+        analytic: whether f and h are analytic functions that take complex numbers: Jacobians that are None are
+            then found by complex steps, exactly (`derivatives.complex_step`).
+        substeps: how often `transition` is applied in one step.
+        operating_state: x* (n,) about which a Kalman filter approximates the model; None for affine models.
+        operating_input: u* (p,), the input that goes with it.
+        operating_points: `operating_points(count)` gives so many pairs (x*, u*) over the range of the one input,
+            in its order, between which a Kalman filter may be scheduled; None if unknown.
+        state_low: the smallest state of normal operation, by components (n,); None if unknown.
+        state_high: the largest one (n,).
+    """
+
+    transition: Callable
+    observe: Callable
+    process_noise_cov: Any
+    measurement_noise_cov: Any
+    prior_mean: Any
+    prior_cov: Any
+    inputs: int = 1
+    constants: tuple = ()
+    transition_jacobian: Callable | None = None
+    observe_jacobian: Callable | None = None
+    analytic: bool = False
+    substeps: int = 1
+    operating_state: Any = None
+    operating_input: Any = None
+    operating_points: Callable | None = None
+    state_low: Any = None
+    state_high: Any = None
+
+    def __post_init__(self):
+        """Check shapes and signs, and try the functions; raise ValueError that states the rule and the value."""
+        mean = vector("prior_mean", self.prior_mean)
+        n, r = len(mean), self.measurement_noise_cov
+        m = len(r) if isinstance(r, (list, tuple, np.ndarray)) and np.ndim(r) else 1
+        checked = {
+            "prior_mean": mean,
+            "prior_cov": covariance("prior_cov", self.prior_cov, n),
+            "process_noise_cov": covariance("process_noise_cov", self.process_noise_cov, n),
+            "measurement_noise_cov": covariance("measurement_noise_cov", r, m, positive_definite=True),
+            "substeps": at_least("substeps", self.substeps, 1, 10_000),
+            "inputs": at_least("inputs", self.inputs, 0),
+            "constants": checked_constants(self.constants),
+        }
+        sizes = {"operating_state": n, "operating_input": checked["inputs"], "state_low": n, "state_high": n}
+        for name, size in sizes.items():
+            if getattr(self, name) is not None:
+                checked[name] = vector(name, getattr(self, name), size)
+        if self.analytic:
+            checked["transition_jacobian"] = self._exact("transition", n, n, "u, c")
+            checked["observe_jacobian"] = self._exact("observe", len(checked["measurement_noise_cov"]), n, "c")
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        check_functions(self)
+
+    def __getstate__(self) -> dict:
+        """The fields, with how to make functions that this package wrote out in place of these."""
+        return {name: as_made(value) for name, value in vars(self).items()}
+
+    def __setstate__(self, state: dict) -> None:
+        """The fields, functions made anew."""
+        vars(self).update({name: as_function(value) for name, value in state.items()})
+
+    def _exact(self, name: str, rows: int, columns: int, arguments: str) -> Callable:
+        """The Jacobian given, or one by complex steps; one that was made before `replace` is made anew."""
+        given, function = getattr(self, f"{name}_jacobian"), getattr(self, name)
+        if given is not None and not hasattr(given, "differentiates"):
+            return given
+        return complex_step(function, rows, columns, arguments)
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.prior_mean)
+
+    @property
+    def m(self) -> int:
+        """Number of measurements."""
+        return len(self.measurement_noise_cov)
+
+    def replace(self, **changes) -> StateSpaceModel:
+        """The same model with some fields changed."""
+        return dataclasses.replace(self, **changes)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """Constants, noise, prior and substeps as one float64 row, the form that compiled functions take."""
+        matrices = (
+            self.process_noise_cov,
+            covariance_root(self.process_noise_cov),
+            self.measurement_noise_cov,
+            covariance_root(self.measurement_noise_cov),
+            self.prior_mean,
+            self.prior_cov,
+            covariance_root(self.prior_cov),
+            self.scales,
+            [self.substeps],
+            list(self.constants),
+        )
+        return np.concatenate([np.ravel(np.asarray(a, dtype=np.float64)) for a in matrices])
+
+    @property
+    def scales(self) -> np.ndarray:
+        """What central differences measure a small step of each state in, (n,): its spread.
+
+        A change of units then changes nothing.
+        """
+        spread = np.sqrt(np.diag(self.prior_cov) + np.diag(self.process_noise_cov))
+        return np.where(spread > 0, spread, 1.0)

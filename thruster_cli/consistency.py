@@ -1,0 +1,75 @@
+"""Whether a filter's covariance is honest, as `thruster evaluate --consistency` tells it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from filters.consistency.intervals import rmse_ratios
+from filters.consistency.nees import SquaresCheck
+from filters.consistency.report import ConsistencyReport
+from filters.consistency.verdicts import comparison_sentence, sentences
+from filters.registry import filter_class
+from numerics.files import check_target
+from tuning.evaluation.baselines import ORACLE
+from tuning.evaluation.evaluate import check_consistency
+from tuning.evaluation.held_out import Comparison
+from tuning.problems.find import Scenario
+from tuning.report.consistency_figures import consistency_figure
+from tuning.search.space import Choice
+
+
+def check_request(path: Path, filter_name: str) -> None:
+    """Raise ValueError if a filter cannot be judged, or its picture not be written there."""
+    if path.suffix != ".png":
+        raise ValueError(f"--consistency must end in .png, but got {str(path)!r}")
+    if not filter_class(filter_name).has_covariance:
+        raise ValueError(f"--consistency must be for a filter with a covariance, but got {filter_name!r}")
+    check_target(path)
+
+
+def judge(choice: Choice, name: str, scenario: Scenario, proof: Comparison, path: Path) -> tuple[list[str], dict]:
+    """Draw the checks of a choice, called `name`; return what is to be said and the numbers behind it."""
+    report = check_consistency(choice.filter(scenario), scenario.data(proof.seeds))
+    ratios = rmse_ratios(proof.tuned.mean_squares, proof.true.mean_squares)
+    said = sentences(report)
+    for state, ratio in zip(report.states, ratios, strict=True):
+        said.append(comparison_sentence(state, name, ORACLE, ratio))
+    title = f"{choice.name}, {name}, on {report.runs} seeds of {scenario.name}"
+    consistency_figure(path, report, title, {f"{name}\nover {ORACLE}": ratios})
+    data = {**as_data(report), "rmse_over_true": ratios, "sentences": said, "picture": str(path)}
+    return [f"Is the {name} filter honest?", *said, f"Picture: {path}"], data
+
+
+def as_data(report: ConsistencyReport) -> dict:
+    """The numbers of a report, by name."""
+    white, ensemble = report.whiteness, report.ensemble
+    members = None
+    if ensemble is not None:
+        ranks = [{"frequencies": found.frequencies, "p_value": found.p_value} for found in ensemble.ranks]
+        members = {"size": ensemble.size, "ranks": ranks, "crps": ensemble.crps}
+    return {
+        "states": report.states,
+        "nees": _of_squares(report.nees),
+        "nis": _of_squares(report.nis),
+        "innovations": {
+            "correlations": white.correlations,
+            "statistic": white.statistic,
+            "p_value": white.p_value,
+        },
+        "coverage_95": report.coverage,
+        "crps": report.crps,
+        "crps_if_honest": report.crps_expected,
+        "members": members,
+        "divergences": report.divergences,
+    }
+
+
+def _of_squares(check: SquaresCheck) -> dict:
+    return {
+        "mean": check.mean,
+        "right": check.dimension,
+        "share_of_steps_in_95_band": check.share_inside,
+        "share_beyond_95_point": check.beyond,
+        "distance_from_chi_square": check.distribution.distance,
+        "p_value": check.distribution.p_value,
+    }

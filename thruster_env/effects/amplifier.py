@@ -1,0 +1,120 @@
+"""The amplifier between the commanded voltage and the motor: effects that a filter is not told of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from numerics.checks import positive
+from numerics.compiled import inlined
+from plants.disturbances.effects import Effect, Registry, Surroundings, set_field
+from thruster_env.engine.memory import OMEGA
+
+AMPLIFIER_EFFECTS = Registry("amplifier")
+
+
+@inlined
+def dead_band(memory, b, target, rows, number, numbers, at, begin):
+    """Take the half width off the voltage's magnitude, down to zero."""
+    width = numbers[at]
+    for j in range(memory.shape[2]):
+        voltage = memory[b, target, j]
+        memory[b, target, j] = voltage - min(max(voltage, -width), width)
+
+
+@inlined
+def slew_limit(memory, b, target, rows, number, numbers, at, begin):
+    """Let the voltage change by so much a step at most; it starts from zero."""
+    change = numbers[at]
+    for j in range(memory.shape[2]):
+        before = 0.0 if begin else memory[b, rows, j]
+        after = min(max(memory[b, target, j], before - change), before + change)
+        memory[b, target, j] = after
+        memory[b, rows, j] = after
+
+
+@inlined
+def saturation(memory, b, target, rows, number, numbers, at, begin):
+    """Clip to plus and minus a limit."""
+    limit = numbers[at]
+    for j in range(memory.shape[2]):
+        memory[b, target, j] = min(max(memory[b, target, j], -limit), limit)
+
+
+@inlined
+def sag(memory, b, target, rows, number, numbers, at, begin):
+    """Lose a fraction of the voltage that drives current, V_s - k_e omega_m."""
+    fraction, back_emf = numbers[at], numbers[at + 1]
+    for j in range(memory.shape[2]):
+        driving = memory[b, target, j] - back_emf * memory[b, OMEGA, j]
+        memory[b, target, j] -= 0.0 if begin else fraction * driving
+
+
+@AMPLIFIER_EFFECTS.register("dead-band")
+@dataclass(frozen=True)
+class DeadBand(Effect):
+    """No voltage within plus and minus `width` [V]; beyond, the voltage less the width."""
+
+    width: float
+    act = staticmethod(dead_band)
+
+    def __post_init__(self):
+        """Check the argument."""
+        set_field(self, "width", positive("width", self.width, zero_allowed=True))
+
+
+@AMPLIFIER_EFFECTS.register("slew-limit")
+@dataclass(frozen=True)
+class SlewLimit(Effect):
+    """A voltage that changes by at most `rate` [V/s], from zero at the start of an episode."""
+
+    rate: float
+    act = staticmethod(slew_limit)
+
+    def __post_init__(self):
+        """Check the argument."""
+        set_field(self, "rate", positive("rate", self.rate))
+
+    def parameters(self, around: Surroundings) -> list[float]:
+        """The largest change in a step [V]."""
+        return [self.rate * around.dt]
+
+    def rows(self, around: Surroundings) -> int:
+        """The voltage of the last step."""
+        return 1
+
+
+@AMPLIFIER_EFFECTS.register("saturation")
+@dataclass(frozen=True)
+class AmplifierSaturation(Effect):
+    """A voltage within plus and minus `limit` [V], less than the action space's bound to matter."""
+
+    limit: float
+    act = staticmethod(saturation)
+
+    def __post_init__(self):
+        """Check the argument."""
+        set_field(self, "limit", positive("limit", self.limit))
+
+
+@AMPLIFIER_EFFECTS.register("sag")
+@dataclass(frozen=True)
+class Sag(Effect):
+    """A supply that gives way under load: `fraction` of V_s - k_e omega_m is lost in its resistance.
+
+    With the resistance r of the supply and R_a of the armature, the fraction is r/(r + R_a). The motor's constant
+    is k_e = K1/K2 of the nominal parameters (a brushed motor without friction), the speed that before the step.
+    """
+
+    fraction: float
+    act = staticmethod(sag)
+
+    def __post_init__(self):
+        """Check the argument."""
+        fraction = positive("fraction", self.fraction, zero_allowed=True)
+        if fraction >= 1:
+            raise ValueError(f"fraction must be less than 1, but got {self.fraction!r}")
+        set_field(self, "fraction", fraction)
+
+    def parameters(self, around: Surroundings) -> list[float]:
+        """Fraction and back-EMF constant [V s/rad]."""
+        return [self.fraction, around.back_emf]

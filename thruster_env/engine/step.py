@@ -1,0 +1,217 @@
+"""The noisy thruster, any number of copies advanced one sample time by one compiled function.
+
+    x_{k+1} = F(x_k, u_k) + w_k,  w ~ N(0, Q);      z_{k+1} = h(x_{k+1}) + v_{k+1},  v ~ N(0, R)
+
+F integrates the equations of motion over one sample time; h are the channels. A single env is one copy, so the
+same seed gives the same numbers on every path. One step: amplifier, flow, motion, process noise, measurement,
+sensor effects, next reference, reward.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+from numerics.compiled import compiled, function_fingerprint, inlined, is_interpreting
+from numerics.streams import MEASUREMENT, normal_block
+from numerics.threads import in_parts
+from numerics.tuples import written_out
+from plants.disturbances.layout import KEY_0, KEY_1, MAX_CHANNELS, STEP
+from thruster_env.engine.memory import (
+    AMBIENT,
+    CHANNEL_COUNT,
+    CHANNEL_KINDS,
+    COMMAND,
+    CONSTANT_COUNT,
+    CONSTANT_ROWS,
+    EFFECT_KIND,
+    EFFECT_NUMBER,
+    EFFECT_PARAMETERS,
+    EFFECT_ROWS,
+    EFFECT_TARGET,
+    FIRST_EFFECT,
+    FIRST_REPORTED,
+    FLOW,
+    LAST_COMMAND,
+    LIMITS,
+    NEXT_REFERENCE,
+    OMEGA,
+    R_ROOT,
+    READINGS,
+    REFERENCE,
+    REPORTED,
+    REWARD,
+    REWARD_WEIGHTS,
+    SAMPLE_TIME,
+    SECTIONS,
+    TERMINATED,
+    THRUST,
+    THRUST_SCALE,
+    TIME,
+    TOP_VOLTAGE,
+    VALID,
+    VOLTAGE,
+)
+from thruster_env.engine.motion import (
+    add_process_noise,
+    clip_command,
+    draw_initial_state,
+    find_any_thrust,
+    find_thrust,
+    move_any,
+    move_thruster,
+)
+from thruster_env.task import step_cost
+
+LARGEST_ERROR = 1e6  # of thrust over T_max: a reward stays finite when a state does not
+
+
+@inlined
+def _measure_thrust(memory, b, numbers):
+    sigma = numbers[R_ROOT]
+    for j in range(memory.shape[2]):
+        v, _, _, _ = normal_block(0, memory[b, STEP, j], MEASUREMENT, memory[b, KEY_0, j], memory[b, KEY_1, j])
+        memory[b, READINGS, j] = memory[b, THRUST, j] + sigma * v
+        memory[b, VALID, j] = 1.0
+
+
+@inlined
+def _measure_all(memory, b, numbers):
+    count, drawn = int(numbers[CHANNEL_COUNT]), int(numbers[CONSTANT_ROWS])
+    for i in range(count):
+        kind = numbers[CHANNEL_KINDS + i]
+        for j in range(memory.shape[2]):
+            omega = memory[b, OMEGA, j]
+            reading = memory[b, THRUST, j]
+            if kind == 1.0:
+                reading = omega
+            elif kind == 2.0:
+                reading = abs(omega)
+            elif kind == 3.0:
+                # K1, K2 and K_h of a brushed motor give its current; see `sensors.CHANNELS`.
+                damping = memory[b, drawn, j] if drawn else numbers[0]
+                gain = memory[b, drawn + 1, j] if drawn else numbers[1]
+                load = memory[b, drawn + 2, j] if drawn else numbers[2]
+                reading = gain * (gain * memory[b, VOLTAGE, j] - damping * omega) / (load * damping)
+            memory[b, READINGS + i, j] = reading
+            memory[b, VALID + i, j] = 1.0
+    for j in range(memory.shape[2]):
+        v = normal_block(0, memory[b, STEP, j], MEASUREMENT, memory[b, KEY_0, j], memory[b, KEY_1, j])
+        for i in range(count):
+            at = R_ROOT + i * MAX_CHANNELS
+            noise = numbers[at] * v[0] + numbers[at + 1] * v[1] + numbers[at + 2] * v[2] + numbers[at + 3] * v[3]
+            memory[b, READINGS + i, j] += noise
+
+
+@inlined
+def _reward(memory, b, numbers):
+    tracking, energy, rate = numbers[REWARD_WEIGHTS], numbers[REWARD_WEIGHTS + 1], numbers[REWARD_WEIGHTS + 2]
+    per_thrust, per_volt = 1.0 / numbers[THRUST_SCALE], 1.0 / numbers[TOP_VOLTAGE]
+    for j in range(memory.shape[2]):
+        error = (memory[b, THRUST, j] - memory[b, REFERENCE, j]) * per_thrust
+        error = error if abs(error) < LARGEST_ERROR else LARGEST_ERROR  # NaN, too, as the episode ends
+        voltage = memory[b, COMMAND, j] * per_volt
+        change = voltage - memory[b, LAST_COMMAND, j] * per_volt
+        memory[b, REWARD, j] = -step_cost(error, voltage, change, tracking, energy, rate)
+
+
+@inlined
+def _tell_time_and_end(memory, b, numbers):
+    top_omega, top_flow = numbers[LIMITS], numbers[LIMITS + 1]
+    for j in range(memory.shape[2]):
+        memory[b, TIME, j] = memory[b, STEP, j] * numbers[SAMPLE_TIME]
+        kept = abs(memory[b, OMEGA, j]) < top_omega and abs(memory[b, FLOW, j]) < top_flow
+        memory[b, TERMINATED, j] = 0.0 if kept else 1.0
+        memory[b, LAST_COMMAND, j] = memory[b, COMMAND, j]
+
+
+def _dispatch(effects) -> Callable:
+    """Write out `run(kind, ...)`, which calls the function of one of some effects."""
+    arguments = "memory, b, target, rows, number, numbers, at, begin"
+    functions = {f"act_{i}": inlined(effect.act) for i, effect in enumerate(effects)}
+    lines = [line for i, name in enumerate(functions) for line in (f"if kind == {i}:", f"    {name}({arguments})")]
+    return written_out("run", f"kind, {arguments}", *lines, "None", **functions)
+
+
+def _chain(effects, section: int) -> Callable:
+    """Return `run(memory, b, numbers, at, begin)`: run a section's effects from numbers[at] on; where it ends."""
+    dispatch = _dispatch(effects)
+    place = SECTIONS + section
+
+    @inlined
+    def run(memory, b, numbers, at, begin):
+        for _ in range(int(numbers[place])):
+            kind, target = int(numbers[at + EFFECT_KIND]), int(numbers[at + EFFECT_TARGET])
+            rows, number = int(numbers[at + EFFECT_ROWS]), int(numbers[at + EFFECT_NUMBER])
+            dispatch(kind, memory, b, target, rows, number, numbers, at + EFFECT_PARAMETERS, begin)
+            at += int(numbers[at])
+        return at
+
+    return run
+
+
+def advance(known_effects, plain: bool) -> Callable:
+    """Compiled `step(first, last, memory, numbers, out, begin)` on blocks first ... last - 1 of a memory.
+
+    With `begin` it starts an episode of every copy from its key (rows KEY_0, KEY_1), and takes the first
+    measurement; else it applies the voltages in row COMMAND for one sample time. The reported rows are copied to
+    out (REPORTED, blocks, width).
+
+    Args:
+        known_effects: a tuple of effects for each registry, as `encoding.known_effects` gives them.
+        plain: know only a nominal thruster whose thrust is measured; compiles and runs faster.
+    """
+    return _build(compiled, known_effects, plain, is_interpreting())
+
+
+def advance_in_parts(known_effects, plain: bool) -> Callable:
+    """The same for `threads.Crew.run`."""
+    return _build(in_parts, known_effects, plain, is_interpreting())
+
+
+@cache
+def _build(maker: Callable, known_effects, plain: bool, interpreting: bool) -> Callable:
+    amplify, stream, sense, refer = (_chain(effects, section) for section, effects in enumerate(known_effects))
+    move, push = (move_thruster, find_thrust) if plain else (move_any, find_any_thrust)
+    measure = _measure_thrust if plain else _measure_all
+    reported = READINGS + 1 if plain else REPORTED  # rows beyond are of channels that there are not
+    fingerprint = function_fingerprint(
+        *(effect.act for effects in known_effects for effect in effects), within=__name__
+    )
+
+    def step(first, last, memory, numbers, out, begin):
+        fingerprint  # noqa: B018 - part of the cache's key
+        width = memory.shape[2]
+        for b in range(first, last):
+            if begin:
+                draw_initial_state(memory, b, numbers)
+            clip_command(memory, b, numbers)
+            for j in range(width):
+                memory[b, STEP, j] = 0.0 if begin else memory[b, STEP, j] + 1.0
+                memory[b, AMBIENT, j] = numbers[CONSTANT_COUNT - 2]
+            at = amplify(memory, b, numbers, FIRST_EFFECT, begin)
+            at = stream(memory, b, numbers, at, begin)
+            if not begin:
+                move(memory, b, numbers)
+                add_process_noise(memory, b, numbers)
+            push(memory, b, numbers)
+            measure(memory, b, numbers)
+            at = sense(memory, b, numbers, at, begin)
+            if begin:  # r_0 first; then r_1, as in every step
+                for j in range(width):
+                    memory[b, STEP, j] = -1.0
+                refer(memory, b, numbers, at, True)
+                for j in range(width):
+                    memory[b, STEP, j] = 0.0
+            for j in range(width):
+                memory[b, REFERENCE, j] = memory[b, NEXT_REFERENCE, j]
+                memory[b, NEXT_REFERENCE, j] = 0.0
+            refer(memory, b, numbers, at, False)
+            if not begin:
+                _reward(memory, b, numbers)
+            _tell_time_and_end(memory, b, numbers)
+            for i in range(FIRST_REPORTED, reported):
+                for j in range(width):
+                    out[i, b, j] = memory[b, i, j]
+
+    return maker(step)

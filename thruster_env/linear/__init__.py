@@ -1,0 +1,1 @@
+"""Steady states, linearisation, its analysis, and the published linear systems."""

@@ -1,0 +1,253 @@
+"""The bridge: the thruster as a `StateSpaceModel`. No other file of this package knows the thruster."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from functools import partial
+
+import numpy as np
+
+from numerics.checks import covariance, finite, positive, shown
+from numerics.compiled import inlined
+from numerics.linear_systems import zero_order_hold
+from numerics.pickling import makes_functions
+from numerics.tuples import tuple_of, written_out
+from plants.affine import affine_model
+from plants.state_space import StateSpaceModel
+from thruster_env.dynamics import (
+    Constants,
+    substep,
+    substep_jacobian,
+    thrust_and_torque,
+    thrust_and_torque_tangent,
+)
+from thruster_env.linear.steady_state import steady_state
+from thruster_env.parameters import ThrusterParameters, checked
+from thruster_env.plant import Plant, make_plant
+from thruster_env.plant_data import check_same_plant
+from thruster_env.rendering import Overlay
+
+ENV_IDS = tuple(f"BowThruster{task}-v0" for task in ("", "Tracking", "Reversal", "Linear"))
+
+
+@inlined
+def transition(x, u, c):
+    """One Runge-Kutta step of the thruster under voltage u = (V_s,)."""
+    return substep(x, (u[0], c.ambient_velocity), c)
+
+
+@inlined
+def transition_jacobian(x, u, c):
+    """Jacobian of `transition` by rows."""
+    return substep_jacobian(x, (u[0], c.ambient_velocity), c)
+
+
+@inlined
+def observe(x, c):
+    """The quantity that is measured by default: thrust [N]."""
+    return (thrust_and_torque(x, c)[0],)
+
+
+@inlined
+def observe_jacobian(x, c):
+    """Jacobian of `observe` by rows."""
+    by_speed, _ = thrust_and_torque_tangent(x, (1.0, 0.0), c)
+    by_flow, _ = thrust_and_torque_tangent(x, (0.0, 1.0), c)
+    return ((by_speed, by_flow),)
+
+
+@makes_functions
+def _channel_functions(channels: tuple[str, ...]) -> tuple[Callable, Callable]:
+    """`observe` and its Jacobian for some measured quantities."""
+    if channels == ("thrust",):
+        return observe, observe_jacobian
+    readings = {"thrust": "thrust(x, c)[0]", "speed": "x[0]", "speed-magnitude": "abs(x[0])"}
+    slopes = {
+        "thrust": "thrust_slopes(x, c)[0]",
+        "speed": "(1.0, 0.0)",
+        "speed-magnitude": "(1.0 if x[0] >= 0.0 else -1.0, 0.0)",
+    }
+    unknown = sorted(set(channels) - set(readings))
+    if unknown:  # it depends on the voltage
+        known = ", ".join(readings)
+        raise ValueError(f"channels that a model of the state can predict must be {known}, but got {unknown}")
+    return (
+        written_out("observe", "x, c", tuple_of(readings[name] for name in channels), thrust=observe),
+        written_out(
+            "observe_jacobian", "x, c", tuple_of(slopes[name] for name in channels), thrust_slopes=observe_jacobian
+        ),
+    )
+
+
+MODEL_ARGUMENTS = (
+    "process_noise_cov",
+    "measurement_noise_cov",
+    "prior_cov_factor",
+    "parameter_factors",
+    "operating_voltage",
+)
+
+
+def thruster_model(
+    *,
+    parameter_factors: Mapping[str, float] | None = None,
+    operating_voltage: float | None = None,
+    prior_cov_factor: float = 1.0,
+    **plant_arguments,
+) -> StateSpaceModel:
+    """What a filter assumes of a thruster, from plain arguments that JSON can hold.
+
+    Args:
+        parameter_factors: factors on fields of `ThrusterParameters`, by which the assumed thruster differs.
+        operating_voltage: where a Kalman filter approximates the model [V]; half of max_voltage if None.
+        prior_cov_factor: P_0, the covariance of the filter's prior, over that of the plant's initial state.
+        **plant_arguments: those of `thruster_env.plant.make_plant`; the noise covariances are the filter's.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
+    return model_of_plant(
+        make_plant(**plant_arguments),
+        parameter_factors=parameter_factors,
+        operating_voltage=operating_voltage,
+        prior_cov_factor=prior_cov_factor,
+    )
+
+
+def model_of_plant(
+    plant: Plant,
+    *,
+    parameter_factors: Mapping[str, float] | None = None,
+    operating_voltage: float | None = None,
+    process_noise_cov=None,
+    measurement_noise_cov=None,
+    prior_cov_factor: float = 1.0,
+) -> StateSpaceModel:
+    """The model of a plant, exact unless told otherwise; see `thruster_model` for the arguments."""
+    if plant.linear is not None and parameter_factors:
+        raise ValueError(f"parameter_factors must be none for a linear plant, but got {parameter_factors}")
+    if parameter_factors is not None:
+        plant = plant._replace(parameters=_scaled(plant.parameters, parameter_factors))
+    if process_noise_cov is not None:
+        plant = plant._replace(process_noise_cov=covariance("process_noise_cov", process_noise_cov, 2))
+    if measurement_noise_cov is not None:
+        r = covariance("measurement_noise_cov", measurement_noise_cov, len(plant.channels))
+        plant = plant._replace(measurement_noise_cov=r)
+    plant = plant._replace(initial_cov=positive("prior_cov_factor", prior_cov_factor) * plant.initial_cov)
+    if operating_voltage is None:
+        operating_voltage = plant.max_voltage / 2
+    operating_voltage = finite("operating_voltage", operating_voltage)
+    if plant.linear is not None:
+        return _linear_model(plant)
+    of_channels, of_channels_jacobian = _channel_functions(plant.channels)
+    return StateSpaceModel(
+        transition=transition,
+        observe=of_channels,
+        transition_jacobian=transition_jacobian,
+        observe_jacobian=of_channels_jacobian,
+        process_noise_cov=plant.process_noise_cov,
+        measurement_noise_cov=plant.measurement_noise_cov,
+        prior_mean=plant.initial_mean,
+        prior_cov=plant.initial_cov,
+        constants=plant.constants,
+        substeps=plant.substeps,
+        operating_state=steady_state(plant.parameters, operating_voltage, plant.ambient_velocity)[:2],
+        operating_input=[operating_voltage],
+        operating_points=partial(_operating_points, plant),
+        **_operating_range(plant),
+    )
+
+
+def model_of_env(env, known: tuple[str, ...] = (), /, **changes) -> StateSpaceModel:
+    """The model of a `BowThruster` env; changes are those of `model_of_plant`.
+
+    Raises:
+        ValueError: if the env has no plant that this package knows, or a change is unknown; the message then lists
+            those of the model behind others that are `known` to the caller: the filter's own numbers.
+    """
+    plant = getattr(env.unwrapped, "plant", None)
+    if not isinstance(plant, Plant):
+        raise ValueError(f"an env other than a bow thruster must come with a model, but got {env}")
+    unknown = sorted(set(changes) - set(MODEL_ARGUMENTS))
+    if unknown:
+        names = ", ".join((*known, *MODEL_ARGUMENTS))
+        raise ValueError(f"arguments must be among {names}, but got {', '.join(map(repr, unknown))}")
+    return model_of_plant(plant, **changes)
+
+
+def check_plant_of_env(env, tuned_for: Mapping | None, file: str) -> None:
+    """Raise ValueError if a tuned file is for another plant than the env's; warn where it is for other noise.
+
+    A file that does not tell (None), and an env that is no bow thruster, are not compared.
+    """
+    plant = getattr(env.unwrapped, "plant", None)
+    if tuned_for is not None and isinstance(plant, Plant):
+        others = check_same_plant(tuned_for, plant, file)
+        if others:
+            warnings.warn(f"{file} was tuned for {', '.join(others)}", stacklevel=4)
+
+
+def thrusts_of(model: StateSpaceModel, states: np.ndarray) -> np.ndarray:
+    """Thrust [N] that a model of the thruster has at states (..., 2); NaN for a linear plant's model."""
+    if not isinstance(model.constants, Constants):
+        return np.full(states.shape[:-1], np.nan)
+    return thrust_and_torque((states[..., 0], states[..., 1]), model.constants)[0]
+
+
+def overlay_of(label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
+    """What a rendered thruster shows of a belief: the state and its thrust, each with a standard deviation."""
+    # A model may have more states, such as parameters, behind these two.
+    (omega, flow), (omega_std, flow_std) = mean[:2].tolist(), np.sqrt(np.diag(cov))[:2].tolist()
+    if not isinstance(model.constants, Constants):  # a linear plant's model
+        return Overlay(label, None, None, omega, omega_std, flow, flow_std)
+    thrust, _ = thrust_and_torque((omega, flow), model.constants)
+    slopes = np.array(observe_jacobian((omega, flow), model.constants)[0])
+    thrust_std = float(slopes @ cov @ slopes) ** 0.5
+    return Overlay(label, thrust, thrust_std, omega, omega_std, flow, flow_std)
+
+
+def _linear_model(plant: Plant) -> StateSpaceModel:
+    """The exact model of a plant that moves by a published linear system."""
+    a, b = zero_order_hold(plant.linear.a, plant.linear.b, plant.dt)
+    rows = {"thrust": plant.linear.c[0], "speed": [1.0, 0.0]}
+    unknown = sorted(set(plant.channels) - set(rows))
+    if unknown:
+        raise ValueError(f"channels of a linear model must be {', '.join(rows)}, but got {unknown}")
+    return affine_model(
+        a=a,
+        b=b[:, :1],
+        c=[rows[channel] for channel in plant.channels],
+        state_offset=b[:, 1] * plant.ambient_velocity,
+        process_noise_cov=plant.process_noise_cov,
+        measurement_noise_cov=plant.measurement_noise_cov,
+        prior_mean=plant.initial_mean,
+        prior_cov=plant.initial_cov,
+    )
+
+
+def _operating_points(plant: Plant, count: int) -> list[tuple[tuple[float, float], tuple[float]]]:
+    """Steady states and their voltages, evenly from -max_voltage to max_voltage."""
+    voltages = np.linspace(-plant.max_voltage, plant.max_voltage, count).tolist()
+    return [(steady_state(plant.parameters, v, plant.ambient_velocity)[:2], (v,)) for v in voltages]
+
+
+def _operating_range(plant: Plant) -> dict[str, np.ndarray]:
+    """Smallest and largest state that the voltages settle to, ambient flow added."""
+    ends = [steady_state(plant.parameters, sign * plant.max_voltage)[:2] for sign in (1.0, -1.0)]
+    flow = np.array([0.0, plant.ambient_velocity])
+    return {
+        "state_low": np.min(ends, axis=0) + np.minimum(flow, 0.0),
+        "state_high": np.max(ends, axis=0) + np.maximum(flow, 0.0),
+    }
+
+
+def _scaled(parameters: ThrusterParameters, factors: Mapping[str, float]) -> ThrusterParameters:
+    names = [name for name in ThrusterParameters._fields if name != "angles"]
+    if not isinstance(factors, Mapping):
+        raise ValueError(f"parameter_factors must map names to factors, but got {shown(factors)}")
+    unknown = [name for name in factors if name not in names]
+    if unknown:
+        raise ValueError(f"parameter_factors must name fields of {', '.join(names)}, but got {unknown}")
+    scaled = {name: getattr(parameters, name) * positive(name, factor) for name, factor in factors.items()}
+    return checked(parameters._replace(**scaled))

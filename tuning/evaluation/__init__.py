@@ -1,0 +1,1 @@
+"""Filters scored on data: evaluation, comparison, held-out evaluation and tuned files."""

@@ -1,0 +1,102 @@
+"""What a tuned filter is compared with: scaled default, rule of thumb and oracle, each defined once."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+from scipy.optimize import brentq
+
+from filters.registry import filter_class
+from tuning.evaluation.evaluate import evaluate
+from tuning.problems.find import Scenario
+from tuning.problems.seeds import training_seeds
+from tuning.search.objectives import LARGEST, nis_ratio
+from tuning.search.plan import TRAINING_SEEDS
+from tuning.search.space import Choice, true_choice, untuned_choice
+
+# The names by which tables, sentences and pictures call them.
+SCALED, RULE, ORACLE, TUNED = "scaled default", "rule of thumb", "oracle", "tuned"
+DECADES = 8  # the factor on Q is searched as far as so many powers of ten, up or down
+DIGITS = 4  # of the factor: what is said of it is what was used
+CLOSE = 0.02  # the mean NIS is called 1 within this: an ensemble's need not be continuous in Q
+
+
+class Scaled(NamedTuple):
+    """The scaled default of a kind of filter, or why there is none."""
+
+    choice: Choice | None
+    factor: float | None  # on the rule of thumb's Q
+    nis: float | None  # mean NIS over the channels on the training runs, with that factor
+    reason: str = ""  # why there is none; empty where there is one
+
+
+def rule_of_thumb(name: str, scenario: Scenario) -> Choice:
+    """R from the sensor's sheet, Q = diag((1 % of each state's range)^2), N = 30 (particles: 1000)."""
+    return untuned_choice(name, scenario)
+
+
+def oracle(name: str, scenario: Scenario) -> Choice:
+    """The filter that is told the plant's own Q and R, with the rule of thumb's N."""
+    return true_choice(name, scenario)
+
+
+@lru_cache(maxsize=64)
+def scaled_default(name: str, scenario: Scenario, seed: int = 0) -> Scaled:
+    """The rule of thumb with one factor on its Q, such that the mean NIS on the training runs is right.
+
+        mean of nu' S(c Q, R)^-1 nu over runs and scored steps = m,  solved for log c
+
+    It is what an engineer does who looks at the innovations once. R stays. The runs are those that a study of this
+    seed learns from, the random numbers the same for each c, so the same arguments give the same factor.
+
+    Args:
+        name: of the filter.
+        scenario: the training runs, and what the filter assumes of the plant.
+        seed: of the study.
+
+    Returns:
+        The choice with its factor and mean NIS; without them, and with the reason, for a filter that has no NIS,
+        or whose mean NIS no factor between 1e-8 and 1e8 brings to 1.
+    """
+    if not filter_class(name).has_covariance:
+        return Scaled(None, None, None, f"{name} has no NIS by which its Q could be scaled")
+    data, start = scenario.data(training_seeds(seed, TRAINING_SEEDS)), rule_of_thumb(name, scenario)
+
+    def nis_at(factor: float) -> float:
+        ratio = nis_ratio(evaluate(scaled(start, factor).filter(scenario), data, scenario.scale))
+        return ratio if 0.0 < ratio < LARGEST else LARGEST
+
+    def excess(exponent: float) -> float:
+        return math.log(nis_at(10.0**exponent))
+
+    first, exponent = excess(0.0), 0
+    step = 1 if first > 0 else -1  # a larger Q lowers the NIS
+    last = first
+    while last * first > 0 and abs(exponent) < DECADES:
+        exponent += step
+        last = excess(exponent)
+    if last * first > 0:
+        ends = f"{math.exp(first):.3g} with a factor of 1 and {math.exp(last):.3g} with {10.0**exponent:g}"
+        return Scaled(None, None, None, f"no factor on Q brings the mean NIS of {name} to 1: it is {ends}")
+    root = brentq(excess, *sorted((exponent - step, exponent)), xtol=1e-3, rtol=1e-3) if exponent else 0.0
+    factor = float(f"{10.0**root:.{DIGITS}g}")
+    nis = nis_at(factor)
+    if abs(nis - 1.0) > CLOSE:
+        said = f"no factor on Q brings the mean NIS of {name} to 1: it jumps to {nis:.3g} with {factor:g}"
+        return Scaled(None, None, None, said)
+    return Scaled(scaled(start, factor), factor, nis)
+
+
+def scaled(choice: Choice, factor: float) -> Choice:
+    """The same choice with variances of the process noise that are a factor times as large."""
+    variances = tuple(factor * variance for variance in choice.model["process_noise_cov"])
+    return choice._replace(model={**choice.model, "process_noise_cov": variances})
+
+
+def baselines(name: str, scenario: Scenario, seed: int = 0) -> dict[str, Choice]:
+    """All baselines of a kind of filter that there are, by what they are called, the one that counts first."""
+    default = scaled_default(name, scenario, seed).choice
+    found = {SCALED: default} if default is not None else {}
+    return found | {RULE: rule_of_thumb(name, scenario), ORACLE: oracle(name, scenario)}

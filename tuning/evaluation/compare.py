@@ -1,0 +1,214 @@
+"""Filters side by side on scenarios: errors, consistency, cost, and who beats whom on the same seeds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.augmented import Unknown, augmented_model
+from filters.consistency.intervals import Interval, rmse_ratios
+from filters.engine.batch import Estimates, run
+from filters.filter import Filter
+from filters.particles.weighted import WeightedFilter
+from filters.registry import filter_class, make_filter
+from numerics.checks import one_of, positive
+from tuning.evaluation.baselines import oracle, rule_of_thumb, scaled_default
+from tuning.evaluation.evaluate import Evaluation, judge, score_ratio
+from tuning.problems.find import Data, Scenario
+from tuning.search.interruption import stop_on_interrupt
+from tuning.search.space import Choice, ensemble_sizes_of, has_ensemble
+
+KNOWLEDGE = ("true", "scaled", "untuned")  # of the plant's Q and R: oracle, scaled default, rule of thumb
+# What is believed of a constant by default: a flow of so many m/s, of others a part of their value.
+FLOW_STD, RELATIVE_STD, WALK_PART = 0.5, 0.2, 0.02  # the last a step, as part of the prior's
+SYMBOLS = {"ambient_velocity": "U_0"}  # for labels
+
+
+class Contender(NamedTuple):
+    """A filter that takes part in a comparison, whatever the scenario."""
+
+    label: str
+    choose: Callable[[Scenario], Choice]
+    unknown: Mapping[str, Unknown | None] = {}  # constants of the model that it estimates, too; None for a default
+
+    def filter(self, scenario: Scenario) -> Filter:
+        """The filter, with what the scenario lets it assume of the plant."""
+        filter_ = self.choose(scenario).filter(scenario)
+        if not self.unknown:
+            return filter_
+        numbers = {name: getattr(filter_, name) for name in self.choose(scenario).numbers}
+        constants, beliefs = filter_.model.constants, {}
+        for name, belief in self.unknown.items():
+            one_of("a constant to estimate", name, getattr(constants, "_fields", ()))
+            beliefs[name] = default_belief(name, getattr(constants, name)) if belief is None else belief
+        return make_filter(filter_.name, augmented_model(filter_.model, beliefs), **numbers)
+
+
+class Row(NamedTuple):
+    """What a filter achieved on a scenario, and against the first filter on the same seeds."""
+
+    label: str
+    filter_name: str
+    evaluation: Evaluation
+    above_bound: np.ndarray  # (n,), RMSE over the bound, less one
+    nees: float  # the mean, where n is right, or the median of a particle filter
+    nees_is_median: bool
+    microseconds: float  # a step of one run, on all cores
+    ratios: tuple[Interval, ...]  # by state, RMSE over the first filter's, paired
+    score_ratio: Interval  # score over the first filter's, paired
+
+    @property
+    def verdict(self) -> str:
+        """Whether the score is significantly lower than the first filter's: "better", "worse" or "tie"."""
+        return "better" if self.score_ratio.high < 1 else "worse" if self.score_ratio.low > 1 else "tie"
+
+
+class Leaderboard(NamedTuple):
+    """Filters on one scenario, in the order in which they were given."""
+
+    scenario: Scenario
+    seeds: Sequence[int]
+    bound: np.ndarray  # (n,), of the scenario's Gaussian core on these seeds
+    rows: list[Row]
+
+
+def contender(
+    name: str, knows: str = "true", unknown: Mapping[str, Unknown | None] | None = None, seed: int = 0, **numbers
+) -> Contender:
+    """A filter by name.
+
+    Args:
+        name: of the filter.
+        knows: "true" for the plant's own Q and R (the oracle), "scaled" for the scaled default, whose Q the mean
+            NIS on the training runs tells, "untuned" for the rule of thumb.
+        unknown: constants of the model to estimate with the states; None as a belief for `default_belief`.
+        seed: of the study whose training runs scale the scaled default.
+        **numbers: of the filter, such as `ensemble_size`; those of the rule of thumb by default.
+
+    Raises:
+        ValueError: for an unknown name or knowledge. (Numbers and constants are checked as the filter is made.)
+    """
+    filter_class(name)
+    one_of("knows", knows, KNOWLEDGE)
+    numbers = {key: value for key, value in numbers.items() if value is not None}
+
+    def chosen(scenario: Scenario) -> Choice:
+        choice = _known(knows, name, scenario, seed)
+        return choice._replace(numbers={**choice.numbers, **numbers})
+
+    unknown = unknown or {}
+    size = [str(numbers.get("ensemble_size", ensemble_sizes_of(name).untuned))] if has_ensemble(name) else []
+    others = [f"{key} {value:g}" for key, value in numbers.items() if key != "ensemble_size"]
+    added = [f"+ {SYMBOLS.get(constant, constant)}" for constant in unknown]
+    return Contender(" ".join([name, *size, *others, *added]), chosen, unknown)
+
+
+def _known(knows: str, name: str, scenario: Scenario, seed: int) -> Choice:
+    """The choice of a filter that knows so much; ValueError where there is no scaled default."""
+    if knows != "scaled":
+        return (oracle if knows == "true" else rule_of_thumb)(name, scenario)
+    found = scaled_default(name, scenario, seed)
+    if found.choice is None:
+        raise ValueError(f"{name} must have a scaled default on {scenario.name}, but {found.reason}")
+    return found.choice
+
+
+def sized(choice: Choice, ensemble_size: int | None) -> Choice:
+    """A choice with another ensemble size, if one is given and the filter has an ensemble."""
+    return choice if ensemble_size is None or not has_ensemble(choice.name) else choice.with_size(ensemble_size)
+
+
+def default_belief(name: str, value: float) -> Unknown:
+    """What is believed of a constant of the model by default.
+
+    Its prior has a standard deviation of 0.5 m/s for the ambient flow, and of a fifth of its value otherwise; a
+    step changes it by 2 % of that.
+
+    Raises:
+        ValueError: if the constant is zero, so that a part of it says nothing.
+    """
+    std = FLOW_STD if name == "ambient_velocity" else RELATIVE_STD * abs(value)
+    positive(f"the assumed {name}, of which a part is its spread,", std)
+    return Unknown(std=std, walk_std=WALK_PART * std)
+
+
+def compare(
+    contenders: Sequence[Contender],
+    scenarios: Iterable[Scenario],
+    seeds: Sequence[int],
+    on_row: Callable[[Scenario, str], None] = lambda scenario, label: None,
+) -> tuple[list[Leaderboard], bool]:
+    """Run filters over scenarios, all on the same seeds.
+
+    Ctrl-C ends it after the running filter and keeps what is done; a second one ends it at once.
+
+    Args:
+        contenders: the filters; the first one is what the others are compared with.
+        scenarios: on what.
+        seeds: at least 2; held-out ones, for a comparison of tuned filters.
+        on_row: called before each filter's run with the scenario and the filter's label.
+
+    Returns:
+        A leaderboard a scenario, and whether it was interrupted.
+
+    Raises:
+        ValueError: if there are no filters, two have the same label, or one cannot work on a scenario.
+        KeyboardInterrupt: if it is interrupted before any row is done.
+    """
+    labels = [one.label for one in contenders]
+    if not labels or len(set(labels)) < len(labels):
+        raise ValueError(f"a comparison must be of different filters, but got {', '.join(labels) or 'none'}")
+    boards: list[Leaderboard] = []
+    interrupted = False
+    # All filters are made before the first one runs: what is wrong with the last one is said at once.
+    teams = [(scenario, [one.filter(scenario) for one in contenders]) for scenario in scenarios]
+    try:
+        with stop_on_interrupt() as stopped:
+            for scenario, filters in teams:
+                data = scenario.data(seeds)
+                board = Leaderboard(scenario, seeds, scenario.bound(data), [])
+                boards.append(board)
+                for label, filter_ in zip(labels, filters, strict=True):
+                    on_row(scenario, label)
+                    board.rows.append(_row(label, filter_, data, board))
+                    if stopped():
+                        raise KeyboardInterrupt
+    except KeyboardInterrupt:
+        interrupted = True
+    boards = [board for board in boards if board.rows]
+    if not boards:
+        raise KeyboardInterrupt
+    return boards, interrupted
+
+
+def _row(label: str, filter_: Filter, data: Data, board: Leaderboard) -> Row:
+    estimates, seconds = timed_run(filter_, data)
+    evaluation = judge(filter_, estimates, data, board.scenario.scale)
+    first = board.rows[0].evaluation if board.rows else evaluation
+    particles = isinstance(filter_, WeightedFilter)
+    return Row(
+        label=label,
+        filter_name=filter_.name,
+        evaluation=evaluation,
+        above_bound=np.array([part.value for part in evaluation.rmse]) / board.bound - 1.0,
+        nees=evaluation.median_nees if particles else evaluation.nees.value,
+        nees_is_median=particles,
+        microseconds=1e6 * seconds / data.measurements[..., 0].size,
+        ratios=rmse_ratios(evaluation.mean_squares, first.mean_squares),
+        score_ratio=score_ratio(evaluation, first),
+    )
+
+
+def timed_run(filter_: Filter, data: Data) -> tuple[Estimates, float]:
+    """Estimates of a filter on some data, and the seconds that they took without compilation."""
+    few = data.filter_keys[:2], data.inputs[:2, :2], data.measurements[:2, :3]
+    first = [np.ascontiguousarray(part) for part in few]
+    for part in first:
+        part.setflags(write=False)  # as the data's are: numba compiles writable arrays anew
+    run(filter_, *first)
+    started = time.perf_counter()
+    estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
+    return estimates, time.perf_counter() - started

@@ -1,0 +1,57 @@
+"""What a choice is worth on seeds that no trial saw: beside its baselines, and the bound on these seeds."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.consistency.intervals import Interval
+from tuning.evaluation.baselines import ORACLE, RULE, SCALED, TUNED, Scaled, oracle, rule_of_thumb, scaled_default
+from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
+from tuning.problems.find import Scenario
+from tuning.problems.seeds import held_out_seeds
+from tuning.search.plan import HELD_OUT_SEEDS
+from tuning.search.space import Choice
+
+
+class Comparison(NamedTuple):
+    """A choice and its baselines on the same held-out seeds, and the bound on these."""
+
+    untuned: Evaluation  # of the rule of thumb
+    tuned: Evaluation
+    true: Evaluation  # of the oracle
+    bound: np.ndarray  # (n,) bound on the standard error of each state
+    seeds: range
+    scaled: Evaluation | None = None  # of the scaled default; None where there is none
+    default: Scaled | None = None  # its factor, or why there is none; None where it was not asked for
+
+    @property
+    def evaluations(self) -> dict[str, Evaluation]:
+        """All evaluations by what they are called: what stands in a table, from top to bottom."""
+        found = {RULE: self.untuned, SCALED: self.scaled, TUNED: self.tuned, ORACLE: self.true}
+        return {name: evaluation for name, evaluation in found.items() if evaluation is not None}
+
+    @property
+    def ratios(self) -> dict[str, Interval]:
+        """Score of the tuned filter over that of each baseline, paired, the one that counts first."""
+        found = self.evaluations
+        names = [name for name in (SCALED, RULE, ORACLE) if name in found]
+        return {name: score_ratio(self.tuned, found[name]) for name in names}
+
+
+def prove(choice: Choice, scenario: Scenario, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:
+    """A choice and its baselines on seeds that the study never saw, with the bound on these seeds.
+
+    Args:
+        choice: of a study.
+        scenario: on what.
+        seed: of the study; its training seeds scale the scaled default.
+        count: number of held-out seeds.
+    """
+    seeds = held_out_seeds(seed, count)
+    data = scenario.data(seeds)
+    default = scaled_default(choice.name, scenario, seed)
+    choices = (rule_of_thumb(choice.name, scenario), choice, oracle(choice.name, scenario), default.choice)
+    *found, scaled = (None if c is None else evaluate(c.filter(scenario), data, scenario.scale) for c in choices)
+    return Comparison(*found, bound=scenario.bound(data), seeds=seeds, scaled=scaled, default=default)

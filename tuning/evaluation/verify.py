@@ -1,0 +1,101 @@
+"""Whether what a tuned file says of held-out seeds is so: its metrics, computed once more."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from filters.tuned_file import read_tuned_file
+from numerics.checks import shown
+from tuning.evaluation.held_out import prove
+from tuning.evaluation.tuned import metrics, read_tuned, scenario_in, versions
+
+TOLERANCE = 1e-9  # relative: what the order of a sum may change
+LATER = ("scaled", "scaled_default")  # what older files lack
+
+
+class Difference(NamedTuple):
+    """A number of a tuned file that is not what comes out here."""
+
+    place: str  # such as "mismatch: tuned nees 0"
+    stored: Any
+    found: Any
+
+    @property
+    def relative(self) -> float:
+        """By how much the two differ, over the larger; infinite where one of them is no number."""
+        if not isinstance(self.stored, int | float) or not isinstance(self.found, int | float):
+            return float("inf")
+        return abs(self.stored - self.found) / max(abs(self.stored), abs(self.found))
+
+
+class Verification(NamedTuple):
+    """What came of computing a tuned file's metrics once more."""
+
+    checked: int  # numbers that were compared
+    differences: list[Difference]  # beyond rounding, the largest first
+    packages: dict[str, tuple[str, str]]  # of another version now: what the file was made with, and what is here
+
+    @property
+    def holds(self) -> bool:
+        """Whether every number is the same within rounding."""
+        return not self.differences
+
+
+def verify(path: str | Path) -> Verification:
+    """Compute the held-out metrics of a tuned file once more, on its seeds of each scenario.
+
+    Args:
+        path: the tuned file.
+
+    Raises:
+        ValueError: if the file is not a whole tuned file as it was written, or holds no metrics.
+    """
+    content, (choice, _, seed) = read_tuned_file(path), read_tuned(path)
+    held_out = content.get("held_out")
+    if not isinstance(held_out, dict) or not held_out:
+        raise ValueError(f"a tuned file must have held-out metrics to verify, but {path} has {shown(held_out)}")
+    places, differences = 0, []
+    for name, stored in held_out.items():
+        proof = prove(choice, scenario_in(content, name, path), seed, _count(stored, path))
+        found = {key: value for key, value in metrics(proof).items() if key in stored or key not in LATER}
+        pairs = _numbers(stored), _numbers(found)
+        names = list(dict.fromkeys([*pairs[0], *pairs[1]]))
+        differing = [Difference(f"{name}: {place}", *(part.get(place) for part in pairs)) for place in names]
+        places += len(names)
+        differences += [one for one in differing if one.stored != one.found and not one.relative <= TOLERANCE]
+    differences.sort(key=lambda difference: -difference.relative)
+    stored_versions, here = content.get("made_with", {}), versions()
+    packages = {
+        name: (stored_versions.get(name, "not stored"), version)
+        for name, version in here.items()
+        if stored_versions.get(name) != version
+    }
+    return Verification(places, differences, packages)
+
+
+def _count(stored, path: str | Path) -> int:
+    """Number of held-out seeds of a scenario's entry."""
+    try:
+        first, beyond = stored["seeds"]
+        return beyond - first
+    except (KeyError, TypeError, ValueError):
+        raise ValueError(
+            f"held-out metrics of a tuned file must tell their first seed and that after the last, but {path} has "
+            f"{shown(stored)}"
+        ) from None
+
+
+def _numbers(value, place: str = "") -> dict[str, Any]:
+    """All that is no mapping or list within a value, by where it is."""
+    return dict(_leaves(value, place))
+
+
+def _leaves(value, place: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict | list | tuple):
+        parts = value.items() if isinstance(value, dict) else enumerate(value)
+        for key, part in parts:
+            yield from _leaves(part, f"{place} {key}".strip())
+    else:
+        yield place, value

@@ -1,0 +1,1 @@
+"""Noise covariances by maximum likelihood, and what data determine of them."""

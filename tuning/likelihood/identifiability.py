@@ -1,0 +1,207 @@
+"""How well the innovations determine a filter's noise covariances, on the runs that it was tuned on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from optuna.distributions import BaseDistribution
+
+from filters.engine.batch import run
+from filters.registry import filter_class
+from tuning.problems.find import Data, Scenario
+from tuning.search.space import Choice, choice_of, parameters_of, untuned_choice
+
+KNOWN_WITHIN = np.log(10.0)  # a 95 % interval that reaches beyond a factor of ten determines nothing
+TWO_SIDED = 1.96  # standard errors of a 95 % interval
+SIGNIFICANT = 1.92  # fall in log-likelihood: half of the 95 % point of chi-squared with one degree of freedom
+STEP = np.log(2.0)  # of differences, in logarithms: ensembles need large ones
+CLOSE = 0.02  # in logarithms, to which the maximum is found
+EVALUATIONS = 100  # at most, on the way there
+LEAST = -1e6  # stands in for the log-likelihood of a run that has none
+COMPANION = 0.2  # part in a direction, of the largest one, from which on a number is named
+
+
+class Identifiability(NamedTuple):
+    """What the innovations of B runs say of p positive numbers; covariances are those of their logarithms."""
+
+    names: tuple[str, ...]
+    tuned: np.ndarray  # (p,), what the study chose
+    likeliest: np.ndarray  # (p,), under which the innovations are most likely
+    cov: np.ndarray  # (p, p)
+    identified: np.ndarray  # (p,) bool, as `is_identified` says
+
+    @property
+    def factors(self) -> np.ndarray:
+        """The 95 % interval of each number is the likeliest one over and times this, (p,)."""
+        return np.exp(TWO_SIDED * np.sqrt(np.diag(self.cov)))
+
+    @property
+    def loosest(self) -> dict[str, float]:
+        """The least known direction: factors by which the numbers go along while the first of them goes up by ten.
+
+        Only numbers with a part in it are told.
+        """
+        axis = np.linalg.eigh(self.cov)[1][:, -1]
+        order = np.argsort(-abs(axis))
+        parts = axis[order] / axis[order[0]]
+        return {
+            self.names[i]: float(10.0**part)
+            for i, part in zip(order, parts, strict=True)
+            if abs(part) >= COMPANION
+        }
+
+
+def identify(
+    choice: Choice, scenarios: Sequence[Scenario], data: Sequence[Data], space: Mapping[str, BaseDistribution]
+) -> Identifiability | None:
+    """How well the innovations determine Q's variances, R and P_0's scale of a choice; None without a covariance.
+
+    It works for every filter with a covariance: only its innovations' log-likelihood is needed.
+
+    Args:
+        choice: of one kind of filter; its other numbers are held.
+        scenarios: whose runs count.
+        data: for each scenario, the training data.
+        space: numbers that were searched with their ranges, `Plan.space`.
+    """
+    own = parameters_of(choice)
+    names = tuple(name for name in space if name in own and (name in ("R", "P0") or name.startswith("Q")))
+    if not names or not filter_class(choice.name).has_covariance:
+        return None
+
+    def log_likelihoods(logarithms: np.ndarray) -> np.ndarray:
+        moved = {**own, **{name: float(value) for name, value in zip(names, np.exp(logarithms), strict=True)}}
+        parts = []
+        for scenario, one in zip(scenarios, data, strict=True):
+            filter_ = choice_of(choice.name, moved, scenario).filter(scenario)
+            parts.append(run(filter_, one.filter_keys, one.inputs, one.measurements).log_likelihoods.sum(axis=1))
+        found = np.concatenate(parts)
+        return np.where(np.isfinite(found), found, LEAST)
+
+    tuned = np.array([own[name] for name in names])
+    bounds = np.log([(space[name].low, space[name].high) for name in names])
+    untuned = parameters_of(untuned_choice(choice.name, scenarios[0]))
+    starts = np.log(tuned), np.log([untuned.get(name, own[name]) for name in names])
+    likeliest = maximum(log_likelihoods, starts, bounds)
+    cov = covariance(log_likelihoods, likeliest)
+    identified = is_identified(log_likelihoods, likeliest, cov, bounds)
+    return Identifiability(names, tuned, np.exp(likeliest), cov, identified)
+
+
+def maximum(
+    log_likelihoods: Callable[[np.ndarray], np.ndarray], starts: Sequence[np.ndarray], bounds: np.ndarray
+) -> np.ndarray:
+    """Where the log-likelihood of all runs is largest, (p,), found by quadratic models without derivatives.
+
+    Args:
+        log_likelihoods: of each run, (B,), as a function of logarithms (p,).
+        starts: points (p,), of which the likeliest one is where the search begins.
+        bounds: low and high, (p, 2).
+
+    Source: Ragonneau, Zhang (2023), "COBYQA: a derivative-free trust-region SQP method".
+    """
+    from scipy.optimize import minimize
+
+    def negative(logarithms: np.ndarray) -> float:
+        return -log_likelihoods(logarithms).sum()
+
+    found = minimize(
+        negative,
+        min((np.clip(start, *bounds.T) for start in starts), key=negative),
+        method="COBYQA",
+        bounds=bounds,
+        options={"initial_tr_radius": STEP, "final_tr_radius": CLOSE, "maxfev": EVALUATIONS},
+    )
+    return found.x
+
+
+def covariance(log_likelihoods: Callable[[np.ndarray], np.ndarray], at: np.ndarray) -> np.ndarray:
+    """Covariance (p, p) of the logarithms of p numbers, from the curvature of a log-likelihood at its maximum.
+
+        H = - sum over runs of d2 log L / d theta2,   C = (H_sure + I / (ln 10)^2)^-1
+
+    with central differences of a factor of two. H_sure has H's directions. A direction's curvature there is that
+    in H less 1.96 of its standard errors over runs, and at least zero: noise is no information. The last term
+    stands for what is known before: the order of magnitude. So a number of which the data say nothing has a
+    standard error of a factor of ten.
+
+    Args:
+        log_likelihoods: of each of B independent runs, (B,), as a function of logarithms (p,).
+        at: the logarithms, (p,).
+
+    Source: Kay (1993), "Fundamentals of statistical signal processing: estimation theory", chapter 7 (observed
+    information).
+    """
+    count, steps = len(at), STEP * np.eye(len(at))
+    here = log_likelihoods(at)
+    above, below = (np.array([log_likelihoods(at + sign * step) - here for step in steps]) for sign in (1, -1))
+    curvatures = np.empty((len(here), count, count))
+    for i in range(count):
+        curvatures[:, i, i] = -(above[i] + below[i]) / STEP**2
+        for j in range(i):
+            both = sum(log_likelihoods(at + sign * (steps[i] + steps[j])) - here for sign in (1, -1))
+            mixed = both - above[i] - below[i] - above[j] - below[j]
+            curvatures[:, i, j] = curvatures[:, j, i] = -mixed / (2.0 * STEP**2)
+    total, axes = np.linalg.eigh(curvatures.sum(axis=0))
+    along = np.einsum("id,bij,jd->bd", axes, curvatures, axes)
+    errors = np.sqrt(len(along)) * along.std(axis=0, ddof=1)
+    sure = np.maximum(total - TWO_SIDED * errors, 0.0)
+    return np.linalg.inv(axes * sure @ axes.T + np.eye(count) / KNOWN_WITHIN**2)
+
+
+def is_identified(
+    log_likelihoods: Callable[[np.ndarray], np.ndarray], at: np.ndarray, cov: np.ndarray, bounds: np.ndarray
+) -> np.ndarray:
+    """Whether the data determine each of p numbers within a factor of ten, (p,) bool.
+
+    They do if its 95 % interval is within that, if ten times more and ten times less are significantly less
+    likely (log L falls by 1.92), where the other numbers go along as `cov` says, and if the maximum is not at an
+    end of the range. The second rule sees what a curvature does not: that there may be no limit on one side.
+
+    Args:
+        log_likelihoods: of each run, (B,), as a function of logarithms (p,).
+        at: the logarithms under which the runs are most likely, (p,).
+        cov: from `covariance`.
+        bounds: low and high, (p, 2).
+
+    Source: Raue et al. (2009), "Structural and practical identifiability analysis of partially observed
+    dynamical models by exploiting the profile likelihood", Bioinformatics 25(15), where a number is practically
+    not identifiable if its likelihood-based interval has no end.
+    """
+    variances, highest = np.diag(cov), log_likelihoods(at).sum()
+    narrow = TWO_SIDED * np.sqrt(variances) < KNOWN_WITHIN
+    inside = (at > bounds[:, 0] + CLOSE) & (at < bounds[:, 1] - CLOSE)
+    moves = KNOWN_WITHIN * cov / variances[:, None]
+    falls = [[highest - log_likelihoods(at + sign * move).sum() for sign in (1, -1)] for move in moves]
+    return narrow & inside & (np.array(falls) > SIGNIFICANT).all(axis=1)
+
+
+def sentences(found: Identifiability) -> list[str]:
+    """What the innovations determine, and what they do not."""
+    rows = list(zip(found.names, found.identified, found.factors, strict=True))
+    known = [f"{name} within a factor of {factor:.3g}" for name, known, factor in rows if known]
+    loose = [name for name, known, _ in rows if not known]
+    said = [f"The innovations of the training runs determine {_listed(known or ['nothing'])} (95 %)."]
+    if loose:
+        parts = [f"{name} x {factor:.2g}" for name, factor in found.loosest.items()]
+        trade = f" Least known is the direction of {_listed(parts)}." if len(parts) > 1 else ""
+        said.append(
+            f"They do not determine {_listed(loose)}: a factor of ten makes no difference that they can show, or "
+            f"the likeliest value lies at the end of the range.{trade}"
+        )
+    return said
+
+
+def as_data(found: Identifiability) -> dict:
+    """The numbers as plain data, by name."""
+    columns = found.names, found.likeliest.tolist(), found.factors.tolist(), found.identified.tolist()
+    return {
+        name: {"most_likely": best, "known_within_a_factor_of": factor, "determined": known}
+        for name, best, factor, known in zip(*columns, strict=True)
+    }
+
+
+def _listed(words: Sequence[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

@@ -1,0 +1,63 @@
+"""What a scenario measures errors in: its bound or, where there is none, the error of the open loop."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from filters.baselines.baselines import OpenLoop
+from filters.engine.batch import run
+from numerics.checks import at_least
+from thruster_env.linear.steady_state import jacobians, steady_state
+from thruster_env.model import model_of_plant
+from thruster_env.plant import Plant
+from tuning.thruster.scenario import Scenario
+
+SEQUENCES = 1200  # voltage sequences that a stored scale is the bound of
+ROUNDING = 1e-6  # of the untuned noise: what is below is no error but rounding
+PARTS = (0.5, 1.0)  # of the largest voltage, where stability is looked at: at rest the quadratic drag vanishes
+
+
+def computed_scale(scenario: Scenario, sequences: int = SEQUENCES, truths: int = 100) -> np.ndarray:
+    """The scale (2,) of a scenario, over voltage sequences of the seeds 0, 1, 2, ...
+
+    It is `Scenario.bound`, and a score is then RMSE over the bound. Where there is none, because Q is singular, it
+    is the RMSE of the open loop: a score below 1 is then skill, what the measurements win.
+
+    Args:
+        scenario: whose own scale does not matter.
+        sequences: number of seeds.
+        truths: drawn for each of them, for the bound.
+
+    Raises:
+        ValueError: if there is neither a bound nor a stable open loop, or the scale is zero or not finite.
+    """
+    data = scenario.data(range(at_least("sequences", sequences, 1)))
+    if scenario.has_bound:
+        what, scale = "the bound", scenario.bound(data, truths)
+    elif is_stable(scenario.plant):
+        open_loop = OpenLoop(model=model_of_plant(scenario.plant))
+        estimates = run(open_loop, data.filter_keys, data.inputs, data.measurements)
+        errors = (estimates.means - data.states)[:, data.scored]
+        what, scale = "the RMSE of the open loop", np.sqrt((errors**2).mean(axis=(0, 1)))
+    else:
+        raise ValueError(
+            "a scenario must have a bound or a stable open loop to measure errors in, but Q is singular, "
+            f"{list(scenario.process_noise_cov)}, and the open loop is unstable"
+        )
+    rounding = ROUNDING * np.sqrt(scenario.untuned["process_noise_cov"])
+    if not (np.isfinite(scale).all() and (scale > rounding).all()):
+        raise ValueError(f"scale must be positive in every state, but {what} is {scale.tolist()}")
+    return scale
+
+
+def is_stable(plant: Plant) -> bool:
+    """Whether the plant without feedback forgets its past: all modes decay, ahead and astern."""
+    if plant.linear is not None:
+        matrices = [plant.linear.a]
+    else:
+        voltages = (sign * part * plant.max_voltage for sign in (1.0, -1.0) for part in PARTS)
+        flow = plant.ambient_velocity
+        matrices = [
+            jacobians(plant.parameters, steady_state(plant.parameters, v, flow)[:2], v, flow)[0] for v in voltages
+        ]
+    return all(np.linalg.eigvals(a).real.max() < 0.0 for a in matrices)

@@ -1,0 +1,82 @@
+"""The report of a tuning: one page with all that is known of it, and its tables as Markdown."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from numerics.files import check_target, write_whole
+from tuning.evaluation.held_out import prove
+from tuning.evaluation.sizes import ensemble_sizes, sufficient_size
+from tuning.likelihood.identifiability import identify, sentences
+from tuning.report.page import Section, Words, html_page, markdown_page
+from tuning.report.parts import (
+    Sketchbook,
+    advice,
+    errors_table,
+    facts_section,
+    known_table,
+    numbers_table,
+    proof_section,
+    run_sections,
+    search_section,
+    sizes_section,
+)
+from tuning.report.subject import find_subject, is_file
+from tuning.search.objectives import nis_ratio
+from tuning.search.space import has_ensemble
+from tuning.search.trials import measure
+
+
+class Report(NamedTuple):
+    """What was written, and the sentence that sums it up."""
+
+    page: Path
+    tables: Path
+    advice: str
+
+
+def write_report(source: str | Path, storage: str, out: str | Path | None = None) -> Report:
+    """Write a page, NAME.html, and its tables, NAME.md, on a tuned file or a study; all metrics are computed anew.
+
+    Args:
+        source: a tuned file, or the name of a study.
+        storage: where the study is; without it a page on a tuned file leaves the search out.
+        out: folder of the two files, by default that of the tuned file, or `out`.
+
+    Raises:
+        ValueError: if the tuned file is refused, there is no such study, or the folder cannot be written.
+    """
+    subject = find_subject(source, storage)
+    plan, choice = subject.plan, subject.choice
+    folder = Path(out) if out is not None else Path(source).parent if is_file(source) else Path("out")
+    name = Path(source).stem if is_file(source) else subject.name
+    page, tables = folder / f"{name}.html", folder / f"{name}.md"
+    for target in (page, tables):
+        check_target(target)
+    data = plan.training_data()
+    sizes = ensemble_sizes(choice, plan, data, subject.consistent) if has_ensemble(choice.name) else []
+    if sizes and not subject.chosen:
+        choice = choice.with_size(sufficient_size(sizes, subject.consistent))
+        subject = subject._replace(choice=choice)
+    proofs = [prove(choice, scenario, plan.seed, subject.seeds) for scenario in plan.scenarios]
+    title = f"{choice.name} tuned on {', '.join(Path(scenario.name).stem for scenario in plan.scenarios)}"
+    said = advice(choice, plan, proofs)
+    known = identify(choice, plan.scenarios, data, plan.space())
+    nis = [nis_ratio(found) for found in measure(choice, plan, data)]
+    numbers = [numbers_table(choice, plan.scenarios[0], plan.seed), *([known_table(known)] if known else [])]
+    with tempfile.TemporaryDirectory() as scratch:
+        book = Sketchbook(Path(scratch))
+        sections = [
+            proof_section(book, subject, proofs),
+            Section("The numbers", [*numbers, *([Words(sentences(known))] if known else [])]),
+            search_section(book, subject),
+            *([sizes_section(book, subject, sizes)] if sizes else []),
+            *run_sections(book, subject, proofs[0]),
+            facts_section(subject, nis),
+        ]
+    write_whole(page, html_page(title, said, sections))
+    errors = [errors_table(scenario, proof) for scenario, proof in zip(plan.scenarios, proofs, strict=True)]
+    write_whole(tables, markdown_page(title, said, [*errors, *numbers]))
+    return Report(page, tables, said)

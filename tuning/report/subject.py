@@ -1,0 +1,113 @@
+"""What a report is of: a tuned file with its study, or a study alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import optuna
+
+from filters.tuned_file import read_tuned_file
+from numerics.checks import at_least, shown
+from tuning.evaluation.tuned import read_tuned, scenario_in
+from tuning.problems.find import Scenario, find_scenario
+from tuning.search.outcome import best_trial, is_consistent
+from tuning.search.plan import HELD_OUT_SEEDS, Plan
+from tuning.search.space import Choice, choice_of
+from tuning.search.storage import open_storage
+from tuning.search.storage_url import shown_storage
+
+
+class Subject(NamedTuple):
+    """A choice, and where it comes from."""
+
+    name: str  # of the study
+    plan: Plan
+    choice: Choice
+    study: optuna.Study | None  # None where it is not in the storage
+    seeds: int  # number of held-out seeds
+    chosen: bool  # whether the ensemble size is that of a tuned file, or still to be chosen
+    consistent: bool = False  # whether its mean NIS is in its band, where it has to be
+
+
+def find_subject(source: str | Path, storage: str) -> Subject:
+    """The subject of a report.
+
+    Args:
+        source: a tuned file (what ends in .json, or is a file), or the name of a study.
+        storage: where the study is; a tuned file may come without.
+
+    Raises:
+        ValueError: if the tuned file is refused, or there is no such study or none of its trials is complete.
+    """
+    return _of_file(source, storage) if is_file(source) else _of_study(str(source), storage)
+
+
+def is_file(source: str | Path) -> bool:
+    """Whether a source stands for a tuned file."""
+    return Path(source).suffix == ".json" or Path(source).is_file()
+
+
+def _of_file(path: str | Path, storage: str) -> Subject:
+    content, (choice, scenario, _) = read_tuned_file(path), read_tuned(path)
+    name, plan = (
+        str(content["study"].get("name")),
+        _plan(content["study"], path, partial(scenario_in, content, path=path)),
+    )
+    study = _load(name, storage)
+    if study is not None and study.user_attrs.get("identity") != plan.identity:
+        study = None  # another study of the same name
+    try:
+        first, beyond = content["held_out"][scenario.name]["seeds"]
+        count = at_least("the number of held-out seeds", beyond - first, 2)
+    except (KeyError, TypeError):
+        raise ValueError(f"a tuned file must tell its held-out seeds, but {path} does not") from None
+    consistent = plan.is_constrained and bool(content["study"].get("any_trial_consistent"))
+    return Subject(name, plan, choice, study, count, chosen=True, consistent=consistent)
+
+
+def _of_study(name: str, storage: str) -> Subject:
+    study = _load(name, storage)
+    if study is None:
+        where = shown_storage(storage)
+        raise ValueError(f"a report must be of a tuned file or of a study in {where}, but got {name!r}")
+    plan = _plan(study.user_attrs.get("identity"), f"study {name!r}")
+    best = best_trial(study.get_trials(deepcopy=False))
+    if best is None:
+        raise ValueError(f"a study must have a complete trial for a report, but {name!r} has none")
+    choice = choice_of(plan.filter, best.params, plan.scenarios[0])
+    consistent = plan.is_constrained and is_consistent(best)
+    return Subject(name, plan, choice, study, HELD_OUT_SEEDS, len(plan.objectives) > 1, consistent)
+
+
+def _load(name: str, storage: str) -> optuna.Study | None:
+    """A study by name, None if it is not there; no storage is made."""
+    if "://" not in storage and not Path(storage).is_file():
+        return None
+    try:
+        return optuna.load_study(study_name=name, storage=open_storage(storage))
+    except KeyError:
+        return None
+
+
+def _plan(identity, where: str | Path, find: Callable[[str], Scenario] = find_scenario) -> Plan:
+    """The plan of which an identity tells, its scenarios found by name."""
+    try:
+        scenarios = tuple(find(name) for name in identity["scenarios"])
+        objectives, seed = tuple(identity["objectives"]), at_least("seed", identity["seed"], 0)
+        plan = Plan(
+            identity["filter"],
+            scenarios,
+            seed,
+            objectives,
+            identity["consistent"],
+            identity["sampler"],
+            identity["hold_r"],
+            budget=identity["budget"],
+            full_q=identity["full_q"],
+        )
+    except (KeyError, TypeError):
+        raise ValueError(f"a report needs the plan of the study, but {where} has {shown(identity)}") from None
+    return plan.checked()

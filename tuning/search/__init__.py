@@ -1,0 +1,1 @@
+"""Optuna studies: what is searched, how trials are scored, and where a study is kept."""

@@ -1,0 +1,116 @@
+"""What a study is for: two studies of the same plan are one study."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import optuna
+from optuna.distributions import BaseDistribution
+
+from filters.registry import filter_class
+from numerics.checks import positive
+from tuning.problems.find import Data, Scenario
+from tuning.problems.seeds import held_out_seeds, size_seeds, training_seeds
+from tuning.search.objectives import Objective, find_objective
+from tuning.search.space import AUTO, AUTO_KINDS, has_search_space, joint_distributions
+
+TRAINING_SEEDS = 32
+HELD_OUT_SEEDS = 200
+SIZE_SEEDS = 100  # an ensemble that is 1 % worse than the best is told from it, one of 30 from 50
+
+
+class Plan(NamedTuple):
+    """A filter, what to tune it on, what to make small and how to search."""
+
+    filter: str  # a name, or "auto" for the best of many kinds
+    scenarios: tuple[Scenario, ...]
+    seed: int = 0
+    objectives: tuple[str, ...] = ("score",)
+    consistent: bool = True  # whether the mean NIS has to be within its band
+    sampler: str = "tpe"
+    hold_r: bool = False  # whether R stays that of the sensor's sheet
+    prune: bool = True  # whether a trial ends early that is worse than the best one on the same seeds
+    budget: float | None = None  # microseconds that a step may cost, as `cost.microseconds_a_step` measures them
+    full_q: bool = False  # whether Q has correlations
+
+    @property
+    def identity(self) -> dict:
+        """What has to be the same for a study to go on."""
+        return {
+            "filter": self.filter,
+            "kinds": list(self.kinds),
+            "budget": self.budget,
+            "full_q": self.full_q,
+            "scenarios": [scenario.name for scenario in self.scenarios],
+            "scenario_digests": [scenario.digest for scenario in self.scenarios],
+            "seed": self.seed,
+            "objectives": list(self.objectives),
+            "consistent": self.consistent,
+            "sampler": self.sampler,
+            "hold_r": self.hold_r,
+            "optuna": optuna.__version__.split(".")[0],
+        }
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Names of the filters among which a trial chooses."""
+        return AUTO_KINDS if self.filter == AUTO else (self.filter,)
+
+    @property
+    def is_constrained(self) -> bool:
+        """Whether the mean NIS is held in its band: a filter without a covariance has none."""
+        return self.consistent and all(filter_class(kind).has_covariance for kind in self.kinds)
+
+    @property
+    def asks_for_cost(self) -> bool:
+        """Whether the cost of a step has to be measured."""
+        return self.budget is not None or "cost" in self.objectives
+
+    def checked(self) -> Plan:
+        """The same plan; ValueError where it cannot work."""
+        if not all(map(has_search_space, self.kinds)):
+            raise ValueError(f"filter must be one that has something to tune, but got {self.filter!r}")
+        if not self.scenarios:
+            raise ValueError("a study must have at least one scenario, but got none")
+        if not 1 <= len(self.objectives) <= 2 or len(set(self.objectives)) < len(self.objectives):
+            raise ValueError(f"objectives must be one, or two different ones, but got {list(self.objectives)}")
+        for name, objective in zip(self.objectives, self.found_objectives(), strict=True):
+            if objective.needs_covariance and not all(filter_class(k).has_covariance for k in self.kinds):
+                raise ValueError(
+                    f"the objective {name!r} needs a filter with a covariance, but got {self.filter!r}"
+                )
+        if self.full_q and not all(filter_class(kind).has_covariance for kind in self.kinds):
+            raise ValueError(f"a full Q needs a filter with a covariance, but got {self.filter!r}")
+        if self.budget is not None:
+            positive("budget", self.budget)
+        elif self.filter == AUTO and "cost" not in self.objectives:
+            raise ValueError(
+                "a study of filter 'auto' must have a budget of microseconds a step (an ekf takes about 0.1, an "
+                "enkf of 30 members 0.7, a pf of 1000 particles 20) or the objective 'cost', but got neither"
+            )
+        return self
+
+    def found_objectives(self) -> list[Objective]:
+        """The objectives themselves."""
+        return [find_objective(name) for name in self.objectives]
+
+    def space(self) -> dict[str, BaseDistribution]:
+        """What a trial may choose, by name; ranges are those of the first scenario.
+
+        The scale of P_0 is among it where a scenario counts the start-up.
+        """
+        prior = any(scenario.counts_start_up for scenario in self.scenarios)
+        options = {"hold_r": self.hold_r, "full_q": self.full_q, "prior": prior}
+        return joint_distributions(self.kinds, self.scenarios[0], **options)
+
+    def training_data(self) -> list[Data]:
+        """Data that every trial shares, one for each scenario."""
+        return [scenario.data(training_seeds(self.seed, TRAINING_SEEDS)) for scenario in self.scenarios]
+
+    def size_data(self) -> list[Data]:
+        """Data that choose the ensemble size once Q and R are chosen, one for each scenario."""
+        return [scenario.data(size_seeds(self.seed, SIZE_SEEDS)) for scenario in self.scenarios]
+
+    def held_out_seeds(self, count: int = HELD_OUT_SEEDS) -> range:
+        """Seeds that no trial sees."""
+        return held_out_seeds(self.seed, count)

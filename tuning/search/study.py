@@ -1,0 +1,244 @@
+"""Optuna studies of a filter's numbers: common random numbers in, a choice out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import optuna
+from optuna.trial import FrozenTrial, TrialState
+
+from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
+from tuning.problems.find import Data
+from tuning.search.cost import COST
+from tuning.search.enqueued import enqueue_followers, enqueue_what_is_left
+from tuning.search.interruption import stop_on_interrupt
+from tuning.search.objectives import nis_ratio
+from tuning.search.outcome import best_trial, is_consistent
+from tuning.search.plan import Plan
+from tuning.search.samplers import give_sampler, make_sampler
+from tuning.search.space import Choice, choice_of, has_ensemble, trial_parameters
+from tuning.search.storage import PROCESS, retry_orphans, this_process
+from tuning.search.trials import cost_of, make_pruner, measure, run_trial
+
+FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
+BEST = "best trial under the constraints"  # attribute of a study, for programs that know no constraints
+OnTrial = Callable[[optuna.Study, int], None]
+
+
+def quiet_optuna() -> None:
+    """Let Optuna report errors only, for programs that show progress of their own."""
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+
+
+class StudyResult(NamedTuple):
+    """What a study found, before it is proved on held-out data."""
+
+    choice: Choice  # with the smallest sufficient ensemble
+    best_value: float  # first objective of the best trial, on the training seeds
+    trials: list[FrozenTrial]
+    sizes: list[SizeRow]  # score against ensemble size, empty without an ensemble
+    seconds: float
+    interrupted: bool
+    free_value: float | None = None  # first objective of the best trial, consistent or not; None where all count
+    front: tuple[FrozenTrial, ...] = ()  # trials that no other beats in both of two objectives
+    microseconds: float | None = None  # that a step of the choice takes, where the plan asks for it
+    consistent: bool | None = None  # whether any trial's mean NIS is in its band; None where all count
+    nis: tuple[float, ...] = ()  # the choice's, over the number of channels, on each scenario's training seeds
+
+    @property
+    def finished(self) -> int:
+        """Trials that count: complete ones and those that ended early."""
+        return sum(trial.state in FINISHED for trial in self.trials)
+
+    @property
+    def pruned(self) -> int:
+        """Trials that ended early."""
+        return sum(trial.state == TrialState.PRUNED for trial in self.trials)
+
+    def or_interrupted(self) -> StudyResult:
+        """This result; KeyboardInterrupt instead if Ctrl-C ended the study, for work of which it is a part."""
+        if self.interrupted:
+            raise KeyboardInterrupt
+        return self
+
+
+def open_study(
+    name: str, plan: Plan, storage: optuna.storages.BaseStorage, start: Choice | None = None, worker: int = 0
+) -> optuna.Study:
+    """Create a study or load it to go on; its first trial is `start`, by default the untuned filter.
+
+    A study over several kinds tries the untuned filter of every kind, one after the other.
+
+    Args:
+        name: of the study.
+        plan: what the study is for.
+        storage: from `open_storage`.
+        start: the first trial, in place of untuned ones.
+        worker: place of this process among those that share the study; 0 if it may be the only one.
+
+    Raises:
+        ValueError: if the plan cannot work, or a study of this name was made for something else or by another
+            version of Optuna.
+    """
+    plan = plan.checked()
+    space = plan.space()
+    make_sampler(plan.sampler, plan.seed, 0, space)  # a clear error before anything is stored
+    study = optuna.create_study(
+        study_name=name,
+        storage=storage,
+        directions=["minimize"] * len(plan.objectives),
+        load_if_exists=True,
+        pruner=make_pruner(plan),
+    )
+    _check_identity(name, plan.identity, study.user_attrs.get("identity", plan.identity))
+    retry_orphans(study)
+    present = len(study.get_trials(deepcopy=False))
+    if worker:
+        study.sampler = make_sampler(plan.sampler, plan.seed, present, space, worker)
+    else:
+        give_sampler(study, partial(make_sampler, plan.sampler, plan.seed, present, space), present)
+    if not present:
+        study.set_user_attr("identity", plan.identity)
+        if start is not None:
+            study.enqueue_trial(trial_parameters(start, space))
+    enqueue_what_is_left(study, plan)
+    return study
+
+
+def _check_identity(name: str, wanted: dict, found: dict) -> None:
+    """Raise ValueError, with what differs, unless a study is for what is wanted."""
+    if found != wanted:
+        differing = [key for key in {**wanted, **found} if wanted.get(key) != found.get(key)]
+        wanted, found = ({key: part.get(key) for key in differing} for part in (wanted, found))
+        changed = "; a scenario is not what it was" if list(wanted) == ["scenario_digests"] else ""
+        raise ValueError(
+            f"study {name!r} must be for {wanted}, but it was made for {found}{changed}: give it another name"
+        )
+
+
+def finished_trials(study: optuna.Study) -> int:
+    """Number of trials that count: complete and pruned ones."""
+    return len(study.get_trials(deepcopy=False, states=FINISHED))
+
+
+def run_study(
+    study: optuna.Study,
+    plan: Plan,
+    trials: int,
+    on_trial: OnTrial = lambda study, finished: None,
+    run: Callable[[optuna.Study, Plan, Sequence[Data], int, OnTrial], bool] | None = None,
+) -> StudyResult:
+    """Run a study until it has `trials` finished trials, all on the same training seeds.
+
+    Ctrl-C ends it after the running trial and keeps what is finished; a second one ends it at once.
+
+    Args:
+        study: from `open_study`.
+        plan: what the study is for.
+        trials: finished trials that the study shall have in total.
+        on_trial: called after each trial with the study and the number of finished trials.
+        run: runs the trials and returns whether it was interrupted; `run_trials` by default.
+
+    Raises:
+        ValueError: if all trials are over the plan's budget.
+        KeyboardInterrupt: if it is interrupted before any trial is complete.
+    """
+    data = plan.training_data()
+    started = time.perf_counter()
+    interrupted = (run or run_trials)(study, plan, data, trials, on_trial)
+    present = study.get_trials(deepcopy=False)
+    best = best_trial(present)
+    if best is None:
+        costs = [trial.user_attrs[COST] for trial in present if COST in trial.user_attrs]
+        if plan.budget is None or interrupted or not costs:
+            raise KeyboardInterrupt
+        raise ValueError(
+            f"budget must be at least what the cheapest trial takes, {min(costs):.3g} microseconds a step, "
+            f"but got {plan.budget:g}"
+        )
+    if study.user_attrs.get(BEST) != best.number:  # another worker's last word may have been an older one
+        study.set_user_attr(BEST, best.number)
+    choice = choice_of(plan.filter, best.params, plan.scenarios[0])
+    sizes, consistent = [], plan.is_constrained and is_consistent(best)
+    if has_ensemble(choice.name) and len(plan.objectives) == 1:
+        sizes = ensemble_sizes(choice, plan, data, consistent)
+        choice = choice.with_size(sufficient_size(sizes, consistent))
+    complete = [trial.values[0] for trial in present if trial.state == TrialState.COMPLETE]
+    return StudyResult(
+        choice,
+        best.values[0],
+        present,
+        sizes,
+        time.perf_counter() - started,
+        interrupted,
+        min(complete) if plan.is_constrained else None,
+        tuple(study.best_trials) if len(plan.objectives) > 1 else (),
+        # A smaller ensemble takes no longer than the trial's.
+        min(cost_of(choice, plan, data), best.user_attrs[COST]) if plan.asks_for_cost else None,
+        is_consistent(best) if plan.is_constrained else None,
+        tuple(map(nis_ratio, measure(choice, plan, data))) if plan.is_constrained else (),
+    )
+
+
+def _note_best(study: optuna.Study, last: FrozenTrial) -> None:
+    """Write down the last trial's number if it is the best one."""
+    best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
+    if best is not None and best.number == last.number:
+        study.set_user_attr(BEST, last.number)
+
+
+def run_trials(
+    study: optuna.Study,
+    plan: Plan,
+    data: Sequence[Data],
+    trials: int,
+    on_trial: OnTrial = lambda study, finished: None,
+    stop: Callable[[], bool] = lambda: False,
+    on_choice: Callable[[Choice], None] = lambda choice: None,
+) -> bool:
+    """Run trials in this process until the study has `trials` finished ones; return whether Ctrl-C ended it.
+
+    Args:
+        study: from `open_study`; other processes may run trials of it, too.
+        plan: what the study is for.
+        data: the plan's training data.
+        trials: finished trials that the study shall have in total.
+        on_trial: called after each trial with the study and the number of finished trials.
+        stop: asked before the first and after each trial whether to end.
+        on_choice: called with what each trial tries.
+    """
+    if stop() or finished_trials(study) >= trials:
+        return False
+
+    def objective(trial: optuna.Trial) -> list[float]:
+        trial.set_user_attr(PROCESS, this_process())
+        return run_trial(trial, plan, data, on_choice)
+
+    def after(study: optuna.Study, trial: FrozenTrial) -> None:
+        _note_best(study, trial)
+        finished = finished_trials(study)
+        if finished < trials:
+            enqueue_followers(study, plan, trial)
+        on_trial(study, finished)
+        if finished >= trials or interrupted() or stop():
+            study.stop()
+
+    try:
+        with stop_on_interrupt() as interrupted:
+            study.optimize(objective, callbacks=[after])
+        return interrupted()
+    except KeyboardInterrupt:
+        return True
+    except (AssertionError, UnboundLocalError) as error:  # of Optuna's, when its storage fails it
+        raise _first_cause(error) from None
+
+
+def _first_cause(error: BaseException) -> BaseException:
+    """What a storage said before Optuna's own assertions hid it."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, (OSError, ValueError)):
+        cause = cause.__context__
+    return cause or error

@@ -1,0 +1,102 @@
+"""One trial of a study: the same seeds for all, in blocks, and an early end for what cannot win."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from statistics import geometric_mean
+
+import numpy as np
+import optuna
+
+from filters.engine.batch import Estimates, run
+from tuning.evaluation.evaluate import Evaluation, judge, run_scores
+from tuning.problems.find import Data
+from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
+from tuning.search.objectives import LARGEST, nis_ratio, nis_violation, penalised
+from tuning.search.plan import Plan
+from tuning.search.space import Choice, suggest
+
+BLOCK = 8  # seeds between two decisions whether to go on
+CONSISTENCY = "mean NIS outside its band"  # name of the constraint; at most zero is inside
+NIS = "mean NIS over the number of channels"
+P_THRESHOLD = 0.1  # of Wilcoxon's signed-rank test, below which a trial ends
+
+
+def make_pruner(plan: Plan) -> optuna.pruners.BasePruner:
+    """Wilcoxon's signed-rank test over seeds, paired with the best trial's; or none."""
+    if not plan.prune or len(plan.objectives) > 1:
+        return optuna.pruners.NopPruner()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        return optuna.pruners.WilcoxonPruner(p_threshold=P_THRESHOLD, n_startup_steps=BLOCK)
+
+
+def run_trial(
+    trial: optuna.Trial,
+    plan: Plan,
+    data: Sequence[Data],
+    on_choice: Callable[[Choice], None] = lambda choice: None,
+) -> list[float]:
+    """Values of a trial, one for each objective; `on_choice` is told what it tries.
+
+    Raises:
+        optuna.TrialPruned: if it is over the plan's budget, or significantly worse than the best one on the seeds
+            so far.
+    """
+    choice = suggest(trial, plan.filter, plan.scenarios[0], plan.space())
+    on_choice(choice)
+    microseconds = math.nan
+    if plan.asks_for_cost:
+        microseconds = cost_of(choice, plan, data)
+        trial.set_user_attr(COST, microseconds)
+    if plan.budget is not None:
+        trial.set_constraint(BUDGET, over_budget(microseconds, plan.budget))
+        if microseconds > plan.budget:
+            raise optuna.TrialPruned
+    prunes = plan.prune and plan.objectives == ("score",)
+    evaluations = measure(choice, plan, data, trial if prunes else None)
+    if plan.is_constrained:
+        outside = max(map(nis_violation, evaluations))
+        trial.set_constraint(CONSISTENCY, outside)
+        if outside < LARGEST:  # else there is no finite NIS to speak of
+            trial.set_user_attr(NIS, geometric_mean(map(nis_ratio, evaluations)))
+    return [
+        float(np.mean([penalised(objective.value(e, microseconds), e) for e in evaluations]))
+        for objective in plan.found_objectives()
+    ]
+
+
+def cost_of(choice: Choice, plan: Plan, data: Sequence[Data]) -> float:
+    """Microseconds that a step of a choice takes, on the scenario where that is most."""
+    pairs = zip(plan.scenarios, data, strict=True)
+    return max(microseconds_a_step(choice.filter(scenario), one) for scenario, one in pairs)
+
+
+def measure(
+    choice: Choice, plan: Plan, data: Sequence[Data], trial: optuna.Trial | None = None
+) -> list[Evaluation]:
+    """Run a choice on all data; with a trial, tell it each seed's score and end where it should be pruned."""
+    filters = [choice.filter(scenario) for scenario in plan.scenarios]
+    count = len(data[0].seeds)
+    size = count if trial is None else BLOCK
+    parts: list[list[Estimates]] = [[] for _ in filters]
+    for first in range(0, count, size):
+        block = [Data(*(part[first : first + size] for part in one)) for one in data]
+        for estimates, filter_, one in zip(parts, filters, block, strict=True):
+            estimates.append(run(filter_, one.filter_keys, one.inputs, one.measurements))
+        if trial is not None:
+            _report(trial, first, [estimates[-1] for estimates in parts], block, plan)
+            if first + size < count and trial.should_prune():
+                raise optuna.TrialPruned
+    whole = [Estimates(*map(np.concatenate, zip(*estimates, strict=True))) for estimates in parts]
+    rows = zip(filters, whole, data, plan.scenarios, strict=True)
+    return [judge(filter_, estimates, one, scenario.scale) for filter_, estimates, one, scenario in rows]
+
+
+def _report(trial: optuna.Trial, first: int, estimates: list[Estimates], block: list[Data], plan: Plan) -> None:
+    rows = zip(estimates, block, plan.scenarios, strict=True)
+    scores = np.mean([run_scores(found, one, scenario.scale) for found, one, scenario in rows], axis=0)
+    for place, score in enumerate(scores):
+        trial.report(float(score), first + place)

@@ -1,0 +1,148 @@
+"""Several processes on one host that run trials of one study.
+
+Each is `python -m tuning.search.workers`, in a session of its own, so that Ctrl-C reaches the parent alone. It
+reads what to do as a line of JSON from its standard input, and ends after its running trial when that is closed:
+by its parent, or because its parent is gone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import subprocess
+import sys
+import time
+import warnings
+import zlib
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+import optuna
+
+from numerics.threads import cores
+from tuning.problems.find import Data, find_scenario
+from tuning.search.interruption import stop_on_interrupt, without_interrupts
+from tuning.search.plan import Plan
+from tuning.search.storage import open_storage, retry_orphans, this_process
+from tuning.search.study import OnTrial, finished_trials, open_study, quiet_optuna, run_trials
+
+POLL_SECONDS = 0.2
+
+
+def run_in_workers(
+    study: optuna.Study,
+    plan: Plan,
+    data: Sequence[Data],
+    trials: int,
+    on_trial: OnTrial,
+    *,
+    storage: str,
+    workers: int,
+) -> bool:
+    """Run trials in several processes until the study has `trials` finished ones; return whether Ctrl-C ended it.
+
+    Ctrl-C ends each worker after its running trial, a second one ends them at once. A worker that dies loses its
+    running trial, which another one repeats; should all die, this process goes on alone.
+
+    Args:
+        study: from `open_study`, in `storage`.
+        plan: what the study is for; its scenarios are found again by their names.
+        data: the plan's training data.
+        trials: finished trials that the study shall have in total; there may be up to workers - 1 more.
+        on_trial: called with the study and the number of finished trials when there are more.
+        storage: journal file or URL, as for `open_storage`.
+        workers: number of processes.
+    """
+    names = [scenario.name for scenario in plan.scenarios]
+    orders = {"study": study.study_name, "storage": storage, "trials": trials, "workers": workers}
+    orders["plan"] = plan._replace(scenarios=names)._asdict()
+    # Places that no other host has, whichever starts first, so that no two workers propose the same.
+    first = zlib.crc32(this_process().encode())
+    processes: dict[int, subprocess.Popen] = {}
+    try:
+        with stop_on_interrupt() as interrupted:
+            for worker in range(workers):
+                processes[worker] = _start({**orders, "worker": worker, "place": first + worker})
+            _watch(study, processes, on_trial, interrupted)
+        return interrupted() or run_trials(study, plan, data, trials, on_trial)
+    except KeyboardInterrupt:
+        return True
+    finally:
+        for process in processes.values():
+            process.kill()
+            process.wait()
+            with suppress(BrokenPipeError):
+                process.stdin.close()
+        retry_orphans(study)
+
+
+def _start(orders: dict) -> subprocess.Popen:
+    command = [sys.executable, "-m", "tuning.search.workers"]
+    with without_interrupts():
+        process = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True)
+    with suppress(BrokenPipeError):  # it has died already, which its exit code tells
+        process.stdin.write(json.dumps(orders) + "\n")
+        process.stdin.flush()
+    return process
+
+
+def _watch(
+    study: optuna.Study, processes: dict[int, subprocess.Popen], on_trial: OnTrial, interrupted: Callable[[], bool]
+) -> None:
+    living, shown = dict(processes), finished_trials(study)
+    while living:
+        time.sleep(POLL_SECONDS)
+        if interrupted():
+            for process in living.values():
+                with suppress(BrokenPipeError):
+                    process.stdin.close()
+        for worker, process in list(living.items()):
+            if process.poll() is not None:
+                del living[worker]
+                if process.returncode:
+                    warnings.warn(
+                        f"worker {worker} has died ({_cause(process)}), {len(living)} go on", stacklevel=4
+                    )
+                    retry_orphans(study)
+        finished = finished_trials(study)
+        if finished > shown:
+            shown = finished
+            on_trial(study, finished)
+
+
+def _cause(process: subprocess.Popen) -> str:
+    code = process.returncode
+    return f"signal {-code}" if code < 0 else f"exit code {code}"
+
+
+def take_share(workers: int) -> None:
+    """Let this process count its share of the cores as all there are, whichever it then runs on."""
+    if hasattr(os, "sched_setaffinity"):
+        allowed = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, sorted(allowed)[: max(1, len(allowed) // workers)])
+        cores()  # is remembered
+        os.sched_setaffinity(0, allowed)
+
+
+def main() -> None:
+    """Run trials as standard input says, until the study is finished or standard input is closed."""
+    orders = json.loads(sys.stdin.readline())
+    take_share(orders["workers"])
+    quiet_optuna()
+    plan = Plan(**orders["plan"])
+    try:
+        scenarios, objectives = tuple(map(find_scenario, plan.scenarios)), tuple(plan.objectives)
+        plan = plan._replace(scenarios=scenarios, objectives=objectives)
+        study = open_study(orders["study"], plan, open_storage(orders["storage"]), worker=orders["place"])
+        run_trials(study, plan, plan.training_data(), orders["trials"], stop=_parent_says_stop)
+    except (ValueError, OSError) as error:
+        sys.exit(f"thruster: worker {orders['worker']}: {error}")
+
+
+def _parent_says_stop() -> bool:
+    return bool(select.select([sys.stdin], [], [], 0)[0])
+
+
+if __name__ == "__main__":
+    main()
