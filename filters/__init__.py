@@ -30,7 +30,6 @@ from filters.wrappers.vector import EstimateStates
 from numerics.compiled import may_be_inlined
 from plants.affine import affine_model, linearize
 from plants.state_space import StateSpaceModel
-from thruster_env.model import thruster_model
 
 __all__ = [
     "FILTERS",
@@ -69,8 +68,16 @@ __all__ = [
     "make_filter",
     "run",
     "smooth",
-    "thruster_model",
 ]
 
 may_be_inlined(__name__, "plants")
 register_filtered_envs()
+
+
+def __getattr__(name: str):
+    """`thruster_model` moved to its plant; for one release it is found here too."""
+    if name == "thruster_model":
+        from importlib import import_module
+
+        return import_module("thruster_env.model").thruster_model
+    raise AttributeError(f"module 'filters' has no attribute {name!r}")

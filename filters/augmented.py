@@ -13,6 +13,7 @@ from numerics.derivatives import RELATIVE_STEP
 from numerics.pickling import makes_functions
 from numerics.tuples import tuple_of, written_out
 from plants.layout import constants_form
+from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
 
 
@@ -84,6 +85,9 @@ def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unkno
         constants=(*map(float, model.constants), *map(float, spread)),
         substeps=model.substeps,
         operating_input=model.operating_input,
+        states=(*model.states, *(Quantity(str(name), str(name)) for name in parameters)),
+        input_quantities=model.input_quantities,
+        measurements=model.measurements,
         **{name: None if value is None else np.append(value, further[name]) for name, value in known.items()},
     )
 

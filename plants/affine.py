@@ -60,6 +60,9 @@ def affine_model(
     prior_cov,
     state_offset=None,
     measurement_offset=None,
+    states=None,
+    input_quantities=None,
+    measurements=None,
 ) -> AffineModel:
     """The model x' = A x + B u + state_offset + w, z = C x + measurement_offset + v.
 
@@ -73,6 +76,9 @@ def affine_model(
         prior_cov: (n, n) or n variances.
         state_offset: (n,), zero if None.
         measurement_offset: (m,), zero if None.
+        states: names of the states, as `StateSpaceModel` takes them; so ...
+        input_quantities: ... those of inputs ...
+        measurements: ... and measurements.
 
     Raises:
         ValueError: if shapes do not fit.
@@ -95,6 +101,9 @@ def affine_model(
         prior_cov=prior_cov,
         inputs=p,
         constants=tuple(float(v) for part in (a, b, offset, c, shift) for v in np.ravel(part)),
+        states=states,
+        input_quantities=input_quantities,
+        measurements=measurements,
     )
 
 
@@ -131,4 +140,5 @@ def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
         measurement_noise_cov=model.measurement_noise_cov,
         prior_mean=model.prior_mean,
         prior_cov=model.prior_cov,
+        **model.quantities._asdict(),
     ).replace(state_low=model.state_low, state_high=model.state_high)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from numerics.checks import at_least, covariance, covariance_root, vector
+from numerics.checks import at_least, covariance, covariance_root, one_of, vector
 from numerics.derivatives import complex_step
 from numerics.pickling import as_function, as_made
 from plants.model_check import check_functions, checked_constants
+from plants.quantities import Quantities, outputs, quantities
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,6 +50,10 @@ class StateSpaceModel:
             in its order, between which a Kalman filter may be scheduled; None if unknown.
         state_low: the smallest state of normal operation, by components (n,); None if unknown.
         state_high: the largest one (n,).
+        states: the states' `Quantity` each, or their names; x_1, x_2, ... if None.
+        input_quantities: those of the inputs, u_1, ...
+        measurements: those of the measurements, z_1, ...
+        outputs: what follows from a state, by symbol: an `Output` each, a quantity and a function of (x, c).
     """
 
     transition: Callable
@@ -68,6 +73,10 @@ class StateSpaceModel:
     operating_points: Callable | None = None
     state_low: Any = None
     state_high: Any = None
+    states: Any = None
+    input_quantities: Any = None
+    measurements: Any = None
+    outputs: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self):
         """Check shapes and signs, and try the functions; raise ValueError that states the rule and the value."""
@@ -90,6 +99,10 @@ class StateSpaceModel:
         if self.analytic:
             checked["transition_jacobian"] = self._exact("transition", n, n, "u, c")
             checked["observe_jacobian"] = self._exact("observe", len(checked["measurement_noise_cov"]), n, "c")
+        checked["states"] = quantities("states", self.states, n, "x")
+        checked["input_quantities"] = quantities("input_quantities", self.input_quantities, checked["inputs"], "u")
+        checked["measurements"] = quantities("measurements", self.measurements, m, "z")
+        checked["outputs"] = outputs(self.outputs)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         check_functions(self)
@@ -122,6 +135,16 @@ class StateSpaceModel:
     def replace(self, **changes) -> StateSpaceModel:
         """The same model with some fields changed."""
         return dataclasses.replace(self, **changes)
+
+    @property
+    def quantities(self) -> Quantities:
+        """Names, symbols and units of states, inputs and measurements."""
+        return Quantities(self.states, self.input_quantities, self.measurements)
+
+    def output(self, symbol: str, states: np.ndarray) -> np.ndarray:
+        """The output of a symbol at states (..., n), (...); ValueError if there is none."""
+        one_of("output", symbol, tuple(self.outputs))
+        return self.outputs[symbol].function(tuple(np.moveaxis(states, -1, 0)), self.constants)
 
     @property
     def numbers(self) -> np.ndarray:

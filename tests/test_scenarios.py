@@ -26,8 +26,7 @@ def test_an_env_stepped_with_a_scenarios_voltages_makes_the_scenarios_data_and_e
             measurement_noise_cov=scenario.measurement_noise_cov,
         ),
         filter="ekf",
-        parameter_factors=dict(scenario.parameter_factors),
-        **choice.model,
+        model_arguments={"parameter_factors": dict(scenario.parameter_factors), **choice.model},
     )
     _, info = env.reset(seed=8)
     for k in range(scenario.steps):

@@ -19,7 +19,6 @@ from thruster_env.effects.flow import Sinusoid
 from thruster_env.effects.uncertainty import LogNormal
 from thruster_env.linear.linear_plant import make_linear_plant
 from thruster_env.linear.published import PUBLISHED
-from thruster_env.model import model_of_env
 from thruster_env.parameters import TUNNEL_PHYSICAL
 from thruster_env.simulation import simulate
 from thruster_env.tasks import BowThrusterLinearEnv
@@ -104,7 +103,7 @@ def test_a_linear_env_is_the_simulated_plant():
 @pytest.mark.parametrize("sensors", [["thrust"], ["speed", "thrust"]], ids=", ".join)
 def test_on_a_linear_env_the_kalman_filter_is_consistent(system, sensors):
     env = gym.make("BowThrusterLinear-v0", system=system, sensors=sensors, ambient_velocity=0.5)
-    model, copies, steps = model_of_env(env), 200, 120
+    model, copies, steps = env.unwrapped.state_space_model(), 200, 120
     keys = episode_keys(range(copies))
     voltages = np.random.default_rng(2).uniform(-24, 24, (copies, steps))
     truth = simulate(env.unwrapped.plant, keys, voltages)

@@ -7,7 +7,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 
 from filters import FILTERS, EstimateState, EstimateStates
-from filters.wrappers.ids import filtered_id
+from filters.wrappers.ids import ALIASES, filtered_id
 
 COPIES, STEPS = 3, 30
 MODES = ["NextStep", "SameStep", "Disabled"]
@@ -106,11 +106,14 @@ def test_filtered_ids_make_single_and_vector_envs(task):
     np.testing.assert_allclose(vector.reset(seed=4)[0][0], first, rtol=1e-6)
 
 
-def test_every_filter_has_an_id_for_every_task():
-    assert filtered_id("BowThruster-v0", "enkf") == "BowThruster-EnKF-v0"
+def test_every_task_has_an_id_that_takes_any_filter_and_some_short_ones():
+    assert filtered_id("BowThruster-v0", "EnKF") == "BowThruster-EnKF-v0"
     for task in ("", "Tracking", "Reversal", "Linear"):
-        for name in FILTERS:
-            assert filtered_id(f"BowThruster{task}-v0", name) in gym.registry
+        for word in ("Filtered", *ALIASES.values()):
+            assert filtered_id(f"BowThruster{task}-v0", word) in gym.registry
+    assert set(ALIASES) <= set(FILTERS)
+    env = gym.make("filters:BowThruster-Filtered-v0", filter="denkf", filter_arguments={"ensemble_size": 7})
+    assert (env.unwrapped.spec.id, env.get_wrapper_attr("filter").size) == ("BowThruster-Filtered-v0", 7)
 
 
 def test_filter_arguments_must_be_a_mapping():

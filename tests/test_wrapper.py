@@ -13,7 +13,6 @@ import thruster_env  # noqa: F401 - registers the env
 from filters import FILTERS, EstimateState, StateSpaceModel, affine_model, make_filter, run, thruster_model
 from filters.tuned_file import sealed
 from tests.models import TUNED
-from thruster_env.model import model_of_env
 from thruster_env.parameters import TUNNEL, derive_constants
 
 # Both checkers would like a bare env with actions in [-1, 1]; volts and a wrapper are what is tested here.
@@ -95,6 +94,13 @@ def two_channels():
         prior_mean=[1.0, -1.0],
         prior_cov=[1.0, 0.5],
     )
+
+
+class Offering(Scripted):
+    """The same env, which says what model it has."""
+
+    def state_space_model(self, noise=1.0):
+        return two_channels().replace(process_noise_cov=[noise, noise])
 
 
 SCRIPT = np.random.default_rng(1).normal(size=(6, 2))
@@ -226,7 +232,7 @@ class TestSeeds:
     def still(self):
         """An env without noise, in which episodes differ by the filter's own numbers only."""
         env = bow_thruster(process_noise_cov=[0, 0], measurement_noise_cov=0, initial_state=[0, 0])
-        return wrapped(env=env, process_noise_cov=[1.0, 4e-4], measurement_noise_cov=0.25)
+        return wrapped(env=env, model_arguments={"process_noise_cov": [1.0, 4e-4], "measurement_noise_cov": 0.25})
 
     def test_an_episode_s_key_follows_from_the_seed_and_changes_from_reset_to_reset(self, still):
         def episodes():
@@ -262,11 +268,23 @@ class TestSpecifications:
     @pytest.mark.parametrize(
         "arguments",
         [
-            {"filter": "kf", "operating_voltage": 6.0, "observation": "belief"},
-            {"filter": "ekf", "parameter_factors": {"lift_coefficient": 1.15, "voltage_gain": 0.95}},
-            {"filter": "enkf", "ensemble_size": 7, "process_noise_cov": [[2.0, 0.01], [0.01, 1e-3]]},
-            {"filter": "enkf", "measurement_noise_cov": 0.5, "observation": "measurement+estimate"},
-            {"filter": "ekf", "model": f"{__name__}:own_model", "process_noise_cov": [9.0, 9.0]},
+            {"filter": "kf", "model_arguments": {"operating_voltage": 6.0}, "observation": "belief"},
+            {"filter": "ekf", "model_arguments": {"parameter_factors": {"lift_coefficient": 1.15}}},
+            {
+                "ensemble_size": 7,
+                "filter": "enkf",
+                "model_arguments": {"process_noise_cov": [[2, 0.01], [0.01, 1e-3]]},
+            },
+            {
+                "filter": "enkf",
+                "model_arguments": {"measurement_noise_cov": 0.5},
+                "observation": "measurement+estimate",
+            },
+            {
+                "filter": "ekf",
+                "model": f"{__name__}:own_model",
+                "model_arguments": {"process_noise_cov": [9.0, 9.0]},
+            },
             {},
         ],
     )
@@ -291,7 +309,9 @@ class TestSpecifications:
         path = tmp_path / "tuned.json"
         path.write_text(json.dumps(TUNED))
         env = EstimateState(bow_thruster(), tuned=str(path))
-        twin = EstimateState(bow_thruster(), filter="enkf", ensemble_size=20, process_noise_cov=[1, 4e-4])
+        twin = EstimateState(
+            bow_thruster(), filter="enkf", ensemble_size=20, model_arguments={"process_noise_cov": [1, 4e-4]}
+        )
         again = self.rebuilt(env)
         actions = voltages(10)
         found = [infos_of("estimate", played(e, actions, 4)[2]) for e in (env, twin, again)]
@@ -336,6 +356,10 @@ class TestModels:
         assert other.filter.model.operating_input.tolist() == [-3.0]
 
 
+def assumed(arguments):
+    return {"model_arguments": arguments}
+
+
 @pytest.mark.parametrize(
     ("arguments", "rule"),
     [
@@ -343,24 +367,54 @@ class TestModels:
         ({"filter": 3}, "filter must be one of .*but got 3"),
         ({"observation": "state"}, "observation must be one of estimate, .*but got 'state'"),
         ({"filter": "enkf", "ensemble_size": 1}, "ensemble_size must be .*at least 2, but got 1"),
-        ({"filter": "enkf", "size": 9}, "among ensemble_size, .*, operating_voltage, but got 'size'"),
-        ({"filter": "ekf", "ensemble_size": 9}, "among process_noise_cov, .* but got 'ensemble_size'"),
-        ({"process_noise_cov": [-1.0, 1.0]}, "process_noise_cov must be positive semidefinite.*-1"),
-        ({"measurement_noise_cov": 0.0}, "measurement_noise_cov must be positive definite"),
-        ({"parameter_factors": {"lift": 1.1}}, r"parameter_factors must name fields of .*\['lift'\]"),
-        ({"parameter_factors": {"voltage_gain": -1.0}}, "voltage_gain must be positive, but got -1"),
-        ({"operating_voltage": math.nan}, "operating_voltage must be a finite number, but got nan"),
+        (
+            {"filter": "enkf", "size": 9},
+            "one of ensemble_size, .*model_arguments.*, but got 'size'",
+        ),
+        (
+            {"filter": "ekf", "ensemble_size": 9},
+            "one of none .* but got 'ensemble_size'",
+        ),
+        (
+            {"process_noise_cov": [1.0, 1.0]},
+            "goes into model_arguments.*but got 'process_noise_cov'",
+        ),
+        ({"model_arguments": [1]}, "model_arguments must be a mapping"),
+        (
+            {"model_arguments": {"alpha": 0.5}},
+            "a bow thruster's model must be among .*'alpha'",
+        ),
+        (
+            {"model_arguments": {"process_noise_cov": [-1.0, 1.0]}},
+            "process_noise_cov must be positive semidefinite.*-1",
+        ),
+        (assumed({"measurement_noise_cov": 0.0}), "measurement_noise_cov must be positive definite"),
+        (
+            {"model_arguments": {"parameter_factors": {"lift": 1.1}}},
+            r"parameter_factors must name fields of .*\['lift'\]",
+        ),
+        (
+            {"model_arguments": {"parameter_factors": {"voltage_gain": -1.0}}},
+            "voltage_gain must be positive, but got -1",
+        ),
+        (
+            {"model_arguments": {"operating_voltage": math.nan}},
+            "operating_voltage must be a finite number, but got nan",
+        ),
         ({"model": "no_such_module:model"}, "model must be 'module:factory'.*'no_such_module:model'"),
         ({"model": "math:no_such_name"}, "model must be 'module:factory'.*'math:no_such_name'"),
         ({"model": "no factory at all"}, "model must be 'module:factory'.*'no factory at all'"),
         ({"model": 3}, "model must be 'module:factory'.*got 3"),
         ({"model": "math:pi"}, "model 'math:pi'"),
         ({"model": "builtins:dict"}, "StateSpaceModel.*builtins:dict|builtins:dict.*StateSpaceModel"),
-        ({"model": f"{__name__}:own_model", "no_argument": 1}, "no_argument"),
-        ({"model": own_model(), "process_noise_cov": [1.0, 1.0]}, "must come without arguments"),
+        ({"model": f"{__name__}:own_model", "model_arguments": {"no_argument": 1}}, "no_argument"),
+        (
+            {"model": own_model(), "model_arguments": {"process_noise_cov": [1.0, 1.0]}},
+            "must come without arguments",
+        ),
         ({"tuned": "nowhere.json"}, "a tuned file must be readable"),
-        ({"tuned": "nowhere.json", "filter": "ekf"}, "tuned must come without filter and numbers"),
-        ({"tuned": "nowhere.json", "ensemble_size": 9}, "tuned must come without filter and numbers"),
+        ({"tuned": "nowhere.json", "filter": "ekf"}, "tuned must come without filter, numbers"),
+        ({"tuned": "nowhere.json", "ensemble_size": 9}, "tuned must come without filter, numbers"),
     ],
 )
 def test_a_wrong_argument_is_refused_with_rule_and_value(arguments, rule):
@@ -420,10 +474,12 @@ class TestOtherEnvs:
         with pytest.raises(ValueError, match="measurement|observation"):
             EstimateState(bow_thruster(), model=one_input).reset(seed=0)
 
-    def test_the_bridge_knows_the_bow_thruster_only(self):
-        assert isinstance(model_of_env(bow_thruster()), StateSpaceModel)
-        with pytest.raises(ValueError, match="must come with a model"):
-            model_of_env(gym.make("Pendulum-v1"))
+    def test_a_bow_thruster_offers_its_model(self):
+        assert isinstance(bow_thruster().unwrapped.state_space_model(), StateSpaceModel)
+
+    def test_any_env_may_offer_its_model(self):
+        env = EstimateState(Offering(SCRIPT), "kf", model_arguments={"noise": 4.0})
+        np.testing.assert_array_equal(env.filter.model.process_noise_cov, 4.0 * np.eye(2))
 
 
 def swing(x, u, c):

@@ -1,8 +1,8 @@
-"""The bridge: the thruster as a `StateSpaceModel`. No other file of this package knows the thruster."""
+"""The thruster as a `StateSpaceModel`: what a filter assumes of it."""
 
 from __future__ import annotations
 
-import warnings
+import inspect
 from collections.abc import Callable, Mapping
 from functools import partial
 
@@ -14,7 +14,9 @@ from numerics.linear_systems import zero_order_hold
 from numerics.pickling import makes_functions
 from numerics.tuples import tuple_of, written_out
 from plants.affine import affine_model
+from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
+from thruster_env.channels import CHANNELS
 from thruster_env.dynamics import (
     Constants,
     substep,
@@ -25,10 +27,10 @@ from thruster_env.dynamics import (
 from thruster_env.linear.steady_state import steady_state
 from thruster_env.parameters import ThrusterParameters, checked
 from thruster_env.plant import Plant, make_plant
-from thruster_env.plant_data import check_same_plant
 from thruster_env.rendering import Overlay
 
-ENV_IDS = tuple(f"BowThruster{task}-v0" for task in ("", "Tracking", "Reversal", "Linear"))
+STATES = (Quantity("motor speed", "omega_m", "rad/s"), Quantity("flow velocity", "U_a", "m/s"))
+INPUTS = (Quantity("voltage", "V_s", "V"),)
 
 
 @inlined
@@ -78,15 +80,6 @@ def _channel_functions(channels: tuple[str, ...]) -> tuple[Callable, Callable]:
             "observe_jacobian", "x, c", tuple_of(slopes[name] for name in channels), thrust_slopes=observe_jacobian
         ),
     )
-
-
-MODEL_ARGUMENTS = (
-    "process_noise_cov",
-    "measurement_noise_cov",
-    "prior_cov_factor",
-    "parameter_factors",
-    "operating_voltage",
-)
 
 
 def thruster_model(
@@ -155,37 +148,18 @@ def model_of_plant(
         operating_state=steady_state(plant.parameters, operating_voltage, plant.ambient_velocity)[:2],
         operating_input=[operating_voltage],
         operating_points=partial(_operating_points, plant),
+        outputs={"T": (Quantity("thrust", "T", "N"), thrust_of)},
+        **_quantities(plant),
         **_operating_range(plant),
     )
 
 
-def model_of_env(env, known: tuple[str, ...] = (), /, **changes) -> StateSpaceModel:
-    """The model of a `BowThruster` env; changes are those of `model_of_plant`.
-
-    Raises:
-        ValueError: if the env has no plant that this package knows, or a change is unknown; the message then lists
-            those of the model behind others that are `known` to the caller: the filter's own numbers.
-    """
-    plant = getattr(env.unwrapped, "plant", None)
-    if not isinstance(plant, Plant):
-        raise ValueError(f"an env other than a bow thruster must come with a model, but got {env}")
-    unknown = sorted(set(changes) - set(MODEL_ARGUMENTS))
-    if unknown:
-        names = ", ".join((*known, *MODEL_ARGUMENTS))
-        raise ValueError(f"arguments must be among {names}, but got {', '.join(map(repr, unknown))}")
-    return model_of_plant(plant, **changes)
+def thrust_of(x, c):
+    """Thrust [N] at components x of the state, floats or arrays."""
+    return thrust_and_torque(x, c)[0]
 
 
-def check_plant_of_env(env, tuned_for: Mapping | None, file: str) -> None:
-    """Raise ValueError if a tuned file is for another plant than the env's; warn where it is for other noise.
-
-    A file that does not tell (None), and an env that is no bow thruster, are not compared.
-    """
-    plant = getattr(env.unwrapped, "plant", None)
-    if tuned_for is not None and isinstance(plant, Plant):
-        others = check_same_plant(tuned_for, plant, file)
-        if others:
-            warnings.warn(f"{file} was tuned for {', '.join(others)}", stacklevel=4)
+MODEL_ARGUMENTS = tuple(inspect.signature(model_of_plant).parameters)[1:]
 
 
 def thrusts_of(model: StateSpaceModel, states: np.ndarray) -> np.ndarray:
@@ -223,7 +197,13 @@ def _linear_model(plant: Plant) -> StateSpaceModel:
         measurement_noise_cov=plant.measurement_noise_cov,
         prior_mean=plant.initial_mean,
         prior_cov=plant.initial_cov,
+        **_quantities(plant),
     )
+
+
+def _quantities(plant: Plant) -> dict:
+    measured = [Quantity(f"measured {name}", name, CHANNELS[name][0]) for name in plant.channels]
+    return {"states": STATES, "input_quantities": INPUTS, "measurements": measured}
 
 
 def _operating_points(plant: Plant, count: int) -> list[tuple[tuple[float, float], tuple[float]]]:

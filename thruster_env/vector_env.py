@@ -27,12 +27,13 @@ from thruster_env.engine.memory import (
     VALID,
 )
 from thruster_env.env import BowThrusterEnv
+from thruster_env.modelled import ModelledEnv
 from thruster_env.tasks import BowThrusterLinearEnv, BowThrusterReversalEnv, BowThrusterTrackingEnv
 
 MOST_ENVS = 1_000_000  # of some kilobytes each
 
 
-class BowThrusterVectorEnv(gym.vector.VectorEnv):
+class BowThrusterVectorEnv(ModelledEnv, gym.vector.VectorEnv):
     """N copies of an env, native: copy i of `reset(seed=s)` equals a single env with `reset(seed=s + i)`.
 
     Its j-th later episode equals that env's j-th unseeded reset, in all three autoreset modes. Parameters that are

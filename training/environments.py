@@ -10,7 +10,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from filters import EstimateState, EstimateStates
 from filters.registry import tunable_numbers
-from thruster_env.model import model_of_env, thruster_model
+from thruster_env.model import thruster_model
 from thruster_env.observe import ObserveState, ObserveStateVector
 from training.controllers import CorrectController, predictive
 from training.observations import find_arm
@@ -47,7 +47,7 @@ def make_environments(
     if arm.pairs:
         venv = ShowHistory(venv, arm.pairs, one.unwrapped.appended_entries)
     if arm.shows_state:
-        venv = ShowThrust(venv, model_of_env(one) if arm.is_true else one.filter.model)
+        venv = ShowThrust(venv, one.unwrapped.state_space_model() if arm.is_true else one.filter.model)
     if setup.controller is not None:
         venv = CorrectController(venv, predictive(setup.controller, one), setup.share)
     seed_episodes(venv, seeds)
@@ -73,11 +73,11 @@ def make_single(setup: Setup, render_mode: str | None = None) -> gym.Env:
 def _filter_arguments(setup: Setup) -> dict:
     """Arguments of the wrapper; where the filter assumes another plant than the env's, a model of that one."""
     arguments = dict(setup.filter_arguments)
-    if setup.assumed_plant is None:
-        return arguments
     own = {
         name: arguments.pop(name) for name in tunable_numbers(find_arm(setup.observe).filter) if name in arguments
     }
+    if setup.assumed_plant is None:
+        return {"model_arguments": arguments, **own}
     return {"model": thruster_model(**{**setup.assumed_plant, **arguments}), **own}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import gymnasium as gym
 import numpy as np
@@ -13,13 +13,12 @@ from filters.registry import make_filter, tunable_numbers
 from filters.tuned_file import read_tuned_file
 from numerics.checks import shown
 from plants.state_space import StateSpaceModel
-from thruster_env.model import check_plant_of_env, model_of_env
 
 OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
 APPENDED = "appended_entries"  # attribute of an env: entries of its observation after the measurement
 
 
-def filter_for(env, filter: str | None, model, tuned: str | None, numbers: dict) -> Filter:
+def filter_for(env, filter: str | None, model, tuned: str | None, model_arguments, numbers: dict) -> Filter:
     """The filter that a wrapper of env is told to run; its class says what the arguments mean.
 
     A tuned file is data: nothing in it becomes a model or another argument of the wrapper. Where no `model` is
@@ -28,23 +27,33 @@ def filter_for(env, filter: str | None, model, tuned: str | None, numbers: dict)
     Raises ValueError if an argument is unknown or off.
     """
     if tuned is not None:
-        if filter is not None or numbers:
-            raise ValueError("tuned must come without filter and numbers, for its file holds them")
+        if filter is not None or numbers or model_arguments is not None:
+            raise ValueError("tuned must come without filter, numbers and model_arguments: its file holds them")
         content = read_tuned_file(tuned)
-        if model is None:
-            check_plant_of_env(env, content.get("plant"), tuned)
+        check = getattr(env.unwrapped, "check_tuned_for", None)
+        if model is None and check is not None:
+            check(content.get("plant"), tuned)
         entry = content["filter"]
-        return make_filter(entry["name"], _model_for(env, model, entry["model"], ()), **entry["numbers"])
+        return make_filter(entry["name"], model_for(env, model, entry["model"]), **entry["numbers"])
     filter = "ekf" if filter is None else filter
-    numbers = dict(numbers)
     known = tunable_numbers(filter)
-    own = {name: numbers.pop(name) for name in known if name in numbers}
-    return make_filter(filter, _model_for(env, model, numbers, known), **own)
+    for name in numbers:
+        if name not in known:
+            rule = f"a number of filter {filter!r} must be one of {', '.join(known) or 'none'}"
+            raise ValueError(f"{rule} (what the model takes goes into model_arguments), but got {name!r}")
+    arguments = {} if model_arguments is None else model_arguments
+    if not isinstance(arguments, Mapping):
+        raise ValueError(f"model_arguments must be a mapping, but got {shown(arguments)}")
+    return make_filter(filter, model_for(env, model, arguments), **numbers)
 
 
-def _model_for(env, model, arguments: dict, known: tuple[str, ...]) -> StateSpaceModel:
+def model_for(env, model: str | StateSpaceModel | None, arguments: Mapping) -> StateSpaceModel:
+    """The model that is given, that the "module:factory" named makes, or the env's own; see `EstimateState`."""
     if model is None:
-        return model_of_env(env, known, **arguments)
+        make = getattr(env.unwrapped, "state_space_model", None)
+        if make is None:
+            raise ValueError(f"an env that offers no state_space_model must come with a model, but got {env}")
+        return _made(f"the model of {env.unwrapped}", make, arguments)
     if isinstance(model, StateSpaceModel):
         if arguments:
             raise ValueError(f"a StateSpaceModel must come without arguments of its own, but got {arguments!r}")
@@ -56,12 +65,16 @@ def _model_for(env, model, arguments: dict, known: tuple[str, ...]) -> StateSpac
         raise ValueError(
             f"model must be 'module:factory' that can be imported, or a StateSpaceModel, but got {model!r}"
         ) from None
+    return _made(f"model {model!r}", factory, arguments)
+
+
+def _made(what: str, make: Callable, arguments: Mapping) -> StateSpaceModel:
     try:
-        made = factory(**arguments)
+        made = make(**arguments)
     except TypeError as error:
-        raise ValueError(f"model {model!r} must take the given arguments: {error}") from None
+        raise ValueError(f"{what} must take the given arguments: {error}") from None
     if not isinstance(made, StateSpaceModel):
-        raise ValueError(f"model {model!r} must return a StateSpaceModel, but it returned {shown(made)}")
+        raise ValueError(f"{what} must be a StateSpaceModel, but it is {shown(made)}")
     return made
 
 

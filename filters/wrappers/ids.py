@@ -1,69 +1,88 @@
 """Registered envs with a filter around them: `gym.make("filters:BowThruster-EnKF-v0")`, single and in number.
 
-Each id is that of an env with the filter's name in it. The keyword arguments are those of the env; `observation`
-and `filter_arguments` (a mapping) are those of the wrapper.
+Packages with envs that offer a model name themselves in the group of entry points PLANTS; each of their ids has
+one here, "BowThruster-Filtered-v0", whose argument `filter` names the filter, and one for each filter of ALIASES.
 """
 
 from __future__ import annotations
 
+import importlib.metadata
 from collections.abc import Mapping
 
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator, register, registry
 
-from filters.registry import FILTERS
 from filters.wrappers.single import EstimateState
 from filters.wrappers.vector import EstimateStates
 from numerics.checks import shown
-from thruster_env.model import ENV_IDS
 
-_SPELLING = {"enkf": "EnKF", "ensrf": "EnSRF", "denkf": "DEnKF", "ienkf": "IEnKF", "low-pass": "LowPass"}
+PLANTS = "filters.plants"  # group of entry points: packages that register their envs when imported
+ALIASES = {"kf": "KF", "ekf": "EKF", "ukf": "UKF", "enkf": "EnKF", "pf": "PF"}
 
 
-def filtered_id(env_id: str, filter_name: str) -> str:
-    """The id of an env with a filter: "BowThruster-v0" and "enkf" give "BowThruster-EnKF-v0"."""
+def filtered_id(env_id: str, word: str = "Filtered") -> str:
+    """The id of an env with a filter: "BowThruster-v0" and "EnKF" give "BowThruster-EnKF-v0"."""
     name, version = env_id.rsplit("-", 1)
-    words = filter_name.split("-")
-    plain = filter_name.upper() if len(words) == 1 else "".join(word.capitalize() for word in words)
-    return f"{name}-{_SPELLING.get(filter_name, plain)}-{version}"
+    return f"{name}-{word}-{version}"
 
 
 def make_env(
     env_id: str,
-    filter: str,
+    filter: str = "ekf",
     observation: str = "estimate",
     filter_arguments: Mapping | None = None,
+    model_arguments: Mapping | None = None,
     **env_arguments,
 ) -> EstimateState:
-    """A single env of an id with a filter around it; see `EstimateState` for the arguments."""
+    """A single env of an id with a filter around it; see `EstimateState` for the arguments.
+
+    `filter_arguments` are the filter's own numbers; what is not named here are arguments of the env.
+    """
     env = load_env_creator(gym.spec(env_id).entry_point)(**env_arguments)
-    return EstimateState(env, filter, observation, **_checked(filter_arguments))
+    numbers = _checked(filter_arguments)
+    return EstimateState(env, filter, observation, model_arguments=model_arguments, **numbers)
 
 
 def make_vector_env(
     env_id: str,
-    filter: str,
+    filter: str = "ekf",
     observation: str = "estimate",
     filter_arguments: Mapping | None = None,
+    model_arguments: Mapping | None = None,
     **env_arguments,
 ) -> EstimateStates:
     """The native vector env of an id with a filter on every copy; see `EstimateStates` for the arguments."""
     env = load_env_creator(gym.spec(env_id).vector_entry_point)(**env_arguments)
-    return EstimateStates(env, filter, observation, **_checked(filter_arguments))
+    numbers = _checked(filter_arguments)
+    return EstimateStates(env, filter, observation, model_arguments=model_arguments, **numbers)
+
+
+def modelled_ids() -> list[str]:
+    """Ids of registered envs, of the packages in PLANTS, whose class offers a model."""
+    packages = {point.value for point in importlib.metadata.entry_points(group=PLANTS)}
+    for package in sorted(packages):
+        importlib.import_module(package)
+    found = []
+    for env_id, spec in registry.items():
+        entry = spec.entry_point
+        if isinstance(entry, str) and entry.partition(".")[0] in packages:
+            if hasattr(load_env_creator(entry), "state_space_model"):
+                found.append(env_id)
+    return found
 
 
 def register_filtered_envs() -> None:
-    """Register every bow thruster env with every filter, unless that has been done."""
-    for env_id in ENV_IDS:
-        for name in FILTERS:
-            new_id = filtered_id(env_id, name)
-            if new_id not in registry:
+    """Register every env that offers a model with a filter around it, unless that has been done."""
+    for env_id in modelled_ids():
+        for word, filter in [("Filtered", None), *((word, name) for name, word in ALIASES.items())]:
+            if filtered_id(env_id, word) not in registry:
+                spec = gym.spec(env_id)
                 register(
-                    id=new_id,
+                    id=filtered_id(env_id, word),
                     entry_point="filters.wrappers.ids:make_env",
                     vector_entry_point="filters.wrappers.ids:make_vector_env",
-                    max_episode_steps=gym.spec(env_id).max_episode_steps,
-                    kwargs={"env_id": env_id, "filter": name},
+                    max_episode_steps=spec.max_episode_steps,
+                    kwargs={"env_id": env_id} | ({} if filter is None else {"filter": filter}),
                 )
 
 

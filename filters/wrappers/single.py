@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import gymnasium as gym
 import numpy as np
@@ -14,7 +14,6 @@ from numerics.checks import one_of, shown
 from numerics.checks import seed as checked_seed
 from numerics.streams import draw_key, filter_generator
 from plants.state_space import StateSpaceModel
-from thruster_env.model import overlay_of
 
 FLOAT32 = np.dtype(np.float32)  # a cast to a dtype is quicker than one to its type
 
@@ -41,12 +40,14 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         env: any env with Box actions and observations.
         filter: name of a filter in `filters.FILTERS`, which `thruster filters` lists; "ekf" if None.
         observation: one of the three forms above.
-        model: None for the model of a bow thruster env, "module:factory" of a function that returns a
-            `StateSpaceModel`, or a `StateSpaceModel` (which JSON cannot hold).
+        model: None for the model that the env itself offers by `env.unwrapped.state_space_model(**arguments)`,
+            as a bow thruster does; "module:factory" of a function that returns a `StateSpaceModel`; or a
+            `StateSpaceModel` (which JSON cannot hold).
         tuned: path of a tuned file; it gives filter, numbers and model arguments.
-        **numbers: the filter's own numbers, such as `ensemble_size`, and arguments of the model: for a bow
-            thruster `process_noise_cov`, `measurement_noise_cov`, `prior_cov_factor`, `parameter_factors`,
+        model_arguments: what the env's own model or the factory takes, a mapping: for a bow thruster
+            `process_noise_cov`, `measurement_noise_cov`, `prior_cov_factor`, `parameter_factors`,
             `operating_voltage`.
+        **numbers: the filter's own numbers, such as `ensemble_size`.
 
     Raises:
         ValueError: if an argument is unknown or off, or spaces and model do not fit.
@@ -59,16 +60,18 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         observation: str = "estimate",
         model: str | StateSpaceModel | None = None,
         tuned: str | None = None,
+        model_arguments: Mapping | None = None,
         **numbers,
     ):
         """Build model and filter; see the class for the arguments."""
         model = model.content if isinstance(model, ModelInSpec) else model
         held = ModelInSpec(model) if isinstance(model, StateSpaceModel) else model
         recorded = {"filter": filter, "observation": observation, "model": held, "tuned": tuned, **numbers}
+        recorded["model_arguments"] = model_arguments
         gym.utils.RecordConstructorArgs.__init__(self, **recorded)
         gym.Wrapper.__init__(self, env)
         self._form = one_of("observation", observation, OBSERVATIONS)
-        self.filter = filter_for(env, filter, model, tuned, numbers)
+        self.filter = filter_for(env, filter, model, tuned, model_arguments, numbers)
         check_spaces(env.action_space, env.observation_space, self.filter.model)
         n, m = self.filter.model.n, self.filter.model.m
         # What an env appends to its measurement, validity flags and the reference, stays in the observation.
@@ -77,7 +80,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
         self._session = Session(self.filter)
         self._generator = filter_generator(None)
-        if hasattr(env.unwrapped, "render_overlay"):  # a bow thruster draws the estimate beside the truth
+        if hasattr(env.unwrapped, "overlay"):  # it draws the estimate beside the truth
             env.unwrapped.render_overlay = self._overlay
         low, high = env.action_space.low.ravel(), env.action_space.high.ravel()
         self._bounds = list(zip(low.tolist(), high.tolist(), strict=True))
@@ -119,7 +122,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         return [min(max(v, low), high) for v, (low, high) in zip(values, self._bounds, strict=True)]
 
     def _overlay(self):
-        return overlay_of(self.filter.name, self.filter.model, self._session.mean, self._session.cov)
+        label, model, session = self.filter.name, self.filter.model, self._session
+        return self.unwrapped.overlay(label, model, session.mean, session.cov)
 
     def _observe(self, observation, z, info) -> np.ndarray:
         session = self._session

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -31,7 +32,7 @@ class EstimateStates(gym.vector.VectorWrapper):
 
     Args:
         env: any vector env with Box actions and observations.
-        filter, observation, model, tuned, **numbers: those of `EstimateState`.
+        filter, observation, model, tuned, model_arguments, **numbers: those of `EstimateState`.
 
     Raises:
         ValueError: if an argument is unknown or off, or spaces and model do not fit.
@@ -44,12 +45,13 @@ class EstimateStates(gym.vector.VectorWrapper):
         observation: str = "estimate",
         model: str | StateSpaceModel | None = None,
         tuned: str | None = None,
+        model_arguments: Mapping | None = None,
         **numbers,
     ):
         """Build model and filter; see the class for the arguments."""
         super().__init__(env)
         self._form = one_of("observation", observation, OBSERVATIONS)
-        self.filter = filter_for(env, filter, model, tuned, numbers)
+        self.filter = filter_for(env, filter, model, tuned, model_arguments, numbers)
         check_spaces(env.single_action_space, env.single_observation_space, self.filter.model)
         self._n, self._m = self.filter.model.n, self.filter.model.m
         self._appended = getattr(env.unwrapped, APPENDED, 0)

@@ -11,12 +11,13 @@ import numpy as np
 
 from thruster_env.engine.memory import COMMAND, READINGS
 from thruster_env.linear.steady_state import state_range
+from thruster_env.modelled import ModelledEnv
 from thruster_env.rendering.history import Moment, Overlay
 from thruster_env.rendering.renderer import MODES, Renderer
 from thruster_env.task import thrust_scale
 
 
-class RenderedEnv(gym.Env):
+class RenderedEnv(ModelledEnv, gym.Env):
     """An env with a `plant` and a `_memory` of one copy that draws itself."""
 
     metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 100}

@@ -1,0 +1,114 @@
+"""What the numbers of a model are: names, symbols and units of states, inputs, measurements and outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from numerics.checks import shown
+
+
+class Quantity(NamedTuple):
+    """One component of a vector.
+
+    Attributes:
+        name: in words, such as "motor speed".
+        symbol: as equations have it and files name it, such as "omega_m"; letters, digits, "_" and "-".
+        unit: of SI, such as "rad/s"; empty for a pure number.
+        angle: whether it wraps at 2 pi [rad]: differences of it are taken the short way round.
+    """
+
+    name: str
+    symbol: str
+    unit: str = ""
+    angle: bool = False
+
+    @property
+    def label(self) -> str:
+        """Name and unit, as tables have it."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+    @property
+    def plot_label(self) -> str:
+        """Name, symbol and unit, as axes of figures have it."""
+        symbol = "" if self.symbol == self.name else f" ${_mathtext(self.symbol)}$"
+        return f"{self.name}{symbol}" + (f" [{self.unit}]" if self.unit else "")
+
+
+class Output(NamedTuple):
+    """What follows from a state: a quantity y = function(x, c) of components x and the model's constants c.
+
+    The function is made of operators on components, so that it takes arrays of them as well as floats.
+    """
+
+    quantity: Quantity
+    function: Callable
+
+
+class Quantities(NamedTuple):
+    """The components of a model's vectors, named as its fields are."""
+
+    states: tuple[Quantity, ...]
+    input_quantities: tuple[Quantity, ...]
+    measurements: tuple[Quantity, ...]
+
+
+def quantities(kind: str, given: Any, count: int, letter: str) -> tuple[Quantity, ...]:
+    """Quantities from such, from tuples of their fields or from names; letter_1, letter_2, ... if None.
+
+    Args:
+        kind: what they are, for messages: "states".
+        given: a sequence with `count` entries, or None.
+        count: how many components there are.
+        letter: what those without names are called.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
+    if given is None:
+        return tuple(Quantity(f"{letter}_{i}", f"{letter}_{i}") for i in range(1, count + 1))
+    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != count:
+        raise ValueError(f"{kind} must be {count} quantities or names, but got {shown(given)}")
+    found = tuple(_quantity(kind, one) for one in given)
+    symbols = [one.symbol for one in found]
+    if len(set(symbols)) < count:
+        raise ValueError(f"symbols of {kind} must differ from one another, but got {', '.join(symbols)}")
+    return found
+
+
+def _quantity(kind: str, given) -> Quantity:
+    try:
+        made = Quantity(given, given.replace(" ", "_")) if isinstance(given, str) else Quantity(*given)
+    except TypeError:
+        made = None
+    texts = made is not None and all(isinstance(text, str) for text in made[:3]) and isinstance(made.angle, bool)
+    plain = texts and made.symbol and made.symbol.replace("_", "").replace("-", "").isalnum()
+    if not plain or (made.angle and made.unit != "rad"):
+        rule = f"each of {kind} must be a name, or have name, symbol (letters, digits, _ and -), unit and angle"
+        raise ValueError(f"{rule}, and an angle the unit rad, but got {shown(given)}")
+    return made
+
+
+def outputs(given: Mapping[str, Output | Sequence]) -> dict[str, Output]:
+    """Outputs by symbol, each an `Output` or (quantity, function); ValueError states the rule and the value."""
+    if not isinstance(given, Mapping):
+        raise ValueError(f"outputs must map symbols to quantities and functions, but got {shown(given)}")
+    found = {}
+    for symbol, one in given.items():
+        if not isinstance(one, Sequence) or len(one) != 2 or not callable(one[1]):
+            raise ValueError(f"the output {symbol!r} must be a quantity and a function, but got {shown(one)}")
+        found[symbol] = Output(_quantity(f"outputs, {symbol}", one[0]), one[1])
+    return found
+
+
+_GREEK = {
+    *("alpha", "beta", "gamma", "delta", "epsilon", "theta", "kappa", "lambda", "mu", "nu", "xi", "rho", "sigma"),
+    *("tau", "phi", "chi", "psi", "omega", "eta", "zeta"),
+}
+
+
+def _mathtext(symbol: str) -> str:
+    """A symbol as matplotlib reads it, Greek letters by name."""
+    letter, *indices = symbol.split("_")
+    letter = f"\\{letter}" if letter.lower() in _GREEK else letter if len(letter) == 1 else f"\\mathrm{{{letter}}}"
+    return letter + (f"_{{{','.join(indices)}}}" if indices else "")
