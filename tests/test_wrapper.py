@@ -339,11 +339,11 @@ class TestModels:
     def test_a_mismatch_is_a_factor_on_a_parameter_of_the_model_alone(self):
         factors = {"lift_coefficient": 1.15, "voltage_gain": 0.95}
         env = wrapped("ekf", **assumed(parameter_factors=factors))
-        assumed, true = env.filter.model.constants, thruster_model().constants
+        found, true = env.filter.model.constants, thruster_model().constants
         scaled = TUNNEL._replace(lift_coefficient=1.15 * 1.75, voltage_gain=0.95 * 1133.2)
         expected = derive_constants(scaled, substep=true.substep)
-        np.testing.assert_allclose(assumed, expected, rtol=1e-12)
-        assert assumed.motor_damping == true.motor_damping
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+        assert found.motor_damping == true.motor_damping
         actions = np.full((300, 1), 10.0, dtype=np.float32)
         one, other = played(env, actions, 1)[2], played(wrapped("ekf"), actions, 1)[2]
         np.testing.assert_array_equal(infos_of("state", one), infos_of("state", other))
