@@ -12,7 +12,6 @@ from numerics.compiled import inlined
 from numerics.derivatives import RELATIVE_STEP
 from numerics.pickling import makes_functions
 from numerics.tuples import tuple_of, written_out
-from plants.layout import constants_form
 from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
 
@@ -58,16 +57,7 @@ def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unkno
         walks.append(positive(f"walk_std of {name}", unknown.walk_std, zero_allowed=True) ** 2)
     if not places:
         raise ValueError("parameters must name at least one constant, but got none")
-    functions = _augmented_functions(
-        inlined(model.transition),
-        inlined(model.observe),
-        model.transition_jacobian,
-        model.observe_jacobian,
-        model.n,
-        model.m,
-        constants_form(model.constants),
-        tuple(places),
-    )
+    functions = _augmented_functions(*model.functions, model.shape, tuple(places))
     spread = np.sqrt(np.add(variances, walks))
     further = {
         "operating_state": means,
@@ -101,10 +91,10 @@ def _block_diagonal(cov: np.ndarray, variances: list[float]) -> np.ndarray:
 
 @makes_functions
 def _augmented_functions(
-    transition, observe, transition_jacobian, observe_jacobian, n, m, form, places
+    transition, transition_jacobian, observe, observe_jacobian, shape, places
 ) -> dict[str, Callable | None]:
     """Functions of the augmented model; its constants are the model's own, then the spread of each parameter."""
-    count, added = form if isinstance(form, int) else len(form._fields), len(places)
+    n, m, form, count, added = shape.n, shape.m, shape.form, shape.constants, len(places)
     values = [f"t[{places.index(i)}]" if i in places else f"c[{i}]" for i in range(count)]
     source = tuple_of(values) if isinstance(form, int) else f"Constants({', '.join(values)})"
     names = {

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from numerics.derivatives import RELATIVE_STEP, jacobian
+from numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from numerics.derivatives import RELATIVE_STEP
 from numerics.formulas import formula
 from numerics.matrices import cholesky_factor, innovation, innovation_likelihood, masked, row_solver
 from numerics.threads import spread
@@ -21,7 +21,8 @@ from numerics.tuples import (
     vector_writer,
     written_out,
 )
-from plants.layout import constants_form, constants_reader, number_places
+from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape, observation_slopes, transition_slopes
 from plants.state_space import StateSpaceModel
 
 
@@ -68,15 +69,7 @@ def likelihood(
             f"inputs, measurements, q_slopes and r_slopes must have the shapes {wanted}, but got {shapes}"
         )
     out = np.zeros((count, 1 + parameters))
-    accumulate = _build(
-        inlined(model.transition),
-        jacobian(model.transition, model.transition_jacobian, n, n, "u, c"),
-        inlined(model.observe),
-        jacobian(model.observe, model.observe_jacobian, m, n, "c"),
-        (n, m, model.inputs),
-        constants_form(model.constants),
-        is_interpreting(),
-    )
+    accumulate = _build(model.functions, model.shape, is_interpreting())
     slopes = q_slopes.reshape(parameters, -1), r_slopes.reshape(parameters, -1)
     arguments = inputs, measurements, model.numbers, *slopes, out
     spread(lambda first, last: accumulate(*arguments, first, last), count)
@@ -84,17 +77,21 @@ def likelihood(
 
 
 @cache
-def _build(transition, transition_matrix, observe, observation_matrix, shape, form, interpreting: bool):
-    n, m, inputs = shape
+def _build(functions: Functions, shape: Shape, interpreting: bool):
+    n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
+    transition_matrix, observation_matrix = (
+        transition_slopes(functions, shape),
+        observation_slopes(functions, shape),
+    )
     places = number_places(n, m)
     constants, scales, control = (
-        constants_reader(n, m, form),
+        constants_reader(shape),
         vector_reader(n, places.scales),
-        vector_reader(inputs),
+        vector_reader(shape.inputs),
     )
     prior_mean, prior_cov = vector_reader(n, places.prior_mean), matrix_reader(n, n, places.prior_cov)
     q, r = matrix_reader(n, n, places.q), matrix_reader(m, m, places.r)
-    control, reading = vector_reader(inputs), vector_reader(m)
+    control, reading = vector_reader(shape.inputs), vector_reader(m)
     q_slope, r_slope = matrix_reader(n, n), matrix_reader(m, m)
     mean_slope, cov_slope = vector_reader(n), matrix_reader(n, n, n)  # a parameter's row: dx, then dP
     store_mean_slope, store_cov_slope = vector_writer(n), matrix_writer(n, n, n)

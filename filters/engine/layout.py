@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from numerics.tuples import matrix_reader, matrix_writer, vector_reader, vector_writer
 from plants.layout import number_places, starts_of
+from plants.shape import Shape
 
 
 class MemoryPlaces(NamedTuple):
@@ -56,6 +57,6 @@ def row_access(n: int, m: int) -> tuple[tuple[Callable, Callable], ...]:
     )
 
 
-def own_place(n: int, m: int, form: type | int) -> int:
-    """First place of a filter's own numbers, behind those of its model; form is that of `constants_form`."""
-    return number_places(n, m).constants + (form if isinstance(form, int) else len(form._fields))
+def own_place(shape: Shape) -> int:
+    """First place of a filter's own numbers, behind those of its model."""
+    return number_places(shape.n, shape.m).constants + shape.constants

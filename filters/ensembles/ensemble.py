@@ -24,22 +24,24 @@ from numerics.tuples import (
     vector_reader,
     written_out,
 )
-from plants.layout import constants_form, constants_reader, number_places
+from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape
 
 LARGEST_ENSEMBLE = 1_000_000
 
 
 @lru_cache(maxsize=64)
-def measurement_moments(observe, n, m, form) -> Callable:
+def measurement_moments(observe: Callable, shape: Shape) -> Callable:
     """Return `compare(memory, z, numbers, size)`: what the members expect to be measured, against z.
 
     It puts y_j = h(x_j) into rows n ... of the table, innovation, S and log-likelihood into the row, and returns
     mean(y) (m,), innovation = z - mean(y) (m,), cov(x, y) (n, m), S = cov(y, y) + R, R (m, m) and the lower
     triangular root of S. In a channel that is NaN in z, y_j is 0, and R has no correlations.
     """
+    n, m = shape.n, shape.m
     places, source = memory_places(n, m), number_places(n, m)
     likelihood_place = places.log_likelihood
-    constants, state, store = constants_reader(n, m, form), column_reader(n), column_writer(m, n)
+    constants, state, store = constants_reader(shape), column_reader(n), column_writer(m, n)
     means_of_all, covariances_with_predicted = row_means(n + m), row_covariances(0, n + m, n, m)
     of_states = written_out("of_states", "c", tuple_of(f"c[{i}]" for i in range(n)))
     of_predicted = written_out("of_predicted", "c", tuple_of(f"c[{n + i}]" for i in range(m)))
@@ -80,22 +82,19 @@ def silence(table, first, z):
 
 
 @lru_cache(maxsize=64)
-def ensemble_kernels(analysis, transition, observe, n, m, inputs, form) -> Kernels:
-    """Kernels of an ensemble filter for model functions and sizes.
+def ensemble_kernels(analysis: Callable, functions: Functions, shape: Shape) -> Kernels:
+    """Kernels of an ensemble filter for a model's functions and shape.
 
     Args:
-        analysis: analysis(observe, n, m, form) returns `analyse(memory, z, numbers, size)`, which moves the
-            members and sets the innovation, its covariance and its likelihood.
-        transition: f.
-        observe: h.
-        n: number of states.
-        m: number of measurements.
-        inputs: number of inputs.
-        form: that of `rows.constants_form`.
+        analysis: analysis(observe, shape) returns `analyse(memory, z, numbers, size)`, which moves the members
+            and sets the innovation, its covariance and its likelihood.
+        functions: of the model.
+        shape: of the model.
 
     The table's rows: n of members, m of predicted measurements, m of scratch.
     """
-    motion, analyse = ensemble_motion(transition, n, m, inputs, form), analysis(observe, n, m, form)
+    n, m, observe = shape.n, shape.m, functions.observe
+    motion, analyse = ensemble_motion(functions.transition, shape), analysis(observe, shape)
     summarise = motion.summarise
 
     @inlined
@@ -153,19 +152,18 @@ class EnsembleFilter(Filter):
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
         model = self.kernel_model
-        functions = inlined(model.transition), inlined(model.observe)
-        form = constants_form(model.constants)
-        plain = ensemble_kernels(type(self).analysis, *functions, model.n, model.m, model.inputs, form)
+        plain = ensemble_kernels(type(self).analysis, model.functions, model.shape)
         # Compiled in only where it does something: in the loop over steps even an idle branch takes a tenth.
         neutral = self.inflation == 1.0 and self.relaxation == 0.0
-        return plain if neutral else with_spread_control(plain, form)
+        return plain if neutral else with_spread_control(plain, model.shape)
 
 
 @lru_cache(maxsize=64)
-def perturbed_analysis(observe, n, m, form) -> Callable:
+def perturbed_analysis(observe: Callable, shape: Shape) -> Callable:
     """Return `analyse(memory, z, numbers, size)` of the stochastic ensemble Kalman filter."""
+    n, m = shape.n, shape.m
     r_root_place = number_places(n, m).r_root
-    compare, draw, solve = measurement_moments(observe, n, m, form), drawer(n, m), matrices.row_solver(n, m)
+    compare, draw, solve = measurement_moments(observe, shape), drawer(n, m), matrices.row_solver(n, m)
     filled = written_out("filled", "z", tuple_of(f"z[{i}] if z[{i}] == z[{i}] else 0.0" for i in range(m)))
     lines = [f"    d{i} = z[{i}] - table[{n + i}, j]" for i in range(m)]
     for a in range(n):

@@ -17,6 +17,7 @@ from numerics.checks import at_least
 from numerics.compiled import inlined
 from numerics.tuples import column_writer, tuple_of, vector_reader, written_out
 from plants.layout import constants_reader
+from plants.shape import Shape
 
 MOST_ITERATIONS = 1000
 
@@ -42,11 +43,12 @@ def linear_prediction(m: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def iterated_analysis(observe, n, m, form) -> Callable:
+def iterated_analysis(observe: Callable, shape: Shape) -> Callable:
     """The analysis of the iterated ensemble Kalman filter; see `ensemble_kernels`."""
-    slopes, iterations_place = n + m, own_place(n, m, form) + 2  # Y lies in rows n + m ... of the table
-    compare, gain, geometric = measurement_moments(observe, n, m, form), transform_gain(n, m), geometric_mean(m)
-    constants, measured, difference = constants_reader(n, m, form), vector_reader(m), matrices.innovation(m, n)
+    n, m = shape.n, shape.m
+    slopes, iterations_place = n + m, own_place(shape) + 2  # Y lies in rows n + m ... of the table
+    compare, gain, geometric = measurement_moments(observe, shape), transform_gain(n, m), geometric_mean(m)
+    constants, measured, difference = constants_reader(shape), vector_reader(m), matrices.innovation(m, n)
     store_state, store_predicted, store_slopes = column_writer(n), column_writer(m, n), column_writer(m, slopes)
     moved, undone, predict = moved_member(n, m, slopes), transform_undone(n, m), linear_prediction(m)
     add, factor, solve = matrices.symmetric_sum(m), matrices.cholesky_factor(m), matrices.row_solver(m, m)

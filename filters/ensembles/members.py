@@ -11,6 +11,7 @@ from numerics.compiled import inlined
 from numerics.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
 from numerics.tuples import column_reader, column_writer, matrix_of, tuple_of, vector_reader, written_out
 from plants.layout import constants_reader, number_places
+from plants.shape import Shape
 
 
 @inlined
@@ -84,14 +85,15 @@ class Motion(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def ensemble_motion(transition, n, m, inputs, form) -> Motion:
+def ensemble_motion(transition: Callable, shape: Shape) -> Motion:
     """Prior, motion x_j = f(x_j, u) + w_j with w_j ~ N(0, Q), and moments of an ensemble."""
+    n, m = shape.n, shape.m
     places, source = memory_places(n, m), number_places(n, m)
     prior_mean_place, prior_root_place = source.prior_mean, source.prior_root
     q_root_place, substeps_place, step_place = source.q_root, source.substeps, places.step
     means_of_members, covariances_of_members = row_means(n), row_covariances(0, n, 0, n)
     _, (store_mean, store_cov), _ = row_access(n, m)
-    constants, control = constants_reader(n, m, form), vector_reader(inputs)
+    constants, control = constants_reader(shape), vector_reader(shape.inputs)
     state, store_state, draw = column_reader(n), column_writer(n), drawer(n, m)
 
     @inlined

@@ -20,7 +20,8 @@ from numerics.tuples import (
     vector_reader,
     written_out,
 )
-from plants.layout import constants_form, constants_reader, number_places
+from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape
 from plants.state_space import StateSpaceModel
 
 
@@ -110,15 +111,16 @@ def silenced_columns(count: int, m: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def sigma_point_kernels(transition, observe, centre, n, m, inputs, form) -> Kernels:
-    """Kernels of the sigma-point filter for model functions and sizes; `centre`: whether the mean is a point."""
-    places, source, own = memory_places(n, m), number_places(n, m), own_place(n, m, form)
+def sigma_point_kernels(functions: Functions, shape: Shape, centre: bool) -> Kernels:
+    """Kernels of the sigma-point filter for a model; `centre`: whether the mean is a point."""
+    n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
+    places, source, own = memory_places(n, m), number_places(n, m), own_place(shape)
     step_place, likelihood_place, first = places.step, places.log_likelihood, places.extras
     count = 2 * n + centre
     (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
     read_points, store_points = matrix_reader(count, n, first), matrix_writer(count, n, first)
     read_q, read_r = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r)
-    constants, control, measured = constants_reader(n, m, form), vector_reader(inputs), vector_reader(m)
+    constants, control, measured = constants_reader(shape), vector_reader(shape.inputs), vector_reader(m)
     read_set = vector_reader(3, own)
     moved = written_out(
         "moved", "x, u, c", tuple_of(f"transition(x[{i}], u, c)" for i in range(count)), transition=transition
@@ -180,5 +182,4 @@ def sigma_point_kernels(transition, observe, centre, n, m, inputs, form) -> Kern
 
 def kernels_of(model: StateSpaceModel, *, centre: bool) -> Kernels:
     """Sigma-point kernels for a model."""
-    functions = inlined(model.transition), inlined(model.observe)
-    return sigma_point_kernels(*functions, centre, model.n, model.m, model.inputs, constants_form(model.constants))
+    return sigma_point_kernels(model.functions, model.shape, centre)

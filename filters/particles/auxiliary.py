@@ -16,23 +16,25 @@ from numerics import matrices
 from numerics.compiled import inlined
 from numerics.streams import FILTER_MEASUREMENT, uniform_block
 from numerics.tuples import column_reader, column_writer, matrix_reader, scaled_sum
-from plants.layout import constants_form, constants_reader, number_places
+from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape
 
 
 @lru_cache(maxsize=64)
-def auxiliary_kernels(transition, observe, n, m, inputs, form) -> Kernels:
-    """Kernels of the auxiliary particle filter for model functions and sizes.
+def auxiliary_kernels(functions: Functions, shape: Shape) -> Kernels:
+    """Kernels of the auxiliary particle filter for a model's functions and shape.
 
     The table's rows: n of particles, one of log weights, n of the noise in the particles, weights, scratch.
     """
+    n, m, observe = shape.n, shape.m, functions.observe
     places, source = memory_places(n, m), number_places(n, m)
     logarithms, noise, weights = n, n + 1, 2 * n + 1
     scratch, q_root_place = weights + 1, source.q_root
     step_place, key_0, key_1, likelihood_place = places.step, places.key_0, places.key_1, places.log_likelihood
-    motion, parts = ensemble_motion(transition, n, m, inputs, form), particle_parts(observe, n, m, form, weights)
+    motion, parts = ensemble_motion(functions.transition, shape), particle_parts(observe, shape, weights)
     draw_prior, move = motion.start, motion.predict
     set_equal, expect, normal, distance, level, weigh, summarise = parts
-    constants, state = constants_reader(n, m, form), column_reader(n)
+    constants, state = constants_reader(shape), column_reader(n)
     predicted, store_effect, effects = (
         column_reader(m, scratch),
         column_writer(m, scratch),
@@ -139,6 +141,4 @@ class AuxiliaryParticleFilter(WeightedFilter):
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
-        model = self.kernel_model
-        functions = inlined(model.transition), inlined(model.observe)
-        return auxiliary_kernels(*functions, model.n, model.m, model.inputs, constants_form(model.constants))
+        return auxiliary_kernels(self.kernel_model.functions, self.kernel_model.shape)

@@ -18,6 +18,7 @@ from numerics.checks import at_least
 from numerics.compiled import inlined
 from numerics.tuples import column_reader, column_writer, matrix_reader, vector_reader
 from plants.layout import constants_reader, number_places
+from plants.shape import Shape
 
 
 class ParticleParts(NamedTuple):
@@ -36,11 +37,12 @@ class ParticleParts(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def particle_parts(observe, n, m, form, weights) -> ParticleParts:
-    """The parts for a model's observation function and sizes; `weights` is the row of weights."""
+def particle_parts(observe: Callable, shape: Shape, weights: int) -> ParticleParts:
+    """The parts for a model's observation function and shape; `weights` is the row of weights."""
+    n, m = shape.n, shape.m
     places, source = memory_places(n, m), number_places(n, m)
     logarithms, scratch, size_place = n, weights + 1, places.extras
-    constants, state, store_predicted = constants_reader(n, m, form), column_reader(n), column_writer(m, scratch)
+    constants, state, store_predicted = constants_reader(shape), column_reader(n), column_writer(m, scratch)
     means, covariances = weighted_means(0, n, weights), weighted_covariances(0, n, weights)
     means_of_predicted = weighted_means(scratch, m, weights)
     covariances_of_predicted = weighted_covariances(scratch, m, weights)

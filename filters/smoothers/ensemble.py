@@ -17,7 +17,6 @@ from filters.ensembles.members import row_covariances, row_means
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from numerics.threads import spread
 from numerics.tuples import tuple_of, written_out
-from plants.layout import constants_form
 from plants.state_space import StateSpaceModel
 
 
@@ -38,8 +37,7 @@ def smooth_ensembles(
         raise ValueError(f"a smoothed filter must have rotations 0, but got {filter_.rotations}")
     paired = dataclasses.replace(filter_, model=_paired_model(filter_.kernel_model))
     kernels, pair_kernels, size = filter_.kernels(), paired.kernels(), filter_.size
-    model, form = paired.model, constants_form(paired.model.constants)
-    analyse_pair = type(filter_).analysis(inlined(model.observe), model.n, model.m, form)
+    analyse_pair = type(filter_).analysis(paired.model.functions.observe, paired.model.shape)
     count, times, _ = measurements.shape
     n = kernels.n
     means, covs = np.empty((count, times, n)), np.empty((count, times, n, n))

@@ -10,14 +10,14 @@ import numpy as np
 from filters.engine.batch import Estimates
 from filters.engine.layout import own_place
 from filters.filter import Filter
-from filters.gaussian.schedule import constants_of_affine, interpolator
+from filters.gaussian.schedule import interpolator
 from numerics import matrices
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from numerics.derivatives import jacobian
 from numerics.threads import spread
 from numerics.tuples import matrix_of, matrix_reader, tuple_of, vector_reader, written_out
 from plants.affine import affine_functions
 from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape, transition_slopes
 
 NEGLIGIBLE = 1e-13  # a pivot of a predicted covariance below this part of its variance counts as zero
 
@@ -87,12 +87,13 @@ def linear_link(n: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def extended_relation(transition, transition_jacobian, n, m, inputs, form) -> Callable:
+def extended_relation(functions: Functions, shape: Shape) -> Callable:
     """Return `relate(mean, p, u, numbers)` of the extended Kalman filter, with F = df/dx at the mean."""
+    n, m, transition = shape.n, shape.m, functions.transition
     source = number_places(n, m)
-    substeps_place, constants, control = source.substeps, constants_reader(n, m, form), vector_reader(inputs)
+    substeps_place, constants, control = source.substeps, constants_reader(shape), vector_reader(shape.inputs)
     read_q, read_scales = matrix_reader(n, n, source.q), vector_reader(n, source.scales)
-    slopes, times = jacobian(transition, transition_jacobian, n, n, "u, c"), matrices.multiplier(n, n, n)
+    slopes, times = transition_slopes(functions, shape), matrices.multiplier(n, n, n)
     identity = written_out("identity", "", matrix_of(n, n, lambda i, j: "1.0" if i == j else "0.0"))
     link = linear_link(n)
 
@@ -109,11 +110,11 @@ def extended_relation(transition, transition_jacobian, n, m, inputs, form) -> Ca
 
 
 @lru_cache(maxsize=64)
-def scheduled_relation(points: int, n: int, m: int) -> Callable:
+def scheduled_relation(points: int, shape: Shape) -> Callable:
     """Return `relate(mean, p, u, numbers)` of a Kalman filter that is scheduled over `points` inputs."""
-    count = constants_of_affine(n, m, 1)
+    n, m, count = shape.n, shape.m, shape.constants
     transition, _, transition_matrix, _ = affine_functions(n, m, 1).values()
-    blend, read_q = interpolator(points, count, own_place(n, m, count)), matrix_reader(n, n, number_places(n, m).q)
+    blend, read_q = interpolator(points, count, own_place(shape)), matrix_reader(n, n, number_places(n, m).q)
     control, link = vector_reader(1), linear_link(n)
 
     @inlined
