@@ -40,9 +40,11 @@ def constants_form(constants: tuple) -> type | int:
 
 def transition_slopes(functions: Functions, shape: Shape) -> Callable:
     """Return `slopes(x, scales, u, c)`: df/dx of one substep, (n, n), as `numerics.derivatives.jacobian`."""
-    return jacobian(functions.transition, functions.transition_jacobian, shape.n, shape.n, "u, c")
+    f, analytic, n = functions.transition, functions.transition_jacobian, shape.n
+    return jacobian(f, analytic, n, n, "u, c", shape.state_angles)
 
 
 def observation_slopes(functions: Functions, shape: Shape) -> Callable:
     """Return `slopes(x, scales, c)`: dh/dx, (m, n)."""
-    return jacobian(functions.observe, functions.observe_jacobian, shape.m, shape.n, "c")
+    h, analytic = functions.observe, functions.observe_jacobian
+    return jacobian(h, analytic, shape.m, shape.n, "c", shape.measurement_angles)
