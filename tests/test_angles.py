@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from filters import FILTERS, StateSpaceModel, Unknown, affine_model, augmented_model, make_filter, run, smooth
+from filters.consistency.report import consistency_report
+from filters.ensembles.recording import record_members
 from filters.gaussian.mixture import part_aligner
 from filters.likelihood import likelihood
 from numerics.angles import difference, row_aligner, wrapped, wrapped_where
@@ -255,6 +257,29 @@ def test_weights_decide_where_the_mean_of_particles_is():
     belief, _ = filter_.update(filter_.init((1, 2)), [3.1, 0.2])
     assert abs(difference(belief.mean, [0.2, 3.1], (False, True))[1]) < 0.02
     assert belief.cov[1, 1] == pytest.approx(1e-3, rel=0.3)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_consistency_is_judged_alike_across_the_cut():
+    """The truth may be of any turn: it is errors that are wrapped."""
+    flags = turning().shape.state_angles
+
+    def find(filter_, *data):
+        keys, inputs, measurements = data
+        heading = filter_.model.prior_mean[1] + (10 * math.pi if filter_.model.shape.state_angles[1] else 0.0)
+        states = np.tile([0.2, heading], (2, STEPS + 1, 1))
+        members = record_members(filter_, *data, every=3)
+        return consistency_report(run(filter_, *data), states, measurements, members=members, angles=flags)
+
+    filters = (make_filter("enkf", model, ensemble_size=8) for model in (turning(angles=False), turning(3.0)))
+    reference, found = compare_rotated(*filters, 3.0, find)
+    assert found.nees.mean == pytest.approx(reference.nees.mean, rel=1e-9)
+    assert found.nis.mean == pytest.approx(reference.nis.mean, rel=1e-9)
+    np.testing.assert_allclose(found.whiteness.correlations, reference.whiteness.correlations, atol=1e-9)
+    np.testing.assert_allclose(found.crps, reference.crps, rtol=1e-9)
+    np.testing.assert_allclose(found.ensemble.crps, reference.ensemble.crps, rtol=1e-9)
+    for one, other in zip(found.ensemble.ranks, reference.ensemble.ranks, strict=True):
+        np.testing.assert_array_equal(one.frequencies, other.frequencies)
 
 
 def test_differences_of_angles_go_the_short_way_round():
