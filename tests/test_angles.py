@@ -163,6 +163,7 @@ OTHERS = [
     ("fuzzy", {"blending": "output"}),
     ("ienkf", {"ensemble_size": 12, "inflation": 1.1, "relaxation": 0.5}),
     ("etkf", {"ensemble_size": 12, "inflation": 1.1, "relaxation": 0.5}),
+    ("ensrf", {"ensemble_size": 12, "rotations": 1}),
     ("sage-husa", {"process_forgetting_factor": 0.9}),
 ]
 
