@@ -16,6 +16,7 @@ from numerics.angles import difference, row_aligner, wrapped, wrapped_where
 from numerics.compiled import compiled, interpreted
 from numerics.streams import filter_keys
 from plants.quantities import Quantity
+from plants.shape import observation_slopes, transition_slopes
 from tests.models import simulated, small
 
 DT = 0.1
@@ -176,6 +177,32 @@ def test_other_forms_of_filters_err_alike_across_the_cut(name, numbers):
     assert_rotated(*reversed(compare_rotated(*filters, 3.0, run)), 3.0)
 
 
+def test_slopes_are_those_of_an_angle_at_the_cut():
+    """Of functions that jump there, by central differences."""
+    model = turning(wraps=True)
+    x = (0.2, math.pi - 0.02)
+    assert turn_and_wrap(x, (0.0,), (0.0,))[1] == pytest.approx(math.pi)
+    found = transition_slopes(model.functions, model.shape)(x, (1.0, 1.0), (0.0,), (0.0,))
+    np.testing.assert_allclose(found, [[1.0, 0.0], [DT, 1.0]], atol=1e-8)
+    found = observation_slopes(model.functions, model.shape)((0.0, math.pi), (1.0, 1.0), (0.0,))
+    np.testing.assert_allclose(found, [[0.0, 1.0], [1.0, 0.0]], atol=1e-8)
+
+
+def test_slopes_along_a_joint_parameter_are_those_of_an_angle_at_the_cut():
+    model = turning(
+        observe=lambda x, c: (turned(x[1] + c[0]), x[0]),
+        observe_jacobian=lambda x, c: ((0.0, 1.0), (1.0, 0.0)),
+        transition=lambda x, u, c: (x[0], turned(x[1] + c[0])),
+        transition_jacobian=lambda x, u, c: ((1.0, 0.0), (0.0, 1.0)),
+    )
+    joint = augmented_model(model, {0: Unknown(0.1)})
+    x = (0.0, math.pi - 0.3, 0.3)
+    np.testing.assert_allclose(joint.observe_jacobian(x, joint.constants)[0], [0.0, 1.0, 1.0], atol=1e-8)
+    np.testing.assert_allclose(
+        joint.transition_jacobian(x, (0.0,), joint.constants)[1], [0.0, 1.0, 1.0], atol=1e-8
+    )
+
+
 @pytest.mark.parametrize("name", ["kf", "ekf", "ukf", "ckf", "enkf", "etkf"])
 @pytest.mark.parametrize("lag", [3, None])
 @pytest.mark.usefixtures("as_python")
@@ -250,11 +277,12 @@ def test_a_sample_is_put_on_the_branch_of_its_weighted_circular_mean(compiling):
             assert np.ptp(found[1] - angles) < 1e-12  # all within half a turn of 3 they stay together
 
 
+@pytest.mark.parametrize(("name", "numbers"), [("pf", {"ensemble_size": 4000}), ("gsf", {"parts": 41})])
 @pytest.mark.usefixtures("as_python")
-def test_weights_decide_where_the_mean_of_particles_is():
-    """Nearly all weight lies opposite to where the particles are on average, on both sides of the cut there."""
+def test_weights_decide_where_the_mean_is(name, numbers):
+    """Nearly all weight lies opposite to where the belief was on average, on both sides of the cut there."""
     model = turning(prior_cov=[1e-4, 4.0], measurement_noise_cov=[1e-3, 1.0])
-    filter_ = make_filter("pf", model, ensemble_size=4000)
+    filter_ = make_filter(name, model, **numbers)
     belief, _ = filter_.update(filter_.init((1, 2)), [3.1, 0.2])
     assert abs(difference(belief.mean, [0.2, 3.1], (False, True))[1]) < 0.02
     assert belief.cov[1, 1] == pytest.approx(1e-3, rel=0.3)
