@@ -12,13 +12,12 @@ from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
 from filters.gaussian.extended import nothing_to_summarise
-from numerics import matrices
 from numerics.angles import wrapped
 from numerics.checks import at_least, positive
 from numerics.compiled import inlined
 from numerics.tuples import vector_reader, vector_writer
 from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape
+from plants.shape import Functions, Shape, innovation_of
 
 
 @inlined
@@ -55,7 +54,7 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
         constants_reader(shape),
         vector_reader(shape.inputs),
     )
-    measured, difference = vector_reader(m), matrices.innovation(m, shape.measurement_angles)
+    measured, difference = vector_reader(m), innovation_of(shape)
     component, channel = inverted or (0, 0)
     angle, inverts = shape.measurement_angles[channel], inverted is not None
     solve = component_solver(observe, n, component, channel, angle)
