@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from numerics.angles import NAMES, short_way
 from numerics.checks import finite, positive
 from numerics.compiled import inlined
 from numerics.derivatives import RELATIVE_STEP
@@ -115,7 +116,10 @@ def _augmented_functions(
         "observe_jacobian": None,
     }
 
-    def jacobian(name, function, analytic, size, arguments, identity):
+    def slope(i, q, angles):
+        return short_way(f"(above{q}[{i}] - below{q}[{i}])", i, angles) + f" / (2.0 * step{q})"
+
+    def jacobian(name, function, analytic, size, arguments, angles, identity):
         lines = [*begin, f"a = analytic(s, {arguments}fill(t, c))"]
         for q in range(added):
             lines.append(f"step{q} = {RELATIVE_STEP} * (abs(t[{q}]) + c[{count + q}])")
@@ -123,20 +127,20 @@ def _augmented_functions(
                 shifted = tuple_of(f"t[{r}] {sign} step{q}" if r == q else f"t[{r}]" for r in range(added))
                 lines.append(f"{side}{q} = {function}(s, {arguments}fill({shifted}, c))")
         known = [
-            [f"a[{i}][{j}]" for j in range(n)]
-            + [f"(above{q}[{i}] - below{q}[{i}]) / (2.0 * step{q})" for q in range(added)]
-            for i in range(size)
+            [f"a[{i}][{j}]" for j in range(n)] + [slope(i, q, angles) for q in range(added)] for i in range(size)
         ]
         rest = (
             [["1.0" if j == n + q else "0.0" for j in range(n + added)] for q in range(added)] if identity else []
         )
         matrix = tuple_of(tuple_of(row) for row in known + rest)
-        return written_out(name, f"x, {arguments}c", *lines, matrix, analytic=inlined(analytic), **names)
+        return written_out(name, f"x, {arguments}c", *lines, matrix, analytic=inlined(analytic), **names, **NAMES)
 
     if transition_jacobian is not None:
         functions["transition_jacobian"] = jacobian(
-            "transition_jacobian", "f", transition_jacobian, n, "u, ", True
+            "transition_jacobian", "f", transition_jacobian, n, "u, ", shape.state_angles, True
         )
     if observe_jacobian is not None:
-        functions["observe_jacobian"] = jacobian("observe_jacobian", "h", observe_jacobian, m, "", False)
+        functions["observe_jacobian"] = jacobian(
+            "observe_jacobian", "h", observe_jacobian, m, "", shape.measurement_angles, False
+        )
     return functions

@@ -125,7 +125,7 @@ def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
     a, b, point, v = np.eye(n), np.zeros((n, p)), tuple(x), tuple(u)
     scales, input_scales = tuple(model.scales), tuple(np.where(u == 0, 1.0, np.abs(u)))
     step = transition_slopes(model.functions, model.shape)
-    by_input = jacobian(_input_first(model.transition), None, n, p, "state, c")
+    by_input = jacobian(_input_first(model.transition), None, n, p, "state, c", model.shape.state_angles)
     for _ in range(model.substeps):
         f = np.array(step(point, scales, v, c))
         a, b = f @ a, f @ b + np.array(by_input(v, input_scales, point, c)).reshape(n, p)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+from numerics import matrices
+from numerics.angles import kept
 from numerics.derivatives import jacobian
 
 
@@ -33,6 +35,11 @@ class Functions(NamedTuple):
     observe_jacobian: Callable | None
 
 
+def innovation_of(shape: Shape, first: int = 0) -> Callable:
+    """Return `subtract(z, y)`: z - y[first:], angles the short way round, zero in channels that are NaN in z."""
+    return kept(matrices.innovation(shape.m, first), "z, y", shape.measurement_angles)
+
+
 def constants_form(constants: tuple) -> type | int:
     """What a `Shape` tells of a model's constants."""
     return type(constants) if hasattr(constants, "_fields") else len(constants)
@@ -40,9 +47,11 @@ def constants_form(constants: tuple) -> type | int:
 
 def transition_slopes(functions: Functions, shape: Shape) -> Callable:
     """Return `slopes(x, scales, u, c)`: df/dx of one substep, (n, n), as `numerics.derivatives.jacobian`."""
-    return jacobian(functions.transition, functions.transition_jacobian, shape.n, shape.n, "u, c")
+    f, analytic, n = functions.transition, functions.transition_jacobian, shape.n
+    return jacobian(f, analytic, n, n, "u, c", shape.state_angles)
 
 
 def observation_slopes(functions: Functions, shape: Shape) -> Callable:
     """Return `slopes(x, scales, c)`: dh/dx, (m, n)."""
-    return jacobian(functions.observe, functions.observe_jacobian, shape.m, shape.n, "c")
+    h, analytic = functions.observe, functions.observe_jacobian
+    return jacobian(h, analytic, shape.m, shape.n, "c", shape.measurement_angles)

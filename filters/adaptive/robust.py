@@ -28,7 +28,7 @@ def robust_kernels(functions: Functions, shape: Shape) -> Kernels:
     places, source, own = memory_places(n, m), number_places(n, m), own_place(shape)
     iterations_place, weight_place, likelihood_place = own + 1, places.extras, places.log_likelihood
     read_r, factor, solve = matrix_reader(m, m, source.r), matrices.cholesky_factor(m), matrices.row_solver(m, m)
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     measured, read_scales = vector_reader(m), vector_reader(n, source.scales)
     constants, observation_matrix = constants_reader(shape), observation_slopes(functions, shape)
     plain = extended_kernels(functions, shape)

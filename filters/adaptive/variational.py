@@ -36,7 +36,7 @@ def variational_kernels(functions: Functions, shape: Shape) -> Kernels:
         matrix_reader(m, m, scale_place),
         matrix_writer(m, m, scale_place),
     )
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     measured, read_scales = vector_reader(m), vector_reader(n, source.scales)
     constants, observation_matrix = constants_reader(shape), observation_slopes(functions, shape)
     plain = extended_kernels(functions, shape)

@@ -21,6 +21,7 @@ from filters.consistency.uniformity import Uniformity, uniformity
 from filters.consistency.whiteness import LAGS, Whiteness, whiteness
 from filters.engine.batch import Estimates
 from filters.ensembles.recording import Members
+from numerics.angles import difference, is_angle, wrapped
 
 
 class EnsembleCheck(NamedTuple):
@@ -59,6 +60,7 @@ def consistency_report(
     first_step: int = 0,
     names: Sequence[str] | None = None,
     lags: int = LAGS,
+    angles: Sequence[bool] = (),
 ) -> ConsistencyReport:
     """Hold a filter's estimates against the truth.
 
@@ -70,6 +72,7 @@ def consistency_report(
         first_step: steps before it are start-up and do not count.
         names: of the states, with units.
         lags: of the innovations' correlation.
+        angles: (n,), which states are angles, as the filter's `model.shape.state_angles`; none if empty.
 
     Raises:
         ValueError: if shapes do not fit or there is only one run.
@@ -83,7 +86,7 @@ def consistency_report(
     names = tuple(names or (f"state {i + 1}" for i in range(n)))
     if len(names) != n:
         raise ValueError(f"names must be {n}, one a state, but got {names!r}")
-    errors, covs = (estimates.means - states)[:, late], estimates.covs[:, late]
+    errors, covs = difference(estimates.means, states, angles)[:, late], estimates.covs[:, late]
     innovations, innovation_covs = estimates.innovations[:, late], estimates.innovation_covs[:, late]
     present = None if measurements is None else ~np.isnan(measurements[:, late])
     variances = np.einsum("bkii->bki", covs)
@@ -104,14 +107,19 @@ def consistency_report(
         crps_ratio=_mean(crps, 0) / _mean(expected, 0),
         divergences=int(estimates.divergences.sum()),
         diverged_runs=int((estimates.divergences > 0).sum()),
-        ensemble=None if members is None else check_ensemble(members, states),
+        ensemble=None if members is None else check_ensemble(members, states, angles),
     )
 
 
-def check_ensemble(members: Members, states: np.ndarray) -> EnsembleCheck:
-    """Hold ensembles of the first runs against the truth of all, (B, K + 1, n)."""
+def check_ensemble(members: Members, states: np.ndarray, angles: Sequence[bool] = ()) -> EnsembleCheck:
+    """Hold ensembles of the first runs against the truth of all, (B, K + 1, n); angles the short way round."""
     truth, size = states[: len(members.members), members.steps], members.members.shape[-1]
-    parts = [(truth[..., i], members.members[..., i, :], members.weights) for i in range(states.shape[-1])]
+
+    def near(i):
+        values, middle = members.members[..., i, :], truth[..., i, None]
+        return middle + wrapped(values - middle) if is_angle(i, angles) else values
+
+    parts = [(truth[..., i], near(i), members.weights) for i in range(states.shape[-1])]
     return EnsembleCheck(
         size,
         tuple(uniformity(ensemble_ranks(*part), steps=size + 1) for part in parts),

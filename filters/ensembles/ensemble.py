@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import ClassVar
 
 from filters.engine.belief import Kernels
@@ -13,6 +13,7 @@ from filters.ensembles.inflation import with_spread_control
 from filters.ensembles.members import add_noise, drawer, ensemble_motion, row_covariances, row_means
 from filters.filter import Filter
 from numerics import matrices
+from numerics.angles import row_aligner
 from numerics.checks import at_least, positive, shown
 from numerics.compiled import inlined
 from numerics.streams import FILTER_MEASUREMENT
@@ -25,7 +26,7 @@ from numerics.tuples import (
     written_out,
 )
 from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape
+from plants.shape import Functions, Shape, innovation_of
 
 LARGEST_ENSEMBLE = 1_000_000
 
@@ -46,9 +47,11 @@ def measurement_moments(observe: Callable, shape: Shape) -> Callable:
     of_states = written_out("of_states", "c", tuple_of(f"c[{i}]" for i in range(n)))
     of_predicted = written_out("of_predicted", "c", tuple_of(f"c[{n + i}]" for i in range(m)))
     read_r, mask, add = matrix_reader(m, m, source.r), matrices.masked(m), matrices.symmetric_sum(m)
-    _, _, (store_innovation, store_s) = row_access(n, m)
+    _, _, (store_innovation, store_s) = row_access(shape)
     factor, likelihood = matrices.cholesky_factor(m), matrices.innovation_likelihood(m)
-    difference, measured = matrices.innovation(m), vector_reader(m)
+    difference, measured = innovation_of(shape), vector_reader(m)
+
+    silence = silencer(n, shape.measurement_angles)
 
     @inlined
     def compare(memory, z, numbers, size):
@@ -56,7 +59,7 @@ def measurement_moments(observe: Callable, shape: Shape) -> Callable:
         c = constants(numbers)
         for j in range(table.shape[1]):
             store(table, j, observe(state(table, j), c))
-        silence(table, n, z)
+        silence(table, z, size)
         means = means_of_all(table, size)
         covariances = covariances_with_predicted(table, size, means)
         present, expected = measured(z), of_predicted(means)
@@ -72,13 +75,30 @@ def measurement_moments(observe: Callable, shape: Shape) -> Callable:
     return compare
 
 
-@inlined
-def silence(table, first, z):
-    """Rows first, first + 1, ... = 0 where z is NaN: what is constant has no covariance with anything."""
-    for i in range(z.shape[0]):
-        if z[i] != z[i]:
-            for j in range(table.shape[1]):
-                table[first + i, j] = 0.0
+@cache
+def silencer(first: int, angles: tuple[bool, ...], weights: int | None = None) -> Callable:
+    """Return `silence(table, z, size)`, for rows first, first + 1, ... of what the members expect to be measured.
+
+    They become 0 where z is NaN: what is constant has no covariance with anything. Angles are put on one branch.
+    """
+
+    @inlined
+    def silence(table, z, size):
+        for i in range(z.shape[0]):
+            if z[i] != z[i]:
+                for j in range(table.shape[1]):
+                    table[first + i, j] = 0.0
+
+    if not any(angles):
+        return silence
+    align = row_aligner(first, angles, weights)
+
+    @inlined
+    def silence_and_align(table, z, size):
+        silence(table, z, size)
+        align(table, size)
+
+    return silence_and_align
 
 
 @lru_cache(maxsize=64)
@@ -164,7 +184,10 @@ def perturbed_analysis(observe: Callable, shape: Shape) -> Callable:
     n, m = shape.n, shape.m
     r_root_place = number_places(n, m).r_root
     compare, draw, solve = measurement_moments(observe, shape), drawer(n, m), matrices.row_solver(n, m)
-    filled = written_out("filled", "z", tuple_of(f"z[{i}] if z[{i}] == z[{i}] else 0.0" for i in range(m)))
+    # Where it is an angle, z on the branch of what the members expect.
+    there = [f"y[{i}] + v[{i}]" if angle else f"z[{i}]" for i, angle in enumerate(shape.measurement_angles)]
+    entries = (f"{source} if z[{i}] == z[{i}] else 0.0" for i, source in enumerate(there))
+    filled = written_out("filled", "z, y, v", tuple_of(entries))
     lines = [f"    d{i} = z[{i}] - table[{n + i}, j]" for i in range(m)]
     for a in range(n):
         lines.append(f"    table[{a}, j] += {' + '.join(f'k[{a}][{i}] * d{i}' for i in range(m))}")
@@ -173,10 +196,10 @@ def perturbed_analysis(observe: Callable, shape: Shape) -> Callable:
     @inlined
     def analyse(memory, z, numbers, size):
         row, table, draws = memory
-        _, _, cross, _, _, root = compare(memory, z, numbers, size)
+        expected, innovation, cross, _, _, root = compare(memory, z, numbers, size)
         draw(draws, m * table.shape[1], row, FILTER_MEASUREMENT)
         add_noise(table, n, m, draws, numbers, r_root_place)
-        nudge(table, solve(cross, root), filled(z))
+        nudge(table, solve(cross, root), filled(z, expected, innovation))
 
     return analyse
 

@@ -36,6 +36,16 @@ def with_spread_control(kernels: Kernels, shape: Shape) -> Kernels:
     relaxation_place = inflation_place + 1
     means_of, covariances_of, scale = row_means(n), row_covariances(0, n, 0, n), spread_scaler(n)
     read_mean = vector_reader(n, memory_places(n, m).mean)
+
+    @inlined
+    def centre_as_kept(row, table, size):
+        return read_mean(row)
+
+    @inlined
+    def centre_on_the_branch(row, table, size):
+        return means_of(table, size)
+
+    centre = centre_on_the_branch if any(shape.state_angles) else centre_as_kept
     variances = written_out("variances", "row", tuple_of(f"row[{cov_place + i * (n + 1)}]" for i in range(n)))
     diagonal = written_out("diagonal", "p", tuple_of(f"p[{i}][{i}]" for i in range(n)))
     alike = written_out("alike", "factor", tuple_of(["factor"] * n))
@@ -54,7 +64,7 @@ def with_spread_control(kernels: Kernels, shape: Shape) -> Kernels:
         before = diagonal(covariances_of(table, size, means_of(table, size)))
         update_plainly(memory, z, numbers, size)
         if numbers[relaxation_place] != 0.0:
-            scale(table, read_mean(row), towards(variances(row), before, numbers[relaxation_place]))
+            scale(table, centre(row, table, size), towards(variances(row), before, numbers[relaxation_place]))
             summarise(memory, size)
 
     return kernels._replace(predict=predict, update=update)

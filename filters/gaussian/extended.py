@@ -14,16 +14,17 @@ from numerics import matrices
 from numerics.compiled import inlined
 from numerics.tuples import matrix_of, matrix_reader, matrix_writer, scaled_sum, vector_reader, written_out
 from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape, observation_slopes, transition_slopes
+from plants.shape import Functions, Shape, innovation_of, observation_slopes, transition_slopes
 from plants.state_space import StateSpaceModel
 
 
 @lru_cache(maxsize=64)
-def gaussian_start(n: int, m: int) -> Callable:
+def gaussian_start(shape: Shape) -> Callable:
     """Return `start(memory, numbers, size)`: belief = prior, for filters of mean and covariance."""
+    n, m = shape.n, shape.m
     source = number_places(n, m)
     read_mean, read_cov = vector_reader(n, source.prior_mean), matrix_reader(n, n, source.prior_cov)
-    _, (store_mean, store_cov), _ = row_access(n, m)
+    _, (store_mean, store_cov), _ = row_access(shape)
 
     @inlined
     def start(memory, numbers, size):
@@ -50,7 +51,7 @@ def gaussian_innovation(shape: Shape) -> Callable:
     mask, factor, present, silent = (
         matrices.masked(m),
         matrices.cholesky_factor(m),
-        matrices.innovation(m),
+        innovation_of(shape),
         silenced(m, n),
     )
     p_ht, s_part, add = (
@@ -118,7 +119,7 @@ def silenced(m: int, columns: int) -> Callable:
 def gaussian_correction(shape: Shape) -> Callable:
     """Return `correct(row, z, predicted, h, r)`: `gaussian_update` of the belief in a row."""
     n, m = shape.n, shape.m
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_innovation_cov) = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_innovation_cov) = row_access(shape)
     log_likelihood_place, condition = memory_places(n, m).log_likelihood, gaussian_update(shape)
 
     @inlined
@@ -160,7 +161,7 @@ def extended_motion(functions: Functions, shape: Shape) -> Callable:
     """Return `advance(row, u, numbers)`: mean = f(mean, u), P = F P F' over one substep."""
     n, m, transition = shape.n, shape.m, functions.transition
     source = number_places(n, m)
-    (read_mean, read_cov), (store_mean, store_cov), _ = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), _ = row_access(shape)
     constants, control = constants_reader(shape), vector_reader(shape.inputs)
     read_scales, transition_matrix = (
         vector_reader(n, source.scales),
@@ -240,7 +241,7 @@ def extended_kernels(functions: Functions, shape: Shape) -> Kernels:
         correct(row, measured(z), observe(mean, c), h, read_r(numbers))
 
     stages = nothing_at_first, substep, finish
-    predict, start = in_stages(n, m, *stages), gaussian_start(n, m)
+    predict, start = in_stages(n, m, *stages), gaussian_start(shape)
     return Kernels(n, m, n, 0, start, predict, update, nothing_to_summarise, stages=stages)
 
 

@@ -62,8 +62,8 @@ def fuzzy_kernels(shape: Shape, blending: str) -> Kernels:
     )
     (_, store_seen), (_, store_seen_cov) = part_vector(m, seen, stride), part_matrix(m, seen_covs, stride)
     between, restarts = blending != "weights", blending != "output"
-    of_states = blender(n, means, covs, weights, stride, between)
-    of_innovations = blender(m, seen, seen_covs, weights, stride, between)
+    of_states = blender(n, means, covs, weights, stride, shape.state_angles, between)
+    of_innovations = blender(m, seen, seen_covs, weights, stride, shape.measurement_angles, between)
     transition, observe, transition_jacobian, observe_jacobian = affine_functions(n, m, inputs).values()
     length = n * (n + inputs + 1) + m * (n + 1)  # of an affine model's constants
     (rule_constants, _), low, high = (
@@ -77,7 +77,7 @@ def fuzzy_kernels(shape: Shape, blending: str) -> Kernels:
     )
     read_q, read_r = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r)
     prior_mean, prior_cov = vector_reader(n, source.prior_mean), matrix_reader(n, n, source.prior_cov)
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     factor, likelihood = matrices.cholesky_factor(m), matrices.innovation_likelihood(m)
     control, measured, condition = vector_reader(inputs), vector_reader(m), gaussian_update(shape)
     times, times_transposed, add = (

@@ -39,10 +39,10 @@ def gaussian_sum_kernels(functions: Functions, shape: Shape, *, parts) -> Kernel
     seen_covs, likelihoods = seen + m, seen + m + m * m
     (_, store_part), (_, store_part_cov) = part_vector(n, means, stride), part_matrix(n, covs, stride)
     (_, store_seen), (_, store_seen_cov) = part_vector(m, seen, stride), part_matrix(m, seen_covs, stride)
-    of_states = blender(n, means, covs, weights, stride)
-    of_innovations = blender(m, seen, seen_covs, weights, stride)
+    of_states = blender(n, means, covs, weights, stride, shape.state_angles)
+    of_innovations = blender(m, seen, seen_covs, weights, stride, shape.measurement_angles)
     component_place, variance_place, nodes_place, shares_place = own, own + 1, own + 2, own + 2 + parts
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     read_r = matrix_reader(m, m, source.r)
     column = written_out(
         "column", "row, i, factor", tuple_of(f"factor * row[{places.cov + n * j} + i]" for j in range(n))

@@ -24,7 +24,7 @@ def iterated_kernels(iterations, functions: Functions, shape: Shape) -> Kernels:
     """Kernels of the iterated extended Kalman filter for a model's functions and shape."""
     n, m, observe = shape.n, shape.m, functions.observe
     places, source = memory_places(n, m), number_places(n, m)
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     constants, measured, read_r = constants_reader(shape), vector_reader(m), matrix_reader(m, m, source.r)
     read_scales, likelihood_place = vector_reader(n, source.scales), places.log_likelihood
     observation_matrix, condition = observation_slopes(functions, shape), gaussian_update(shape)

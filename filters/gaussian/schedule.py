@@ -53,10 +53,10 @@ def scheduled_kernels(points: int, shape: Shape) -> Kernels:
     transition, observe, transition_matrix, observation_matrix = affine_functions(n, m, 1).values()
     blend = interpolator(points, count, own_place(shape))
     read_constants, store_constants = vector_reader(count, places.extras), vector_writer(count, places.extras)
-    (read_mean, read_cov), (store_mean, store_cov), _ = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), _ = row_access(shape)
     read_q, read_r, measured = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r), vector_reader(m)
     times, times_transposed, control = multiplier(n, n, n), transposed_multiplier(n, n, n), vector_reader(1)
-    start_gaussian, settle, correct = gaussian_start(n, m), noise_added(n, m), gaussian_correction(shape)
+    start_gaussian, settle, correct = gaussian_start(shape), noise_added(n, m), gaussian_correction(shape)
 
     @inlined
     def start(memory, numbers, size):

@@ -27,7 +27,7 @@ def steady_kernels(functions: Functions, shape: Shape) -> Kernels:
     """Kernels for an affine model's functions and shape; the filter's own numbers are the gain (n, m)."""
     n, m, observe, observe_jacobian = shape.n, shape.m, functions.observe, functions.observe_jacobian
     places, source = memory_places(n, m), number_places(n, m)
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     constants, measured, read_r = constants_reader(shape), vector_reader(m), matrix_reader(m, m, source.r)
     read_gain, likelihood_place = matrix_reader(n, m, own_place(shape)), places.log_likelihood
     gain_of_present = written_out(

@@ -13,6 +13,7 @@ from filters.ensembles.members import add_noise, ensemble_motion
 from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
 from filters.particles.weights import normalise, read_weights, systematic_resampler, weighted_squares
 from numerics import matrices
+from numerics.angles import kept
 from numerics.compiled import inlined
 from numerics.streams import FILTER_MEASUREMENT, uniform_block
 from numerics.tuples import column_reader, column_writer, matrix_reader, scaled_sum
@@ -42,7 +43,7 @@ def auxiliary_kernels(functions: Functions, shape: Shape) -> Kernels:
     )
     far = scratch + 2 * m
     foreseen, store_foreseen = column_reader(m, scratch + m), column_writer(m, scratch + m)
-    add_scaled, add = scaled_sum(m), matrices.symmetric_sum(m)
+    add_scaled, add = kept(scaled_sum(m), "x, a, y", shape.measurement_angles), matrices.symmetric_sum(m)
     read_r, choose = matrix_reader(m, m, source.r), systematic_resampler(n + 1, weights, scratch)
 
     @inlined

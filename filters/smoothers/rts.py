@@ -12,6 +12,7 @@ from filters.engine.layout import own_place
 from filters.filter import Filter
 from filters.gaussian.schedule import interpolator
 from numerics import matrices
+from numerics.angles import NAMES, difference, kept, short_way
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from numerics.threads import spread
 from numerics.tuples import matrix_of, matrix_reader, tuple_of, vector_reader, written_out
@@ -19,6 +20,7 @@ from plants.affine import affine_functions
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape, transition_slopes
 
+ROUNDING = 1e-12  # of angles that were wrapped [rad]
 NEGLIGIBLE = 1e-13  # a pivot of a predicted covariance below this part of its variance counts as zero
 
 
@@ -42,9 +44,11 @@ def smooth_backwards(
         lag: number of later measurements, 0 ... K.
     """
     model, (count, times, n) = filter_.kernel_model, estimates.means.shape
-    run_part, numbers = _smoother(relate, n, is_interpreting()), filter_.numbers
+    angles = model.shape.state_angles
+    run_part, numbers = _smoother(relate, n, angles, is_interpreting()), filter_.numbers
     # A restarted belief is the prior; without any restart a belief may be the prior for other reasons.
-    means_alike = (estimates.means == model.prior_mean).all(axis=-1)
+    apart = np.abs(difference(estimates.means, model.prior_mean, angles))
+    means_alike = (apart <= np.where(angles, ROUNDING, 0.0)).all(axis=-1)
     is_prior = means_alike & (estimates.covs == model.prior_cov).all(axis=(-2, -1))
     given = estimates.means, estimates.covs, is_prior & (estimates.divergences > 0)[:, None]
     links = tuple(np.empty((count, times - 1, *shape)) for shape in ((n,), (n, n), (n, n)))
@@ -127,7 +131,7 @@ def scheduled_relation(points: int, shape: Shape) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def _smoother(relate: Callable, n: int, interpreting: bool) -> CompiledOrPython:
+def _smoother(relate: Callable, n: int, angles: tuple[bool, ...], interpreting: bool) -> CompiledOrPython:
     entries = [(i, j) for i in range(n) for j in range(n)]
     read_vector = written_out("read", "a, b, k", tuple_of(f"a[b, k, {i}]" for i in range(n)))
     read_matrix = written_out("read", "a, b, k", matrix_of(n, n, lambda i, j: f"a[b, k, {i}, {j}]"))
@@ -144,8 +148,9 @@ def _smoother(relate: Callable, n: int, interpreting: bool) -> CompiledOrPython:
         matrices.multiplier(n, n, n),
         matrices.transposed_multiplier(n, n, n),
     )
-    sums = (" + ".join([f"x[{i}]", *(f"g[{i}][{j}] * (s[{j}] - e[{j}])" for j in range(n))]) for i in range(n))
-    corrected = written_out("corrected", "x, g, s, e", tuple_of(sums))
+    apart = [short_way(f"(s[{j}] - e[{j}])", j, angles) for j in range(n)]
+    sums = (" + ".join([f"x[{i}]", *(f"g[{i}][{j}] * {apart[j]}" for j in range(n))]) for i in range(n))
+    corrected = kept(written_out("corrected", "x, g, s, e", tuple_of(sums), **NAMES), "x, g, s, e", angles)
     fingerprint = function_fingerprint(relate, within=__name__)
 
     @inlined

@@ -39,7 +39,7 @@ def sigma_relation(transition: Callable, shape: Shape, centre: bool) -> Callable
     root_of, around, deviate = (
         matrices.semidefinite_factor(n),
         points_around(n, centre),
-        deviations(n, 2 * n, centre),
+        deviations(n, 2 * n, centre, shape.state_angles),
     )
     sum_of, cross, rest = scatter(n, 2 * n), cross_scatter(n, n), residuals(n, n)
     factor, solve, apply = careful_factor(n), matrices.row_solver(n, n), matrices.vector_multiplier(n, n)

@@ -12,6 +12,7 @@ from filters.consistency.report import ConsistencyReport, consistency_report
 from filters.engine.batch import Estimates, run
 from filters.ensembles.recording import record_members
 from filters.filter import Filter
+from numerics.angles import difference
 from thruster_env.model import thrusts_of
 from tuning.problems.find import FIRST_SCORED_STEP, Data
 
@@ -56,7 +57,7 @@ def judge(filter_: Filter, estimates: Estimates, data: Data, scale) -> Evaluatio
     if not (scale > 0).all():
         raise ValueError(f"scale must be positive in every state, but got {scale.tolist()}")
     n, late = data.states.shape[-1], data.scored
-    errors = estimates.means[..., :n] - data.states
+    errors = state_errors(filter_, estimates, data)
     squares = normalized_squares(errors[:, late], estimates.covs[:, late, :n, :n])
     mean_squares = (errors[:, late] ** 2).mean(axis=1)
     with np.errstate(all="ignore"):  # estimates far off, though finite, may have a thrust that is not
@@ -97,7 +98,14 @@ def check_consistency(filter_: Filter, data: Data) -> ConsistencyReport:
         members=members,
         first_step=data.scored.start,
         names=STATES,
+        angles=filter_.model.shape.state_angles,
     )
+
+
+def state_errors(filter_: Filter, estimates: Estimates, data: Data) -> np.ndarray:
+    """Errors (B, K + 1, n) of the plant's n states, those of angles the short way round."""
+    n = data.states.shape[-1]
+    return difference(estimates.means[..., :n], data.states, filter_.model.shape.state_angles[:n])
 
 
 def score(mean_squares: np.ndarray, scale: np.ndarray) -> float:
@@ -105,10 +113,9 @@ def score(mean_squares: np.ndarray, scale: np.ndarray) -> float:
     return float((np.sqrt(mean_squares.mean(axis=0)) / scale).mean())
 
 
-def run_scores(estimates: Estimates, data: Data, scale) -> np.ndarray:
+def run_scores(filter_: Filter, estimates: Estimates, data: Data, scale) -> np.ndarray:
     """The score of each run by itself, (B,): mean over states of its RMSE over scale."""
-    late = data.scored
-    errors = estimates.means[:, late, : data.states.shape[-1]] - data.states[:, late]
+    errors = state_errors(filter_, estimates, data)[:, data.scored]
     return (np.sqrt((errors**2).mean(axis=1)) / np.asarray(scale)).mean(axis=1)
 
 
