@@ -51,10 +51,9 @@ def encode(plant: Plant, task: Task) -> tuple[np.ndarray, int]:
     numbers[at.Q_ROOT : at.Q_ROOT + 3] = covariance_root(plant.process_noise_cov)[lower]
     numbers[at.PRIOR_MEAN : at.PRIOR_MEAN + 2] = plant.initial_mean
     numbers[at.PRIOR_ROOT : at.PRIOR_ROOT + 3] = covariance_root(plant.initial_cov)[lower]
-    kinds = [list(CHANNELS).index(channel) for channel in plant.channels]
-    m = len(kinds)
+    m = len(plant.channels)
     numbers[at.CHANNEL_COUNT] = m
-    numbers[at.CHANNEL_KINDS : at.CHANNEL_KINDS + m] = kinds
+    numbers[at.CHANNEL_CODES : at.CHANNEL_CODES + m] = [CHANNELS[channel].code for channel in plant.channels]
     r_root = np.zeros((at.MAX_CHANNELS, at.MAX_CHANNELS))
     r_root[:m, :m] = covariance_root(plant.measurement_noise_cov)
     numbers[at.R_ROOT : at.R_ROOT + r_root.size] = r_root.ravel()

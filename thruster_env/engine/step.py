@@ -16,11 +16,13 @@ from numerics.compiled import compiled, function_fingerprint, inlined, is_interp
 from numerics.streams import MEASUREMENT, normal_block
 from numerics.threads import in_parts
 from numerics.tuples import written_out
+from plants.channels import Channel, reader_of
 from plants.disturbances.layout import KEY_0, KEY_1, MAX_CHANNELS, STEP
+from thruster_env.channels import CHANNELS, thrust
 from thruster_env.engine.memory import (
     AMBIENT,
+    CHANNEL_CODES,
     CHANNEL_COUNT,
-    CHANNEL_KINDS,
     COMMAND,
     CONSTANT_COUNT,
     CONSTANT_ROWS,
@@ -55,6 +57,7 @@ from thruster_env.engine.memory import (
 from thruster_env.engine.motion import (
     add_process_noise,
     clip_command,
+    constants_of_copy,
     draw_initial_state,
     find_any_thrust,
     find_thrust,
@@ -71,36 +74,35 @@ def _measure_thrust(memory, b, numbers):
     sigma = numbers[R_ROOT]
     for j in range(memory.shape[2]):
         v, _, _, _ = normal_block(0, memory[b, STEP, j], MEASUREMENT, memory[b, KEY_0, j], memory[b, KEY_1, j])
-        memory[b, READINGS, j] = memory[b, THRUST, j] + sigma * v
+        memory[b, READINGS, j] = thrust((), (memory[b, THRUST, j],), (), ()) + sigma * v
         memory[b, VALID, j] = 1.0
 
 
-@inlined
-def _measure_all(memory, b, numbers):
-    count, drawn = int(numbers[CHANNEL_COUNT]), int(numbers[CONSTANT_ROWS])
-    for i in range(count):
-        kind = numbers[CHANNEL_KINDS + i]
-        for j in range(memory.shape[2]):
-            omega = memory[b, OMEGA, j]
-            reading = memory[b, THRUST, j]
-            if kind == 1.0:
-                reading = omega
-            elif kind == 2.0:
-                reading = abs(omega)
-            elif kind == 3.0:
-                # K1, K2 and K_h of a brushed motor give its current; see `sensors.CHANNELS`.
-                damping = memory[b, drawn, j] if drawn else numbers[0]
-                gain = memory[b, drawn + 1, j] if drawn else numbers[1]
-                load = memory[b, drawn + 2, j] if drawn else numbers[2]
-                reading = gain * (gain * memory[b, VOLTAGE, j] - damping * omega) / (load * damping)
-            memory[b, READINGS + i, j] = reading
-            memory[b, VALID + i, j] = 1.0
-    for j in range(memory.shape[2]):
-        v = normal_block(0, memory[b, STEP, j], MEASUREMENT, memory[b, KEY_0, j], memory[b, KEY_1, j])
+@cache
+def _measure_any(channels: tuple[Channel, ...]) -> Callable:
+    """`measure(memory, b, numbers)` for a plant that has some of these channels."""
+    read = reader_of(channels)
+
+    @inlined
+    def measure(memory, b, numbers):
+        count, drawn = int(numbers[CHANNEL_COUNT]), int(numbers[CONSTANT_ROWS])
         for i in range(count):
-            at = R_ROOT + i * MAX_CHANNELS
-            noise = numbers[at] * v[0] + numbers[at + 1] * v[1] + numbers[at + 2] * v[2] + numbers[at + 3] * v[3]
-            memory[b, READINGS + i, j] += noise
+            code = numbers[CHANNEL_CODES + i]
+            for j in range(memory.shape[2]):
+                x, y = (memory[b, OMEGA, j], memory[b, FLOW, j]), (memory[b, THRUST, j],)
+                c = constants_of_copy(memory, b, drawn, j, numbers)
+                memory[b, READINGS + i, j] = read(code, x, y, (memory[b, VOLTAGE, j],), c)
+                memory[b, VALID + i, j] = 1.0
+        for j in range(memory.shape[2]):
+            v = normal_block(0, memory[b, STEP, j], MEASUREMENT, memory[b, KEY_0, j], memory[b, KEY_1, j])
+            for i in range(count):
+                at = R_ROOT + i * MAX_CHANNELS
+                noise = (
+                    numbers[at] * v[0] + numbers[at + 1] * v[1] + numbers[at + 2] * v[2] + numbers[at + 3] * v[3]
+                )
+                memory[b, READINGS + i, j] += noise
+
+    return measure
 
 
 @inlined
@@ -161,23 +163,27 @@ def advance(known_effects, plain: bool) -> Callable:
         known_effects: a tuple of effects for each registry, as `encoding.known_effects` gives them.
         plain: know only a nominal thruster whose thrust is measured; compiles and runs faster.
     """
-    return _build(compiled, known_effects, plain, is_interpreting())
+    return _build(compiled, known_effects, _known_channels(plain), plain, is_interpreting())
 
 
 def advance_in_parts(known_effects, plain: bool) -> Callable:
     """The same for `threads.Crew.run`."""
-    return _build(in_parts, known_effects, plain, is_interpreting())
+    return _build(in_parts, known_effects, _known_channels(plain), plain, is_interpreting())
+
+
+def _known_channels(plain: bool) -> tuple[Channel, ...]:
+    """Channels that compiled code has to know, by their codes."""
+    return () if plain else tuple(sorted(CHANNELS.values(), key=lambda channel: channel.code))
 
 
 @cache
-def _build(maker: Callable, known_effects, plain: bool, interpreting: bool) -> Callable:
+def _build(maker: Callable, known_effects, channels, plain: bool, interpreting: bool) -> Callable:
     amplify, stream, sense, refer = (_chain(effects, section) for section, effects in enumerate(known_effects))
     move, push = (move_thruster, find_thrust) if plain else (move_any, find_any_thrust)
-    measure = _measure_thrust if plain else _measure_all
+    measure = _measure_thrust if plain else _measure_any(channels)
     reported = READINGS + 1 if plain else REPORTED  # rows beyond are of channels that there are not
-    fingerprint = function_fingerprint(
-        *(effect.act for effects in known_effects for effect in effects), within=__name__
-    )
+    acts = [effect.act for effects in known_effects for effect in effects]
+    fingerprint = function_fingerprint(*acts, measure, within=__name__)
 
     def step(first, last, memory, numbers, out, begin):
         fingerprint  # noqa: B018 - part of the cache's key
