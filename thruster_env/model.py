@@ -14,7 +14,6 @@ from numerics.linear_systems import zero_order_hold
 from numerics.pickling import makes_functions
 from plants.affine import affine_model
 from plants.channels import functions_of
-from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
 from thruster_env.channels import CHANNELS
 from thruster_env.dynamics import (
@@ -27,10 +26,8 @@ from thruster_env.dynamics import (
 from thruster_env.linear.steady_state import steady_state
 from thruster_env.parameters import ThrusterParameters, checked
 from thruster_env.plant import Plant, make_plant
+from thruster_env.quantities import INPUTS, STATES, THRUST
 from thruster_env.rendering import Overlay
-
-STATES = (Quantity("motor speed", "omega_m", "rad/s"), Quantity("flow velocity", "U_a", "m/s"))
-INPUTS = (Quantity("voltage", "V_s", "V"),)
 
 
 @inlined
@@ -142,7 +139,7 @@ def model_of_plant(
         operating_state=steady_state(plant.parameters, operating_voltage, plant.ambient_velocity)[:2],
         operating_input=[operating_voltage],
         operating_points=partial(_operating_points, plant),
-        outputs={"T": (Quantity("thrust", "T", "N"), thrust_of)},
+        outputs={"T": (THRUST, thrust_of)},
         **_quantities(plant),
         **_operating_range(plant),
     )

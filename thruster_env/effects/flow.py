@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from numerics.checks import finite, positive
 from numerics.compiled import inlined
-from plants.disturbances.effects import Effect, Registry, Surroundings, normals, set_field, uniforms
+from plants.disturbances.effects import Context, Effect, Registry, normals, set_field, uniforms
 from plants.disturbances.layout import STEP
 from plants.disturbances.recorded import RecordedSeries, recorded_value
 from thruster_env.engine.memory import SAMPLE_TIME
@@ -104,11 +104,11 @@ class GaussMarkov(Effect):
         """Four standard deviations [m/s]."""
         return 4.0 * self.std
 
-    def parameters(self, around: Surroundings) -> list[float]:
+    def parameters(self, context: Context) -> list[float]:
         """Standard deviation and the correlation of neighbouring steps."""
-        return [self.std, math.exp(-around.dt / self.time_constant)]
+        return [self.std, math.exp(-context.dt / self.time_constant)]
 
-    def rows(self, around: Surroundings) -> int:
+    def rows(self, context: Context) -> int:
         """The process."""
         return 1
 
@@ -139,11 +139,11 @@ class Gusts(Effect):
         """Four standard deviations of the height [m/s]."""
         return 4.0 * self.std
 
-    def parameters(self, around: Surroundings) -> list[float]:
+    def parameters(self, context: Context) -> list[float]:
         """Probability that one begins in a calm step, standard deviation, duration [s]."""
-        return [1.0 - math.exp(-self.rate * around.dt), self.std, self.duration]
+        return [1.0 - math.exp(-self.rate * context.dt), self.std, self.duration]
 
-    def rows(self, around: Surroundings) -> int:
+    def rows(self, context: Context) -> int:
         """Time since the gust began and its height."""
         return 2
 

@@ -15,9 +15,9 @@ from functools import cache
 from numerics.compiled import compiled, function_fingerprint, inlined, is_interpreting
 from numerics.streams import MEASUREMENT, normal_block
 from numerics.threads import in_parts
-from numerics.tuples import written_out
 from plants.channels import Channel, reader_of
-from plants.disturbances.layout import KEY_0, KEY_1, MAX_CHANNELS, STEP
+from plants.disturbances.chains import chain_of
+from plants.disturbances.layout import FIRST_REPORTED, KEY_0, KEY_1, REWARD, STEP, TERMINATED, TIME
 from thruster_env.channels import CHANNELS, thrust
 from thruster_env.engine.memory import (
     AMBIENT,
@@ -26,30 +26,22 @@ from thruster_env.engine.memory import (
     COMMAND,
     CONSTANT_COUNT,
     CONSTANT_ROWS,
-    EFFECT_KIND,
-    EFFECT_NUMBER,
-    EFFECT_PARAMETERS,
-    EFFECT_ROWS,
-    EFFECT_TARGET,
     FIRST_EFFECT,
-    FIRST_REPORTED,
     FLOW,
     LAST_COMMAND,
     LIMITS,
+    MAX_CHANNELS,
     NEXT_REFERENCE,
     OMEGA,
     R_ROOT,
     READINGS,
     REFERENCE,
     REPORTED,
-    REWARD,
     REWARD_WEIGHTS,
     SAMPLE_TIME,
     SECTIONS,
-    TERMINATED,
     THRUST,
     THRUST_SCALE,
-    TIME,
     TOP_VOLTAGE,
     VALID,
     VOLTAGE,
@@ -127,31 +119,6 @@ def _tell_time_and_end(memory, b, numbers):
         memory[b, LAST_COMMAND, j] = memory[b, COMMAND, j]
 
 
-def _dispatch(effects) -> Callable:
-    """Write out `run(kind, ...)`, which calls the function of one of some effects."""
-    arguments = "memory, b, target, rows, number, numbers, at, begin"
-    functions = {f"act_{i}": inlined(effect.act) for i, effect in enumerate(effects)}
-    lines = [line for i, name in enumerate(functions) for line in (f"if kind == {i}:", f"    {name}({arguments})")]
-    return written_out("run", f"kind, {arguments}", *lines, "None", **functions)
-
-
-def _chain(effects, section: int) -> Callable:
-    """Return `run(memory, b, numbers, at, begin)`: run a section's effects from numbers[at] on; where it ends."""
-    dispatch = _dispatch(effects)
-    place = SECTIONS + section
-
-    @inlined
-    def run(memory, b, numbers, at, begin):
-        for _ in range(int(numbers[place])):
-            kind, target = int(numbers[at + EFFECT_KIND]), int(numbers[at + EFFECT_TARGET])
-            rows, number = int(numbers[at + EFFECT_ROWS]), int(numbers[at + EFFECT_NUMBER])
-            dispatch(kind, memory, b, target, rows, number, numbers, at + EFFECT_PARAMETERS, begin)
-            at += int(numbers[at])
-        return at
-
-    return run
-
-
 def advance(known_effects, plain: bool) -> Callable:
     """Compiled `step(first, last, memory, numbers, out, begin)` on blocks first ... last - 1 of a memory.
 
@@ -178,7 +145,9 @@ def _known_channels(plain: bool) -> tuple[Channel, ...]:
 
 @cache
 def _build(maker: Callable, known_effects, channels, plain: bool, interpreting: bool) -> Callable:
-    amplify, stream, sense, refer = (_chain(effects, section) for section, effects in enumerate(known_effects))
+    amplify, stream, sense, refer = (
+        chain_of(effects, SECTIONS + section) for section, effects in enumerate(known_effects)
+    )
     move, push = (move_thruster, find_thrust) if plain else (move_any, find_any_thrust)
     measure = _measure_thrust if plain else _measure_any(channels)
     reported = READINGS + 1 if plain else REPORTED  # rows beyond are of channels that there are not
