@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import ClassVar
 
 import numpy as np
 
-from numerics.threads import crew
+from numerics.compiled import compiled, function_fingerprint, inlined, is_interpreting
+from numerics.threads import crew, in_parts
 from plants.disturbances.layout import KEY_0, KEY_1
 from plants.memory import gathered, new_memory, scatter, set_row
 
@@ -44,7 +46,7 @@ class PlantCopies:
         self._find_machine_code()
 
     def machine_code(self) -> tuple[Callable, Callable]:
-        """The compiled step, and the same for `threads` to share out (`numerics.threads.in_parts`)."""
+        """The compiled step, and the same for threads to share out, as `machine_code_of` gives both."""
         raise NotImplementedError
 
     def numbers_from(self, options: Mapping | None) -> np.ndarray | None:
@@ -112,3 +114,20 @@ class PlantCopies:
         else:
             crew().run(self._advance_in_parts, blocks, memory, numbers, out, begin)
         return out.reshape(self.reported, -1)
+
+
+def machine_code_of(step: Callable) -> tuple[Callable, Callable]:
+    """The step of a plant's class as `PlantCopies.machine_code` has to give it, from a plain function."""
+    return _machine_code_of(step, is_interpreting())
+
+
+@cache
+def _machine_code_of(step: Callable, interpreting: bool) -> tuple[Callable, Callable]:
+    inlined(step)
+    fingerprint = function_fingerprint(step, within=step.__module__)
+
+    def advance(first, last, memory, numbers, out, begin):
+        fingerprint  # noqa: B018 - part of the cache's key
+        step(first, last, memory, numbers, out, begin)
+
+    return compiled(advance), in_parts(step)

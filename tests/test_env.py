@@ -367,3 +367,14 @@ def test_the_id_with_the_package_name_imports_the_package():
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     state = gym.make("BowThruster-v0").reset(seed=3)[1]["state"].tolist()
     assert result.stdout.strip() == f"500 {state}"
+
+
+def test_a_picture_shows_what_a_step_reports():
+    env = BowThrusterEnv(ambient_velocity=0.2, sensors=["speed", "thrust"], render_mode="rgb_array")
+    env.reset(seed=1)
+    *_, info = env.step(np.array([9.0]))
+    shown = env.moment_of(env._report.tolist())
+    assert (shown.omega_m, shown.U_a) == tuple(info["state"])
+    assert shown.measured_thrust == info["measurement"][1] and shown.voltage == 9.0
+    assert all(getattr(shown, name) == info[name] for name in ("time", "thrust", "reference", "ambient_velocity"))
+    env.close()
