@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from numerics.compiled import compiled, function_fingerprint, inlined, is_interpreting
-from numerics.threads import crew, in_parts
+from numerics.threads import in_parts, worker_threads
 from plants.disturbances.layout import KEY_0, KEY_1
 from plants.memory import gathered, new_memory, scatter, set_row
 
@@ -112,7 +112,7 @@ class PlantCopies:
         if blocks < THREADED_BLOCKS:
             self.advance(0, blocks, memory, numbers, out, begin)
         else:
-            crew().run(self._advance_in_parts, blocks, memory, numbers, out, begin)
+            worker_threads().run(self._advance_in_parts, blocks, memory, numbers, out, begin)
         return out.reshape(self.reported, -1)
 
 

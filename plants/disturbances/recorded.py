@@ -1,4 +1,4 @@
-"""A recorded series as a signal: flow or reference that somebody measured."""
+"""A recorded series as a signal that somebody measured."""
 
 from __future__ import annotations
 

@@ -134,7 +134,7 @@ def advance(known_effects, plain: bool) -> Callable:
 
 
 def advance_in_parts(known_effects, plain: bool) -> Callable:
-    """The same for `threads.Crew.run`."""
+    """The same for `threads.WorkerThreads.run`."""
     return _build(in_parts, known_effects, _known_channels(plain), plain, is_interpreting())
 
 
