@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cache
 from typing import NamedTuple
 
 from numerics.compiled import inlined
@@ -36,22 +35,25 @@ class Channel(NamedTuple):
     affine: bool = True
 
 
-@cache
-def reader_of(channels: tuple[Channel, ...]) -> Callable:
-    """Return `read(code, x, y, u, c)`, which reads the channel of a code.
+def measure_of(channels: Sequence[Channel], loop_of: Callable[[Callable], Callable], arguments: str) -> Callable:
+    """Return `measure(code, *arguments)`, which runs what `loop_of` makes of the channel of a code.
+
+    A loop over copies for each channel, with nothing to decide within it, is vector code.
+
+    Args:
+        channels: what compiled code has to know.
+        loop_of: `loop_of(read)` makes a function of the arguments that reads one channel of many copies.
+        arguments: their names, "memory, b, row".
 
     Raises:
         ValueError: if two channels have one code.
     """
-    first, *others = sorted(channels, key=lambda channel: channel.code)
     codes = [channel.code for channel in channels]
     if len(set(codes)) < len(codes):
         raise ValueError(f"codes of channels must differ from one another, but got {codes}")
-    functions = {f"read_{channel.code}": inlined(channel.read) for channel in channels}
-    source = f"read_{first.code}(x, y, u, c)"
-    for channel in others:
-        source = f"read_{channel.code}(x, y, u, c) if code == {channel.code} else {source}"
-    return written_out("read", "code, x, y, u, c", source, **functions)
+    loops = {f"loop_{channel.code}": inlined(loop_of(inlined(channel.read))) for channel in channels}
+    lines = [line for code in codes for line in (f"if code == {code}:", f"    loop_{code}({arguments})")]
+    return written_out("measure", f"code, {arguments}", *lines, "None", **loops)
 
 
 def functions_of(
