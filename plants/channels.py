@@ -35,25 +35,26 @@ class Channel(NamedTuple):
     affine: bool = True
 
 
-def measure_of(channels: Sequence[Channel], loop_of: Callable[[Callable], Callable], arguments: str) -> Callable:
-    """Return `measure(code, *arguments)`, which runs what `loop_of` makes of the channel of a code.
-
-    A loop over copies for each channel, with nothing to decide within it, is vector code.
+def reader_of(channels: Sequence[Channel], of_copy: Callable[[Callable], Callable], arguments: str) -> Callable:
+    """Return `read(code, *arguments)`, which reads the channel of a code for one copy of a plant.
 
     Args:
         channels: what compiled code has to know.
-        loop_of: `loop_of(read)` makes a function of the arguments that reads one channel of many copies.
-        arguments: their names, "memory, b, row".
+        of_copy: `of_copy(read)` makes a function of the arguments that finds what a channel's `read` takes of a
+            copy, and reads it; so compiled code finds nothing that the channel at hand does not need.
+        arguments: their names, "memory, b, j".
 
     Raises:
         ValueError: if two channels have one code.
     """
-    codes = [channel.code for channel in channels]
+    codes = sorted(channel.code for channel in channels)
     if len(set(codes)) < len(codes):
         raise ValueError(f"codes of channels must differ from one another, but got {codes}")
-    loops = {f"loop_{channel.code}": inlined(loop_of(inlined(channel.read))) for channel in channels}
-    lines = [line for code in codes for line in (f"if code == {code}:", f"    loop_{code}({arguments})")]
-    return written_out("measure", f"code, {arguments}", *lines, "None", **loops)
+    functions = {f"read_{channel.code}": inlined(of_copy(inlined(channel.read))) for channel in channels}
+    source = f"read_{codes[0]}({arguments})"
+    for code in codes[1:]:
+        source = f"read_{code}({arguments}) if code == {code} else {source}"
+    return written_out("read", f"code, {arguments}", source, **functions)
 
 
 def functions_of(

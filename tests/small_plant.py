@@ -17,7 +17,7 @@ from numerics.compiled import inlined
 from numerics.streams import INITIAL, MEASUREMENT, PROCESS
 from plants.affine import affine_model
 from plants.arguments import arguments_of, takes_arguments_of
-from plants.channels import Channel, measure_of
+from plants.channels import Channel, reader_of
 from plants.copies import PlantCopies, machine_code_of
 from plants.disturbances.chains import chain_of
 from plants.disturbances.effects import Context, encoded
@@ -90,17 +90,13 @@ def cart_model(cart: Cart, process_noise_cov=None):
     )
 
 
-def loop_of(read):
-    @inlined
-    def loop(memory, b, row):
-        for j in range(memory.shape[2]):
-            memory[b, row, j] = read((memory[b, X, j], memory[b, X + 1, j], memory[b, X + 2, j]), (), (), ())
-            memory[b, row + VALID - READINGS, j] = 1.0
-
-    return loop
+def of_copy(read):
+    return inlined(
+        lambda memory, b, j: read((memory[b, X, j], memory[b, X + 1, j], memory[b, X + 2, j]), (), (), ())
+    )
 
 
-measure = measure_of(tuple(CHANNELS.values()), loop_of, "memory, b, row")
+read = reader_of(tuple(CHANNELS.values()), of_copy, "memory, b, j")
 sense = chain_of(KINDS, COUNT)
 draw_state, disturb = noise_adder(3, X, P_ROOT, INITIAL), noise_adder(3, X, Q_ROOT, PROCESS)
 spoil = noise_adder(2, READINGS, R_ROOT, MEASUREMENT)
@@ -124,9 +120,10 @@ def step(first, last, memory, numbers, out, begin):
             draw_state(memory, b, numbers)
         else:
             disturb(memory, b, numbers)
-        for i in range(2):
-            measure(int(numbers[CODES + i]), memory, b, READINGS + i)
         for j in range(memory.shape[2]):
+            for i in range(2):
+                memory[b, READINGS + i, j] = read(numbers[CODES + i], memory, b, j)
+                memory[b, VALID + i, j] = 1.0
             memory[b, REWARD, j] = 0.0 if begin else -memory[b, X, j] * memory[b, X, j]
             memory[b, TERMINATED, j] = 1.0 if abs(memory[b, X, j]) > 0.8 else 0.0
             memory[b, TIME, j] = memory[b, STEP, j] * numbers[DT]

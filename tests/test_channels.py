@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from numerics.streams import episode_keys
-from plants.channels import Channel, measure_of
+from plants.channels import Channel, reader_of
 from plants.quantities import Quantity
 from thruster_env.channels import CHANNELS
 from thruster_env.linear.linear_plant import make_linear_plant
@@ -95,4 +95,4 @@ def test_a_linear_plant_has_the_channels_that_are_affine():
 def test_codes_differ():
     twice = (FLOW, FLOW._replace(variance=1.0))
     with pytest.raises(ValueError, match=r"codes of channels must differ from one another, but got \[17, 17\]"):
-        measure_of(twice, lambda read: read, "x, y, u, c")
+        reader_of(twice, lambda read: read, "x, y, u, c")

@@ -15,7 +15,7 @@ from functools import cache
 from numerics.compiled import compiled, function_fingerprint, inlined, is_interpreting
 from numerics.streams import MEASUREMENT, normal_block
 from numerics.threads import in_parts
-from plants.channels import Channel, measure_of
+from plants.channels import Channel, reader_of
 from plants.disturbances.chains import chain_of
 from plants.disturbances.layout import FIRST_REPORTED, KEY_0, KEY_1, REWARD, STEP, TERMINATED, TIME
 from thruster_env.channels import CHANNELS, thrust
@@ -70,30 +70,31 @@ def _measure_thrust(memory, b, numbers):
         memory[b, VALID, j] = 1.0
 
 
-def _loop_of(read: Callable) -> Callable:
-    """Read one channel of every copy, into a row of readings."""
+def _of_copy(read: Callable) -> Callable:
+    """Read one channel of copy j; where `drawn` is not 0, its own constants begin in that row."""
 
     @inlined
-    def loop(memory, b, row, drawn, numbers):
-        for j in range(memory.shape[2]):
-            x, y = (memory[b, OMEGA, j], memory[b, FLOW, j]), (memory[b, THRUST, j],)
-            c = constants_of_copy(memory, b, drawn, j, numbers)
-            memory[b, row, j] = read(x, y, (memory[b, VOLTAGE, j],), c)
-            memory[b, row + MAX_CHANNELS, j] = 1.0
+    def read_copy(memory, b, j, drawn, numbers):
+        x, y = (memory[b, OMEGA, j], memory[b, FLOW, j]), (memory[b, THRUST, j],)
+        c = constants_of_copy(memory, b, drawn, j, numbers)
+        return read(x, y, (memory[b, VOLTAGE, j],), c)
 
-    return loop
+    return read_copy
 
 
 @cache
 def _measure_any(channels: tuple[Channel, ...]) -> Callable:
     """`measure(memory, b, numbers)` for a plant that has some of these channels."""
-    measure_one = measure_of(channels, _loop_of, "memory, b, row, drawn, numbers")
+    read = reader_of(channels, _of_copy, "memory, b, j, drawn, numbers")
 
     @inlined
     def measure(memory, b, numbers):
         count, drawn = int(numbers[CHANNEL_COUNT]), int(numbers[CONSTANT_ROWS])
         for i in range(count):
-            measure_one(int(numbers[CHANNEL_CODES + i]), memory, b, READINGS + i, drawn, numbers)
+            code = numbers[CHANNEL_CODES + i]
+            for j in range(memory.shape[2]):
+                memory[b, READINGS + i, j] = read(code, memory, b, j, drawn, numbers)
+                memory[b, VALID + i, j] = 1.0
         for j in range(memory.shape[2]):
             v = normal_block(0, memory[b, STEP, j], MEASUREMENT, memory[b, KEY_0, j], memory[b, KEY_1, j])
             for i in range(count):
