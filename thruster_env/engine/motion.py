@@ -31,18 +31,20 @@ from thruster_env.engine.memory import (
 )
 
 read_constants = vector_reader(CONSTANT_COUNT)
-
-
-def _constants_from(name: str, arguments: str, entry: str):
-    """A function that makes `Constants` of entries, given by their source in terms of the number i."""
-    entries = ", ".join(entry.format(i=i) for i in range(CONSTANT_COUNT))
-    return written_out(name, arguments, f"Constants({entries})", Constants=Constants)
-
-
-drawn_constants = _constants_from("drawn_constants", "memory, b, first, j", "memory[b, first + {i}, j]")
-constants_of_copy = _constants_from(  # drawn ones from row `drawn` on, the nominal ones where that is 0
-    "constants_of_copy", "memory, b, drawn, j, numbers", "memory[b, drawn + {i}, j] if drawn else numbers[{i}]"
+drawn_constants = written_out(
+    "drawn_constants",
+    "memory, b, first, j",
+    f"Constants({', '.join(f'memory[b, first + {i}, j]' for i in range(CONSTANT_COUNT))})",
+    Constants=Constants,
 )
+
+
+@inlined
+def constants_of_copy(memory, b, drawn, j, numbers):
+    """Constants of copy j: those drawn for it, from row `drawn` on, the nominal ones where that is 0."""
+    if drawn > 0:
+        return drawn_constants(memory, b, drawn, j)
+    return Constants(*read_constants(numbers))
 
 
 @inlined
