@@ -56,6 +56,8 @@ def test_a_further_channel_is_measured_and_predicted():
     with other_channels():
         run = measured(["speed", "flow"], measurement_noise_cov=[0.0, 0.0])
         model = thruster_model(sensors=["flow", "speed"])
+        with pytest.raises(ValueError, match="sensors must name at most 4 channels, but got 5"):
+            make_plant(sensors=list(CHANNELS))
     np.testing.assert_array_equal(run.measurements, run.states)
     assert [quantity.symbol for quantity in model.measurements] == ["flow", "speed"]
     np.testing.assert_array_equal(model.measurement_noise_cov, np.diag([1e-4, 4.0]))

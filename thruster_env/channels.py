@@ -49,6 +49,8 @@ def current(x, y, u, c):
     return c.voltage_gain * driving / (c.load_gain * c.motor_damping)
 
 
+MAX_CHANNELS = 4  # that a thruster may be measured by at once; a draw of noise makes four numbers
+
 CHANNELS: dict[str, Channel] = {
     "thrust": Channel(Quantity("measured thrust", "thrust", "N"), 0.25, 0, thrust, thrust_slopes),
     "speed": Channel(Quantity("measured speed", "speed", "rad/s"), 4.0, 1, speed, speed_slopes),

@@ -10,7 +10,7 @@ import numpy as np
 from numerics.checks import at_least, between, covariance, finite, one_of, positive, shown, vector, within
 from plants.disturbances.effects import Effect
 from plants.disturbances.sensors import SENSOR_EFFECTS
-from thruster_env.channels import CHANNELS
+from thruster_env.channels import CHANNELS, MAX_CHANNELS
 from thruster_env.dynamics import Constants
 from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
 from thruster_env.effects.flow import FLOW_SIGNALS
@@ -152,6 +152,8 @@ def _sensors(given) -> dict[str, tuple[Effect, ...]]:
             raise ValueError(f"sensors must name each channel once, but got {shown(names)}")
     if not given:
         raise ValueError("sensors must name at least one channel, but got none")
+    if len(given) > MAX_CHANNELS:
+        raise ValueError(f"sensors must name at most {MAX_CHANNELS} channels, but got {len(given)}")
     return {
         one_of("a channel of sensors", channel, tuple(CHANNELS)): SENSOR_EFFECTS.make(effects)
         for channel, effects in given.items()

@@ -8,7 +8,7 @@ from numerics.checks import covariance_root
 from numerics.linear_systems import zero_order_hold
 from plants.disturbances.effects import Effect, encoded
 from plants.disturbances.sensors import SENSOR_EFFECTS
-from thruster_env.channels import CHANNELS
+from thruster_env.channels import CHANNELS, MAX_CHANNELS
 from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
 from thruster_env.effects.context import ThrusterContext
 from thruster_env.effects.flow import FLOW_SIGNALS
@@ -42,7 +42,7 @@ def encode(plant: Plant, task: Task) -> tuple[np.ndarray, int]:
     """Numbers of a plant and a task, and how many rows beyond the fixed ones a copy's memory needs."""
     p = plant.parameters
     scale = thrust_scale(plant)
-    context = ThrusterContext(plant.dt, at.MAX_CHANNELS, scale, p.motor_damping / p.voltage_gain)
+    context = ThrusterContext(plant.dt, MAX_CHANNELS, scale, p.motor_damping / p.voltage_gain)
     numbers = np.zeros(at.FIRST_EFFECT)
     numbers[: at.CONSTANT_COUNT] = plant.constants
     numbers[at.SUBSTEPS] = plant.substeps
@@ -55,7 +55,7 @@ def encode(plant: Plant, task: Task) -> tuple[np.ndarray, int]:
     m = len(plant.channels)
     numbers[at.CHANNEL_COUNT] = m
     numbers[at.CHANNEL_CODES : at.CHANNEL_CODES + m] = [CHANNELS[channel].code for channel in plant.channels]
-    r_root = np.zeros((at.MAX_CHANNELS, at.MAX_CHANNELS))
+    r_root = np.zeros((MAX_CHANNELS, MAX_CHANNELS))
     r_root[:m, :m] = covariance_root(plant.measurement_noise_cov)
     numbers[at.R_ROOT : at.R_ROOT + r_root.size] = r_root.ravel()
     if plant.linear is not None:

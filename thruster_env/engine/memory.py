@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from plants.disturbances.layout import FRONT
+from thruster_env.channels import MAX_CHANNELS
 from thruster_env.dynamics import Constants
-
-MAX_CHANNELS = 4  # that a thruster may be measured by at once; a draw of noise makes four numbers
 
 # Behind the rows that all plants have in front, those that every step reports, ...
 OMEGA, FLOW, THRUST, AMBIENT, REFERENCE, NEXT_REFERENCE = range(len(FRONT), len(FRONT) + 6)

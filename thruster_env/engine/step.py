@@ -18,7 +18,7 @@ from numerics.threads import in_parts
 from plants.channels import Channel, reader_of
 from plants.disturbances.chains import chain_of
 from plants.disturbances.layout import FIRST_REPORTED, KEY_0, KEY_1, REWARD, STEP, TERMINATED, TIME
-from thruster_env.channels import CHANNELS, thrust
+from thruster_env.channels import CHANNELS, MAX_CHANNELS, thrust
 from thruster_env.engine.memory import (
     AMBIENT,
     CHANNEL_CODES,
@@ -30,7 +30,6 @@ from thruster_env.engine.memory import (
     FLOW,
     LAST_COMMAND,
     LIMITS,
-    MAX_CHANNELS,
     NEXT_REFERENCE,
     OMEGA,
     R_ROOT,
