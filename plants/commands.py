@@ -48,22 +48,26 @@ def of_copies(actions, copies: int, quantities: tuple[Quantity, ...], ignored: n
         ValueError: for another shape, and for NaN.
     """
     p = len(quantities)
-    what = f"rows of {p} numbers ({_labels(quantities)})"
-    if p == 1:
-        what = f"{quantities[0].name}s [{quantities[0].unit}]"
     try:
         commands = as_floats(actions)
     except ValueError:
         commands = np.empty(0)
     if commands.shape != (copies, p) and (p > 1 or commands.shape != (copies,)):
-        raise ValueError(f"actions must be {copies} {what}, but got {shown(actions)}")
+        raise ValueError(f"actions must be {copies} {_rows(quantities)}, but got {shown(actions)}")
     wrong = np.isnan(commands)
     if wrong.any():
         lost = wrong.reshape(copies, -1).any(axis=1)
         found = np.flatnonzero(lost if ignored is None else lost & ~ignored)
         if len(found):
-            raise ValueError(f"actions must be {what} and not NaN, but got NaN in copy {found[0]}")
+            raise ValueError(f"actions must be {_rows(quantities)} and not NaN, but got NaN in copy {found[0]}")
     return commands.reshape(-1) if p == 1 else commands
+
+
+def _rows(quantities: tuple[Quantity, ...]) -> str:
+    """What the actions of many copies are."""
+    if len(quantities) == 1:
+        return f"{quantities[0].name}s [{quantities[0].unit}]"
+    return f"rows of {len(quantities)} numbers ({_labels(quantities)})"
 
 
 def _labels(quantities: tuple[Quantity, ...]) -> str:
