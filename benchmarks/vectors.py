@@ -15,9 +15,10 @@ from benchmarks.rows import Row
 from benchmarks.timing import Measure, side_by_side
 from numerics.compiled import compiled, function_fingerprint
 from numerics.threads import spread
+from plants.memory import set_row
 from thruster_env.dynamics import substep
 from thruster_env.engine.copies import Copies
-from thruster_env.engine.memory import COMMAND, SUBSTEPS, VOLTAGE, set_row
+from thruster_env.engine.memory import COMMAND, SUBSTEPS, VOLTAGE
 from thruster_env.engine.motion import move_thruster
 from thruster_env.plant import make_plant
 from thruster_env.task import Task

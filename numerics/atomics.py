@@ -1,4 +1,4 @@
-"""Numbers by which compiled code in several threads tells one another how far it is.
+"""Atomic flags by which compiled code in several threads tells one another how far it is.
 
 One number, for all calls, says which call is on. Each call has for each part that a helper may do a number that
 says whether anybody has taken it, and whether it is done. Every number has a cache line of its own, so that
@@ -16,25 +16,25 @@ from numerics.compiled import inlined, overloaded
 LINE = 16  # integers of 8 bytes: two cache lines, for processors that fetch pairs
 CALL = 0  # place of the current call's number
 OPEN, TAKEN, DONE = 0, 1, 2  # what a part of a call may be
-LOOKS = 64  # at a number between two moments in which another thread may have the core
-PATIENCE = 1000  # such moments, of about half a microsecond each
+SPINS = 64  # at a number between two moments in which another thread may have the core
+SPIN_ROUNDS = 1000  # such moments, of about half a microsecond each
 
 
-def new_signals(places: int) -> np.ndarray:
+def new_flags(places: int) -> np.ndarray:
     """Zeros, a line for each of some places."""
     return np.zeros(LINE * places, np.int64)
 
 
 @overloaded
-def read(signals, place):
-    """Read one signal, and with it all that its writer wrote before."""
-    return signals[place]
+def read(flags, place):
+    """Read one flag, and with it all that its writer wrote before."""
+    return flags[place]
 
 
 @overloaded
-def post(signals, place, value):
-    """Write one signal; who reads it sees all that was written before."""
-    signals[place] = value
+def post(flags, place, value):
+    """Write one flag; who reads it sees all that was written before."""
+    flags[place] = value
 
 
 @overloaded
@@ -47,52 +47,52 @@ def take(marks, place, mark):
 
 
 @overloaded
-def give_way():
+def yield_core():
     """Let another thread have the core if one wants it."""
 
 
 @inlined
 def wait_for(marks, place):
     """Wait until a part that another thread has taken is done."""
-    looks = 0
+    spins = 0
     while read(marks, place) != DONE:
-        looks += 1
-        if looks % LOOKS == 0:
-            give_way()
+        spins += 1
+        if spins % SPINS == 0:
+            yield_core()
 
 
 @inlined
-def look_out(signals, call):
-    """Look out for a call after this one for a while."""
-    for _ in range(PATIENCE):
-        for _ in range(LOOKS):
-            if read(signals, CALL) > call:
+def spin_for_call(flags, call):
+    """Wait for a call after this one for a while, spinning."""
+    for _ in range(SPIN_ROUNDS):
+        for _ in range(SPINS):
+            if read(flags, CALL) > call:
                 return
-        give_way()
+        yield_core()
 
 
 @cache
 def teach_numba() -> None:
-    """Have numba compile `read`, `post`, `take` and `give_way` to what the processor has for it."""
+    """Have numba compile `read`, `post`, `take` and `yield_core` to what the processor has for it."""
     from numba import types
     from numba.extending import intrinsic, overload
 
     @intrinsic
-    def load(context, signals, place):
+    def load(context, flags, place):
         def generate(context, builder, signature, arguments):
             array = context.make_array(signature.args[0])(context, builder, arguments[0])
             return builder.load_atomic(builder.gep(array.data, [arguments[1]]), "acquire", 8)
 
-        return types.int64(signals, types.intp), generate
+        return types.int64(flags, types.intp), generate
 
     @intrinsic
-    def store(context, signals, place, value):
+    def store(context, flags, place, value):
         def generate(context, builder, signature, arguments):
             array = context.make_array(signature.args[0])(context, builder, arguments[0])
             builder.store_atomic(arguments[2], builder.gep(array.data, [arguments[1]]), "release", 8)
             return context.get_dummy_value()
 
-        return types.void(signals, types.intp, types.int64), generate
+        return types.void(flags, types.intp, types.int64), generate
 
     @intrinsic
     def exchange(context, marks, place, mark):
@@ -106,20 +106,20 @@ def teach_numba() -> None:
     sched_yield = types.ExternalFunction("sched_yield", types.int32())
 
     @overload(read)
-    def read_compiled(signals, place):
-        return lambda signals, place: load(signals, place)
+    def read_compiled(flags, place):
+        return lambda flags, place: load(flags, place)
 
     @overload(post)
-    def post_compiled(signals, place, value):
-        return lambda signals, place, value: store(signals, place, value)
+    def post_compiled(flags, place, value):
+        return lambda flags, place, value: store(flags, place, value)
 
     @overload(take)
     def take_compiled(marks, place, mark):
         return lambda marks, place, mark: exchange(marks, place, mark)
 
-    @overload(give_way)
-    def give_way_compiled():
-        def compiled_give_way():
+    @overload(yield_core)
+    def yield_core_compiled():
+        def compiled_yield_core():
             sched_yield()
 
-        return compiled_give_way
+        return compiled_yield_core

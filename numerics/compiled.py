@@ -1,7 +1,7 @@
 """Compilation: plain Python functions in, cached machine code out, one source for both.
 
 Functions marked `inlined` stay ordinary Python and may be called by any function given to `compiled`.
-numba is imported at the first compilation only, which keeps `import thruster_env` light. With the
+numba is imported at the first compilation only, which keeps imports light. With the
 environment variable NUMBA_DISABLE_JIT=1 everything runs as Python.
 """
 

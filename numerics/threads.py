@@ -1,7 +1,7 @@
-"""Work on all cores: calls in parts, and a crew of threads for calls that take some hundred microseconds.
+"""Work on all cores: calls in parts, and worker threads for calls that take some hundred microseconds.
 
-A thread that has gone to sleep wakes up tens of microseconds after it is called. So the crew's threads look out
-for the next call during half a millisecond, in compiled code that holds no lock, before they go to sleep.
+A thread that has gone to sleep wakes up tens of microseconds after it is called. So worker threads wait for
+the next call spinning, during half a millisecond, in compiled code that holds no lock, before they go to sleep.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from queue import SimpleQueue
 
 import numpy as np
 
-from numerics.atomics import CALL, DONE, LINE, TAKEN, look_out, new_signals, post, take, teach_numba, wait_for
+from numerics.atomics import CALL, DONE, LINE, TAKEN, new_flags, post, spin_for_call, take, teach_numba, wait_for
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined
 
 CALLER = 0  # place of the thread that makes a call; helpers are 1, 2, ...
@@ -37,19 +37,19 @@ def spread(part: Callable[[int, int], None], count: int) -> None:
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(cores(), thread_name_prefix="thrusters")
+    return ThreadPoolExecutor(cores(), thread_name_prefix="numerics-pool")
 
 
 def in_parts(work: Callable) -> CompiledOrPython:
-    """Return the call that `Crew.run` makes: work(first, last, *arguments), compiled, shared out over places."""
+    """Return the call that `WorkerThreads.run` makes: work(first, last, *arguments), compiled, in shared parts."""
     teach_numba()
     inlined(work)
     fingerprint = function_fingerprint(work, within=work.__module__)
 
-    def part(signals, marks, place, helpers, call, count, arguments):
+    def part(flags, marks, place, helpers, call, count, arguments):
         fingerprint  # noqa: B018 - part of the cache's key
         if place == CALLER and helpers > 0:
-            post(signals, CALL, call)
+            post(flags, CALL, call)
         # The caller does its own part, then each that no helper has taken; a helper does its own if it is open.
         last, mark = (helpers, DONE) if place == CALLER else (place, TAKEN)
         for p in range(place, last + 1):
@@ -60,37 +60,37 @@ def in_parts(work: Callable) -> CompiledOrPython:
             elif place == CALLER:
                 wait_for(marks, LINE * p)
         if place != CALLER:
-            look_out(signals, call)
+            spin_for_call(flags, call)
 
     return CompiledOrPython(part)
 
 
 @cache
-def crew() -> Crew:
-    """The crew of this process, a thread for each core but one."""
-    return Crew(cores() - 1 if hasattr(os, "sched_yield") else 0)
+def worker_threads() -> WorkerThreads:
+    """The worker threads of this process, one for each core but one."""
+    return WorkerThreads(cores() - 1 if hasattr(os, "sched_yield") else 0)
 
 
 if hasattr(os, "register_at_fork"):  # a forked child has none of the threads
     os.register_at_fork(after_in_child=_pool.cache_clear)
-    os.register_at_fork(after_in_child=crew.cache_clear)
+    os.register_at_fork(after_in_child=worker_threads.cache_clear)
 
 
-class Crew:
+class WorkerThreads:
     """Threads that share the work of a call with the thread that makes it.
 
-    A call owns nothing of the crew: its parts, and who has taken them, are its own. Whoever makes it does what no
-    helper has begun, so that it never waits for a helper that is late, busy with another call, or not told. And an
-    exception at any moment, such as Ctrl-C brings, leaves the crew as it was.
+    A call owns nothing of the workers: its parts, and who has taken them, are its own. Whoever makes it does what
+    no helper has begun, so that it never waits for a helper that is late, busy with another call, or not told. And
+    an exception at any moment, such as Ctrl-C brings, leaves the workers as they were.
     """
 
     def __init__(self, helpers: int):
         """Start `helpers` threads."""
-        self._signals, self._nothing = new_signals(1), new_signals(1)
+        self._flags, self._nothing = new_flags(1), new_flags(1)
         self._calls = itertools.count(1)
         self._jobs = [SimpleQueue() for _ in range(helpers)]
         for place, jobs in enumerate(self._jobs, 1):
-            name, arguments = f"thruster-crew-{place}", (place, jobs)
+            name, arguments = f"numerics-worker-{place}", (place, jobs)
             threading.Thread(target=self._help, args=arguments, name=name, daemon=True).start()
 
     def run(self, part: CompiledOrPython, count: int, *arguments, alone: bool = False) -> None:
@@ -100,20 +100,20 @@ class Crew:
         """
         direct = part.direct
         if alone or direct is part or not self._jobs:
-            part(self._signals, self._nothing, CALLER, 0, 0, count, arguments)
+            part(self._flags, self._nothing, CALLER, 0, 0, count, arguments)
         else:
             self._share(direct, count, arguments)
 
     def _share(self, part: Callable, count: int, arguments: tuple) -> None:
-        signals, helpers, call = self._signals, len(self._jobs), next(self._calls)
-        marks, errors = new_signals(helpers + 1), []
+        flags, helpers, call = self._flags, len(self._jobs), next(self._calls)
+        marks, errors = new_flags(helpers + 1), []
         try:
             for place, jobs in enumerate(self._jobs, 1):
                 if jobs.qsize() < BEHIND:  # else it would keep the arguments of calls that are over
-                    jobs.put((part, (signals, marks, place, helpers, call, count, arguments), errors))
-            part(signals, marks, CALLER, helpers, call, count, arguments)
+                    jobs.put((part, (flags, marks, place, helpers, call, count, arguments), errors))
+            part(flags, marks, CALLER, helpers, call, count, arguments)
         except BaseException:  # no helper may be at work when the caller goes on
-            part(signals, marks, CALLER, helpers, call, 0, arguments)
+            part(flags, marks, CALLER, helpers, call, 0, arguments)
             raise
         if errors:
             raise errors[0]

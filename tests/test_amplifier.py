@@ -8,8 +8,9 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
 from numerics.streams import episode_keys
+from plants.memory import row
 from thruster_env.engine.copies import Copies
-from thruster_env.engine.memory import COMMAND, FLOW, OMEGA, VOLTAGE, row
+from thruster_env.engine.memory import COMMAND, FLOW, OMEGA, VOLTAGE
 from thruster_env.linear.steady_state import run_substeps
 from thruster_env.parameters import PRESETS, TUNNEL_PHYSICAL
 from thruster_env.plant import make_plant

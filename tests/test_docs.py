@@ -117,7 +117,8 @@ def test_the_page_names_the_arguments_of_the_other_envs():
 
 def test_the_page_has_every_channel_with_unit_and_variance():
     rows = rows_of("Sensors")
-    assert {name: (rows[name][1], float(rows[name][2])) for name in CHANNELS} == CHANNELS
+    told = {name: (rows[name][1], float(rows[name][2])) for name in CHANNELS}
+    assert told == {name: (channel.quantity.unit, channel.variance) for name, channel in CHANNELS.items()}
 
 
 def test_the_page_names_every_env_and_every_preset():

@@ -15,6 +15,7 @@ import thruster_env
 from thruster_env import PRESETS, BowThrusterEnv
 from thruster_env.linear.steady_state import run_substeps, state_range, steady_state
 from thruster_env.parameters import TUNNEL, TUNNEL_PHYSICAL
+from thruster_env.plant import make_plant
 
 every_preset = pytest.mark.parametrize("preset", PRESETS)
 INFO = {"state", "thrust", "measurement", "reference", "ambient_velocity", "time"}
@@ -71,12 +72,21 @@ def test_spaces_are_one_voltage_in_and_one_thrust_out():
     assert BowThrusterEnv(max_voltage=5.0).action_space == gym.spaces.Box(-5.0, 5.0, (1,), np.float32)
 
 
-def test_arguments_have_the_published_names():
-    names = "preset dt max_voltage ambient_velocity process_noise_cov measurement_noise_cov reference"
-    parameters = list(inspect.signature(BowThrusterEnv).parameters)
-    names += " initial_state sensors flow amplifier uncertainty"
-    names += " tracking_weight energy_weight voltage_rate_weight render_mode"
-    assert parameters == names.split()
+def test_arguments_are_those_of_plant_and_task_and_go_by_name():
+    parameters = inspect.signature(BowThrusterEnv).parameters
+    names = "preset dt max_voltage ambient_velocity process_noise_cov measurement_noise_cov initial_state sensors"
+    names += " flow amplifier uncertainty reference tracking_weight energy_weight voltage_rate_weight render_mode"
+    assert list(parameters) == names.split()
+    assert {name for name, one in parameters.items() if one.kind is not one.KEYWORD_ONLY} == {"preset"}
+    for name, one in inspect.signature(make_plant).parameters.items():
+        assert name == "substeps" or parameters[name].default == one.default
+    env = BowThrusterEnv("tunnel_physical", dt=0.02, tracking_weight=2.0)
+    assert (env.plant.dt, env.task.weights[0]) == (0.02, 2.0)
+    for name in ("foo", "substeps"):
+        with pytest.raises(TypeError, match=rf"^BowThrusterEnv.__init__\(\) got an unexpected .* '{name}'$"):
+            BowThrusterEnv(**{name: 1})
+    with pytest.raises(TypeError, match=r"^BowThrusterEnv.__init__\(\) too many positional arguments$"):
+        BowThrusterEnv("tunnel", 0.01)
 
 
 def test_results_have_the_types_of_the_interface():
@@ -357,3 +367,14 @@ def test_the_id_with_the_package_name_imports_the_package():
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     state = gym.make("BowThruster-v0").reset(seed=3)[1]["state"].tolist()
     assert result.stdout.strip() == f"500 {state}"
+
+
+def test_a_picture_shows_what_a_step_reports():
+    env = BowThrusterEnv(ambient_velocity=0.2, sensors=["speed", "thrust"], render_mode="rgb_array")
+    env.reset(seed=1)
+    *_, info = env.step(np.array([9.0]))
+    shown = env.moment_of(env._report.tolist())
+    assert (shown.omega_m, shown.U_a) == tuple(info["state"])
+    assert shown.measured_thrust == info["measurement"][1] and shown.voltage == 9.0
+    assert all(getattr(shown, name) == info[name] for name in ("time", "thrust", "reference", "ambient_velocity"))
+    env.close()

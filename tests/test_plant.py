@@ -9,8 +9,9 @@ import thruster_env  # noqa: F401 - registers the env
 from numerics.checks import at_least, covariance, covariance_root, finite, one_of, positive, vector
 from numerics.compiled import interpreted
 from numerics.streams import draw_key, episode_keys
+from plants.memory import row
 from thruster_env.engine.copies import Copies
-from thruster_env.engine.memory import COMMAND, FLOW, OMEGA, READINGS, THRUST, row
+from thruster_env.engine.memory import COMMAND, FLOW, OMEGA, READINGS, THRUST
 from thruster_env.linear.steady_state import run_substeps, steady_state
 from thruster_env.parameters import PRESETS, TUNNEL, checked
 from thruster_env.plant import make_plant

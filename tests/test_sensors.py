@@ -251,7 +251,7 @@ def test_noise_of_the_channels_has_covariance_r():
     assert (np.abs(v.T @ v / len(v) - r) < 4.5 * errors).all()
     assert_white((noisy - exact)[..., 1])
     defaults = make_plant(sensors=["speed", "thrust"]).measurement_noise_cov
-    np.testing.assert_array_equal(defaults, np.diag([CHANNELS["speed"][1], CHANNELS["thrust"][1]]))
+    np.testing.assert_array_equal(defaults, np.diag([CHANNELS["speed"].variance, CHANNELS["thrust"].variance]))
 
 
 @pytest.mark.parametrize("effect", EVERY_EFFECT, ids=lambda effect: effect["name"])

@@ -14,7 +14,7 @@ import pytest
 
 from numerics.atomics import LINE, TAKEN, take
 from numerics.compiled import interpreted
-from numerics.threads import BEHIND, CALLER, Crew, crew, in_parts, spread
+from numerics.threads import BEHIND, CALLER, WorkerThreads, in_parts, spread, worker_threads
 
 COUNT = 1000
 
@@ -27,35 +27,35 @@ def add_index(first, last, values):
 @pytest.fixture(scope="module")
 def part():
     part = in_parts(add_index)
-    crew().run(part, 1, np.zeros(1))  # compiled by this thread alone
+    worker_threads().run(part, 1, np.zeros(1))  # compiled by this thread alone
     return part
 
 
 @pytest.mark.parametrize("helpers", [0, 1, 3])
 @pytest.mark.parametrize("pause", [0.0, 0.003])
 def test_every_call_covers_everything_once(part, helpers, pause):
-    team, values = Crew(helpers), np.zeros(COUNT)
+    workers, values = WorkerThreads(helpers), np.zeros(COUNT)
     for _ in range(20):
-        team.run(part, COUNT, values)
+        workers.run(part, COUNT, values)
         time.sleep(pause)  # in the longer one the helpers go to sleep
     assert np.array_equal(values, 20.0 * np.arange(COUNT))
 
 
 def test_fewer_tasks_than_threads(part):
     values = np.zeros(2)
-    Crew(3).run(part, 2, values)
+    WorkerThreads(3).run(part, 2, values)
     assert np.array_equal(values, [0.0, 1.0])
 
 
 def test_a_first_call_and_an_interpreted_one_are_made_alone():
-    team = Crew(1)
+    workers = WorkerThreads(1)
     with interpreted():
         part = in_parts(add_index)
         for _ in range(2):
             values = np.zeros(COUNT)
-            team.run(part, COUNT, values)
+            workers.run(part, COUNT, values)
             assert np.array_equal(values, np.arange(COUNT))
-    assert not team._signals.any()
+    assert not workers._flags.any()
 
 
 def test_many_threads_may_ask_at_once(part):
@@ -63,7 +63,7 @@ def test_many_threads_may_ask_at_once(part):
 
     def ask(values):
         for _ in range(200):
-            crew().run(part, COUNT, values)
+            worker_threads().run(part, COUNT, values)
 
     callers = [threading.Thread(target=ask, args=(values,)) for values in results]
     for caller in callers:
@@ -83,29 +83,29 @@ class Rehearsed:
     def direct(self):
         return self._fail_or_do
 
-    def _fail_or_do(self, signals, marks, place, helpers, call, count, arguments):
+    def _fail_or_do(self, flags, marks, place, helpers, call, count, arguments):
         if count > 0:  # else it only makes sure that no helper is at work
             if place != CALLER and place in self.failing:
                 take(marks, LINE * place, TAKEN)
             self.begun.wait(30)
             if place in self.failing:
                 raise KeyboardInterrupt
-        self.part(signals, marks, place, helpers, call, count, arguments)
+        self.part(flags, marks, place, helpers, call, count, arguments)
 
 
 @pytest.mark.parametrize("failing", [{0}, {1}, {2}, {1, 2}])
 def test_after_a_failure_in_any_thread_the_next_call_is_right(part, failing):
-    team, values = Crew(2), np.zeros(COUNT)
+    workers, values = WorkerThreads(2), np.zeros(COUNT)
     with pytest.raises(KeyboardInterrupt):
-        team.run(Rehearsed(part, 2, failing), COUNT, values)
+        workers.run(Rehearsed(part, 2, failing), COUNT, values)
     values[:] = 0.0
-    team.run(part, COUNT, values)
+    workers.run(part, COUNT, values)
     assert np.array_equal(values, np.arange(COUNT))
 
 
 @contextmanager
 def interrupted_at(moment):
-    """Raise KeyboardInterrupt before the byte code of this number in what the crew does in this thread."""
+    """Raise KeyboardInterrupt before the byte code of this number in what the workers do in this thread."""
     passed = 0
 
     def count(frame, event, argument):
@@ -118,7 +118,7 @@ def interrupted_at(moment):
         return count
 
     def trace(frame, event, argument):
-        return count(frame, event, argument) if frame.f_code in OF_THE_CREW else None
+        return count(frame, event, argument) if frame.f_code in OF_THE_WORKERS else None
 
     before = sys.gettrace()
     sys.settrace(trace)
@@ -128,21 +128,21 @@ def interrupted_at(moment):
         sys.settrace(before)
 
 
-OF_THE_CREW = (Crew.run.__code__, Crew._share.__code__)
+OF_THE_WORKERS = (WorkerThreads.run.__code__, WorkerThreads._share.__code__)
 
 
-def test_ctrl_c_at_any_moment_leaves_a_crew_whose_helpers_help(part):
-    team, moment = Crew(2), 0
+def test_ctrl_c_at_any_moment_leaves_workers_that_help(part):
+    workers, moment = WorkerThreads(2), 0
     while True:
         moment, values = moment + 1, np.zeros(COUNT)
         with interrupted_at(moment) as passed:
             with contextlib.suppress(KeyboardInterrupt):
-                team.run(part, COUNT, values)
+                workers.run(part, COUNT, values)
         done = values.copy()
-        while not all(jobs.empty() for jobs in team._jobs):
+        while not all(jobs.empty() for jobs in workers._jobs):
             time.sleep(1e-4)
         expected = values + np.arange(COUNT)
-        team.run(Rehearsed(part, 2), COUNT, values)  # would wait in vain for a helper that does not come
+        workers.run(Rehearsed(part, 2), COUNT, values)  # would wait in vain for a helper that does not come
         assert np.array_equal(values, expected)
         assert np.isin(done - np.arange(COUNT) * (done != 0), 0).all()  # what is done is done once
         if passed() < moment:
@@ -151,24 +151,24 @@ def test_ctrl_c_at_any_moment_leaves_a_crew_whose_helpers_help(part):
 
 
 def test_a_helper_that_never_comes_is_not_waited_for(part):
-    team, values = Crew(2), np.zeros(COUNT)
-    team._jobs[1] = SimpleQueue()  # nobody looks into this one
+    workers, values = WorkerThreads(2), np.zeros(COUNT)
+    workers._jobs[1] = SimpleQueue()  # nobody spins into this one
     for _ in range(5):
-        team.run(part, COUNT, values)
+        workers.run(part, COUNT, values)
     assert np.array_equal(values, 5.0 * np.arange(COUNT))
-    assert team._jobs[1].qsize() == BEHIND
+    assert workers._jobs[1].qsize() == BEHIND
 
 
 def _ask_in_child(part, results):
     values = np.zeros(COUNT)
     for _ in range(3):
-        crew().run(part, COUNT, values)
+        worker_threads().run(part, COUNT, values)
     results.put(bool(np.array_equal(values, 3.0 * np.arange(COUNT))))
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
-def test_a_forked_child_has_a_crew_of_its_own(part):
-    crew().run(part, COUNT, np.zeros(COUNT))
+def test_a_forked_child_has_workers_of_its_own(part):
+    worker_threads().run(part, COUNT, np.zeros(COUNT))
     context = multiprocessing.get_context("fork")
     results = context.SimpleQueue()
     child = context.Process(target=_ask_in_child, args=(part, results))

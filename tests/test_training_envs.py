@@ -95,7 +95,7 @@ def test_attributes_and_methods_are_those_of_all_copies():
     assert venv.has_attr("task") and not venv.has_attr("no_such_thing")
     venv.set_attr("mark", 4)
     assert venv.get_attr("mark") == [4] * COPIES
-    assert venv.env_method("_voltages", np.zeros(COPIES))[0].tolist() == [0.0] * COPIES
+    assert [model.n for model in venv.env_method("state_space_model", operating_voltage=3.0)] == [2] * COPIES
     assert venv.env_is_wrapped(TimeLimit) == [False] * COPIES and not is_wrapped(venv, TimeLimit)
     assert venv.render_mode is None
     with pytest.raises(ValueError, match="indices must be None, for the copies are one object, but got 0"):

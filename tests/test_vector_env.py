@@ -74,14 +74,14 @@ class Single:
         self.env, self.mode, self.done = gym.make(name, max_episode_steps=limit, **given), mode, False
         self.start = self.env.reset(seed=seed)
 
-    def step(self, voltage):
+    def step(self, action):
         """What a step returns, and the last observation and info of an episode that ends with it."""
         final = None
         if self.done and self.mode == NEXT_STEP:
             observation, info = self.env.reset()
             self.done = False
             return observation, 0.0, False, False, info, None
-        observation, reward, terminated, truncated, info = self.env.step([voltage])
+        observation, reward, terminated, truncated, info = self.env.step(np.atleast_1d(action))
         self.done = terminated or truncated
         if self.done and self.mode == SAME_STEP:
             final = observation, info
@@ -100,7 +100,7 @@ def assert_info(found, i, expected):
         np.testing.assert_allclose(found[key][i], value, rtol=1e-12, atol=1e-12, err_msg=key)
 
 
-def assert_copies_are_single_envs(name, count, mode, steps, limit, watched, exact=(), **given):
+def assert_copies_are_single_envs(name, count, mode, steps, limit, watched, exact=(), inputs=None, **given):
     """Compare some copies, step by step; return how often one was terminated and truncated."""
     vector = make_vec(name, count, mode, limit, **given)
     singles = {i: Single(name, mode, limit, seed=7 + i, **given) for i in watched}
@@ -108,13 +108,14 @@ def assert_copies_are_single_envs(name, count, mode, steps, limit, watched, exac
     for i, single in singles.items():
         np.testing.assert_allclose(observation[i], single.start[0], rtol=1e-6)
         assert_info(info, i, single.start[1])
-    voltages, ends = np.random.default_rng(3).uniform(-30, 30, (steps, count)), np.zeros(2, dtype=int)
-    for k, voltage in enumerate(voltages):
-        observation, reward, terminated, truncated, info = vector.step(voltage[:, None] if k % 2 else voltage)
+    shape, ends = (steps, count) if inputs is None else (steps, count, inputs), np.zeros(2, dtype=int)
+    for k, action in enumerate(np.random.default_rng(3).uniform(-30, 30, shape)):
+        rows = inputs is None and k % 2  # one number a copy will do
+        observation, reward, terminated, truncated, info = vector.step(action[:, None] if rows else action)
         assert observation.dtype == np.float32 and reward.dtype == np.float64
         assert terminated.dtype == truncated.dtype == bool
         for i, single in singles.items():
-            expected = single.step(voltage[i])
+            expected = single.step(action[i])
             np.testing.assert_allclose(observation[i], expected[0], rtol=1e-6)
             assert reward[i] == pytest.approx(expected[1], rel=1e-11, abs=1e-12)
             assert (terminated[i], truncated[i]) == expected[2:4]

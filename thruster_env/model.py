@@ -12,9 +12,8 @@ from numerics.checks import covariance, finite, positive, shown
 from numerics.compiled import inlined
 from numerics.linear_systems import zero_order_hold
 from numerics.pickling import makes_functions
-from numerics.tuples import tuple_of, written_out
 from plants.affine import affine_model
-from plants.quantities import Quantity
+from plants.channels import functions_of
 from plants.state_space import StateSpaceModel
 from thruster_env.channels import CHANNELS
 from thruster_env.dynamics import (
@@ -27,10 +26,8 @@ from thruster_env.dynamics import (
 from thruster_env.linear.steady_state import steady_state
 from thruster_env.parameters import ThrusterParameters, checked
 from thruster_env.plant import Plant, make_plant
+from thruster_env.quantities import INPUTS, STATES, THRUST
 from thruster_env.rendering import Overlay
-
-STATES = (Quantity("motor speed", "omega_m", "rad/s"), Quantity("flow velocity", "U_a", "m/s"))
-INPUTS = (Quantity("voltage", "V_s", "V"),)
 
 
 @inlined
@@ -60,26 +57,20 @@ def observe_jacobian(x, c):
 
 
 @makes_functions
-def _channel_functions(channels: tuple[str, ...]) -> tuple[Callable, Callable]:
+def _channel_functions(names: tuple[str, ...]) -> tuple[Callable, Callable]:
     """`observe` and its Jacobian for some measured quantities."""
-    if channels == ("thrust",):
+    if names == ("thrust",):
         return observe, observe_jacobian
-    readings = {"thrust": "thrust(x, c)[0]", "speed": "x[0]", "speed-magnitude": "abs(x[0])"}
-    slopes = {
-        "thrust": "thrust_slopes(x, c)[0]",
-        "speed": "(1.0, 0.0)",
-        "speed-magnitude": "(1.0 if x[0] >= 0.0 else -1.0, 0.0)",
-    }
-    unknown = sorted(set(channels) - set(readings))
-    if unknown:  # it depends on the voltage
-        known = ", ".join(readings)
-        raise ValueError(f"channels that a model of the state can predict must be {known}, but got {unknown}")
-    return (
-        written_out("observe", "x, c", tuple_of(readings[name] for name in channels), thrust=observe),
-        written_out(
-            "observe_jacobian", "x, c", tuple_of(slopes[name] for name in channels), thrust_slopes=observe_jacobian
-        ),
-    )
+    _check_channels("that a model of the state can predict", names, lambda channel: channel.slopes is not None)
+    return functions_of([CHANNELS[name] for name in names], observe, observe_jacobian)
+
+
+def _check_channels(which: str, names: tuple[str, ...], fit: Callable) -> None:
+    """Raise ValueError unless all channels of these names fit."""
+    known = [name for name, channel in CHANNELS.items() if fit(channel)]
+    unknown = sorted(set(names) - set(known))
+    if unknown:
+        raise ValueError(f"channels {which} must be {', '.join(known)}, but got {unknown}")
 
 
 def thruster_model(
@@ -148,7 +139,7 @@ def model_of_plant(
         operating_state=steady_state(plant.parameters, operating_voltage, plant.ambient_velocity)[:2],
         operating_input=[operating_voltage],
         operating_points=partial(_operating_points, plant),
-        outputs={"T": (Quantity("thrust", "T", "N"), thrust_of)},
+        outputs={"T": (THRUST, thrust_of)},
         **_quantities(plant),
         **_operating_range(plant),
     )
@@ -184,14 +175,14 @@ def overlay_of(label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.nda
 def _linear_model(plant: Plant) -> StateSpaceModel:
     """The exact model of a plant that moves by a published linear system."""
     a, b = zero_order_hold(plant.linear.a, plant.linear.b, plant.dt)
-    rows = {"thrust": plant.linear.c[0], "speed": [1.0, 0.0]}
-    unknown = sorted(set(plant.channels) - set(rows))
-    if unknown:
-        raise ValueError(f"channels of a linear model must be {', '.join(rows)}, but got {unknown}")
+    _check_channels(
+        "of a linear model", plant.channels, lambda channel: channel.slopes is not None and channel.affine
+    )
+    rest = np.zeros(2)
     return affine_model(
         a=a,
         b=b[:, :1],
-        c=[rows[channel] for channel in plant.channels],
+        c=[CHANNELS[name].slopes(rest, plant.linear.c, None) for name in plant.channels],
         state_offset=b[:, 1] * plant.ambient_velocity,
         process_noise_cov=plant.process_noise_cov,
         measurement_noise_cov=plant.measurement_noise_cov,
@@ -202,7 +193,7 @@ def _linear_model(plant: Plant) -> StateSpaceModel:
 
 
 def _quantities(plant: Plant) -> dict:
-    measured = [Quantity(f"measured {name}", name, CHANNELS[name][0]) for name in plant.channels]
+    measured = [CHANNELS[name].quantity for name in plant.channels]
     return {"states": STATES, "input_quantities": INPUTS, "measurements": measured}
 
 

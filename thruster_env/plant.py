@@ -10,7 +10,7 @@ import numpy as np
 from numerics.checks import at_least, between, covariance, finite, one_of, positive, shown, vector, within
 from plants.disturbances.effects import Effect
 from plants.disturbances.sensors import SENSOR_EFFECTS
-from thruster_env.channels import CHANNELS
+from thruster_env.channels import CHANNELS, MAX_CHANNELS
 from thruster_env.dynamics import Constants
 from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
 from thruster_env.effects.flow import FLOW_SIGNALS
@@ -24,7 +24,7 @@ DEFAULT_MAX_VOLTAGE = 24.0  # [V]
 # Tunnel, signal to noise: w stirs motor and flow by 0.5 % of their values at 12 V each step (in stationarity
 # 1.15 rad/s and 0.035 m/s at 12 V); v is 0.5 N, 4 % of the thrust at 12 V, 16 % at 6 V and 65 % at 3 V.
 DEFAULT_PROCESS_NOISE = (1.0, 4e-4)  # variances a step, [(rad/s)^2, (m/s)^2]
-DEFAULT_MEASUREMENT_NOISE = CHANNELS["thrust"][1]  # variance, [N^2]
+DEFAULT_MEASUREMENT_NOISE = CHANNELS["thrust"].variance  # [N^2]
 # Beyond these limits there is no ship, and floating point may overflow.
 SAMPLE_TIMES = (1e-9, 10.0)  # [s]
 VOLTAGES = (1e-3, 1e6)  # [V]
@@ -91,10 +91,10 @@ def make_plant(
         ambient_velocity: flow U_0 along the thruster's axis [m/s].
         process_noise_cov: Q, covariance (2, 2) or two variances a step; zero allowed.
         measurement_noise_cov: R, covariance (m, m) or m variances; zero allowed. None for the defaults of
-            `sensors.CHANNELS`.
+            `channels.CHANNELS`.
         initial_state: None for N(0, diag(1, 0.01)), a fixed state [omega_m, U_a], or a mapping:
             {"voltage": V} for the steady state of V volts, {"mean": [..], "cov": [..]} for a distribution.
-        sensors: None for the thrust alone, a list of channels of `sensors.CHANNELS`, or a mapping from
+        sensors: None for the thrust alone, a list of channels of `channels.CHANNELS`, or a mapping from
             channels to lists of effects, {"thrust": [{"name": "dropout", "probability": 0.1}]}.
         flow: signals of `flow.FLOW_SIGNALS` that add to ambient_velocity.
         amplifier: effects of `amplifier.AMPLIFIER_EFFECTS` between the commanded voltage and the motor.
@@ -113,7 +113,7 @@ def make_plant(
     if "current" in sensors and parameters.load_gain == 0:
         raise ValueError("load_gain must be positive for a motor current to follow from it, but got 0.0")
     if measurement_noise_cov is None:
-        measurement_noise_cov = [CHANNELS[channel][1] for channel in sensors]
+        measurement_noise_cov = [CHANNELS[channel].variance for channel in sensors]
     uncertainty = make_uncertainty(uncertainty)
     corners = extreme_parameters(parameters, uncertainty)
     flow = FLOW_SIGNALS.make(flow)
@@ -152,6 +152,8 @@ def _sensors(given) -> dict[str, tuple[Effect, ...]]:
             raise ValueError(f"sensors must name each channel once, but got {shown(names)}")
     if not given:
         raise ValueError("sensors must name at least one channel, but got none")
+    if len(given) > MAX_CHANNELS:
+        raise ValueError(f"sensors must name at most {MAX_CHANNELS} channels, but got {len(given)}")
     return {
         one_of("a channel of sensors", channel, tuple(CHANNELS)): SENSOR_EFFECTS.make(effects)
         for channel, effects in given.items()

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from numerics.checks import shown
 from plants.disturbances.effects import Effect
-from thruster_env.effects.uncertainty import as_mapping
 from thruster_env.parameters import PRESETS, ThrusterParameters
 from thruster_env.plant import Plant
 
@@ -49,7 +48,7 @@ def plant_data(plant: Plant) -> dict:
         "sensor_effects": {channel: _mappings(effects) for channel, effects in plant.sensors.items()},
         "flow": _mappings(plant.flow),
         "amplifier": _mappings(plant.amplifier),
-        "uncertainty": {name: as_mapping(distribution) for name, distribution in plant.uncertainty.items()},
+        "uncertainty": {name: distribution.as_mapping() for name, distribution in plant.uncertainty.items()},
     }
     return json.loads(json.dumps(data))  # lists for tuples, as a file has them
 

@@ -35,8 +35,24 @@ def step_cost(error, voltage, change, tracking, energy, rate):
     return tracking * error * error + energy * voltage * voltage + rate * change * change
 
 
-def make_task(reference, tracking_weight: float, energy_weight: float, voltage_rate_weight: float) -> Task:
-    """Make a task from plain arguments; raises ValueError that states the rule and the value."""
+def make_task(
+    reference=None,
+    tracking_weight: float = DEFAULT_WEIGHTS[0],
+    energy_weight: float = DEFAULT_WEIGHTS[1],
+    voltage_rate_weight: float = DEFAULT_WEIGHTS[2],
+) -> Task:
+    """Make a task from plain arguments, the same ones that the env takes.
+
+    Args:
+        reference: signals of `reference.REFERENCE_SIGNALS`, which are added; none if None. (An env has a default
+            of its own; `BowThruster-v0` takes a thrust [N].)
+        tracking_weight: of the squared thrust error over T_max.
+        energy_weight: of the squared voltage over max_voltage.
+        voltage_rate_weight: of the squared change of voltage over max_voltage.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
     weights = {"tracking": tracking_weight, "energy": energy_weight, "voltage_rate": voltage_rate_weight}
     checked = (positive(f"{name}_weight", value, zero_allowed=True) for name, value in weights.items())
     checked = [

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from plants.arguments import arguments_of, takes_arguments_of
 from thruster_env.env import BowThrusterEnv
 from thruster_env.linear.linear_plant import PUBLISHED_NOISE, make_linear_plant
-from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE
-from thruster_env.task import DEFAULT_WEIGHTS
+from thruster_env.task import make_task
 
 
 class BowThrusterTrackingEnv(BowThrusterEnv):
@@ -56,39 +56,14 @@ class BowThrusterLinearEnv(BowThrusterEnv):
     unstable.)
 
     ## Arguments
-    `system` is "tunnel" or "open_bladed"; `process_noise_cov` and `measurement_noise_cov` are the published 0.5 of
-    each state and measurement by default; the others as in `BowThrusterEnv`, without `preset` and `uncertainty`.
+    The list is that of `thruster_env.linear.linear_plant.make_linear_plant` (`system` is "tunnel" or
+    "open_bladed"; `process_noise_cov` and `measurement_noise_cov` are the published 0.5 of each state and
+    measurement by default) and of `thruster_env.task.make_task`; `render_mode` comes on top.
     """
 
-    def __init__(
-        self,
-        system: str = "tunnel",
-        dt: float = DEFAULT_DT,
-        max_voltage: float = DEFAULT_MAX_VOLTAGE,
-        ambient_velocity: float = 0.0,
-        process_noise_cov=(PUBLISHED_NOISE, PUBLISHED_NOISE),
-        measurement_noise_cov=None,
-        reference=None,
-        initial_state=None,
-        sensors=None,
-        flow=None,
-        amplifier=None,
-        tracking_weight: float = DEFAULT_WEIGHTS[0],
-        energy_weight: float = DEFAULT_WEIGHTS[1],
-        voltage_rate_weight: float = DEFAULT_WEIGHTS[2],
-        render_mode: str | None = None,
-    ):
+    @takes_arguments_of(
+        make_linear_plant, make_task, defaults={"process_noise_cov": (PUBLISHED_NOISE, PUBLISHED_NOISE)}
+    )
+    def __init__(self, *, render_mode: str | None = None, **arguments):
         """Build the plant; see the class for the arguments."""
-        plant = make_linear_plant(
-            system,
-            dt=dt,
-            max_voltage=max_voltage,
-            ambient_velocity=ambient_velocity,
-            process_noise_cov=process_noise_cov,
-            measurement_noise_cov=measurement_noise_cov,
-            initial_state=initial_state,
-            sensors=sensors,
-            flow=flow,
-            amplifier=amplifier,
-        )
-        self._build(plant, reference, (tracking_weight, energy_weight, voltage_rate_weight), render_mode)
+        self._build(make_linear_plant(**arguments_of(make_linear_plant, arguments)), render_mode, arguments)

@@ -2,181 +2,20 @@
 
 from __future__ import annotations
 
-import copy
-from typing import Any
-
-import gymnasium as gym
-import numpy as np
-from gymnasium.utils.seeding import np_random
-from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
-
-from numerics.checks import as_floats, at_least, shown
-from numerics.keys import EpisodeKeys, reset_mask
-from thruster_env.engine.copies import Copies
-from thruster_env.engine.memory import (
-    AMBIENT,
-    FLOW,
-    OMEGA,
-    READINGS,
-    REFERENCE,
-    REWARD,
-    TERMINATED,
-    THRUST,
-    TIME,
-    VALID,
-)
+from plants.vector_env import PlantVectorEnv
 from thruster_env.env import BowThrusterEnv
-from thruster_env.modelled import ModelledEnv
+from thruster_env.modelled import ModelledThruster
 from thruster_env.tasks import BowThrusterLinearEnv, BowThrusterReversalEnv, BowThrusterTrackingEnv
 
-MOST_ENVS = 1_000_000  # of some kilobytes each
 
+class BowThrusterVectorEnv(ModelledThruster, PlantVectorEnv):
+    """`BowThruster-v0` in number; see `PlantVectorEnv`. Uncertain parameters are drawn for each copy and episode.
 
-class BowThrusterVectorEnv(ModelledEnv, gym.vector.VectorEnv):
-    """N copies of an env, native: copy i of `reset(seed=s)` equals a single env with `reset(seed=s + i)`.
-
-    Its j-th later episode equals that env's j-th unseeded reset, in all three autoreset modes. Parameters that are
-    uncertain are drawn for each copy and episode. Info holds arrays with one row a copy, and a mask `_key` for
-    each key, as Gymnasium's own vector envs do. Actions of copies that are about to be reset are ignored.
-
-    Args:
-        num_envs: number of copies.
-        max_episode_steps: steps after which an episode is truncated; None for never.
-        autoreset_mode: "NextStep" (default), "SameStep" or "Disabled", or the `AutoresetMode`.
-        **arguments: those of the single env.
-
-    Raises:
-        ValueError: states the rule and the value.
+    `num_envs`, `max_episode_steps` and `autoreset_mode` are those of `PlantVectorEnv`, the others those of the
+    single env.
     """
 
     single_env: type[BowThrusterEnv] = BowThrusterEnv
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        max_episode_steps: int | None = None,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        **arguments,
-    ):
-        """Build one env, for its plant and spaces, and the memory of all copies."""
-        self.num_envs = at_least("num_envs", num_envs, 1, MOST_ENVS)
-        self.autoreset_mode = _autoreset_mode(autoreset_mode)
-        if arguments.get("render_mode") is not None:
-            raise ValueError(f"render_mode must be None in number, but got {arguments['render_mode']!r}")
-        env = self.single_env(**arguments)
-        self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
-        self.plant, self.task, self._observed = env.plant, env.task, env.observed_rows
-        self.appended_entries = env.appended_entries  # of an observation, after the measurement
-        self.single_action_space, self.single_observation_space = env.action_space, env.observation_space
-        self.action_space = batch_space(env.action_space, self.num_envs)
-        self.observation_space = batch_space(env.observation_space, self.num_envs)
-        steps = np.inf if max_episode_steps is None else at_least("max_episode_steps", max_episode_steps, 1)
-        self._last_time = steps * self.plant.dt
-        self._copies = Copies(self.plant, self.task, self.num_envs)
-        self._keys = EpisodeKeys(self.num_envs)
-        self._done = np.zeros(self.num_envs, dtype=bool)
-
-    def __copy__(self) -> BowThrusterVectorEnv:
-        """A deep copy: two envs with one memory would move one another."""
-        return copy.deepcopy(self)
-
-    @property
-    def bytes_per_copy(self) -> int:
-        """Memory that one copy takes while it is stepped [bytes]; its generator and next keys come on top."""
-        return self._copies.bytes_per_copy
-
-    def reset(self, *, seed: int | list[int | None] | None = None, options: dict | None = None):
-        """Start an episode of every copy, or of those where `options["reset_mask"]` (num_envs,) is true.
-
-        `options={"state": [omega_m, U_a]}` fixes the initial state of these episodes.
-        """
-        numbers = self._copies.numbers_from(options)
-        mask = reset_mask(options, self._keys)
-        self._keys.seeds(seed)  # a wrong one changes nothing
-        if isinstance(seed, (int, np.integer)):
-            self._np_random, self._np_random_seed = np_random(int(seed))
-        self._keys.seed(seed, np.ones(self.num_envs, dtype=bool) if mask is None else mask)
-        report = self._copies.report()
-        which = np.arange(self.num_envs) if mask is None else np.flatnonzero(mask)
-        self._restart(which, report, numbers)
-        return self._observation(report), self._info(report, mask)
-
-    def step(self, actions):
-        """Apply one voltage a copy, (num_envs, 1) or (num_envs,), for one sample time.
-
-        Raises ValueError for actions of another shape, and for NaN in a copy that is not about to be reset.
-        """
-        if not self._keys.seeded:
-            raise gym.error.ResetNeeded("call reset() before step()")
-        report = self._copies.step(self._voltages(actions))
-        if self.autoreset_mode == AutoresetMode.NEXT_STEP and self._done.any():
-            self._restart(np.flatnonzero(self._done), report)
-        terminated, truncated = report[TERMINATED] > 0.0, report[TIME] >= self._last_time
-        rewards = report[REWARD]
-        self._done = terminated | truncated
-        ends = {}
-        if self.autoreset_mode == AutoresetMode.SAME_STEP and self._done.any():
-            rewards = rewards.copy()
-            ends = self._endings(report)
-            self._restart(np.flatnonzero(self._done), report)
-        return self._observation(report), rewards, terminated, truncated, self._info(report) | ends
-
-    def _restart(self, which: np.ndarray, report: np.ndarray, numbers: np.ndarray | None = None) -> None:
-        keys = self._keys.draw(which)
-        if len(which) == self.num_envs:
-            report[:] = self._copies.begin(keys, numbers=numbers)
-        else:
-            report[:, which] = self._copies.begin(keys, which, numbers)
-        self._done[which] = False
-
-    def _endings(self, report: np.ndarray) -> dict[str, Any]:
-        done = self._done.copy()
-        observation = self._observation(report)
-        final = np.full(self.num_envs, None, dtype=object)
-        for i in np.flatnonzero(done):
-            final[i] = observation[i]
-        info = self._info(report.copy(), done)
-        return {"final_obs": final, "_final_obs": done, "final_info": info, "_final_info": done.copy()}
-
-    def _voltages(self, actions) -> np.ndarray:
-        try:
-            voltages = as_floats(actions)
-        except ValueError:
-            voltages = np.empty(0)
-        if voltages.shape not in ((self.num_envs,), (self.num_envs, 1)):
-            raise ValueError(f"actions must be {self.num_envs} voltages [V], but got {shown(actions)}")
-        voltages = voltages.reshape(-1)
-        if np.isnan(voltages).any():
-            ignored = self._done if self.autoreset_mode == AutoresetMode.NEXT_STEP else False
-            wrong = np.flatnonzero(np.isnan(voltages) & ~np.asarray(ignored))
-            if len(wrong):
-                raise ValueError(f"actions must be voltages [V] and not NaN, but got NaN in copy {wrong[0]}")
-        return voltages
-
-    def _observation(self, report: np.ndarray) -> np.ndarray:
-        observation = np.empty((self.num_envs, len(self._observed)), dtype=np.float32)
-        with np.errstate(over="ignore"):  # beyond 3.4e38 lies infinity
-            for i, reported in enumerate(self._observed):
-                observation[:, i] = report[reported]
-        if np.isnan(observation.sum()):  # of a copy that terminates; a single env reports infinity, too
-            observation[np.isnan(observation)] = np.inf
-        return observation
-
-    def _info(self, report: np.ndarray, mask: np.ndarray | None = None) -> dict[str, Any]:
-        m = len(self.plant.channels)
-        info = {
-            "state": report[OMEGA : FLOW + 1].T,
-            "thrust": report[THRUST],
-            "measurement": report[READINGS : READINGS + m].T,
-            "reference": report[REFERENCE],
-            "ambient_velocity": report[AMBIENT],
-            "time": report[TIME],
-        }
-        if self.plant.dropping_channels:
-            info["measurement_valid"] = report[VALID : VALID + m].T > 0.0
-        there = np.ones(self.num_envs, dtype=bool) if mask is None else mask
-        return info | {f"_{key}": there for key in info}
 
 
 class BowThrusterTrackingVectorEnv(BowThrusterVectorEnv):
@@ -195,11 +34,3 @@ class BowThrusterLinearVectorEnv(BowThrusterVectorEnv):
     """`BowThrusterLinear-v0` in number."""
 
     single_env = BowThrusterLinearEnv
-
-
-def _autoreset_mode(given) -> AutoresetMode:
-    try:
-        return AutoresetMode(given)
-    except ValueError:
-        names = ", ".join(repr(mode.value) for mode in AutoresetMode)
-        raise ValueError(f"autoreset_mode must be one of {names}, but got {given!r}") from None

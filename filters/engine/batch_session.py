@@ -11,7 +11,7 @@ from filters.engine.compile import PREDICT, START, UPDATE, build_operation, new_
 from filters.engine.layout import memory_places
 from filters.filter import Filter
 from numerics.compiled import CompiledOrPython, inlined, is_interpreting
-from numerics.threads import crew, in_parts
+from numerics.threads import in_parts, worker_threads
 
 THREADED_COPIES = 256  # fewer are done before a second thread has woken up
 IDLE, STEP, BEGIN = 0, PREDICT + UPDATE, START + UPDATE  # what a copy's belief does in a call
@@ -60,7 +60,7 @@ class Beliefs:
         self._u[:], self._z[:] = u, z
         arrays = tasks, self._rows, self._tables, self._u, self._z
         arguments = *self._own, self._size, *arrays, self._numbers
-        crew().run(self._operate, len(tasks), *arguments, alone=len(tasks) < THREADED_COPIES)
+        worker_threads().run(self._operate, len(tasks), *arguments, alone=len(tasks) < THREADED_COPIES)
 
     def part(self, name: str, *shape: int) -> np.ndarray:
         """A copy of a part of all memories, such as "mean": (N, *shape)."""

@@ -1,4 +1,4 @@
-"""What disturbs a thruster: immutable descriptions, registered by name, that JSON can hold.
+"""What disturbs a plant: immutable descriptions, registered by name, that JSON can hold.
 
 An effect is a frozen dataclass of plain numbers with the function that acts on a block of copies,
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 
@@ -27,12 +27,12 @@ MAGNITUDES = (1e-100, 1e100)  # of an effect's arguments and of what follows fro
 LONGEST = 1e9  # [s], and in steps: what an effect may hold
 
 
-class Surroundings(NamedTuple):
-    """What an effect may need to turn its arguments into numbers."""
+@dataclasses.dataclass(frozen=True)
+class Context:
+    """What an effect may need to turn its arguments into numbers; a plant may add to it, in a class of its own."""
 
-    dt: float  # [s]
-    thrust_scale: float  # steady thrust at max_voltage [N]
-    back_emf: float  # motor speed to back-EMF, K1/K2 [V s/rad]
+    dt: float  # sample time [s]
+    valid_offset: int  # from the row of a measured channel to the one that says whether it is valid
 
 
 class Effect:
@@ -41,11 +41,11 @@ class Effect:
     act: ClassVar[Callable]  # the function above, a staticmethod
     name: ClassVar[str]
 
-    def parameters(self, around: Surroundings) -> list[float]:
+    def parameters(self, context: Context) -> list[float]:
         """Numbers that `act` finds from `numbers[at]` on: the fields in order, unless overridden."""
         return [float(value) for value in dataclasses.astuple(self)]
 
-    def rows(self, around: Surroundings) -> int:
+    def rows(self, context: Context) -> int:
         """Number of states that a copy keeps for this effect."""
         return 0
 
@@ -122,15 +122,17 @@ def uniforms(memory, b, j, number):
     return uniform_block(number, memory[b, STEP, j], CHANCE, memory[b, KEY_0, j], memory[b, KEY_1, j])
 
 
-def encoded(effects, kinds: tuple[type[Effect], ...], target: int, first_row: int, first_number: int, around):
+def encoded(
+    effects, kinds: tuple[type[Effect], ...], target: int, first_row: int, first_number: int, context: Context
+):
     """Numbers of some effects on one target row, and the number of rows that they take."""
     numbers: list[float] = []
     rows = 0
     for number, effect in enumerate(effects, first_number):
-        parameters = _representable(effect, effect.parameters(around))
+        parameters = _representable(effect, effect.parameters(context))
         header = [5 + len(parameters), kinds.index(type(effect)), target, first_row + rows, number]
         numbers += [*header, *parameters]
-        rows += effect.rows(around)
+        rows += effect.rows(context)
     return numbers, rows
 
 

@@ -1,4 +1,4 @@
-"""A recorded series as a signal: flow or reference that somebody measured."""
+"""A recorded series as a signal that somebody measured."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from numerics.checks import positive, shown, vector
 from numerics.compiled import inlined
-from plants.disturbances.effects import Effect, Surroundings, set_field
+from plants.disturbances.effects import Context, Effect, set_field
 
 
 @inlined
@@ -67,7 +67,7 @@ class RecordedSeries(Effect):
         """Largest magnitude in the series."""
         return max(map(abs, self.values))
 
-    def parameters(self, around: Surroundings) -> list[float]:
+    def parameters(self, context: Context) -> list[float]:
         """What `recorded_value` takes."""
         return [self.sample_time, float(self.repeat), float(len(self.values)), *self.values]
 

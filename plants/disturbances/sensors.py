@@ -13,8 +13,8 @@ import numpy as np
 
 from numerics.checks import at_least, finite, positive, within
 from numerics.compiled import inlined
-from plants.disturbances.effects import Effect, Registry, Surroundings, normals, set_field, uniforms
-from plants.disturbances.layout import MAX_CHANNELS, STEP
+from plants.disturbances.effects import Context, Effect, Registry, normals, set_field, uniforms
+from plants.disturbances.layout import STEP
 
 SENSOR_EFFECTS = Registry("sensors")
 LONGEST_DELAY = 10_000  # steps, each of which takes two numbers of every copy's memory
@@ -71,9 +71,8 @@ def saturation(memory, b, target, rows, number, numbers, at, begin):
 @inlined
 def dropout(memory, b, target, rows, number, numbers, at, begin):
     """Lose measurements in runs: a chain of two states. A lost one repeats the last, and is not valid."""
-    begins, ends = numbers[at], numbers[at + 1]
+    begins, ends, valid = numbers[at], numbers[at + 1], target + int(numbers[at + 2])
     held, lost = rows, rows + 1
-    valid = target + MAX_CHANNELS
     for j in range(memory.shape[2]):
         u, _, _, _ = uniforms(memory, b, j, number)
         if begin:
@@ -92,8 +91,7 @@ def dropout(memory, b, target, rows, number, numbers, at, begin):
 @inlined
 def delay(memory, b, target, rows, number, numbers, at, begin):
     """Report what was measured some steps ago, in a ring of rows; before that, the first measurement."""
-    steps = int(numbers[at])
-    valid = target + MAX_CHANNELS
+    steps, valid = int(numbers[at]), target + int(numbers[at + 1])
     for j in range(memory.shape[2]):
         if begin:
             for i in range(steps):
@@ -129,7 +127,7 @@ class StudentT(Effect):
             raise ValueError(f"degrees must be at least 1, but got {self.degrees!r}")
         set_field(self, "degrees", degrees)
 
-    def parameters(self, around: Surroundings) -> list[float]:
+    def parameters(self, context: Context) -> list[float]:
         """Degrees of freedom and scale."""
         return [self.degrees, self.scale]
 
@@ -148,7 +146,7 @@ class Outliers(Effect):
         set_field(self, "std", positive("std", self.std, zero_allowed=True))
         set_field(self, "probability", probability("probability", self.probability))
 
-    def parameters(self, around: Surroundings) -> list[float]:
+    def parameters(self, context: Context) -> list[float]:
         """Probability and standard deviation."""
         return [self.probability, self.std]
 
@@ -169,7 +167,7 @@ class Bias(Effect):
         set_field(self, "std", positive("std", self.std, zero_allowed=True))
         set_field(self, "drift", positive("drift", self.drift, zero_allowed=True))
 
-    def rows(self, around: Surroundings) -> int:
+    def rows(self, context: Context) -> int:
         """The bias."""
         return 1
 
@@ -234,11 +232,12 @@ class Dropout(Effect):
         set_field(self, "probability", share)
         set_field(self, "mean_length", length)
 
-    def parameters(self, around: Surroundings) -> list[float]:
-        """Probabilities that a run of missing measurements begins, and that it ends."""
-        return [self.probability / (1.0 - self.probability) / self.mean_length, 1.0 / self.mean_length]
+    def parameters(self, context: Context) -> list[float]:
+        """Probabilities that a run of missing measurements begins, and that it ends; where validity stands."""
+        begins = self.probability / (1.0 - self.probability) / self.mean_length
+        return [begins, 1.0 / self.mean_length, context.valid_offset]
 
-    def rows(self, around: Surroundings) -> int:
+    def rows(self, context: Context) -> int:
         """The last valid measurement, and whether one is missing."""
         return 2
 
@@ -258,7 +257,11 @@ class Delay(Effect):
             raise ValueError(f"steps must be at most {LONGEST_DELAY}, but got {self.steps!r}")
         set_field(self, "steps", steps)
 
-    def rows(self, around: Surroundings) -> int:
+    def parameters(self, context: Context) -> list[float]:
+        """Steps, and where validity stands."""
+        return [self.steps, context.valid_offset]
+
+    def rows(self, context: Context) -> int:
         """Measurements on their way, and whether they are valid."""
         return 2 * self.steps
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from numerics.checks import positive
 from numerics.compiled import inlined
-from plants.disturbances.effects import Effect, Registry, Surroundings, set_field
+from plants.disturbances.effects import Context, Effect, Registry, set_field
+from thruster_env.effects.context import ThrusterContext
 from thruster_env.engine.memory import OMEGA
 
 AMPLIFIER_EFFECTS = Registry("amplifier")
@@ -74,11 +75,11 @@ class SlewLimit(Effect):
         """Check the argument."""
         set_field(self, "rate", positive("rate", self.rate))
 
-    def parameters(self, around: Surroundings) -> list[float]:
+    def parameters(self, context: Context) -> list[float]:
         """The largest change in a step [V]."""
-        return [self.rate * around.dt]
+        return [self.rate * context.dt]
 
-    def rows(self, around: Surroundings) -> int:
+    def rows(self, context: Context) -> int:
         """The voltage of the last step."""
         return 1
 
@@ -115,6 +116,6 @@ class Sag(Effect):
             raise ValueError(f"fraction must be less than 1, but got {self.fraction!r}")
         set_field(self, "fraction", fraction)
 
-    def parameters(self, around: Surroundings) -> list[float]:
+    def parameters(self, context: ThrusterContext) -> list[float]:
         """Fraction and back-EMF constant [V s/rad]."""
-        return [self.fraction, around.back_emf]
+        return [self.fraction, context.back_emf]

@@ -14,9 +14,10 @@ import numpy as np
 from numerics.checks import finite, positive, shown, vector
 from numerics.compiled import inlined
 from numerics.streams import REFERENCE_SIGNAL, normal_block, uniform_block
-from plants.disturbances.effects import LONGEST, Effect, Registry, Surroundings, set_field
+from plants.disturbances.effects import LONGEST, Effect, Registry, set_field
 from plants.disturbances.layout import KEY_0, KEY_1, STEP
 from plants.disturbances.recorded import RecordedSeries, recorded_value
+from thruster_env.effects.context import ThrusterContext
 from thruster_env.engine.memory import SAMPLE_TIME
 
 REFERENCE_SIGNALS = Registry("reference")
@@ -124,9 +125,9 @@ class Constant(Effect):
         name = "level" if self.thrust is None else "thrust"
         set_field(self, name, finite(name, getattr(self, name)))
 
-    def parameters(self, around: Surroundings) -> list[float]:
+    def parameters(self, context: ThrusterContext) -> list[float]:
         """The thrust [N]."""
-        return [self.level * around.thrust_scale if self.thrust is None else self.thrust]
+        return [self.level * context.thrust_scale if self.thrust is None else self.thrust]
 
 
 def held_time(name: str, value) -> float:
@@ -153,10 +154,10 @@ class _Levels(Effect):
         set_field(self, "high", high)
         set_field(self, "hold_time", held_time("hold_time", self.hold_time))
 
-    def parameters(self, around: Surroundings) -> list[float]:
+    def parameters(self, context: ThrusterContext) -> list[float]:
         """Lowest and highest level [N], steps between two levels."""
-        hold = max(1.0, round(self.hold_time / around.dt))
-        return [self.low * around.thrust_scale, self.high * around.thrust_scale, hold]
+        hold = max(1.0, round(self.hold_time / context.dt))
+        return [self.low * context.thrust_scale, self.high * context.thrust_scale, hold]
 
 
 @REFERENCE_SIGNALS.register("steps")
@@ -200,12 +201,12 @@ class MultiSine(Effect):
         periods = tuple(positive("periods", period) for period in vector("periods", self.periods))
         set_field(self, "periods", periods)
 
-    def parameters(self, around: Surroundings) -> list[float]:
+    def parameters(self, context: ThrusterContext) -> list[float]:
         """Offset and amplitude [N], number of sines, their periods [s]."""
-        scale = around.thrust_scale
+        scale = context.thrust_scale
         return [self.offset * scale, self.amplitude * scale, float(len(self.periods)), *self.periods]
 
-    def rows(self, around: Surroundings) -> int:
+    def rows(self, context: ThrusterContext) -> int:
         """The phases."""
         return len(self.periods)
 
@@ -232,23 +233,23 @@ class BandLimitedNoise(Effect):
         set_field(self, "offset", finite("offset", self.offset))
         set_field(self, "bandwidth", positive("bandwidth", self.bandwidth))
 
-    def parameters(self, around: Surroundings) -> list[float]:
+    def parameters(self, context: ThrusterContext) -> list[float]:
         """Offset [N]; A, b, c of the filter with unit variance times std [N]; root of the state's covariance."""
         from scipy.linalg import solve_discrete_lyapunov
         from scipy.signal import butter, tf2ss
 
-        low, high = LEAST_BANDWIDTH / around.dt, 0.5 / around.dt
+        low, high = LEAST_BANDWIDTH / context.dt, 0.5 / context.dt
         if not low <= self.bandwidth < high:
             rule = f"at least {low:g} Hz and below {high:g} Hz at this dt"
             raise ValueError(f"bandwidth must be {rule}, but got {self.bandwidth}")
-        a, b, c, _ = tf2ss(*butter(2, self.bandwidth, fs=1.0 / around.dt))
+        a, b, c, _ = tf2ss(*butter(2, self.bandwidth, fs=1.0 / context.dt))
         cov = solve_discrete_lyapunov(a, b @ b.T)
-        c = c * self.std * around.thrust_scale / float((c @ cov @ c.T).item()) ** 0.5
+        c = c * self.std * context.thrust_scale / float((c @ cov @ c.T).item()) ** 0.5
         root = np.linalg.cholesky(cov)
         numbers = [*a.ravel(), *b.ravel(), *c.ravel(), root[0, 0], root[1, 0], root[1, 1]]
-        return [self.offset * around.thrust_scale, *map(float, numbers)]
+        return [self.offset * context.thrust_scale, *map(float, numbers)]
 
-    def rows(self, around: Surroundings) -> int:
+    def rows(self, context: ThrusterContext) -> int:
         """The states of the low-pass."""
         return 2
 

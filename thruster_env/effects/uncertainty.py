@@ -18,8 +18,16 @@ from thruster_env.parameters import ThrusterParameters, checked
 UNCERTAIN = tuple(name for name in ThrusterParameters._fields if name not in ("angles", "thrust_asymmetry"))
 
 
+class _Distribution:
+    name: ClassVar[str]
+
+    def as_mapping(self) -> dict:
+        """The distribution as JSON can hold it: its name and its arguments."""
+        return {"name": self.name, **asdict(self)}
+
+
 @dataclass(frozen=True)
-class Uniform:
+class Uniform(_Distribution):
     """A factor drawn uniformly from `low` to `high`."""
 
     low: float
@@ -46,7 +54,7 @@ class Uniform:
 
 
 @dataclass(frozen=True)
-class LogNormal:
+class LogNormal(_Distribution):
     """A factor exp(std n) with a standard normal n: a relative uncertainty of about `std`."""
 
     std: float
@@ -100,11 +108,6 @@ def make_uncertainty(given) -> dict[str, Uniform | LogNormal]:
         except TypeError:
             raise ValueError(f"{rule}, but got {shown(distribution)}") from None
     return made
-
-
-def as_mapping(distribution: Uniform | LogNormal) -> dict:
-    """A distribution as JSON can hold it: its name and its arguments."""
-    return {"name": distribution.name, **asdict(distribution)}
 
 
 def drawn_parameters(nominal: ThrusterParameters, uncertainty: Mapping, keys: np.ndarray) -> ThrusterParameters:

@@ -6,10 +6,11 @@ import numpy as np
 
 from numerics.checks import covariance_root
 from numerics.linear_systems import zero_order_hold
-from plants.disturbances.effects import Effect, Surroundings, encoded
+from plants.disturbances.effects import Effect, encoded
 from plants.disturbances.sensors import SENSOR_EFFECTS
-from thruster_env.channels import CHANNELS
+from thruster_env.channels import CHANNELS, MAX_CHANNELS
 from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
+from thruster_env.effects.context import ThrusterContext
 from thruster_env.effects.flow import FLOW_SIGNALS
 from thruster_env.effects.reference import REFERENCE_SIGNALS, Constant
 from thruster_env.engine import memory as at
@@ -41,7 +42,7 @@ def encode(plant: Plant, task: Task) -> tuple[np.ndarray, int]:
     """Numbers of a plant and a task, and how many rows beyond the fixed ones a copy's memory needs."""
     p = plant.parameters
     scale = thrust_scale(plant)
-    around = Surroundings(plant.dt, scale, p.motor_damping / p.voltage_gain)
+    context = ThrusterContext(plant.dt, MAX_CHANNELS, scale, p.motor_damping / p.voltage_gain)
     numbers = np.zeros(at.FIRST_EFFECT)
     numbers[: at.CONSTANT_COUNT] = plant.constants
     numbers[at.SUBSTEPS] = plant.substeps
@@ -51,11 +52,10 @@ def encode(plant: Plant, task: Task) -> tuple[np.ndarray, int]:
     numbers[at.Q_ROOT : at.Q_ROOT + 3] = covariance_root(plant.process_noise_cov)[lower]
     numbers[at.PRIOR_MEAN : at.PRIOR_MEAN + 2] = plant.initial_mean
     numbers[at.PRIOR_ROOT : at.PRIOR_ROOT + 3] = covariance_root(plant.initial_cov)[lower]
-    kinds = [list(CHANNELS).index(channel) for channel in plant.channels]
-    m = len(kinds)
+    m = len(plant.channels)
     numbers[at.CHANNEL_COUNT] = m
-    numbers[at.CHANNEL_KINDS : at.CHANNEL_KINDS + m] = kinds
-    r_root = np.zeros((at.MAX_CHANNELS, at.MAX_CHANNELS))
+    numbers[at.CHANNEL_CODES : at.CHANNEL_CODES + m] = [CHANNELS[channel].code for channel in plant.channels]
+    r_root = np.zeros((MAX_CHANNELS, MAX_CHANNELS))
     r_root[:m, :m] = covariance_root(plant.measurement_noise_cov)
     numbers[at.R_ROOT : at.R_ROOT + r_root.size] = r_root.ravel()
     if plant.linear is not None:
@@ -64,7 +64,7 @@ def encode(plant: Plant, task: Task) -> tuple[np.ndarray, int]:
     numbers[at.REWARD_WEIGHTS : at.REWARD_WEIGHTS + 3] = task.weights
     numbers[at.THRUST_SCALE] = scale
     numbers[at.LIMITS : at.LIMITS + 2] = state_limits(plant)
-    program, rows = _program(plant, task, around, numbers)
+    program, rows = _program(plant, task, context, numbers)
     numbers[at.CONSTANT_ROWS] = at.FIXED_ROWS + rows if plant.uncertainty else 0.0
     return np.concatenate([numbers, program]), rows + (at.CONSTANT_COUNT if plant.uncertainty else 0)
 
@@ -74,7 +74,7 @@ def _held(plant: Plant) -> np.ndarray:
     return np.concatenate([a_d.ravel(), b_d.ravel(), plant.linear.c.ravel()])
 
 
-def _program(plant: Plant, task: Task, around: Surroundings, numbers: np.ndarray) -> tuple[list[float], int]:
+def _program(plant: Plant, task: Task, context: ThrusterContext, numbers: np.ndarray) -> tuple[list[float], int]:
     known = known_effects(plant, task)
     chains = [(0, plant.amplifier, at.VOLTAGE), (1, plant.flow, at.AMBIENT)]
     chains += [(2, effects, at.READINGS + i) for i, effects in enumerate(plant.sensors.values())]
@@ -84,7 +84,7 @@ def _program(plant: Plant, task: Task, around: Surroundings, numbers: np.ndarray
     for index, (section, effects, target) in enumerate(chains):
         # The reference draws from a stream of its own, so it begins with number 0 whatever disturbs the plant.
         first_number = 0 if section == 3 else index * _SPACING
-        code, taken = encoded(effects, known[section], target, at.FIXED_ROWS + rows, first_number, around)
+        code, taken = encoded(effects, known[section], target, at.FIXED_ROWS + rows, first_number, context)
         numbers[at.SECTIONS + section] += len(effects)
         program += code
         rows += taken

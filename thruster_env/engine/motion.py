@@ -9,7 +9,7 @@ from __future__ import annotations
 from numerics.compiled import inlined
 from numerics.streams import INITIAL, PROCESS, normal_block
 from numerics.tuples import vector_reader, written_out
-from plants.disturbances.layout import KEY_0, KEY_1, STEP
+from plants.disturbances.layout import KEY_0, KEY_1, REWARD, STEP
 from thruster_env.dynamics import Constants, substep, thrust_and_torque
 from thruster_env.engine.memory import (
     AMBIENT,
@@ -24,7 +24,6 @@ from thruster_env.engine.memory import (
     PRIOR_MEAN,
     PRIOR_ROOT,
     Q_ROOT,
-    REWARD,
     SUBSTEPS,
     THRUST,
     TOP_VOLTAGE,
@@ -38,6 +37,14 @@ drawn_constants = written_out(
     f"Constants({', '.join(f'memory[b, first + {i}, j]' for i in range(CONSTANT_COUNT))})",
     Constants=Constants,
 )
+
+
+@inlined
+def constants_of_copy(memory, b, drawn, j, numbers):
+    """Constants of copy j: those drawn for it, from row `drawn` on, the nominal ones where that is 0."""
+    if drawn > 0:
+        return drawn_constants(memory, b, drawn, j)
+    return Constants(*read_constants(numbers))
 
 
 @inlined

@@ -15,22 +15,18 @@ from functools import cache
 from numerics.compiled import compiled, function_fingerprint, inlined, is_interpreting
 from numerics.streams import MEASUREMENT, normal_block
 from numerics.threads import in_parts
-from numerics.tuples import written_out
-from plants.disturbances.layout import KEY_0, KEY_1, MAX_CHANNELS, STEP
+from plants.channels import Channel, reader_of
+from plants.disturbances.chains import chain_of
+from plants.disturbances.layout import FIRST_REPORTED, KEY_0, KEY_1, REWARD, STEP, TERMINATED, TIME
+from thruster_env.channels import CHANNELS, MAX_CHANNELS, thrust
 from thruster_env.engine.memory import (
     AMBIENT,
+    CHANNEL_CODES,
     CHANNEL_COUNT,
-    CHANNEL_KINDS,
     COMMAND,
     CONSTANT_COUNT,
     CONSTANT_ROWS,
-    EFFECT_KIND,
-    EFFECT_NUMBER,
-    EFFECT_PARAMETERS,
-    EFFECT_ROWS,
-    EFFECT_TARGET,
     FIRST_EFFECT,
-    FIRST_REPORTED,
     FLOW,
     LAST_COMMAND,
     LIMITS,
@@ -40,14 +36,11 @@ from thruster_env.engine.memory import (
     READINGS,
     REFERENCE,
     REPORTED,
-    REWARD,
     REWARD_WEIGHTS,
     SAMPLE_TIME,
     SECTIONS,
-    TERMINATED,
     THRUST,
     THRUST_SCALE,
-    TIME,
     TOP_VOLTAGE,
     VALID,
     VOLTAGE,
@@ -55,6 +48,7 @@ from thruster_env.engine.memory import (
 from thruster_env.engine.motion import (
     add_process_noise,
     clip_command,
+    constants_of_copy,
     draw_initial_state,
     find_any_thrust,
     find_thrust,
@@ -71,36 +65,45 @@ def _measure_thrust(memory, b, numbers):
     sigma = numbers[R_ROOT]
     for j in range(memory.shape[2]):
         v, _, _, _ = normal_block(0, memory[b, STEP, j], MEASUREMENT, memory[b, KEY_0, j], memory[b, KEY_1, j])
-        memory[b, READINGS, j] = memory[b, THRUST, j] + sigma * v
+        memory[b, READINGS, j] = thrust((), (memory[b, THRUST, j],), (), ()) + sigma * v
         memory[b, VALID, j] = 1.0
 
 
-@inlined
-def _measure_all(memory, b, numbers):
-    count, drawn = int(numbers[CHANNEL_COUNT]), int(numbers[CONSTANT_ROWS])
-    for i in range(count):
-        kind = numbers[CHANNEL_KINDS + i]
-        for j in range(memory.shape[2]):
-            omega = memory[b, OMEGA, j]
-            reading = memory[b, THRUST, j]
-            if kind == 1.0:
-                reading = omega
-            elif kind == 2.0:
-                reading = abs(omega)
-            elif kind == 3.0:
-                # K1, K2 and K_h of a brushed motor give its current; see `sensors.CHANNELS`.
-                damping = memory[b, drawn, j] if drawn else numbers[0]
-                gain = memory[b, drawn + 1, j] if drawn else numbers[1]
-                load = memory[b, drawn + 2, j] if drawn else numbers[2]
-                reading = gain * (gain * memory[b, VOLTAGE, j] - damping * omega) / (load * damping)
-            memory[b, READINGS + i, j] = reading
-            memory[b, VALID + i, j] = 1.0
-    for j in range(memory.shape[2]):
-        v = normal_block(0, memory[b, STEP, j], MEASUREMENT, memory[b, KEY_0, j], memory[b, KEY_1, j])
+def _of_copy(read: Callable) -> Callable:
+    """Read one channel of copy j; where `drawn` is not 0, its own constants begin in that row."""
+
+    @inlined
+    def read_copy(memory, b, j, drawn, numbers):
+        x, y = (memory[b, OMEGA, j], memory[b, FLOW, j]), (memory[b, THRUST, j],)
+        c = constants_of_copy(memory, b, drawn, j, numbers)
+        return read(x, y, (memory[b, VOLTAGE, j],), c)
+
+    return read_copy
+
+
+@cache
+def _measure_any(channels: tuple[Channel, ...]) -> Callable:
+    """`measure(memory, b, numbers)` for a plant that has some of these channels."""
+    read = reader_of(channels, _of_copy, "memory, b, j, drawn, numbers")
+
+    @inlined
+    def measure(memory, b, numbers):
+        count, drawn = int(numbers[CHANNEL_COUNT]), int(numbers[CONSTANT_ROWS])
         for i in range(count):
-            at = R_ROOT + i * MAX_CHANNELS
-            noise = numbers[at] * v[0] + numbers[at + 1] * v[1] + numbers[at + 2] * v[2] + numbers[at + 3] * v[3]
-            memory[b, READINGS + i, j] += noise
+            code = numbers[CHANNEL_CODES + i]
+            for j in range(memory.shape[2]):
+                memory[b, READINGS + i, j] = read(code, memory, b, j, drawn, numbers)
+                memory[b, VALID + i, j] = 1.0
+        for j in range(memory.shape[2]):
+            v = normal_block(0, memory[b, STEP, j], MEASUREMENT, memory[b, KEY_0, j], memory[b, KEY_1, j])
+            for i in range(count):
+                at = R_ROOT + i * MAX_CHANNELS
+                noise = (
+                    numbers[at] * v[0] + numbers[at + 1] * v[1] + numbers[at + 2] * v[2] + numbers[at + 3] * v[3]
+                )
+                memory[b, READINGS + i, j] += noise
+
+    return measure
 
 
 @inlined
@@ -125,31 +128,6 @@ def _tell_time_and_end(memory, b, numbers):
         memory[b, LAST_COMMAND, j] = memory[b, COMMAND, j]
 
 
-def _dispatch(effects) -> Callable:
-    """Write out `run(kind, ...)`, which calls the function of one of some effects."""
-    arguments = "memory, b, target, rows, number, numbers, at, begin"
-    functions = {f"act_{i}": inlined(effect.act) for i, effect in enumerate(effects)}
-    lines = [line for i, name in enumerate(functions) for line in (f"if kind == {i}:", f"    {name}({arguments})")]
-    return written_out("run", f"kind, {arguments}", *lines, "None", **functions)
-
-
-def _chain(effects, section: int) -> Callable:
-    """Return `run(memory, b, numbers, at, begin)`: run a section's effects from numbers[at] on; where it ends."""
-    dispatch = _dispatch(effects)
-    place = SECTIONS + section
-
-    @inlined
-    def run(memory, b, numbers, at, begin):
-        for _ in range(int(numbers[place])):
-            kind, target = int(numbers[at + EFFECT_KIND]), int(numbers[at + EFFECT_TARGET])
-            rows, number = int(numbers[at + EFFECT_ROWS]), int(numbers[at + EFFECT_NUMBER])
-            dispatch(kind, memory, b, target, rows, number, numbers, at + EFFECT_PARAMETERS, begin)
-            at += int(numbers[at])
-        return at
-
-    return run
-
-
 def advance(known_effects, plain: bool) -> Callable:
     """Compiled `step(first, last, memory, numbers, out, begin)` on blocks first ... last - 1 of a memory.
 
@@ -161,23 +139,29 @@ def advance(known_effects, plain: bool) -> Callable:
         known_effects: a tuple of effects for each registry, as `encoding.known_effects` gives them.
         plain: know only a nominal thruster whose thrust is measured; compiles and runs faster.
     """
-    return _build(compiled, known_effects, plain, is_interpreting())
+    return _build(compiled, known_effects, _known_channels(plain), plain, is_interpreting())
 
 
 def advance_in_parts(known_effects, plain: bool) -> Callable:
-    """The same for `threads.Crew.run`."""
-    return _build(in_parts, known_effects, plain, is_interpreting())
+    """The same for `threads.WorkerThreads.run`."""
+    return _build(in_parts, known_effects, _known_channels(plain), plain, is_interpreting())
+
+
+def _known_channels(plain: bool) -> tuple[Channel, ...]:
+    """Channels that compiled code has to know, by their codes."""
+    return () if plain else tuple(sorted(CHANNELS.values(), key=lambda channel: channel.code))
 
 
 @cache
-def _build(maker: Callable, known_effects, plain: bool, interpreting: bool) -> Callable:
-    amplify, stream, sense, refer = (_chain(effects, section) for section, effects in enumerate(known_effects))
-    move, push = (move_thruster, find_thrust) if plain else (move_any, find_any_thrust)
-    measure = _measure_thrust if plain else _measure_all
-    reported = READINGS + 1 if plain else REPORTED  # rows beyond are of channels that there are not
-    fingerprint = function_fingerprint(
-        *(effect.act for effects in known_effects for effect in effects), within=__name__
+def _build(maker: Callable, known_effects, channels, plain: bool, interpreting: bool) -> Callable:
+    amplify, stream, sense, refer = (
+        chain_of(effects, SECTIONS + section) for section, effects in enumerate(known_effects)
     )
+    move, push = (move_thruster, find_thrust) if plain else (move_any, find_any_thrust)
+    measure = _measure_thrust if plain else _measure_any(channels)
+    reported = READINGS + 1 if plain else REPORTED  # rows beyond are of channels that there are not
+    acts = [effect.act for effects in known_effects for effect in effects]
+    fingerprint = function_fingerprint(*acts, measure, within=__name__)
 
     def step(first, last, memory, numbers, out, begin):
         fingerprint  # noqa: B018 - part of the cache's key

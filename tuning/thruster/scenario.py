@@ -82,7 +82,7 @@ class Scenario:
     name: str
     about: str = ""
     process_noise_cov: tuple[float, float] = DEFAULT_PROCESS_NOISE
-    measurement_noise_cov: float = CHANNELS["thrust"][1]
+    measurement_noise_cov: float = CHANNELS["thrust"].variance
     scale: tuple[float, float]
     parameter_factors: Mapping[str, float] = field(default_factory=dict)
     excitation: Excitation | Mapping = field(default_factory=Steps)

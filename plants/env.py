@@ -1,0 +1,160 @@
+"""The mechanics of a plant's Gymnasium env: seeds, steps, observations, infos, copies, pickles and its spec."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+
+from numerics.checks import seed as checked_seed
+from numerics.streams import draw_key
+from plants.commands import one_number, some_numbers
+from plants.copies import PlantCopies
+from plants.disturbances.layout import REWARD, TERMINATED
+from plants.quantities import Quantity
+from plants.rendered import RenderedEnv
+from plants.report import ReportRows, info_maker, observation_of, views_of
+
+# What `_set_views` makes.
+VIEWS = ("_memory", "_command", "_numbers", "_advance", "_report", "_views", "_info")
+
+
+class PlantEnv(RenderedEnv):
+    """An env of one copy of a plant, whose compiled step does all that moves.
+
+    A plant's env has `inputs`, makes `copies_of` the plant, and calls `_set_up` from its `__init__`. Rendering is
+    that of `RenderedEnv`; what it offers to filters is in `plants.modelled`. The vector env is then a class of two
+    lines, see `plants.vector_env`.
+
+    Attributes:
+        inputs: what the p entries of an action are.
+        plant: the plant; it has `dt`, its sample time [s].
+        task: what the env asks of it, if that is a value.
+    """
+
+    inputs: ClassVar[tuple[Quantity, ...]]
+    plant: Any
+    task: Any = None
+
+    def copies_of(self, count: int) -> PlantCopies:
+        """So many copies of the plant, with what the env asks of it."""
+        raise NotImplementedError
+
+    def _set_up(self, action_space: gym.spaces.Box, rows: ReportRows, render_mode: str | None = None) -> None:
+        """Make spaces and memory; `plant`, and what `copies_of` needs, must be there.
+
+        Args:
+            action_space: of shape (p,).
+            rows: what a report holds, and which of it is shown.
+            render_mode: None, or one of the modes in `metadata`.
+
+        Raises:
+            ValueError: if there is no such mode.
+        """
+        self._prepare_rendering(render_mode)
+        self._rows, self._observed = rows, rows.observed
+        self._readings = rows.observed[0]
+        self._single = len(rows.observed) == 1  # the frequent case, which has to be quick
+        self._one_input = len(self.inputs) == 1
+        self.action_space = action_space
+        shape = (len(rows.observed),)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=shape, dtype=np.float32)
+        self._copies = self.copies_of(1)
+        self._out = np.zeros((self._copies.reported, 1, 1))
+        self._observation_buffer = np.zeros(1, dtype=np.float32)
+        self._set_views()
+
+    def _set_views(self) -> None:
+        """Short ways into the memory of the one copy, for a step has to be quick."""
+        copies = self._copies
+        self._memory, self._numbers, self._advance = copies.memory, copies.numbers, copies.advance
+        self._command = self._memory[0, copies.commands[0] : copies.commands[-1] + 1, 0]
+        self._report = self._out.reshape(-1)
+        self._views, self._info = views_of(self._report, self._rows), info_maker(self._rows)
+
+    def __getstate__(self) -> dict:
+        """The state without its views, for copies and pickles, which go on with the same numbers."""
+        return {key: value for key, value in vars(self).items() if key not in VIEWS}
+
+    def __setstate__(self, state: dict) -> None:
+        """Make the views on the memory that was kept."""
+        vars(self).update(state)
+        self._set_views()
+
+    def __copy__(self) -> PlantEnv:
+        """A deep copy: two envs with one memory would move one another."""
+        return copy.deepcopy(self)
+
+    @property
+    def report_rows(self) -> ReportRows:
+        """What a report holds, and which of it makes observation and info."""
+        return self._rows
+
+    @property
+    def appended_entries(self) -> int:
+        """Entries of the observation after the measurement: validity flags and what the plant appends."""
+        return len(self._rows.flags) + len(self._rows.appended)
+
+    @property
+    def spec(self):
+        """The specification that made this env; its objects are kept as mappings, which JSON can hold."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec) -> None:
+        if spec is not None:
+            spec.kwargs.update({key: as_json(value) for key, value in spec.kwargs.items()})
+        self._spec = spec
+
+    _spec = None
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Start an episode: a key from the env's generator, an initial state and a first measurement.
+
+        `options={"state": [..]}` fixes the initial state of this episode.
+        """
+        numbers = self._copies.numbers_from(options)
+        super().reset(seed=checked_seed(seed))
+        self._report[:] = self._copies.begin(draw_key(self.np_random)[None], numbers=numbers)[:, 0]
+        report = self._report.tolist()
+        if self.render_mode is not None:
+            self._show(report, begin=True)
+        return self._observation(report), self._info(self._report, self._views)
+
+    def step(self, action):
+        """Apply an action for one sample time.
+
+        Raises ValueError for an action that is not the plant's number of numbers, or has NaN.
+        """
+        if self._one_input:
+            self._command[0] = one_number(action, self.inputs[0])
+        else:
+            self._command[:] = some_numbers(action, self.inputs)
+        self._advance(0, 1, self._memory, self._numbers, self._out, False)
+        report = self._report.tolist()
+        if self.render_mode is not None:
+            self._show(report)
+        info = self._info(self._report, self._views)
+        return self._observation(report), report[REWARD], report[TERMINATED] > 0.0, False, info
+
+    def _observation(self, report: list[float]) -> np.ndarray:
+        if self._single and -3e38 < report[self._readings] < 3e38:
+            self._observation_buffer[0] = report[self._readings]
+            return self._observation_buffer.copy()  # twice as fast as a new array of one number
+        return observation_of([report[row] for row in self._observed])
+
+
+def as_json(value):
+    """An argument of an env as JSON can hold it, effects and parameters as mappings of plain numbers."""
+    if hasattr(value, "as_mapping"):
+        return value.as_mapping()
+    if hasattr(value, "_asdict"):
+        return value._asdict()
+    if isinstance(value, Mapping):
+        return {key: as_json(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [as_json(entry) for entry in value]
+    return value

@@ -1,0 +1,36 @@
+"""Gaussian noise on rows of a plant's memory, for a plant of any size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+from numerics.streams import normal_block
+from numerics.tuples import written_out
+from plants.disturbances.layout import KEY_0, KEY_1, STEP
+
+BLOCK = 4  # normals of one draw
+
+
+@cache
+def noise_adder(size: int, first: int, root: int, stream: int) -> Callable:
+    """Return `add(memory, b, numbers)`: add w ~ N(0, L L') to rows first ... first + size - 1 of every copy.
+
+    The draws are those of `plants.simulate` with the same keys. For initial states the row STEP must be 0.
+
+    Args:
+        size: number of rows.
+        first: the first of them.
+        root: where the lower triangular L (size, size) lies in numbers, by rows.
+        stream: what the noise is for, of `numerics.streams`.
+    """
+    of_copy = "memory[b, KEY_0, j], memory[b, KEY_1, j]"
+    lines = ["for j in range(memory.shape[2]):"]
+    for block in range(-(-size // BLOCK)):
+        draws = ", ".join(f"w{BLOCK * block + i}" for i in range(BLOCK))
+        lines.append(f"    {draws} = normal_block({block}, memory[b, STEP, j], {stream}, {of_copy})")
+    for i in range(size):
+        terms = " + ".join(f"numbers[{root + i * size + k}] * w{k}" for k in range(i + 1))
+        lines.append(f"    memory[b, {first + i}, j] += {terms}")
+    names = {"normal_block": normal_block, "KEY_0": KEY_0, "KEY_1": KEY_1, "STEP": STEP}
+    return written_out("add", "memory, b, numbers", *lines, "None", **names)
