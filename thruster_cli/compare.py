@@ -20,10 +20,12 @@ from thruster_cli.tables import about, unless_blank
 from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender, sized
 from tuning.evaluation.evaluate import STATES
 from tuning.evaluation.tuned import check_plant, read_tuned, summary
-from tuning.problems.find import SCENARIOS, Scenario, find_scenario
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import has_ensemble
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenario import Scenario
+from tuning.thruster.scenarios import SCENARIOS
 
 DEFAULT_FILTERS = ("ekf", "enkf", "pf")
 

@@ -13,9 +13,9 @@ from numerics.files import check_target
 from tuning.evaluation.baselines import ORACLE
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison
-from tuning.problems.find import Scenario
 from tuning.report.consistency_figures import consistency_figure
 from tuning.search.space import Choice
+from tuning.thruster.scenario import Scenario
 
 
 def check_request(path: Path, filter_name: str) -> None:

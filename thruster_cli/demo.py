@@ -14,11 +14,11 @@ from thruster_cli.reproduce import reproduce
 from thruster_cli.tune import tune
 from thruster_cli.tuning_report import Tuning, as_json, report
 from tuning.evaluation.worth import worth
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import held_out_seeds
 from tuning.report.figures import comparison_figure, estimates_figure, history_figure
 from tuning.search.plan import Plan
 from tuning.search.space import true_choice
+from tuning.thruster.find import find_scenario
 
 FILTER, SCENARIO = "enkf", "mismatch"  # where tuning earns its keep
 STUDY = "nurhadi2022"

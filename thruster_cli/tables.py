@@ -11,10 +11,10 @@ from rich.table import Table
 from thruster_cli.output import table
 from tuning.evaluation.evaluate import Evaluation, Interval
 from tuning.likelihood.gradient import GradientResult
-from tuning.problems.find import Scenario
 from tuning.search.filter_types import Kind
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, neutral, parameters_of
+from tuning.thruster.scenario import Scenario
 
 
 def choice_table(choices: Mapping[str, Choice], scenario: Scenario) -> Table:

@@ -23,13 +23,13 @@ from tuning.evaluation.tuned import consistency, metrics
 from tuning.evaluation.worth import scaling_sentence
 from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import Identifiability, as_data, sentences
-from tuning.problems.find import Scenario
 from tuning.search.filter_types import kinds_tried
 from tuning.search.objectives import NIS_BAND
 from tuning.search.outcome import is_over_budget
 from tuning.search.plan import Plan
 from tuning.search.space import size_ladder
 from tuning.search.study import StudyResult
+from tuning.thruster.scenario import Scenario
 
 
 class Tuning(NamedTuple):

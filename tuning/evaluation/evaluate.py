@@ -13,7 +13,7 @@ from filters.engine.batch import Estimates, run
 from filters.ensembles.recording import record_members
 from filters.filter import Filter
 from thruster_env.model import thrusts_of
-from tuning.problems.find import FIRST_SCORED_STEP, Data
+from tuning.problems.data import FIRST_SCORED_STEP, Data
 
 STATES = ("omega_m [rad/s]", "U_a [m/s]")
 MEMBER_RUNS, MEMBER_STEPS = 40, 5  # rank histograms are made of so many runs, and of every fifth step
@@ -61,7 +61,7 @@ def judge(filter_: Filter, estimates: Estimates, data: Data, scale) -> Evaluatio
     mean_squares = (errors[:, late] ** 2).mean(axis=1)
     with np.errstate(all="ignore"):  # estimates far off, though finite, may have a thrust that is not
         thrusts = np.clip(thrusts_of(filter_.model, estimates.means[:, late]), -1e100, 1e100)
-    thrust_errors = thrusts - data.thrusts[:, late]
+    thrust_errors = thrusts - data.outputs["T"][:, late]
     innovations, innovation_covs = estimates.innovations[:, late], estimates.innovation_covs[:, late]
     measured = ~np.isnan(data.measurements[:, late]).all(axis=-1)
     nis = np.where(measured, normalized_squares(innovations, innovation_covs), np.nan)

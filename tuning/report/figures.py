@@ -14,7 +14,7 @@ from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from thruster_env.linear.figures import STATES
 from tuning.evaluation.baselines import ORACLE, RULE, SCALED, TUNED
 from tuning.evaluation.held_out import Comparison
-from tuning.problems.find import Data
+from tuning.problems.data import Data
 from tuning.search.outcome import is_consistent
 
 SCORE = "score: mean RMSE over bound [-]"

@@ -19,7 +19,7 @@ from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.tuned import versions
 from tuning.evaluation.worth import scaling_sentence, worth
 from tuning.likelihood.identifiability import Identifiability
-from tuning.problems.find import Scenario
+from tuning.problems.problem import Problem
 from tuning.problems.seeds import size_seeds, training_seeds
 from tuning.report.consistency_figures import consistency_figure
 from tuning.report.figures import SCORE, comparison_figure, estimates_figure, history_figure
@@ -68,7 +68,7 @@ def advice(choice: Choice, plan: Plan, proofs: Sequence[Comparison]) -> str:
     return "; ".join(parts) + "."
 
 
-def errors_table(scenario: Scenario, proof: Comparison) -> Table:
+def errors_table(scenario: Problem, proof: Comparison) -> Table:
     """RMSE, score and consistency of a tuned filter and its baselines on held-out seeds, and the bound."""
     ratios = proof.ratios
     rows = [
@@ -85,7 +85,7 @@ def errors_table(scenario: Scenario, proof: Comparison) -> Table:
     return Table(f"{scenario.name}, {seeds}, with 95 % intervals", columns, rows)
 
 
-def numbers_table(choice: Choice, scenario: Scenario, seed: int) -> Table:
+def numbers_table(choice: Choice, scenario: Problem, seed: int) -> Table:
     """The numbers of a tuned filter and of its baselines."""
     found = baselines(choice.name, scenario, seed)
     choices, default = {TUNED: choice, **found}, found[RULE].numbers

@@ -9,7 +9,8 @@ from optuna.distributions import BaseDistribution
 
 from filters.registry import filter_class
 from numerics.checks import positive
-from tuning.problems.find import Data, Scenario
+from tuning.problems.data import Data
+from tuning.problems.problem import Problem
 from tuning.problems.seeds import held_out_seeds, size_seeds, training_seeds
 from tuning.search.objectives import Objective, find_objective
 from tuning.search.space import AUTO, AUTO_KINDS, has_search_space, joint_distributions
@@ -23,7 +24,7 @@ class Plan(NamedTuple):
     """A filter, what to tune it on, what to make small and how to search."""
 
     filter: str  # a name, or "auto" for the best of many kinds
-    scenarios: tuple[Scenario, ...]
+    scenarios: tuple[Problem, ...]
     seed: int = 0
     objectives: tuple[str, ...] = ("score",)
     consistent: bool = True  # whether the mean NIS has to be within its band
