@@ -115,7 +115,7 @@ class Plan(NamedTuple):
 
     @property
     def tunes_noise(self) -> bool:
-        """Whether what is tuned of the model are the variances of Q and R, and no parameters of the problem's own."""
+        """Whether the variances of Q and R are tuned, and no parameters of the problem's own."""
         return self.scenarios[0].parameters is None
 
     @property
