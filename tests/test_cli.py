@@ -189,7 +189,7 @@ def test_help_teaches(command, thruster):
 
 BAD = [
     (("tune", "--filter", "none"), "filter must be one of kf, kf-steady, ekf, "),
-    (("tune", "--scenario", "none"), "scenario must be one of"),
+    (("tune", "--scenario", "none"), "problem must be one of"),
     (("tune", "--filter", "ekf", "--method", "gradient", "--hold-r"), "R must be free for --method gradient"),
     (
         ("tune", "--filter", "enkf", "--method", "gradient"),

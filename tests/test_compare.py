@@ -12,11 +12,11 @@ from tuning.evaluation.compare import compare, contender, default_belief, sized
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.tuned import write_tuned
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan
 from tuning.search.space import true_choice, untuned_choice
 from tuning.search.study import StudyResult
+from tuning.thruster.find import find_scenario
 
 NOMINAL, SEEDS = find_scenario("nominal"), held_out_seeds(0, 12)
 

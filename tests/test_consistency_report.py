@@ -25,9 +25,9 @@ from numerics.compiled import interpreted
 from numerics.streams import episode_keys
 from plants import simulate
 from tests.models import scalar_model
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import held_out_seeds
 from tuning.report.consistency_figures import consistency_figure
+from tuning.thruster.find import find_scenario
 
 
 def scalar(**changes):

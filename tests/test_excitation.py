@@ -8,8 +8,8 @@ import thruster_env  # noqa: F401 - registers the envs
 from numerics.streams import episode_keys
 from thruster_env.control.controllers import PIController
 from thruster_env.plant import make_plant
-from tuning.problems.find import find_scenario
 from tuning.thruster.excitation import EXCITATIONS, BinarySequence, ClosedLoop, Dwells, MultiSine, Steps
+from tuning.thruster.find import find_scenario
 
 PLANT = make_plant()
 KEYS = episode_keys(range(40))

@@ -18,9 +18,9 @@ from tuning.likelihood.identifiability import (
     maximum,
     sentences,
 )
-from tuning.problems.find import find_scenario
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters_of, true_choice, untuned_choice
+from tuning.thruster.find import find_scenario
 
 BOUNDS = np.log([(1e-4, 1e4)] * 3)
 TRUE = np.log([0.3, 0.2, 0.5])  # Q11, Q22, R

@@ -13,7 +13,6 @@ from filters.consistency.intervals import Interval
 from thruster_cli.main import main
 from tuning.evaluation.held_out import Comparison, prove
 from tuning.evaluation.tuned import write_tuned
-from tuning.problems.find import find_scenario
 from tuning.report.figures import early_trials
 from tuning.report.page import Picture, Section, Table, Words, html_page, markdown_page
 from tuning.report.parts import advice
@@ -23,6 +22,7 @@ from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study, run_study
+from tuning.thruster.find import find_scenario
 
 MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
 VOID = {"meta", "img", "br", "link", "input", "hr"}

@@ -10,7 +10,6 @@ from optuna.trial import TrialState
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import prove
 from tuning.likelihood.gradient import BAD_START, maximise_likelihood
-from tuning.problems.find import find_scenario
 from tuning.search import trials
 from tuning.search.enqueued import LIKELIEST, LIKELIEST_AFTER, TWIN
 from tuning.search.objectives import LARGEST, NIS_BAND, nis_violation
@@ -20,6 +19,7 @@ from tuning.search.samplers import SAMPLERS, make_sampler
 from tuning.search.space import choice_of, distributions, true_choice, untuned_choice
 from tuning.search.study import open_study, run_study
 from tuning.search.trials import BLOCK, measure
+from tuning.thruster.find import find_scenario
 
 MISMATCH, NOMINAL, OUTLIERS = map(find_scenario, ("mismatch", "nominal", "outliers"))
 PLAN = Plan("ekf", (MISMATCH,))
@@ -91,7 +91,7 @@ def test_the_reported_values_are_the_scores_of_single_seeds():
     result = studied(PLAN, 1)
     data = MISMATCH.data(range(32))
     for seed in (0, 9, 31):
-        alone = type(data)(*(part[seed : seed + 1] for part in data))
+        alone = data.slice(seed, seed + 1)
         filter_ = untuned_choice("ekf", MISMATCH).filter(MISMATCH)
         found = evaluate(filter_, alone, MISMATCH.scale).score.value
         assert result.trials[0].intermediate_values[seed] == pytest.approx(found, rel=1e-12)

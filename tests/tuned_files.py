@@ -8,10 +8,11 @@ from pathlib import Path
 from filters.tuned_file import sealed
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import write_tuned
-from tuning.problems.find import Scenario, find_scenario
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import StudyResult
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenario import Scenario
 
 
 def write_untuned(

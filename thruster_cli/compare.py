@@ -19,10 +19,12 @@ from thruster_cli.leaderboard import as_json, report
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
 from tuning.evaluation.compare import Contender, compare, contender, sized
 from tuning.evaluation.tuned import check_plant, read_tuned
-from tuning.problems.find import SCENARIOS, Scenario, find_scenario
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import has_ensemble
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenario import Scenario
+from tuning.thruster.scenarios import SCENARIOS
 
 DEFAULT_FILTERS = ("ekf", "enkf", "pf")
 

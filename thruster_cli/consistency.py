@@ -13,7 +13,7 @@ from numerics.files import check_target
 from tuning.evaluation.baselines import ORACLE
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison
-from tuning.problems.find import Scenario
+from tuning.problems.problem import Problem
 from tuning.report.consistency_figures import consistency_figure
 from tuning.search.space import Choice
 
@@ -27,7 +27,7 @@ def check_request(path: Path, filter_name: str) -> None:
     check_target(path)
 
 
-def judge(choice: Choice, name: str, scenario: Scenario, proof: Comparison, path: Path) -> tuple[list[str], dict]:
+def judge(choice: Choice, name: str, scenario: Problem, proof: Comparison, path: Path) -> tuple[list[str], dict]:
     """Draw the checks of a choice, called `name`; return what is to be said and the numbers behind it."""
     report = check_consistency(choice.filter(scenario), scenario.data(proof.seeds))
     said, against, ratios = sentences(report), {}, None

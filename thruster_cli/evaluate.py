@@ -16,8 +16,8 @@ from tuning.evaluation.baselines import RULE, TUNED, baselines, rule_of_thumb
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import check_plant, metrics, read_tuned
 from tuning.evaluation.worth import scaling_sentence, without_truth
-from tuning.problems.find import find_scenario
 from tuning.search.plan import HELD_OUT_SEEDS
+from tuning.thruster.find import find_scenario
 
 
 def command(

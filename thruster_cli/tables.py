@@ -9,14 +9,14 @@ from rich.table import Table
 
 from thruster_cli.output import table
 from tuning.likelihood.gradient import GradientResult
-from tuning.problems.find import Scenario
+from tuning.problems.problem import Problem
 from tuning.report.units import labelled
 from tuning.search.filter_types import Kind
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, neutral, parameters_of
 
 
-def choice_table(choices: Mapping[str, Choice], scenario: Scenario) -> Table:
+def choice_table(choices: Mapping[str, Choice], scenario: Problem) -> Table:
     """The numbers of filters of one kind, a column each."""
     kind, caption = next(iter(choices.values())).name, None
     model = scenario.model()

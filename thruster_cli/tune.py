@@ -20,7 +20,6 @@ from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import write_tuned
 from tuning.likelihood.gradient import DIFFERENTIABLE, maximise_likelihood
 from tuning.likelihood.identifiability import identify
-from tuning.problems.find import SCENARIOS, find_scenario
 from tuning.search.filter_types import kinds_running
 from tuning.search.objectives import OBJECTIVES
 from tuning.search.outcome import best_trial
@@ -29,6 +28,8 @@ from tuning.search.samplers import SAMPLERS
 from tuning.search.storage import open_storage
 from tuning.search.study import OnTrial, finished_trials, open_study, quiet_optuna, run_study, run_trials
 from tuning.search.workers import run_in_workers
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import SCENARIOS
 
 DEFAULT_STORAGE = "out/studies.journal"
 MOST_TRIALS = 1_000_000

@@ -20,7 +20,7 @@ from tuning.evaluation.tuned import consistency, metrics
 from tuning.evaluation.worth import scaling_sentence, without_truth
 from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import Identifiability, as_data, sentences
-from tuning.problems.find import Scenario
+from tuning.problems.problem import Problem
 from tuning.search.filter_types import kinds_tried
 from tuning.search.objectives import NIS_BAND
 from tuning.search.outcome import is_over_budget
@@ -42,7 +42,7 @@ class Tuning(NamedTuple):
     known: Identifiability | None = None  # what the innovations determine; None without a covariance
 
     @property
-    def scenario(self) -> Scenario:
+    def scenario(self) -> Problem:
         """The first scenario."""
         return self.plan.scenarios[0]
 

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 
 from filters.registry import filter_class
 from tuning.evaluation.evaluate import evaluate
-from tuning.problems.find import Scenario
+from tuning.problems.problem import Problem
 from tuning.problems.seeds import training_seeds
 from tuning.search.objectives import LARGEST, nis_ratio
 from tuning.search.plan import TRAINING_SEEDS
@@ -32,18 +32,18 @@ class Scaled(NamedTuple):
     reason: str = ""  # why there is none; empty where there is one
 
 
-def rule_of_thumb(name: str, scenario: Scenario) -> Choice:
+def rule_of_thumb(name: str, scenario: Problem) -> Choice:
     """R from the sensor's sheet, Q = diag((1 % of each state's range)^2), N = 30 (particles: 1000)."""
     return untuned_choice(name, scenario)
 
 
-def oracle(name: str, scenario: Scenario) -> Choice:
+def oracle(name: str, scenario: Problem) -> Choice:
     """The filter that is told the plant's own Q and R, with the rule of thumb's N."""
     return true_choice(name, scenario)
 
 
 @lru_cache(maxsize=64)
-def scaled_default(name: str, scenario: Scenario, seed: int = 0) -> Scaled:
+def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
     """The rule of thumb with one factor on its Q, such that the mean NIS on the training runs is right.
 
         mean of nu' S(c Q, R)^-1 nu over runs and scored steps = m,  solved for log c
@@ -95,7 +95,7 @@ def scaled(choice: Choice, factor: float) -> Choice:
     return choice._replace(model={**choice.model, "process_noise_cov": variances})
 
 
-def baselines(name: str, scenario: Scenario, seed: int = 0) -> dict[str, Choice]:
+def baselines(name: str, scenario: Problem, seed: int = 0) -> dict[str, Choice]:
     """All baselines of a kind of filter that there are, by what they are called, the one that counts first."""
     default = scaled_default(name, scenario, seed).choice
     found = {SCALED: default} if default is not None else {}

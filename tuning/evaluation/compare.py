@@ -17,7 +17,8 @@ from filters.registry import filter_class, make_filter
 from numerics.checks import one_of, positive
 from tuning.evaluation.baselines import oracle, rule_of_thumb, scaled_default
 from tuning.evaluation.evaluate import Evaluation, judge, likelihood_gain, score_ratio
-from tuning.problems.find import Data, Scenario
+from tuning.problems.data import Data
+from tuning.problems.problem import Problem
 from tuning.search.interruption import stop_on_interrupt
 from tuning.search.space import Choice, ensemble_sizes_of, has_ensemble
 
@@ -31,10 +32,10 @@ class Contender(NamedTuple):
     """A filter that takes part in a comparison, whatever the scenario."""
 
     label: str
-    choose: Callable[[Scenario], Choice]
+    choose: Callable[[Problem], Choice]
     unknown: Mapping[str, Unknown | None] = {}  # constants of the model that it estimates, too; None for a default
 
-    def filter(self, scenario: Scenario) -> Filter:
+    def filter(self, scenario: Problem) -> Filter:
         """The filter, with what the scenario lets it assume of the plant."""
         filter_ = self.choose(scenario).filter(scenario)
         if not self.unknown:
@@ -78,7 +79,7 @@ class Row(NamedTuple):
 class Leaderboard(NamedTuple):
     """Filters on one scenario, in the order in which they were given."""
 
-    scenario: Scenario
+    scenario: Problem
     seeds: Sequence[int]
     bound: np.ndarray  # (n,), of the scenario's Gaussian core on these seeds
     rows: list[Row]
@@ -104,7 +105,7 @@ def contender(
     one_of("knows", knows, KNOWLEDGE)
     numbers = {key: value for key, value in numbers.items() if value is not None}
 
-    def chosen(scenario: Scenario) -> Choice:
+    def chosen(scenario: Problem) -> Choice:
         choice = _known(knows, name, scenario, seed)
         return choice._replace(numbers={**choice.numbers, **numbers})
 
@@ -115,7 +116,7 @@ def contender(
     return Contender(" ".join([name, *size, *others, *added]), chosen, unknown)
 
 
-def _known(knows: str, name: str, scenario: Scenario, seed: int) -> Choice:
+def _known(knows: str, name: str, scenario: Problem, seed: int) -> Choice:
     """The choice of a filter that knows so much; ValueError where there is no scaled default."""
     if knows != "scaled":
         return (oracle if knows == "true" else rule_of_thumb)(name, scenario)
@@ -146,9 +147,9 @@ def default_belief(name: str, value: float) -> Unknown:
 
 def compare(
     contenders: Sequence[Contender],
-    scenarios: Iterable[Scenario],
+    scenarios: Iterable[Problem],
     seeds: Sequence[int],
-    on_row: Callable[[Scenario, str], None] = lambda scenario, label: None,
+    on_row: Callable[[Problem, str], None] = lambda scenario, label: None,
 ) -> tuple[list[Leaderboard], bool]:
     """Run filters over scenarios, all on the same seeds.
 

@@ -15,7 +15,7 @@ from filters.engine.batch import Estimates, run
 from filters.ensembles.recording import record_members
 from filters.filter import Filter
 from plants.quantities import Quantity
-from tuning.problems.find import FIRST_SCORED_STEP, Data
+from tuning.problems.data import FIRST_SCORED_STEP, Data
 
 MEMBER_RUNS, MEMBER_STEPS = 40, 5  # rank histograms are made of so many runs, and of every fifth step
 FARTHEST = 1e100  # an output beyond this is this: its square is a number

@@ -9,7 +9,7 @@ import numpy as np
 from filters.consistency.intervals import Interval
 from tuning.evaluation.baselines import ORACLE, RULE, SCALED, TUNED, Scaled, oracle, rule_of_thumb, scaled_default
 from tuning.evaluation.evaluate import Evaluation, evaluate, likelihood_gain, score_ratio
-from tuning.problems.find import Scenario
+from tuning.problems.problem import Problem
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
@@ -47,7 +47,7 @@ class Comparison(NamedTuple):
         return {name: likelihood_gain(self.tuned, found[name]) for name in names}
 
 
-def prove(choice: Choice, scenario: Scenario, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:
+def prove(choice: Choice, scenario: Problem, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:
     """A choice and its baselines on seeds that the study never saw, with the bound on these seeds.
 
     Args:

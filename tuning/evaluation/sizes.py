@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 from filters.consistency.intervals import Interval
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
-from tuning.problems.find import Data, Scenario
+from tuning.problems.data import Data
+from tuning.problems.problem import Problem
 from tuning.search.objectives import nis_violation
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, size_ladder
@@ -69,7 +70,7 @@ def _counting(outside: Sequence[float], consistent: bool) -> list[int]:
     return [i for i in everywhere if outside[i] <= 0 or not consistent] or everywhere
 
 
-def _on(scenario: Scenario, data: Data, choice: Choice, sizes: Sequence[int]) -> list[Evaluation]:
+def _on(scenario: Problem, data: Data, choice: Choice, sizes: Sequence[int]) -> list[Evaluation]:
     return [evaluate(choice.with_size(n).filter(scenario), data, scenario.scale) for n in sizes]
 
 

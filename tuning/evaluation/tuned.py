@@ -19,13 +19,15 @@ from plants.quantities import Quantity
 from thruster_env.plant_data import check_same_plant, plant_data
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
-from tuning.problems.find import SCENARIOS, Scenario, find_scenario
+from tuning.problems.find import find_problem
+from tuning.problems.problem import Problem
 from tuning.search.objectives import NIS_BAND
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 from tuning.search.study import StudyResult
 from tuning.thruster.files import scenario_of
 from tuning.thruster.scenario import frozen
+from tuning.thruster.scenarios import SCENARIOS
 
 PACKAGES = ("thruster-env", "optuna", "numpy", "numba", "gymnasium")
 
@@ -78,12 +80,12 @@ def write_tuned(
     write_whole(Path(path), json.dumps(sealed(content), indent=2) + "\n")
 
 
-def _kept(scenario: Scenario) -> dict:
+def _kept(scenario: Problem) -> dict:
     """A scenario as a tuned file keeps it, to do without the file that it comes from."""
     return {"digest": scenario.digest, "content": scenario.as_mapping()}
 
 
-def scenario_in(content: Mapping, name, path: str | Path) -> Scenario:
+def scenario_in(content: Mapping, name, path: str | Path) -> Problem:
     """A scenario that a tuned file names: of the package, or as the file keeps it.
 
     A file without it (version 2) has only the path of a scenario's own file, which is then read.
@@ -98,7 +100,7 @@ def scenario_in(content: Mapping, name, path: str | Path) -> Scenario:
     """
     kept = content.get("scenarios", {}).get(name) if isinstance(name, str) and name not in SCENARIOS else None
     if kept is None:
-        return find_scenario(name)
+        return find_problem(name)
     return scenario_of(kept.get("content") if isinstance(kept, Mapping) else kept, name, path)
 
 
@@ -109,7 +111,7 @@ def _warn_of_changes(content: Mapping, path: str | Path) -> None:
             continue
         then = scenario_in(content, name, path).digest
         try:
-            now = find_scenario(name).digest
+            now = find_problem(name).digest
         except ValueError:
             now = "none that can be read"
         if now != then:
@@ -120,14 +122,14 @@ def _warn_of_changes(content: Mapping, path: str | Path) -> None:
             )
 
 
-def check_plant(path: str | Path, scenario: Scenario) -> None:
+def check_plant(path: str | Path, scenario: Problem) -> None:
     """Raise ValueError if a tuned file is for another plant than a scenario's: another thruster, dt or sensor."""
     tuned_for = read_tuned_file(path).get("plant")
     if tuned_for is not None:
         check_same_plant(tuned_for, scenario.plant, path)
 
 
-def read_tuned(path: str | Path) -> tuple[Choice, Scenario, int]:
+def read_tuned(path: str | Path) -> tuple[Choice, Problem, int]:
     """Choice, scenario and study seed of a tuned file; ValueError that says what is wrong with a bad one.
 
     A scenario of a file of its own is that of the time of tuning; a warning says if the file has changed since.

@@ -12,7 +12,8 @@ from filters.likelihood import likelihood
 from filters.registry import make_filter
 from numerics.checks import one_of
 from tuning.likelihood.identifiability import KNOWN_WITHIN, TWO_SIDED
-from tuning.problems.find import Data, Scenario
+from tuning.problems.data import Data
+from tuning.problems.problem import Problem
 from tuning.search.space import Choice, distributions, untuned_choice
 
 DIFFERENTIABLE = ("kf", "ekf")
@@ -48,7 +49,7 @@ class GradientResult(NamedTuple):
 
 
 def maximise_likelihood(
-    filter_name: str, scenario: Scenario, data: Data, starts: Sequence[Sequence[float]] = STARTS
+    filter_name: str, scenario: Problem, data: Data, starts: Sequence[Sequence[float]] = STARTS
 ) -> GradientResult:
     """Find the diagonal Q and R under which a Kalman filter's innovations are most likely.
 

@@ -10,7 +10,8 @@ from optuna.distributions import BaseDistribution
 
 from filters.engine.batch import run
 from filters.registry import filter_class
-from tuning.problems.find import Data, Scenario
+from tuning.problems.data import Data
+from tuning.problems.problem import Problem
 from tuning.search.space import Choice, choice_of, parameters_of, untuned_choice
 
 KNOWN_WITHIN = np.log(10.0)  # a 95 % interval that reaches beyond a factor of ten determines nothing
@@ -54,7 +55,7 @@ class Identifiability(NamedTuple):
 
 
 def identify(
-    choice: Choice, scenarios: Sequence[Scenario], data: Sequence[Data], space: Mapping[str, BaseDistribution]
+    choice: Choice, scenarios: Sequence[Problem], data: Sequence[Data], space: Mapping[str, BaseDistribution]
 ) -> Identifiability | None:
     """How well the innovations determine Q's variances, R and P_0's scale of a choice; None without a covariance.
 

@@ -166,7 +166,7 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
     pair = {name: before.filter(scenario), TUNED: tuned}
     what = "Estimate and innovation, each with its" if data.states is None else "Truth, estimate and"
     caption = f"{what} 95 % band on {scenario.name}, held-out seed {proof.seeds.start}, before and after."
-    picture = book.picture(caption, estimates_figure, pair, data, 0, scenario.plant.dt, sharey="row")
+    picture = book.picture(caption, estimates_figure, pair, data, 0, scenario.dt, sharey="row")
     sections = [Section("One run over time", [picture])]
     if filter_class(choice.name).has_covariance:
         report = check_consistency(tuned, data)

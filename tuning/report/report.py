@@ -14,11 +14,8 @@ from tuning.report.page import Section, Words, html_page, markdown_page
 from tuning.report.parts import (
     Sketchbook,
     advice,
-    errors_table,
     facts_section,
     held_out_section,
-    known_table,
-    numbers_table,
     run_sections,
     search_section,
     sizes_section,

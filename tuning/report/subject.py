@@ -12,7 +12,8 @@ import optuna
 from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least, shown
 from tuning.evaluation.tuned import read_tuned, scenario_in
-from tuning.problems.find import Scenario, find_scenario
+from tuning.problems.find import find_problem
+from tuning.problems.problem import Problem
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.space import Choice, choice_of
@@ -92,7 +93,7 @@ def _load(name: str, storage: str) -> optuna.Study | None:
         return None
 
 
-def _plan(identity, where: str | Path, find: Callable[[str], Scenario] = find_scenario) -> Plan:
+def _plan(identity, where: str | Path, find: Callable[[str], Problem] = find_problem) -> Plan:
     """The plan of which an identity tells, its scenarios found by name."""
     try:
         scenarios = tuple(find(name) for name in identity["scenarios"])

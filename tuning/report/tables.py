@@ -11,7 +11,7 @@ from tuning.evaluation.baselines import RULE, TUNED, baselines
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.held_out import Comparison
 from tuning.likelihood.identifiability import Identifiability
-from tuning.problems.find import Scenario
+from tuning.problems.problem import Problem
 from tuning.report.page import Table
 from tuning.report.units import labelled
 from tuning.search.space import Choice, neutral, parameters_of
@@ -20,7 +20,7 @@ MOST_ACROSS = 3  # states side by side; more stand one below the other
 EXPECTED = "bound; expected value"  # what stands beside the metrics
 
 
-def errors_table(scenario: Scenario, proof: Comparison) -> Table:
+def errors_table(scenario: Problem, proof: Comparison) -> Table:
     """Metrics of a tuned filter and its baselines on held-out seeds, and the bound.
 
     A row is a filter; of more states than fit side by side, and of derived outputs then, a row is a state and a
@@ -86,7 +86,7 @@ def _output_label(output: Quantity) -> str:
     return f"RMSE {output.label}"
 
 
-def numbers_table(choice: Choice, scenario: Scenario, seed: int) -> Table:
+def numbers_table(choice: Choice, scenario: Problem, seed: int) -> Table:
     """The numbers of a tuned filter and of its baselines."""
     found = baselines(choice.name, scenario, seed)
     choices, default = {TUNED: choice, **found}, found[RULE].numbers

@@ -14,7 +14,7 @@ from filters.filter import Filter
 from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from plants.quantities import Quantity
 from tuning.evaluation.evaluate import errors_of
-from tuning.problems.find import Data
+from tuning.problems.data import Data
 from tuning.report.panels import axis_label, shown_states
 
 TRUTH, ESTIMATE, ERROR = DARK, BLUE, RUST

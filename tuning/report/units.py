@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 from plants.quantities import Quantities, Quantity
+from tuning.problems.parameter import squared
 
 VARIANCE = re.compile(r"(Q|R)(?:(\d+)\2)?")  # Q11, Q22, ..., Q1111 of state 11; R, or R11, R22, ...
 
@@ -17,13 +18,8 @@ def labelled(name: str, quantities: Quantities, square: str = "^2") -> str:
         quantities: of the model.
         square: what stands for "squared".
     """
-    words, unit = name.replace("_", " "), _unit(name, quantities)
-    return f"{words} [{squared(unit, square)}]" if unit else words
-
-
-def squared(unit: str, square: str = "^2") -> str:
-    """The unit of a variance: (rad/s)^2 of rad/s."""
-    return f"{unit}{square}" if unit.isalpha() else f"({unit}){square}"
+    words, unit = name.replace("_", " "), squared(_unit(name, quantities)).replace("^2", square)
+    return f"{words} [{unit}]" if unit else words
 
 
 def _unit(name: str, quantities: Quantities) -> str:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from numerics.checks import one_of, shown
 from tuning.evaluation.evaluate import Evaluation
-from tuning.problems.find import Data
+from tuning.problems.data import Data
 
 NIS_BAND = (0.8, 1.25)  # of the mean NIS over what is right: what a constrained study calls consistent
 DIVERGENCE_PENALTY = 10.0  # added for each run that had to restart

@@ -9,9 +9,10 @@ from optuna.distributions import BaseDistribution
 
 from filters.registry import filter_class
 from numerics.checks import positive
-from tuning.problems.find import Data, Scenario
+from tuning.problems.data import Data
+from tuning.problems.problem import Problem
 from tuning.problems.seeds import held_out_seeds, size_seeds, training_seeds
-from tuning.search.objectives import Objective, find_objective
+from tuning.search.objectives import Objective, check_outputs, find_objective
 from tuning.search.space import AUTO, AUTO_KINDS, has_search_space, joint_distributions
 
 TRAINING_SEEDS = 32
@@ -23,7 +24,7 @@ class Plan(NamedTuple):
     """A filter, what to tune it on, what to make small and how to search."""
 
     filter: str  # a name, or "auto" for the best of many kinds
-    scenarios: tuple[Scenario, ...]
+    scenarios: tuple[Problem, ...]
     seed: int = 0
     objectives: tuple[str, ...] = ("score",)
     consistent: bool = True  # whether the mean NIS has to be within its band
@@ -79,6 +80,8 @@ class Plan(NamedTuple):
                 raise ValueError(
                     f"the objective {name!r} needs a filter with a covariance, but got {self.filter!r}"
                 )
+        for problem in self.scenarios:
+            check_outputs(self.objectives, problem.model().outputs, problem.name)
         if self.full_q and not all(filter_class(kind).has_covariance for kind in self.kinds):
             raise ValueError(f"a full Q needs a filter with a covariance, but got {self.filter!r}")
         if self.budget is not None:

@@ -11,7 +11,7 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
-from tuning.problems.find import Data
+from tuning.problems.data import Data
 from tuning.search.cost import COST
 from tuning.search.enqueued import enqueue_followers, enqueue_what_is_left
 from tuning.search.interruption import stop_on_interrupt

@@ -13,7 +13,7 @@ import optuna
 from filters.engine.batch import Estimates, run
 from filters.filter import Filter
 from tuning.evaluation.evaluate import Evaluation, judge, run_scores
-from tuning.problems.find import Data
+from tuning.problems.data import Data
 from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
 from tuning.search.objectives import LARGEST, check_truth, nis_ratio, nis_violation, penalised
 from tuning.search.plan import Plan
@@ -85,7 +85,7 @@ def measure(
     size = count if trial is None else BLOCK
     parts: list[list[Estimates]] = [[] for _ in filters]
     for first in range(0, count, size):
-        block = [Data(*(part[first : first + size] for part in one)) for one in data]
+        block = [one.slice(first, first + size) for one in data]
         for estimates, filter_, one in zip(parts, filters, block, strict=True):
             estimates.append(run(filter_, one.filter_keys, one.inputs, one.measurements))
         if trial is not None:

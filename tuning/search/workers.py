@@ -21,7 +21,8 @@ from contextlib import suppress
 import optuna
 
 from numerics.threads import cores
-from tuning.problems.find import Data, find_scenario
+from tuning.problems.data import Data
+from tuning.problems.find import find_problem
 from tuning.search.interruption import stop_on_interrupt, without_interrupts
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage, retry_orphans, this_process
@@ -132,7 +133,7 @@ def main() -> None:
     quiet_optuna()
     plan = Plan(**orders["plan"])
     try:
-        scenarios, objectives = tuple(map(find_scenario, plan.scenarios)), tuple(plan.objectives)
+        scenarios, objectives = tuple(map(find_problem, plan.scenarios)), tuple(plan.objectives)
         plan = plan._replace(scenarios=scenarios, objectives=objectives)
         study = open_study(orders["study"], plan, open_storage(orders["storage"]), worker=orders["place"])
         run_trials(study, plan, plan.training_data(), orders["trials"], stop=_parent_says_stop)
