@@ -33,9 +33,7 @@ def comparison_table(evaluations: Mapping[str, Evaluation], bound: np.ndarray, w
     outputs = {symbol: one for found in evaluations.values() for symbol, one in found.outputs.items()}
     layout = _across if 2 * len(first.states) + len(outputs) <= MOST_COLUMNS else _below
     columns, rows = layout(evaluations, bound, outputs)
-    caption = (
-        f"above: the bound. ±: half of the 95 % interval. Consistent: NEES {len(bound)}, NIS {right_nis(first)}."
-    )
+    caption = f"above: the bound. ±: half of the 95 % interval. Ideal: NEES {len(bound)}, NIS {right_nis(first)}."
     return table(f"RMSE on {where}", columns, rows, caption=caption)
 
 
@@ -80,7 +78,7 @@ def _innovations_table(evaluations: Mapping[str, Evaluation], where: str) -> Tab
         [name, unless_blank(found.log_likelihood, ".2f"), consistency_cells(found)[1], str(found.divergences)]
         for name, found in evaluations.items()
     ]
-    caption = f"log L: of a run, the more the better. Consistent: NIS {right_nis(first)}. div.: restarts."
+    caption = f"log L: of a run, the more the better. Ideal: NIS {right_nis(first)}. div.: restarts."
     return table(f"Innovations on {where}", ["filter", "log L", "NIS", "div."], rows, caption=caption)
 
 

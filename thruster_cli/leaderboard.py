@@ -114,7 +114,7 @@ def _against(board: Leaderboard) -> Table:
     medians = any(row.nees_is_median for row in board.rows)
     right = f"NEES {n}, NIS {right_nis(board.rows[0].evaluation)}{_median(n) if medians else ''}"
     heads = ["filter", *(state.symbol for state in shown), "score", "NEES", "NIS", "div.", "us/step"]
-    caption = f"±: half of the 95 % interval. Consistent: {right}. div.: restarts."
+    caption = f"±: half of the 95 % interval. Ideal: {right}. div.: restarts."
     return table(f"Over {first}, paired; consistency and cost", heads, rows, caption=caption)
 
 
@@ -136,7 +136,7 @@ def _predictions(board: Leaderboard, title: str) -> Table:
         cells = [unless_blank(found.log_likelihood, ".2f"), gain, consistency_cells(found)[1]]
         rows.append([row.label, *cells, str(found.divergences), f"{row.microseconds:.3g}"])
     right = right_nis(board.rows[0].evaluation)
-    caption = f"log L: of a run. ±: half of the 95 % interval. Consistent: NIS {right}. div.: restarts."
+    caption = f"log L: of a run. ±: half of the 95 % interval. Ideal: NIS {right}. div.: restarts."
     return table(
         title, ["filter", "log L", f"less that\nof {first}", "NIS", "div.", "us/step"], rows, caption=caption
     )

@@ -63,11 +63,13 @@ def _panels(report: ConsistencyReport, comparison: Mapping | None) -> list[Calla
         found.append(partial(_correlations, report=report))
     found += [partial(_distribution, check=check) for check in squares]
     if not np.isnan(report.coverage_by_level).all():
-        coverage = report.coverage, report.coverage_by_level, "truth", _shown(report)[0]
-        found += [partial(_coverage, *coverage), partial(_crps, report=report)]
+        by_level, places = report.coverage_by_level, _shown(report)[0]
+        coverage = partial(_coverage, found=report.coverage, by_level=by_level, what="truth", places=places)
+        found += [coverage, partial(_crps, report=report)]
     elif not (report.has_truth or np.isnan(report.innovation_coverage_by_level).all()):
-        coverage = report.innovation_coverage, report.innovation_coverage_by_level, "measurements"
-        found.append(partial(_coverage, *coverage, range(len(report.channels))))
+        by_level, places = report.innovation_coverage_by_level, range(len(report.channels))
+        shares = {"found": report.innovation_coverage, "by_level": by_level, "places": places}
+        found.append(partial(_coverage, what="measurements", **shares))
     if report.ensemble is not None:
         found.append(partial(_ranks, report=report))
     if comparison:

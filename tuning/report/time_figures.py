@@ -20,7 +20,7 @@ from tuning.report.panels import axis_label, shown_states
 TRUTH, ESTIMATE, ERROR = DARK, BLUE, RUST
 WIDTH = 5.4  # of a filter [inch]
 TALL, LOW = 2.0, 1.3  # relative heights of panels of values and of errors ...
-UNIT, UNIT_OF_MANY = 1.21, 0.9  # ... in so many inches, for up to two states and for more
+UNIT, UNIT_OF_MANY = 8.0 / 6.6, 0.9  # ... in so many inches, for up to two states and for more
 
 
 class Run(NamedTuple):

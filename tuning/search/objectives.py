@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from numerics.checks import one_of, shown
 from tuning.evaluation.evaluate import Evaluation
-from tuning.problems.data import Data
+from tuning.problems.problem import Problem
 
 NIS_BAND = (0.8, 1.25)  # of the mean NIS over what is right: what a constrained study calls consistent
 DIVERGENCE_PENALTY = 10.0  # added for each run that had to restart
@@ -77,24 +77,21 @@ def find_objective(name: str) -> Objective:
     return OBJECTIVES[one_of("objective", name, (*OBJECTIVES, f"{OUTPUT}SYMBOL"))]
 
 
-def check_outputs(names: Iterable[str], outputs: Iterable[str], where: str) -> None:
-    """Raise ValueError if an objective is on a derived output that a problem called `where` has not."""
-    outputs = tuple(outputs)
+def check_objectives(names: Iterable[str], problem: Problem) -> None:
+    """Raise ValueError if an objective needs the truth, or a derived output, and a problem has none such."""
     for name in names:
-        symbol = find_objective(name).output
-        if symbol and symbol not in outputs:
-            has = f"has {', '.join(outputs)}" if outputs else "has none"
-            raise ValueError(f"the objective {shown(name)} needs the derived output {symbol}, but {where} {has}")
-
-
-def check_truth(names: Iterable[str], data: Sequence[Data]) -> None:
-    """Raise ValueError if an objective needs the truth and some data come without."""
-    if all(one.states is not None for one in data):
-        return
-    for name in names:
-        if find_objective(name).needs_truth:
-            free = ", ".join(known for known, objective in OBJECTIVES.items() if not objective.needs_truth)
-            raise ValueError(f"without truth an objective must be one of {free}, but got {shown(name)}")
+        objective = find_objective(name)
+        if objective.needs_truth and problem.scale is None:
+            free = ", ".join(known for known, one in OBJECTIVES.items() if not one.needs_truth)
+            raise ValueError(
+                f"an objective on {problem.name}, which has no truth, must be one of {free}, but got {shown(name)}"
+            )
+        outputs = tuple(problem.model().outputs) if objective.output else ()
+        if objective.output and objective.output not in outputs:
+            has = ", ".join(f"{OUTPUT}{symbol}" for symbol in outputs) or "none"
+            raise ValueError(
+                f"an objective on a derived output of {problem.name} must be one of {has}, but got {shown(name)}"
+            )
 
 
 def penalised(value: float, evaluation: Evaluation) -> float:

@@ -12,7 +12,7 @@ from numerics.checks import positive
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 from tuning.problems.seeds import held_out_seeds, size_seeds, training_seeds
-from tuning.search.objectives import Objective, check_outputs, find_objective
+from tuning.search.objectives import Objective, check_objectives, find_objective
 from tuning.search.space import AUTO, AUTO_KINDS, has_search_space, joint_distributions
 
 TRAINING_SEEDS = 32
@@ -81,7 +81,7 @@ class Plan(NamedTuple):
                     f"the objective {name!r} needs a filter with a covariance, but got {self.filter!r}"
                 )
         for problem in self.scenarios:
-            check_outputs(self.objectives, problem.model().outputs, problem.name)
+            check_objectives(self.objectives, problem)
         if self.full_q and not all(filter_class(kind).has_covariance for kind in self.kinds):
             raise ValueError(f"a full Q needs a filter with a covariance, but got {self.filter!r}")
         if self.budget is not None:

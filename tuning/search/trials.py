@@ -15,7 +15,7 @@ from filters.filter import Filter
 from tuning.evaluation.evaluate import Evaluation, judge, run_scores
 from tuning.problems.data import Data
 from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
-from tuning.search.objectives import LARGEST, check_truth, nis_ratio, nis_violation, penalised
+from tuning.search.objectives import LARGEST, nis_ratio, nis_violation, penalised
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, suggest
 
@@ -46,7 +46,6 @@ def run_trial(
         optuna.TrialPruned: if it is over the plan's budget, or significantly worse than the best one on the seeds
             so far.
     """
-    check_truth(plan.objectives, data)
     choice = suggest(trial, plan.filter, plan.scenarios[0], plan.space())
     on_choice(choice)
     microseconds = math.nan
