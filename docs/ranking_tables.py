@@ -16,8 +16,8 @@ from docs.page import with_tables
 from filters.consistency.intervals import Interval
 from numerics.files import write_whole
 from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender
+from tuning.problems.excitation import Steps
 from tuning.problems.seeds import held_out_seeds
-from tuning.thruster.excitation import Steps
 from tuning.thruster.find import find_scenario
 from tuning.thruster.scenario import Scenario
 from tuning.thruster.scenarios import SCENARIOS

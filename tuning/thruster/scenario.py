@@ -24,8 +24,9 @@ from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_PROCESS_
 from thruster_env.plant_data import plant_data
 from thruster_env.simulation import simulate
 from tuning.problems.data import FIRST_SCORED_STEP, Data
+from tuning.problems.excitation import EXCITATIONS, Excitation, Steps
 from tuning.problems.problem import Problem
-from tuning.thruster.excitation import EXCITATIONS, Excitation, Steps
+from tuning.thruster.excitation import voltages_of
 
 DEEPEST = 10  # levels of mappings and lists in a scenario
 MOST_STEPS = 1_000_000
@@ -218,7 +219,7 @@ class Scenario(Problem):
 @lru_cache(maxsize=8)
 def _data(scenario: Scenario, seeds: tuple[int, ...]) -> Data:
     keys, plant = episode_keys(seeds), scenario.plant
-    voltages = scenario.excitation.voltages(plant, keys, scenario.steps)
+    voltages = voltages_of(scenario.excitation, plant, keys, scenario.steps)
     voltages = np.clip(voltages, -plant.max_voltage, plant.max_voltage)  # as the env does
     simulation = simulate(plant, keys, voltages).checked(f"the plant of scenario {scenario.name}")
     measurements = np.where(simulation.valid, simulation.measurements, np.nan)  # as filters take missing ones

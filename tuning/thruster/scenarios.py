@@ -10,7 +10,8 @@ from __future__ import annotations
 import sys
 
 from numerics.checks import one_of
-from tuning.thruster.excitation import BinarySequence, ClosedLoop, Dwells, MultiSine
+from tuning.problems.excitation import BinarySequence, Dwells, MultiSine
+from tuning.thruster.excitation import ClosedLoop
 from tuning.thruster.scale import computed_scale
 from tuning.thruster.scenario import Scenario
 
