@@ -10,7 +10,7 @@ from rich.table import Table
 from thruster_cli.output import table
 from tuning.likelihood.gradient import GradientResult
 from tuning.problems.problem import Problem
-from tuning.report.units import labelled
+from tuning.report.units import labels
 from tuning.search.filter_types import Kind
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, neutral, parameters_of
@@ -21,12 +21,9 @@ def choice_table(choices: Mapping[str, Choice], scenario: Problem) -> Table:
     kind, caption = next(iter(choices.values())).name, None
     model = scenario.model()
     columns = [parameters_of(choice) for choice in choices.values()]
+    names = labels(dict.fromkeys(name for column in columns for name in column), kind, scenario)
     rows = [
-        [
-            labelled(name, model.quantities),
-            *(_number(column.get(name, neutral(name))) for column in columns),
-        ]
-        for name in dict.fromkeys(name for column in columns for name in column)
+        [label, *(_number(column.get(name, neutral(name))) for column in columns)] for name, label in names.items()
     ]
     if kind == "kf" and model.operating_input is not None:
         pairs = zip(model.operating_input, model.input_quantities, strict=True)

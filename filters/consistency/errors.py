@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from numerics.angles import difference
+
 
 def state_errors(means: np.ndarray, states: np.ndarray, angles: Sequence[bool] = ()) -> np.ndarray:
     """Estimates less truth, (..., n), angles the short way round: e = mean - x, in (-pi, pi] for an angle.
@@ -15,7 +17,4 @@ def state_errors(means: np.ndarray, states: np.ndarray, angles: Sequence[bool] =
         states: truth (..., n).
         angles: which of the n states wrap at 2 pi; none by default.
     """
-    errors = means[..., : states.shape[-1]] - states
-    for i in np.flatnonzero(angles):
-        errors[..., i] = np.pi - (np.pi - errors[..., i]) % (2.0 * np.pi)
-    return errors
+    return difference(means[..., : states.shape[-1]], states, angles)

@@ -20,7 +20,7 @@ class Comparison(NamedTuple):
 
     untuned: Evaluation  # of the rule of thumb
     tuned: Evaluation
-    true: Evaluation  # of the oracle
+    true: Evaluation | None  # of the oracle; None where nobody knows the plant's Q and R
     bound: np.ndarray  # (n,) bound on the standard error of each state
     seeds: range
     scaled: Evaluation | None = None  # of the scaled default; None where there is none

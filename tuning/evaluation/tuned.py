@@ -171,10 +171,13 @@ def metrics(proof: Comparison) -> dict:
     return {
         "seeds": [proof.seeds.start, proof.seeds.stop],
         "bound": [None if math.isnan(part) else part for part in proof.bound.tolist()],
-        **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
-        "scaled": None if proof.scaled is None else summary(proof.scaled),
+        **{name: _summary_of(getattr(proof, name)) for name in ("untuned", "tuned", "true", "scaled")},
         "scaled_default": scaling(proof),
     }
+
+
+def _summary_of(evaluation: Evaluation | None) -> dict | None:
+    return None if evaluation is None else summary(evaluation)
 
 
 def scaling(proof: Comparison) -> dict:

@@ -58,7 +58,8 @@ def scaling_sentence(proof: Comparison) -> str:
         return ""
     if found.choice is None:
         return f"There is no {SCALED}, so the {RULE} comes first: {found.reason}."
+    oracle = f"; the {ORACLE} has the plant's own Q and R" if proof.true is not None else ""
     return (
         f"The {SCALED} is the {RULE} with its Q times {found.factor:.4g}, which brings the mean NIS on the "
-        f"training runs to {found.nis:.2f}; the {ORACLE} has the plant's own Q and R."
+        f"training runs to {found.nis * proof.tuned.channels:.2f}{oracle}."
     )

@@ -13,7 +13,7 @@ from tuning.evaluation.held_out import Comparison
 from tuning.likelihood.identifiability import Identifiability
 from tuning.problems.problem import Problem
 from tuning.report.page import Table
-from tuning.report.units import labelled
+from tuning.report.units import labels
 from tuning.search.space import Choice, neutral, parameters_of
 
 MOST_ACROSS = 3  # states side by side; more stand one below the other
@@ -91,12 +91,16 @@ def numbers_table(choice: Choice, scenario: Problem, seed: int) -> Table:
     found = baselines(choice.name, scenario, seed)
     choices, default = {TUNED: choice, **found}, found[RULE].numbers
     columns = [parameters_of(one._replace(numbers={**default, **one.numbers})) for one in choices.values()]
-    quantities = scenario.model().quantities
+    names = labels(dict.fromkeys(name for column in columns for name in column), choice.name, scenario, "²")
     rows = [
-        [labelled(name, quantities, "²")] + [f"{column.get(name, neutral(name)):.4g}" for column in columns]
-        for name in dict.fromkeys(name for column in columns for name in column)
+        [label, *(_number(column.get(name, neutral(name))) for column in columns)] for name, label in names.items()
     ]
     return Table(f"Numbers of the {choice.name} filter", ["", *choices], rows)
+
+
+def _number(value: float | None) -> str:
+    """A number of a filter; empty where a choice lacks it."""
+    return "" if value is None else f"{value:.4g}"
 
 
 def known_table(found: Identifiability) -> Table:

@@ -1,32 +1,23 @@
-"""Units of the numbers that a study chooses, from the names and units of a model."""
+"""Numbers of a filter in words, each with its unit."""
 
 from __future__ import annotations
 
-import re
+from collections.abc import Iterable
 
-from plants.quantities import Quantities, Quantity
-from tuning.problems.parameter import squared
-
-VARIANCE = re.compile(r"(Q|R)(?:(\d+)\2)?")  # Q11, Q22, ..., Q1111 of state 11; R, or R11, R22, ...
+from tuning.problems.problem import Problem
+from tuning.search.space import parameters
 
 
-def labelled(name: str, quantities: Quantities, square: str = "^2") -> str:
-    """A trial parameter in words with its unit: Q11 is a variance of the first state, R of the measurement.
+def labels(names: Iterable[str], kind: str, problem: Problem, square: str = "^2") -> dict[str, str]:
+    """What tables call the numbers of a filter: Q11 of the thruster is "Q11 [(rad/s)^2]".
 
     Args:
-        name: of the parameter.
-        quantities: of the model.
+        names: of trial parameters.
+        kind: name of the filter.
+        problem: whose parameters have the units.
         square: what stands for "squared".
     """
-    words, unit = name.replace("_", " "), squared(_unit(name, quantities)).replace("^2", square)
-    return f"{words} [{unit}]" if unit else words
-
-
-def _unit(name: str, quantities: Quantities) -> str:
-    """The unit of which a parameter is the square; empty for all that is no variance, and for pure numbers."""
-    found = VARIANCE.fullmatch(name)
-    if found is None:
-        return ""
-    of: tuple[Quantity, ...] = quantities.states if found[1] == "Q" else quantities.measurements
-    place = int(found[2] or 1) - 1
-    return of[place].unit if place < len(of) else ""
+    everything = {} if problem.parameters is not None else {"full_q": True, "prior": True}
+    units = {one.name: one.unit.replace("^2", square) for one in parameters(kind, problem, **everything)}
+    said = {name: name.replace("_", " ") for name in names}
+    return {name: f"{words} [{units[name]}]" if units.get(name) else words for name, words in said.items()}
