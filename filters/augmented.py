@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from numerics.angles import NAMES, short_way
 from numerics.checks import finite, positive
 from numerics.compiled import inlined
 from numerics.derivatives import RELATIVE_STEP
 from numerics.pickling import makes_functions
 from numerics.tuples import tuple_of, written_out
-from plants.layout import constants_form
 from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
 
@@ -58,16 +58,7 @@ def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unkno
         walks.append(positive(f"walk_std of {name}", unknown.walk_std, zero_allowed=True) ** 2)
     if not places:
         raise ValueError("parameters must name at least one constant, but got none")
-    functions = _augmented_functions(
-        inlined(model.transition),
-        inlined(model.observe),
-        model.transition_jacobian,
-        model.observe_jacobian,
-        model.n,
-        model.m,
-        constants_form(model.constants),
-        tuple(places),
-    )
+    functions = _augmented_functions(*model.functions, model.shape, tuple(places))
     spread = np.sqrt(np.add(variances, walks))
     further = {
         "operating_state": means,
@@ -101,10 +92,10 @@ def _block_diagonal(cov: np.ndarray, variances: list[float]) -> np.ndarray:
 
 @makes_functions
 def _augmented_functions(
-    transition, observe, transition_jacobian, observe_jacobian, n, m, form, places
+    transition, transition_jacobian, observe, observe_jacobian, shape, places
 ) -> dict[str, Callable | None]:
     """Functions of the augmented model; its constants are the model's own, then the spread of each parameter."""
-    count, added = form if isinstance(form, int) else len(form._fields), len(places)
+    n, m, form, count, added = shape.n, shape.m, shape.form, shape.constants, len(places)
     values = [f"t[{places.index(i)}]" if i in places else f"c[{i}]" for i in range(count)]
     source = tuple_of(values) if isinstance(form, int) else f"Constants({', '.join(values)})"
     names = {
@@ -125,7 +116,10 @@ def _augmented_functions(
         "observe_jacobian": None,
     }
 
-    def jacobian(name, function, analytic, size, arguments, identity):
+    def slope(i, q, angles):
+        return short_way(f"(above{q}[{i}] - below{q}[{i}])", i, angles) + f" / (2.0 * step{q})"
+
+    def jacobian(name, function, analytic, size, arguments, angles, identity):
         lines = [*begin, f"a = analytic(s, {arguments}fill(t, c))"]
         for q in range(added):
             lines.append(f"step{q} = {RELATIVE_STEP} * (abs(t[{q}]) + c[{count + q}])")
@@ -133,20 +127,20 @@ def _augmented_functions(
                 shifted = tuple_of(f"t[{r}] {sign} step{q}" if r == q else f"t[{r}]" for r in range(added))
                 lines.append(f"{side}{q} = {function}(s, {arguments}fill({shifted}, c))")
         known = [
-            [f"a[{i}][{j}]" for j in range(n)]
-            + [f"(above{q}[{i}] - below{q}[{i}]) / (2.0 * step{q})" for q in range(added)]
-            for i in range(size)
+            [f"a[{i}][{j}]" for j in range(n)] + [slope(i, q, angles) for q in range(added)] for i in range(size)
         ]
         rest = (
             [["1.0" if j == n + q else "0.0" for j in range(n + added)] for q in range(added)] if identity else []
         )
         matrix = tuple_of(tuple_of(row) for row in known + rest)
-        return written_out(name, f"x, {arguments}c", *lines, matrix, analytic=inlined(analytic), **names)
+        return written_out(name, f"x, {arguments}c", *lines, matrix, analytic=inlined(analytic), **names, **NAMES)
 
     if transition_jacobian is not None:
         functions["transition_jacobian"] = jacobian(
-            "transition_jacobian", "f", transition_jacobian, n, "u, ", True
+            "transition_jacobian", "f", transition_jacobian, n, "u, ", shape.state_angles, True
         )
     if observe_jacobian is not None:
-        functions["observe_jacobian"] = jacobian("observe_jacobian", "h", observe_jacobian, m, "", False)
+        functions["observe_jacobian"] = jacobian(
+            "observe_jacobian", "h", observe_jacobian, m, "", shape.measurement_angles, False
+        )
     return functions

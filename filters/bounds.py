@@ -8,14 +8,14 @@ import numpy as np
 
 from numerics.checks import at_least
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from numerics.derivatives import jacobian
 from numerics.matrices import multiplier, quadratic_form
 from numerics.streams import GROUP
 from numerics.threads import spread
 from numerics.tuples import matrix_reader, vector_reader, written_out
 from plants.affine import AffineModel
-from plants.layout import constants_form, constants_reader, number_places, padded
-from plants.simulate import truth_steps_of
+from plants.layout import constants_reader, number_places, padded
+from plants.shape import Functions, Shape, observation_slopes, transition_slopes
+from plants.simulate import truth_steps
 from plants.state_space import StateSpaceModel
 
 
@@ -71,7 +71,7 @@ def posterior_bound(model: StateSpaceModel, inputs: np.ndarray, *, truths: int =
     r_inverse = np.linalg.inv(model.measurement_noise_cov)
     keys = np.random.default_rng(seed).integers(0, 2**32, size=(count, truths, 2)).astype(np.float64)
     f_mean, d11, information = (np.zeros((count, steps + 1, n, n)) for _ in range(3))
-    gather = _gatherer(model, is_interpreting())
+    gather = _gatherer(model.functions, model.shape, is_interpreting())
     spread(
         lambda first, last: gather(
             keys,
@@ -106,26 +106,15 @@ def _less_information(p: np.ndarray, information: np.ndarray) -> np.ndarray:
     return (result + np.swapaxes(result, -1, -2)) / 2
 
 
-def _gatherer(model: StateSpaceModel, interpreting: bool):
-    for function in (model.transition, model.observe):
-        inlined(function)
-    return _build_gatherer(
-        truth_steps_of(model),
-        model.transition,
-        jacobian(model.transition, model.transition_jacobian, model.n, model.n, "u, c"),
-        jacobian(model.observe, model.observe_jacobian, model.m, model.n, "c"),
-        model.n,
-        model.m,
-        model.inputs,
-        constants_form(model.constants),
-        interpreting,
-    )
-
-
 @cache
-def _build_gatherer(steps, transition, transition_matrix, observation_matrix, n, m, inputs, form, interpreting):
-    begin, advance, _ = steps
-    state, control, constants = vector_reader(n), vector_reader(inputs), constants_reader(n, m, form)
+def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
+    n, m, transition = shape.n, shape.m, functions.transition
+    transition_matrix, observation_matrix = (
+        transition_slopes(functions, shape),
+        observation_slopes(functions, shape),
+    )
+    begin, advance, _ = truth_steps(functions, shape)
+    state, control, constants = vector_reader(n), vector_reader(shape.inputs), constants_reader(shape)
     scales = vector_reader(n, number_places(n, m).scales)
     substeps, room = number_places(n, m).substeps, padded(max(n, m), GROUP)
     times, identity = multiplier(n, n, n), matrix_reader(n, n)

@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from numerics.derivatives import RELATIVE_STEP, jacobian
+from numerics.angles import kept
+from numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from numerics.derivatives import RELATIVE_STEP
 from numerics.formulas import formula
 from numerics.matrices import cholesky_factor, innovation, innovation_likelihood, masked, row_solver
 from numerics.threads import spread
@@ -21,7 +22,8 @@ from numerics.tuples import (
     vector_writer,
     written_out,
 )
-from plants.layout import constants_form, constants_reader, number_places
+from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape, observation_slopes, transition_slopes
 from plants.state_space import StateSpaceModel
 
 
@@ -68,15 +70,7 @@ def likelihood(
             f"inputs, measurements, q_slopes and r_slopes must have the shapes {wanted}, but got {shapes}"
         )
     out = np.zeros((count, 1 + parameters))
-    accumulate = _build(
-        inlined(model.transition),
-        jacobian(model.transition, model.transition_jacobian, n, n, "u, c"),
-        inlined(model.observe),
-        jacobian(model.observe, model.observe_jacobian, m, n, "c"),
-        (n, m, model.inputs),
-        constants_form(model.constants),
-        is_interpreting(),
-    )
+    accumulate = _build(model.functions, model.shape, is_interpreting())
     slopes = q_slopes.reshape(parameters, -1), r_slopes.reshape(parameters, -1)
     arguments = inputs, measurements, model.numbers, *slopes, out
     spread(lambda first, last: accumulate(*arguments, first, last), count)
@@ -84,21 +78,31 @@ def likelihood(
 
 
 @cache
-def _build(transition, transition_matrix, observe, observation_matrix, shape, form, interpreting: bool):
-    n, m, inputs = shape
+def _build(functions: Functions, shape: Shape, interpreting: bool):
+    n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
+    transition_matrix, observation_matrix = (
+        transition_slopes(functions, shape),
+        observation_slopes(functions, shape),
+    )
+    transition = kept(transition, "x, u, c", shape.state_angles)
     places = number_places(n, m)
     constants, scales, control = (
-        constants_reader(n, m, form),
+        constants_reader(shape),
         vector_reader(n, places.scales),
-        vector_reader(inputs),
+        vector_reader(shape.inputs),
     )
-    prior_mean, prior_cov = vector_reader(n, places.prior_mean), matrix_reader(n, n, places.prior_cov)
+    prior_mean = kept(vector_reader(n, places.prior_mean), "numbers", shape.state_angles)
+    prior_cov = matrix_reader(n, n, places.prior_cov)
     q, r = matrix_reader(n, n, places.q), matrix_reader(m, m, places.r)
-    control, reading = vector_reader(inputs), vector_reader(m)
+    control, reading = vector_reader(shape.inputs), vector_reader(m)
     q_slope, r_slope = matrix_reader(n, n), matrix_reader(m, m)
     mean_slope, cov_slope = vector_reader(n), matrix_reader(n, n, n)  # a parameter's row: dx, then dP
     store_mean_slope, store_cov_slope = vector_writer(n), matrix_writer(n, n, n)
-    difference, root_of, log_likelihood = innovation(m), cholesky_factor(m), innovation_likelihood(m)
+    difference, root_of, log_likelihood = (
+        innovation(m, shape.measurement_angles),
+        cholesky_factor(m),
+        innovation_likelihood(m),
+    )
     motion_slope = _slope_along(n, n, transition_matrix, "u, c")
     observation_slope = _slope_along(m, n, observation_matrix, "c")
     present_rows, present = _present_rows(m, n), masked(m)
@@ -115,7 +119,7 @@ def _build(transition, transition_matrix, observe, observation_matrix, shape, fo
     uneven_gain = formula("dP H' + P dH' - K dS", H=mn, dH=mn, P=nn, dP=nn, K=nm, dS=mm)
     moved_mean_slope = formula("F dx", F=nn, dx=(n,))
     seen_mean_slope = formula("H dx", H=mn, dx=(n,))  # less the slope of the innovation
-    corrected = formula("x + K v", x=(n,), K=nm, v=(m,))
+    corrected = kept(formula("x + K v", x=(n,), K=nm, v=(m,)), "x, K, v", shape.state_angles)
     corrected_slope = formula("dx + dK v - K dy", dx=(n,), K=nm, dK=nm, v=(m,), dy=(m,))
     reduced = formula("P - K S K'", P=nn, K=nm, S=mm)
     reduced_slope = formula("dP - dK S K' - K dS K' - K S dK'", dP=nn, K=nm, dK=nm, S=mm, dS=mm)

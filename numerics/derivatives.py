@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
+from numerics.angles import NAMES, short_way
 from numerics.compiled import inlined
 from numerics.pickling import makes_functions
 from numerics.tuples import matrix_of, tuple_of, written_out
@@ -38,7 +39,14 @@ def complex_step(function: Callable, rows: int, columns: int, arguments: str) ->
 
 
 @cache
-def jacobian(function: Callable, analytic: Callable | None, rows: int, columns: int, arguments: str) -> Callable:
+def jacobian(
+    function: Callable,
+    analytic: Callable | None,
+    rows: int,
+    columns: int,
+    arguments: str,
+    angles: tuple[bool, ...] = (),
+) -> Callable:
     """Return `jacobian(x, scales, <arguments>)`: d function/dx as a tuple of rows.
 
     Args:
@@ -47,6 +55,7 @@ def jacobian(function: Callable, analytic: Callable | None, rows: int, columns: 
         rows: number of components of the result.
         columns: number of components of x.
         arguments: names of the other arguments, comma separated.
+        angles: which components of the result are angles, so that differences of them go the short way round.
 
     The steps of central differences are relative to |x| + scales, both tuples of `columns` components.
     """
@@ -59,5 +68,10 @@ def jacobian(function: Callable, analytic: Callable | None, rows: int, columns: 
         for name, sign in (("above", "+"), ("below", "-")):
             point = tuple_of(f"x[{i}] {sign} h{j}" if i == j else f"x[{i}]" for i in range(columns))
             lines.append(f"{name}{j} = function({point}, {arguments})")
-    source = matrix_of(rows, columns, lambda i, j: f"(above{j}[{i}] - below{j}[{i}]) / (2.0 * h{j})")
-    return written_out("jacobian", signature, *lines, source, function=inlined(function))
+
+    def slope(i, j):
+        return short_way(f"(above{j}[{i}] - below{j}[{i}])", i, angles) + f" / (2.0 * h{j})"
+
+    return written_out(
+        "jacobian", signature, *lines, matrix_of(rows, columns, slope), function=inlined(function), **NAMES
+    )

@@ -13,6 +13,7 @@ from numerics.checks import covariance, vector
 from numerics.derivatives import jacobian
 from numerics.pickling import makes_functions
 from numerics.tuples import tuple_of, written_out
+from plants.shape import observation_slopes, transition_slopes
 from plants.state_space import StateSpaceModel
 
 
@@ -120,16 +121,16 @@ def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
     if isinstance(model, AffineModel):
         return model
     x, u, c = np.array(state, dtype=np.float64), np.array(control, dtype=np.float64), model.constants
-    n, m, p = model.n, model.m, model.inputs
+    n, p = model.n, model.inputs
     a, b, point, v = np.eye(n), np.zeros((n, p)), tuple(x), tuple(u)
     scales, input_scales = tuple(model.scales), tuple(np.where(u == 0, 1.0, np.abs(u)))
-    step = jacobian(model.transition, model.transition_jacobian, n, n, "u, c")
-    by_input = jacobian(_input_first(model.transition), None, n, p, "state, c")
+    step = transition_slopes(model.functions, model.shape)
+    by_input = jacobian(_input_first(model.transition), None, n, p, "state, c", model.shape.state_angles)
     for _ in range(model.substeps):
         f = np.array(step(point, scales, v, c))
         a, b = f @ a, f @ b + np.array(by_input(v, input_scales, point, c)).reshape(n, p)
         point = model.transition(point, v, c)
-    h = np.array(jacobian(model.observe, model.observe_jacobian, m, n, "c")(tuple(x), scales, c))
+    h = np.array(observation_slopes(model.functions, model.shape)(tuple(x), scales, c))
     return affine_model(
         a=a,
         b=b,

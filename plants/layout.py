@@ -10,6 +10,7 @@ import numpy as np
 
 from numerics.checks import covariance_root
 from numerics.tuples import tuple_of, written_out
+from plants.shape import Shape
 
 LANES = 8  # float64 in the widest vector register: ensembles are padded, so that loops have no remainder
 
@@ -50,17 +51,11 @@ def starts_of(*lengths: int) -> list[int]:
     return [0, *np.cumsum(lengths).tolist()]
 
 
-def constants_form(constants: tuple) -> type | int:
-    """What `constants_reader` needs to know of a model's constants: their NamedTuple class, or how many."""
-    return type(constants) if hasattr(constants, "_fields") else len(constants)
-
-
 @cache
-def constants_reader(n: int, m: int, form: type | int) -> Callable:
+def constants_reader(shape: Shape) -> Callable:
     """Return `read(numbers)`: the model's constants as its functions take them."""
-    start = number_places(n, m).constants
-    count = form if isinstance(form, int) else len(form._fields)
-    values = [f"row[{start + i}]" for i in range(count)]
-    if isinstance(form, int):
+    start = number_places(shape.n, shape.m).constants
+    values = [f"row[{start + i}]" for i in range(shape.constants)]
+    if isinstance(shape.form, int):
         return written_out("read", "row", tuple_of(values))
-    return written_out("read", "row", f"Constants({', '.join(values)})", Constants=form)
+    return written_out("read", "row", f"Constants({', '.join(values)})", Constants=shape.form)

@@ -10,7 +10,8 @@ import numpy as np
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from numerics.streams import GROUP, INITIAL, MEASUREMENT, PROCESS, fill_normals
 from numerics.tuples import vector_reader, vector_writer
-from plants.layout import constants_form, constants_reader, number_places, padded
+from plants.layout import constants_reader, number_places, padded
+from plants.shape import Functions, Shape
 from plants.state_space import StateSpaceModel
 
 
@@ -30,16 +31,17 @@ def add_correlated(out, numbers, root, count, draws):
 
 
 @cache
-def truth_steps(transition, observe, n: int, m: int, inputs: int, form):
+def truth_steps(functions: Functions, shape: Shape):
     """Functions begin(x, draws, key, numbers), advance(x, u, draws, step, key, numbers), measure(z, x, ...).
 
     They work on arrays x (n,), u (inputs,), z (m,), draws with room for GROUP multiples, key (2,).
     """
+    n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
     source = number_places(n, m)
     prior_mean, prior_root, substeps = source.prior_mean, source.prior_root, source.substeps
     q_root, r_root = source.q_root, source.r_root
     state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)
-    control, constants = vector_reader(inputs), constants_reader(n, m, form)
+    control, constants = vector_reader(shape.inputs), constants_reader(shape)
 
     @inlined
     def begin(x, draws, key_0, key_1, numbers):
@@ -67,8 +69,7 @@ def truth_steps(transition, observe, n: int, m: int, inputs: int, form):
 
 def truth_steps_of(model: StateSpaceModel):
     """`truth_steps` for a model."""
-    functions = inlined(model.transition), inlined(model.observe)
-    return truth_steps(*functions, model.n, model.m, model.inputs, constants_form(model.constants))
+    return truth_steps(model.functions, model.shape)
 
 
 @cache

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 
 from numerics.checks import at_least, covariance, covariance_root, one_of, vector
+from numerics.compiled import inlined
 from numerics.derivatives import complex_step
 from numerics.pickling import as_function, as_made
 from plants.model_check import check_functions, checked_constants
 from plants.quantities import Quantities, outputs, quantities
+from plants.shape import Functions, Shape, constants_form
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -131,6 +133,18 @@ class StateSpaceModel:
     def m(self) -> int:
         """Number of measurements."""
         return len(self.measurement_noise_cov)
+
+    @property
+    def shape(self) -> Shape:
+        """Sizes of the model, and what else compiled code is made for."""
+        angles = (tuple(one.angle for one in part) for part in (self.states, self.measurements))
+        return Shape(self.n, self.m, self.inputs, constants_form(self.constants), *angles)
+
+    @property
+    def functions(self) -> Functions:
+        """The model's functions, ready for compiled code."""
+        f, h = inlined(self.transition), inlined(self.observe)
+        return Functions(f, self.transition_jacobian, h, self.observe_jacobian)
 
     def replace(self, **changes) -> StateSpaceModel:
         """The same model with some fields changed."""

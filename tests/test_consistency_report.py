@@ -234,5 +234,5 @@ def test_the_figure_is_drawn(scalar_truth, kind, tmp_path):
         with pytest.raises(ValueError, match="needs something to draw"):
             consistency_figure(tmp_path / "none.png", report, "a title")
     ratios = {"one\nover other": rmse_ratios(np.ones((40, 1)), np.full((40, 1), 2.0))}
-    path = consistency_figure(tmp_path / "new" / "honest.png", report, "a title", ratios)
+    path = consistency_figure(tmp_path / "new" / "calibrated.png", report, "a title", ratios)
     assert path.read_bytes().startswith(b"\x89PNG")

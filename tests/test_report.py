@@ -84,7 +84,7 @@ def test_the_page_of_a_tuned_ensemble_has_all_parts_and_needs_no_network(folder)
         "The study",
         "Error against ensemble size",
         "One run over time",
-        "Is the covariance honest?",
+        "Is the covariance consistent?",
         "What was done",
     ]
     assert "http" not in text and not {"script", "link", "iframe"} & {tag for tag, _ in page.attributes}
@@ -134,7 +134,7 @@ def test_a_baseline_has_no_covariance_to_speak_of():
     report = write_report("s.json", STORAGE)
     assert "covariance" not in report.advice
     page = Page(report.page.read_text())
-    assert "Is the covariance honest?" not in page.headings
+    assert "Is the covariance consistent?" not in page.headings
     assert "| tuned | " in report.tables.read_text() and "nan" not in report.tables.read_text()
 
 

@@ -15,11 +15,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from filters.augmented import Unknown
 from filters.registry import FILTERS, filter_class
 from numerics.checks import at_least
-from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
-from thruster_cli.tables import about, unless_blank
-from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender, sized
-from tuning.evaluation.evaluate import STATES
-from tuning.evaluation.tuned import check_plant, read_tuned, summary
+from thruster_cli.leaderboard import as_json, report
+from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
+from tuning.evaluation.compare import Contender, compare, contender, sized
+from tuning.evaluation.tuned import check_plant, read_tuned
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import has_ensemble
@@ -70,7 +69,8 @@ def command(
     """Rank filters on scenarios: errors, consistency, cost, and which beat the first one on the same seeds.
 
     All filters meet the same truth, inputs and measurements. A filter is better or worse than the first one if
-    the paired 95 % interval of the ratio of their scores leaves out 1. Ctrl-C keeps the rows that are done.
+    the paired 95 % interval of the ratio of their scores leaves out 1; where there is no truth, if that of the
+    difference of their log-likelihoods leaves out 0. Ctrl-C keeps the rows that are done.
 
     Example: thruster compare --filter ekf --filter ekf-robust --filter pf --scenario outliers --scenario ambient
 
@@ -140,90 +140,3 @@ def _bar(total: int) -> Iterator:
 
         yield on_row
         progress.update(task, completed=len(begun))
-
-
-def report(board: Leaderboard) -> list:
-    """Two tables of a scenario and a sentence on who wins."""
-    scenario, seeds = board.scenario, board.seeds
-    first = board.rows[0].label
-    title = f"{scenario.name}: {scenario.about}" if scenario.about else scenario.name
-    errors = table(
-        f"{title}\nRMSE on held-out seeds {seeds[0]} to {seeds[-1]}",
-        ["filter", "omega_m\n[rad/s]", "above\n[%]", "U_a\n[m/s]", "above\n[%]", "start-up\n[rad/s]", "\n[m/s]"],
-        [_errors(row) for row in board.rows] + [_bound_row(board)],
-        caption="above: the bound. ±: half of the 95 % interval. start-up: the first 50 steps.",
-    )
-    right = f"NEES {len(board.bound)}, NIS 1" + (
-        " (~ median NEES, 1.39)" if any(r.nees_is_median for r in board.rows) else ""
-    )
-    ratios = table(
-        f"Over {first}, paired; consistency and cost",
-        ["filter", "omega_m", "U_a", "score", "NEES", "NIS", "div.", "us a step"],
-        [_against(row, row.label == first) for row in board.rows],
-        caption=f"±: half of the 95 % interval. Honest: {right}. div.: restarts.",
-    )
-    for shown in (errors, ratios):
-        shown.columns[0].overflow = "fold"
-    return [errors, ratios, winners(board)]
-
-
-def winners(board: Leaderboard) -> str:
-    """Who is significantly better or worse than the first filter."""
-    first, *others = board.rows
-    if not others:
-        return f"On {board.scenario.name} there is nothing to compare {first.label} with."
-    said = []
-    for verdict, words in (("better", "better"), ("worse", "worse"), ("tie", "no different")):
-        names = [row.label for row in others if row.verdict == verdict]
-        said += [f"{words}: {', '.join(names)}"] if names else []
-    return f"On {board.scenario.name}, against {first.label} by the score: {'; '.join(said)}.\n"
-
-
-def _errors(row: Row) -> list[str]:
-    speed, flow = row.evaluation.rmse
-    above = [unless_blank(100.0 * part, "+.0f") for part in row.above_bound]
-    at_first = [f"{part:.3g}" for part in row.evaluation.start_up_rmse]
-    return [row.label, about(speed, 3), above[0], about(flow, 4), above[1], *at_first]
-
-
-def _bound_row(board: Leaderboard) -> list[str]:
-    return ["bound", unless_blank(board.bound[0], ".3f"), "", unless_blank(board.bound[1], ".4f"), "", "", ""]
-
-
-def _against(row: Row, is_first: bool) -> list[str]:
-    ratios = [about(part, 3) for part in (*row.ratios, row.score_ratio)]
-    ratios = ["1", "1", "1"] if is_first else ratios
-    honest = row.evaluation.nees.value == row.evaluation.nees.value  # baselines have no covariance
-    nees = f"{'~' if row.nees_is_median else ''}{row.nees:.3g}" if honest else ""
-    nis = f"{row.evaluation.nis.value:.3g}" if honest else ""
-    return [row.label, *ratios, nees, nis, f"{row.evaluation.divergences}", f"{row.microseconds:.3g}"]
-
-
-def as_json(boards: list[Leaderboard]) -> dict:
-    """The leaderboards as plain data."""
-    return {
-        "seeds": [boards[0].seeds[0], boards[0].seeds[-1] + 1],
-        "states": STATES,
-        "scenarios": {
-            board.scenario.name: {
-                "about": board.scenario.about,
-                "bound": board.bound,
-                "scale": board.scenario.scale,
-                "filters": {row.label: _row_as_json(row) for row in board.rows},
-            }
-            for board in boards
-        },
-    }
-
-
-def _row_as_json(row: Row) -> dict:
-    return {
-        "filter": row.filter_name,
-        **summary(row.evaluation),
-        "median_nees": row.evaluation.median_nees,
-        "above_bound": row.above_bound,
-        "microseconds_a_step": row.microseconds,
-        "rmse_over_first": row.ratios,
-        "score_over_first": row.score_ratio,
-        "verdict": row.verdict,
-    }

@@ -8,13 +8,14 @@ from typing import Annotated
 import typer
 
 from thruster_cli.consistency import check_request, judge
+from thruster_cli.error_tables import comparison_table
 from thruster_cli.output import FILTER_HELP, JsonOption, SeedOption, announce_compilation, emit, progress_console
-from thruster_cli.tables import choice_table, comparison_table
+from thruster_cli.tables import choice_table
 from thruster_cli.tuning_report import gains
 from tuning.evaluation.baselines import RULE, TUNED, baselines, rule_of_thumb
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import check_plant, metrics, read_tuned
-from tuning.evaluation.worth import scaling_sentence
+from tuning.evaluation.worth import scaling_sentence, without_truth
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.thruster.find import find_scenario
 
@@ -30,7 +31,7 @@ def command(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Also say whether the filter is as sure of itself as it may be, and draw that: a .png file.",
+            help="Also say whether the filter's covariance is consistent, and draw that: a .png file.",
         ),
     ] = None,
     seed: SeedOption = 0,
@@ -44,7 +45,7 @@ def command(
     With --consistency its errors and innovations are held against its own covariances: NEES, NIS, whiteness,
     coverage, CRPS and, for ensembles, ranks; a sentence each, and a picture of all.
 
-    Example: thruster evaluate --filter enkf --scenario mismatch --consistency honest.png
+    Example: thruster evaluate --filter enkf --scenario mismatch --consistency calibrated.png
     """
     if (tuned is None) == (filter_name is None):
         raise ValueError("give either --tuned FILE or --filter NAME")
@@ -70,8 +71,10 @@ def command(
         "scenario": chosen.name,
         **said,
     }
-    title = f"RMSE on held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
-    shown = [choice_table(choices, chosen), comparison_table(evaluations, proof.bound, title)]
+    where = f"held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
+    shown = [choice_table(choices, chosen), comparison_table(evaluations, proof.bound, where)]
+    if tuned is None and not proof.tuned.has_truth:
+        shown.append(without_truth(chosen.name))
     shown += [scaling_sentence(proof)] if tuned is None else gains(proof)
     if consistency is not None:
         name = RULE if tuned is None else TUNED

@@ -11,8 +11,8 @@ import typer
 
 from filters.consistency.intervals import mean_interval
 from numerics.checks import one_of
+from thruster_cli.error_tables import about, unless_blank
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
-from thruster_cli.tables import about, unless_blank
 from thruster_cli.train import LEARNABLE
 from training.extras import check_installed
 from training.observations import find_arm

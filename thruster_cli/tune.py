@@ -47,7 +47,7 @@ def command(
     trials: Annotated[int, typer.Option(help="Finished trials that the study shall have in total.")] = 50,
     objective: Annotated[
         list[str] | None,
-        typer.Option(help=f"What to make small: {', '.join(OBJECTIVES)}; two for a Pareto front."),
+        typer.Option(help=f"What to minimise: {', '.join(OBJECTIVES)}, output:SYMBOL; two for a Pareto front."),
     ] = None,
     any_nis: Annotated[
         bool,

@@ -9,10 +9,11 @@ from filters.gaussian.extended import silenced
 from numerics import matrices
 from numerics.compiled import inlined
 from numerics.tuples import matrix_of, written_out
+from plants.shape import Shape
 
 
 @lru_cache(maxsize=64)
-def measurement_noise_moment(n: int, m: int) -> Callable:
+def measurement_noise_moment(shape: Shape) -> Callable:
     """Return `expect(p, z, predicted, h, r)`: E[v v' | z] of v ~ N(0, R) in z = h(x) + v, for x of covariance P.
 
     With S = H P H' + R and G = R S^-1: E[v | z] = G innovation, and in Joseph's form cov(v | z) is
@@ -20,8 +21,9 @@ def measurement_noise_moment(n: int, m: int) -> Callable:
     e = innovation - H K innovation and the covariance P after the update it is e e' + H P H'. Channels that are
     NaN in z tell nothing; their part of the moment is what R makes of the others.
     """
+    n, m = shape.n, shape.m
     mask, factor, solve = matrices.masked(m), matrices.cholesky_factor(m), matrices.row_solver(m, m)
-    silent, difference = silenced(m, n), matrices.innovation(m)
+    silent, difference = silenced(m, n), matrices.innovation(m, shape.measurement_angles)
     p_ht, h_p_ht = matrices.transposed_multiplier(n, n, m), matrices.multiplier(m, n, m)
     present = written_out(
         "present", "r, z", matrix_of(m, m, lambda i, j: f"(r[{i}][{j}] if z[{j}] == z[{j}] else 0.0)")

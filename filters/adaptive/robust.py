@@ -14,27 +14,28 @@ from filters.gaussian.extended import extended_kernels, gaussian_update, kernels
 from numerics import matrices
 from numerics.checks import at_least, positive
 from numerics.compiled import inlined
-from numerics.derivatives import jacobian
 from numerics.tuples import matrix_of, matrix_reader, vector_reader, written_out
 from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape, observation_slopes
 
 MOST_ITERATIONS = 1000
 
 
 @lru_cache(maxsize=64)
-def robust_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form) -> Kernels:
-    """Kernels for model functions and sizes; extras: the last weight."""
-    places, source, own = memory_places(n, m), number_places(n, m), own_place(n, m, form)
+def robust_kernels(functions: Functions, shape: Shape) -> Kernels:
+    """Kernels for a model's functions and shape; extras: the last weight."""
+    n, m, observe = shape.n, shape.m, functions.observe
+    places, source, own = memory_places(n, m), number_places(n, m), own_place(shape)
     iterations_place, weight_place, likelihood_place = own + 1, places.extras, places.log_likelihood
     read_r, factor, solve = matrix_reader(m, m, source.r), matrices.cholesky_factor(m), matrices.row_solver(m, m)
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     measured, read_scales = vector_reader(m), vector_reader(n, source.scales)
-    constants, observation_matrix = constants_reader(n, m, form), jacobian(observe, observe_jacobian, m, n, "c")
-    plain = extended_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form)
+    constants, observation_matrix = constants_reader(shape), observation_slopes(functions, shape)
+    plain = extended_kernels(functions, shape)
     begin, predict, nothing_to_summarise = plain.start, plain.predict, plain.summarise
     condition, expect, mix, mask = (
-        gaussian_update(n, m),
-        measurement_noise_moment(n, m),
+        gaussian_update(shape),
+        measurement_noise_moment(shape),
         mixer(m),
         matrices.masked(m),
     )

@@ -23,9 +23,9 @@ from filters.gaussian.extended import (
 from numerics import matrices
 from numerics.checks import finite
 from numerics.compiled import inlined
-from numerics.derivatives import jacobian
 from numerics.tuples import matrix_of, matrix_reader, matrix_writer, scaled_sum, vector_reader, written_out
 from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape, observation_slopes
 
 
 @lru_cache(maxsize=64)
@@ -54,19 +54,20 @@ def bounded_step(size: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def sage_husa_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form) -> Kernels:
-    """Kernels for model functions and sizes; extras as the class says."""
-    places, source, own = memory_places(n, m), number_places(n, m), own_place(n, m, form)
+def sage_husa_kernels(functions: Functions, shape: Shape) -> Kernels:
+    """Kernels for a model's functions and shape; extras as the class says."""
+    n, m, observe = shape.n, shape.m, functions.observe
+    places, source, own = memory_places(n, m), number_places(n, m), own_place(shape)
     r_place, q_place, predicted_place = places.extras, places.extras + m * m, places.extras + m * m + n * n
     likelihood_place = places.log_likelihood
     prior_r, prior_q = matrix_reader(m, m, source.r), matrix_reader(n, n, source.q)
     read_r, store_r = matrix_reader(m, m, r_place), matrix_writer(m, m, r_place)
     read_q, store_q = matrix_reader(n, n, q_place), matrix_writer(n, n, q_place)
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     measured, read_scales = vector_reader(m), vector_reader(n, source.scales)
-    constants, observation_matrix = constants_reader(n, m, form), jacobian(observe, observe_jacobian, m, n, "c")
-    begin, condition = gaussian_start(n, m), gaussian_update(n, m)
-    move = extended_prediction(transition, transition_jacobian, n, m, inputs, form)
+    constants, observation_matrix = constants_reader(shape), observation_slopes(functions, shape)
+    begin, condition = gaussian_start(shape), gaussian_update(shape)
+    move = extended_prediction(functions, shape)
     step_r, step_q, square_m, square_n = bounded_step(m), bounded_step(n), outer(m), outer(n)
     mix, change = mixer(n), scaled_sum(n)
     of_present = written_out(

@@ -17,17 +17,18 @@ from filters.gaussian.extended import extended_kernels, gaussian_update, kernels
 from filters.particles.weighted import anything_measured
 from numerics.checks import at_least, positive
 from numerics.compiled import inlined
-from numerics.derivatives import jacobian
 from numerics.tuples import matrix_reader, matrix_writer, vector_reader
 from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape, observation_slopes
 
 MOST_ITERATIONS = 1000
 
 
 @lru_cache(maxsize=64)
-def variational_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form) -> Kernels:
-    """Kernels for model functions and sizes; extras as the class says."""
-    places, source, own = memory_places(n, m), number_places(n, m), own_place(n, m, form)
+def variational_kernels(functions: Functions, shape: Shape) -> Kernels:
+    """Kernels for a model's functions and shape; extras as the class says."""
+    n, m, observe = shape.n, shape.m, functions.observe
+    places, source, own = memory_places(n, m), number_places(n, m), own_place(shape)
     scale_place, weight_place, likelihood_place = places.extras, places.extras + m * m, places.log_likelihood
     kept_place, prior_place, iterations_place = own, own + 1, own + 2
     prior_r, read_scale, store_scale = (
@@ -35,12 +36,12 @@ def variational_kernels(transition, transition_jacobian, observe, observe_jacobi
         matrix_reader(m, m, scale_place),
         matrix_writer(m, m, scale_place),
     )
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     measured, read_scales = vector_reader(m), vector_reader(n, source.scales)
-    constants, observation_matrix = constants_reader(n, m, form), jacobian(observe, observe_jacobian, m, n, "c")
-    plain = extended_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form)
+    constants, observation_matrix = constants_reader(shape), observation_slopes(functions, shape)
+    plain = extended_kernels(functions, shape)
     begin, predict = plain.start, plain.predict
-    condition, expect, mix = gaussian_update(n, m), measurement_noise_moment(n, m), mixer(m)
+    condition, expect, mix = gaussian_update(shape), measurement_noise_moment(shape), mixer(m)
 
     @inlined
     def start(memory, numbers, size):

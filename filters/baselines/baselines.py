@@ -13,40 +13,53 @@ from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
 from filters.gaussian.extended import nothing_to_summarise
 from numerics import matrices
+from numerics.angles import angle_writer, wrapped
 from numerics.checks import at_least, positive
 from numerics.compiled import inlined
-from numerics.tuples import vector_reader, vector_writer
-from plants.layout import constants_form, constants_reader, number_places
+from numerics.tuples import vector_reader
+from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape
+
+
+@inlined
+def blend_numbers(y, z, kept):
+    """What a low-pass makes of its last value y and a measurement z."""
+    return kept * y + (1.0 - kept) * z
+
+
+@inlined
+def blend_angles(y, z, kept):
+    """The same of angles: from y the short way towards z."""
+    return wrapped(y + (1.0 - kept) * wrapped(z - y))
 
 
 @lru_cache(maxsize=64)
-def baseline_kernels(transition, observe, n, m, inputs, form, inverted) -> Kernels:
-    """Kernels of all baselines for model functions and sizes.
+def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, int] | None) -> Kernels:
+    """Kernels of all baselines for a model's functions and shape.
 
     Args:
-        transition: f.
-        observe: h.
-        n: number of states.
-        m: number of measurements.
-        inputs: number of inputs.
-        form: that of `rows.constants_form`.
+        functions: of the model.
+        shape: of the model.
         inverted: (component, channel) that are inverted, or None for the open loop.
 
     Extras: the open loop's state (n,), the low-passed measurement, and 1 once it has a value.
     """
-    places, source, own = memory_places(n, m), number_places(n, m), own_place(n, m, form)
+    n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
+    places, source, own = memory_places(n, m), number_places(n, m), own_place(shape)
     substeps_place, step_place, likelihood_place = source.substeps, places.step, places.log_likelihood
     smooth_place, known_place, reach_place, kept_place = places.extras + n, places.extras + n + 1, own, own + 1
-    read_open, store_open = vector_reader(n, places.extras), vector_writer(n, places.extras)
-    (read_mean, _), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    read_open, store_open = vector_reader(n, places.extras), angle_writer(places.extras, shape.state_angles)
+    (read_mean, _), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     prior_mean, constants, control = (
         vector_reader(n, source.prior_mean),
-        constants_reader(n, m, form),
-        vector_reader(inputs),
+        constants_reader(shape),
+        vector_reader(shape.inputs),
     )
-    measured, difference = vector_reader(m), matrices.innovation(m)
+    measured, difference = vector_reader(m), matrices.innovation(m, shape.measurement_angles)
     component, channel = inverted or (0, 0)
-    solve, inverts = component_solver(observe, n, component, channel), inverted is not None
+    angle, inverts = shape.measurement_angles[channel], inverted is not None
+    solve = component_solver(observe, n, component, channel, angle)
+    blend = blend_angles if angle else blend_numbers
     no_cov, no_s = ((0.0,) * n,) * n, ((0.0,) * m,) * m
 
     @inlined
@@ -83,7 +96,7 @@ def baseline_kernels(transition, observe, n, m, inputs, form, inverted) -> Kerne
         row[likelihood_place] = 0.0
         if inverts and z[channel] == z[channel]:
             kept = numbers[kept_place] * row[known_place]
-            row[smooth_place] = kept * row[smooth_place] + (1.0 - kept) * z[channel]
+            row[smooth_place] = blend(row[smooth_place], z[channel], kept)
             row[known_place] = 1.0
             estimate(row, numbers)
 
@@ -103,9 +116,7 @@ class OpenLoop(Filter):
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
-        model, pair = self.kernel_model, self.inverted_pair
-        functions = inlined(model.transition), inlined(model.observe)
-        return baseline_kernels(*functions, model.n, model.m, model.inputs, constants_form(model.constants), pair)
+        return baseline_kernels(self.kernel_model.functions, self.kernel_model.shape, self.inverted_pair)
 
     @property
     def inverted_pair(self) -> tuple[int, int] | None:

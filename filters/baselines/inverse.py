@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 
+from numerics.angles import wrapped
 from numerics.compiled import inlined
 from numerics.tuples import tuple_of, written_out
 
@@ -14,19 +16,35 @@ _GOLDEN = 0.6180339887498949
 
 
 @lru_cache(maxsize=64)
-def component_solver(observe: Callable, n: int, component: int, channel: int) -> Callable:
+def component_solver(observe: Callable, n: int, component: int, channel: int, angle: bool = False) -> Callable:
     """Return `solve(x, z, c, reach)`: x with the value of one component at which channel h_i(x) = z.
 
     It is the root nearest to the value in x, among those within `reach` of it whose sign change shows between two
     of 100 equal steps on either side. If there is none, it is the value at which h comes nearest to z, as found by
-    a golden section about the nearest step.
+    a golden section about the nearest step. Where the channel is an `angle`, h_i(x) - z goes the short way round,
+    and its jump half a turn away is no root.
     """
     entries = ("v" if i == component else f"x[{i}]" for i in range(n))
     place = written_out("place", "x, v", tuple_of(entries))
 
     @inlined
-    def misfit(x, v, z, c):
+    def misfit_of_number(x, v, z, c):
         return observe(place(x, v), c)[channel] - z
+
+    @inlined
+    def misfit_of_angle(x, v, z, c):
+        return wrapped(observe(place(x, v), c)[channel] - z)
+
+    @inlined
+    def crossing_of_number(one, other):
+        return (other > 0.0) != (one > 0.0)
+
+    @inlined
+    def crossing_of_angle(one, other):
+        return (other > 0.0) != (one > 0.0) and abs(other - one) < math.pi
+
+    misfit = misfit_of_angle if angle else misfit_of_number
+    crossing = crossing_of_angle if angle else crossing_of_number
 
     @inlined
     def halved(x, z, c, one, other, at_one):
@@ -56,7 +74,7 @@ def component_solver(observe: Callable, n: int, component: int, channel: int) ->
         nearest, least = start, abs(below)
         for k in range(1, INTERVALS + 1):
             next_below, next_above = misfit(x, start - k * step, z, c), misfit(x, start + k * step, z, c)
-            crossed_below, crossed_above = (next_below > 0.0) != (below > 0.0), (next_above > 0.0) != (above > 0.0)
+            crossed_below, crossed_above = crossing(below, next_below), crossing(above, next_above)
             if crossed_below or crossed_above:
                 inner = (k - 1) * step
                 down = halved(x, z, c, start - inner, start - k * step, below) if crossed_below else start - reach

@@ -11,8 +11,10 @@ from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
+from numerics.angles import angle_writer
 from numerics.tuples import matrix_reader, matrix_writer, vector_reader, vector_writer
 from plants.layout import number_places, starts_of
+from plants.shape import Shape
 
 
 class MemoryPlaces(NamedTuple):
@@ -37,25 +39,31 @@ def memory_places(n: int, m: int) -> MemoryPlaces:
     return MemoryPlaces(*starts_of(n, n * n, 1, 1, 1, 1, m, m * m, 1, n * m))
 
 
+def mean_writer(shape: Shape) -> Callable:
+    """Return `store(row, x)`: write the mean, its angles in (-pi, pi]."""
+    return angle_writer(memory_places(shape.n, shape.m).mean, shape.state_angles)
+
+
 @cache
-def row_access(n: int, m: int) -> tuple[tuple[Callable, Callable], ...]:
+def row_access(shape: Shape) -> tuple[tuple[Callable, Callable], ...]:
     """Functions that read and write a filter's row, as pairs: a vector's, then that of its covariance.
 
-    Vectors are tuples, covariances tuples of rows.
+    Vectors are tuples, covariances tuples of rows. Angles in a mean are kept in (-pi, pi].
 
     Returns:
         `read(row)` of the mean (n,) and its covariance (n, n).
         `write(row, value)` of the same.
         `write(row, value)` of the innovation (m,) and its covariance (m, m).
     """
+    n, m = shape.n, shape.m
     places = memory_places(n, m)
     return (
         (vector_reader(n, places.mean), matrix_reader(n, n, places.cov)),
-        (vector_writer(n, places.mean), matrix_writer(n, n, places.cov)),
+        (mean_writer(shape), matrix_writer(n, n, places.cov)),
         (vector_writer(m, places.innovation), matrix_writer(m, m, places.innovation_cov)),
     )
 
 
-def own_place(n: int, m: int, form: type | int) -> int:
-    """First place of a filter's own numbers, behind those of its model; form is that of `constants_form`."""
-    return number_places(n, m).constants + (form if isinstance(form, int) else len(form._fields))
+def own_place(shape: Shape) -> int:
+    """First place of a filter's own numbers, behind those of its model."""
+    return number_places(shape.n, shape.m).constants + shape.constants

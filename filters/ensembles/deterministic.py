@@ -11,6 +11,7 @@ from filters.ensembles.ensemble import EnsembleFilter, measurement_moments
 from numerics import matrices
 from numerics.compiled import inlined
 from numerics.tuples import column_writer, matrix_of, tuple_of, written_out
+from plants.shape import Shape
 
 
 @cache
@@ -26,13 +27,14 @@ def moved_member(n: int, m: int, first: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def deterministic_analysis(gain: Callable, observe, n, m, form) -> Callable:
+def deterministic_analysis(gain: Callable, observe: Callable, shape: Shape) -> Callable:
     """Return `analyse(memory, z, numbers, size)`: x_j += K innovation - G (y_j - mean(y)), K = cov(x, y) S^-1.
 
     The mean moves as the Kalman filter's. `gain(cross, s, r, root)` returns G (n, m), which decides on the spread,
     from cov(x, y) (n, m), S = cov(y, y) + R, R (m, m) and the lower triangular root of S.
     """
-    compare, solve = measurement_moments(observe, n, m, form), matrices.row_solver(n, m)
+    n, m = shape.n, shape.m
+    compare, solve = measurement_moments(observe, shape), matrices.row_solver(n, m)
     apply, store, moved = matrices.vector_multiplier(n, m), column_writer(n), moved_member(n, m, n)
 
     @inlined
@@ -60,9 +62,9 @@ def half_gain(n: int, m: int) -> Callable:
 
 
 @cache
-def half_gain_analysis(observe, n, m, form) -> Callable:
+def half_gain_analysis(observe: Callable, shape: Shape) -> Callable:
     """The analysis of the deterministic ensemble Kalman filter; see `ensemble_kernels`."""
-    return deterministic_analysis(half_gain(n, m), observe, n, m, form)
+    return deterministic_analysis(half_gain(shape.n, shape.m), observe, shape)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import ClassVar
 
 from filters.engine.belief import Kernels
@@ -13,6 +13,7 @@ from filters.ensembles.inflation import with_spread_control
 from filters.ensembles.members import add_noise, drawer, ensemble_motion, row_covariances, row_means
 from filters.filter import Filter
 from numerics import matrices
+from numerics.angles import row_aligner
 from numerics.checks import at_least, positive, shown
 from numerics.compiled import inlined
 from numerics.streams import FILTER_MEASUREMENT
@@ -24,29 +25,33 @@ from numerics.tuples import (
     vector_reader,
     written_out,
 )
-from plants.layout import constants_form, constants_reader, number_places
+from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape
 
 LARGEST_ENSEMBLE = 1_000_000
 
 
 @lru_cache(maxsize=64)
-def measurement_moments(observe, n, m, form) -> Callable:
+def measurement_moments(observe: Callable, shape: Shape) -> Callable:
     """Return `compare(memory, z, numbers, size)`: what the members expect to be measured, against z.
 
     It puts y_j = h(x_j) into rows n ... of the table, innovation, S and log-likelihood into the row, and returns
     mean(y) (m,), innovation = z - mean(y) (m,), cov(x, y) (n, m), S = cov(y, y) + R, R (m, m) and the lower
     triangular root of S. In a channel that is NaN in z, y_j is 0, and R has no correlations.
     """
+    n, m = shape.n, shape.m
     places, source = memory_places(n, m), number_places(n, m)
     likelihood_place = places.log_likelihood
-    constants, state, store = constants_reader(n, m, form), column_reader(n), column_writer(m, n)
+    constants, state, store = constants_reader(shape), column_reader(n), column_writer(m, n)
     means_of_all, covariances_with_predicted = row_means(n + m), row_covariances(0, n + m, n, m)
     of_states = written_out("of_states", "c", tuple_of(f"c[{i}]" for i in range(n)))
     of_predicted = written_out("of_predicted", "c", tuple_of(f"c[{n + i}]" for i in range(m)))
     read_r, mask, add = matrix_reader(m, m, source.r), matrices.masked(m), matrices.symmetric_sum(m)
-    _, _, (store_innovation, store_s) = row_access(n, m)
+    _, _, (store_innovation, store_s) = row_access(shape)
     factor, likelihood = matrices.cholesky_factor(m), matrices.innovation_likelihood(m)
-    difference, measured = matrices.innovation(m), vector_reader(m)
+    difference, measured = matrices.innovation(m, shape.measurement_angles), vector_reader(m)
+
+    silence = silencer(n, shape.measurement_angles)
 
     @inlined
     def compare(memory, z, numbers, size):
@@ -54,7 +59,7 @@ def measurement_moments(observe, n, m, form) -> Callable:
         c = constants(numbers)
         for j in range(table.shape[1]):
             store(table, j, observe(state(table, j), c))
-        silence(table, n, z)
+        silence(table, z, size)
         means = means_of_all(table, size)
         covariances = covariances_with_predicted(table, size, means)
         present, expected = measured(z), of_predicted(means)
@@ -70,32 +75,46 @@ def measurement_moments(observe, n, m, form) -> Callable:
     return compare
 
 
-@inlined
-def silence(table, first, z):
-    """Rows first, first + 1, ... = 0 where z is NaN: what is constant has no covariance with anything."""
-    for i in range(z.shape[0]):
-        if z[i] != z[i]:
-            for j in range(table.shape[1]):
-                table[first + i, j] = 0.0
+@cache
+def silencer(first: int, angles: tuple[bool, ...], weights: int | None = None) -> Callable:
+    """Return `silence(table, z, size)`, for rows first, first + 1, ... of what the members expect to be measured.
+
+    They become 0 where z is NaN: what is constant has no covariance with anything. Angles are put on one branch.
+    """
+
+    @inlined
+    def silence(table, z, size):
+        for i in range(z.shape[0]):
+            if z[i] != z[i]:
+                for j in range(table.shape[1]):
+                    table[first + i, j] = 0.0
+
+    if not any(angles):
+        return silence
+    align = row_aligner(first, angles, weights)
+
+    @inlined
+    def silence_and_align(table, z, size):
+        silence(table, z, size)
+        align(table, size)
+
+    return silence_and_align
 
 
 @lru_cache(maxsize=64)
-def ensemble_kernels(analysis, transition, observe, n, m, inputs, form) -> Kernels:
-    """Kernels of an ensemble filter for model functions and sizes.
+def ensemble_kernels(analysis: Callable, functions: Functions, shape: Shape) -> Kernels:
+    """Kernels of an ensemble filter for a model's functions and shape.
 
     Args:
-        analysis: analysis(observe, n, m, form) returns `analyse(memory, z, numbers, size)`, which moves the
-            members and sets the innovation, its covariance and its likelihood.
-        transition: f.
-        observe: h.
-        n: number of states.
-        m: number of measurements.
-        inputs: number of inputs.
-        form: that of `rows.constants_form`.
+        analysis: analysis(observe, shape) returns `analyse(memory, z, numbers, size)`, which moves the members
+            and sets the innovation, its covariance and its likelihood.
+        functions: of the model.
+        shape: of the model.
 
     The table's rows: n of members, m of predicted measurements, m of scratch.
     """
-    motion, analyse = ensemble_motion(transition, n, m, inputs, form), analysis(observe, n, m, form)
+    n, m, observe = shape.n, shape.m, functions.observe
+    motion, analyse = ensemble_motion(functions.transition, shape), analysis(observe, shape)
     summarise = motion.summarise
 
     @inlined
@@ -153,20 +172,22 @@ class EnsembleFilter(Filter):
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
         model = self.kernel_model
-        functions = inlined(model.transition), inlined(model.observe)
-        form = constants_form(model.constants)
-        plain = ensemble_kernels(type(self).analysis, *functions, model.n, model.m, model.inputs, form)
+        plain = ensemble_kernels(type(self).analysis, model.functions, model.shape)
         # Compiled in only where it does something: in the loop over steps even an idle branch takes a tenth.
         neutral = self.inflation == 1.0 and self.relaxation == 0.0
-        return plain if neutral else with_spread_control(plain, form)
+        return plain if neutral else with_spread_control(plain, model.shape)
 
 
 @lru_cache(maxsize=64)
-def perturbed_analysis(observe, n, m, form) -> Callable:
+def perturbed_analysis(observe: Callable, shape: Shape) -> Callable:
     """Return `analyse(memory, z, numbers, size)` of the stochastic ensemble Kalman filter."""
+    n, m = shape.n, shape.m
     r_root_place = number_places(n, m).r_root
-    compare, draw, solve = measurement_moments(observe, n, m, form), drawer(n, m), matrices.row_solver(n, m)
-    filled = written_out("filled", "z", tuple_of(f"z[{i}] if z[{i}] == z[{i}] else 0.0" for i in range(m)))
+    compare, draw, solve = measurement_moments(observe, shape), drawer(n, m), matrices.row_solver(n, m)
+    # Where it is an angle, z on the branch of what the members expect.
+    there = [f"y[{i}] + v[{i}]" if angle else f"z[{i}]" for i, angle in enumerate(shape.measurement_angles)]
+    entries = (f"{source} if z[{i}] == z[{i}] else 0.0" for i, source in enumerate(there))
+    filled = written_out("filled", "z, y, v", tuple_of(entries))
     lines = [f"    d{i} = z[{i}] - table[{n + i}, j]" for i in range(m)]
     for a in range(n):
         lines.append(f"    table[{a}, j] += {' + '.join(f'k[{a}][{i}] * d{i}' for i in range(m))}")
@@ -175,10 +196,10 @@ def perturbed_analysis(observe, n, m, form) -> Callable:
     @inlined
     def analyse(memory, z, numbers, size):
         row, table, draws = memory
-        _, _, cross, _, _, root = compare(memory, z, numbers, size)
+        expected, innovation, cross, _, _, root = compare(memory, z, numbers, size)
         draw(draws, m * table.shape[1], row, FILTER_MEASUREMENT)
         add_noise(table, n, m, draws, numbers, r_root_place)
-        nudge(table, solve(cross, root), filled(z))
+        nudge(table, solve(cross, root), filled(z, expected, innovation))
 
     return analyse
 

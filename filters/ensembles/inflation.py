@@ -10,6 +10,7 @@ from filters.engine.layout import memory_places, own_place
 from filters.ensembles.members import row_covariances, row_means
 from numerics.compiled import inlined
 from numerics.tuples import tuple_of, vector_reader, written_out
+from plants.shape import Shape
 
 
 @cache
@@ -20,7 +21,7 @@ def spread_scaler(n: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def with_spread_control(kernels: Kernels, form) -> Kernels:
+def with_spread_control(kernels: Kernels, shape: Shape) -> Kernels:
     """An ensemble's kernels with inflation and relaxation, by the first two of the filter's own numbers.
 
         predict: ..., then x_j = mean + inflation (x_j - mean)
@@ -31,10 +32,20 @@ def with_spread_control(kernels: Kernels, form) -> Kernels:
     """
     n, m, summarise = kernels.n, kernels.m, kernels.summarise
     predict_plainly, update_plainly, cov_place = kernels.predict, kernels.update, memory_places(n, m).cov
-    inflation_place = own_place(n, m, form)
+    inflation_place = own_place(shape)
     relaxation_place = inflation_place + 1
     means_of, covariances_of, scale = row_means(n), row_covariances(0, n, 0, n), spread_scaler(n)
     read_mean = vector_reader(n, memory_places(n, m).mean)
+
+    @inlined
+    def centre_as_kept(row, table, size):
+        return read_mean(row)
+
+    @inlined
+    def centre_on_the_branch(row, table, size):
+        return means_of(table, size)
+
+    centre = centre_on_the_branch if any(shape.state_angles) else centre_as_kept
     variances = written_out("variances", "row", tuple_of(f"row[{cov_place + i * (n + 1)}]" for i in range(n)))
     diagonal = written_out("diagonal", "p", tuple_of(f"p[{i}][{i}]" for i in range(n)))
     alike = written_out("alike", "factor", tuple_of(["factor"] * n))
@@ -53,7 +64,7 @@ def with_spread_control(kernels: Kernels, form) -> Kernels:
         before = diagonal(covariances_of(table, size, means_of(table, size)))
         update_plainly(memory, z, numbers, size)
         if numbers[relaxation_place] != 0.0:
-            scale(table, read_mean(row), towards(variances(row), before, numbers[relaxation_place]))
+            scale(table, centre(row, table, size), towards(variances(row), before, numbers[relaxation_place]))
             summarise(memory, size)
 
     return kernels._replace(predict=predict, update=update)

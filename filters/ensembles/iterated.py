@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from filters.engine.layout import own_place
 from filters.ensembles.deterministic import moved_member
-from filters.ensembles.ensemble import EnsembleFilter, measurement_moments, silence
+from filters.ensembles.ensemble import EnsembleFilter, measurement_moments, silencer
 from filters.ensembles.members import row_covariances, row_means
 from filters.ensembles.transform import geometric_mean, transform_gain
 from numerics import matrices
@@ -17,6 +17,7 @@ from numerics.checks import at_least
 from numerics.compiled import inlined
 from numerics.tuples import column_writer, tuple_of, vector_reader, written_out
 from plants.layout import constants_reader
+from plants.shape import Shape
 
 MOST_ITERATIONS = 1000
 
@@ -42,11 +43,13 @@ def linear_prediction(m: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def iterated_analysis(observe, n, m, form) -> Callable:
+def iterated_analysis(observe: Callable, shape: Shape) -> Callable:
     """The analysis of the iterated ensemble Kalman filter; see `ensemble_kernels`."""
-    slopes, iterations_place = n + m, own_place(n, m, form) + 2  # Y lies in rows n + m ... of the table
-    compare, gain, geometric = measurement_moments(observe, n, m, form), transform_gain(n, m), geometric_mean(m)
-    constants, measured, difference = constants_reader(n, m, form), vector_reader(m), matrices.innovation(m, n)
+    n, m = shape.n, shape.m
+    slopes, iterations_place = n + m, own_place(shape) + 2  # Y lies in rows n + m ... of the table
+    compare, gain, geometric = measurement_moments(observe, shape), transform_gain(n, m), geometric_mean(m)
+    constants, measured = constants_reader(shape), vector_reader(m)
+    difference = matrices.innovation(m, shape.measurement_angles, n)
     store_state, store_predicted, store_slopes = column_writer(n), column_writer(m, n), column_writer(m, slopes)
     moved, undone, predict = moved_member(n, m, slopes), transform_undone(n, m), linear_prediction(m)
     add, factor, solve = matrices.symmetric_sum(m), matrices.cholesky_factor(m), matrices.row_solver(m, m)
@@ -55,6 +58,7 @@ def iterated_analysis(observe, n, m, form) -> Callable:
     of_states_and_slopes, none = row_covariances(0, n, slopes, m), (0.0,) * m
     known = [*(f"means[{i}]" for i in range(n + m)), *["0.0"] * m]
     with_slopes = written_out("with_slopes", "means", tuple_of(known))
+    silence = silencer(n, shape.measurement_angles)
     total = written_out("total", "a, b", tuple_of(f"a[{i}] + b[{i}]" for i in range(m)))
 
     @inlined
@@ -70,7 +74,7 @@ def iterated_analysis(observe, n, m, form) -> Callable:
         for _ in range(1, int(numbers[iterations_place])):
             for j in range(table.shape[1]):
                 store_predicted(table, j, observe(moved(table, j, shift, g, none), c))
-            silence(table, n, z)
+            silence(table, z, size)
             means = with_slopes(means_of(table, size))
             e = of_predicted_and_slopes(table, size, means)
             d = solve(e, factor(add(r, geometric(r, s))))

@@ -7,10 +7,12 @@ from functools import cache, lru_cache
 from typing import NamedTuple
 
 from filters.engine.layout import memory_places, row_access
+from numerics.angles import row_aligner
 from numerics.compiled import inlined
 from numerics.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
 from numerics.tuples import column_reader, column_writer, matrix_of, tuple_of, vector_reader, written_out
 from plants.layout import constants_reader, number_places
+from plants.shape import Shape
 
 
 @inlined
@@ -75,6 +77,22 @@ def row_covariances(first: int, rows: int, second: int, columns: int) -> Callabl
     )
 
 
+def _aligned(start: Callable, predict: Callable, align: Callable) -> tuple[Callable, Callable]:
+    """Both, with states that are angles put on one branch at the end; updates then move the members as numbers."""
+
+    @inlined
+    def start_aligned(memory, numbers, size):
+        start(memory, numbers, size)
+        align(memory[1], size)
+
+    @inlined
+    def predict_aligned(memory, u, numbers, size):
+        predict(memory, u, numbers, size)
+        align(memory[1], size)
+
+    return start_aligned, predict_aligned
+
+
 class Motion(NamedTuple):
     """What all ensembles do alike, for one shape of model."""
 
@@ -84,14 +102,15 @@ class Motion(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def ensemble_motion(transition, n, m, inputs, form) -> Motion:
+def ensemble_motion(transition: Callable, shape: Shape) -> Motion:
     """Prior, motion x_j = f(x_j, u) + w_j with w_j ~ N(0, Q), and moments of an ensemble."""
+    n, m = shape.n, shape.m
     places, source = memory_places(n, m), number_places(n, m)
     prior_mean_place, prior_root_place = source.prior_mean, source.prior_root
     q_root_place, substeps_place, step_place = source.q_root, source.substeps, places.step
     means_of_members, covariances_of_members = row_means(n), row_covariances(0, n, 0, n)
-    _, (store_mean, store_cov), _ = row_access(n, m)
-    constants, control = constants_reader(n, m, form), vector_reader(inputs)
+    _, (store_mean, store_cov), _ = row_access(shape)
+    constants, control = constants_reader(shape), vector_reader(shape.inputs)
     state, store_state, draw = column_reader(n), column_writer(n), drawer(n, m)
 
     @inlined
@@ -113,6 +132,9 @@ def ensemble_motion(transition, n, m, inputs, form) -> Motion:
         row[step_place] += 1.0
         draw(draws, n * table.shape[1], row, FILTER_PROCESS)
         add_noise(table, 0, n, draws, numbers, q_root_place)
+
+    if any(shape.state_angles):
+        start, predict = _aligned(start, predict, row_aligner(0, shape.state_angles))
 
     @inlined
     def summarise(memory, size):

@@ -12,6 +12,7 @@ from filters.ensembles.ensemble import EnsembleFilter
 from numerics import matrices
 from numerics.compiled import inlined
 from numerics.tuples import matrix_of, written_out
+from plants.shape import Shape
 
 
 @cache
@@ -32,9 +33,9 @@ def serial_gain(n: int, m: int) -> Callable:
 
 
 @cache
-def serial_analysis(observe, n, m, form) -> Callable:
+def serial_analysis(observe: Callable, shape: Shape) -> Callable:
     """The analysis of the serial ensemble square root filter; see `ensemble_kernels`."""
-    return deterministic_analysis(serial_gain(n, m), observe, n, m, form)
+    return deterministic_analysis(serial_gain(shape.n, shape.m), observe, shape)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -12,6 +12,7 @@ from filters.ensembles.ensemble import EnsembleFilter
 from numerics import matrices
 from numerics.compiled import inlined
 from numerics.tuples import matrix_of, written_out
+from plants.shape import Shape
 
 ROUNDS = 14  # enough for condition numbers of 1e16: at the end each round doubles the figures
 
@@ -67,9 +68,9 @@ def transform_gain(n: int, m: int) -> Callable:
 
 
 @cache
-def transform_analysis(observe, n, m, form) -> Callable:
+def transform_analysis(observe: Callable, shape: Shape) -> Callable:
     """The analysis of the ensemble transform Kalman filter; see `ensemble_kernels`."""
-    return deterministic_analysis(transform_gain(n, m), observe, n, m, form)
+    return deterministic_analysis(transform_gain(shape.n, shape.m), observe, shape)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

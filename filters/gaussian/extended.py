@@ -12,18 +12,19 @@ from filters.engine.layout import memory_places, row_access
 from filters.filter import Filter
 from numerics import matrices
 from numerics.compiled import inlined
-from numerics.derivatives import jacobian
 from numerics.tuples import matrix_of, matrix_reader, matrix_writer, scaled_sum, vector_reader, written_out
-from plants.layout import constants_form, constants_reader, number_places
+from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape, observation_slopes, transition_slopes
 from plants.state_space import StateSpaceModel
 
 
 @lru_cache(maxsize=64)
-def gaussian_start(n: int, m: int) -> Callable:
+def gaussian_start(shape: Shape) -> Callable:
     """Return `start(memory, numbers, size)`: belief = prior, for filters of mean and covariance."""
+    n, m = shape.n, shape.m
     source = number_places(n, m)
     read_mean, read_cov = vector_reader(n, source.prior_mean), matrix_reader(n, n, source.prior_cov)
-    _, (store_mean, store_cov), _ = row_access(n, m)
+    _, (store_mean, store_cov), _ = row_access(shape)
 
     @inlined
     def start(memory, numbers, size):
@@ -40,16 +41,17 @@ def nothing_to_summarise(memory, size):
 
 
 @lru_cache(maxsize=64)
-def gaussian_innovation(n: int, m: int) -> Callable:
+def gaussian_innovation(shape: Shape) -> Callable:
     """Return `compare(p, z, predicted, h, r)`: what a measurement says, and how sure it is.
 
     It returns innovation = z - predicted, S = H P H' + R, the lower triangular root of S, P H', and H and R as
     they are without the channels that are NaN in z: zeros in the innovation and in H, no correlations in R.
     """
+    n, m = shape.n, shape.m
     mask, factor, present, silent = (
         matrices.masked(m),
         matrices.cholesky_factor(m),
-        matrices.innovation(m),
+        matrices.innovation(m, shape.measurement_angles),
         silenced(m, n),
     )
     p_ht, s_part, add = (
@@ -85,14 +87,15 @@ def joseph_form(n: int, m: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def gaussian_update(n: int, m: int) -> Callable:
+def gaussian_update(shape: Shape) -> Callable:
     """Return `condition(mean, p, z, predicted, h, r)`: the Kalman update, as a function of tuples.
 
     innovation = z - predicted, S = H P H' + R, K = P H' S^-1, mean + K innovation,
     (I - K H) P (I - K H)' + K R K' (Joseph's form). Channels that are NaN in z have no effect. It returns the new
     mean and covariance, the innovation, S and the log-likelihood.
     """
-    compare, reduce, likelihood = gaussian_innovation(n, m), joseph_form(n, m), matrices.innovation_likelihood(m)
+    n, m = shape.n, shape.m
+    compare, reduce, likelihood = gaussian_innovation(shape), joseph_form(n, m), matrices.innovation_likelihood(m)
     solve, apply, add = matrices.row_solver(n, m), matrices.vector_multiplier(n, m), scaled_sum(n)
 
     @inlined
@@ -113,10 +116,11 @@ def silenced(m: int, columns: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def gaussian_correction(n: int, m: int) -> Callable:
+def gaussian_correction(shape: Shape) -> Callable:
     """Return `correct(row, z, predicted, h, r)`: `gaussian_update` of the belief in a row."""
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_innovation_cov) = row_access(n, m)
-    log_likelihood_place, condition = memory_places(n, m).log_likelihood, gaussian_update(n, m)
+    n, m = shape.n, shape.m
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_innovation_cov) = row_access(shape)
+    log_likelihood_place, condition = memory_places(n, m).log_likelihood, gaussian_update(shape)
 
     @inlined
     def correct(row, z, predicted, observation_matrix, r):
@@ -153,14 +157,15 @@ def in_stages(n: int, m: int, begin: Callable, advance: Callable, finish: Callab
 
 
 @lru_cache(maxsize=64)
-def extended_motion(transition, transition_jacobian, n, m, inputs, form) -> Callable:
+def extended_motion(functions: Functions, shape: Shape) -> Callable:
     """Return `advance(row, u, numbers)`: mean = f(mean, u), P = F P F' over one substep."""
+    n, m, transition = shape.n, shape.m, functions.transition
     source = number_places(n, m)
-    (read_mean, read_cov), (store_mean, store_cov), _ = row_access(n, m)
-    constants, control = constants_reader(n, m, form), vector_reader(inputs)
+    (read_mean, read_cov), (store_mean, store_cov), _ = row_access(shape)
+    constants, control = constants_reader(shape), vector_reader(shape.inputs)
     read_scales, transition_matrix = (
         vector_reader(n, source.scales),
-        jacobian(transition, transition_jacobian, n, n, "u, c"),
+        transition_slopes(functions, shape),
     )
     times, times_transposed = matrices.multiplier(n, n, n), matrices.transposed_multiplier(n, n, n)
 
@@ -190,10 +195,11 @@ def noise_added(n: int, m: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def extended_prediction(transition, transition_jacobian, n, m, inputs, form) -> Callable:
+def extended_prediction(functions: Functions, shape: Shape) -> Callable:
     """Return `move(row, u, numbers, q)`: the extended filter's prediction of the belief in a row."""
+    n, m = shape.n, shape.m
     substeps_place, settle = number_places(n, m).substeps, noise_added(n, m)
-    advance = extended_motion(transition, transition_jacobian, n, m, inputs, form)
+    advance = extended_motion(functions, shape)
 
     @inlined
     def move(row, u, numbers, q):
@@ -205,18 +211,19 @@ def extended_prediction(transition, transition_jacobian, n, m, inputs, form) -> 
 
 
 @lru_cache(maxsize=64)
-def extended_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form) -> Kernels:
-    """Kernels of the extended Kalman filter for model functions and sizes."""
+def extended_kernels(functions: Functions, shape: Shape) -> Kernels:
+    """Kernels of the extended Kalman filter for a model's functions and shape."""
+    n, m, observe = shape.n, shape.m, functions.observe
     source, read_mean = number_places(n, m), vector_reader(n, memory_places(n, m).mean)
     read_q, read_r, constants = (
         matrix_reader(n, n, source.q),
         matrix_reader(m, m, source.r),
-        constants_reader(n, m, form),
+        constants_reader(shape),
     )
     measured, read_scales = vector_reader(m), vector_reader(n, source.scales)
-    observation_matrix = jacobian(observe, observe_jacobian, m, n, "c")
-    advance = extended_motion(transition, transition_jacobian, n, m, inputs, form)
-    settle, correct = noise_added(n, m), gaussian_correction(n, m)
+    observation_matrix = observation_slopes(functions, shape)
+    advance = extended_motion(functions, shape)
+    settle, correct = noise_added(n, m), gaussian_correction(shape)
 
     @inlined
     def substep(memory, u, numbers, size):
@@ -234,22 +241,13 @@ def extended_kernels(transition, transition_jacobian, observe, observe_jacobian,
         correct(row, measured(z), observe(mean, c), h, read_r(numbers))
 
     stages = nothing_at_first, substep, finish
-    predict, start = in_stages(n, m, *stages), gaussian_start(n, m)
+    predict, start = in_stages(n, m, *stages), gaussian_start(shape)
     return Kernels(n, m, n, 0, start, predict, update, nothing_to_summarise, stages=stages)
 
 
 def kernels_of(model: StateSpaceModel, build: Callable[..., Kernels] = extended_kernels) -> Kernels:
     """Kernels for a model, by default extended Kalman ones; build takes the arguments of `extended_kernels`."""
-    return build(
-        inlined(model.transition),
-        model.transition_jacobian,
-        inlined(model.observe),
-        model.observe_jacobian,
-        model.n,
-        model.m,
-        model.inputs,
-        constants_form(model.constants),
-    )
+    return build(model.functions, model.shape)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

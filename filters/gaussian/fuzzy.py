@@ -19,7 +19,8 @@ from numerics.checks import one_of, shown, vector
 from numerics.compiled import inlined
 from numerics.tuples import matrix_reader, tuple_of, vector_reader, written_out
 from plants.affine import AffineModel, affine_functions, linearize
-from plants.layout import constants_form, number_places
+from plants.layout import number_places
+from plants.shape import Shape
 
 MOST_STATES = 8  # 256 rules
 BLENDINGS = ("weights", "moments", "output")
@@ -47,9 +48,10 @@ def memberships(n: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def fuzzy_kernels(n: int, m: int, inputs: int, form, blending: str) -> Kernels:
-    """Kernels for sizes and one of `BLENDINGS`; the rules' models are numbers. Extras: `rule_length` a rule."""
-    places, source, own = memory_places(n, m), number_places(n, m), own_place(n, m, form)
+def fuzzy_kernels(shape: Shape, blending: str) -> Kernels:
+    """Kernels for a shape and one of `BLENDINGS`; the rules' models are numbers. Extras: `rule_length` a rule."""
+    n, m, inputs = shape.n, shape.m, shape.inputs
+    places, source, own = memory_places(n, m), number_places(n, m), own_place(shape)
     step_place, likelihood_place, rules, stride = places.step, places.log_likelihood, 2**n, rule_length(n, m)
     means = places.extras
     covs, weights, seen = means + n, means + n + n * n, means + n + n * n + 1
@@ -60,8 +62,8 @@ def fuzzy_kernels(n: int, m: int, inputs: int, form, blending: str) -> Kernels:
     )
     (_, store_seen), (_, store_seen_cov) = part_vector(m, seen, stride), part_matrix(m, seen_covs, stride)
     between, restarts = blending != "weights", blending != "output"
-    of_states = blender(n, means, covs, weights, stride, between)
-    of_innovations = blender(m, seen, seen_covs, weights, stride, between)
+    of_states = blender(n, means, covs, weights, stride, shape.state_angles, between)
+    of_innovations = blender(m, seen, seen_covs, weights, stride, shape.measurement_angles, between)
     transition, observe, transition_jacobian, observe_jacobian = affine_functions(n, m, inputs).values()
     length = n * (n + inputs + 1) + m * (n + 1)  # of an affine model's constants
     (rule_constants, _), low, high = (
@@ -75,9 +77,9 @@ def fuzzy_kernels(n: int, m: int, inputs: int, form, blending: str) -> Kernels:
     )
     read_q, read_r = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r)
     prior_mean, prior_cov = vector_reader(n, source.prior_mean), matrix_reader(n, n, source.prior_cov)
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     factor, likelihood = matrices.cholesky_factor(m), matrices.innovation_likelihood(m)
-    control, measured, condition = vector_reader(inputs), vector_reader(m), gaussian_update(n, m)
+    control, measured, condition = vector_reader(inputs), vector_reader(m), gaussian_update(shape)
     times, times_transposed, add = (
         matrices.multiplier(n, n, n),
         matrices.transposed_multiplier(n, n, n),
@@ -238,9 +240,8 @@ class FuzzyKalmanFilter(Filter):
         return (*self.low, *self.high, *(number for rule in self.rules for number in rule.constants))
 
     def kernels(self) -> Kernels:
-        """Kernels for the model's sizes; see `Filter.kernels`."""
-        model = self.kernel_model
-        return fuzzy_kernels(model.n, model.m, model.inputs, constants_form(model.constants), self.blending)
+        """Kernels for the model's shape; see `Filter.kernels`."""
+        return fuzzy_kernels(self.kernel_model.shape, self.blending)
 
     def rule_estimates(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Means (2^n, n), covariances (2^n, n, n) and memberships (2^n,) of the rules of a belief."""

@@ -19,9 +19,9 @@ from filters.gaussian.mixture import blender, part_matrix, part_vector
 from filters.particles.weighted import anything_measured
 from numerics.checks import at_least
 from numerics.compiled import inlined
-from numerics.derivatives import jacobian
 from numerics.tuples import matrix_reader, scaled_sum, tuple_of, vector_reader, written_out
 from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape, observation_slopes
 
 FEWEST_PARTS, MOST_PARTS = 7, 1000
 REACH = 4.5  # of the outermost parts, in standard deviations of the split component
@@ -29,29 +29,28 @@ OVERLAP = 0.6  # standard deviation of a part, over the distance from one to the
 
 
 @lru_cache(maxsize=64)
-def gaussian_sum_kernels(
-    transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form, *, parts
-) -> Kernels:
+def gaussian_sum_kernels(functions: Functions, shape: Shape, *, parts) -> Kernels:
     """Kernels for model functions, sizes and a number of parts; extras as the class says."""
-    places, source, own = memory_places(n, m), number_places(n, m), own_place(n, m, form)
+    n, m, observe = shape.n, shape.m, functions.observe
+    places, source, own = memory_places(n, m), number_places(n, m), own_place(shape)
     stride, likelihood_place = n + n * n + 1 + m + m * m + 1, places.log_likelihood
     means = places.extras
     covs, weights, seen = means + n, means + n + n * n, means + n + n * n + 1
     seen_covs, likelihoods = seen + m, seen + m + m * m
     (_, store_part), (_, store_part_cov) = part_vector(n, means, stride), part_matrix(n, covs, stride)
     (_, store_seen), (_, store_seen_cov) = part_vector(m, seen, stride), part_matrix(m, seen_covs, stride)
-    of_states = blender(n, means, covs, weights, stride)
-    of_innovations = blender(m, seen, seen_covs, weights, stride)
+    of_states = blender(n, means, covs, weights, stride, shape.state_angles)
+    of_innovations = blender(m, seen, seen_covs, weights, stride, shape.measurement_angles)
     component_place, variance_place, nodes_place, shares_place = own, own + 1, own + 2, own + 2 + parts
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     read_r = matrix_reader(m, m, source.r)
     column = written_out(
         "column", "row, i, factor", tuple_of(f"factor * row[{places.cov + n * j} + i]" for j in range(n))
     )
     measured, read_scales = vector_reader(m), vector_reader(n, source.scales)
-    constants, observation_matrix = constants_reader(n, m, form), jacobian(observe, observe_jacobian, m, n, "c")
-    plain = extended_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form)
-    condition, move, square, mix = gaussian_update(n, m), scaled_sum(n), outer(n), mixer(n)
+    constants, observation_matrix = constants_reader(shape), observation_slopes(functions, shape)
+    plain = extended_kernels(functions, shape)
+    condition, move, square, mix = gaussian_update(shape), scaled_sum(n), outer(n), mixer(n)
     begin, predict, nothing_to_summarise = plain.start, plain.predict, plain.summarise
 
     @inlined

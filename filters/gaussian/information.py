@@ -9,14 +9,14 @@ from filters.engine.layout import memory_places, row_access
 from filters.gaussian.extended import extended_kernels, gaussian_innovation
 from numerics import matrices
 from numerics.compiled import inlined
-from numerics.derivatives import jacobian
 from numerics.tuples import matrix_of, matrix_reader, scaled_sum, vector_reader, written_out
 from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape, observation_slopes
 
 
 @lru_cache(maxsize=64)
-def information_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form) -> Kernels:
-    """Kernels for model functions and sizes; they predict as the extended filter does.
+def information_kernels(functions: Functions, shape: Shape) -> Kernels:
+    """Kernels for a model's functions and shape; they predict as the extended filter does.
 
         update: Y = P^-1 + H' R^-1 H,  P = Y^-1,  mean += P H' R^-1 innovation
 
@@ -26,12 +26,12 @@ def information_kernels(transition, transition_jacobian, observe, observe_jacobi
 
     Source: Anderson, Moore (1979), Optimal Filtering, section 6.3.
     """
-    arguments = transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form
+    n, m, observe = shape.n, shape.m, functions.observe
     places, source = memory_places(n, m), number_places(n, m)
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
-    constants, measured, read_r = constants_reader(n, m, form), vector_reader(m), matrix_reader(m, m, source.r)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
+    constants, measured, read_r = constants_reader(shape), vector_reader(m), matrix_reader(m, m, source.r)
     read_scales, likelihood_place = vector_reader(n, source.scales), places.log_likelihood
-    observation_matrix, compare = jacobian(observe, observe_jacobian, m, n, "c"), gaussian_innovation(n, m)
+    observation_matrix, compare = observation_slopes(functions, shape), gaussian_innovation(shape)
     factor_n, factor_m = matrices.cholesky_factor(n), matrices.cholesky_factor(m)
     invert, likelihood = matrices.factored_inverse(n), matrices.innovation_likelihood(m)
     transposed = written_out("transposed", "h", matrix_of(n, m, lambda i, j: f"h[{j}][{i}]"))
@@ -52,4 +52,4 @@ def information_kernels(transition, transition_jacobian, observe, observe_jacobi
         store_s(row, s)
         row[likelihood_place] = likelihood(innovation, s_root, z)
 
-    return extended_kernels(*arguments)._replace(update=update)
+    return extended_kernels(functions, shape)._replace(update=update)

@@ -12,24 +12,22 @@ from filters.filter import Filter
 from filters.gaussian.extended import extended_kernels, gaussian_update, kernels_of
 from numerics.checks import at_least
 from numerics.compiled import inlined
-from numerics.derivatives import jacobian
 from numerics.tuples import matrix_reader, tuple_of, vector_reader, written_out
 from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape, observation_slopes
 
 MOST_ITERATIONS = 20
 
 
 @lru_cache(maxsize=64)
-def iterated_kernels(
-    iterations, transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form
-) -> Kernels:
-    """Kernels of the iterated extended Kalman filter for model functions and sizes."""
-    arguments = transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form
+def iterated_kernels(iterations, functions: Functions, shape: Shape) -> Kernels:
+    """Kernels of the iterated extended Kalman filter for a model's functions and shape."""
+    n, m, observe = shape.n, shape.m, functions.observe
     places, source = memory_places(n, m), number_places(n, m)
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
-    constants, measured, read_r = constants_reader(n, m, form), vector_reader(m), matrix_reader(m, m, source.r)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
+    constants, measured, read_r = constants_reader(shape), vector_reader(m), matrix_reader(m, m, source.r)
     read_scales, likelihood_place = vector_reader(n, source.scales), places.log_likelihood
-    observation_matrix, condition = jacobian(observe, observe_jacobian, m, n, "c"), gaussian_update(n, m)
+    observation_matrix, condition = observation_slopes(functions, shape), gaussian_update(shape)
     rises = [" + ".join(f"h[{i}][{j}] * (mean[{j}] - x[{j}])" for j in range(n)) for i in range(m)]
     on_tangent = written_out(
         "on_tangent", "y, h, x, mean", tuple_of(f"y[{i}] + {rise}" for i, rise in enumerate(rises))
@@ -63,7 +61,7 @@ def iterated_kernels(
         store_s(row, s)
         row[likelihood_place] = log_likelihood
 
-    return extended_kernels(*arguments)._replace(update=update)
+    return extended_kernels(functions, shape)._replace(update=update)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -105,5 +105,5 @@ class KalmanFilter(AffineFilter):
     def kernels(self) -> Kernels:
         """Kernels of the extended filter, or those of another form or a schedule, on the affine model."""
         if self.schedule > 1:
-            return scheduled_kernels(self.schedule, self.model.n, self.model.m)
+            return scheduled_kernels(self.schedule, self.kernel_model.shape)
         return kernels_of(self.kernel_model, FORMS[self.form])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
+from numerics.angles import NAMES
 from numerics.compiled import inlined
 from numerics.tuples import matrix_of, tuple_of, written_out
 
@@ -29,12 +30,20 @@ def part_matrix(size: int, first: int, stride: int) -> tuple[Callable, Callable]
 
 
 @cache
-def blender(count: int, means: int, covs: int, weights: int, stride: int, between: bool = True) -> Callable:
+def blender(
+    count: int,
+    means: int,
+    covs: int,
+    weights: int,
+    stride: int,
+    angles: tuple[bool, ...] = (),
+    between: bool = True,
+) -> Callable:
     """Return `blend(row, parts)`: mean and covariance of a mixture from those of its parts and their weights.
 
     The covariance is that within the parts and that between them: sum of w (P + (x - mean)(x - mean)'), or that
     within them alone, sum of w P. The means, covariances and weights of the first part lie from row[means],
-    row[covs] and row[weights] on.
+    row[covs] and row[weights] on. Means of parts that are angles are put on one branch (`numerics.angles`).
     """
     pairs = [(i, j) for i in range(count) for j in range(i + 1)]
     spread = " + d{} * d{}" if between else ""
@@ -65,4 +74,32 @@ def blender(count: int, means: int, covs: int, weights: int, stride: int, betwee
         mean = mean_of(row, parts)
         return mean, cov_of(row, parts, mean)
 
-    return blend
+    if not any(angles):
+        return blend
+    align = part_aligner(means, weights, stride, angles)
+
+    @inlined
+    def blend_aligned(row, parts):
+        align(row, parts)
+        return blend(row, parts)
+
+    return blend_aligned
+
+
+@cache
+def part_aligner(means: int, weights: int, stride: int, angles: tuple[bool, ...]) -> Callable:
+    """Return `align(row, parts)`: put means of parts that are angles on the branch of their circular mean."""
+    lines = []
+    for place in (means + i for i, angle in enumerate(angles) if angle):
+        lines += [
+            "s = c = 0.0",
+            "for part in range(parts):",
+            f"    k = {stride} * part",
+            f"    s += row[k + {weights}] * sin(row[k + {place}])",
+            f"    c += row[k + {weights}] * cos(row[k + {place}])",
+            "middle = arctan2(s, c)",
+            "for part in range(parts):",
+            f"    k = {stride} * part + {place}",
+            "    row[k] -= whole_turns(row[k] - middle)",
+        ]
+    return written_out("align", "row, parts", *lines, "None", **NAMES)

@@ -19,11 +19,7 @@ from numerics.matrices import multiplier, transposed_multiplier
 from numerics.tuples import matrix_reader, tuple_of, vector_reader, vector_writer, written_out
 from plants.affine import affine_functions
 from plants.layout import number_places
-
-
-def constants_of_affine(n: int, m: int, p: int) -> int:
-    """How many constants an affine model has: A, B, a, C, d."""
-    return n * (n + p + 1) + m * (n + 1)
+from plants.shape import Shape
 
 
 @cache
@@ -47,20 +43,20 @@ def interpolator(points: int, count: int, first: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def scheduled_kernels(points: int, n: int, m: int) -> Kernels:
+def scheduled_kernels(points: int, shape: Shape) -> Kernels:
     """Kernels of the Kalman filter on affine models at several inputs (p = 1), one after the other in its numbers.
 
     The extras are the constants of the model in use, which those of the last input are until the next.
     """
-    count = constants_of_affine(n, m, 1)
+    n, m, count = shape.n, shape.m, shape.constants
     places, source = memory_places(n, m), number_places(n, m)
     transition, observe, transition_matrix, observation_matrix = affine_functions(n, m, 1).values()
-    blend = interpolator(points, count, own_place(n, m, count))
+    blend = interpolator(points, count, own_place(shape))
     read_constants, store_constants = vector_reader(count, places.extras), vector_writer(count, places.extras)
-    (read_mean, read_cov), (store_mean, store_cov), _ = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), _ = row_access(shape)
     read_q, read_r, measured = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r), vector_reader(m)
     times, times_transposed, control = multiplier(n, n, n), transposed_multiplier(n, n, n), vector_reader(1)
-    start_gaussian, settle, correct = gaussian_start(n, m), noise_added(n, m), gaussian_correction(n, m)
+    start_gaussian, settle, correct = gaussian_start(shape), noise_added(n, m), gaussian_correction(shape)
 
     @inlined
     def start(memory, numbers, size):

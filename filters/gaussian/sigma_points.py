@@ -10,6 +10,7 @@ from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.gaussian.extended import gaussian_start, in_stages, nothing_to_summarise
 from numerics import matrices
+from numerics.angles import NAMES, circular_mean, is_angle, short_way
 from numerics.compiled import inlined
 from numerics.tuples import (
     matrix_of,
@@ -20,7 +21,8 @@ from numerics.tuples import (
     vector_reader,
     written_out,
 )
-from plants.layout import constants_form, constants_reader, number_places
+from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape
 from plants.state_space import StateSpaceModel
 
 
@@ -43,25 +45,38 @@ def points_around(n: int, centre: bool) -> Callable:
 
 
 @cache
-def deviations(size: int, count: int, centre: bool) -> Callable:
+def deviations(size: int, count: int, centre: bool, angles: tuple[bool, ...] = ()) -> Callable:
     """Return `deviate(y, w)`: mean, shift and deviations of values at the points, y of shape (.., size).
 
     With a centre, d_i = y_i - y_0, shift = w sum d_i, mean = y_0 + shift; without, mean = w sum y_i,
-    d_i = y_i - mean, shift = 0.
+    d_i = y_i - mean, shift = 0. Of angles d_i are taken the short way round from y_0; without a centre the y_i are
+    put on the branch of their circular mean before.
     """
     places, first = range(size), int(centre)
     values = range(first, first + count)
     lines = []
+
+    def value(i, a):
+        return f"y{i}_{a}" if is_angle(a, angles) else f"y[{i}][{a}]"
+
     for a in places:
         if centre:
-            lines.append(f"s{a} = w * ({' + '.join(f'(y[{i}][{a}] - y[0][{a}])' for i in values)})")
+            apart = (short_way(f"(y[{i}][{a}] - y[0][{a}])", a, angles) for i in values)
+            lines.append(f"s{a} = w * ({' + '.join(apart)})")
             lines.append(f"m{a} = y[0][{a}] + s{a}")
         else:
             lines.append(f"s{a} = 0.0")
-            lines.append(f"m{a} = w * ({' + '.join(f'y[{i}][{a}]' for i in values)})")
-    apart = (tuple_of(f"y[{i}][{a}] - " + (f"y[0][{a}]" if centre else f"m{a}") for a in places) for i in values)
+            if is_angle(a, angles):
+                lines.append(f"r{a} = {circular_mean([f'y[{i}][{a}]' for i in values])}")
+                lines += [f"y{i}_{a} = r{a} + wrapped(y[{i}][{a}] - r{a})" for i in values]
+            lines.append(f"m{a} = w * ({' + '.join(value(i, a) for i in values)})")
+
+    def distance(i, a):
+        return short_way(f"y[{i}][{a}] - y[0][{a}]", a, angles) if centre else f"{value(i, a)} - m{a}"
+
+    apart = (tuple_of(distance(i, a) for a in places) for i in values)
     mean, shift = (tuple_of(f"{name}{a}" for a in places) for name in "ms")
-    return written_out("deviate", "y, w", *lines, f"({mean}, {shift}, {tuple_of(apart)})")
+    return written_out("deviate", "y, w", *lines, f"({mean}, {shift}, {tuple_of(apart)})", **NAMES)
 
 
 @cache
@@ -110,29 +125,31 @@ def silenced_columns(count: int, m: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def sigma_point_kernels(transition, observe, centre, n, m, inputs, form) -> Kernels:
-    """Kernels of the sigma-point filter for model functions and sizes; `centre`: whether the mean is a point."""
-    places, source, own = memory_places(n, m), number_places(n, m), own_place(n, m, form)
+def sigma_point_kernels(functions: Functions, shape: Shape, centre: bool) -> Kernels:
+    """Kernels of the sigma-point filter for a model; `centre`: whether the mean is a point."""
+    n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
+    places, source, own = memory_places(n, m), number_places(n, m), own_place(shape)
     step_place, likelihood_place, first = places.step, places.log_likelihood, places.extras
     count = 2 * n + centre
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     read_points, store_points = matrix_reader(count, n, first), matrix_writer(count, n, first)
     read_q, read_r = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r)
-    constants, control, measured = constants_reader(n, m, form), vector_reader(inputs), vector_reader(m)
+    constants, control, measured = constants_reader(shape), vector_reader(shape.inputs), vector_reader(m)
     read_set = vector_reader(3, own)
     moved = written_out(
         "moved", "x, u, c", tuple_of(f"transition(x[{i}], u, c)" for i in range(count)), transition=transition
     )
     seen = written_out("seen", "x, c", tuple_of(f"observe(x[{i}], c)" for i in range(count)), observe=observe)
     root_of, around = matrices.semidefinite_factor(n), points_around(n, centre)
-    state_deviations, measured_deviations = deviations(n, 2 * n, centre), deviations(m, 2 * n, centre)
+    state_deviations = deviations(n, 2 * n, centre, shape.state_angles)
+    measured_deviations = deviations(m, 2 * n, centre, shape.measurement_angles)
     state_scatter, measured_scatter, cross = scatter(n, 2 * n), scatter(m, 2 * n), cross_scatter(n, m)
     add_n, add_m = matrices.symmetric_sum(n), matrices.symmetric_sum(m)
     silence, silence_shift, mask = silenced_columns(2 * n, m), silenced_columns(1, m), matrices.masked(m)
-    present, factor, solve = matrices.innovation(m), matrices.cholesky_factor(m), matrices.row_solver(n, m)
+    present, factor = matrices.innovation(m, shape.measurement_angles), matrices.cholesky_factor(m)
     rest, apply, likelihood = residuals(n, m), matrices.vector_multiplier(n, m), matrices.innovation_likelihood(m)
     k_r, k_r_kt = matrices.multiplier(n, m, m), matrices.transposed_multiplier(n, m, n)
-    corrected = scaled_sum(n)
+    solve, corrected = matrices.row_solver(n, m), scaled_sum(n)
 
     @inlined
     def begin(memory, u, numbers, size):
@@ -174,11 +191,10 @@ def sigma_point_kernels(transition, observe, centre, n, m, inputs, form) -> Kern
 
     stages = begin, advance, finish
     predict = in_stages(n, m, *stages)
-    start = gaussian_start(n, m)
+    start = gaussian_start(shape)
     return Kernels(n, m, n, 0, start, predict, update, nothing_to_summarise, scratch=n * count, stages=stages)
 
 
 def kernels_of(model: StateSpaceModel, *, centre: bool) -> Kernels:
     """Sigma-point kernels for a model."""
-    functions = inlined(model.transition), inlined(model.observe)
-    return sigma_point_kernels(*functions, centre, model.n, model.m, model.inputs, constants_form(model.constants))
+    return sigma_point_kernels(model.functions, model.shape, centre)

@@ -5,26 +5,25 @@ from __future__ import annotations
 from functools import lru_cache
 
 from filters.engine.belief import Kernels
-from filters.engine.layout import memory_places, row_access
+from filters.engine.layout import mean_writer, memory_places, row_access
 from filters.gaussian.extended import gaussian_start, in_stages, nothing_at_first, nothing_to_summarise, silenced
 from numerics import matrices
 from numerics.compiled import inlined
-from numerics.derivatives import jacobian
 from numerics.tuples import (
     matrix_of,
     matrix_reader,
     matrix_writer,
     scaled_sum,
     vector_reader,
-    vector_writer,
     written_out,
 )
 from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape, observation_slopes, transition_slopes
 
 
 @lru_cache(maxsize=64)
-def square_root_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form) -> Kernels:
-    """Kernels for model functions and sizes; the extras are L (n, n), lower triangular, with P = L L'.
+def square_root_kernels(functions: Functions, shape: Shape) -> Kernels:
+    """Kernels for a model's functions and shape; the extras are L (n, n), lower triangular, with P = L L'.
 
     An orthogonal Theta from the right makes a matrix lower triangular (`matrices.triangular_root`):
 
@@ -38,22 +37,23 @@ def square_root_kernels(transition, transition_jacobian, observe, observe_jacobi
     Source: Kaminski, Bryson, Schmidt (1971), "Discrete square root filtering: a survey of current techniques",
     IEEE Trans. Automatic Control 16(6).
     """
+    n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
     places, source = memory_places(n, m), number_places(n, m)
     step_place, likelihood_place = places.step, places.log_likelihood
-    read_mean, store_mean = vector_reader(n, places.mean), vector_writer(n, places.mean)
+    read_mean, store_mean = vector_reader(n, places.mean), mean_writer(shape)
     read_root, write_root = matrix_reader(n, n, places.extras), matrix_writer(n, n, places.extras)
     write_cov, prior_root = matrix_writer(n, n, places.cov), matrix_reader(n, n, source.prior_root)
-    _, _, (store_innovation, store_s) = row_access(n, m)
+    _, _, (store_innovation, store_s) = row_access(shape)
     read_q_root, read_r = matrix_reader(n, n, source.q_root), matrix_reader(m, m, source.r)
-    constants, control, measured = constants_reader(n, m, form), vector_reader(inputs), vector_reader(m)
-    read_scales, begin = vector_reader(n, source.scales), gaussian_start(n, m)
-    transition_matrix = jacobian(transition, transition_jacobian, n, n, "u, c")
-    observation_matrix = jacobian(observe, observe_jacobian, m, n, "c")
+    constants, control, measured = constants_reader(shape), vector_reader(shape.inputs), vector_reader(m)
+    read_scales, begin = vector_reader(n, source.scales), gaussian_start(shape)
+    transition_matrix = transition_slopes(functions, shape)
+    observation_matrix = observation_slopes(functions, shape)
     times_n, times_m = matrices.multiplier(n, n, n), matrices.multiplier(m, n, n)
     square_n, square_m = matrices.square(n, n), matrices.square(m, m)
     triangle_n, triangle = matrices.triangular_root(n, 2 * n), matrices.triangular_root(m + n, m + n)
     mask, factor, silent = matrices.masked(m), matrices.cholesky_factor(m), silenced(m, n)
-    present, likelihood = matrices.innovation(m), matrices.innovation_likelihood(m)
+    present, likelihood = matrices.innovation(m, shape.measurement_angles), matrices.innovation_likelihood(m)
     solve, apply, moved = matrices.forward_solver(m), matrices.vector_multiplier(n, m), scaled_sum(n)
     beside = written_out(
         "beside", "a, b", matrix_of(n, 2 * n, lambda i, j: f"a[{i}][{j}]" if j < n else f"b[{i}][{j - n}]")

@@ -17,22 +17,23 @@ from numerics import matrices
 from numerics.compiled import inlined
 from numerics.tuples import matrix_of, matrix_reader, scaled_sum, vector_reader, written_out
 from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape
 
 STABLE = 1.0 - 1e-7  # magnitude of an eigenvalue of A (I - K C): an error lasts for less than ten million steps
 
 
 @lru_cache(maxsize=64)
-def steady_kernels(transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form) -> Kernels:
-    """Kernels for an affine model's functions and sizes; the filter's own numbers are the gain (n, m)."""
-    arguments = transition, transition_jacobian, observe, observe_jacobian, n, m, inputs, form
+def steady_kernels(functions: Functions, shape: Shape) -> Kernels:
+    """Kernels for an affine model's functions and shape; the filter's own numbers are the gain (n, m)."""
+    n, m, observe, observe_jacobian = shape.n, shape.m, functions.observe, functions.observe_jacobian
     places, source = memory_places(n, m), number_places(n, m)
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
-    constants, measured, read_r = constants_reader(n, m, form), vector_reader(m), matrix_reader(m, m, source.r)
-    read_gain, likelihood_place = matrix_reader(n, m, own_place(n, m, form)), places.log_likelihood
+    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
+    constants, measured, read_r = constants_reader(shape), vector_reader(m), matrix_reader(m, m, source.r)
+    read_gain, likelihood_place = matrix_reader(n, m, own_place(shape)), places.log_likelihood
     gain_of_present = written_out(
         "gain_of_present", "k, z", matrix_of(n, m, lambda i, j: f"(k[{i}][{j}] if z[{j}] == z[{j}] else 0.0)")
     )
-    compare, reduce, likelihood = gaussian_innovation(n, m), joseph_form(n, m), matrices.innovation_likelihood(m)
+    compare, reduce, likelihood = gaussian_innovation(shape), joseph_form(n, m), matrices.innovation_likelihood(m)
     apply, moved = matrices.vector_multiplier(n, m), scaled_sum(n)
 
     @inlined
@@ -49,7 +50,7 @@ def steady_kernels(transition, transition_jacobian, observe, observe_jacobian, n
         store_s(row, s)
         row[likelihood_place] = likelihood(innovation, s_root, z)
 
-    return extended_kernels(*arguments)._replace(update=update)
+    return extended_kernels(functions, shape)._replace(update=update)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

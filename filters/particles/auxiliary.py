@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import ClassVar
 
 from filters.engine.belief import Kernels
@@ -13,26 +14,36 @@ from filters.ensembles.members import add_noise, ensemble_motion
 from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
 from filters.particles.weights import normalise, read_weights, systematic_resampler, weighted_squares
 from numerics import matrices
+from numerics.angles import NAMES, short_way
 from numerics.compiled import inlined
 from numerics.streams import FILTER_MEASUREMENT, uniform_block
-from numerics.tuples import column_reader, column_writer, matrix_reader, scaled_sum
-from plants.layout import constants_form, constants_reader, number_places
+from numerics.tuples import column_reader, column_writer, matrix_reader, tuple_of, written_out
+from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape
+
+
+@cache
+def less(count: int, angles: tuple[bool, ...]) -> Callable:
+    """Return `less(x, y)`: the tuple x - y, the short way round where it is an angle."""
+    entries = (short_way(f"x[{i}] + a * y[{i}]", i, angles) for i in range(count))
+    return written_out("less", "x, y", "a = -1.0", tuple_of(entries), **NAMES)
 
 
 @lru_cache(maxsize=64)
-def auxiliary_kernels(transition, observe, n, m, inputs, form) -> Kernels:
-    """Kernels of the auxiliary particle filter for model functions and sizes.
+def auxiliary_kernels(functions: Functions, shape: Shape) -> Kernels:
+    """Kernels of the auxiliary particle filter for a model's functions and shape.
 
     The table's rows: n of particles, one of log weights, n of the noise in the particles, weights, scratch.
     """
+    n, m, observe = shape.n, shape.m, functions.observe
     places, source = memory_places(n, m), number_places(n, m)
     logarithms, noise, weights = n, n + 1, 2 * n + 1
     scratch, q_root_place = weights + 1, source.q_root
     step_place, key_0, key_1, likelihood_place = places.step, places.key_0, places.key_1, places.log_likelihood
-    motion, parts = ensemble_motion(transition, n, m, inputs, form), particle_parts(observe, n, m, form, weights)
+    motion, parts = ensemble_motion(functions.transition, shape), particle_parts(observe, shape, weights)
     draw_prior, move = motion.start, motion.predict
     set_equal, expect, normal, distance, level, weigh, summarise = parts
-    constants, state = constants_reader(n, m, form), column_reader(n)
+    constants, state = constants_reader(shape), column_reader(n)
     predicted, store_effect, effects = (
         column_reader(m, scratch),
         column_writer(m, scratch),
@@ -40,7 +51,7 @@ def auxiliary_kernels(transition, observe, n, m, inputs, form) -> Kernels:
     )
     far = scratch + 2 * m
     foreseen, store_foreseen = column_reader(m, scratch + m), column_writer(m, scratch + m)
-    add_scaled, add = scaled_sum(m), matrices.symmetric_sum(m)
+    apart, add = less(m, shape.measurement_angles), matrices.symmetric_sum(m)
     read_r, choose = matrix_reader(m, m, source.r), systematic_resampler(n + 1, weights, scratch)
 
     @inlined
@@ -76,7 +87,7 @@ def auxiliary_kernels(transition, observe, n, m, inputs, form) -> Kernels:
             for j in range(table.shape[1]):
                 y = observe(state(table, j), c)
                 store_foreseen(table, j, y)
-                store_effect(table, j, add_scaled(predicted(table, j), -1.0, y))
+                store_effect(table, j, apart(predicted(table, j), y))
             read_weights(table, logarithms, weights, size)
             foresight = normal(z, add(effects(table, size), read_r(numbers)))
             for j in range(table.shape[1]):
@@ -139,6 +150,4 @@ class AuxiliaryParticleFilter(WeightedFilter):
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
-        model = self.kernel_model
-        functions = inlined(model.transition), inlined(model.observe)
-        return auxiliary_kernels(*functions, model.n, model.m, model.inputs, constants_form(model.constants))
+        return auxiliary_kernels(self.kernel_model.functions, self.kernel_model.shape)

@@ -15,17 +15,19 @@ from numerics.checks import finite
 from numerics.compiled import inlined
 from numerics.streams import FILTER_MEASUREMENT, uniform_block
 from numerics.tuples import column_reader, matrix_reader
-from plants.layout import constants_form, number_places
+from plants.layout import number_places
+from plants.shape import Functions, Shape
 
 
 @lru_cache(maxsize=64)
-def particle_kernels(transition, observe, n, m, inputs, form) -> Kernels:
-    """Kernels of the bootstrap particle filter for model functions and sizes."""
+def particle_kernels(functions: Functions, shape: Shape) -> Kernels:
+    """Kernels of the bootstrap particle filter for a model's functions and shape."""
+    n, m, observe = shape.n, shape.m, functions.observe
     places, weights = memory_places(n, m), n + 1
     scratch, logarithms = weights + 1, n
     size_place, step_place, key_0, key_1 = places.extras, places.step, places.key_0, places.key_1
-    likelihood_place, threshold_place = places.log_likelihood, own_place(n, m, form)
-    motion, parts = ensemble_motion(transition, n, m, inputs, form), particle_parts(observe, n, m, form, weights)
+    likelihood_place, threshold_place = places.log_likelihood, own_place(shape)
+    motion, parts = ensemble_motion(functions.transition, shape), particle_parts(observe, shape, weights)
     draw_prior, move = motion.start, motion.predict
     set_equal, expect, normal, distance, level, weigh, summarise = parts
     resample = systematic_resampler(n, weights, scratch)
@@ -108,6 +110,4 @@ class ParticleFilter(WeightedFilter):
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
-        model = self.kernel_model
-        functions = inlined(model.transition), inlined(model.observe)
-        return particle_kernels(*functions, model.n, model.m, model.inputs, constants_form(model.constants))
+        return particle_kernels(self.kernel_model.functions, self.kernel_model.shape)

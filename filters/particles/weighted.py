@@ -10,14 +10,16 @@ from typing import ClassVar, NamedTuple
 
 from filters.engine.belief import Belief
 from filters.engine.layout import memory_places, row_access
-from filters.ensembles.ensemble import LARGEST_ENSEMBLE
+from filters.ensembles.ensemble import LARGEST_ENSEMBLE, silencer
 from filters.filter import Filter
 from filters.particles.weights import log_density, normalise, read_weights, weighted_covariances, weighted_means
 from numerics import matrices
+from numerics.angles import row_aligner
 from numerics.checks import at_least
 from numerics.compiled import inlined
 from numerics.tuples import column_reader, column_writer, matrix_reader, vector_reader
 from plants.layout import constants_reader, number_places
+from plants.shape import Shape
 
 
 class ParticleParts(NamedTuple):
@@ -36,23 +38,29 @@ class ParticleParts(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def particle_parts(observe, n, m, form, weights) -> ParticleParts:
-    """The parts for a model's observation function and sizes; `weights` is the row of weights."""
+def particle_parts(observe: Callable, shape: Shape, weights: int) -> ParticleParts:
+    """The parts for a model's observation function and shape; `weights` is the row of weights."""
+    n, m = shape.n, shape.m
     places, source = memory_places(n, m), number_places(n, m)
     logarithms, scratch, size_place = n, weights + 1, places.extras
-    constants, state, store_predicted = constants_reader(n, m, form), column_reader(n), column_writer(m, scratch)
+    constants, state, store_predicted = constants_reader(shape), column_reader(n), column_writer(m, scratch)
     means, covariances = weighted_means(0, n, weights), weighted_covariances(0, n, weights)
     means_of_predicted = weighted_means(scratch, m, weights)
     covariances_of_predicted = weighted_covariances(scratch, m, weights)
-    _, (store_mean, store_cov), (store_innovation, store_s) = row_access(n, m)
+    _, (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     read_r, mask, add, factor = (
         matrix_reader(m, m, source.r),
         matrices.masked(m),
         matrices.symmetric_sum(m),
         matrices.cholesky_factor(m),
     )
-    difference, measured = matrices.innovation(m), vector_reader(m)
+    difference, measured = matrices.innovation(m, shape.measurement_angles), vector_reader(m)
     half_square, constant = log_density(m)
+    silence = silencer(scratch, shape.measurement_angles, weights)
+    of_states = means, covariances
+    if any(shape.state_angles):
+        of_states = aligned_moments(*of_states, row_aligner(0, shape.state_angles, weights))
+    means, covariances = of_states
 
     @inlined
     def set_equal(memory, size):
@@ -75,11 +83,8 @@ def particle_parts(observe, n, m, form, weights) -> ParticleParts:
         c, present = constants(numbers), measured(z)
         for j in range(table.shape[1]):
             store_predicted(table, j, observe(state(table, j), c))
-        for i in range(m):
-            if z[i] != z[i]:  # a missing channel: constant predictions have no covariance with anything
-                for j in range(table.shape[1]):
-                    table[scratch + i, j] = 0.0
         read_weights(table, logarithms, weights, size)
+        silence(table, z, size)
         mean = means_of_predicted(table, size)
         store_innovation(row, difference(present, mean))
         s = add(covariances_of_predicted(table, size, mean), mask(read_r(numbers), present))
@@ -108,6 +113,17 @@ def particle_parts(observe, n, m, form, weights) -> ParticleParts:
         return total
 
     return ParticleParts(set_equal, expect, normal, distance, level, weigh, summarise)
+
+
+def aligned_moments(means: Callable, covariances: Callable, align: Callable) -> tuple[Callable, Callable]:
+    """The functions `means` and `covariances` of a table, after its angles were put on one branch."""
+
+    @inlined
+    def means_aligned(table, size):
+        align(table, size)
+        return means(table, size)
+
+    return means_aligned, covariances
 
 
 @inlined

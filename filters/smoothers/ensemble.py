@@ -14,10 +14,10 @@ from filters.engine.layout import memory_places
 from filters.engine.restart import restart_if_lost
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.ensembles.members import row_covariances, row_means
+from numerics.angles import NAMES, short_way
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from numerics.threads import spread
 from numerics.tuples import tuple_of, written_out
-from plants.layout import constants_form
 from plants.state_space import StateSpaceModel
 
 
@@ -34,12 +34,11 @@ def smooth_ensembles(
     """
     paired = dataclasses.replace(filter_, model=_paired_model(filter_.kernel_model))
     kernels, pair_kernels, size = filter_.kernels(), paired.kernels(), filter_.size
-    model, form = paired.model, constants_form(paired.model.constants)
-    analyse_pair = type(filter_).analysis(inlined(model.observe), model.n, model.m, form)
+    analyse_pair = type(filter_).analysis(paired.model.functions.observe, paired.model.shape)
     count, times, _ = measurements.shape
     n = kernels.n
     means, covs = np.empty((count, times, n)), np.empty((count, times, n, n))
-    smooth = _smoother(kernels, analyse_pair, is_interpreting())
+    smooth = _smoother(kernels, analyse_pair, filter_.kernel_model.shape.state_angles, is_interpreting())
 
     def part(first: int, last: int) -> None:
         now, pair = new_memory(kernels, size), new_memory(pair_kernels, size)
@@ -65,6 +64,7 @@ def _paired_model(model: StateSpaceModel) -> StateSpaceModel:
         inputs=model.inputs,
         constants=model.constants,
         substeps=model.substeps,
+        measurements=model.measurements,  # of which some may be angles
     )
 
 
@@ -76,14 +76,17 @@ def _paired_functions(transition: Callable, observe: Callable, n: int) -> tuple[
 
 
 @lru_cache(maxsize=64)
-def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> CompiledOrPython:
+def _smoother(
+    kernels: Kernels, analyse_pair: Callable, angles: tuple[bool, ...], interpreting: bool
+) -> CompiledOrPython:
     n, m = kernels.n, kernels.m
     start, predict, update, restart = kernels.start, kernels.predict, kernels.update, restart_if_lost(kernels)
     places, pair_places = memory_places(n, m), memory_places(2 * n, m)
     key_0, key_1, step, divergences = places.key_0, places.key_1, places.step, places.divergences
     pair_key_0, pair_key_1, pair_step = pair_places.key_0, pair_places.key_1, pair_places.step
     means_of, covariances_of = row_means(n), row_covariances(0, n, 0, n)
-    write_mean = written_out("write", "out, b, k, x", *(f"out[b, k, {i}] = x[{i}]" for i in range(n)), "None")
+    entries = (f"out[b, k, {i}] = {short_way(f'x[{i}]', i, angles)}" for i in range(n))
+    write_mean = written_out("write", "out, b, k, x", *entries, "None", **NAMES)
     entries = (f"out[b, k, {i}, {j}] = p[{i}][{j}]" for i in range(n) for j in range(n))
     write_cov = written_out("write", "out, b, k, p", *entries, "None")
     fingerprint = function_fingerprint(start, predict, update, analyse_pair, within=__name__)

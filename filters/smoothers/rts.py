@@ -10,15 +10,17 @@ import numpy as np
 from filters.engine.batch import Estimates
 from filters.engine.layout import own_place
 from filters.filter import Filter
-from filters.gaussian.schedule import constants_of_affine, interpolator
+from filters.gaussian.schedule import interpolator
 from numerics import matrices
+from numerics.angles import NAMES, difference, kept, short_way
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from numerics.derivatives import jacobian
 from numerics.threads import spread
 from numerics.tuples import matrix_of, matrix_reader, tuple_of, vector_reader, written_out
 from plants.affine import affine_functions
 from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape, transition_slopes
 
+ROUNDING = 1e-12  # of angles that were wrapped [rad]
 NEGLIGIBLE = 1e-13  # a pivot of a predicted covariance below this part of its variance counts as zero
 
 
@@ -42,9 +44,11 @@ def smooth_backwards(
         lag: number of later measurements, 0 ... K.
     """
     model, (count, times, n) = filter_.kernel_model, estimates.means.shape
-    run_part, numbers = _smoother(relate, n, is_interpreting()), filter_.numbers
+    angles = model.shape.state_angles
+    run_part, numbers = _smoother(relate, n, angles, is_interpreting()), filter_.numbers
     # A restarted belief is the prior; without any restart a belief may be the prior for other reasons.
-    means_alike = (estimates.means == model.prior_mean).all(axis=-1)
+    apart = np.abs(difference(estimates.means, model.prior_mean, angles))
+    means_alike = (apart <= np.where(angles, ROUNDING, 0.0)).all(axis=-1)
     is_prior = means_alike & (estimates.covs == model.prior_cov).all(axis=(-2, -1))
     given = estimates.means, estimates.covs, is_prior & (estimates.divergences > 0)[:, None]
     links = tuple(np.empty((count, times - 1, *shape)) for shape in ((n,), (n, n), (n, n)))
@@ -87,12 +91,13 @@ def linear_link(n: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def extended_relation(transition, transition_jacobian, n, m, inputs, form) -> Callable:
+def extended_relation(functions: Functions, shape: Shape) -> Callable:
     """Return `relate(mean, p, u, numbers)` of the extended Kalman filter, with F = df/dx at the mean."""
+    n, m, transition = shape.n, shape.m, functions.transition
     source = number_places(n, m)
-    substeps_place, constants, control = source.substeps, constants_reader(n, m, form), vector_reader(inputs)
+    substeps_place, constants, control = source.substeps, constants_reader(shape), vector_reader(shape.inputs)
     read_q, read_scales = matrix_reader(n, n, source.q), vector_reader(n, source.scales)
-    slopes, times = jacobian(transition, transition_jacobian, n, n, "u, c"), matrices.multiplier(n, n, n)
+    slopes, times = transition_slopes(functions, shape), matrices.multiplier(n, n, n)
     identity = written_out("identity", "", matrix_of(n, n, lambda i, j: "1.0" if i == j else "0.0"))
     link = linear_link(n)
 
@@ -109,11 +114,11 @@ def extended_relation(transition, transition_jacobian, n, m, inputs, form) -> Ca
 
 
 @lru_cache(maxsize=64)
-def scheduled_relation(points: int, n: int, m: int) -> Callable:
+def scheduled_relation(points: int, shape: Shape) -> Callable:
     """Return `relate(mean, p, u, numbers)` of a Kalman filter that is scheduled over `points` inputs."""
-    count = constants_of_affine(n, m, 1)
+    n, m, count = shape.n, shape.m, shape.constants
     transition, _, transition_matrix, _ = affine_functions(n, m, 1).values()
-    blend, read_q = interpolator(points, count, own_place(n, m, count)), matrix_reader(n, n, number_places(n, m).q)
+    blend, read_q = interpolator(points, count, own_place(shape)), matrix_reader(n, n, number_places(n, m).q)
     control, link = vector_reader(1), linear_link(n)
 
     @inlined
@@ -126,7 +131,7 @@ def scheduled_relation(points: int, n: int, m: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def _smoother(relate: Callable, n: int, interpreting: bool) -> CompiledOrPython:
+def _smoother(relate: Callable, n: int, angles: tuple[bool, ...], interpreting: bool) -> CompiledOrPython:
     entries = [(i, j) for i in range(n) for j in range(n)]
     read_vector = written_out("read", "a, b, k", tuple_of(f"a[b, k, {i}]" for i in range(n)))
     read_matrix = written_out("read", "a, b, k", matrix_of(n, n, lambda i, j: f"a[b, k, {i}, {j}]"))
@@ -143,8 +148,9 @@ def _smoother(relate: Callable, n: int, interpreting: bool) -> CompiledOrPython:
         matrices.multiplier(n, n, n),
         matrices.transposed_multiplier(n, n, n),
     )
-    sums = (" + ".join([f"x[{i}]", *(f"g[{i}][{j}] * (s[{j}] - e[{j}])" for j in range(n))]) for i in range(n))
-    corrected = written_out("corrected", "x, g, s, e", tuple_of(sums))
+    apart = [short_way(f"(s[{j}] - e[{j}])", j, angles) for j in range(n)]
+    sums = (" + ".join([f"x[{i}]", *(f"g[{i}][{j}] * {apart[j]}" for j in range(n))]) for i in range(n))
+    corrected = kept(written_out("corrected", "x, g, s, e", tuple_of(sums), **NAMES), "x, g, s, e", angles)
     fingerprint = function_fingerprint(relate, within=__name__)
 
     @inlined

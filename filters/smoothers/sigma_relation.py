@@ -12,10 +12,11 @@ from numerics import matrices
 from numerics.compiled import inlined
 from numerics.tuples import matrix_reader, tuple_of, vector_reader, written_out
 from plants.layout import constants_reader, number_places
+from plants.shape import Shape
 
 
 @lru_cache(maxsize=64)
-def sigma_relation(transition, centre, n, m, inputs, form) -> Callable:
+def sigma_relation(transition: Callable, shape: Shape, centre: bool) -> Callable:
     """Return `relate(mean, p, u, numbers)` of an unscented filter, or of a cubature filter (no centre).
 
         points x_i = mean +- g L_i,  L L' = P;  f_i = f(x_i, u);  predicted mean and P as the filter predicts,
@@ -28,8 +29,9 @@ def sigma_relation(transition, centre, n, m, inputs, form) -> Callable:
     Source: Sarkka (2008), "Unscented Rauch-Tung-Striebel smoother", algorithm 1, with additive noise; for cubature
     points Arasaratnam, Haykin (2011), "Cubature Kalman smoothers".
     """
-    source, own, count = number_places(n, m), own_place(n, m, form), 2 * n + centre
-    substeps_place, constants, control = source.substeps, constants_reader(n, m, form), vector_reader(inputs)
+    n, m = shape.n, shape.m
+    source, own, count = number_places(n, m), own_place(shape), 2 * n + centre
+    substeps_place, constants, control = source.substeps, constants_reader(shape), vector_reader(shape.inputs)
     read_q, read_set = matrix_reader(n, n, source.q), vector_reader(len(PointSet._fields), own)
     moved = written_out(
         "moved", "x, u, c", tuple_of(f"transition(x[{i}], u, c)" for i in range(count)), transition=transition
@@ -37,7 +39,7 @@ def sigma_relation(transition, centre, n, m, inputs, form) -> Callable:
     root_of, around, deviate = (
         matrices.semidefinite_factor(n),
         points_around(n, centre),
-        deviations(n, 2 * n, centre),
+        deviations(n, 2 * n, centre, shape.state_angles),
     )
     sum_of, cross, rest = scatter(n, 2 * n), cross_scatter(n, n), residuals(n, n)
     factor, solve, apply = careful_factor(n), matrices.row_solver(n, n), matrices.vector_multiplier(n, n)

@@ -19,8 +19,6 @@ from filters.smoothers.ensemble import smooth_ensembles
 from filters.smoothers.rts import extended_relation, scheduled_relation, smooth_backwards
 from filters.smoothers.sigma_relation import sigma_relation
 from numerics.checks import at_least
-from numerics.compiled import inlined
-from plants.layout import constants_form
 
 LINEARISED = (KalmanFilter, ExtendedKalmanFilter, IteratedExtendedKalmanFilter)
 WITH_POINTS = {UnscentedKalmanFilter: True, CubatureKalmanFilter: False}  # whether the mean is a point
@@ -75,16 +73,12 @@ def smooth(
 def relation_of(filter_: Filter) -> Callable:
     """What `smooth_backwards` needs to know of a filter; ValueError if it has no such smoother."""
     model, kind = filter_.kernel_model, type(filter_)
-    transition, sizes = (
-        inlined(model.transition),
-        (model.n, model.m, model.inputs, constants_form(model.constants)),
-    )
     if kind is KalmanFilter and filter_.schedule > 1:
-        return scheduled_relation(filter_.schedule, model.n, model.m)
+        return scheduled_relation(filter_.schedule, model.shape)
     if kind in LINEARISED:
-        return extended_relation(transition, model.transition_jacobian, *sizes)
+        return extended_relation(model.functions, model.shape)
     if kind in WITH_POINTS:
-        return sigma_relation(transition, WITH_POINTS[kind], *sizes)
+        return sigma_relation(model.functions.transition, model.shape, WITH_POINTS[kind])
     known = ", ".join(known.name for known in (*LINEARISED, *WITH_POINTS))
     raise ValueError(
         f"a smoother needs a filter of {known} or an ensemble Kalman filter, but got {filter_.name!r}"

@@ -16,7 +16,7 @@ from filters.particles.weighted import WeightedFilter
 from filters.registry import filter_class, make_filter
 from numerics.checks import one_of, positive
 from tuning.evaluation.baselines import oracle, rule_of_thumb, scaled_default
-from tuning.evaluation.evaluate import Evaluation, judge, score_ratio
+from tuning.evaluation.evaluate import Evaluation, judge, likelihood_gain, score_ratio
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 from tuning.search.interruption import stop_on_interrupt
@@ -60,11 +60,20 @@ class Row(NamedTuple):
     microseconds: float  # a step of one run, on all cores
     ratios: tuple[Interval, ...]  # by state, RMSE over the first filter's, paired
     score_ratio: Interval  # score over the first filter's, paired
+    likelihood_gain: Interval  # log-likelihood of a run less the first filter's, paired
 
     @property
     def verdict(self) -> str:
-        """Whether the score is significantly lower than the first filter's: "better", "worse" or "tie"."""
-        return "better" if self.score_ratio.high < 1 else "worse" if self.score_ratio.low > 1 else "tie"
+        """Whether the score is significantly lower than the first filter's: "better", "worse" or "tie".
+
+        Without truth it is by the log-likelihood of the innovations; "unknown" of a filter that has none, either.
+        """
+        if self.evaluation.has_truth:
+            return "better" if self.score_ratio.high < 1 else "worse" if self.score_ratio.low > 1 else "tie"
+        gain = self.likelihood_gain
+        if np.isnan(gain.value):
+            return "unknown"
+        return "better" if gain.low > 0 else "worse" if gain.high < 0 else "tie"
 
 
 class Leaderboard(NamedTuple):
@@ -200,6 +209,7 @@ def _row(label: str, filter_: Filter, data: Data, board: Leaderboard) -> Row:
         microseconds=1e6 * seconds / data.measurements[..., 0].size,
         ratios=rmse_ratios(evaluation.mean_squares, first.mean_squares),
         score_ratio=score_ratio(evaluation, first),
+        likelihood_gain=likelihood_gain(evaluation, first),
     )
 
 

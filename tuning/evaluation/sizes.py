@@ -31,7 +31,7 @@ def ensemble_sizes(
     """The score of a choice against ensemble size, paired on the same fresh seeds, smallest size first.
 
     The seeds chose neither Q, R nor N (`scenarios.size_seeds`). Where the plan has a budget, no size is above that
-    of the choice, which is known to be within it.
+    of the choice, which is known to be within it. Without truth there is no score, and no row.
 
     Args:
         choice: of a study.
@@ -39,6 +39,8 @@ def ensemble_sizes(
         training: the plan's training data, on which the mean NIS is held in its band, as in the trials.
         consistent: whether the best one is that of the sizes whose mean NIS is in its band.
     """
+    if any(problem.scale is None for problem in plan.scenarios):
+        return []
     size = choice.numbers["ensemble_size"]
     sizes = [n for n in sorted({*size_ladder(choice.name), size}) if plan.budget is None or n <= size]
     outside = [_outside(choice.with_size(n), plan, training) if plan.is_constrained else 0.0 for n in sizes]

@@ -15,6 +15,7 @@ from filters.consistency.intervals import Interval
 from filters.tuned_file import FILE_FORMAT, FILE_VERSION, read_tuned_file, sealed
 from numerics.checks import at_least, covariance, positive, shown
 from numerics.files import write_whole
+from plants.quantities import Quantity
 from thruster_env.plant_data import check_same_plant, plant_data
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
@@ -170,10 +171,13 @@ def metrics(proof: Comparison) -> dict:
     return {
         "seeds": [proof.seeds.start, proof.seeds.stop],
         "bound": [None if math.isnan(part) else part for part in proof.bound.tolist()],
-        **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
-        "scaled": None if proof.scaled is None else summary(proof.scaled),
+        **{name: _summary_of(getattr(proof, name)) for name in ("untuned", "tuned", "true", "scaled")},
         "scaled_default": scaling(proof),
     }
+
+
+def _summary_of(evaluation: Evaluation | None) -> dict | None:
+    return None if evaluation is None else summary(evaluation)
 
 
 def scaling(proof: Comparison) -> dict:
@@ -196,15 +200,20 @@ def versions() -> dict[str, str]:
 def summary(evaluation: Evaluation) -> dict:
     """The figures of an evaluation as plain numbers for JSON, None where there is nothing to tell."""
     return {
-        "rmse": [list(value) for value in evaluation.rmse],
-        "start_up_rmse": evaluation.start_up_rmse.tolist(),
-        "thrust_rmse": _numbers(evaluation.thrust_rmse),
-        "score": list(evaluation.score),
+        "rmse": [_numbers(value) for value in evaluation.rmse],
+        "start_up_rmse": [None if math.isnan(part) else part for part in evaluation.start_up_rmse.tolist()],
+        **{_key(evaluation.outputs[symbol]): _numbers(one) for symbol, one in evaluation.output_rmse.items()},
+        "score": _numbers(evaluation.score),
         "nees": _numbers(evaluation.nees),
         "nis": _numbers(evaluation.nis),
         "log_likelihood": None if math.isnan(evaluation.log_likelihood) else evaluation.log_likelihood,
         "divergences": evaluation.divergences,
     }
+
+
+def _key(output: Quantity) -> str:
+    """What the RMSE of a derived output is called in a file: "thrust_rmse" of the thrust."""
+    return f"{output.name.replace(' ', '_')}_rmse"
 
 
 def _numbers(value: Interval) -> list[float] | None:

@@ -14,16 +14,14 @@ from tuning.report.page import Section, Words, html_page, markdown_page
 from tuning.report.parts import (
     Sketchbook,
     advice,
-    errors_table,
     facts_section,
-    known_table,
-    numbers_table,
-    proof_section,
+    held_out_section,
     run_sections,
     search_section,
     sizes_section,
 )
 from tuning.report.subject import find_subject, is_file
+from tuning.report.tables import errors_table, known_table, numbers_table
 from tuning.search.objectives import nis_ratio
 from tuning.search.space import has_ensemble
 from tuning.search.trials import measure
@@ -69,7 +67,7 @@ def write_report(source: str | Path, storage: str, out: str | Path | None = None
     with tempfile.TemporaryDirectory() as scratch:
         book = Sketchbook(Path(scratch))
         sections = [
-            proof_section(book, subject, proofs),
+            held_out_section(book, subject, proofs),
             Section("The numbers", [*numbers, *([Words(sentences(known))] if known else [])]),
             search_section(book, subject),
             *([sizes_section(book, subject, sizes)] if sizes else []),

@@ -13,7 +13,7 @@ from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.problems.seeds import held_out_seeds, size_seeds, training_seeds
-from tuning.search.objectives import Objective, find_objective
+from tuning.search.objectives import Objective, check_objectives, find_objective
 from tuning.search.space import AUTO, AUTO_KINDS, has_search_space, joint_distributions, joint_parameters
 
 TRAINING_SEEDS = 32
@@ -81,6 +81,8 @@ class Plan(NamedTuple):
                 raise ValueError(
                     f"the objective {name!r} needs a filter with a covariance, but got {self.filter!r}"
                 )
+        for problem in self.scenarios:
+            check_objectives(self.objectives, problem)
         if not self.tunes_noise and (self.full_q or self.hold_r):
             names = ", ".join(one.name for one in self.scenarios[0].parameters)
             raise ValueError(

@@ -165,7 +165,7 @@ def run_study(
     sizes, consistent = [], plan.is_constrained and is_consistent(best)
     if has_ensemble(choice.name) and len(plan.objectives) == 1:
         sizes = ensemble_sizes(choice, plan, data, consistent)
-        choice = choice.with_size(sufficient_size(sizes, consistent))
+        choice = choice.with_size(sufficient_size(sizes, consistent)) if sizes else choice
     complete = [trial.values[0] for trial in present if trial.state == TrialState.COMPLETE]
     return StudyResult(
         choice,

@@ -11,6 +11,7 @@ import numpy as np
 import optuna
 
 from filters.engine.batch import Estimates, run
+from filters.filter import Filter
 from tuning.evaluation.evaluate import Evaluation, judge, run_scores
 from tuning.problems.data import Data
 from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
@@ -87,7 +88,7 @@ def measure(
         for estimates, filter_, one in zip(parts, filters, block, strict=True):
             estimates.append(run(filter_, one.filter_keys, one.inputs, one.measurements))
         if trial is not None:
-            _report(trial, first, [estimates[-1] for estimates in parts], block, plan)
+            _report(trial, first, filters, [estimates[-1] for estimates in parts], block, plan)
             if first + size < count and trial.should_prune():
                 raise optuna.TrialPruned
     whole = [Estimates(*map(np.concatenate, zip(*estimates, strict=True))) for estimates in parts]
@@ -95,8 +96,15 @@ def measure(
     return [judge(filter_, estimates, one, scenario.scale) for filter_, estimates, one, scenario in rows]
 
 
-def _report(trial: optuna.Trial, first: int, estimates: list[Estimates], block: list[Data], plan: Plan) -> None:
-    rows = zip(estimates, block, plan.scenarios, strict=True)
-    scores = np.mean([run_scores(found, one, scenario.scale) for found, one, scenario in rows], axis=0)
+def _report(
+    trial: optuna.Trial,
+    first: int,
+    filters: list[Filter],
+    estimates: list[Estimates],
+    block: list[Data],
+    plan: Plan,
+) -> None:
+    rows = zip(filters, estimates, block, plan.scenarios, strict=True)
+    scores = np.mean([run_scores(*row, scenario.scale) for *row, scenario in rows], axis=0)
     for place, score in enumerate(scores):
         trial.report(float(score), first + place)

@@ -1,0 +1,50 @@
+"""What compiled code is made for: the shape of a model, and its functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from numerics.derivatives import jacobian
+
+
+class Shape(NamedTuple):
+    """Sizes of a model, and what else compiled code has to know of it beforehand."""
+
+    n: int  # states
+    m: int  # measurements
+    inputs: int
+    form: type | int  # of the constants: their NamedTuple class, or how many
+    state_angles: tuple[bool, ...]  # (n,), which states wrap at 2 pi
+    measurement_angles: tuple[bool, ...]  # (m,), which measurements do
+
+    @property
+    def constants(self) -> int:
+        """Number of the model's constants."""
+        return self.form if isinstance(self.form, int) else len(self.form._fields)
+
+
+class Functions(NamedTuple):
+    """The functions of a model, as `StateSpaceModel` describes them; Jacobians that are unknown are None."""
+
+    transition: Callable
+    transition_jacobian: Callable | None
+    observe: Callable
+    observe_jacobian: Callable | None
+
+
+def constants_form(constants: tuple) -> type | int:
+    """What a `Shape` tells of a model's constants."""
+    return type(constants) if hasattr(constants, "_fields") else len(constants)
+
+
+def transition_slopes(functions: Functions, shape: Shape) -> Callable:
+    """Return `slopes(x, scales, u, c)`: df/dx of one substep, (n, n), as `numerics.derivatives.jacobian`."""
+    f, analytic, n = functions.transition, functions.transition_jacobian, shape.n
+    return jacobian(f, analytic, n, n, "u, c", shape.state_angles)
+
+
+def observation_slopes(functions: Functions, shape: Shape) -> Callable:
+    """Return `slopes(x, scales, c)`: dh/dx, (m, n)."""
+    h, analytic = functions.observe, functions.observe_jacobian
+    return jacobian(h, analytic, shape.m, shape.n, "c", shape.measurement_angles)
