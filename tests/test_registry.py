@@ -130,8 +130,12 @@ def test_a_damaged_tuned_file_is_refused_in_one_line(write, content, rule):
 
 def test_the_hash_does_not_depend_on_order_and_layout(write):
     entries = reversed(TUNED.items())
-    assert read_tuned_file(write(json.dumps(dict(entries), indent=7))) == {**TUNED, "problem": None, "problems": {}}
-    assert sealed(TUNED) == {**TUNED, "problem": None, "problems": {}}
+    assert read_tuned_file(write(json.dumps(dict(entries), indent=7))) == {
+        **TUNED,
+        "problem": None,
+        "problems": {},
+    }
+    assert sealed(TUNED) == TUNED
 
 
 def test_a_tuned_file_that_is_not_there_is_refused(tmp_path):
