@@ -66,8 +66,8 @@ def report(tuning: Tuning) -> list:
         shown.append(_consistency_sentence(proof.tuned))
         if proof.tuned.has_truth and isnan(proof.bound).all():
             shown.append(
-                f"{scenario.name} has no bound: for a singular Q there is none. Its score is RMSE over its scale, "
-                "which is the RMSE of the open loop unless it was given."
+                f"{scenario.name} has no bound: there is none for a singular Q, or if the plant is no model. Its "
+                "score is RMSE over its scale."
             )
     shown += sentences(tuning.known) if tuning.known else []
     shown += _search_sentences(tuning)

@@ -117,9 +117,14 @@ def contender(
 
 
 def _known(knows: str, name: str, scenario: Problem, seed: int) -> Choice:
-    """The choice of a filter that knows so much; ValueError where there is no scaled default."""
-    if knows != "scaled":
-        return (oracle if knows == "true" else rule_of_thumb)(name, scenario)
+    """The choice of a filter that knows so much; ValueError where there is no scaled default, or no oracle."""
+    if knows == "untuned":
+        return rule_of_thumb(name, scenario)
+    if knows == "true":
+        known = oracle(name, scenario)
+        if known is None:
+            raise ValueError(f"an oracle must know the plant's Q and R, but those of {scenario.name} are unknown")
+        return known
     found = scaled_default(name, scenario, seed)
     if found.choice is None:
         raise ValueError(f"{name} must have a scaled default on {scenario.name}, but {found.reason}")

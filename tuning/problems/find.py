@@ -50,6 +50,16 @@ def find_problem(name: str) -> Problem:
     return known[name].find_scenario(name)
 
 
+def find_same(name: str, digest: str) -> Problem:
+    """A problem by its name, which has to be what another process has: ValueError for another digest."""
+    found = find_problem(name)
+    if found.digest != digest:
+        raise ValueError(
+            f"problem {name} must be the same in all processes, of digest {digest}, but here it has {found.digest}"
+        )
+    return found
+
+
 def find_given(name, given: Sequence[Problem], where: str | Path) -> Problem:
     """A problem that a file or a storage names, of those that the user gives or, if it is no code, by its name.
 

@@ -80,9 +80,7 @@ class ModelProblem(AssumedProblem):
             about=about,
         )
         if isinstance(self.inputs, np.ndarray) and len(self.inputs) != self.steps:
-            raise ValueError(
-                f"inputs must have one row for each of {self.steps} steps, but got {len(self.inputs)}"
-            )
+            raise ValueError(f"inputs must have a row for each of {self.steps} steps, but got {len(self.inputs)}")
         model = self.model()
         for kind in ("input_quantities", "measurements"):
             pair = getattr(model, kind), getattr(truth, kind)

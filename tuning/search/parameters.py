@@ -35,7 +35,7 @@ class ProcessVariance:
 
     def set(self, choice, value):
         """The choice with another variance."""
-        return _with_noise(choice, Q, _replaced(_diagonal(choice.model[Q]), self.index, value))
+        return _with_variance(choice, Q, self.index, value)
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,8 @@ class ProcessCorrelation:
         variances = _diagonal(choice.model[Q])
         count = len(variances) * (len(variances) - 1) // 2
         given = correlations_of(np.asarray(choice.model[Q])) if np.ndim(choice.model[Q]) == 2 else [0.0] * count
-        return _with_noise(choice, Q, variances, _replaced(given, self.index, value))
+        q = full_covariance(variances, _replaced(given, self.index, value))
+        return choice._replace(model={**choice.model, Q: tuple(map(tuple, q.tolist()))})
 
 
 @dataclass(frozen=True)
@@ -72,9 +73,7 @@ class MeasurementVariance:
 
     def set(self, choice, value):
         """The choice with another variance."""
-        if np.ndim(choice.model[R]) == 0:
-            return choice._replace(model={**choice.model, R: value})
-        return _with_noise(choice, R, _replaced(_diagonal(choice.model[R]), self.index, value))
+        return _with_variance(choice, R, self.index, value)
 
 
 @dataclass(frozen=True)
@@ -202,15 +201,21 @@ def _diagonal(cov) -> tuple | None:
     return (cov,) if np.ndim(cov) == 0 else tuple(np.diag(covariance("a covariance", cov, len(cov))).tolist())
 
 
-def _with_noise(choice, argument: str, variances: Sequence[float], correlations: Sequence[float] | None = None):
-    """A choice with other variances, and the correlations that are given, or those that it has."""
+def _with_variance(choice, argument: str, index: int, value: float):
+    """A choice with another variance in Q or R, whose correlations stay."""
     before = choice.model[argument]
-    if correlations is None and np.ndim(before) == 2:
-        correlations = correlations_of(np.asarray(before))
-    value = tuple(variances)
-    if correlations is not None:
-        value = tuple(map(tuple, full_covariance(value, correlations).tolist()))
-    return choice._replace(model={**choice.model, argument: value})
+    if np.ndim(before) == 0:
+        after = value
+    elif np.ndim(before) == 1:
+        after = _replaced(tuple(before), index, value)
+    else:
+        cov = np.array(before)
+        factor = np.sqrt(value / cov[index, index])
+        cov[index] *= factor
+        cov[:, index] *= factor
+        cov[index, index] = value
+        after = tuple(map(tuple, cov.tolist()))
+    return choice._replace(model={**choice.model, argument: after})
 
 
 def _replaced(values: Sequence[float], index: int, value: float) -> tuple[float, ...]:
