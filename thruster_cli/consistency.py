@@ -39,7 +39,7 @@ def judge(choice: Choice, name: str, scenario: Problem, proof: Comparison, path:
         if len(named) > MOST_STATES:
             said.append(f"Of {len(named)} states these are the first {MOST_STATES}.")
     title = f"{choice.name}, {name}, on {report.runs} seeds of {scenario.name}"
-    consistency_figure(path, report, title, against)
+    consistency_figure(path, report, title, against, proof.tuned.scored or None)
     data = {**as_data(report), "rmse_over_true": ratios, "sentences": said, "picture": str(path)}
     return [f"Is the {name} filter consistent?", *said, f"Picture: {path}"], data
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -42,7 +42,13 @@ class Row(NamedTuple):
 
 
 def estimates_figure(
-    path: Path, filters: Mapping[str, Filter], data: Data, run_index: int, dt: float | None, **options
+    path: Path,
+    filters: Mapping[str, Filter],
+    data: Data,
+    run_index: int,
+    dt: float | None,
+    scored: Collection[int] | None = None,
+    **options,
 ) -> Path:
     """Truth and estimate of every state over time, and the error in its 95 % band; one column a filter.
 
@@ -55,11 +61,12 @@ def estimates_figure(
         data: of a problem.
         run_index: which of its runs.
         dt: sample time [s]; None for an axis of steps.
+        scored: places of the states that count in the score, which come first where not all are shown.
         **options: of matplotlib's `subplots`, such as `sharey="row"`.
     """
     model = next(iter(filters.values())).model
     states = model.states if data.states is None else model.states[: data.states.shape[-1]]
-    places, left_out = shown_states(states)
+    places, left_out = shown_states(states, scored)
     rows = _rows(states, places, model.measurements, data.states is not None)
     heights = [row.height for row in rows]
     unit = UNIT if len(places) <= 2 else UNIT_OF_MANY
