@@ -43,7 +43,7 @@ def test_a_binary_sequence_has_two_levels_with_equal_chance_and_holds_them():
 
 
 def test_sines_have_their_amplitude_offset_and_periods():
-    voltages = MultiSine(amplitude=3.0, offset=1.0, periods=(0.5, 0.2)).voltages(PLANT, KEYS, 500)
+    voltages = voltages_of(MultiSine(amplitude=3.0, offset=1.0, periods=(0.5, 0.2)), PLANT, KEYS, 500)
     spectrum = np.abs(np.fft.rfft(voltages, axis=1)) / 500
     expected = np.zeros(251)
     expected[[0, 10, 25]] = 1.0, 1.5, 1.5  # 5 s hold ten and 25 periods
