@@ -68,10 +68,10 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
     Raises:
         ValueError: if the scale is not positive, or not one a state.
     """
-    return judge(filter_, run(filter_, data.filter_keys, data.inputs, data.measurements), data, scale)
+    return compute_metrics(filter_, run(filter_, data.filter_keys, data.inputs, data.measurements), data, scale)
 
 
-def judge(filter_: Filter, estimates: Estimates, data: Data, scale) -> Evaluation:
+def compute_metrics(filter_: Filter, estimates: Estimates, data: Data, scale) -> Evaluation:
     """What the estimates of a filter on some data are worth; arguments and errors are those of `evaluate`."""
     late, measurements = data.scored, data.measurements
     innovations, innovation_covs = estimates.innovations[:, late], estimates.innovation_covs[:, late]
