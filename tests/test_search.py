@@ -143,7 +143,7 @@ def test_a_grid_ends_where_it_is_exhausted():
     [
         ({"scenarios": ()}, "a study must have at least one scenario, but got none"),
         ({"objectives": ("score", "score")}, "objectives must be one, or two different ones"),
-        ({"objectives": ("speed",)}, "objective must be one of score, thrust, likelihood, consistency, cost"),
+        ({"objectives": ("speed",)}, "objective must be one of score, thrust, likelihood, nis, consistency, cost"),
         ({"filter": "low-pass", "objectives": ("likelihood",)}, "'likelihood' needs a filter with a covariance"),
         ({"sampler": "guess"}, "sampler must be one of tpe, gp, cma-es, nsga-ii, random, grid, but got 'guess'"),
     ],
