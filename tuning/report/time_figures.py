@@ -13,7 +13,7 @@ from filters.engine.batch import Estimates, run
 from filters.filter import Filter
 from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from plants.quantities import Quantity
-from tuning.evaluation.evaluate import errors_of
+from tuning.evaluation.evaluate import state_errors
 from tuning.problems.data import Data
 from tuning.report.panels import axis_label, shown_states
 
@@ -114,7 +114,7 @@ def _run(filter_: Filter, data: Data, index: int, dt: float | None) -> Run:
     innovations = np.where(np.isnan(data.measurements[index]), np.nan, estimates.innovations[0])
     if data.states is None:
         return Run(time, None, None, estimates, innovations)
-    errors = errors_of(filter_, estimates, data._replace(states=data.states[one]))[0]
+    errors = state_errors(filter_, estimates, data._replace(states=data.states[one]))[0]
     return Run(time, data.states[index], errors, estimates, innovations)
 
 
