@@ -36,8 +36,15 @@ def digest_of(*values: Any) -> str:
 
 
 def model_digest(model: StateSpaceModel) -> str:
-    """The digest of all that a model says: functions, numbers, names and units."""
-    return digest_of(model)
+    """The digest of what filters read of a model: its functions, numbers, names and units."""
+    return digest_of(*_parts_of(model))
+
+
+def _parts_of(model: StateSpaceModel) -> tuple:
+    functions = model.transition, model.observe, model.transition_jacobian, model.observe_jacobian
+    noise = model.process_noise_cov, model.measurement_noise_cov
+    numbers = model.prior_mean, model.prior_cov, model.inputs, model.constants, model.substeps
+    return functions, noise, numbers, model.quantities, model.outputs
 
 
 def _texts(value: Any, seen: set[int]) -> Iterator[str]:
@@ -51,6 +58,8 @@ def _texts(value: Any, seen: set[int]) -> Iterator[str]:
     elif isinstance(value, Made):
         yield f"made by {_name(value.maker)}, {value.key}"
         yield from _texts(value.arguments, seen)
+    elif isinstance(value, StateSpaceModel):
+        yield from _texts(_parts_of(value), seen)
     elif isinstance(value, functools.partial):
         yield "partial"
         yield from _texts((value.func, value.args, value.keywords), seen)
@@ -69,7 +78,7 @@ def _texts(value: Any, seen: set[int]) -> Iterator[str]:
         yield _name(value)
     elif id(value) not in seen:
         seen.add(id(value))
-        yield _name(type(value))
+        yield type(value).__qualname__
         names = [field.name for field in dataclasses.fields(value)] if dataclasses.is_dataclass(value) else None
         held = vars(value) if names is None and hasattr(value, "__dict__") else {}
         yield from _texts(held if names is None else {name: getattr(value, name) for name in names}, seen)
@@ -79,9 +88,10 @@ def _of_function(function: types.FunctionType, seen: set[int]) -> Iterator[str]:
     if id(function) in seen:
         return
     seen.add(id(function))
-    yield _name(function)
     if _is_of_a_library(function.__module__):
+        yield _name(function)
         return
+    yield function.__qualname__  # without the module: the same file may be run and be imported
     try:
         yield textwrap.dedent(inspect.getsource(function))
     except (OSError, TypeError):  # from a prompt, or written out by a program

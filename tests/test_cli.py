@@ -203,7 +203,7 @@ BAD = [
     (("evaluate", "--tuned", "text.txt"), "a tuned file must be whole JSON"),
     (
         ("evaluate", "--tuned", "old.json"),
-        "a tuned file must be of version 2 or 3, but old.json is of version 1: tune again",
+        "a tuned file must be of version 2, 3 or 4, but old.json is of version 1: tune again",
     ),
     (("verify", "missing.json"), "a tuned file must be readable"),
     (

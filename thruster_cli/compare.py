@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Annotated
@@ -14,17 +15,17 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from filters.augmented import Unknown
 from filters.registry import FILTERS, filter_class
+from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least
 from thruster_cli.leaderboard import as_json, report
-from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
+from thruster_cli.output import PROBLEMS, JsonOption, SeedOption, announce_compilation, emit, progress_console
 from tuning.evaluation.compare import Contender, compare, contender, sized
-from tuning.evaluation.tuned import check_plant, read_tuned
+from tuning.evaluation.tuned import read_choice, read_tuned
+from tuning.problems.find import find_problem
+from tuning.problems.problem import Problem
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import HELD_OUT_SEEDS
-from tuning.search.space import has_ensemble
-from tuning.thruster.find import find_scenario
-from tuning.thruster.scenario import Scenario
-from tuning.thruster.scenarios import SCENARIOS
+from tuning.search.space import Choice, has_ensemble
 
 DEFAULT_FILTERS = ("ekf", "enkf", "pf")
 
@@ -41,7 +42,7 @@ def command(
     ] = None,
     scenarios: Annotated[
         list[str] | None,
-        typer.Option("--scenario", help=f"{', '.join(SCENARIOS)}, or a .toml file; may be repeated."),
+        typer.Option("--problem", "--scenario", help=f"{PROBLEMS} May be repeated."),
     ] = None,
     seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,
     knows: Annotated[
@@ -76,10 +77,10 @@ def command(
 
     Example: thruster compare --filter ekf --augment ambient_velocity --scenario ambient
     """
-    contenders, default = _contenders(files or [], filters or [], knows, augment or [], ensemble_size or [], seed)
-    chosen = [find_scenario(name) for name in scenarios] if scenarios else [default]
-    for file, scenario in product(files or [], chosen):
-        check_plant(file, scenario)
+    chosen = [find_problem(name) for name in scenarios or []] or [_default(files or [])]
+    for file, problem in product(files or [], chosen):
+        read_choice(file, problem)  # a clear error for a file that is for another plant
+    contenders = _contenders(files or [], filters or [], knows, augment or [], ensemble_size or [], seed)
     held_out = held_out_seeds(seed, seeds)
     announce_compilation()
     with _bar(len(contenders) * len(chosen)) as on_row:
@@ -92,23 +93,29 @@ def command(
         sys.exit(130)
 
 
-def _contenders(files, filters, knows, augment, sizes, seed) -> tuple[list[Contender], Scenario]:
-    """The filters that take part, and the scenario where none is named: that of the first file, or nominal."""
+def _default(files: list[Path]) -> Problem:
+    """The problem where none is named: that of the first file, or nominal."""
+    return [read_tuned(file)[1] for file in files][0] if files else find_problem("nominal")
+
+
+def _contenders(files, filters, knows, augment, sizes, seed) -> list[Contender]:
+    """The filters that take part."""
     wanted = dict(_size(text) for text in sizes)
     unknown = dict(_unknown(text) for text in augment)
-    out, default = [], find_scenario("nominal")
-    for place, file in enumerate(files):
-        choice, scenario, _ = read_tuned(file)
-        if place == 0:
-            default = scenario
-        choice = sized(choice, wanted.get(choice.name, wanted.get(None)))
-        out.append(Contender(file.stem, lambda scenario, choice=choice: choice))
+    out = []
+    for file in files:
+        size = wanted.get(read_tuned_file(file)["filter"]["name"], wanted.get(None))
+        out.append(Contender(file.stem, partial(_from_file, file, size)))
     for name in filters or ([] if files else DEFAULT_FILTERS):
         size = wanted.get(name, wanted.get(None)) if has_ensemble(name) else None
         out.append(contender(name, knows, seed=seed, ensemble_size=size))
         if unknown and filter_class(name).has_covariance:
             out.append(contender(name, knows, unknown, seed, ensemble_size=size))
-    return out, default
+    return out
+
+
+def _from_file(file: Path, size: int | None, problem: Problem) -> Choice:
+    return sized(read_choice(file, problem), size)
 
 
 def _size(text: str) -> tuple[str | None, int]:
@@ -134,7 +141,7 @@ def _bar(total: int) -> Iterator:
     with Progress(*columns, console=progress_console) as progress:
         task, begun = progress.add_task("comparing ...", total=total), []
 
-        def on_row(scenario: Scenario, label: str) -> None:
+        def on_row(scenario: Problem, label: str) -> None:
             progress.update(task, description=f"{label} on {scenario.name}", completed=len(begun))
             begun.append(label)
 

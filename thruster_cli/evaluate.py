@@ -9,15 +9,23 @@ import typer
 
 from thruster_cli.consistency import check_covariance, check_request
 from thruster_cli.error_tables import comparison_table
-from thruster_cli.output import FILTER_HELP, JsonOption, SeedOption, announce_compilation, emit, progress_console
+from thruster_cli.output import (
+    FILTER_HELP,
+    PROBLEMS,
+    JsonOption,
+    SeedOption,
+    announce_compilation,
+    emit,
+    progress_console,
+)
 from thruster_cli.tables import choice_table
 from thruster_cli.tuning_report import gains
 from tuning.evaluation.baselines import RULE, TUNED, baselines, rule_of_thumb
 from tuning.evaluation.held_out import prove
-from tuning.evaluation.tuned import check_plant, metrics, read_tuned
+from tuning.evaluation.tuned import metrics, read_choice, read_tuned
 from tuning.evaluation.worth import scaling_sentence, without_truth
+from tuning.problems.find import find_problem
 from tuning.search.plan import HELD_OUT_SEEDS
-from tuning.thruster.find import find_scenario
 
 
 def command(
@@ -25,7 +33,10 @@ def command(
     filter_name: Annotated[
         str | None, typer.Option("--filter", help=f"Without a tuned file. {FILTER_HELP}")
     ] = None,
-    scenario: Annotated[str | None, typer.Option(help="Another scenario than the tuned file's.")] = None,
+    scenario: Annotated[
+        str | None,
+        typer.Option("--problem", "--scenario", help=f"By default the tuned file's, or nominal. {PROBLEMS}"),
+    ] = None,
     seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,
     consistency: Annotated[
         Path | None,
@@ -50,11 +61,13 @@ def command(
     if (tuned is None) == (filter_name is None):
         raise ValueError("give either --tuned FILE or --filter NAME")
     if tuned is not None:
-        choice, default, _ = read_tuned(tuned)
-        chosen = default if scenario is None else find_scenario(scenario)
-        check_plant(tuned, chosen)
+        if scenario is None:
+            choice, chosen, _ = read_tuned(tuned)
+        else:
+            chosen = find_problem(scenario)
+            choice = read_choice(tuned, chosen)
     else:
-        chosen = find_scenario(scenario or "nominal")
+        chosen = find_problem(scenario or "nominal")
         choice = rule_of_thumb(filter_name, chosen)
     if consistency is not None:
         check_request(consistency, choice.name)

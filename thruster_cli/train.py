@@ -109,7 +109,7 @@ def command(
     )
     check_installed()
     folder = out or POLICIES / name_of(setup, tuned, untuned)
-    if tuned is not None and (meant := read_tuned_file(tuned)["scenario"]) != scenario:
+    if tuned is not None and (meant := read_tuned_file(tuned)["problem"]) != scenario:
         progress_console.print(f"{tuned} was tuned on {meant}, and its filter assumes what it did there.")
     with progress_console.status("loading torch ..."):
         from training.learn import train

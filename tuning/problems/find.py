@@ -6,7 +6,7 @@ import copy
 import importlib
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -48,6 +48,30 @@ def find_problem(name: str) -> Problem:
         rule = f"problem must be one of {', '.join(known)}, a file that ends in .toml, or module:object"
         raise ValueError(f"{rule}, but got {shown(name)}")
     return known[name].find_scenario(name)
+
+
+def find_given(name, given: Sequence[Problem], where: str | Path) -> Problem:
+    """A problem that a file or a storage names, of those that the user gives or, if it is no code, by its name.
+
+    Nothing is imported that a file or a storage names.
+
+    Args:
+        name: the problem's.
+        given: by the user.
+        where: the name comes from, for errors.
+
+    Raises:
+        ValueError: if there is no such problem, or it is code that is not given.
+    """
+    for one in given:
+        if one.name == name:
+            return one
+    if not is_code(name):
+        return find_problem(name)
+    raise ValueError(
+        f"a problem that is code must be given, but {where} only names {shown(name)}: "
+        f"say --problem {name}, if you trust it"
+    )
 
 
 def problem_from_mapping(content: Mapping, name: str, file: str | Path) -> Problem:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -90,7 +91,11 @@ class Problem(ABC):
 
     @property
     def plant_data(self) -> Mapping | None:
-        """The plant as data for an env's `check_tuned_for`, which compares it with its own; None without one."""
+        """The plant as data, which tuned files keep for `check_tuned_for`, here and of envs; None without."""
+        return None
+
+    def check_tuned_for(self, plant: Mapping | None, file: str | Path) -> None:
+        """Raise ValueError if what a tuned file holds as `plant_data` is another plant; None is not compared."""
         return None
 
     def as_mapping(self) -> Mapping | None:

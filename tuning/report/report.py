@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +11,7 @@ from numerics.files import check_target, write_whole
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.sizes import ensemble_sizes, sufficient_size
 from tuning.likelihood.identifiability import identify, sentences
+from tuning.problems.problem import Problem
 from tuning.report.page import Section, Words, html_page, markdown_page
 from tuning.report.parts import (
     Sketchbook,
@@ -35,18 +37,21 @@ class Report(NamedTuple):
     advice: str
 
 
-def write_report(source: str | Path, storage: str, out: str | Path | None = None) -> Report:
+def write_report(
+    source: str | Path, storage: str, out: str | Path | None = None, problems: Sequence[Problem] = ()
+) -> Report:
     """Write a page, NAME.html, and its tables, NAME.md, on a tuned file or a study; all metrics are computed anew.
 
     Args:
         source: a tuned file, or the name of a study.
         storage: where the study is; without it a page on a tuned file leaves the search out.
         out: folder of the two files, by default that of the tuned file, or `out`.
+        problems: what it is of, where that is code: nothing that a file or a study names is imported.
 
     Raises:
         ValueError: if the tuned file is refused, there is no such study, or the folder cannot be written.
     """
-    subject = find_subject(source, storage)
+    subject = find_subject(source, storage, problems)
     plan, choice = subject.plan, subject.choice
     folder = Path(out) if out is not None else Path(source).parent if is_file(source) else Path("out")
     name = Path(source).stem if is_file(source) else subject.name

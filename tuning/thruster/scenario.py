@@ -7,6 +7,7 @@ import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -21,7 +22,7 @@ from thruster_env.linear.linear_plant import make_linear_plant
 from thruster_env.linear.steady_state import state_range
 from thruster_env.model import model_of_plant
 from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_PROCESS_NOISE, Plant, make_plant
-from thruster_env.plant_data import plant_data
+from thruster_env.plant_data import check_same_plant, plant_data
 from thruster_env.simulation import simulate
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.excitation import EXCITATIONS, Excitation, Steps
@@ -166,6 +167,11 @@ class Scenario(Problem):
     def plant_data(self) -> dict:
         """The plant as data, for comparison with an env's."""
         return plant_data(self.plant)
+
+    def check_tuned_for(self, plant: Mapping | None, file: str | Path) -> None:
+        """Raise ValueError if a tuned file is for another thruster, dt or sensor."""
+        if plant is not None:
+            check_same_plant(plant, self.plant, file)
 
     @property
     def counts_start_up(self) -> bool:
