@@ -93,7 +93,7 @@ def _timed(plan: Plan, count: int) -> tuple[float, float, StudyResult]:
 
         return call
 
-    with mock.patch.multiple(trials, run=clocked(trials.run), judge=clocked(trials.judge)):
+    with mock.patch.multiple(trials, run=clocked(trials.run), compute_metrics=clocked(trials.compute_metrics)):
         begin = perf_counter()
         result = _study(plan, count)
         return perf_counter() - begin, spent[0], result

@@ -57,6 +57,7 @@ def _check_arguments(name: str, function: Callable, arguments: str) -> None:
 
 def _check_result(name: str, function: Callable, model, arguments: str, shape: tuple, rule: str) -> None:
     for point in (model.prior_mean, model.prior_mean + model.scales):
+        must_be_known = point is model.prior_mean and not name.endswith("jacobian")
         given = {"x": tuple(point.tolist()), "u": (0.0,) * model.inputs, "c": model.constants}
         try:
             with np.errstate(all="ignore"):
@@ -65,6 +66,8 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
             continue
         except Exception as error:
             if str(error).startswith("math "):  # "math domain error", where machine code has NaN
+                if must_be_known:
+                    raise ValueError(_not_nan(name, str(error))) from None
                 continue
             sizes = f"{_count(model.n, 'state')} and {_count(model.inputs, 'input')}"
             reason = " ".join(f"{type(error).__name__}: {error}".split())
@@ -72,7 +75,13 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
         found = _shape(result)
         if found != shape:
             raise ValueError(f"{name} must return {rule}, but returned {_said(found, result)}")
+        if must_be_known and np.isnan(as_floats(result)).any():
+            raise ValueError(_not_nan(name, shown(result)))
         return
+
+
+def _not_nan(name: str, said: str) -> str:
+    return f"{name} must not be NaN at the prior mean with inputs of zero, but got {said}"
 
 
 def _shape(result) -> tuple[int, ...] | None:

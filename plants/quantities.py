@@ -16,7 +16,7 @@ class Quantity(NamedTuple):
         name: in words, such as "motor speed".
         symbol: as equations have it and files name it, such as "omega_m"; letters, digits, "_" and "-".
         unit: of SI, such as "rad/s"; empty for a pure number.
-        angle: whether it wraps at 2 pi [rad]: differences of it are taken the short way round.
+        angle: whether it wraps at 2 pi [rad]: filters and scores take differences of it the short way round.
     """
 
     name: str

@@ -100,7 +100,8 @@ def _simulation(begin, advance, measure, n: int, m: int, interpreting: bool):
 def simulate(model: StateSpaceModel, keys: np.ndarray, inputs: np.ndarray) -> Truth:
     """Draw truths from a model, one for every key (B, 2), under inputs (B, K, p).
 
-    The numbers are those of the plant with the same key, where the model is exact.
+    The numbers are those of the plant with the same key, where the model is exact. States and measurements that
+    are angles are as f and h give them, of any turn: filters and errors (`numerics.angles.difference`) wrap them.
 
     Raises:
         ValueError: if shapes do not fit.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from numerics.compiled import inlined
 from numerics.derivatives import complex_step
 from numerics.pickling import as_function, as_made
 from plants.model_check import check_functions, checked_constants
+from plants.model_digest import digest_of
 from plants.quantities import Quantities, outputs, quantities
 from plants.shape import Functions, Shape, constants_form
 
@@ -154,6 +156,11 @@ class StateSpaceModel:
     def quantities(self) -> Quantities:
         """Names, symbols and units of states, inputs and measurements."""
         return Quantities(self.states, self.input_quantities, self.measurements)
+
+    @cached_property
+    def digest(self) -> str:
+        """A short hash of names, units, sizes and what f and h compute; Q, R and the prior are no part of it."""
+        return digest_of(self)
 
     def output(self, symbol: str, states: np.ndarray) -> np.ndarray:
         """The output of a symbol at states (..., n), (...); ValueError if there is none."""

@@ -1,4 +1,4 @@
-"""A small linear problem for tests: any number of states and channels, an output, with or without truth."""
+"""A linear problem for tests: any number of states and channels, a derived output, with or without truth."""
 
 import numpy as np
 

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 from filters import FILTERS, StateSpaceModel, Unknown, affine_model, augmented_model, make_filter, run, smooth
+from filters.consistency.report import consistency_report
+from filters.ensembles.recording import record_members
 from filters.gaussian.mixture import part_aligner
 from filters.likelihood import likelihood
 from numerics.angles import difference, row_aligner, wrapped, wrapped_where
 from numerics.compiled import compiled, interpreted
 from numerics.streams import filter_keys
 from plants.quantities import Quantity
+from plants.shape import observation_slopes, transition_slopes
 from tests.models import simulated, small
 
 DT = 0.1
@@ -161,6 +164,7 @@ OTHERS = [
     ("fuzzy", {"blending": "output"}),
     ("ienkf", {"ensemble_size": 12, "inflation": 1.1, "relaxation": 0.5}),
     ("etkf", {"ensemble_size": 12, "inflation": 1.1, "relaxation": 0.5}),
+    ("ensrf", {"ensemble_size": 12, "rotations": 1}),
     ("sage-husa", {"process_forgetting_factor": 0.9}),
 ]
 
@@ -171,6 +175,32 @@ def test_other_forms_of_filters_err_alike_across_the_cut(name, numbers):
     _, plain, make = makers(name)
     filters = (make_filter(name, model, **numbers) for model in (plain, make(3.0)))
     assert_rotated(*reversed(compare_rotated(*filters, 3.0, run)), 3.0)
+
+
+def test_slopes_are_those_of_an_angle_at_the_cut():
+    """Of functions that jump there, by central differences."""
+    model = turning(wraps=True)
+    x = (0.2, math.pi - 0.02)
+    assert turn_and_wrap(x, (0.0,), (0.0,))[1] == pytest.approx(math.pi)
+    found = transition_slopes(model.functions, model.shape)(x, (1.0, 1.0), (0.0,), (0.0,))
+    np.testing.assert_allclose(found, [[1.0, 0.0], [DT, 1.0]], atol=1e-8)
+    found = observation_slopes(model.functions, model.shape)((0.0, math.pi), (1.0, 1.0), (0.0,))
+    np.testing.assert_allclose(found, [[0.0, 1.0], [1.0, 0.0]], atol=1e-8)
+
+
+def test_slopes_along_a_joint_parameter_are_those_of_an_angle_at_the_cut():
+    model = turning(
+        observe=lambda x, c: (turned(x[1] + c[0]), x[0]),
+        observe_jacobian=lambda x, c: ((0.0, 1.0), (1.0, 0.0)),
+        transition=lambda x, u, c: (x[0], turned(x[1] + c[0])),
+        transition_jacobian=lambda x, u, c: ((1.0, 0.0), (0.0, 1.0)),
+    )
+    joint = augmented_model(model, {0: Unknown(0.1)})
+    x = (0.0, math.pi - 0.3, 0.3)
+    np.testing.assert_allclose(joint.observe_jacobian(x, joint.constants)[0], [0.0, 1.0, 1.0], atol=1e-8)
+    np.testing.assert_allclose(
+        joint.transition_jacobian(x, (0.0,), joint.constants)[1], [0.0, 1.0, 1.0], atol=1e-8
+    )
 
 
 @pytest.mark.parametrize("name", ["kf", "ekf", "ukf", "ckf", "enkf", "etkf"])
@@ -247,14 +277,38 @@ def test_a_sample_is_put_on_the_branch_of_its_weighted_circular_mean(compiling):
             assert np.ptp(found[1] - angles) < 1e-12  # all within half a turn of 3 they stay together
 
 
+@pytest.mark.parametrize(("name", "numbers"), [("pf", {"ensemble_size": 4000}), ("gsf", {"parts": 41})])
 @pytest.mark.usefixtures("as_python")
-def test_weights_decide_where_the_mean_of_particles_is():
-    """Nearly all weight lies opposite to where the particles are on average, on both sides of the cut there."""
+def test_weights_decide_where_the_mean_is(name, numbers):
+    """Nearly all weight lies opposite to where the belief was on average, on both sides of the cut there."""
     model = turning(prior_cov=[1e-4, 4.0], measurement_noise_cov=[1e-3, 1.0])
-    filter_ = make_filter("pf", model, ensemble_size=4000)
+    filter_ = make_filter(name, model, **numbers)
     belief, _ = filter_.update(filter_.init((1, 2)), [3.1, 0.2])
     assert abs(difference(belief.mean, [0.2, 3.1], (False, True))[1]) < 0.02
     assert belief.cov[1, 1] == pytest.approx(1e-3, rel=0.3)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_consistency_is_judged_alike_across_the_cut():
+    """The truth may be of any turn: it is errors that are wrapped."""
+    flags = turning().shape.state_angles
+
+    def find(filter_, *data):
+        keys, inputs, measurements = data
+        heading = filter_.model.prior_mean[1] + (10 * math.pi if filter_.model.shape.state_angles[1] else 0.0)
+        states = np.tile([0.2, heading], (2, STEPS + 1, 1))
+        members = record_members(filter_, *data, every=3)
+        return consistency_report(run(filter_, *data), states, measurements, members=members, angles=flags)
+
+    filters = (make_filter("enkf", model, ensemble_size=8) for model in (turning(angles=False), turning(3.0)))
+    reference, found = compare_rotated(*filters, 3.0, find)
+    assert found.nees.mean == pytest.approx(reference.nees.mean, rel=1e-9)
+    assert found.nis.mean == pytest.approx(reference.nis.mean, rel=1e-9)
+    np.testing.assert_allclose(found.whiteness.correlations, reference.whiteness.correlations, atol=1e-9)
+    np.testing.assert_allclose(found.crps, reference.crps, rtol=1e-9)
+    np.testing.assert_allclose(found.ensemble.crps, reference.ensemble.crps, rtol=1e-9)
+    for one, other in zip(found.ensemble.ranks, reference.ensemble.ranks, strict=True):
+        np.testing.assert_array_equal(one.frequencies, other.frequencies)
 
 
 def test_differences_of_angles_go_the_short_way_round():

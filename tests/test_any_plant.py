@@ -17,11 +17,14 @@ from thruster_cli.tables import choice_table
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
 from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.sizes import ensemble_sizes
 from tuning.evaluation.tuned import summary
 from tuning.evaluation.worth import worth
 from tuning.report.consistency_figures import consistency_figure
 from tuning.report.figures import comparison_figure
 from tuning.report.panels import shown_states
+from tuning.report.parts import advice, held_out_section
+from tuning.report.subject import Subject
 from tuning.report.tables import errors_table, numbers_table
 from tuning.report.time_figures import estimates_figure
 from tuning.search.objectives import check_objectives, find_objective, nis_ratio
@@ -220,6 +223,18 @@ def test_objectives_say_what_they_need(proofs):
         ValueError, match="objective must be one of score, thrust, .*output:SYMBOL, but got 'output:'"
     ):
         find_objective("output:")
+
+
+def test_a_report_without_truth_says_so_and_has_no_errors(proofs):
+    problem, proof = proofs[3, False]
+    plan, choice = Plan("kf", (problem,), objectives=("likelihood",)), true_choice("kf", problem)
+    assert advice(choice, plan, [proof]).endswith(
+        "the covariance is consistent (mean NIS 1.76 where 1.81 is right)."
+    )
+    said, table = held_out_section(None, Subject("s", plan, choice, None, 8, True), [proof]).parts
+    assert said.sentences[0].startswith("linear-3 has no truth: filters are compared by how well they predict")
+    assert table == errors_table(problem, proof)
+    assert ensemble_sizes(true_choice("enkf", problem), plan, []) == []
 
 
 def test_numbers_of_a_filter_have_the_units_of_their_states(proofs, monkeypatch):

@@ -143,7 +143,7 @@ def test_a_grid_ends_where_it_is_exhausted():
     [
         ({"scenarios": ()}, "a study must have at least one scenario, but got none"),
         ({"objectives": ("score", "score")}, "objectives must be one, or two different ones"),
-        ({"objectives": ("speed",)}, "objective must be one of score, thrust, likelihood, consistency, cost"),
+        ({"objectives": ("speed",)}, "objective must be one of score, thrust, likelihood, nis, consistency, cost"),
         ({"filter": "low-pass", "objectives": ("likelihood",)}, "'likelihood' needs a filter with a covariance"),
         ({"sampler": "guess"}, "sampler must be one of tpe, gp, cma-es, nsga-ii, random, grid, but got 'guess'"),
     ],
@@ -168,11 +168,11 @@ def test_from_a_bad_start_a_study_of_a_perfect_model_comes_within_half_a_per_cen
 
 
 def test_a_trial_whose_nis_is_not_finite_is_inconsistent_and_has_no_twin(monkeypatch):
-    def lost(filter_, estimates, data, scale, judge=trials.judge):
+    def lost(filter_, estimates, data, scale, judge=trials.compute_metrics):
         evaluation = judge(filter_, estimates, data, scale)
         return evaluation._replace(nis=evaluation.nis._replace(value=np.nan))
 
-    monkeypatch.setattr(trials, "judge", lost)
+    monkeypatch.setattr(trials, "compute_metrics", lost)
     result = studied(PLAN, 3)
     assert len(result.trials) == 3 and all(violation(trial) == LARGEST for trial in result.trials)
     assert not any(TWIN in trial.user_attrs for trial in result.trials)

@@ -320,6 +320,10 @@ class TestSpecifications:
         assert env.filter.ensemble_size == 20
 
 
+def assumed(**arguments):
+    return {"model_arguments": arguments}
+
+
 class TestModels:
     def test_without_a_model_it_assumes_the_env_s_own_plant(self):
         arguments = {"preset": "tunnel_physical", "dt": 0.005, "process_noise_cov": [4.0, 0.01]}
@@ -328,36 +332,32 @@ class TestModels:
         np.testing.assert_array_equal(env.filter.model.numbers, expected.numbers)
 
     def test_the_noise_is_the_filter_s_own_where_it_is_given(self):
-        model = wrapped("ekf", process_noise_cov=[4.0, 0.01], measurement_noise_cov=9.0).filter.model
+        model = wrapped("ekf", **assumed(process_noise_cov=[4.0, 0.01], measurement_noise_cov=9.0)).filter.model
         np.testing.assert_array_equal(model.process_noise_cov, np.diag([4.0, 0.01]))
         np.testing.assert_array_equal(model.measurement_noise_cov, [[9.0]])
 
     def test_a_mismatch_is_a_factor_on_a_parameter_of_the_model_alone(self):
         factors = {"lift_coefficient": 1.15, "voltage_gain": 0.95}
-        env = wrapped("ekf", parameter_factors=factors)
-        assumed, true = env.filter.model.constants, thruster_model().constants
+        env = wrapped("ekf", **assumed(parameter_factors=factors))
+        found, true = env.filter.model.constants, thruster_model().constants
         scaled = TUNNEL._replace(lift_coefficient=1.15 * 1.75, voltage_gain=0.95 * 1133.2)
         expected = derive_constants(scaled, substep=true.substep)
-        np.testing.assert_allclose(assumed, expected, rtol=1e-12)
-        assert assumed.motor_damping == true.motor_damping
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+        assert found.motor_damping == true.motor_damping
         actions = np.full((300, 1), 10.0, dtype=np.float32)
         one, other = played(env, actions, 1)[2], played(wrapped("ekf"), actions, 1)[2]
         np.testing.assert_array_equal(infos_of("state", one), infos_of("state", other))
         error = [abs((infos_of("estimate", i) - infos_of("state", i))[100:, 0].mean()) for i in (one, other)]
         assert error[0] > 2.0 > 1.0 > error[1]  # a voltage gain 5 % low: 4 rad/s of bias at 80
 
-    def test_a_module_s_factory_makes_the_model_from_the_other_arguments(self):
-        env = wrapped("ekf", model=f"{__name__}:own_model", process_noise_cov=[9.0, 0.1])
+    def test_a_module_s_factory_makes_the_model_from_its_arguments(self):
+        env = wrapped("ekf", model=f"{__name__}:own_model", **assumed(process_noise_cov=[9.0, 0.1]))
         np.testing.assert_array_equal(env.filter.model.process_noise_cov, np.diag([9.0, 0.1]))
 
     def test_a_kalman_filter_works_about_the_operating_voltage(self):
-        default, other = wrapped("kf"), wrapped("kf", operating_voltage=-3.0)
+        default, other = wrapped("kf"), wrapped("kf", **assumed(operating_voltage=-3.0))
         assert default.filter.model.operating_input.tolist() == [12.0]
         assert other.filter.model.operating_input.tolist() == [-3.0]
-
-
-def assumed(arguments):
-    return {"model_arguments": arguments}
 
 
 @pytest.mark.parametrize(
@@ -388,7 +388,7 @@ def assumed(arguments):
             {"model_arguments": {"process_noise_cov": [-1.0, 1.0]}},
             "process_noise_cov must be positive semidefinite.*-1",
         ),
-        (assumed({"measurement_noise_cov": 0.0}), "measurement_noise_cov must be positive definite"),
+        ({"model_arguments": {"measurement_noise_cov": 0.0}}, "measurement_noise_cov must be positive definite"),
         (
             {"model_arguments": {"parameter_factors": {"lift": 1.1}}},
             r"parameter_factors must name fields of .*\['lift'\]",

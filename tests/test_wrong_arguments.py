@@ -267,6 +267,14 @@ def fails(x, c):
             "transition_jacobian must return 2 rows of 2, as prior_mean has 2, but returned 1 x 2 numbers",
         ),
         ({"observe_jacobian": lambda x, c: (1.0, 0.0)}, "observe_jacobian must return 2 rows of 2, .* 2 entries"),
+        (
+            {"observe": lambda x, c: (x[0], math.sqrt(-x[0]))},
+            "observe must not be NaN at the prior mean with inputs of zero, but got .*",
+        ),
+        (
+            {"transition": lambda x, u, c: (x[0], np.log(u[0] - 1.0))},
+            r"transition must not be NaN at the prior mean with inputs of zero, but got \(0.5, .*nan",
+        ),
     ],
 )
 def test_a_model_is_tried_when_it_is_made(changes, rule):
@@ -277,3 +285,4 @@ def test_what_has_no_value_at_the_mean_is_tried_beside_it():
     changes = {"prior_mean": [0.0, 0.0]}
     pendulum(observe=lambda x, c: (1.0 / x[0], math.log(x[1])), **changes)
     refused(lambda: pendulum(observe=lambda x, c: (1.0 / x[0],), **changes), "but returned 1 entry")
+    pendulum(observe_jacobian=lambda x, c: ((math.nan, 0.0), (0.0, 1.0)))  # particles do without it

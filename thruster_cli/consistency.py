@@ -19,7 +19,7 @@ from tuning.search.space import Choice
 
 
 def check_request(path: Path, filter_name: str) -> None:
-    """Raise ValueError if a filter cannot be judged, or its picture not be written there."""
+    """Raise ValueError if a filter has no covariance to check, or its picture not be written there."""
     if path.suffix != ".png":
         raise ValueError(f"--consistency must end in .png, but got {str(path)!r}")
     if not filter_class(filter_name).has_covariance:
@@ -27,7 +27,9 @@ def check_request(path: Path, filter_name: str) -> None:
     check_target(path)
 
 
-def judge(choice: Choice, name: str, scenario: Problem, proof: Comparison, path: Path) -> tuple[list[str], dict]:
+def check_covariance(
+    choice: Choice, name: str, scenario: Problem, proof: Comparison, path: Path
+) -> tuple[list[str], dict]:
     """Draw the checks of a choice, called `name`; return what is to be said and the numbers behind it."""
     report = check_consistency(choice.filter(scenario), scenario.data(proof.seeds))
     said, against, ratios = sentences(report), {}, None
@@ -39,7 +41,7 @@ def judge(choice: Choice, name: str, scenario: Problem, proof: Comparison, path:
         if len(named) > MOST_STATES:
             said.append(f"Of {len(named)} states these are the first {MOST_STATES}.")
     title = f"{choice.name}, {name}, on {report.runs} seeds of {scenario.name}"
-    consistency_figure(path, report, title, against)
+    consistency_figure(path, report, title, against, proof.tuned.scored or None)
     data = {**as_data(report), "rmse_over_true": ratios, "sentences": said, "picture": str(path)}
     return [f"Is the {name} filter consistent?", *said, f"Picture: {path}"], data
 

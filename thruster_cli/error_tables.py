@@ -66,6 +66,7 @@ def _below(evaluations: Mapping[str, Evaluation], bound: np.ndarray, outputs: Ma
         heads = [[name, *consistency_cells(found)]] + [["", "", ""]] * (len(block) - 1)
         rows += [[head[0], *cells, *head[1:]] for head, cells in zip(heads, block, strict=True)]
     limits = [[s.short_label, limit_cell(b, d), ""] for s, b, d in zip(first.states, bound, digits, strict=True)]
+    limits = limits if any(cells[1] for cells in limits) else [["", "", ""]]
     heads = [["bound", str(len(bound)), right_nis(first)]] + [["", "", ""]] * (len(limits) - 1)
     rows += [[head[0], *cells, *head[1:]] for head, cells in zip(heads, limits, strict=True)]
     return ["filter", "state", "RMSE", "above\n[%]", "NEES", "NIS"], rows

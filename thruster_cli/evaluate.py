@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from thruster_cli.consistency import check_request, judge
+from thruster_cli.consistency import check_covariance, check_request
 from thruster_cli.error_tables import comparison_table
 from thruster_cli.output import (
     FILTER_HELP,
@@ -92,6 +92,6 @@ def command(
     if consistency is not None:
         name = RULE if tuned is None else TUNED
         with progress_console.status("checking the covariance ..."):
-            words, data["consistency"] = judge(choice, name, chosen, proof, consistency)
+            words, data["consistency"] = check_covariance(choice, name, chosen, proof, consistency)
         shown += words
     emit(shown, data, json)

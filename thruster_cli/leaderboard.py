@@ -86,7 +86,8 @@ def _errors_below(board: Leaderboard, title: str) -> Table:
         rows += [[row.label if i == 0 else "", *cells] for i, cells in enumerate(block)]
     limits = zip(states, board.bound, digits, strict=True)
     bounds = [[state.short_label, limit_cell(bound, places), "", "", ""] for state, bound, places in limits]
-    rows += [["bound" if i == 0 else "", *cells] for i, cells in enumerate(bounds)]
+    if any(cells[1] for cells in bounds):
+        rows += [["bound" if i == 0 else "", *cells] for i, cells in enumerate(bounds)]
     heads = ["filter", "state", "RMSE", "above\n[%]", "start-up", f"over\n{board.rows[0].label}"]
     return table(title, heads, rows, caption=_CAPTION)
 

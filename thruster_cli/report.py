@@ -1,4 +1,4 @@
-"""`thruster report`: a page on a tuned filter, its study and its proof."""
+"""`thruster report`: a page on a tuned filter, its study and its evaluation on held-out seeds."""
 
 from __future__ import annotations
 

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.consistency.errors import state_errors
 from filters.consistency.intervals import Interval, mean_interval
 from filters.consistency.nees import SquaresCheck, check_squares
 from filters.consistency.scores import (
@@ -22,6 +21,7 @@ from filters.consistency.uniformity import Uniformity, uniformity
 from filters.consistency.whiteness import LAGS, Whiteness, whiteness
 from filters.engine.batch import Estimates
 from filters.ensembles.recording import Members
+from numerics.angles import difference, is_angle, wrapped
 
 
 class EnsembleCheck(NamedTuple):
@@ -76,7 +76,7 @@ def consistency_report(
         members: of the first of these runs, for ensembles, from `filters.ensembles.recording.record_members`.
         first_step: steps before it are start-up and do not count.
         names: of the states, with units.
-        angles: which states are angles, whose errors are taken the short way round.
+        angles: (n,), which states are angles, as the filter's `model.shape.state_angles`; none if empty.
         channels: names of the measurements, with units.
         lags: of the innovations' correlation.
 
@@ -92,7 +92,7 @@ def consistency_report(
     names = _named("names", names, n, "state")
     channels = _named("channels", channels, m, "channel")
     truth = np.full(estimates.means.shape, np.nan) if states is None else states
-    errors, covs = state_errors(estimates.means, truth, angles)[:, late], estimates.covs[:, late]
+    errors, covs = difference(estimates.means, truth, angles)[:, late], estimates.covs[:, late]
     innovations, innovation_covs = estimates.innovations[:, late], estimates.innovation_covs[:, late]
     present = None if measurements is None else ~np.isnan(measurements[:, late])
     deviations, expected_deviations = _deviations(covs), _deviations(innovation_covs)
@@ -126,12 +126,14 @@ def consistency_report(
 
 
 def check_ensemble(members: Members, states: np.ndarray, angles: Sequence[bool] = ()) -> EnsembleCheck:
-    """Hold ensembles of the first runs against the truth of all, (B, K + 1, n); angles as for `state_errors`."""
+    """Hold ensembles of the first runs against the truth of all, (B, K + 1, n); angles the short way round."""
     truth, size = states[: len(members.members), members.steps], members.members.shape[-1]
-    x = np.moveaxis(members.members, -1, 0)
-    if np.any(angles):
-        x = truth + state_errors(x, np.broadcast_to(truth, x.shape), angles)  # as near to the truth as angles are
-    parts = [(truth[..., i], np.moveaxis(x[..., i], 0, -1), members.weights) for i in range(states.shape[-1])]
+
+    def near(i):
+        values, middle = members.members[..., i, :], truth[..., i, None]
+        return middle + wrapped(values - middle) if is_angle(i, angles) else values
+
+    parts = [(truth[..., i], near(i), members.weights) for i in range(states.shape[-1])]
     return EnsembleCheck(
         size,
         tuple(uniformity(ensemble_ranks(*part), steps=size + 1) for part in parts),

@@ -199,7 +199,7 @@ def remedy_sentence(report: ConsistencyReport) -> str:
     next_step = np.diagonal(report.whiteness.correlations[0])
     strongest = next_step[np.argmax(np.abs(next_step))]
     slow, quick = strongest > SLIGHT_CORRELATION, strongest < -SLIGHT_CORRELATION
-    word = confidence(nees.mean, nees.dimension) if report.has_truth else "consistent"
+    word = "consistent" if np.isnan(nees.mean.value) else confidence(nees.mean, nees.dimension)
     if over:
         what = "raise Q, or repair the model" if slow else "raise R" if quick else "raise Q and R alike"
     elif under:

@@ -7,8 +7,11 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import ClassVar
 
+from filters.engine.belief import Kernels
 from filters.ensembles.ensemble import EnsembleFilter, measurement_moments
+from filters.ensembles.rotation import with_rotation
 from numerics import matrices
+from numerics.checks import at_least
 from numerics.compiled import inlined
 from numerics.tuples import column_writer, matrix_of, tuple_of, written_out
 from plants.shape import Shape
@@ -48,6 +51,29 @@ def deterministic_analysis(gain: Callable, observe: Callable, shape: Shape) -> C
     return analyse
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DeterministicUpdateFilter(EnsembleFilter):
+    """Base of the ensemble filters whose update draws nothing.
+
+    Attributes:
+        rotations: 1 for a random rotation of the members about their mean after each update, 0 for none. It keeps
+            them from growing outliers where little or no process noise mixes them.
+    """
+
+    rotations: int = 0
+
+    def __post_init__(self):
+        """Check the numbers; raise ValueError that states the rule and the value."""
+        super().__post_init__()
+        if at_least("rotations", self.rotations, 0) > 1:
+            raise ValueError(f"rotations must be 0 or 1, but got {self.rotations}")
+
+    def kernels(self) -> Kernels:
+        """Kernels for the model's functions; see `Filter.kernels`."""
+        plain = super().kernels()
+        return with_rotation(plain) if self.rotations else plain
+
+
 @cache
 def half_gain(n: int, m: int) -> Callable:
     """Return `gain(cross, s, r, root)`: half of K = cross S^-1."""
@@ -68,7 +94,7 @@ def half_gain_analysis(observe: Callable, shape: Shape) -> Callable:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class DeterministicEnsembleKalmanFilter(EnsembleFilter):
+class DeterministicEnsembleKalmanFilter(DeterministicUpdateFilter):
     """Deterministic ensemble Kalman filter: the mean moves by the gain, the members' distances by half of it.
 
         predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
@@ -78,7 +104,7 @@ class DeterministicEnsembleKalmanFilter(EnsembleFilter):
     With a linear h the update leaves P - K H P + K H P H'K'/4, more than the Kalman filter's P - K H P, by little
     where measurements are poor. The update draws nothing: the process noise that stirs the members is all that is
     random, and what its sample lacks of mean zero and covariance Q enters the estimate. Attributes are those of
-    `EnsembleFilter`.
+    `DeterministicUpdateFilter`.
 
     Source: Sakov, Oke (2008), "A deterministic formulation of the ensemble Kalman filter".
     """

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import ClassVar
 
-from filters.ensembles.deterministic import deterministic_analysis
-from filters.ensembles.ensemble import EnsembleFilter
+from filters.ensembles.deterministic import DeterministicUpdateFilter, deterministic_analysis
 from numerics import matrices
 from numerics.compiled import inlined
 from numerics.tuples import matrix_of, written_out
@@ -39,7 +38,7 @@ def serial_analysis(observe: Callable, shape: Shape) -> Callable:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SerialSquareRootFilter(EnsembleFilter):
+class SerialSquareRootFilter(DeterministicUpdateFilter):
     """Serial ensemble square root filter (EnSRF), without perturbed measurements.
 
         predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
@@ -56,7 +55,7 @@ class SerialSquareRootFilter(EnsembleFilter):
     enters the estimate.
 
     With one channel it is the `EnsembleTransformFilter`. Close relatives go by the name of EnKF-SR in the
-    literature on ships. Attributes are those of `EnsembleFilter`.
+    literature on ships. Attributes are those of `DeterministicUpdateFilter`.
 
     Source: Whitaker, Hamill (2002), "Ensemble data assimilation without perturbed observations", equations (10) to
     (13); Andrews (1968), "A square root formulation of the Kalman covariance equations".

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import ClassVar
 
-from filters.ensembles.deterministic import deterministic_analysis
-from filters.ensembles.ensemble import EnsembleFilter
+from filters.ensembles.deterministic import DeterministicUpdateFilter, deterministic_analysis
 from numerics import matrices
 from numerics.compiled import inlined
 from numerics.tuples import matrix_of, written_out
@@ -74,7 +73,7 @@ def transform_analysis(observe: Callable, shape: Shape) -> Callable:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EnsembleTransformFilter(EnsembleFilter):
+class EnsembleTransformFilter(DeterministicUpdateFilter):
     """Ensemble transform Kalman filter (ETKF) with the symmetric square root, without perturbed measurements.
 
         predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
@@ -88,7 +87,7 @@ class EnsembleTransformFilter(EnsembleFilter):
     The covariance after an update is exactly P - K S K', where the stochastic filter's is so on average only; the
     mean moves as the Kalman filter's. The update draws nothing: the process noise that stirs the members is all
     that is random, and what its sample lacks of mean zero and covariance Q enters the estimate. Attributes are
-    those of `EnsembleFilter`.
+    those of `DeterministicUpdateFilter`.
 
     Source: Bishop, Etherton, Majumdar (2001), "Adaptive sampling with the ensemble transform Kalman filter", part
     I; the symmetric root: Hunt, Kostelich, Szunyogh (2007), "Efficient data assimilation for spatiotemporal chaos:

@@ -31,7 +31,11 @@ def smooth_ensembles(
     get the analysis that they would get as part of one long state: with perturbed measurements
     x_lj += cov(x_l, y) S^-1 (z - v_j - y_j). Relaxation is for the members of now only, and steps before a restart
     from the prior are left as they are.
+
+    Raises ValueError for a filter with rotations, which would part the members of different steps.
     """
+    if getattr(filter_, "rotations", 0):
+        raise ValueError(f"a smoothed filter must have rotations 0, but got {filter_.rotations}")
     paired = dataclasses.replace(filter_, model=_paired_model(filter_.kernel_model))
     kernels, pair_kernels, size = filter_.kernels(), paired.kernels(), filter_.size
     analyse_pair = type(filter_).analysis(paired.model.functions.observe, paired.model.shape)

@@ -16,7 +16,7 @@ from filters.particles.weighted import WeightedFilter
 from filters.registry import filter_class, make_filter
 from numerics.checks import one_of, positive
 from tuning.evaluation.baselines import oracle, rule_of_thumb, scaled_default
-from tuning.evaluation.evaluate import Evaluation, judge, likelihood_gain, score_ratio
+from tuning.evaluation.evaluate import Evaluation, compute_metrics, likelihood_gain, score_ratio
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 from tuning.search.interruption import stop_on_interrupt
@@ -201,7 +201,7 @@ def compare(
 
 def _row(label: str, filter_: Filter, data: Data, board: Leaderboard) -> Row:
     estimates, seconds = timed_run(filter_, data)
-    evaluation = judge(filter_, estimates, data, board.scenario.scale)
+    evaluation = compute_metrics(filter_, estimates, data, board.scenario.scale)
     first = board.rows[0].evaluation if board.rows else evaluation
     particles = isinstance(filter_, WeightedFilter)
     return Row(

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.consistency.errors import state_errors
 from filters.consistency.intervals import Interval, interval, mean_interval, resampled_means, rmse_intervals
 from filters.consistency.nees import normalized_squares
 from filters.consistency.report import ConsistencyReport, consistency_report
 from filters.engine.batch import Estimates, run
 from filters.ensembles.recording import record_members
 from filters.filter import Filter
+from numerics.angles import difference
 from plants.quantities import Quantity
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 
@@ -68,10 +68,10 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
     Raises:
         ValueError: if the scale is not positive, or not one a state.
     """
-    return judge(filter_, run(filter_, data.filter_keys, data.inputs, data.measurements), data, scale)
+    return compute_metrics(filter_, run(filter_, data.filter_keys, data.inputs, data.measurements), data, scale)
 
 
-def judge(filter_: Filter, estimates: Estimates, data: Data, scale) -> Evaluation:
+def compute_metrics(filter_: Filter, estimates: Estimates, data: Data, scale) -> Evaluation:
     """What the estimates of a filter on some data are worth; arguments and errors are those of `evaluate`."""
     late, measurements = data.scored, data.measurements
     innovations, innovation_covs = estimates.innovations[:, late], estimates.innovation_covs[:, late]
@@ -108,7 +108,7 @@ def _errors(filter_: Filter, estimates: Estimates, data: Data, scale) -> dict:
             "scale": np.full(n, np.nan),
         }
     n, late, scale = data.states.shape[-1], data.scored, _checked(scale, data.states.shape[-1])
-    errors = errors_of(filter_, estimates, data)
+    errors = state_errors(filter_, estimates, data)
     squares = normalized_squares(errors[:, late], estimates.covs[:, late, :n, :n])
     mean_squares = (errors[:, late] ** 2).mean(axis=1)
     resampled = np.sqrt(resampled_means(mean_squares))  # (resamples, n)
@@ -138,14 +138,10 @@ def _checked(scale, n: int) -> np.ndarray:
     return scale
 
 
-def errors_of(filter_: Filter, estimates: Estimates, data: Data) -> np.ndarray:
-    """Estimates less truth (B, K + 1, n), angles of the filter's model the short way round."""
-    return state_errors(estimates.means, data.states, angles_of(filter_, data.states.shape[-1]))
-
-
-def angles_of(filter_: Filter, n: int) -> list[bool]:
-    """Which of the first n states are angles, as the filter's model says."""
-    return [state.angle for state in filter_.model.states[:n]]
+def state_errors(filter_: Filter, estimates: Estimates, data: Data) -> np.ndarray:
+    """Errors (B, K + 1, n) of the plant's n states, those of angles the short way round."""
+    n = data.states.shape[-1]
+    return difference(estimates.means[..., :n], data.states, filter_.model.shape.state_angles[:n])
 
 
 def _output_rmse(filter_: Filter, estimates: Estimates, data: Data) -> dict[str, Interval]:
@@ -156,12 +152,9 @@ def _output_rmse(filter_: Filter, estimates: Estimates, data: Data) -> dict[str,
             continue
         with np.errstate(all="ignore"):  # estimates far off, though finite, may have an output that is not
             values = filter_.model.output(symbol, estimates.means[:, late])
-        errors = state_errors(
-            np.clip(values, -FARTHEST, FARTHEST)[..., None],
-            truth[:, late, None],
-            [filter_.model.outputs[symbol].quantity.angle],
-        )
-        found[symbol] = rmse_intervals((errors[..., 0] ** 2).mean(axis=1, keepdims=True))[0]
+        values, angle = np.clip(values, -FARTHEST, FARTHEST), filter_.model.outputs[symbol].quantity.angle
+        errors = difference(values[..., None], truth[:, late, None], (angle,))[..., 0]
+        found[symbol] = rmse_intervals((errors**2).mean(axis=1, keepdims=True))[0]
     return found
 
 
@@ -179,7 +172,7 @@ def check_consistency(filter_: Filter, data: Data) -> ConsistencyReport:
         members=members,
         first_step=data.scored.start,
         names=[state.short_label for state in model.states[:n]],
-        angles=angles_of(filter_, n),
+        angles=model.shape.state_angles[:n],
         channels=[channel.label for channel in model.measurements],
     )
 
@@ -197,7 +190,7 @@ def _scores(rmse: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 def run_scores(filter_: Filter, estimates: Estimates, data: Data, scale) -> np.ndarray:
     """The score of each run by itself, (B,): mean over states of its RMSE over scale."""
-    errors = errors_of(filter_, estimates, data)[:, data.scored]
+    errors = state_errors(filter_, estimates, data)[:, data.scored]
     return _scores(np.sqrt((errors**2).mean(axis=1)), np.asarray(scale))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -17,7 +17,8 @@ from numerics.plots import BLUE, DARK, RUST, panels, save_figure
 from tuning.report.panels import COLUMNS, shown_states
 
 FOUND = BLUE
-COLOURS = (BLUE, RUST, "#5a8f3c", "#7a5195", "#9aa5ad", "#c9a227")  # of states, or of channels
+COLOURS = (BLUE, RUST, "#5a8f3c", "#7a5195", "#9aa5ad", "#c9a227")  # of states
+CHANNEL_COLOURS = ("#44aa99", "#cc6677", "#999933", "#882255", "#ddaa33", "#332288")
 PANEL = (4.0, 3.0)  # [inch]
 MOST_HANDLES = 5  # of a legend side by side
 MOST_VALUES = 3  # in the title of a panel
@@ -29,6 +30,7 @@ def consistency_figure(
     report: ConsistencyReport,
     title: str,
     comparison: Mapping[str, tuple[Interval, ...]] | None = None,
+    scored: Collection[int] | None = None,
 ) -> Path:
     """Draw a consistency report; dashed lines show the expected value, grey bands what chance allows.
 
@@ -39,23 +41,25 @@ def consistency_figure(
         report: the checks of one filter.
         title: said above the picture.
         comparison: RMSE ratios by state, from `intervals.rmse_ratios`, under the names of the pairs.
+        scored: places of the states that count in the score, which come first where not all are drawn.
 
     Raises:
         ValueError: if there is nothing to draw, or nothing can be written.
     """
-    checks = _panels(report, comparison)
+    places, left_out = shown_states(report.states, scored)
+    checks = _panels(report, comparison, places)
     if not checks:
         raise ValueError("a figure needs something to draw, but the filter gives no covariance")
     figure, axes = panels(len(checks), COLUMNS, PANEL, extra=0.4)
     for axis, draw in zip(axes, checks, strict=True):
         draw(axis)
         axis.title.set_fontsize(10)
-    _legend(figure, report)
+    _legend(figure, report, places, left_out)
     figure.suptitle(title, fontsize=11)
     return save_figure(figure, path)
 
 
-def _panels(report: ConsistencyReport, comparison: Mapping | None) -> list[Callable]:
+def _panels(report: ConsistencyReport, comparison: Mapping | None, places: Sequence[int]) -> list[Callable]:
     """A function on axes for each check of which there are numbers."""
     squares = [check for check in (report.nees, report.nis) if not np.isnan(check.mean.value)]
     found: list[Callable] = [partial(_squares, check=check, report=report) for check in squares]
@@ -63,26 +67,31 @@ def _panels(report: ConsistencyReport, comparison: Mapping | None) -> list[Calla
         found.append(partial(_correlations, report=report))
     found += [partial(_distribution, check=check) for check in squares]
     if not np.isnan(report.coverage_by_level).all():
-        by_level, places = report.coverage_by_level, _shown(report)[0]
-        coverage = partial(_coverage, found=report.coverage, by_level=by_level, what="truth", places=places)
-        found += [coverage, partial(_crps, report=report)]
+        shares = {"found": report.coverage, "by_level": report.coverage_by_level}
+        found.append(partial(_coverage, what="truth", colours=_of_states(places), **shares))
+        found.append(partial(_crps, report=report, places=places))
     elif not (report.has_truth or np.isnan(report.innovation_coverage_by_level).all()):
-        by_level, places = report.innovation_coverage_by_level, range(len(report.channels))
-        shares = {"found": report.innovation_coverage, "by_level": by_level, "places": places}
-        found.append(partial(_coverage, what="measurements", **shares))
+        shares = {"found": report.innovation_coverage, "by_level": report.innovation_coverage_by_level}
+        found.append(partial(_coverage, what="measurements", colours=_of_channels(report), **shares))
     if report.ensemble is not None:
-        found.append(partial(_ranks, report=report))
+        found.append(partial(_ranks, report=report, places=places))
     if comparison:
-        found.append(partial(_comparison, comparison=comparison, places=_shown(report)[0]))
+        found.append(partial(_comparison, comparison=comparison, places=places))
     return found
 
 
-def _shown(report: ConsistencyReport) -> tuple[list[int], str]:
-    """Places of the states that are drawn, and a line that says how many are not."""
-    return shown_states(report.states)
+def _of_states(places: Sequence[int]) -> dict[int, str]:
+    """Colours of the states that are drawn."""
+    return {i: COLOURS[row % len(COLOURS)] for row, i in enumerate(places)}
 
 
-def _legend(figure, report: ConsistencyReport) -> None:
+def _of_channels(report: ConsistencyReport) -> dict[int, str]:
+    """Colours of the channels, others than those of states; a single one has that of all that was found."""
+    count = len(report.channels)
+    return {j: FOUND if count == 1 else CHANNEL_COLOURS[j % len(CHANNEL_COLOURS)] for j in range(count)}
+
+
+def _legend(figure, report: ConsistencyReport, places: Sequence[int], left_out: str) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -91,17 +100,13 @@ def _legend(figure, report: ConsistencyReport) -> None:
         Patch(color=DARK, alpha=0.15, linewidth=0, label="95 % of chance"),
         Line2D([], [], color=FOUND, linewidth=1, label=f"found in {report.runs} runs"),
     ]
-    named, (places, left_out) = report.states, _shown(report)
-    if not report.has_truth:  # the colours are those of the channels
-        named, places, left_out = report.channels, range(len(report.channels)), ""
-        places = places if len(named) > 1 else ()
-    handles += [Line2D([], [], color=_colour(i), marker="o", label=named[i]) for i in places]
-    options = {"ncols": min(len(handles), MOST_HANDLES), "frameon": False, "title": left_out or None}
+    named = {report.states[i]: colour for i, colour in _of_states(places).items()} if report.has_truth else {}
+    if len(report.channels) > 1:
+        named |= {report.channels[j]: colour for j, colour in _of_channels(report).items()}
+    handles += [Line2D([], [], color=colour, marker="o", label=name) for name, colour in named.items()]
+    title = left_out if report.has_truth and left_out else None
+    options = {"ncols": min(len(handles), MOST_HANDLES), "frameon": False, "title": title}
     figure.legend(handles=handles, loc="outside lower center", **options)
-
-
-def _colour(i: int) -> str:
-    return COLOURS[i % len(COLOURS)]
 
 
 def _steps(report: ConsistencyReport) -> np.ndarray:
@@ -130,9 +135,8 @@ def _squares(axis, check: SquaresCheck, report: ConsistencyReport) -> None:
 def _correlations(axis, report: ConsistencyReport) -> None:
     found = report.whiteness
     lags, channels = np.arange(1, len(found.correlations) + 1), found.correlations.shape[1]
-    for i in range(channels):
-        places = lags + (i - (channels - 1) / 2) * 0.6 / channels
-        values, colour = found.correlations[:, i, i], FOUND if channels == 1 else _colour(i)
+    for i, colour in _of_channels(report).items():
+        places, values = lags + (i - (channels - 1) / 2) * 0.6 / channels, found.correlations[:, i, i]
         axis.vlines(places, 0, values, color=colour, linewidth=1.5)
         axis.plot(places, values, "o", color=colour, markersize=3)
     half = found.half_widths[:, 0, 0]
@@ -157,10 +161,12 @@ def _distribution(axis, check: SquaresCheck) -> None:
     axis.set_ylabel("frequency over the right one")
 
 
-def _coverage(axis, found: Sequence[Interval], by_level: np.ndarray, what: str, places: Sequence[int]) -> None:
+def _coverage(
+    axis, found: Sequence[Interval], by_level: np.ndarray, what: str, colours: Mapping[int, str]
+) -> None:
     axis.plot([0, 100], [0, 100], color=DARK, linestyle="--", linewidth=1)
-    for i in places:
-        axis.plot(100 * LEVELS, 100 * by_level[:, i], ".-", linewidth=1, color=_colour(i))
+    for i, colour in colours.items():
+        axis.plot(100 * LEVELS, 100 * by_level[:, i], ".-", linewidth=1, color=colour)
     axis.set_title(f"95 % intervals hold {_told([100 * part.value for part in found], '{:.1f} %'.format)}")
     axis.set_xlabel("level of the interval [%]")
     axis.set_ylabel(f"{what} found in it [%]")
@@ -173,9 +179,9 @@ def _told(values: Sequence[float], form: Callable[[float], str]) -> str:
     return f"{form(np.nanmin(values))} to {form(np.nanmax(values))}"
 
 
-def _crps(axis, report: ConsistencyReport) -> None:
-    for i in _shown(report)[0]:
-        axis.plot(_steps(report), report.crps_ratio[:, i], color=_colour(i), linewidth=0.8)
+def _crps(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
+    for i, colour in _of_states(places).items():
+        axis.plot(_steps(report), report.crps_ratio[:, i], color=colour, linewidth=0.8)
     _right(axis, 1)
     axis.set_ylim(bottom=0)
     axis.set_title(f"mean CRPS {_told([part.value for part in report.crps], rounded)}")
@@ -184,11 +190,11 @@ def _crps(axis, report: ConsistencyReport) -> None:
     axis.margins(x=0.01)
 
 
-def _ranks(axis, report: ConsistencyReport) -> None:
+def _ranks(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
     size = report.ensemble.size
-    for i in _shown(report)[0]:
+    for i, colour in _of_states(places).items():
         found = report.ensemble.ranks[i]
-        axis.stairs(found.frequencies, found.edges * (size + 1), color=_colour(i), linewidth=1.4)
+        axis.stairs(found.frequencies, found.edges * (size + 1), color=colour, linewidth=1.4)
     _right(axis, 1)
     axis.set_ylim(bottom=0)
     axis.set_title(f"rank of the truth among {size} members")
@@ -199,10 +205,10 @@ def _ranks(axis, report: ConsistencyReport) -> None:
 def _comparison(axis, comparison: Mapping[str, tuple[Interval, ...]], places: Sequence[int]) -> None:
     apart = min(0.2, 0.8 / len(places))
     for place, ratios in enumerate(comparison.values()):
-        for row, i in enumerate(places):
+        for row, (i, colour) in enumerate(_of_states(places).items()):
             ratio, height = ratios[i], -place - apart * (row - (len(places) - 1) / 2)
-            axis.plot([ratio.low, ratio.high], [height, height], "|-", color=_colour(i))
-            axis.plot(ratio.value, height, "o", color=_colour(i))
+            axis.plot([ratio.low, ratio.high], [height, height], "|-", color=colour)
+            axis.plot(ratio.value, height, "o", color=colour)
     axis.axvline(1, color=DARK, linestyle="--", linewidth=1)
     axis.set_yticks(-np.arange(len(comparison)), list(comparison))
     axis.set_ylim(0.5 - len(comparison), 0.5)

@@ -166,13 +166,14 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
     pair = {name: before.filter(scenario), TUNED: tuned}
     what = "Estimate and innovation, each with its" if data.states is None else "Truth, estimate and"
     caption = f"{what} 95 % band on {scenario.name}, held-out seed {proof.seeds.start}, before and after."
-    picture = book.picture(caption, estimates_figure, pair, data, 0, scenario.dt, sharey="row")
+    scored = proof.tuned.scored or None
+    picture = book.picture(caption, estimates_figure, pair, data, 0, scenario.dt, scored, sharey="row")
     sections = [Section("One run over time", [picture])]
     if filter_class(choice.name).has_covariance:
         report = check_consistency(tuned, data)
         caption = f"Checks of the tuned filter's covariance on {report.runs} held-out seeds of {scenario.name}."
         title = f"{choice.name}, tuned, on {report.runs} seeds of {scenario.name}"
-        picture = book.picture(caption, consistency_figure, report, title)
+        picture = book.picture(caption, consistency_figure, report, title, scored=scored)
         sections.append(Section("Is the covariance consistent?", [Words(sentences(report)), picture]))
     return sections
 

@@ -64,7 +64,7 @@ def write_report(
         choice = choice.with_size(sufficient_size(sizes, subject.consistent))
         subject = subject._replace(choice=choice)
     proofs = [prove(choice, scenario, plan.seed, subject.seeds) for scenario in plan.scenarios]
-    title = f"{choice.name} tuned on {', '.join(Path(scenario.name).stem for scenario in plan.scenarios)}"
+    title = f"{choice.name} tuned on {', '.join(_short(scenario.name) for scenario in plan.scenarios)}"
     said = advice(choice, plan, proofs)
     known = identify(choice, plan.scenarios, data, plan.space())
     nis = [nis_ratio(found) for found in measure(choice, plan, data)]
@@ -83,3 +83,8 @@ def write_report(
     errors = [errors_table(scenario, proof) for scenario, proof in zip(plan.scenarios, proofs, strict=True)]
     write_whole(tables, markdown_page(title, said, [*errors, *numbers]))
     return Report(page, tables, said)
+
+
+def _short(name: str) -> str:
+    """A problem's name in a title: of a file its own name alone."""
+    return Path(name).stem if name.endswith(".toml") else name

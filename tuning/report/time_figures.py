@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from filters.engine.batch import Estimates, run
 from filters.filter import Filter
 from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from plants.quantities import Quantity
-from tuning.evaluation.evaluate import errors_of
+from tuning.evaluation.evaluate import state_errors
 from tuning.problems.data import Data
 from tuning.report.panels import axis_label, shown_states
 
@@ -42,7 +42,13 @@ class Row(NamedTuple):
 
 
 def estimates_figure(
-    path: Path, filters: Mapping[str, Filter], data: Data, run_index: int, dt: float | None, **options
+    path: Path,
+    filters: Mapping[str, Filter],
+    data: Data,
+    run_index: int,
+    dt: float | None,
+    scored: Collection[int] | None = None,
+    **options,
 ) -> Path:
     """Truth and estimate of every state over time, and the error in its 95 % band; one column a filter.
 
@@ -55,11 +61,12 @@ def estimates_figure(
         data: of a problem.
         run_index: which of its runs.
         dt: sample time [s]; None for an axis of steps.
+        scored: places of the states that count in the score, which come first where not all are shown.
         **options: of matplotlib's `subplots`, such as `sharey="row"`.
     """
     model = next(iter(filters.values())).model
     states = model.states if data.states is None else model.states[: data.states.shape[-1]]
-    places, left_out = shown_states(states)
+    places, left_out = shown_states(states, scored)
     rows = _rows(states, places, model.measurements, data.states is not None)
     heights = [row.height for row in rows]
     unit = UNIT if len(places) <= 2 else UNIT_OF_MANY
@@ -107,7 +114,7 @@ def _run(filter_: Filter, data: Data, index: int, dt: float | None) -> Run:
     innovations = np.where(np.isnan(data.measurements[index]), np.nan, estimates.innovations[0])
     if data.states is None:
         return Run(time, None, None, estimates, innovations)
-    errors = errors_of(filter_, estimates, data._replace(states=data.states[one]))[0]
+    errors = state_errors(filter_, estimates, data._replace(states=data.states[one]))[0]
     return Run(time, data.states[index], errors, estimates, innovations)
 
 

@@ -12,7 +12,7 @@ import optuna
 
 from filters.engine.batch import Estimates, run
 from filters.filter import Filter
-from tuning.evaluation.evaluate import Evaluation, judge, run_scores
+from tuning.evaluation.evaluate import Evaluation, compute_metrics, run_scores
 from tuning.problems.data import Data
 from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
 from tuning.search.objectives import LARGEST, nis_ratio, nis_violation, penalised
@@ -93,7 +93,7 @@ def measure(
                 raise optuna.TrialPruned
     whole = [Estimates(*map(np.concatenate, zip(*estimates, strict=True))) for estimates in parts]
     rows = zip(filters, whole, data, plan.scenarios, strict=True)
-    return [judge(filter_, estimates, one, scenario.scale) for filter_, estimates, one, scenario in rows]
+    return [compute_metrics(filter_, estimates, one, scenario.scale) for filter_, estimates, one, scenario in rows]
 
 
 def _report(
