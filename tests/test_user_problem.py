@@ -2,6 +2,7 @@
 # ruff: noqa: F811 - fixtures come by import and go by name
 
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from filters import EstimateState
 from filters.engine.batch import run
 from filters.tuned_file import read_tuned_file
+from numerics.compiled import interpreted
 from tests import pendulum_problem
 from tests.test_cli import thruster  # noqa: F401 - a fixture
 from tests.tuned_files import rewrite
@@ -21,9 +23,10 @@ from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import read_choice, read_tuned, write_tuned
 from tuning.evaluation.verify import verify
 from tuning.likelihood.gradient import maximise_likelihood
+from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem, find_same
 from tuning.search.plan import Plan
-from tuning.search.space import choice_of
+from tuning.search.space import choice_of, parameters
 from tuning.search.study import open_study, run_study
 from tuning.thruster.find import find_scenario
 
@@ -220,3 +223,14 @@ def test_what_is_no_problem_is_one_clear_line(text, name, line, thruster, tmp_pa
     done = thruster("evaluate", "--filter", "ekf", "--problem", name)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and done.stderr.startswith("thruster: ")
     sys.modules.pop("my_bad", None)
+
+
+def test_the_problems_of_the_page_are_problems():
+    page = (Path(__file__).parents[1] / "docs" / "problems.md").read_text(encoding="utf-8")
+    names = {}
+    for code in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL):
+        exec(compile(code, "docs/problems.md", "exec"), names)
+    with interpreted():
+        assert [one.symbol for one in checked_problem(names["problem"]).quantities.states] == ["theta", "omega"]
+        assert [one.name for one in parameters("kf", checked_problem(names["pair"]))] == ["Q11", "Q22", "R"]
+        assert [one.name for one in parameters("kf", checked_problem(names["one_number"]))] == ["sigma_a"]
