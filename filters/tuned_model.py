@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from numerics.checks import shown
-from plants.digest import model_digest
 from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
 
@@ -17,7 +16,7 @@ KEYS = ("digest", "dt", *VECTORS)
 def model_data(model: StateSpaceModel, dt: float | None) -> dict:
     """A model's digest, sample time [s] and quantities, as JSON can hold them."""
     named = {key: [list(one) for one in getattr(model, name)] for key, name in VECTORS.items()}
-    return {"digest": model_digest(model), "dt": dt, **named}
+    return {"digest": model.digest, "dt": dt, **named}
 
 
 def check_same_quantities(tuned_for: Mapping, model: StateSpaceModel, dt: float | None, file: str | Path) -> None:
@@ -50,11 +49,10 @@ def check_same_model(tuned_for: Mapping, model: StateSpaceModel, dt: float | Non
     Arguments are those of `check_same_quantities`; the model has the file's Q and R.
     """
     check_same_quantities(tuned_for, model, dt, file)
-    digest = model_digest(model)
-    if digest != tuned_for["digest"]:
+    if model.digest != tuned_for["digest"]:
         raise ValueError(
             f"a tuned file must be for the model it is put on, but {file} was tuned for a model of digest "
-            f"{tuned_for['digest']} (here {digest})"
+            f"{tuned_for['digest']} (here {model.digest})"
         )
 
 

@@ -21,13 +21,13 @@ def look(x, c):
 
 
 def model(sigma=0.1, **changes):
-    noise = {"process_noise_cov": [(DT * sigma) ** 2, sigma**2], "measurement_noise_cov": SENSORS}
     return StateSpaceModel(
-        transition=swing, observe=look, prior_mean=[0.0, 0.0], prior_cov=[3.0, 0.5],
+        transition=swing, observe=look, process_noise_cov=[(DT * sigma) ** 2, sigma**2],
+        measurement_noise_cov=SENSORS, prior_mean=[0.0, 0.0], prior_cov=[3.0, 0.5],
         states=[("angle", "theta", "rad", True), ("angular rate", "omega", "rad/s", False)],
         input_quantities=[("torque", "tau", "N m")],
-        measurements=["cosine", "sine", ("measured rate", "rate", "rad/s")], **{**noise, **changes},
-    )  # fmt: skip
+        measurements=["cosine", "sine", ("measured rate", "rate", "rad/s")],
+    ).replace(**changes)  # fmt: skip
 
 
 def state(env):
@@ -35,9 +35,9 @@ def state(env):
 
 
 def problem(assumed=None, **arguments):
-    given = {"state_of": state, "measurement_noise_cov": SENSORS, "steps": 60, **arguments}
+    given = {"state_of": state, "measurement_noise_cov": SENSORS, "steps": 80, **arguments}
     return EnvProblem("Pendulum-v1", Steps(amplitude=2.0, hold=10), assumed or model(), **given)
 
 
-def of_one_number():
-    return problem(model, parameters=[Parameter("sigma", 1e-3, 1.0, unit="rad/s")])
+def of_one_number(**arguments):
+    return problem(model, parameters=[Parameter("sigma", 1e-3, 1.0, unit="rad/s")], **arguments)

@@ -39,8 +39,8 @@ MAKERS = {
     "thruster": thruster,
     "two sensors": functools.partial(thruster, sensors=["thrust", "speed"], measurement_noise_cov=[0.25, 4.0]),
     "pair": pair,
-    "env": pendulum_problem.problem,
-    "one number": pendulum_problem.of_one_number,
+    "env": functools.partial(pendulum_problem.problem, steps=60),
+    "one number": functools.partial(pendulum_problem.of_one_number, steps=60),
 }
 every_problem = pytest.mark.parametrize("make", MAKERS.values(), ids=list(MAKERS))
 
@@ -178,8 +178,8 @@ def line(transition=lambda x, u, c: (0.9 * x[0],), **changes):
     )  # fmt: skip
 
 
-def nothing(x, u, c):
-    return (x[0] * float("nan"),)
+def nowhere_else(x, u, c):  # than at the prior mean
+    return (x[0] if x[0] == 1.0 else float("nan"),)
 
 
 BAD = {
@@ -214,12 +214,12 @@ BAD = {
         "scale of problem a pair of models must be 3 positive numbers, infinite for states that do not count",
     ),
     "true NaN": (
-        lambda: ModelProblem(line(nothing), steps=60).data([5]),
+        lambda: ModelProblem(line(nowhere_else), steps=60).data([5]),
         "states of problem a pair of models must be finite, but those of seed 5 are not from step 1 on",
     ),
     "assumed NaN": (
-        lambda: checked_problem(ModelProblem(line(), line(nothing), steps=60, scale=(1.0,))),
-        r"transition of the model of problem a pair of models must be finite at its prior mean, but got \(nan,\)",
+        lambda: checked_problem(ModelProblem(line(), line(nowhere_else), steps=60, scale=(1.0,))),
+        r"transition of the model of problem .* must be finite at the first true state, but got \(nan,\)",
     ),
     "argument": (
         lambda: pair().model(sigma=3.0),
@@ -242,7 +242,7 @@ BAD = {
         lambda: EnvProblem("Nowhere-v0", "random", pendulum_problem.model()),
         "the env of problem an env must be one that can be made, but NameNotFound",
     ),
-    "policy": (lambda: EnvProblem("Pendulum-v1", 3, pendulum_problem.model()), "policy must be 'random', .* got 3"),
+    "policy": (lambda: EnvProblem("Pendulum-v1", 3, pendulum_problem.model()), "policy must be 'random', .*3"),
     "state": (
         lambda: pendulum_problem.problem(state_of=None).data([1]),
         r'must show its state in info\["state"\], or state_of must tell it, but info has nothing',
@@ -255,7 +255,7 @@ BAD = {
     ),
     "measured": (
         lambda: pendulum_problem.problem(measure=two_of_three, measurement_noise_cov=None).data([1]),
-        r"measurements of problem an env must have the shape \(1, 61, 3\) of its model, but got \(1, 61, 2\)",
+        r"measurements of problem an env must have the shape \(1, 81, 3\) of its model, but got \(1, 81, 2\)",
     ),
     "actions": (
         lambda: EnvProblem("Pendulum-v1", "random", line()),

@@ -63,18 +63,19 @@ def _with_numbers(
     fits: Callable[[StateSpaceModel], None],
     by_digest: bool,
 ) -> StateSpaceModel:
-    """A model with the numbers of a tuned file: made of those that the maker takes, Q, R and P_0 set on it.
+    """A model with the numbers of a tuned file: Q and R, the factor on P_0, and what else the maker takes by name.
 
-    What the maker does not take is left out only where the digest then tells whether that makes another model.
+    Other numbers are left out only where the model's digest then tells whether that makes another model.
     """
     if isinstance(make, StateSpaceModel):
         fits(make)
         return _with_noise(make, numbers)
-    known = _arguments_of(make) if by_digest else None
-    taken = {name: value for name, value in numbers.items() if known is None or name in known}
-    plain = made(what, make, {name: value for name, value in taken.items() if name not in NOISE})
+    own = {name: value for name, value in numbers.items() if name not in NOISE}
+    if by_digest:
+        own = {name: value for name, value in own.items() if name in _arguments_of(make)}
+    plain = made(what, make, own)
     fits(plain)  # before Q and R of other sizes are
-    return made(what, make, taken) if NOISE & set(taken) == NOISE & set(numbers) else _with_noise(plain, numbers)
+    return _with_noise(plain, numbers) if by_digest else made(what, make, numbers)
 
 
 def _with_noise(model: StateSpaceModel, numbers: Mapping) -> StateSpaceModel:
@@ -84,10 +85,9 @@ def _with_noise(model: StateSpaceModel, numbers: Mapping) -> StateSpaceModel:
     return model.replace(**changes)
 
 
-def _arguments_of(make: Callable) -> set[str] | None:
-    """Names of the arguments that a function takes; None if it takes any."""
+def _arguments_of(make: Callable) -> set[str]:
+    """Names of the arguments that a function takes, none if it does not tell."""
     try:
-        known = inspect.signature(make).parameters.values()
+        return set(inspect.signature(make).parameters)
     except (TypeError, ValueError):  # some are written in C
-        return None
-    return None if any(one.kind is one.VAR_KEYWORD for one in known) else {one.name for one in known}
+        return set()

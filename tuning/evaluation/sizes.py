@@ -30,7 +30,7 @@ def ensemble_sizes(
 ) -> list[SizeRow]:
     """The score of a choice against ensemble size, paired on the same fresh seeds, smallest size first.
 
-    The seeds chose neither Q, R nor N (`scenarios.size_seeds`). Where the plan has a budget, no size is above that
+    The seeds chose neither Q, R nor N (`seeds.size_seeds`). Where the plan has a budget, no size is above that
     of the choice, which is known to be within it. Without truth there is no score, and no row.
 
     Args:

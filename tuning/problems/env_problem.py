@@ -10,10 +10,10 @@ import numpy as np
 
 from numerics.checks import covariance, covariance_root, shown
 from numerics.streams import MEASUREMENT, episode_keys, filter_keys, normal_block
-from plants.digest import digest_of
 from plants.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, wrapped
 from tuning.problems.data import FIRST_SCORED_STEP, Data
+from tuning.problems.digest import digest_of
 from tuning.problems.excitation import EXCITATIONS, Excitation
 from tuning.problems.parameter import Parameter
 

@@ -11,12 +11,12 @@ from filters.bounds import posterior_bound
 from filters.engine.batch import run
 from numerics.checks import shown
 from numerics.streams import episode_keys, filter_keys
-from plants.digest import digest_of
 from plants.simulate import simulate
 from plants.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_argument
 from tuning.problems.check import check_quantities
 from tuning.problems.data import FIRST_SCORED_STEP, Data
+from tuning.problems.digest import digest_of
 from tuning.problems.excitation import EXCITATIONS, Excitation
 from tuning.problems.parameter import Parameter
 

@@ -25,26 +25,15 @@ LENGTH = 12  # of the hexadecimal digits of a SHA-256 that are kept
 def digest_of(*values: Any) -> str:
     """The first part of a SHA-256 of numbers, texts, arrays, collections, dataclasses and functions.
 
-    A function is its source, or its byte code where there is none, its defaults, what it closes over, and all of
-    that of the functions of its own package that it calls by name. Functions of this project's packages, of the
-    standard library and of other packages are their names: another version of them is told by their versions.
+    A model is its own digest, its noise and its prior. A function is its source, or its byte code where there is
+    none, its defaults, what it closes over, and all of that of the functions of its own package that it calls by
+    name. Functions of this project's packages, of the standard library and of other packages are their names:
+    another version of them is told by their versions.
     """
     found = hashlib.sha256()
     for text in _texts(values, set()):
         found.update(text.encode() + b"\0")
     return found.hexdigest()[:LENGTH]
-
-
-def model_digest(model: StateSpaceModel) -> str:
-    """The digest of what filters read of a model: its functions, numbers, names and units."""
-    return digest_of(*_parts_of(model))
-
-
-def _parts_of(model: StateSpaceModel) -> tuple:
-    functions = model.transition, model.observe, model.transition_jacobian, model.observe_jacobian
-    noise = model.process_noise_cov, model.measurement_noise_cov
-    numbers = model.prior_mean, model.prior_cov, model.inputs, model.constants, model.substeps
-    return functions, noise, numbers, model.quantities, model.outputs
 
 
 def _texts(value: Any, seen: set[int]) -> Iterator[str]:
@@ -59,7 +48,8 @@ def _texts(value: Any, seen: set[int]) -> Iterator[str]:
         yield f"made by {_name(value.maker)}, {value.key}"
         yield from _texts(value.arguments, seen)
     elif isinstance(value, StateSpaceModel):
-        yield from _texts(_parts_of(value), seen)
+        noise = value.process_noise_cov, value.measurement_noise_cov
+        yield from _texts((value.digest, noise, value.prior_mean, value.prior_cov), seen)
     elif isinstance(value, functools.partial):
         yield "partial"
         yield from _texts((value.func, value.args, value.keywords), seen)
