@@ -18,9 +18,9 @@ from numerics.tuples import column_reader, column_writer, vector_reader
 from thruster_env.dynamics import Constants, substep
 from thruster_env.plant import Plant
 from tuning.evaluation.evaluate import evaluate
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import training_seeds
 from tuning.search.space import Choice, true_choice
+from tuning.thruster.find import find_scenario
 
 SEEDS, ENSEMBLE_SIZE = 64, 50
 NORMALS = 3  # a member and step: one for each state, one for the measurement

@@ -9,8 +9,8 @@ import numpy as np
 
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, alone, side_by_side
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import training_seeds
+from tuning.thruster.find import find_scenario
 
 COPIES = 64
 GOAL = 1 / 1.5  # of the time that PPO takes with DummyVecEnv

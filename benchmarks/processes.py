@@ -16,7 +16,7 @@ env.step(env.action_space.high)
 """
 TUNING_IMPORTS = """
 from tuning.evaluation.evaluate import evaluate
-from tuning.problems.find import find_scenario
+from tuning.thruster.find import find_scenario
 from tuning.problems.seeds import training_seeds
 from tuning.search.space import true_choice
 """

@@ -14,17 +14,18 @@ import numpy as np
 from benchmarks.peers import EnsembleStep, python_model
 from benchmarks.rows import Row
 from benchmarks.timing import Timing
-from tuning.problems.find import Scenario, find_scenario
 from tuning.search import trials
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.study import StudyResult, open_study, quiet_optuna, run_study
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenario import Scenario
 
 TRIALS = 200
 SIZES, PEER_STEPS = (20, 200), 200  # FilterPy's time a step is a straight line over N
 GOAL, MEMORY_GOAL = 6.0, 500.0  # [s], [MB]
 IN_A_PROCESS = """
 from tuning.search.plan import Plan
-from tuning.problems.find import find_scenario
+from tuning.thruster.find import find_scenario
 from tuning.search.study import open_study, quiet_optuna, run_study
 quiet_optuna()
 plan = Plan("enkf", (find_scenario("nominal"),), {seed})
@@ -92,7 +93,7 @@ def _timed(plan: Plan, count: int) -> tuple[float, float, StudyResult]:
 
         return call
 
-    with mock.patch.multiple(trials, run=clocked(trials.run), judge=clocked(trials.judge)):
+    with mock.patch.multiple(trials, run=clocked(trials.run), compute_metrics=clocked(trials.compute_metrics)):
         begin = perf_counter()
         result = _study(plan, count)
         return perf_counter() - begin, spent[0], result

@@ -16,9 +16,10 @@ from benchmarks.timing import alone, side_by_side
 from filters import run
 from filters.filter import Filter
 from numerics.threads import cores
-from tuning.problems.find import Data, find_scenario
+from tuning.problems.data import Data
 from tuning.problems.seeds import training_seeds
 from tuning.search.space import true_choice
+from tuning.thruster.find import find_scenario
 
 TRAJECTORIES, ENSEMBLE_SIZE = 256, 100
 AGREEMENT = 0.03  # how far the RMSE of two filters that differ in their random numbers alone may lie apart

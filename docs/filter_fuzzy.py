@@ -16,7 +16,7 @@ from filters.gaussian.fuzzy import BLENDINGS
 from numerics.plots import DARK, new_figure, save_figure, tidy
 from thruster_env.linear.steady_state import steady_state
 from thruster_env.parameters import PRESETS
-from tuning.problems.find import FIRST_SCORED_STEP
+from tuning.problems.data import FIRST_SCORED_STEP
 
 CENTRE = 12.0  # [V]
 SHOWN_WIDTH = 12.0  # [V], of the run that is drawn

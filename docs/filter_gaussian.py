@@ -20,7 +20,7 @@ from filters import (
 from filters.bounds import posterior_bound
 from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from thruster_env.plant import make_plant
-from tuning.problems.find import FIRST_SCORED_STEP
+from tuning.problems.data import FIRST_SCORED_STEP
 
 FLOW = "flow velocity $U_a$ [m/s]"
 FLOW_RMSE = "RMSE of $U_a$ [m/s]"

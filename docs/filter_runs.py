@@ -14,7 +14,8 @@ from numerics.plots import BLUE, DARK, RUST
 from numerics.streams import episode_keys, filter_keys
 from thruster_env.plant import Plant, make_plant
 from thruster_env.simulation import simulate
-from tuning.problems.find import FIRST_SCORED_STEP, held_levels
+from tuning.problems.data import FIRST_SCORED_STEP
+from tuning.problems.excitation import held_levels
 
 SEED, RUNS, STEPS, AMPLITUDE, HOLD, DT = 1, 60, 500, 12.0, 25, 0.01
 PUBLISHED_NOISE = {"process_noise_cov": (0.5, 0.5), "measurement_noise_cov": 0.5}

@@ -16,9 +16,11 @@ from docs.page import with_tables
 from filters.consistency.intervals import Interval
 from numerics.files import write_whole
 from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender
-from tuning.problems.find import SCENARIOS, Scenario, find_scenario
+from tuning.problems.excitation import Steps
 from tuning.problems.seeds import held_out_seeds
-from tuning.thruster.excitation import Steps
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenario import Scenario
+from tuning.thruster.scenarios import SCENARIOS
 
 SEEDS = 200
 REFERENCE_SEEDS, REFERENCE_SIZE = 20, 100_000

@@ -22,11 +22,12 @@ from tuning.evaluation.baselines import ORACLE, RULE, SCALED
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import prove
 from tuning.likelihood.gradient import maximise_likelihood
-from tuning.problems.find import Scenario, find_scenario
 from tuning.search.objectives import NIS_BAND
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 from tuning.search.study import StudyResult, open_study, quiet_optuna, run_study
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenario import Scenario
 
 SEED, TRIALS = 0, 100
 COLUMNS = [

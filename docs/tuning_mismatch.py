@@ -22,11 +22,12 @@ from plants.state_space import StateSpaceModel
 from thruster_env.dynamics import Constants
 from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
-from tuning.problems.find import Scenario, find_scenario
 from tuning.search.objectives import nis_violation, penalised
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.space import Choice, distributions, suggest, trial_parameters
 from tuning.search.study import open_study, quiet_optuna, run_study
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenario import Scenario
 
 SCENARIO, SEED, TRIALS = "mismatch", 0, 100
 LIFT = "lift_factor"  # on the lift coefficient, which enters several constants of the model

@@ -19,10 +19,11 @@ from tuning.evaluation.evaluate import score_ratio
 from tuning.evaluation.held_out import prove
 from tuning.likelihood.gradient import BAD_START
 from tuning.likelihood.identifiability import Identifiability, identify
-from tuning.problems.find import Scenario, find_scenario
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, parameters_of, true_choice
 from tuning.search.study import open_study, quiet_optuna, run_study
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenario import Scenario
 
 STUDIES = ("ekf", "nominal", 100), ("kf", "published_tunnel", 100), ("kf", "published_open_bladed", 100)
 SEEDS = range(8)  # of studies

@@ -23,13 +23,14 @@ import optuna
 from optuna.trial import TrialState
 
 import tuning.search.study
-from tuning.problems.find import Data, find_scenario
+from tuning.problems.data import Data
 from tuning.search.plan import Plan
 from tuning.search.space import suggest, untuned_choice
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study, quiet_optuna, run_trials
 from tuning.search.trials import CONSISTENCY, NIS, measure
 from tuning.search.workers import take_share
+from tuning.thruster.find import find_scenario
 
 STORAGES = ("journal", "PostgreSQL")
 SETTLE, WINDOW = 1.0, 3.0  # [s] after which a run is counted, and for how long

@@ -13,13 +13,18 @@ from pathlib import Path
 from typing import Any
 
 from filters.registry import FILTERS, tunable_numbers
+from filters.tuned_model import check_model_data
 from numerics.checks import finite, one_of, positive, shown
 
-FILE_FORMAT = "thruster-env tuned filter"
-FILE_VERSION = 3  # 3: the plant that it is for, and scenarios of files, as data; 2: no such, still read
-READ_VERSIONS = (2, 3)
-MODEL_KEYS = ("process_noise_cov", "measurement_noise_cov", "prior_cov_factor", "parameter_factors")
-NEEDED = MODEL_KEYS[:2]
+FILE_FORMAT = "tuned filter"
+OLD_FORMAT = "thruster-env tuned filter"  # of versions 2 and 3
+FILE_VERSION = (
+    4  # 4: any problem, and its model as data; 3: the plant, and scenarios of files, as data; 2: no such
+)
+READ_VERSIONS = (2, 3, 4)
+NEEDED = ("process_noise_cov", "measurement_noise_cov")
+MODEL_KEYS = (*NEEDED, "prior_cov_factor", "parameter_factors")  # what every plant with data of its own knows
+FACTORS = "parameter_factors"  # a mapping of names to factors
 
 
 def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -34,7 +39,9 @@ def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
 def read_tuned_file(path: str | Path) -> dict[str, Any]:
     """Content of a tuned file; its "filter" entry holds `name`, `numbers` and the `model` arguments.
 
-    Of `numbers` only the filter's own numbers are known, of `model` only MODEL_KEYS, and all are finite.
+    Of `numbers` only the filter's own numbers are known, and of `model` only MODEL_KEYS where the file is for a
+    plant that it holds as data; of others it holds what their model takes. All are finite, Q and R among them.
+    Whatever its version, "problem" names what it was tuned on, and "problems" holds problems as data.
 
     Raises:
         ValueError: if the file cannot be read, is damaged, was edited, was written by a later version, or holds
@@ -46,7 +53,7 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
         raise ValueError(f"a tuned file must be readable, but {path} is not: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
         raise ValueError(f"a tuned file must be whole JSON, but {path} is not: {error}") from None
-    if not isinstance(content, dict) or content.get("format") != FILE_FORMAT:
+    if not isinstance(content, dict) or content.get("format") not in (FILE_FORMAT, OLD_FORMAT):
         raise ValueError(f"a tuned file must say format: {FILE_FORMAT!r}, but {path} does not")
     _check_version(path, content.get("version"))
     if content.get("hash") != sealed(content)["hash"]:
@@ -55,12 +62,28 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
             f"but {path} was edited: its hash is {shown(content.get('hash'))}"
         )
     try:
-        _check_filter(content.get("filter"))
+        content = _of_this_version(content)
+        of_a_plant = content["version"] < FILE_VERSION or content.get("plant") is not None
+        _check_filter(content.get("filter"), known=MODEL_KEYS if of_a_plant else None)
+    except ValueError as error:
+        raise ValueError(f"{error} (in the tuned file {path})") from None
+    return content
+
+
+def _of_this_version(content: dict) -> dict:
+    """Content of any version with the entries of this one that it tells, checked."""
+    if content["version"] < FILE_VERSION:
         if content["version"] > 2:
             for part in ("plant", "scenarios"):
                 _mapping(part, content.get(part))
-    except ValueError as error:
-        raise ValueError(f"{error} (in the tuned file {path})") from None
+        return content | {"problem": content.get("scenario"), "problems": content.get("scenarios", {})}
+    _mapping("problems", content.get("problems"))
+    check_model_data(content.get("model"))
+    if content.get("plant") is not None:
+        _mapping("plant", content["plant"])
+    for part in ("problem", "digest"):
+        if not isinstance(content.get(part), str):
+            raise ValueError(f"the {part} of a tuned file must be text, but got {shown(content.get(part))}")
     return content
 
 
@@ -70,32 +93,39 @@ def _check_version(path: str | Path, version) -> None:
     advice = ""
     if isinstance(version, int):
         advice = ": update thruster-env" if version > FILE_VERSION else ": tune again"
-    known = " or ".join(map(str, READ_VERSIONS))
+    known = f"{', '.join(map(str, READ_VERSIONS[:-1]))} or {READ_VERSIONS[-1]}"
     raise ValueError(f"a tuned file must be of version {known}, but {path} is of version {shown(version)}{advice}")
 
 
-def _check_filter(entry) -> None:
-    """Raise ValueError unless an entry names a filter, some of its numbers, and what it assumes, all as data."""
+def _check_filter(entry, known: tuple[str, ...] | None) -> None:
+    """Raise ValueError unless an entry names a filter, some of its numbers, and what it assumes, all as data.
+
+    Arguments of the model are those that are known, or any names if None.
+    """
     if not isinstance(entry, dict) or set(entry) != {"name", "numbers", "model"}:
         raise ValueError(f"a tuned file must have a filter with name, numbers and model, but got {shown(entry)}")
     name = one_of("the filter of a tuned file", entry["name"], tuple(FILTERS))
-    known = tunable_numbers(name)
+    numbers = tunable_numbers(name)
     for key, value in _mapping("numbers", entry["numbers"]).items():
-        one_of(f"a number of filter {name!r}", key, known)
+        one_of(f"a number of filter {name!r}", key, numbers)
         _check_finite(key, value)
     model = _mapping("model", entry["model"])
     for key in model:
-        one_of("an argument of the model of a tuned file", key, MODEL_KEYS)
+        if known is not None:
+            one_of("an argument of the model of a tuned file", key, known)
+        elif not key.isidentifier():
+            raise ValueError(f"an argument of the model of a tuned file must be a name, but got {shown(key)}")
     for key in NEEDED:
         if model.get(key) is None:
             raise ValueError(f"the model of a tuned file must have a {key}, but got {shown(model)}")
-        _check_finite(key, model[key])
+    for key, value in model.items():
+        if key != FACTORS:
+            _check_finite(key, value)
     if "prior_cov_factor" in model:
-        _check_finite("prior_cov_factor", model["prior_cov_factor"])
         positive("prior_cov_factor", model["prior_cov_factor"])
-    for key, value in _mapping("parameter_factors", model.get("parameter_factors", {})).items():
-        _check_finite(f"parameter_factors, {key}", value)
-        positive(f"parameter_factors, {key}", value)
+    for key, value in _mapping(FACTORS, model.get(FACTORS, {})).items():
+        _check_finite(f"{FACTORS}, {key}", value)
+        positive(f"{FACTORS}, {key}", value)
 
 
 def _check_finite(name: str, value) -> None:

@@ -117,6 +117,11 @@ def may_be_inlined(package: str, *below: str) -> None:
     _packages[package] = below
 
 
+def registered_packages() -> frozenset[str]:
+    """The packages that have called `may_be_inlined`."""
+    return frozenset(_packages)
+
+
 @functools.cache
 def _package_hash(package: str) -> str:
     digest = hashlib.sha256(package.encode())

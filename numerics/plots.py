@@ -24,6 +24,31 @@ def tidy(axes: Iterable) -> None:
         axis.grid(alpha=0.25, linewidth=0.6)
 
 
+def grid_of(count: int, columns: int) -> tuple[int, int]:
+    """Rows and columns of so many panels, at most `columns` side by side, and none of the rows empty."""
+    columns = max(1, min(columns, count))
+    return -(-count // columns), columns
+
+
+def panels(count: int, columns: int, size: tuple[float, float], extra: float = 0.0, **options):
+    """A figure and exactly `count` axes in a grid, in their common form.
+
+    Args:
+        count: of panels.
+        columns: at most so many side by side.
+        size: of a panel [inch].
+        extra: height for a title or a legend [inch].
+        **options: of matplotlib's `subplots`.
+    """
+    rows, columns = grid_of(count, columns)
+    figure = new_figure((size[0] * columns, size[1] * rows + extra))
+    axes = list(figure.subplots(rows, columns, squeeze=False, **options).flat)
+    for axis in axes[count:]:
+        axis.remove()
+    tidy(axes[:count])
+    return figure, axes[:count]
+
+
 def save_figure(figure, path: str | Path) -> Path:
     """Write a figure as PNG, whole or not at all; return the path."""
     write_whole(path, lambda stream: figure.savefig(stream, format="png"))

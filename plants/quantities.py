@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -27,6 +28,17 @@ class Quantity(NamedTuple):
     def label(self) -> str:
         """Name and unit, as tables have it."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+    @property
+    def short_label(self) -> str:
+        """Symbol and unit, as columns of tables and of files have it."""
+        return f"{self.symbol} [{self.unit}]" if self.unit else self.symbol
+
+    @property
+    def text_symbol(self) -> str:
+        """The symbol with Greek letters as such, as pages have it: omega_m is "ω_m"."""
+        letter, underscore, index = self.symbol.partition("_")
+        return (_greek(letter) or letter) + underscore + index
 
     @property
     def plot_label(self) -> str:
@@ -105,6 +117,14 @@ _GREEK = {
     *("alpha", "beta", "gamma", "delta", "epsilon", "theta", "kappa", "lambda", "mu", "nu", "xi", "rho", "sigma"),
     *("tau", "phi", "chi", "psi", "omega", "eta", "zeta"),
 }
+
+
+def _greek(name: str) -> str | None:
+    """The Greek letter of a name such as "omega" or "Omega"; None if it is none."""
+    if name.lower() not in _GREEK:
+        return None
+    size = "CAPITAL" if name[0].isupper() else "SMALL"
+    return unicodedata.lookup(f"GREEK {size} LETTER {name.upper().replace('LAMBDA', 'LAMDA')}")
 
 
 def _mathtext(symbol: str) -> str:

@@ -14,8 +14,8 @@ from numerics.checks import at_least, covariance, covariance_root, one_of, vecto
 from numerics.compiled import inlined
 from numerics.derivatives import complex_step
 from numerics.pickling import as_function, as_made
-from plants.digest import digest_of
 from plants.model_check import check_functions, checked_constants
+from plants.model_digest import digest_of
 from plants.quantities import Quantities, outputs, quantities
 from plants.shape import Functions, Shape, constants_form
 

@@ -9,7 +9,7 @@ from training.environments import make_environments
 from training.learn import train
 from training.saved import load, read_setup
 from training.setup import make_setup
-from tuning.problems.find import find_scenario
+from tuning.thruster.find import find_scenario
 
 COPIES, LIMIT = 4, 30
 SMALL = {

@@ -14,7 +14,6 @@ from filters.registry import FILTERS
 from thruster_cli.main import main
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import write_tuned
-from tuning.problems.find import find_scenario
 from tuning.search import trials as tuning_trials
 from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
 from tuning.search.enqueued import HEIR, SMALLER, TWIN, UNTUNED, _ends_a_round
@@ -30,6 +29,7 @@ from tuning.search.space import (
     untuned_choice,
 )
 from tuning.search.study import open_study, run_study
+from tuning.thruster.find import find_scenario
 
 MISMATCH = find_scenario("mismatch")
 PLAN = Plan("auto", (MISMATCH,), budget=1.0)

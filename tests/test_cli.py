@@ -89,9 +89,9 @@ def test_tune_resume_evaluate_and_wrap(thruster, as_json, tmp_path):
     np.testing.assert_allclose(env.filter.model.constants, expected, rtol=1e-12)
 
 
-def test_evaluate_says_and_draws_whether_a_filter_is_honest(thruster, as_json, tmp_path):
+def test_evaluate_says_and_draws_whether_a_filter_is_consistent(thruster, as_json, tmp_path):
     options = "evaluate", "--filter", "ekf", "--seeds", 30, "--consistency"
-    done = thruster(*options, "new/honest.png")
+    done = thruster(*options, "new/calibrated.png")
     words = " ".join(done.stdout.split())
     for part in (
         "Underconfident: mean NEES",
@@ -100,11 +100,11 @@ def test_evaluate_says_and_draws_whether_a_filter_is_honest(thruster, as_json, t
         "rule of thumb over oracle",
     ):
         assert part in words
-    assert (tmp_path / "new" / "honest.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "new" / "calibrated.png").read_bytes().startswith(b"\x89PNG")
     found = as_json(*options, "again.png")["consistency"]
     assert found["nees"]["mean"][0] < found["nees"]["right"] == 2.0
     assert found["picture"] == "again.png" and len(found["sentences"]) == 13
-    assert thruster("evaluate", "--help").stdout.count("honest.png") == 1
+    assert thruster("evaluate", "--help").stdout.count("calibrated.png") == 1
 
 
 def test_simulate_writes_what_the_env_does_with_units_in_the_header(thruster, tmp_path):
@@ -189,7 +189,7 @@ def test_help_teaches(command, thruster):
 
 BAD = [
     (("tune", "--filter", "none"), "filter must be one of kf, kf-steady, ekf, "),
-    (("tune", "--scenario", "none"), "scenario must be one of"),
+    (("tune", "--scenario", "none"), "problem must be one of"),
     (("tune", "--filter", "ekf", "--method", "gradient", "--hold-r"), "R must be free for --method gradient"),
     (
         ("tune", "--filter", "enkf", "--method", "gradient"),
@@ -203,7 +203,7 @@ BAD = [
     (("evaluate", "--tuned", "text.txt"), "a tuned file must be whole JSON"),
     (
         ("evaluate", "--tuned", "old.json"),
-        "a tuned file must be of version 2 or 3, but old.json is of version 1: tune again",
+        "a tuned file must be of version 2, 3 or 4, but old.json is of version 1: tune again",
     ),
     (("verify", "missing.json"), "a tuned file must be readable"),
     (

@@ -12,11 +12,11 @@ from tuning.evaluation.compare import compare, contender, default_belief, sized
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.tuned import write_tuned
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan
 from tuning.search.space import true_choice, untuned_choice
 from tuning.search.study import StudyResult
+from tuning.thruster.find import find_scenario
 
 NOMINAL, SEEDS = find_scenario("nominal"), held_out_seeds(0, 12)
 
@@ -173,7 +173,7 @@ def test_the_command_takes_tuned_files(thruster, tmp_path):
     ("arguments", "line"),
     [
         (("--filter", "none"), "filter must be one of kf, "),
-        (("--scenario", "none"), "scenario must be one of nominal, "),
+        (("--scenario", "none"), "problem must be one of nominal, "),
         (("--scenario", "no.toml"), "a scenario file must be readable, but no.toml is not"),
         (("--knows", "all"), "knows must be one of true, scaled, untuned, but got 'all'"),
         (("--seeds", "1"), "held-out seeds must be a whole number of at least 2, but got 1"),

@@ -20,8 +20,8 @@ from training.comparison.tables import HEADER, rows_of, summary_rows
 from training.environments import make_environments
 from training.score import FIRST_SCORED_STEP, Part, Scores, run_episodes, score
 from training.setup import make_setup
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import held_out_seeds
+from tuning.thruster.find import find_scenario
 
 MEDIUM = find_scenario("medium_noise")
 SEEDS = held_out_seeds(0, 3)

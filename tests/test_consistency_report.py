@@ -25,9 +25,9 @@ from numerics.compiled import interpreted
 from numerics.streams import episode_keys
 from plants import simulate
 from tests.models import scalar_model
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import held_out_seeds
 from tuning.report.consistency_figures import consistency_figure
+from tuning.thruster.find import find_scenario
 
 
 def scalar(**changes):
@@ -234,5 +234,5 @@ def test_the_figure_is_drawn(scalar_truth, kind, tmp_path):
         with pytest.raises(ValueError, match="needs something to draw"):
             consistency_figure(tmp_path / "none.png", report, "a title")
     ratios = {"one\nover other": rmse_ratios(np.ones((40, 1)), np.full((40, 1), 2.0))}
-    path = consistency_figure(tmp_path / "new" / "honest.png", report, "a title", ratios)
+    path = consistency_figure(tmp_path / "new" / "calibrated.png", report, "a title", ratios)
     assert path.read_bytes().startswith(b"\x89PNG")

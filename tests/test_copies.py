@@ -17,9 +17,9 @@ from filters.engine.session import Session
 from tests.models import pendulum, scalar_model, small, wide_model
 from tests.test_robustness import AMPLIFIER, FLOW, REFERENCE, SENSORS, UNCERTAINTY
 from tuning.evaluation.evaluate import evaluate
-from tuning.problems.find import SCENARIOS
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
+from tuning.thruster.scenarios import SCENARIOS
 
 pytestmark = pytest.mark.usefixtures("as_python")
 

@@ -8,9 +8,9 @@ from numerics.compiled import interpreted
 from plants import simulate
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.tuned import summary
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.space import choice_of, parameters_of, true_choice, untuned_choice
+from tuning.thruster.find import find_scenario
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +68,9 @@ def test_rmse_of_thrust_is_that_of_the_model_s_thrust_at_the_estimate(nominal, d
     filter_ = true_choice("ekf", nominal).filter(nominal)
     estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
     states = np.moveaxis(estimates.means, -1, 0)
-    errors = observe((states[0], states[1]), filter_.model.constants)[0] - data.thrusts
-    assert ekf.thrust_rmse.value == pytest.approx(np.sqrt((errors[:, 50:] ** 2).mean()), rel=1e-12)
-    assert ekf.thrust_rmse.low < ekf.thrust_rmse.value < ekf.thrust_rmse.high
+    errors = observe((states[0], states[1]), filter_.model.constants)[0] - data.outputs["T"]
+    assert ekf.output_rmse["T"].value == pytest.approx(np.sqrt((errors[:, 50:] ** 2).mean()), rel=1e-12)
+    assert ekf.output_rmse["T"].low < ekf.output_rmse["T"].value < ekf.output_rmse["T"].high
 
 
 def test_steps_without_a_measurement_do_not_lower_the_mean_nis(nominal, data):
@@ -81,11 +81,11 @@ def test_steps_without_a_measurement_do_not_lower_the_mean_nis(nominal, data):
 
 
 def test_a_filter_without_covariance_is_judged_by_its_errors_only(nominal, data):
-    few = data._replace(**{name: part[:3] for name, part in zip(data._fields, data, strict=True)})
+    few = data.slice(0, 3)
     with interpreted():
         evaluation = evaluate(make_filter("low-pass", nominal.model()), few, nominal.scale)
     assert np.isnan([evaluation.nees, evaluation.nis]).all() and np.isnan(evaluation.log_likelihood)
-    assert np.isfinite(evaluation.rmse).all() and np.isfinite(evaluation.thrust_rmse).all()
+    assert np.isfinite(evaluation.rmse).all() and np.isfinite(evaluation.output_rmse["T"]).all()
     said = summary(evaluation)
     assert said["nees"] is said["nis"] is said["log_likelihood"] is None
 

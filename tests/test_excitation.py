@@ -8,8 +8,9 @@ import thruster_env  # noqa: F401 - registers the envs
 from numerics.streams import episode_keys
 from thruster_env.control.controllers import PIController
 from thruster_env.plant import make_plant
-from tuning.problems.find import find_scenario
-from tuning.thruster.excitation import EXCITATIONS, BinarySequence, ClosedLoop, Dwells, MultiSine, Steps
+from tuning.problems.excitation import EXCITATIONS, BinarySequence, Dwells, MultiSine, Steps
+from tuning.thruster.excitation import ClosedLoop, voltages_of
+from tuning.thruster.find import find_scenario
 
 PLANT = make_plant()
 KEYS = episode_keys(range(40))
@@ -18,10 +19,10 @@ every_excitation = pytest.mark.parametrize("kind", list(EXCITATIONS.effects.valu
 
 @every_excitation
 def test_a_seed_s_voltages_depend_on_that_seed_alone(kind):
-    together = kind().voltages(PLANT, KEYS, 120)
+    together = voltages_of(kind(), PLANT, KEYS, 120)
     assert together.shape == (40, 120) and np.isfinite(together).all()
-    np.testing.assert_array_equal(together, kind().voltages(PLANT, KEYS, 120))
-    np.testing.assert_array_equal(together[7:9], kind().voltages(PLANT, KEYS[7:9], 120))
+    np.testing.assert_array_equal(together, voltages_of(kind(), PLANT, KEYS, 120))
+    np.testing.assert_array_equal(together[7:9], voltages_of(kind(), PLANT, KEYS[7:9], 120))
     assert len(np.unique(together, axis=0)) > 10, "seeds differ"
 
 
@@ -35,14 +36,14 @@ def test_an_excitation_is_a_value_that_json_can_hold(kind):
 
 
 def test_a_binary_sequence_has_two_levels_with_equal_chance_and_holds_them():
-    voltages = BinarySequence(amplitude=5.0, hold=10).voltages(PLANT, KEYS, 500)
+    voltages = voltages_of(BinarySequence(amplitude=5.0, hold=10), PLANT, KEYS, 500)
     levels = voltages.reshape(40, 50, 10)
     assert set(np.unique(voltages)) == {-5.0, 5.0} and (levels == levels[:, :, :1]).all()
     assert abs((levels[:, :, 0] > 0).mean() - 0.5) < 5 * 0.5 / np.sqrt(2000)
 
 
 def test_sines_have_their_amplitude_offset_and_periods():
-    voltages = MultiSine(amplitude=3.0, offset=1.0, periods=(0.5, 0.2)).voltages(PLANT, KEYS, 500)
+    voltages = voltages_of(MultiSine(amplitude=3.0, offset=1.0, periods=(0.5, 0.2)), PLANT, KEYS, 500)
     spectrum = np.abs(np.fft.rfft(voltages, axis=1)) / 500
     expected = np.zeros(251)
     expected[[0, 10, 25]] = 1.0, 1.5, 1.5  # 5 s hold ten and 25 periods
@@ -51,7 +52,7 @@ def test_sines_have_their_amplitude_offset_and_periods():
 
 def test_dwells_rest_at_zero_half_of_the_time_and_move_slowly_between():
     excitation = Dwells(amplitude=2.0, ramp=50, dwell=25)
-    voltages = excitation.voltages(PLANT, KEYS, 750)
+    voltages = voltages_of(excitation, PLANT, KEYS, 750)
     assert np.abs(voltages).max() <= 2.0
     assert np.abs(np.diff(voltages)).max() <= 2 * 2.0 / 50 + 1e-12
     rests = voltages.reshape(40, 10, 75)[:, :, :25]

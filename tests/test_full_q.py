@@ -15,12 +15,12 @@ from thruster_cli.tune import tune
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.evaluation.verify import verify
-from tuning.problems.find import find_scenario
 from tuning.search.correlations import correlations_of, full_covariance
 from tuning.search.enqueued import TWIN
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters_of, trial_parameters, untuned_choice
 from tuning.search.study import open_study, run_study
+from tuning.thruster.find import find_scenario
 
 MISMATCH = find_scenario("mismatch")
 PLAN = Plan("ekf", (MISMATCH,), full_q=True)

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tuning.problems import find
+
 ROOT = Path(__file__).resolve().parents[1]
 ROOMS = (
     "numerics",
@@ -83,6 +85,13 @@ def known_to(path):
 
 def test_a_room_knows_only_the_rooms_below():
     assert not those(lambda path: packages_of(path) & set(ROOMS) - known_to(path))
+
+
+def test_rooms_of_tuning_know_those_of_plants_by_the_finder_alone():
+    rooms = {room.replace("/", ".") for room in TUNING_OF_PLANTS}
+    outside = [path for path in FILES if path.relative_to(ROOT).parent.as_posix() not in TUNING_OF_PLANTS]
+    knowing = [path for path in outside if room_of(path) == "tuning" and imports_of(path) & rooms]
+    assert not knowing and set(find.ROOMS) == {f"{room}.find" for room in rooms}
 
 
 def test_only_tuning_imports_optuna():

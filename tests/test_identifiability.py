@@ -18,9 +18,9 @@ from tuning.likelihood.identifiability import (
     maximum,
     sentences,
 )
-from tuning.problems.find import find_scenario
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters_of, true_choice, untuned_choice
+from tuning.thruster.find import find_scenario
 
 BOUNDS = np.log([(1e-4, 1e4)] * 3)
 TRUE = np.log([0.3, 0.2, 0.5])  # Q11, Q22, R
@@ -135,7 +135,7 @@ def test_the_published_tunnel_tells_nothing_of_its_small_r():
 def test_numbers_that_are_held_are_not_told_and_baselines_have_none():
     scenario = find_scenario("nominal")
     plan = Plan("ekf", (scenario,), hold_r=True)
-    data = [type(one)(*(part[:4] for part in one)) for one in plan.training_data()]
+    data = [one.slice(0, 4) for one in plan.training_data()]
     assert identify(untuned_choice("ekf", scenario), plan.scenarios, data, plan.space()).names == ("Q11", "Q22")
     plan = Plan("low-pass", (scenario,))
     assert identify(untuned_choice("low-pass", scenario), plan.scenarios, data, plan.space()) is None

@@ -10,8 +10,8 @@ from numerics.formulas import formula
 from numerics.streams import episode_keys
 from plants import simulate
 from tuning.likelihood.gradient import BAD_START, maximise_likelihood
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import training_seeds
+from tuning.thruster.find import find_scenario
 
 RNG = np.random.default_rng(0)
 

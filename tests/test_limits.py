@@ -15,9 +15,9 @@ from studies.comparison import compare
 from thruster_cli.simulate import command
 from thruster_env.parameters import TUNNEL
 from training.setup import setup_from_json
-from tuning.problems.find import SCENARIOS
 from tuning.problems.seeds import held_out_seeds, training_seeds
 from tuning.thruster.files import read_scenario
+from tuning.thruster.scenarios import SCENARIOS
 
 pytestmark = pytest.mark.usefixtures("as_python")
 HUGE = 10**12

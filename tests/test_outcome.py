@@ -9,7 +9,6 @@ import pytest
 from filters.consistency.intervals import Interval
 from thruster_cli.main import main
 from tuning.evaluation.sizes import SizeRow, sufficient_size
-from tuning.problems.find import find_scenario
 from tuning.search.enqueued import TWIN
 from tuning.search.objectives import NIS_BAND
 from tuning.search.outcome import best_trial, is_consistent
@@ -17,6 +16,7 @@ from tuning.search.plan import Plan
 from tuning.search.storage import open_storage
 from tuning.search.study import BEST, open_study, run_study
 from tuning.search.trials import CONSISTENCY
+from tuning.thruster.find import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),))  # whose untuned filter has a mean NIS of 0.2
 

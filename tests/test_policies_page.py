@@ -16,8 +16,8 @@ from training.observations import ARMS
 from training.score import score
 from training.setup import make_setup
 from training.tasks import TASKS
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import held_out_seeds
+from tuning.thruster.find import find_scenario
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE = (DOCS / "policies.md").read_text()

@@ -10,9 +10,10 @@ import pytest
 from docs.page import with_tables
 from docs.ranking_tables import TABLES, main, scenarios
 from tuning.evaluation.compare import compare, contender
-from tuning.problems.find import SCENARIOS, find_scenario
+from tuning.problems.excitation import EXCITATIONS
 from tuning.problems.seeds import held_out_seeds
-from tuning.thruster.excitation import EXCITATIONS
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import SCENARIOS
 
 
 def ranked(name, contenders, seeds=24):

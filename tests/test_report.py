@@ -13,7 +13,6 @@ from filters.consistency.intervals import Interval
 from thruster_cli.main import main
 from tuning.evaluation.held_out import Comparison, prove
 from tuning.evaluation.tuned import write_tuned
-from tuning.problems.find import find_scenario
 from tuning.report.figures import early_trials
 from tuning.report.page import Picture, Section, Table, Words, html_page, markdown_page
 from tuning.report.parts import advice
@@ -23,6 +22,7 @@ from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study, run_study
+from tuning.thruster.find import find_scenario
 
 MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -84,7 +84,7 @@ def test_the_page_of_a_tuned_ensemble_has_all_parts_and_needs_no_network(folder)
         "The study",
         "Error against ensemble size",
         "One run over time",
-        "Is the covariance honest?",
+        "Is the covariance consistent?",
         "What was done",
     ]
     assert "http" not in text and not {"script", "link", "iframe"} & {tag for tag, _ in page.attributes}
@@ -134,7 +134,7 @@ def test_a_baseline_has_no_covariance_to_speak_of():
     report = write_report("s.json", STORAGE)
     assert "covariance" not in report.advice
     page = Page(report.page.read_text())
-    assert "Is the covariance honest?" not in page.headings
+    assert "Is the covariance consistent?" not in page.headings
     assert "| tuned | " in report.tables.read_text() and "nan" not in report.tables.read_text()
 
 

@@ -10,11 +10,12 @@ from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import write_tuned
 from tuning.evaluation.verify import verify
-from tuning.problems.find import SCENARIOS, computed_scale, find_scenario
-from tuning.problems.scale import is_stable
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scale import computed_scale, is_stable
+from tuning.thruster.scenarios import SCENARIOS
 
 
 @pytest.fixture

@@ -17,11 +17,11 @@ from tuning.evaluation.compare import contender
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison, prove
 from tuning.evaluation.worth import scaling_sentence, worth
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import held_out_seeds, training_seeds
 from tuning.search.objectives import nis_ratio
 from tuning.search.plan import TRAINING_SEEDS
 from tuning.search.space import true_choice, untuned_choice
+from tuning.thruster.find import find_scenario
 
 MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
 

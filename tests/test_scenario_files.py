@@ -4,11 +4,12 @@ import pytest
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.tuned import read_tuned, write_tuned
-from tuning.problems.find import computed_scale, find_scenario
+from tuning.problems.excitation import BinarySequence, Steps
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import StudyResult
-from tuning.thruster.excitation import BinarySequence, Steps
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scale import computed_scale
 
 
 @pytest.fixture
@@ -78,9 +79,9 @@ BAD = {
     "measurement_noise_cov = 'small'": r"measurement_noise_cov must be a finite number, but got 'small'",
     "excitation = {name = 'steps', height = 3}": "arguments of 'steps' must be among amplitude, hold",
     "excitation = 'prbs'": "each entry of excitation must be a mapping whose name is one of steps",
-    "sensors = ['thrust', 'speed']": "sensors of a scenario must be one channel, but got",
+    "sensors = ['thrust', 'speed']": "measurement_noise_cov must be 2 finite numbers, but got 0.25",
     "sensors = ['current']": r"channels that a model of the state can predict must be .* \(in my.toml\)",
-    "sensors = 3": r"sensors of a scenario must be one channel, but got 3 \(in my.toml\)",
+    "sensors = 3": r"sensors of a scenario must be one channel or several, but got 3 \(in my.toml\)",
     "flow = [{name = 'tide'}]": "each entry of flow must be a mapping whose name is one of",
     "preset = 'none'": "preset must be one of",
     "system = 'none'": "system must be one of tunnel, open_bladed, but got 'none'",

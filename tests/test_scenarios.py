@@ -8,10 +8,11 @@ import pytest
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState, run
 from filters.bounds import riccati_covariances
-from tuning.problems.find import SCENARIOS, computed_scale, find_scenario
 from tuning.problems.seeds import held_out_seeds, training_seeds
 from tuning.search.space import untuned_choice
-from tuning.thruster.scenarios import main
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scale import computed_scale
+from tuning.thruster.scenarios import SCENARIOS, main
 
 
 def test_an_env_stepped_with_a_scenarios_voltages_makes_the_scenarios_data_and_estimates():
@@ -51,7 +52,7 @@ def test_every_scenario_s_data_are_those_of_an_env_of_its_plant(name):
         if valid:
             assert info["measurement"][0] == data.measurements[1, k, 0]
         np.testing.assert_array_equal(info["state"], data.states[1, k])
-        assert info["thrust"] == data.thrusts[1, k]
+        assert info["thrust"] == data.outputs["T"][1, k]
         _, _, _, _, info = env.step(data.inputs[1, k])
 
 
@@ -62,11 +63,11 @@ def test_what_a_scenario_is_named_for_is_in_its_data():
     nominal = data("nominal")
     for name in ("outliers", "dropout", "mismatch"):  # the same truth, whatever spoils the sensor or the model
         np.testing.assert_array_equal(data(name).states, nominal.states)
-    errors = np.abs(data("outliers").measurements[..., 0] - nominal.thrusts)
+    errors = np.abs(data("outliers").measurements[..., 0] - nominal.outputs["T"])
     assert 0.02 < (errors > 4.0).mean() < 0.08
     assert 0.3 < np.isnan(data("dropout").measurements).mean() < 0.7
     biased = data("bias")
-    offsets = (biased.measurements[..., 0] - biased.thrusts).mean(axis=1)
+    offsets = (biased.measurements[..., 0] - biased.outputs["T"]).mean(axis=1)
     assert 1.0 < offsets.std() < 2.5
     assert (data("quantised").measurements % 4.0 == 0).all()
     assert np.abs(data("startup").states[:, 0]).mean(axis=0)[0] > 40.0

@@ -10,7 +10,6 @@ from optuna.trial import TrialState
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import prove
 from tuning.likelihood.gradient import BAD_START, maximise_likelihood
-from tuning.problems.find import find_scenario
 from tuning.search import trials
 from tuning.search.enqueued import LIKELIEST, LIKELIEST_AFTER, TWIN
 from tuning.search.objectives import LARGEST, NIS_BAND, nis_violation
@@ -20,6 +19,7 @@ from tuning.search.samplers import SAMPLERS, make_sampler
 from tuning.search.space import choice_of, distributions, true_choice, untuned_choice
 from tuning.search.study import open_study, run_study
 from tuning.search.trials import BLOCK, measure
+from tuning.thruster.find import find_scenario
 
 MISMATCH, NOMINAL, OUTLIERS = map(find_scenario, ("mismatch", "nominal", "outliers"))
 PLAN = Plan("ekf", (MISMATCH,))
@@ -91,7 +91,7 @@ def test_the_reported_values_are_the_scores_of_single_seeds():
     result = studied(PLAN, 1)
     data = MISMATCH.data(range(32))
     for seed in (0, 9, 31):
-        alone = type(data)(*(part[seed : seed + 1] for part in data))
+        alone = data.slice(seed, seed + 1)
         filter_ = untuned_choice("ekf", MISMATCH).filter(MISMATCH)
         found = evaluate(filter_, alone, MISMATCH.scale).score.value
         assert result.trials[0].intermediate_values[seed] == pytest.approx(found, rel=1e-12)
@@ -143,7 +143,7 @@ def test_a_grid_ends_where_it_is_exhausted():
     [
         ({"scenarios": ()}, "a study must have at least one scenario, but got none"),
         ({"objectives": ("score", "score")}, "objectives must be one, or two different ones"),
-        ({"objectives": ("speed",)}, "objective must be one of score, thrust, likelihood, consistency, cost"),
+        ({"objectives": ("speed",)}, "objective must be one of score, thrust, likelihood, nis, consistency, cost"),
         ({"filter": "low-pass", "objectives": ("likelihood",)}, "'likelihood' needs a filter with a covariance"),
         ({"sampler": "guess"}, "sampler must be one of tpe, gp, cma-es, nsga-ii, random, grid, but got 'guess'"),
     ],
@@ -168,11 +168,11 @@ def test_from_a_bad_start_a_study_of_a_perfect_model_comes_within_half_a_per_cen
 
 
 def test_a_trial_whose_nis_is_not_finite_is_inconsistent_and_has_no_twin(monkeypatch):
-    def lost(filter_, estimates, data, scale, judge=trials.judge):
+    def lost(filter_, estimates, data, scale, judge=trials.compute_metrics):
         evaluation = judge(filter_, estimates, data, scale)
         return evaluation._replace(nis=evaluation.nis._replace(value=np.nan))
 
-    monkeypatch.setattr(trials, "judge", lost)
+    monkeypatch.setattr(trials, "compute_metrics", lost)
     result = studied(PLAN, 3)
     assert len(result.trials) == 3 and all(violation(trial) == LARGEST for trial in result.trials)
     assert not any(TWIN in trial.user_attrs for trial in result.trials)

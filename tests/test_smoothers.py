@@ -21,8 +21,8 @@ from numerics.compiled import interpreted
 from numerics.streams import episode_keys
 from plants import simulate
 from tests.models import KEY, held_voltages, pendulum, scalar_model, simulated, swing, wide_model
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import held_out_seeds
+from tuning.thruster.find import find_scenario
 
 KEYS = np.array([KEY])
 with_gaps = partial(simulated, level=1.0, missing=0.25)

@@ -2,10 +2,10 @@ import optuna
 import pytest
 
 from filters.registry import FILTERS
-from tuning.problems.find import find_scenario
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters_of, size_ladder, untuned_choice
 from tuning.search.study import open_study
+from tuning.thruster.find import find_scenario
 
 NOMINAL = find_scenario("nominal")
 

@@ -18,8 +18,8 @@ from numerics.streams import filter_keys
 from tests.models import KEY, simulated, wide_model
 from tests.oracles import convergence
 from tuning.evaluation.evaluate import evaluate
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import held_out_seeds
+from tuning.thruster.find import find_scenario
 
 SIZE = 9
 SQUARE_ROOTS = EnsembleTransformFilter, SerialSquareRootFilter

@@ -11,11 +11,11 @@ from thruster_env.model import thruster_model
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import read_tuned, write_tuned
-from tuning.problems.find import find_scenario
 from tuning.search.enqueued import TWIN
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
+from tuning.thruster.find import find_scenario
 
 STARTUP, NOMINAL = find_scenario("startup"), find_scenario("nominal")
 PLAN = Plan("ekf", (STARTUP,))

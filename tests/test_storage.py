@@ -10,12 +10,12 @@ import pytest
 import sqlalchemy
 from optuna.trial import TrialState
 
-from tuning.problems.find import find_scenario
 from tuning.search import storage as storages
 from tuning.search.plan import Plan
 from tuning.search.space import distributions
 from tuning.search.storage import PROCESS, RETRY_OF, open_storage
 from tuning.search.study import open_study, run_study
+from tuning.thruster.find import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"),), prune=False)
 

@@ -18,8 +18,8 @@ from training.environments import make_environments
 from training.play import play
 from training.saved import FINAL, load, read_setup
 from training.score import score
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import held_out_seeds
+from tuning.thruster.find import find_scenario
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "gif"])

@@ -18,7 +18,7 @@ from training.environments import make_environments, make_single
 from training.observations import ARMS, STACKED
 from training.setup import in_scenario, make_setup
 from training.vec_env import NativeVecEnv
-from tuning.problems.find import find_scenario
+from tuning.thruster.find import find_scenario
 
 COPIES, LIMIT, STEPS = 3, 12, 30
 SEEDS = [7, 107, 5]

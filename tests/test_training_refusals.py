@@ -17,7 +17,7 @@ from training.extras import check_installed
 from training.play import play
 from training.saved import FINAL, find_saved, load
 from training.setup import make_setup, setup_from_json
-from tuning.problems.find import find_scenario
+from tuning.thruster.find import find_scenario
 
 
 def damage(path, how):

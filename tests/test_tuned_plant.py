@@ -4,6 +4,7 @@
 import json
 import shutil
 import warnings
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,7 +14,7 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState, EstimateStates, thruster_model
 from tests.test_cli import thruster  # noqa: F401 - a fixture
-from tests.tuned_files import rewrite, write_untuned
+from tests.tuned_files import of_version, rewrite, write_untuned
 from thruster_env.effects.flow import Gusts
 from thruster_env.parameters import PRESETS
 from thruster_env.plant import make_plant
@@ -21,9 +22,10 @@ from thruster_env.plant_data import differences, plant_data
 from training.setup import make_setup
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.verify import verify
-from tuning.problems.find import SCENARIOS, find_scenario
 from tuning.report.subject import find_subject
 from tuning.thruster.files import scenario_of
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenarios import SCENARIOS
 
 TOML = 'base = "nominal"\nscale = [1.0, 0.05]\nsteps = 60\nflow = [{name = "gusts", std = 0.5}]\n'
 
@@ -91,13 +93,16 @@ def test_a_model_of_one_s_own_and_a_file_of_before_are_not_compared(nominal, tmp
     model = "thruster_env.model:thruster_model"
     assert EstimateState(env, tuned=str(nominal), model=model).filter.model.substeps == thruster_model().substeps
 
-    def older(content):
-        content["version"] = 2
-        del content["plant"], content["scenarios"]
-
-    path = rewrite(shutil.copy(nominal, tmp_path / "old.json"), older)
+    path = rewrite(shutil.copy(nominal, tmp_path / "old.json"), partial(of_version, version=2))
     assert wrapped(path, dt=0.02).filter.name == "ekf"
     assert read_tuned(path)[1] is find_scenario("nominal") and verify(path).holds
+
+
+def test_a_file_of_the_version_before_this_is_compared_by_its_plant(nominal, tmp_path):
+    path = rewrite(shutil.copy(nominal, tmp_path / "old.json"), partial(of_version, version=3))
+    assert read_tuned(path) == read_tuned(nominal) and verify(path).holds and wrapped(path).filter.name == "ekf"
+    with pytest.raises(ValueError, match=r"old.json was tuned for dt 0.01 \(here 0.02\)$"):
+        wrapped(path, dt=0.02)
 
 
 def test_a_policy_a_comparison_and_an_evaluation_refuse_it_too(nominal, thruster, tmp_path):
@@ -139,7 +144,7 @@ def test_a_tuned_file_does_without_the_file_of_its_scenario(moved, thruster):
         choice, scenario, _ = read_tuned("ekf.json")
         assert scenario == moved and scenario.digest == moved.digest and verify("ekf.json").holds
     assert find_subject("ekf.json", "none.journal").plan.scenarios == (moved,)
-    kept = json.loads(Path("ekf.json").read_text())["scenarios"]
+    kept = json.loads(Path("ekf.json").read_text())["problems"]
     assert list(kept) == ["my.toml"] and kept["my.toml"]["digest"] == moved.digest
     for command in (("evaluate", "--tuned", "ekf.json", "--seeds", 2), ("compare", "ekf.json", "--seeds", 2)):
         done = thruster(*command)
@@ -175,7 +180,7 @@ def test_a_scenario_file_that_has_changed_is_told_and_what_was_tuned_on_counts(t
     ],
 )
 def test_a_scenario_in_a_tuned_file_is_checked_as_one_in_a_file(kept, rule, moved, tmp_path):
-    path = rewrite(tmp_path / "ekf.json", lambda content: content["scenarios"].update({"my.toml": kept}))
+    path = rewrite(tmp_path / "ekf.json", lambda content: content["problems"].update({"my.toml": kept}))
     with pytest.raises(ValueError, match=rule) as error:
         read_tuned(path.name)
     assert "\n" not in str(error.value)

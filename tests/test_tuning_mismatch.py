@@ -3,7 +3,7 @@
 import numpy as np
 
 from docs.tuning_mismatch import LIFT, RIGHT, SLOPES, UNKNOWNS, bought, lifted, plans
-from tuning.problems.find import find_scenario
+from tuning.thruster.find import find_scenario
 
 MISMATCH = find_scenario("mismatch")
 

@@ -11,9 +11,9 @@ from thruster_cli.main import main
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import write_tuned
 from tuning.evaluation.verify import Difference, verify
-from tuning.problems.find import find_scenario
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, run_study
+from tuning.thruster.find import find_scenario
 
 PLAN = Plan("ekf", (find_scenario("mismatch"), find_scenario("nominal")))
 
@@ -82,7 +82,7 @@ def test_a_number_that_is_missing_or_none_differs(content, file):
         ({}, "must have held-out metrics to verify"),
         ({"nominal": {}}, "must tell their first seed and that after the last"),
         ({"nominal": {"seeds": [3]}}, "must tell their first seed and that after the last"),
-        ({"none": {"seeds": [0, 2]}}, "scenario must be one of"),
+        ({"none": {"seeds": [0, 2]}}, "problem must be one of"),
         ({"nominal": {"seeds": [2, 2]}}, "held-out seeds must be a whole number of at least 2, but got 0"),
     ],
 )

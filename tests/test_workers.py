@@ -18,13 +18,13 @@ import typer
 from optuna.trial import TrialState
 
 from thruster_cli.app import app
-from tuning.problems.find import find_scenario
 from tuning.search.plan import Plan
 from tuning.search.samplers import make_sampler
 from tuning.search.space import distributions
 from tuning.search.storage import PROCESS, RETRY_OF, open_storage
 from tuning.search.study import finished_trials, open_study
 from tuning.search.workers import run_in_workers
+from tuning.thruster.find import find_scenario
 
 PLAN = Plan("enkf", (find_scenario("mismatch"),), prune=False)
 WORKERS = 3
@@ -136,7 +136,7 @@ def test_workers_that_cannot_work_say_so_and_leave_the_trials_to_their_parent(tm
     with pytest.warns(UserWarning, match=r"worker [01] has died \(exit code 1\)"):
         run_in_workers(study, plan, plan.training_data(), 2, lambda _, n: seen.append(n), storage=path, workers=2)
     assert seen == [1, 2]
-    assert "thruster: worker 1: scenario must be one of" in capfd.readouterr().err
+    assert "thruster: worker 1: problem must be one of" in capfd.readouterr().err
 
 
 def test_workers_propose_different_things_and_go_through_one_grid():

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from filters.tuned_file import sealed
+from filters.tuned_file import OLD_FORMAT, sealed
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import write_tuned
-from tuning.problems.find import Scenario, find_scenario
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import StudyResult
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenario import Scenario
 
 
 def write_untuned(
@@ -31,3 +32,13 @@ def rewrite(path: Path, change) -> Path:
     change(content)
     path.write_text(json.dumps(sealed(content)))
     return path
+
+
+def of_version(content: dict, version: int) -> None:
+    """Change what a tuned file of this version holds to what one of an earlier version held."""
+    content |= {"format": OLD_FORMAT, "version": version, "scenario": content.pop("problem")}
+    scenarios = content.pop("problems")
+    if version > 2:
+        content["scenarios"] = scenarios
+    for name in ("digest", "model", *(["plant"] if version == 2 else [])):
+        del content[name]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Annotated
@@ -14,16 +15,17 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from filters.augmented import Unknown
 from filters.registry import FILTERS, filter_class
+from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least
-from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
-from thruster_cli.tables import about, unless_blank
-from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender, sized
-from tuning.evaluation.evaluate import STATES
-from tuning.evaluation.tuned import check_plant, read_tuned, summary
-from tuning.problems.find import SCENARIOS, Scenario, find_scenario
+from thruster_cli.leaderboard import as_json, report
+from thruster_cli.output import PROBLEMS, JsonOption, SeedOption, announce_compilation, emit, progress_console
+from tuning.evaluation.compare import Contender, compare, contender, sized
+from tuning.evaluation.tuned import read_choice, read_tuned
+from tuning.problems.find import find_problem
+from tuning.problems.problem import Problem
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import HELD_OUT_SEEDS
-from tuning.search.space import has_ensemble
+from tuning.search.space import Choice, has_ensemble
 
 DEFAULT_FILTERS = ("ekf", "enkf", "pf")
 
@@ -40,7 +42,7 @@ def command(
     ] = None,
     scenarios: Annotated[
         list[str] | None,
-        typer.Option("--scenario", help=f"{', '.join(SCENARIOS)}, or a .toml file; may be repeated."),
+        typer.Option("--problem", "--scenario", help=f"{PROBLEMS} May be repeated."),
     ] = None,
     seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,
     knows: Annotated[
@@ -68,16 +70,17 @@ def command(
     """Rank filters on scenarios: errors, consistency, cost, and which beat the first one on the same seeds.
 
     All filters meet the same truth, inputs and measurements. A filter is better or worse than the first one if
-    the paired 95 % interval of the ratio of their scores leaves out 1. Ctrl-C keeps the rows that are done.
+    the paired 95 % interval of the ratio of their scores leaves out 1; where there is no truth, if that of the
+    difference of their log-likelihoods leaves out 0. Ctrl-C keeps the rows that are done.
 
     Example: thruster compare --filter ekf --filter ekf-robust --filter pf --scenario outliers --scenario ambient
 
     Example: thruster compare --filter ekf --augment ambient_velocity --scenario ambient
     """
-    contenders, default = _contenders(files or [], filters or [], knows, augment or [], ensemble_size or [], seed)
-    chosen = [find_scenario(name) for name in scenarios] if scenarios else [default]
-    for file, scenario in product(files or [], chosen):
-        check_plant(file, scenario)
+    chosen = [find_problem(name) for name in scenarios or []] or [_default(files or [])]
+    for file, problem in product(files or [], chosen):
+        read_choice(file, problem)  # a clear error for a file that is for another plant
+    contenders = _contenders(files or [], filters or [], knows, augment or [], ensemble_size or [], seed)
     held_out = held_out_seeds(seed, seeds)
     announce_compilation()
     with _bar(len(contenders) * len(chosen)) as on_row:
@@ -90,23 +93,29 @@ def command(
         sys.exit(130)
 
 
-def _contenders(files, filters, knows, augment, sizes, seed) -> tuple[list[Contender], Scenario]:
-    """The filters that take part, and the scenario where none is named: that of the first file, or nominal."""
+def _default(files: list[Path]) -> Problem:
+    """The problem where none is named: that of the first file, or nominal."""
+    return [read_tuned(file)[1] for file in files][0] if files else find_problem("nominal")
+
+
+def _contenders(files, filters, knows, augment, sizes, seed) -> list[Contender]:
+    """The filters that take part."""
     wanted = dict(_size(text) for text in sizes)
     unknown = dict(_unknown(text) for text in augment)
-    out, default = [], find_scenario("nominal")
-    for place, file in enumerate(files):
-        choice, scenario, _ = read_tuned(file)
-        if place == 0:
-            default = scenario
-        choice = sized(choice, wanted.get(choice.name, wanted.get(None)))
-        out.append(Contender(file.stem, lambda scenario, choice=choice: choice))
+    out = []
+    for file in files:
+        size = wanted.get(read_tuned_file(file)["filter"]["name"], wanted.get(None))
+        out.append(Contender(file.stem, partial(_from_file, file, size)))
     for name in filters or ([] if files else DEFAULT_FILTERS):
         size = wanted.get(name, wanted.get(None)) if has_ensemble(name) else None
         out.append(contender(name, knows, seed=seed, ensemble_size=size))
         if unknown and filter_class(name).has_covariance:
             out.append(contender(name, knows, unknown, seed, ensemble_size=size))
-    return out, default
+    return out
+
+
+def _from_file(file: Path, size: int | None, problem: Problem) -> Choice:
+    return sized(read_choice(file, problem), size)
 
 
 def _size(text: str) -> tuple[str | None, int]:
@@ -132,96 +141,9 @@ def _bar(total: int) -> Iterator:
     with Progress(*columns, console=progress_console) as progress:
         task, begun = progress.add_task("comparing ...", total=total), []
 
-        def on_row(scenario: Scenario, label: str) -> None:
+        def on_row(scenario: Problem, label: str) -> None:
             progress.update(task, description=f"{label} on {scenario.name}", completed=len(begun))
             begun.append(label)
 
         yield on_row
         progress.update(task, completed=len(begun))
-
-
-def report(board: Leaderboard) -> list:
-    """Two tables of a scenario and a sentence on who wins."""
-    scenario, seeds = board.scenario, board.seeds
-    first = board.rows[0].label
-    title = f"{scenario.name}: {scenario.about}" if scenario.about else scenario.name
-    errors = table(
-        f"{title}\nRMSE on held-out seeds {seeds[0]} to {seeds[-1]}",
-        ["filter", "omega_m\n[rad/s]", "above\n[%]", "U_a\n[m/s]", "above\n[%]", "start-up\n[rad/s]", "\n[m/s]"],
-        [_errors(row) for row in board.rows] + [_bound_row(board)],
-        caption="above: the bound. ±: half of the 95 % interval. start-up: the first 50 steps.",
-    )
-    right = f"NEES {len(board.bound)}, NIS 1" + (
-        " (~ median NEES, 1.39)" if any(r.nees_is_median for r in board.rows) else ""
-    )
-    ratios = table(
-        f"Over {first}, paired; consistency and cost",
-        ["filter", "omega_m", "U_a", "score", "NEES", "NIS", "div.", "us a step"],
-        [_against(row, row.label == first) for row in board.rows],
-        caption=f"±: half of the 95 % interval. Honest: {right}. div.: restarts.",
-    )
-    for shown in (errors, ratios):
-        shown.columns[0].overflow = "fold"
-    return [errors, ratios, winners(board)]
-
-
-def winners(board: Leaderboard) -> str:
-    """Who is significantly better or worse than the first filter."""
-    first, *others = board.rows
-    if not others:
-        return f"On {board.scenario.name} there is nothing to compare {first.label} with."
-    said = []
-    for verdict, words in (("better", "better"), ("worse", "worse"), ("tie", "no different")):
-        names = [row.label for row in others if row.verdict == verdict]
-        said += [f"{words}: {', '.join(names)}"] if names else []
-    return f"On {board.scenario.name}, against {first.label} by the score: {'; '.join(said)}.\n"
-
-
-def _errors(row: Row) -> list[str]:
-    speed, flow = row.evaluation.rmse
-    above = [unless_blank(100.0 * part, "+.0f") for part in row.above_bound]
-    at_first = [f"{part:.3g}" for part in row.evaluation.start_up_rmse]
-    return [row.label, about(speed, 3), above[0], about(flow, 4), above[1], *at_first]
-
-
-def _bound_row(board: Leaderboard) -> list[str]:
-    return ["bound", unless_blank(board.bound[0], ".3f"), "", unless_blank(board.bound[1], ".4f"), "", "", ""]
-
-
-def _against(row: Row, is_first: bool) -> list[str]:
-    ratios = [about(part, 3) for part in (*row.ratios, row.score_ratio)]
-    ratios = ["1", "1", "1"] if is_first else ratios
-    honest = row.evaluation.nees.value == row.evaluation.nees.value  # baselines have no covariance
-    nees = f"{'~' if row.nees_is_median else ''}{row.nees:.3g}" if honest else ""
-    nis = f"{row.evaluation.nis.value:.3g}" if honest else ""
-    return [row.label, *ratios, nees, nis, f"{row.evaluation.divergences}", f"{row.microseconds:.3g}"]
-
-
-def as_json(boards: list[Leaderboard]) -> dict:
-    """The leaderboards as plain data."""
-    return {
-        "seeds": [boards[0].seeds[0], boards[0].seeds[-1] + 1],
-        "states": STATES,
-        "scenarios": {
-            board.scenario.name: {
-                "about": board.scenario.about,
-                "bound": board.bound,
-                "scale": board.scenario.scale,
-                "filters": {row.label: _row_as_json(row) for row in board.rows},
-            }
-            for board in boards
-        },
-    }
-
-
-def _row_as_json(row: Row) -> dict:
-    return {
-        "filter": row.filter_name,
-        **summary(row.evaluation),
-        "median_nees": row.evaluation.median_nees,
-        "above_bound": row.above_bound,
-        "microseconds_a_step": row.microseconds,
-        "rmse_over_first": row.ratios,
-        "score_over_first": row.score_ratio,
-        "verdict": row.verdict,
-    }

@@ -1,4 +1,4 @@
-"""Whether a filter's covariance is honest, as `thruster evaluate --consistency` tells it."""
+"""Whether a filter's covariance is consistent, as `thruster evaluate --consistency` tells it."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from pathlib import Path
 from filters.consistency.intervals import rmse_ratios
 from filters.consistency.nees import SquaresCheck
 from filters.consistency.report import ConsistencyReport
-from filters.consistency.verdicts import comparison_sentence, sentences
+from filters.consistency.verdicts import MOST_STATES, comparison_sentence, sentences
 from filters.registry import filter_class
 from numerics.files import check_target
 from tuning.evaluation.baselines import ORACLE
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison
-from tuning.problems.find import Scenario
+from tuning.problems.problem import Problem
 from tuning.report.consistency_figures import consistency_figure
 from tuning.search.space import Choice
 
 
 def check_request(path: Path, filter_name: str) -> None:
-    """Raise ValueError if a filter cannot be judged, or its picture not be written there."""
+    """Raise ValueError if a filter has no covariance to check, or its picture not be written there."""
     if path.suffix != ".png":
         raise ValueError(f"--consistency must end in .png, but got {str(path)!r}")
     if not filter_class(filter_name).has_covariance:
@@ -27,17 +27,23 @@ def check_request(path: Path, filter_name: str) -> None:
     check_target(path)
 
 
-def judge(choice: Choice, name: str, scenario: Scenario, proof: Comparison, path: Path) -> tuple[list[str], dict]:
+def check_covariance(
+    choice: Choice, name: str, scenario: Problem, proof: Comparison, path: Path
+) -> tuple[list[str], dict]:
     """Draw the checks of a choice, called `name`; return what is to be said and the numbers behind it."""
     report = check_consistency(choice.filter(scenario), scenario.data(proof.seeds))
-    ratios = rmse_ratios(proof.tuned.mean_squares, proof.true.mean_squares)
-    said = sentences(report)
-    for state, ratio in zip(report.states, ratios, strict=True):
-        said.append(comparison_sentence(state, name, ORACLE, ratio))
+    said, against, ratios = sentences(report), {}, None
+    if report.has_truth and proof.true is not None:
+        ratios = rmse_ratios(proof.tuned.mean_squares, proof.true.mean_squares)
+        against[f"{name}\nover {ORACLE}"] = ratios
+        named = list(zip(report.states, ratios, strict=True))
+        said += [comparison_sentence(state, name, ORACLE, ratio) for state, ratio in named[:MOST_STATES]]
+        if len(named) > MOST_STATES:
+            said.append(f"Of {len(named)} states these are the first {MOST_STATES}.")
     title = f"{choice.name}, {name}, on {report.runs} seeds of {scenario.name}"
-    consistency_figure(path, report, title, {f"{name}\nover {ORACLE}": ratios})
+    consistency_figure(path, report, title, against, proof.tuned.scored or None)
     data = {**as_data(report), "rmse_over_true": ratios, "sentences": said, "picture": str(path)}
-    return [f"Is the {name} filter honest?", *said, f"Picture: {path}"], data
+    return [f"Is the {name} filter consistent?", *said, f"Picture: {path}"], data
 
 
 def as_data(report: ConsistencyReport) -> dict:
@@ -60,6 +66,8 @@ def as_data(report: ConsistencyReport) -> dict:
         "crps": report.crps,
         "crps_if_honest": report.crps_expected,
         "members": members,
+        "channels": report.channels,
+        "innovation_coverage_95": report.innovation_coverage,
         "divergences": report.divergences,
     }
 

@@ -1,4 +1,4 @@
-"""`thruster demo`: the main job from end to end: tune, prove, picture, and the published tables."""
+"""`thruster demo`: the main job from end to end: tune, evaluate, draw, and the published tables."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from thruster_cli.reproduce import reproduce
 from thruster_cli.tune import tune
 from thruster_cli.tuning_report import Tuning, as_json, report
 from tuning.evaluation.worth import worth
-from tuning.problems.find import find_scenario
 from tuning.problems.seeds import held_out_seeds
-from tuning.report.figures import comparison_figure, estimates_figure, history_figure
+from tuning.report.figures import comparison_figure, history_figure
+from tuning.report.time_figures import estimates_figure
 from tuning.search.plan import Plan
 from tuning.search.space import true_choice
+from tuning.thruster.find import find_scenario
 
 FILTER, SCENARIO = "enkf", "mismatch"  # where tuning earns its keep
 STUDY = "nurhadi2022"
@@ -30,7 +31,7 @@ def command(
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Tune an ensemble Kalman filter, prove it on held-out seeds, and reproduce a published table."""
+    """Tune an ensemble Kalman filter, evaluate it on held-out seeds, and reproduce a published table."""
     started = time.perf_counter()
     file = out / f"{FILTER}-{SCENARIO}-seed{seed}.json"
     plan = Plan(FILTER, (find_scenario(SCENARIO),), seed)
@@ -75,7 +76,7 @@ def draw(tuning: Tuning, out: Path, seed: int) -> list[Path]:
     }
     label = f"{tuning.result.choice.name} on {tuning.scenario.name}"
     return [
-        estimates_figure(out / "estimates.png", filters, data, 0, nominal.plant.dt),
+        estimates_figure(out / "estimates.png", filters, data, 0, nominal.dt),
         history_figure(out / "history.png", tuning.result.trials, f"Study of {label}"),
         comparison_figure(
             out / "rmse.png",

@@ -7,15 +7,24 @@ from typing import Annotated
 
 import typer
 
-from thruster_cli.consistency import check_request, judge
-from thruster_cli.output import FILTER_HELP, JsonOption, SeedOption, announce_compilation, emit, progress_console
-from thruster_cli.tables import choice_table, comparison_table
+from thruster_cli.consistency import check_covariance, check_request
+from thruster_cli.error_tables import comparison_table
+from thruster_cli.output import (
+    FILTER_HELP,
+    PROBLEMS,
+    JsonOption,
+    SeedOption,
+    announce_compilation,
+    emit,
+    progress_console,
+)
+from thruster_cli.tables import choice_table
 from thruster_cli.tuning_report import gains
 from tuning.evaluation.baselines import RULE, TUNED, baselines, rule_of_thumb
 from tuning.evaluation.held_out import prove
-from tuning.evaluation.tuned import check_plant, metrics, read_tuned
-from tuning.evaluation.worth import scaling_sentence
-from tuning.problems.find import find_scenario
+from tuning.evaluation.tuned import metrics, read_choice, read_tuned
+from tuning.evaluation.worth import scaling_sentence, without_truth
+from tuning.problems.find import find_problem
 from tuning.search.plan import HELD_OUT_SEEDS
 
 
@@ -24,13 +33,16 @@ def command(
     filter_name: Annotated[
         str | None, typer.Option("--filter", help=f"Without a tuned file. {FILTER_HELP}")
     ] = None,
-    scenario: Annotated[str | None, typer.Option(help="Another scenario than the tuned file's.")] = None,
+    scenario: Annotated[
+        str | None,
+        typer.Option("--problem", "--scenario", help=f"By default the tuned file's, or nominal. {PROBLEMS}"),
+    ] = None,
     seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,
     consistency: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Also say whether the filter is as sure of itself as it may be, and draw that: a .png file.",
+            help="Also say whether the filter's covariance is consistent, and draw that: a .png file.",
         ),
     ] = None,
     seed: SeedOption = 0,
@@ -44,16 +56,18 @@ def command(
     With --consistency its errors and innovations are held against its own covariances: NEES, NIS, whiteness,
     coverage, CRPS and, for ensembles, ranks; a sentence each, and a picture of all.
 
-    Example: thruster evaluate --filter enkf --scenario mismatch --consistency honest.png
+    Example: thruster evaluate --filter enkf --scenario mismatch --consistency calibrated.png
     """
     if (tuned is None) == (filter_name is None):
         raise ValueError("give either --tuned FILE or --filter NAME")
     if tuned is not None:
-        choice, default, _ = read_tuned(tuned)
-        chosen = default if scenario is None else find_scenario(scenario)
-        check_plant(tuned, chosen)
+        if scenario is None:
+            choice, chosen, _ = read_tuned(tuned)
+        else:
+            chosen = find_problem(scenario)
+            choice = read_choice(tuned, chosen)
     else:
-        chosen = find_scenario(scenario or "nominal")
+        chosen = find_problem(scenario or "nominal")
         choice = rule_of_thumb(filter_name, chosen)
     if consistency is not None:
         check_request(consistency, choice.name)
@@ -70,12 +84,14 @@ def command(
         "scenario": chosen.name,
         **said,
     }
-    title = f"RMSE on held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
-    shown = [choice_table(choices, chosen), comparison_table(evaluations, proof.bound, title)]
+    where = f"held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
+    shown = [choice_table(choices, chosen), comparison_table(evaluations, proof.bound, where)]
+    if tuned is None and not proof.tuned.has_truth:
+        shown.append(without_truth(chosen.name))
     shown += [scaling_sentence(proof)] if tuned is None else gains(proof)
     if consistency is not None:
         name = RULE if tuned is None else TUNED
         with progress_console.status("checking the covariance ..."):
-            words, data["consistency"] = judge(choice, name, chosen, proof, consistency)
+            words, data["consistency"] = check_covariance(choice, name, chosen, proof, consistency)
         shown += words
     emit(shown, data, json)

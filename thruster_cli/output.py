@@ -19,6 +19,7 @@ from numerics.compiled import tell_when_compiling
 from numerics.files import write_whole
 from thruster_cli.characters import showable
 from thruster_env.parameters import PRESETS
+from tuning.thruster.scenarios import SCENARIOS
 
 JsonOption = Annotated[
     str | None,
@@ -27,6 +28,18 @@ JsonOption = Annotated[
 PresetOption = Annotated[str, typer.Option("--preset", help=f"{', '.join(PRESETS)}.")]
 SeedOption = Annotated[
     int, typer.Option("--seed", min=0, help="Seed of all randomness; the same seed repeats all.")
+]
+PROBLEMS = (
+    f"{', '.join(SCENARIOS)}, a .toml file, or module:object: a tuning.problems.problem.Problem, or a function "
+    "that gives one."
+)
+CodeOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--problem",
+        metavar="MODULE:OBJECT",
+        help="What it was tuned on, where that is code: nothing that a file or a study names is imported.",
+    ),
 ]
 FILTER_HELP = "Name of a filter; `thruster filters` lists them."
 

@@ -1,4 +1,4 @@
-"""`thruster report`: a page on a tuned filter, its study and its proof."""
+"""`thruster report`: a page on a tuned filter, its study and its evaluation on held-out seeds."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
-from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console
+from thruster_cli.output import CodeOption, JsonOption, announce_compilation, emit, progress_console
 from thruster_cli.tune import DEFAULT_STORAGE
+from tuning.problems.find import find_problem
 from tuning.report.report import write_report
 from tuning.search.study import quiet_optuna
 
@@ -21,6 +22,7 @@ def command(
     out: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Where to write; by default beside the tuned file.")
     ] = None,
+    problem: CodeOption = None,
     json: JsonOption = None,
 ) -> None:
     """Write a page on a tuned filter that any browser shows without a network, and its tables as Markdown.
@@ -33,6 +35,6 @@ def command(
     quiet_optuna()
     announce_compilation()
     with progress_console.status(f"reporting on {source} ..."):
-        report = write_report(source, storage, out)
+        report = write_report(source, storage, out, [find_problem(name) for name in problem or []])
     data = {"advice": report.advice, "page": str(report.page), "tables": str(report.tables)}
     emit([report.advice, f"Page: {report.page}", f"Tables: {report.tables}"], data, json)

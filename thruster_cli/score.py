@@ -11,15 +11,16 @@ import typer
 
 from filters.consistency.intervals import mean_interval
 from numerics.checks import one_of
+from thruster_cli.error_tables import about, unless_blank
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
-from thruster_cli.tables import about, unless_blank
 from thruster_cli.train import LEARNABLE
 from training.extras import check_installed
 from training.observations import find_arm
 from training.setup import Setup, in_scenario
-from tuning.problems.find import Scenario, find_scenario
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import HELD_OUT_SEEDS
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenario import Scenario
 
 if TYPE_CHECKING:
     from training.score import Scores

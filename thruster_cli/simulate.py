@@ -20,7 +20,7 @@ from thruster_env.plant import (
     make_plant,
 )
 from thruster_env.simulation import simulate
-from tuning.problems.find import held_levels
+from tuning.problems.excitation import held_levels
 
 MOST_STEPS = 10_000_000  # which take a gigabyte
 COLUMNS = ("time_s", "voltage_V", "omega_m_rad_per_s", "U_a_m_per_s", "thrust_N", "measured_thrust_N")

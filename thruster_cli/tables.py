@@ -3,57 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import isnan
 
 import numpy as np
 from rich.table import Table
 
 from thruster_cli.output import table
-from tuning.evaluation.evaluate import Evaluation, Interval
 from tuning.likelihood.gradient import GradientResult
-from tuning.problems.find import Scenario
+from tuning.problems.problem import Problem
+from tuning.report.units import labels
 from tuning.search.filter_types import Kind
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, neutral, parameters_of
 
 
-def choice_table(choices: Mapping[str, Choice], scenario: Scenario) -> Table:
+def choice_table(choices: Mapping[str, Choice], scenario: Problem) -> Table:
     """The numbers of filters of one kind, a column each."""
     kind, caption = next(iter(choices.values())).name, None
-    unit = "N^2" if scenario.plant.channels == ("thrust",) else "(rad/s)^2"
-    units = {"Q11": " [(rad/s)^2]", "Q22": " [(m/s)^2]", "R": f" [{unit}]"}
+    model = scenario.model()
     columns = [parameters_of(choice) for choice in choices.values()]
+    names = labels(dict.fromkeys(name for column in columns for name in column), kind, scenario)
     rows = [
-        [
-            name.replace("_", " ") + units.get(name, ""),
-            *(_number(column.get(name, neutral(name))) for column in columns),
-        ]
-        for name in dict.fromkeys(name for column in columns for name in column)
+        [label, *(_number(column.get(name, neutral(name))) for column in columns)] for name, label in names.items()
     ]
-    operating = scenario.model().operating_input
-    if kind == "kf" and operating is not None:
-        caption = f"kf: on the affine approximation about {operating[0]:g} V"
+    if kind == "kf" and model.operating_input is not None:
+        pairs = zip(model.operating_input, model.input_quantities, strict=True)
+        about = ", ".join(f"{value:g} {quantity.unit}".rstrip() for value, quantity in pairs)
+        caption = f"kf: on the affine approximation about {about}"
     return table(f"Numbers of the {kind} filter", ["", *choices], rows, caption=caption)
 
 
 def _number(value) -> str:
     return "default" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def comparison_table(evaluations: Mapping[str, Evaluation], bound: np.ndarray, title: str) -> Table:
-    """RMSE, distance from the bound and consistency of filters on the same seeds, a row each."""
-    rows = []
-    for name, evaluation in evaluations.items():
-        above = [100.0 * (rmse.value / b - 1.0) for rmse, b in zip(evaluation.rmse, bound, strict=True)]
-        above = [unless_blank(part, "+.0f") for part in above]
-        speed, flow = evaluation.rmse
-        states = [about(speed, 3), above[0], about(flow, 4), above[1]]
-        honesty = (unless_blank(mean.value, ".3g") for mean in (evaluation.nees, evaluation.nis))
-        rows.append([name, *states, about(evaluation.thrust_rmse, 3), *honesty])
-    rows.append(["bound", unless_blank(bound[0], ".3f"), "", unless_blank(bound[1], ".4f"), "", "", "2", "1"])
-    columns = ["filter", "omega_m\n[rad/s]", "above\n[%]", "U_a\n[m/s]", "above\n[%]", "T\n[N]", "NEES", "NIS"]
-    caption = "above: the bound. ±: half of the 95 % interval. Honest: NEES 2, NIS 1."
-    return table(title, columns, rows, caption=caption)
 
 
 def front_table(plan: Plan, front: Sequence) -> Table:
@@ -75,8 +55,8 @@ def kinds_table(kinds: Sequence[Kind], plan: Plan) -> Table:
         + ["" if kind.microseconds is None else f"{kind.microseconds:.3g}"]
         for kind in kinds
     ]
-    columns = ["filter", "trials", "ended\nearly", "over\nbudget", f"best\n{plan.objectives[0]}", "us a\nstep"]
-    caption = "us a step: of the best trial; of the cheapest where none is complete. *: mean NIS outside its band."
+    columns = ["filter", "trials", "pruned", "over\nbudget", f"best\n{plan.objectives[0]}", "us/step"]
+    caption = "us/step: of the best trial; of the cheapest where none is complete. *: mean NIS outside its band."
     return table("Filters that were tried, on the training seeds", columns, rows, caption=caption)
 
 
@@ -98,19 +78,3 @@ def gradient_table(found: GradientResult) -> Table:
     rows.append(["standard error", *errors, "", ""])
     columns = ["start, factors on the rule of thumb", *found.names, "log L", "evaluations"]
     return table("Maximum of the innovations' likelihood on the training seeds", columns, rows)
-
-
-def about(value: Interval, digits: int) -> str:
-    """A value with half of its 95 % interval; empty if there is no value."""
-    half_width = (value.high - value.low) / 2
-    return "" if isnan(value.value) else f"{value.value:.{digits}f} ±{half_width:.{digits}f}"
-
-
-def span(value: Interval, digits: int) -> str:
-    """A value with its 95 % interval in brackets."""
-    return f"{value.value:.{digits}f} [{value.low:.{digits}f}, {value.high:.{digits}f}]"
-
-
-def unless_blank(value: float, form: str) -> str:
-    """A value in a form; empty if there is no value."""
-    return "" if isnan(value) else format(value, form)

@@ -22,8 +22,9 @@ from training.extras import check_installed
 from training.observations import ARMS
 from training.setup import Setup, make_setup
 from training.tasks import TASKS
-from tuning.problems.find import SCENARIOS, find_scenario
+from tuning.thruster.find import find_scenario
 from tuning.thruster.scenario import plain
+from tuning.thruster.scenarios import SCENARIOS
 
 if TYPE_CHECKING:
     from training.learn import Trained
@@ -108,7 +109,7 @@ def command(
     )
     check_installed()
     folder = out or POLICIES / name_of(setup, tuned, untuned)
-    if tuned is not None and (meant := read_tuned_file(tuned)["scenario"]) != scenario:
+    if tuned is not None and (meant := read_tuned_file(tuned)["problem"]) != scenario:
         progress_console.print(f"{tuned} was tuned on {meant}, and its filter assumes what it did there.")
     with progress_console.status("loading torch ..."):
         from training.learn import train

@@ -14,13 +14,22 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from numerics.checks import at_least, one_of
 from numerics.files import check_target
-from thruster_cli.output import FILTER_HELP, JsonOption, SeedOption, announce_compilation, emit, progress_console
+from thruster_cli.output import (
+    FILTER_HELP,
+    PROBLEMS,
+    JsonOption,
+    SeedOption,
+    announce_compilation,
+    emit,
+    progress_console,
+)
 from thruster_cli.tuning_report import Tuning, as_json, report
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import write_tuned
 from tuning.likelihood.gradient import DIFFERENTIABLE, maximise_likelihood
 from tuning.likelihood.identifiability import identify
-from tuning.problems.find import SCENARIOS, find_scenario
+from tuning.problems.find import find_problem
+from tuning.problems.problem import Problem
 from tuning.search.filter_types import kinds_running
 from tuning.search.objectives import OBJECTIVES
 from tuning.search.outcome import best_trial
@@ -41,12 +50,12 @@ TUNED_FILTER_HELP = f"{FILTER_HELP} Or auto: the best of all within --budget."
 def command(
     filter_name: Annotated[str, typer.Option("--filter", help=TUNED_FILTER_HELP)] = "enkf",
     scenario: Annotated[
-        list[str] | None, typer.Option(help=f"{', '.join(SCENARIOS)}, or a .toml file; several are averaged.")
+        list[str] | None, typer.Option("--problem", "--scenario", help=f"{PROBLEMS} Several are averaged.")
     ] = None,
     trials: Annotated[int, typer.Option(help="Finished trials that the study shall have in total.")] = 50,
     objective: Annotated[
         list[str] | None,
-        typer.Option(help=f"What to make small: {', '.join(OBJECTIVES)}; two for a Pareto front."),
+        typer.Option(help=f"What to minimise: {', '.join(OBJECTIVES)}, output:SYMBOL; two for a Pareto front."),
     ] = None,
     any_nis: Annotated[
         bool,
@@ -95,7 +104,7 @@ def command(
     Example: thruster tune --filter auto --budget 2 --scenario published_noise --trials 100
     """
     one_of("method", method, METHODS)
-    scenarios = tuple(find_scenario(name) for name in scenario or ["mismatch"])
+    scenarios = tuple(find_problem(name) for name in scenario or ["mismatch"])
     objectives = tuple(objective or ["score"])
     plan = Plan(
         filter_name,
@@ -178,7 +187,13 @@ def _name(plan: Plan, by_gradient: bool) -> str:
 
 
 def _scenarios(plan: Plan) -> str:
-    return ", ".join(Path(scenario.name).stem for scenario in plan.scenarios)
+    return ", ".join(map(_short, plan.scenarios))
+
+
+def _short(problem: Problem) -> str:
+    """A problem's name as that of a study and of a file has it: without folders and colons."""
+    name = Path(problem.name)
+    return (name.stem if name.suffix == ".toml" else name.name).replace(":", "-").replace(" ", "-")
 
 
 @contextmanager

@@ -6,24 +6,21 @@ from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
+from numpy import isnan
+
+from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import mean_sentence
-from thruster_cli.tables import (
-    choice_table,
-    comparison_table,
-    front_table,
-    gradient_table,
-    kinds_table,
-    span,
-)
+from thruster_cli.error_tables import comparison_table, span
+from thruster_cli.tables import choice_table, front_table, gradient_table, kinds_table
 from tuning.evaluation.baselines import ORACLE, RULE, SCALED, TUNED, baselines
-from tuning.evaluation.evaluate import Evaluation, Interval, score_ratio
+from tuning.evaluation.evaluate import Evaluation, score_ratio
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SIZE_TOLERANCE
 from tuning.evaluation.tuned import consistency, metrics
-from tuning.evaluation.worth import scaling_sentence
+from tuning.evaluation.worth import scaling_sentence, without_truth
 from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import Identifiability, as_data, sentences
-from tuning.problems.find import Scenario
+from tuning.problems.problem import Problem
 from tuning.search.filter_types import kinds_tried
 from tuning.search.objectives import NIS_BAND
 from tuning.search.outcome import is_over_budget
@@ -45,7 +42,7 @@ class Tuning(NamedTuple):
     known: Identifiability | None = None  # what the innovations determine; None without a covariance
 
     @property
-    def scenario(self) -> Scenario:
+    def scenario(self) -> Problem:
         """The first scenario."""
         return self.plan.scenarios[0]
 
@@ -63,18 +60,18 @@ def report(tuning: Tuning) -> list:
         found = {TUNED: result.choice, **baselines(result.choice.name, scenario, plan.seed)}
         evaluations = proof.evaluations
         choices = {name: found[name] for name in evaluations}
-        title = f"RMSE on held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {scenario.name}"
-        shown += [choice_table(choices, scenario), comparison_table(evaluations, proof.bound, title)]
+        where = f"held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {scenario.name}"
+        shown += [choice_table(choices, scenario), comparison_table(evaluations, proof.bound, where)]
         shown += gains(proof)
         shown.append(_consistency_sentence(proof.tuned))
-        if not scenario.has_bound:
+        if proof.tuned.has_truth and isnan(proof.bound).all():
             shown.append(
-                f"{scenario.name} has no bound, for its Q is singular. Its score is RMSE over its scale, which is "
-                "the RMSE of the open loop unless it was given."
+                f"{scenario.name} has no bound: there is none for a singular Q, or if the plant is no model. Its "
+                "score is RMSE over its scale."
             )
     shown += sentences(tuning.known) if tuning.known else []
     shown += _search_sentences(tuning)
-    trained = f"{result.finished} trials, {result.pruned} of them ended early, {result.seconds:.1f} s in this run"
+    trained = f"{result.finished} trials, {result.pruned} of them pruned, {result.seconds:.1f} s in this run"
     over = sum(map(is_over_budget, result.trials))
     trained += f"; {over} ended for their cost" if over else ""
     shown.append(f"Study {tuning.study!r}: {trained}. Tuned filter: {tuning.file}")
@@ -113,7 +110,7 @@ def _search_sentences(tuning: Tuning) -> list:
             f"Consistency costs {price:.1f} % of the score on the training seeds: the best trial has "
             f"{result.free_value:.3f} whatever its NIS, {result.best_value:.3f} with it in its band."
         )
-    if plan.objectives == ("score",):
+    if plan.objectives == ("score",):  # which needs truth
         found = sum(proof.tuned.score.value for proof in tuning.proofs) / len(tuning.proofs)
         shown.append(
             f"Optimism: the best trial scores {result.best_value:.3f} on the training seeds, the tuned filter "
@@ -205,12 +202,25 @@ def ratios_as_json(proof: Comparison) -> dict:
 
 def gains(proof: Comparison) -> list[str]:
     """What tuning is worth, over each baseline, the one that counts first, and what that one is."""
+    if not proof.tuned.has_truth:
+        return _likelihood_gains(proof)
     ratios = proof.ratios
     parts = [f"x {span(ratio, 3)} that of the {name}" for name, ratio in ratios.items()]
     first, place = next(iter(ratios)), f"{len(proof.seeds)} held-out seeds"
     said = f"Score of the tuned filter on {place}: {', '.join(parts)} (paired 95 % intervals)."
     scaling = scaling_sentence(proof)
     return [f"{said} {_verdict(ratios[first], first)}", *([scaling] if scaling else [])]
+
+
+def _likelihood_gains(proof: Comparison) -> list[str]:
+    """What tuning is worth where there is no truth: by how much the log-likelihood of a run rises."""
+    gained = {name: found for name, found in proof.likelihood_gains.items() if not isnan(found.value)}
+    said, scaling = [without_truth("This problem")], scaling_sentence(proof)
+    if gained:
+        parts = [f"{span(found, 2)} above that of the {name}" for name, found in gained.items()]
+        place = f"{len(proof.seeds)} held-out seeds"
+        said.append(f"Log-likelihood of a run of the tuned filter on {place}: {', '.join(parts)}.")
+    return [*said, *([scaling] if scaling else [])]
 
 
 def _verdict(ratio: Interval, name: str) -> str:
@@ -229,6 +239,8 @@ def _size_sentence(kept: int, result: StudyResult) -> str:
 
 
 def _consistency_sentence(evaluation: Evaluation) -> str:
+    if not evaluation.has_truth:
+        return mean_sentence("NIS", evaluation.nis, evaluation.expected_nis)
     said = mean_sentence("NEES", evaluation.nees, len(evaluation.rmse))
     return (
         said if said.startswith("Consistent") else f"{said} RMSE and NIS alone do not see all of the covariance."

@@ -8,14 +8,16 @@ from typing import Annotated
 
 import typer
 
-from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
+from thruster_cli.output import CodeOption, JsonOption, announce_compilation, emit, progress_console, table
 from tuning.evaluation.verify import TOLERANCE, Verification, verify
+from tuning.problems.find import find_problem
 
 LISTED = 10  # differences in the table; --json has all
 
 
 def command(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Tuned file, as `thruster tune` writes it.")],
+    problem: CodeOption = None,
     json: JsonOption = None,
 ) -> None:
     """Compute the held-out metrics of a tuned file once more, on its seeds, and say whether they hold.
@@ -27,7 +29,7 @@ def command(
     """
     announce_compilation()
     with progress_console.status(f"computing the metrics of {file} once more ..."):
-        found = verify(file)
+        found = verify(file, [find_problem(name) for name in problem or []])
     emit(_shown(file, found), _as_json(file, found), json)
     if not found.holds:
         sys.exit(1)

@@ -115,7 +115,7 @@ def make_setup(
         content = read_tuned_file(tuned)
         found = content["filter"]
         one_of("filter of the tuned file", found["name"], (arm.filter,))
-        if "plant" in content:
+        if content.get("plant") is not None:
             check_same_plant(content["plant"], scenario.plant, tuned)
         given |= {**found["numbers"], **found["model"]}
     given |= filter_arguments or {}

@@ -1,1 +1,1 @@
-"""Is a filter honest? Its errors and innovations held against the covariance that it claims."""
+"""Is a filter consistent? Its errors and innovations held against the covariance that it claims."""

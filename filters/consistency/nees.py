@@ -1,4 +1,4 @@
-"""Is a filter's covariance honest? NEES and NIS of many runs against their chi-square distributions."""
+"""Is a filter's covariance consistent? NEES and NIS of many runs against their chi-square distributions."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def whitened(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
 def normalized_squares(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     """E' P^-1 e for errors (..., d) and covariances (..., d, d); NaN where P is singular.
 
-    With estimation errors this is the NEES, with innovations and their covariances the NIS; for an honest
-    filter each is chi-squared with d degrees of freedom. Source: Bar-Shalom, Li, Kirubarajan (2001),
+    With estimation errors this is the NEES, with innovations and their covariances the NIS; for a
+    consistent filter each is chi-squared with d degrees of freedom. Source: Bar-Shalom, Li, Kirubarajan (2001),
     Estimation with Applications to Tracking and Navigation, section 5.4.
     """
     return (whitened(errors, covs) ** 2).sum(axis=-1)

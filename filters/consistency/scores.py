@@ -9,9 +9,9 @@ LEVELS = np.arange(0.05, 1.0, 0.05)  # of intervals whose coverage is looked at
 
 
 def covered(errors: np.ndarray, deviations: np.ndarray, level: float = 0.95) -> np.ndarray:
-    """1 where an error lies in its Gaussian interval of a level, else 0; NaN unless the deviation is positive."""
+    """1 where an error lies in its Gaussian interval of a level, else 0; NaN without a positive deviation."""
     reach = ndtri(0.5 + 0.5 * level)
-    return np.where(deviations > 0, np.abs(errors) <= reach * deviations, np.nan)
+    return np.where((deviations > 0) & ~np.isnan(errors), np.abs(errors) <= reach * deviations, np.nan)
 
 
 def gaussian_crps(errors: np.ndarray, deviations: np.ndarray) -> np.ndarray:
@@ -73,7 +73,7 @@ def ensemble_ranks(truth: np.ndarray, members: np.ndarray, weights: np.ndarray |
     """Where the truth (...,) stands among members (..., N), as (rank + 1/2)/(N + 1) in 0 ... 1.
 
     The rank is the number of members below the truth, 0 ... N; with weights (..., N) it is N times their weight.
-    For an honest ensemble all ranks are equally likely. Source: Hamill (2001), "Interpretation of rank
+    For a consistent ensemble all ranks are equally likely. Source: Hamill (2001), "Interpretation of rank
     histograms for verifying ensemble forecasts".
     """
     size = members.shape[-1]

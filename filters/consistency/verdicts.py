@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from filters.consistency.intervals import Interval
@@ -15,28 +17,46 @@ SLIGHT_DISTANCE = 0.02  # so are distributions this close
 SLIGHT_CORRELATION = 0.05  # and correlations this small
 SIGNIFICANT = 0.05
 EVEN = "even, as far as these runs show"
+MOST_STATES = 6  # of which there are sentences
+NO_TRUTH = "These data come without truth: what follows is from the innovations alone."
 
 
 def sentences(report: ConsistencyReport) -> list[str]:
-    """What a report says, one check a sentence, a remedy last."""
-    said = []
-    for check in (report.nees, report.nis):
+    """What a report says, one check a sentence, a remedy last; of many states those with the worst coverage."""
+    said = [] if report.has_truth else [NO_TRUTH]
+    for check in (report.nees, report.nis) if report.has_truth else (report.nis,):
         said.append(squares_sentence(check, report.runs))
         if not np.isnan(check.mean.value):
             said.append(distribution_sentence(check))
-    said.append(whiteness_sentence(report.whiteness))
-    of_members = report.ensemble.crps if report.ensemble is not None else (None,) * len(report.states)
-    columns = report.states, report.coverage, report.crps, report.crps_expected, of_members
-    for name, coverage, *crps in zip(*columns, strict=True):
-        said += [coverage_sentence(name, coverage), crps_sentence(name, *crps)]
-    if report.ensemble is not None:
-        size = report.ensemble.size
-        said += [
-            ranks_sentence(name, r, size) for name, r in zip(report.states, report.ensemble.ranks, strict=True)
-        ]
+    said.append(whiteness_sentence(report.whiteness, report.channels))
+    if report.has_truth:
+        said += _state_sentences(report)
+    else:
+        pairs = zip(report.channels, report.innovation_coverage, strict=True)
+        said += [coverage_sentence(f"the expected {name}", part, "the measurement") for name, part in pairs]
     said.append(divergence_sentence(report.divergences, report.diverged_runs, report.runs))
     said.append(remedy_sentence(report))
     return [sentence for sentence in said if sentence]
+
+
+def _state_sentences(report: ConsistencyReport) -> list[str]:
+    """Coverage, CRPS and ranks, state by state."""
+    ensemble, n = report.ensemble, len(report.states)
+    off = [-abs(part.value - 0.95) for part in report.coverage]
+    told = sorted(sorted(range(n), key=off.__getitem__)[:MOST_STATES])
+    said = []
+    for i in told:
+        of_members = None if ensemble is None else ensemble.crps[i]
+        said.append(coverage_sentence(report.states[i], report.coverage[i]))
+        said.append(crps_sentence(report.states[i], report.crps[i], report.crps_expected[i], of_members))
+    if n > MOST_STATES and not np.isnan(off).all():
+        said.append(
+            f"Of {n} states these are the {MOST_STATES} whose coverage is furthest off; that of the others lies "
+            f"within {100 * sorted(-part for part in off)[-MOST_STATES - 1]:.2g} percentage points of 95 %."
+        )
+    if ensemble is not None:
+        said += [ranks_sentence(report.states[i], ensemble.ranks[i], ensemble.size) for i in told]
+    return said
 
 
 def confidence(mean: Interval, dimension: float) -> str:
@@ -81,17 +101,18 @@ def distribution_sentence(check: SquaresCheck) -> str:
     )
 
 
-def whiteness_sentence(found: Whiteness) -> str:
-    """Whether innovations are white, and which way they are not."""
+def whiteness_sentence(found: Whiteness, channels: Sequence[str] = ()) -> str:
+    """Whether innovations are white, and which way they are not; `channels` names the measurements."""
     if found.statistic == 0:
         return "No test of whiteness: the filter gives no innovation covariance, or nothing was measured."
     lag, i, j = np.unravel_index(np.argmax(np.abs(found.correlations)), found.correlations.shape)
     largest = found.correlations[lag, i, j]
     after = "from one step to the next" if lag == 0 else f"over {lag + 1} steps"
-    channels = "" if found.correlations.shape[1] == 1 else f", of channel {i + 1} with channel {j + 1}"
+    channels = channels or [f"channel {place + 1}" for place in range(found.correlations.shape[1])]
+    of = "" if len(channels) == 1 else f", of {channels[i]} with {channels[j]}"
     share, width = 100 * found.share_inside, np.median(found.half_widths)
     numbers = (
-        f"the largest correlation is {largest:+.2g} {after}{channels}; {share:.0f} % of them lie within "
+        f"the largest correlation is {largest:+.2g} {after}{of}; {share:.0f} % of them lie within "
         f"±{width:.2g}, where 95 % do by chance ({probability_text(found.p_value)})"
     )
     if found.p_value >= SIGNIFICANT:
@@ -103,14 +124,14 @@ def whiteness_sentence(found: Whiteness) -> str:
     return f"Innovations are not white, the filter follows the noise: {numbers}."
 
 
-def coverage_sentence(name: str, coverage: Interval) -> str:
-    """Whether a state's 95 % interval holds the truth as often as it says."""
+def coverage_sentence(name: str, coverage: Interval, held: str = "the truth") -> str:
+    """Whether a 95 % interval holds the truth, or a measurement, as often as it says."""
     if np.isnan(coverage.value):
         return ""
     low, value, high = 100 * coverage.low, 100 * coverage.value, 100 * coverage.high
     amiss = "too rarely" if value < 95 else "more often than it says"
     return (
-        f"The 95 % interval of {name} holds the truth in {value:.1f} % [{low:.1f}, {high:.1f}] of cases: "
+        f"The 95 % interval of {name} holds {held} in {value:.1f} % [{low:.1f}, {high:.1f}] of cases: "
         f"{'as it should' if coverage.covers(0.95) else amiss}."
     )
 
@@ -152,7 +173,7 @@ def ranks_verdict(ranks: Uniformity) -> str:
 
 
 def divergence_sentence(divergences: int, diverged_runs: int, runs: int) -> str:
-    """How often a filter lost itself."""
+    """How often a filter diverged."""
     if divergences == 0:
         return "No run diverged."
     return f"{diverged_runs} of {runs} runs diverged and restarted from the prior, {divergences} times in all."
@@ -178,7 +199,7 @@ def remedy_sentence(report: ConsistencyReport) -> str:
     next_step = np.diagonal(report.whiteness.correlations[0])
     strongest = next_step[np.argmax(np.abs(next_step))]
     slow, quick = strongest > SLIGHT_CORRELATION, strongest < -SLIGHT_CORRELATION
-    word = confidence(nees.mean, nees.dimension)
+    word = "consistent" if np.isnan(nees.mean.value) else confidence(nees.mean, nees.dimension)
     if over:
         what = "raise Q, or repair the model" if slow else "raise R" if quick else "raise Q and R alike"
     elif under:

@@ -14,7 +14,7 @@ LAGS = 20
 
 
 class Whiteness(NamedTuple):
-    """Correlations of normalised innovations over time, pooled over runs; all zero for an honest filter."""
+    """Correlations of normalised innovations over time, pooled over runs; all zero for a consistent filter."""
 
     correlations: np.ndarray  # (lags, m, m): of channel i with channel j so many steps later; lags 1, 2, ...
     half_widths: np.ndarray  # (lags, m, m): a correlation lies within plus and minus this with 95 % probability

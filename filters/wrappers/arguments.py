@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import gymnasium as gym
 import numpy as np
 
 from filters.filter import Filter
 from filters.registry import make_filter, tunable_numbers
-from filters.tuned_file import read_tuned_file
+from filters.wrappers.models import made, maker_of
+from filters.wrappers.tuned import tuned_filter
 from numerics.checks import shown
 from plants.state_space import StateSpaceModel
 
@@ -21,20 +21,14 @@ APPENDED = "appended_entries"  # attribute of an env: entries of its observation
 def filter_for(env, filter: str | None, model, tuned: str | None, model_arguments, numbers: dict) -> Filter:
     """The filter that a wrapper of env is told to run; its class says what the arguments mean.
 
-    A tuned file is data: nothing in it becomes a model or another argument of the wrapper. Where no `model` is
-    given it has to be for the env's plant.
+    A tuned file is data: nothing in it becomes a model or another argument of the wrapper.
 
     Raises ValueError if an argument is unknown or off.
     """
     if tuned is not None:
         if filter is not None or numbers or model_arguments is not None:
             raise ValueError("tuned must come without filter, numbers and model_arguments: its file holds them")
-        content = read_tuned_file(tuned)
-        check = getattr(env.unwrapped, "check_tuned_for", None)
-        if model is None and check is not None:
-            check(content.get("plant"), tuned)
-        entry = content["filter"]
-        return make_filter(entry["name"], model_for(env, model, entry["model"]), **entry["numbers"])
+        return tuned_filter(env, model, tuned)
     filter = "ekf" if filter is None else filter
     known = tunable_numbers(filter)
     for name in numbers:
@@ -49,33 +43,12 @@ def filter_for(env, filter: str | None, model, tuned: str | None, model_argument
 
 def model_for(env, model: str | StateSpaceModel | None, arguments: Mapping) -> StateSpaceModel:
     """The model that is given, that the "module:factory" named makes, or the env's own; see `EstimateState`."""
-    if model is None:
-        make = getattr(env.unwrapped, "state_space_model", None)
-        if make is None:
-            raise ValueError(f"an env that offers no state_space_model must come with a model, but got {env}")
-        return _made(f"the model of {env.unwrapped}", make, arguments)
-    if isinstance(model, StateSpaceModel):
-        if arguments:
-            raise ValueError(f"a StateSpaceModel must come without arguments of its own, but got {arguments!r}")
-        return model
-    module, _, name = str(model).partition(":")
-    try:
-        factory: Callable = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError):
-        raise ValueError(
-            f"model must be 'module:factory' that can be imported, or a StateSpaceModel, but got {model!r}"
-        ) from None
-    return _made(f"model {model!r}", factory, arguments)
-
-
-def _made(what: str, make: Callable, arguments: Mapping) -> StateSpaceModel:
-    try:
-        made = make(**arguments)
-    except TypeError as error:
-        raise ValueError(f"{what} must take the given arguments: {error}") from None
-    if not isinstance(made, StateSpaceModel):
-        raise ValueError(f"{what} must be a StateSpaceModel, but it is {shown(made)}")
-    return made
+    what, make = maker_of(env, model)
+    if not isinstance(make, StateSpaceModel):
+        return made(what, make, arguments)
+    if arguments:
+        raise ValueError(f"a StateSpaceModel must come without arguments of its own, but got {arguments!r}")
+    return make
 
 
 class ModelInSpec:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from training.setup import Setup, make_setup, setup_from_json
-from tuning.problems.find import find_scenario
+from tuning.thruster.find import find_scenario
 
 KILLS = 20
 COPIES, STEPS = 4, 8192

@@ -23,10 +23,10 @@ from tests.tuned_files import write_untuned
 from training.environments import make_environments
 from training.setup import make_setup, setup_from_json
 from tuning.evaluation.tuned import read_tuned
-from tuning.problems.find import find_scenario
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage
 from tuning.search.study import open_study
+from tuning.thruster.find import find_scenario
 
 TRAP = "tests_fuzz_trap"  # a module that nothing may import, with a function that nothing may call
 VALUES = (

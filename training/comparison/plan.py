@@ -13,9 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from training.setup import Setup, make_setup
-from tuning.problems.find import Scenario, find_scenario
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, quiet_optuna, run_study
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenario import Scenario
 
 TASK = "manoeuvre"
 NOISES = {"low": "low_noise", "medium": "medium_noise", "high": "high_noise"}  # names of scenarios

@@ -6,11 +6,12 @@ import math
 from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 from scipy.optimize import brentq
 
 from filters.registry import filter_class
 from tuning.evaluation.evaluate import evaluate
-from tuning.problems.find import Scenario
+from tuning.problems.problem import Problem
 from tuning.problems.seeds import training_seeds
 from tuning.search.objectives import LARGEST, nis_ratio
 from tuning.search.plan import TRAINING_SEEDS
@@ -32,18 +33,18 @@ class Scaled(NamedTuple):
     reason: str = ""  # why there is none; empty where there is one
 
 
-def rule_of_thumb(name: str, scenario: Scenario) -> Choice:
+def rule_of_thumb(name: str, scenario: Problem) -> Choice:
     """R from the sensor's sheet, Q = diag((1 % of each state's range)^2), N = 30 (particles: 1000)."""
     return untuned_choice(name, scenario)
 
 
-def oracle(name: str, scenario: Scenario) -> Choice:
-    """The filter that is told the plant's own Q and R, with the rule of thumb's N."""
+def oracle(name: str, scenario: Problem) -> Choice | None:
+    """The filter that is told the plant's own Q and R, with the rule of thumb's N; None if they are unknown."""
     return true_choice(name, scenario)
 
 
 @lru_cache(maxsize=64)
-def scaled_default(name: str, scenario: Scenario, seed: int = 0) -> Scaled:
+def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
     """The rule of thumb with one factor on its Q, such that the mean NIS on the training runs is right.
 
         mean of nu' S(c Q, R)^-1 nu over runs and scored steps = m,  solved for log c
@@ -62,7 +63,8 @@ def scaled_default(name: str, scenario: Scenario, seed: int = 0) -> Scaled:
     """
     if not filter_class(name).has_covariance:
         return Scaled(None, None, None, f"{name} has no NIS by which its Q could be scaled")
-    data, start = scenario.data(training_seeds(seed, TRAINING_SEEDS)), rule_of_thumb(name, scenario)
+    data = scenario.data(training_seeds(seed, TRAINING_SEEDS))
+    start = _with_q(rule_of_thumb(name, scenario), scenario)
 
     def nis_at(factor: float) -> float:
         ratio = nis_ratio(evaluate(scaled(start, factor).filter(scenario), data, scenario.scale))
@@ -91,12 +93,25 @@ def scaled_default(name: str, scenario: Scenario, seed: int = 0) -> Scaled:
 
 def scaled(choice: Choice, factor: float) -> Choice:
     """The same choice with variances of the process noise that are a factor times as large."""
-    variances = tuple(factor * variance for variance in choice.model["process_noise_cov"])
-    return choice._replace(model={**choice.model, "process_noise_cov": variances})
+    q = choice.model["process_noise_cov"]
+    if np.ndim(q) == 1:
+        larger = tuple(factor * variance for variance in q)
+    else:
+        larger = tuple(map(tuple, (factor * np.asarray(q)).tolist()))
+    return choice._replace(model={**choice.model, "process_noise_cov": larger})
 
 
-def baselines(name: str, scenario: Scenario, seed: int = 0) -> dict[str, Choice]:
+def _with_q(choice: Choice, scenario: Problem) -> Choice:
+    """The same choice, which says what Q is even where it follows from other numbers."""
+    if "process_noise_cov" in choice.model:
+        return choice
+    q = scenario.model(**choice.model).process_noise_cov
+    return choice._replace(model={**choice.model, "process_noise_cov": tuple(map(tuple, q.tolist()))})
+
+
+def baselines(name: str, scenario: Problem, seed: int = 0) -> dict[str, Choice]:
     """All baselines of a kind of filter that there are, by what they are called, the one that counts first."""
     default = scaled_default(name, scenario, seed).choice
     found = {SCALED: default} if default is not None else {}
-    return found | {RULE: rule_of_thumb(name, scenario), ORACLE: oracle(name, scenario)}
+    known = oracle(name, scenario)
+    return found | {RULE: rule_of_thumb(name, scenario)} | ({} if known is None else {ORACLE: known})

@@ -16,8 +16,9 @@ from filters.particles.weighted import WeightedFilter
 from filters.registry import filter_class, make_filter
 from numerics.checks import one_of, positive
 from tuning.evaluation.baselines import oracle, rule_of_thumb, scaled_default
-from tuning.evaluation.evaluate import Evaluation, judge, score_ratio
-from tuning.problems.find import Data, Scenario
+from tuning.evaluation.evaluate import Evaluation, compute_metrics, likelihood_gain, score_ratio
+from tuning.problems.data import Data
+from tuning.problems.problem import Problem
 from tuning.search.interruption import stop_on_interrupt
 from tuning.search.space import Choice, ensemble_sizes_of, has_ensemble
 
@@ -31,10 +32,10 @@ class Contender(NamedTuple):
     """A filter that takes part in a comparison, whatever the scenario."""
 
     label: str
-    choose: Callable[[Scenario], Choice]
+    choose: Callable[[Problem], Choice]
     unknown: Mapping[str, Unknown | None] = {}  # constants of the model that it estimates, too; None for a default
 
-    def filter(self, scenario: Scenario) -> Filter:
+    def filter(self, scenario: Problem) -> Filter:
         """The filter, with what the scenario lets it assume of the plant."""
         filter_ = self.choose(scenario).filter(scenario)
         if not self.unknown:
@@ -59,17 +60,26 @@ class Row(NamedTuple):
     microseconds: float  # a step of one run, on all cores
     ratios: tuple[Interval, ...]  # by state, RMSE over the first filter's, paired
     score_ratio: Interval  # score over the first filter's, paired
+    likelihood_gain: Interval  # log-likelihood of a run less the first filter's, paired
 
     @property
     def verdict(self) -> str:
-        """Whether the score is significantly lower than the first filter's: "better", "worse" or "tie"."""
-        return "better" if self.score_ratio.high < 1 else "worse" if self.score_ratio.low > 1 else "tie"
+        """Whether the score is significantly lower than the first filter's: "better", "worse" or "tie".
+
+        Without truth it is by the log-likelihood of the innovations; "unknown" of a filter that has none, either.
+        """
+        if self.evaluation.has_truth:
+            return "better" if self.score_ratio.high < 1 else "worse" if self.score_ratio.low > 1 else "tie"
+        gain = self.likelihood_gain
+        if np.isnan(gain.value):
+            return "unknown"
+        return "better" if gain.low > 0 else "worse" if gain.high < 0 else "tie"
 
 
 class Leaderboard(NamedTuple):
     """Filters on one scenario, in the order in which they were given."""
 
-    scenario: Scenario
+    scenario: Problem
     seeds: Sequence[int]
     bound: np.ndarray  # (n,), of the scenario's Gaussian core on these seeds
     rows: list[Row]
@@ -95,7 +105,7 @@ def contender(
     one_of("knows", knows, KNOWLEDGE)
     numbers = {key: value for key, value in numbers.items() if value is not None}
 
-    def chosen(scenario: Scenario) -> Choice:
+    def chosen(scenario: Problem) -> Choice:
         choice = _known(knows, name, scenario, seed)
         return choice._replace(numbers={**choice.numbers, **numbers})
 
@@ -106,10 +116,15 @@ def contender(
     return Contender(" ".join([name, *size, *others, *added]), chosen, unknown)
 
 
-def _known(knows: str, name: str, scenario: Scenario, seed: int) -> Choice:
-    """The choice of a filter that knows so much; ValueError where there is no scaled default."""
-    if knows != "scaled":
-        return (oracle if knows == "true" else rule_of_thumb)(name, scenario)
+def _known(knows: str, name: str, scenario: Problem, seed: int) -> Choice:
+    """The choice of a filter that knows so much; ValueError where there is no scaled default, or no oracle."""
+    if knows == "untuned":
+        return rule_of_thumb(name, scenario)
+    if knows == "true":
+        known = oracle(name, scenario)
+        if known is None:
+            raise ValueError(f"an oracle must know the plant's Q and R, but those of {scenario.name} are unknown")
+        return known
     found = scaled_default(name, scenario, seed)
     if found.choice is None:
         raise ValueError(f"{name} must have a scaled default on {scenario.name}, but {found.reason}")
@@ -137,9 +152,9 @@ def default_belief(name: str, value: float) -> Unknown:
 
 def compare(
     contenders: Sequence[Contender],
-    scenarios: Iterable[Scenario],
+    scenarios: Iterable[Problem],
     seeds: Sequence[int],
-    on_row: Callable[[Scenario, str], None] = lambda scenario, label: None,
+    on_row: Callable[[Problem, str], None] = lambda scenario, label: None,
 ) -> tuple[list[Leaderboard], bool]:
     """Run filters over scenarios, all on the same seeds.
 
@@ -186,7 +201,7 @@ def compare(
 
 def _row(label: str, filter_: Filter, data: Data, board: Leaderboard) -> Row:
     estimates, seconds = timed_run(filter_, data)
-    evaluation = judge(filter_, estimates, data, board.scenario.scale)
+    evaluation = compute_metrics(filter_, estimates, data, board.scenario.scale)
     first = board.rows[0].evaluation if board.rows else evaluation
     particles = isinstance(filter_, WeightedFilter)
     return Row(
@@ -199,6 +214,7 @@ def _row(label: str, filter_: Filter, data: Data, board: Leaderboard) -> Row:
         microseconds=1e6 * seconds / data.measurements[..., 0].size,
         ratios=rmse_ratios(evaluation.mean_squares, first.mean_squares),
         score_ratio=score_ratio(evaluation, first),
+        likelihood_gain=likelihood_gain(evaluation, first),
     )
 
 

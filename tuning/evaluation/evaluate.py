@@ -1,7 +1,8 @@
-"""A filter on a scenario: errors with intervals, consistency, and paired comparisons."""
+"""A filter on a problem's data: errors with intervals, consistency, and paired comparisons."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -13,93 +14,128 @@ from filters.engine.batch import Estimates, run
 from filters.ensembles.recording import record_members
 from filters.filter import Filter
 from numerics.angles import difference
-from thruster_env.model import thrusts_of
-from tuning.problems.find import FIRST_SCORED_STEP, Data
+from plants.quantities import Quantity
+from tuning.problems.data import FIRST_SCORED_STEP, Data
 
-STATES = ("omega_m [rad/s]", "U_a [m/s]")
 MEMBER_RUNS, MEMBER_STEPS = 40, 5  # rank histograms are made of so many runs, and of every fifth step
+FARTHEST = 1e100  # an output beyond this is this: its square is a number
+NOTHING = Interval(np.nan, np.nan, np.nan)
 
 
 class Evaluation(NamedTuple):
-    """What a filter achieved on B seeds; errors are pooled over seeds and over the steps that count."""
+    """What a filter achieved on B seeds; errors are pooled over seeds and over the steps that count.
 
-    rmse: tuple[Interval, ...]  # by state, (omega_m [rad/s], U_a [m/s])
+    Without truth all that is held against it is NaN: errors, score and NEES. What the innovations tell stays.
+    """
+
+    states: tuple[Quantity, ...]  # of the plant
+    outputs: Mapping[str, Quantity]  # derived, by symbol
+    rmse: tuple[Interval, ...]  # by state, in its unit
     start_up_rmse: np.ndarray  # (n,), over the steps before 50
     score: Interval  # mean over states of RMSE over scale [-]
-    thrust_rmse: Interval  # of the thrust that the filter's model has at its estimate [N]
+    output_rmse: Mapping[str, Interval]  # by symbol, of the output that the filter's model has at its estimate
     nees: Interval  # mean; n is right; NaN for filters that give no covariance
     median_nees: float  # for two states 1.39 is right; says more where a few steps have all of the mean
-    nis: Interval  # mean; m is right
+    nis: Interval  # mean ...
+    expected_nis: float  # ... and what is right: m, or less where channels are missing at times
     channels: int  # m
     log_likelihood: float  # mean over seeds of the scored steps' sum; NaN for filters that give no covariance
+    log_likelihoods: np.ndarray  # (B,), of each run, for paired comparisons
     divergences: int  # restarts from the prior, over all seeds
     mean_squares: np.ndarray  # (B, n), mean square error of each run, for paired comparisons
     scale: np.ndarray  # (n,), what the score measures errors in
 
+    @property
+    def has_truth(self) -> bool:
+        """Whether there was a truth to hold the estimates against."""
+        return not np.isnan(self.mean_squares).all()
+
+    @property
+    def scored(self) -> list[int]:
+        """Which states count in the score."""
+        return np.flatnonzero(np.isfinite(self.scale)).tolist()
+
 
 def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
-    """Run a filter over all seeds of some data in one compiled, parallel call, and judge it.
+    """Run a filter over all seeds of some data in one compiled, parallel call, and compute its metrics.
 
     Args:
         filter_: the filter; where it estimates more than the plant's n states, these come first.
-        data: truth, inputs and measurements of a scenario.
-        scale: (n,) what errors are measured in for the score, as the scenario says.
+        data: inputs and measurements, and the truth where it is known.
+        scale: (n,) what errors are measured in for the score, as the problem says: infinite for states that do
+            not count; None where there is no truth.
 
     Raises:
-        ValueError: if the scale is not positive.
+        ValueError: if the scale is not positive, or not one a state.
     """
-    return judge(filter_, run(filter_, data.filter_keys, data.inputs, data.measurements), data, scale)
+    return compute_metrics(filter_, run(filter_, data.filter_keys, data.inputs, data.measurements), data, scale)
 
 
-def judge(filter_: Filter, estimates: Estimates, data: Data, scale) -> Evaluation:
+def compute_metrics(filter_: Filter, estimates: Estimates, data: Data, scale) -> Evaluation:
     """What the estimates of a filter on some data are worth; arguments and errors are those of `evaluate`."""
-    scale = np.asarray(scale, dtype=np.float64)
-    if not (scale > 0).all():
-        raise ValueError(f"scale must be positive in every state, but got {scale.tolist()}")
-    n, late = data.states.shape[-1], data.scored
+    late, measurements = data.scored, data.measurements
+    innovations, innovation_covs = estimates.innovations[:, late], estimates.innovation_covs[:, late]
+    present = (~np.isnan(measurements[:, late])).sum(axis=-1)
+    squares = normalized_squares(innovations, innovation_covs)
+    likelihoods = np.full(len(measurements), np.nan)
+    if filter_.has_covariance:
+        likelihoods = estimates.log_likelihoods[:, late].sum(axis=1)
+    return Evaluation(
+        **_errors(filter_, estimates, data, scale),
+        nis=mean_interval(np.where(present > 0, squares, np.nan)),
+        expected_nis=float(present[present > 0].mean()) if present.any() else np.nan,
+        channels=measurements.shape[-1],
+        log_likelihood=float(likelihoods.mean()),
+        log_likelihoods=likelihoods,
+        divergences=int(estimates.divergences.sum()),
+    )
+
+
+def _errors(filter_: Filter, estimates: Estimates, data: Data, scale) -> dict:
+    """The fields of an `Evaluation` that need the truth; NaN without it."""
+    if data.states is None:
+        n = filter_.model.n if scale is None else len(scale)
+        return {
+            "states": filter_.model.states[:n],
+            "outputs": {},
+            "rmse": (NOTHING,) * n,
+            "start_up_rmse": np.full(n, np.nan),
+            "score": NOTHING,
+            "output_rmse": {},
+            "nees": NOTHING,
+            "median_nees": np.nan,
+            "mean_squares": np.full((len(data.measurements), n), np.nan),
+            "scale": np.full(n, np.nan),
+        }
+    n, late, scale = data.states.shape[-1], data.scored, _checked(scale, data.states.shape[-1])
     errors = state_errors(filter_, estimates, data)
     squares = normalized_squares(errors[:, late], estimates.covs[:, late, :n, :n])
     mean_squares = (errors[:, late] ** 2).mean(axis=1)
-    with np.errstate(all="ignore"):  # estimates far off, though finite, may have a thrust that is not
-        thrusts = np.clip(thrusts_of(filter_.model, estimates.means[:, late]), -1e100, 1e100)
-    thrust_errors = thrusts - data.thrusts[:, late]
-    innovations, innovation_covs = estimates.innovations[:, late], estimates.innovation_covs[:, late]
-    measured = ~np.isnan(data.measurements[:, late]).all(axis=-1)
-    nis = np.where(measured, normalized_squares(innovations, innovation_covs), np.nan)
-    likelihood = estimates.log_likelihoods[:, late] if filter_.has_covariance else np.full((1, 1), np.nan)
     resampled = np.sqrt(resampled_means(mean_squares))  # (resamples, n)
-    return Evaluation(
-        rmse=rmse_intervals(mean_squares),
-        start_up_rmse=np.sqrt((errors[:, :FIRST_SCORED_STEP] ** 2).mean(axis=(0, 1))),
-        score=interval(score(mean_squares, scale), (resampled / scale).mean(axis=1)),
-        thrust_rmse=rmse_intervals((thrust_errors**2).mean(axis=1, keepdims=True))[0],
-        nees=mean_interval(squares),
-        median_nees=float(np.nanmedian(squares)) if np.isfinite(squares).any() else np.nan,
-        nis=mean_interval(nis),
-        channels=data.measurements.shape[-1],
-        log_likelihood=float(likelihood.sum(axis=1).mean()),
-        divergences=int(estimates.divergences.sum()),
-        mean_squares=mean_squares,
-        scale=scale,
-    )
+    outputs = _output_rmse(filter_, estimates, data)
+    return {
+        "states": filter_.model.states[:n],
+        "outputs": {symbol: filter_.model.outputs[symbol].quantity for symbol in outputs},
+        "rmse": rmse_intervals(mean_squares),
+        "start_up_rmse": np.sqrt((errors[:, :FIRST_SCORED_STEP] ** 2).mean(axis=(0, 1))),
+        "score": interval(score(mean_squares, scale), _scores(resampled, scale)),
+        "output_rmse": outputs,
+        "nees": mean_interval(squares),
+        "median_nees": float(np.nanmedian(squares)) if np.isfinite(squares).any() else np.nan,
+        "mean_squares": mean_squares,
+        "scale": scale,
+    }
 
 
-def check_consistency(filter_: Filter, data: Data) -> ConsistencyReport:
-    """Whether a filter's covariance is honest on a scenario, and for an ensemble whether its members are."""
-    estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
-    members = None
-    if filter_.size:
-        some = (part[:MEMBER_RUNS] for part in (data.filter_keys, data.inputs, data.measurements))
-        members = record_members(filter_, *some, first=data.scored.start, every=MEMBER_STEPS)
-    return consistency_report(
-        estimates,
-        data.states,
-        data.measurements,
-        members=members,
-        first_step=data.scored.start,
-        names=STATES,
-        angles=filter_.model.shape.state_angles,
-    )
+def _checked(scale, n: int) -> np.ndarray:
+    scale = np.asarray(scale, dtype=np.float64)
+    if scale.shape != (n,):
+        raise ValueError(f"scale must be one number a state, {n}, but got {scale.tolist()}")
+    if not (scale > 0).all():
+        raise ValueError(f"scale must be positive in every state, but got {scale.tolist()}")
+    if not np.isfinite(scale).any():
+        raise ValueError(f"scale must be finite in some state, but got {scale.tolist()}")
+    return scale
 
 
 def state_errors(filter_: Filter, estimates: Estimates, data: Data) -> np.ndarray:
@@ -108,26 +144,83 @@ def state_errors(filter_: Filter, estimates: Estimates, data: Data) -> np.ndarra
     return difference(estimates.means[..., :n], data.states, filter_.model.shape.state_angles[:n])
 
 
+def _output_rmse(filter_: Filter, estimates: Estimates, data: Data) -> dict[str, Interval]:
+    """RMSE of each derived output that both the truth and the filter's model have."""
+    late, found = data.scored, {}
+    for symbol, truth in (data.outputs or {}).items():
+        if symbol not in filter_.model.outputs:
+            continue
+        with np.errstate(all="ignore"):  # estimates far off, though finite, may have an output that is not
+            values = filter_.model.output(symbol, estimates.means[:, late])
+        values, angle = np.clip(values, -FARTHEST, FARTHEST), filter_.model.outputs[symbol].quantity.angle
+        errors = difference(values[..., None], truth[:, late, None], (angle,))[..., 0]
+        found[symbol] = rmse_intervals((errors**2).mean(axis=1, keepdims=True))[0]
+    return found
+
+
+def check_consistency(filter_: Filter, data: Data) -> ConsistencyReport:
+    """Whether a filter's covariance is consistent on some data, and for an ensemble whether its members are."""
+    estimates, members, model = run(filter_, data.filter_keys, data.inputs, data.measurements), None, filter_.model
+    n = model.n if data.states is None else data.states.shape[-1]
+    if filter_.size and data.states is not None:
+        some = (part[:MEMBER_RUNS] for part in (data.filter_keys, data.inputs, data.measurements))
+        members = record_members(filter_, *some, first=data.scored.start, every=MEMBER_STEPS)
+    return consistency_report(
+        estimates._replace(means=estimates.means[..., :n], covs=estimates.covs[..., :n, :n]),
+        data.states,
+        data.measurements,
+        members=members,
+        first_step=data.scored.start,
+        names=[state.short_label for state in model.states[:n]],
+        angles=model.shape.state_angles[:n],
+        channels=[channel.label for channel in model.measurements],
+    )
+
+
 def score(mean_squares: np.ndarray, scale: np.ndarray) -> float:
     """Mean over states of RMSE over scale, from mean square errors of runs (B, n)."""
-    return float((np.sqrt(mean_squares.mean(axis=0)) / scale).mean())
+    return float(_scores(np.sqrt(mean_squares.mean(axis=0)), scale))
+
+
+def _scores(rmse: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Mean of RMSE (..., n) over scale, over the states that count: the others have an infinite scale."""
+    counted = np.isfinite(scale)
+    return (rmse[..., counted] / scale[counted]).mean(axis=-1)
 
 
 def run_scores(filter_: Filter, estimates: Estimates, data: Data, scale) -> np.ndarray:
     """The score of each run by itself, (B,): mean over states of its RMSE over scale."""
     errors = state_errors(filter_, estimates, data)[:, data.scored]
-    return (np.sqrt((errors**2).mean(axis=1)) / np.asarray(scale)).mean(axis=1)
+    return _scores(np.sqrt((errors**2).mean(axis=1)), np.asarray(scale))
 
 
 def score_ratio(a: Evaluation, b: Evaluation) -> Interval:
-    """Score of a over score of b on the same seeds, with a paired bootstrap interval over seeds.
+    """Score of a over that of b on the same seeds, with a paired bootstrap interval over seeds; NaN without truth.
 
     Raises:
         ValueError: if the two were not evaluated on equally many seeds.
     """
+    _check_paired(a, b)
+    if not (a.has_truth and b.has_truth):
+        return NOTHING
+    scores = [_scores(np.sqrt(resampled_means(e.mean_squares)), e.scale) for e in (a, b)]
+    return interval(score(a.mean_squares, a.scale) / score(b.mean_squares, b.scale), scores[0] / scores[1])
+
+
+def likelihood_gain(a: Evaluation, b: Evaluation) -> Interval:
+    """Log-likelihood of a less that of b, mean over runs with a paired interval: above 0, a predicts better.
+
+    It needs no truth. NaN where a filter gives no covariance.
+
+    Raises:
+        ValueError: if the two were not evaluated on equally many seeds.
+    """
+    _check_paired(a, b)
+    return mean_interval(a.log_likelihoods - b.log_likelihoods)
+
+
+def _check_paired(a: Evaluation, b: Evaluation) -> None:
     if a.mean_squares.shape != b.mean_squares.shape:
         raise ValueError(
             f"a paired comparison needs the same seeds, but got {len(a.mean_squares)} and {len(b.mean_squares)}"
         )
-    scores = [(np.sqrt(resampled_means(e.mean_squares)) / e.scale).mean(axis=1) for e in (a, b)]
-    return interval(score(a.mean_squares, a.scale) / score(b.mean_squares, b.scale), scores[0] / scores[1])

@@ -8,8 +8,8 @@ import numpy as np
 
 from filters.consistency.intervals import Interval
 from tuning.evaluation.baselines import ORACLE, RULE, SCALED, TUNED, Scaled, oracle, rule_of_thumb, scaled_default
-from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
-from tuning.problems.find import Scenario
+from tuning.evaluation.evaluate import Evaluation, evaluate, likelihood_gain, score_ratio
+from tuning.problems.problem import Problem
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
@@ -20,7 +20,7 @@ class Comparison(NamedTuple):
 
     untuned: Evaluation  # of the rule of thumb
     tuned: Evaluation
-    true: Evaluation  # of the oracle
+    true: Evaluation | None  # of the oracle; None where nobody knows the plant's Q and R
     bound: np.ndarray  # (n,) bound on the standard error of each state
     seeds: range
     scaled: Evaluation | None = None  # of the scaled default; None where there is none
@@ -39,8 +39,15 @@ class Comparison(NamedTuple):
         names = [name for name in (SCALED, RULE, ORACLE) if name in found]
         return {name: score_ratio(self.tuned, found[name]) for name in names}
 
+    @property
+    def likelihood_gains(self) -> dict[str, Interval]:
+        """Log-likelihood of a run of the tuned filter less that of each baseline; it needs no truth."""
+        found = self.evaluations
+        names = [name for name in (SCALED, RULE, ORACLE) if name in found]
+        return {name: likelihood_gain(self.tuned, found[name]) for name in names}
 
-def prove(choice: Choice, scenario: Scenario, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:
+
+def prove(choice: Choice, scenario: Problem, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:
     """A choice and its baselines on seeds that the study never saw, with the bound on these seeds.
 
     Args:

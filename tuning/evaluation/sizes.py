@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 from filters.consistency.intervals import Interval
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
-from tuning.problems.find import Data, Scenario
+from tuning.problems.data import Data
+from tuning.problems.problem import Problem
 from tuning.search.objectives import nis_violation
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, size_ladder
@@ -29,8 +30,8 @@ def ensemble_sizes(
 ) -> list[SizeRow]:
     """The score of a choice against ensemble size, paired on the same fresh seeds, smallest size first.
 
-    The seeds chose neither Q, R nor N (`scenarios.size_seeds`). Where the plan has a budget, no size is above that
-    of the choice, which is known to be within it.
+    The seeds chose neither Q, R nor N (`seeds.size_seeds`). Where the plan has a budget, no size is above that
+    of the choice, which is known to be within it. Without truth there is no score, and no row.
 
     Args:
         choice: of a study.
@@ -38,6 +39,8 @@ def ensemble_sizes(
         training: the plan's training data, on which the mean NIS is held in its band, as in the trials.
         consistent: whether the best one is that of the sizes whose mean NIS is in its band.
     """
+    if any(problem.scale is None for problem in plan.scenarios):
+        return []
     size = choice.numbers["ensemble_size"]
     sizes = [n for n in sorted({*size_ladder(choice.name), size}) if plan.budget is None or n <= size]
     outside = [_outside(choice.with_size(n), plan, training) if plan.is_constrained else 0.0 for n in sizes]
@@ -69,7 +72,7 @@ def _counting(outside: Sequence[float], consistent: bool) -> list[int]:
     return [i for i in everywhere if outside[i] <= 0 or not consistent] or everywhere
 
 
-def _on(scenario: Scenario, data: Data, choice: Choice, sizes: Sequence[int]) -> list[Evaluation]:
+def _on(scenario: Problem, data: Data, choice: Choice, sizes: Sequence[int]) -> list[Evaluation]:
     return [evaluate(choice.with_size(n).filter(scenario), data, scenario.scale) for n in sizes]
 
 

@@ -12,19 +12,20 @@ from pathlib import Path
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from filters.tuned_file import FILE_FORMAT, FILE_VERSION, read_tuned_file, sealed
+from filters.tuned_file import FACTORS, FILE_FORMAT, FILE_VERSION, read_tuned_file, sealed
+from filters.tuned_model import check_same_quantities, model_data
 from numerics.checks import at_least, covariance, positive, shown
 from numerics.files import write_whole
-from thruster_env.plant_data import check_same_plant, plant_data
+from plants.quantities import Quantity
+from plants.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
-from tuning.problems.find import SCENARIOS, Scenario, find_scenario
+from tuning.problems.find import built_in, find_given, find_problem, problem_from_mapping
+from tuning.problems.problem import NOISE, Problem
 from tuning.search.objectives import NIS_BAND
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 from tuning.search.study import StudyResult
-from tuning.thruster.files import scenario_of
-from tuning.thruster.scenario import frozen
 
 PACKAGES = ("thruster-env", "optuna", "numpy", "numba", "gymnasium")
 
@@ -50,7 +51,8 @@ def write_tuned(
     Raises:
         ValueError: if the folder cannot be written.
     """
-    choice, scenario = result.choice, plan.scenarios[0]
+    choice, problem = result.choice, plan.scenarios[0]
+    model = problem.model(**choice.model)
     content = {
         "format": FILE_FORMAT,
         "version": FILE_VERSION,
@@ -58,11 +60,13 @@ def write_tuned(
         "filter": {
             "name": choice.name,
             "numbers": choice.numbers,
-            "model": {**choice.model, "parameter_factors": dict(scenario.parameter_factors)},
+            "model": {**_noise_of(model), **choice.model, **problem.held},
         },
-        "scenario": scenario.name,
-        "plant": plant_data(scenario.plant),
-        "scenarios": {one.name: _kept(one) for one in plan.scenarios if one.name not in SCENARIOS},
+        "problem": problem.name,
+        "digest": problem.digest,
+        "model": model_data(model, problem.dt),
+        "plant": problem.plant_data,
+        "problems": {one.name: _kept(one) for one in plan.scenarios if one.name not in built_in()},
         "study": {
             "name": study_name,
             **plan.identity,
@@ -77,38 +81,55 @@ def write_tuned(
     write_whole(Path(path), json.dumps(sealed(content), indent=2) + "\n")
 
 
-def _kept(scenario: Scenario) -> dict:
-    """A scenario as a tuned file keeps it, to do without the file that it comes from."""
-    return {"digest": scenario.digest, "content": scenario.as_mapping()}
+def _noise_of(model: StateSpaceModel) -> dict:
+    """Q and R as data, for those who know nothing of the numbers that they follow from."""
+    return {name: getattr(model, name).tolist() for name in NOISE}
 
 
-def scenario_in(content: Mapping, name, path: str | Path) -> Scenario:
-    """A scenario that a tuned file names: of the package, or as the file keeps it.
+def _kept(problem: Problem) -> dict:
+    """A problem as a tuned file keeps it: its digest and, unless it is code, what makes it anew."""
+    return {"digest": problem.digest, "content": problem.as_mapping()}
 
-    A file without it (version 2) has only the path of a scenario's own file, which is then read.
+
+def problem_in(content: Mapping, name, path: str | Path, given: Sequence[Problem] = ()) -> Problem:
+    """A problem that a tuned file names: of the package, as the file keeps it, or as the caller gives it.
+
+    Nothing is imported that a file names: a problem that is code has to be given. A file of version 2 has only the
+    path of a scenario's own file, which is then read.
 
     Args:
         content: of the tuned file, from `read_tuned_file`.
-        name: of the scenario.
+        name: of the problem.
         path: of the tuned file, for errors.
+        given: by the caller; each stands in for the one of its name or digest.
 
     Raises:
-        ValueError: if there is no such scenario, or what is kept is none.
+        ValueError: if there is no such problem, what is kept is none, or what is given is another one.
     """
-    kept = content.get("scenarios", {}).get(name) if isinstance(name, str) and name not in SCENARIOS else None
-    if kept is None:
-        return find_scenario(name)
-    return scenario_of(kept.get("content") if isinstance(kept, Mapping) else kept, name, path)
+    kept = content["problems"].get(name) if isinstance(name, str) and name not in built_in() else None
+    digest = kept.get("digest") if isinstance(kept, Mapping) else None
+    for one in given if digest is not None else ():
+        if one.digest == digest:
+            return one
+        if one.name == name:
+            raise ValueError(
+                f"the problem of a tuned file must be what it was tuned on, {name} of digest {digest}, "
+                f"but here it has the digest {one.digest} ({path})"
+            )
+    mapping = kept.get("content") if isinstance(kept, Mapping) else kept
+    if mapping is None:
+        return find_given(name, (), path)
+    return problem_from_mapping(mapping, name, path)
 
 
 def _warn_of_changes(content: Mapping, path: str | Path) -> None:
     """Warn of each scenario file that says something else now than what the tuned file keeps."""
-    for name in content.get("scenarios", {}):
+    for name in content["problems"]:
         if not name.endswith(".toml") or not Path(name).is_file():
             continue
-        then = scenario_in(content, name, path).digest
+        then = problem_in(content, name, path).digest
         try:
-            now = find_scenario(name).digest
+            now = find_problem(name).digest
         except ValueError:
             now = "none that can be read"
         if now != then:
@@ -119,48 +140,68 @@ def _warn_of_changes(content: Mapping, path: str | Path) -> None:
             )
 
 
-def check_plant(path: str | Path, scenario: Scenario) -> None:
-    """Raise ValueError if a tuned file is for another plant than a scenario's: another thruster, dt or sensor."""
-    tuned_for = read_tuned_file(path).get("plant")
-    if tuned_for is not None:
-        check_same_plant(tuned_for, scenario.plant, path)
-
-
-def read_tuned(path: str | Path) -> tuple[Choice, Scenario, int]:
-    """Choice, scenario and study seed of a tuned file; ValueError that says what is wrong with a bad one.
+def read_tuned(path: str | Path, problems: Sequence[Problem] = ()) -> tuple[Choice, Problem, int]:
+    """Choice, problem and study seed of a tuned file; ValueError that says what is wrong with a bad one.
 
     A scenario of a file of its own is that of the time of tuning; a warning says if the file has changed since.
+
+    Args:
+        path: of the file.
+        problems: what it was tuned on, where that is code, which the file only names.
     """
     content = read_tuned_file(path)
-    entry = content["filter"]
     try:
         seed = at_least("seed", content["study"]["seed"], 0)
-        scenario = scenario_in(content, content["scenario"], path)
+        found = problem_in(content, content["problem"], path, problems)
         _warn_of_changes(content, path)
-        given = dict(entry["model"])
-        factors = given.pop("parameter_factors", {})
-        model = {
-            "process_noise_cov": _noise(given.pop("process_noise_cov")),
-            "measurement_noise_cov": positive("measurement_noise_cov", given.pop("measurement_noise_cov")),
-        }
-        if "prior_cov_factor" in given:
-            model["prior_cov_factor"] = positive("prior_cov_factor", given.pop("prior_cov_factor"))
     except (KeyError, TypeError) as error:
         raise ValueError(f"a tuned file must have all its entries, but {path} lacks or bends {error}") from None
-    if given or factors != dict(scenario.parameter_factors):
+    given = content["filter"]["model"]
+    held = {name: given.get(name, {}) for name in {*found.held, *(set(given) & {FACTORS})}}
+    if held != dict(found.held):
         raise ValueError(
-            f"the model of a tuned file must be that of its scenario, {dict(scenario.parameter_factors)}, "
-            f"but {path} has {shown(entry['model'])}"
+            f"the model of a tuned file must be that of its scenario, {found.held.get(FACTORS, {})}, "
+            f"but {path} has {shown(given)}"
         )
-    choice = Choice(entry["name"], model, dict(entry["numbers"]))
-    choice.filter(scenario)  # a clear error for numbers that the filter does not take
-    return choice, scenario, seed
+    return _choice(content, found), found, seed
 
 
-def _noise(given) -> tuple:
-    """Q as a choice holds it: variances, or the rows of a matrix."""
-    matrix = covariance("process_noise_cov", given, 2, positive_definite=True)
-    return frozen((matrix if np.ndim(given) == 2 else np.diag(matrix)).tolist())
+def read_choice(path: str | Path, problem: Problem) -> Choice:
+    """The choice of a tuned file for any problem with the same plant, or the same states, inputs and sensors.
+
+    Raises:
+        ValueError: if the file is a bad one, or for another plant: another thruster, dt or sensor.
+    """
+    content = read_tuned_file(path)
+    problem.check_tuned_for(content.get("plant"), path)
+    if "model" in content:
+        check_same_quantities(content["model"], problem.model(), problem.dt, path)
+    return _choice(content, problem)
+
+
+def _choice(content: Mapping, problem: Problem) -> Choice:
+    """The choice of a tuned file's content: the problem's own parameters if it has them, else Q and R."""
+    entry, model = content["filter"], problem.model()
+    own = [one.name for one in problem.parameters or ()]
+    chosen = {name: entry["model"][name] for name in own if name in entry["model"]}
+    if not own or len(chosen) < len(own):
+        chosen = {
+            name: _noise(name, entry["model"][name], size, positive_definite=name == "measurement_noise_cov")
+            for name, size in zip(NOISE, (model.n, model.m), strict=True)
+        }
+    if "prior_cov_factor" in entry["model"]:
+        chosen["prior_cov_factor"] = positive("prior_cov_factor", entry["model"]["prior_cov_factor"])
+    choice = Choice(entry["name"], chosen, dict(entry["numbers"]))
+    choice.filter(problem)  # a clear error for numbers that the filter does not take
+    return choice
+
+
+def _noise(name: str, given, size: int, *, positive_definite: bool):
+    """A covariance as a choice holds it: one variance, some, or the rows of a matrix."""
+    if np.ndim(given) == 0:
+        return positive(name, given)
+    matrix = covariance(name, given, size, positive_definite=positive_definite)
+    return tuple(map(tuple, matrix.tolist())) if np.ndim(given) == 2 else tuple(np.diag(matrix).tolist())
 
 
 def metrics(proof: Comparison) -> dict:
@@ -168,10 +209,13 @@ def metrics(proof: Comparison) -> dict:
     return {
         "seeds": [proof.seeds.start, proof.seeds.stop],
         "bound": [None if math.isnan(part) else part for part in proof.bound.tolist()],
-        **{name: summary(getattr(proof, name)) for name in ("untuned", "tuned", "true")},
-        "scaled": None if proof.scaled is None else summary(proof.scaled),
+        **{name: _summary_of(getattr(proof, name)) for name in ("untuned", "tuned", "true", "scaled")},
         "scaled_default": scaling(proof),
     }
+
+
+def _summary_of(evaluation: Evaluation | None) -> dict | None:
+    return None if evaluation is None else summary(evaluation)
 
 
 def scaling(proof: Comparison) -> dict:
@@ -194,15 +238,20 @@ def versions() -> dict[str, str]:
 def summary(evaluation: Evaluation) -> dict:
     """The figures of an evaluation as plain numbers for JSON, None where there is nothing to tell."""
     return {
-        "rmse": [list(value) for value in evaluation.rmse],
-        "start_up_rmse": evaluation.start_up_rmse.tolist(),
-        "thrust_rmse": _numbers(evaluation.thrust_rmse),
-        "score": list(evaluation.score),
+        "rmse": [_numbers(value) for value in evaluation.rmse],
+        "start_up_rmse": [None if math.isnan(part) else part for part in evaluation.start_up_rmse.tolist()],
+        **{_key(evaluation.outputs[symbol]): _numbers(one) for symbol, one in evaluation.output_rmse.items()},
+        "score": _numbers(evaluation.score),
         "nees": _numbers(evaluation.nees),
         "nis": _numbers(evaluation.nis),
         "log_likelihood": None if math.isnan(evaluation.log_likelihood) else evaluation.log_likelihood,
         "divergences": evaluation.divergences,
     }
+
+
+def _key(output: Quantity) -> str:
+    """What the RMSE of a derived output is called in a file: "thrust_rmse" of the thrust."""
+    return f"{output.name.replace(' ', '_')}_rmse"
 
 
 def _numbers(value: Interval) -> list[float] | None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from filters.tuned_file import read_tuned_file
 from numerics.checks import shown
 from tuning.evaluation.held_out import prove
-from tuning.evaluation.tuned import metrics, read_tuned, scenario_in, versions
+from tuning.evaluation.tuned import metrics, problem_in, read_tuned, versions
+from tuning.problems.problem import Problem
 
 TOLERANCE = 1e-9  # relative: what the order of a sum may change
 LATER = ("scaled", "scaled_default")  # what older files lack
@@ -43,22 +44,23 @@ class Verification(NamedTuple):
         return not self.differences
 
 
-def verify(path: str | Path) -> Verification:
+def verify(path: str | Path, problems: Sequence[Problem] = ()) -> Verification:
     """Compute the held-out metrics of a tuned file once more, on its seeds of each scenario.
 
     Args:
         path: the tuned file.
+        problems: what it was tuned on, where that is code: nothing that a file names is imported.
 
     Raises:
         ValueError: if the file is not a whole tuned file as it was written, or holds no metrics.
     """
-    content, (choice, _, seed) = read_tuned_file(path), read_tuned(path)
+    content, (choice, _, seed) = read_tuned_file(path), read_tuned(path, problems)
     held_out = content.get("held_out")
     if not isinstance(held_out, dict) or not held_out:
         raise ValueError(f"a tuned file must have held-out metrics to verify, but {path} has {shown(held_out)}")
     places, differences = 0, []
     for name, stored in held_out.items():
-        proof = prove(choice, scenario_in(content, name, path), seed, _count(stored, path))
+        proof = prove(choice, problem_in(content, name, path, problems), seed, _count(stored, path))
         found = {key: value for key, value in metrics(proof).items() if key in stored or key not in LATER}
         pairs = _numbers(stored), _numbers(found)
         names = list(dict.fromkeys([*pairs[0], *pairs[1]]))

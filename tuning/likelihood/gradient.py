@@ -8,16 +8,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.likelihood import likelihood
-from filters.registry import make_filter
+from filters.likelihood import Likelihood, likelihood
 from numerics.checks import one_of
 from tuning.likelihood.identifiability import KNOWN_WITHIN, TWO_SIDED
-from tuning.problems.find import Data, Scenario
-from tuning.search.space import Choice, distributions, untuned_choice
+from tuning.likelihood.noise import noise_family
+from tuning.problems.data import Data
+from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Problem
+from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters
+from tuning.search.space import Choice, untuned_choice
 
 DIFFERENTIABLE = ("kf", "ekf")
-BAD_START = (1.0, 1e-2, 1e2)  # factors on the untuned Q11, Q22 and R
-STARTS = ((1.0, 1.0, 1.0), BAD_START, (0.1, 0.1, 10.0))
+BAD_START = (1.0, 1e-2, 1e2)  # factors on Q11, Q22 and R, far from where they belong
 STEP = 1e-3  # in the logarithms, of the differences of gradients that give the Hessian
 FLAT = 1e-12  # curvature over the largest one, below which there is none
 DIVERGED = 1e12  # stands in for -log L where the filter diverges
@@ -27,8 +29,8 @@ EQUAL_LOGARITHMS = 0.02  # optima this close in every logarithm are one
 class Optimum(NamedTuple):
     """Where one start led."""
 
-    start: tuple[float, ...]  # factors on the untuned variances
-    variances: np.ndarray  # (n + m,), the diagonals of Q, then of R
+    start: tuple[float, ...]  # factors on the untuned numbers
+    variances: np.ndarray  # (p,), the diagonals of Q, then of R; or the problem's own parameters
     log_likelihood: float  # of all training runs
     evaluations: int  # of log-likelihood and gradient
     converged: bool
@@ -38,32 +40,33 @@ class GradientResult(NamedTuple):
     """A maximum of the likelihood, and how well the data determine it."""
 
     choice: Choice
-    names: tuple[str, ...]  # of the variances
+    names: tuple[str, ...]  # of the numbers
     best: Optimum
     optima: tuple[Optimum, ...]  # one for each start
-    standard_errors: np.ndarray  # (n + m,), of the variances' logarithms, from the scatter between runs
-    identified: np.ndarray  # (n + m,) whether a variance's 95 % interval is within a factor of ten
+    standard_errors: np.ndarray  # (p,), of the numbers' logarithms, from the scatter between runs
+    identified: np.ndarray  # (p,) whether a number's 95 % interval is within a factor of ten
     agree: bool  # whether all starts led to the same place, in the identified variances
     seconds: float
 
 
 def maximise_likelihood(
-    filter_name: str, scenario: Scenario, data: Data, starts: Sequence[Sequence[float]] = STARTS
+    filter_name: str, problem: Problem, data: Data, starts: Sequence[Sequence[float] | float] | None = None
 ) -> GradientResult:
     """Find the diagonal Q and R under which a Kalman filter's innovations are most likely.
 
     Works on the logarithms of the variances, by L-BFGS-B with the gradient of `filters.likelihood`, within the
     same ranges as an Optuna study. With the Hessian H of -log L and the gradients g_b of B independent runs, the
-    errors are the roots of the diagonal of H^-1 (sum_b g_b g_b') H^-1, which holds for a wrong model, too.
+    errors are the roots of the diagonal of H^-1 (sum_b g_b g_b') H^-1, which holds for a wrong model, too. Where
+    the problem has parameters of its own, from which Q and R follow, it finds these.
 
     Args:
         filter_name: "kf" or "ekf".
-        scenario: says what the filter assumes of the plant and what the untuned variances are.
+        problem: says what the filter assumes of the plant and what the untuned variances are.
         data: the runs to learn from.
-        starts: factors on the untuned variances, (Q11, Q22, R).
+        starts: factors on the untuned numbers, one for all or one each, (Q11, Q22, ..., R); `starts_of` if None.
 
     Raises:
-        ValueError: for another filter.
+        ValueError: for another filter, or a parameter of the problem's own that is more than noise.
 
     Source: Huber (1967), "The behavior of maximum likelihood estimates under nonstandard conditions".
     """
@@ -71,20 +74,14 @@ def maximise_likelihood(
 
     one_of("filter", filter_name, DIFFERENTIABLE)
     begin = time.perf_counter()
-    untuned = untuned_choice(filter_name, scenario)
-    model = make_filter(filter_name, scenario.model(**untuned.model)).kernel_model
-    n, m = model.n, model.m
-    reference = np.append(np.diag(model.process_noise_cov), np.diag(model.measurement_noise_cov))
+    parameters = model_parameters(problem)
+    untuned = untuned_choice(filter_name, problem)
+    reference = np.array([one.get(untuned) for one in parameters], dtype=np.float64)
+    noise_at = noise_family(untuned, problem, parameters)
 
-    def slopes(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
-        """Log-likelihood of each run (B,), and its gradients (B, n + m) in the logarithms."""
-        variances = np.exp(logarithms)
-        q, r = np.diag(variances[:n]), np.diag(variances[n:])
-        q_slopes, r_slopes = np.zeros((n + m, n, n)), np.zeros((n + m, m, m))
-        q_slopes[range(n), range(n), range(n)] = variances[:n]
-        r_slopes[range(n, n + m), range(m), range(m)] = variances[n:]
-        changed = model.replace(process_noise_cov=q, measurement_noise_cov=r)
-        return likelihood(changed, data.inputs, data.measurements, q_slopes, r_slopes)
+    def slopes(logarithms: np.ndarray) -> Likelihood:
+        """Log-likelihood of each run (B,), and its gradients (B, p) in the logarithms."""
+        return likelihood(*noise_at(np.exp(logarithms), data))
 
     def negative(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
         found = slopes(logarithms)
@@ -93,14 +90,14 @@ def maximise_likelihood(
             return value, gradient
         return DIVERGED, np.zeros_like(gradient)  # the line search takes a shorter step
 
-    space = distributions(filter_name, scenario)
-    names = [f"Q{i}{i}" for i in range(1, n + 1)] + ["R"]
-    bounds = [tuple(np.log([space[name].low, space[name].high])) for name in names]
+    bounds = [tuple(np.log([one.low, one.high])) for one in parameters]
     optima = []
-    for start in starts:
-        first = np.log(reference * np.asarray(start, dtype=np.float64))
+    for start in starts_of(parameters) if starts is None else starts:
+        factors = np.broadcast_to(np.asarray(start, dtype=np.float64), reference.shape)
+        first = np.log(reference * factors)
         found = minimize(negative, first, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-13})
-        optima.append(Optimum(tuple(start), np.exp(found.x), -found.fun, found.nfev, bool(found.success)))
+        start = tuple(factors.tolist())
+        optima.append(Optimum(start, np.exp(found.x), -found.fun, found.nfev, bool(found.success)))
     best = max(optima, key=lambda optimum: optimum.log_likelihood)
     errors = _standard_errors(slopes, np.log(best.variances))
     inside = np.array(
@@ -108,9 +105,12 @@ def maximise_likelihood(
     )
     identified = inside & (errors * TWO_SIDED < KNOWN_WITHIN)
     apart = [np.abs(np.log(o.variances / best.variances))[identified] for o in optima]
+    choice = untuned
+    for one, value in zip(parameters, best.variances.tolist(), strict=True):
+        choice = one.set(choice, value)
     return GradientResult(
-        choice=_choice(filter_name, best.variances, n, m),
-        names=tuple(names),
+        choice=choice,
+        names=tuple(one.name for one in parameters),
         best=best,
         optima=tuple(optima),
         standard_errors=errors,
@@ -120,8 +120,21 @@ def maximise_likelihood(
     )
 
 
+def starts_of(parameters: Sequence[Parameter]) -> list[tuple[float, ...]]:
+    """Three starts, as factors on the untuned numbers: these themselves, a bad one, and little Q with much R."""
+    channels = [isinstance(one.place, MeasurementVariance) for one in parameters]
+    return [(1.0,) * len(parameters), tuple(map(_bad, parameters)), tuple(10.0 if r else 0.1 for r in channels)]
+
+
+def _bad(parameter: Parameter) -> float:
+    """The factor of a bad start: Q too small in every other state, R too large, as in BAD_START."""
+    if isinstance(parameter.place, MeasurementVariance):
+        return BAD_START[2]
+    return BAD_START[parameter.place.index % 2] if isinstance(parameter.place, ProcessVariance) else BAD_START[1]
+
+
 def _standard_errors(slopes: Callable, logarithms: np.ndarray) -> np.ndarray:
-    """Of the maximum's logarithms, (n + m,): those from the scatter between runs, or from the Hessian if larger.
+    """Of the maximum's logarithms, (p,): those from the scatter between runs, or from the Hessian if larger.
 
     Along a direction in which the likelihood is flat both scatter and Hessian vanish, and the Hessian tells.
     """
@@ -136,12 +149,3 @@ def _standard_errors(slopes: Callable, logarithms: np.ndarray) -> np.ndarray:
     scores -= scores.mean(axis=0)
     scatter = axes @ (scores.T @ scores) @ axes.T * len(scores) / (len(scores) - 1)
     return np.sqrt(np.maximum(np.diag(scatter), np.diag(axes / values @ axes.T)))
-
-
-def _choice(filter_name: str, variances: np.ndarray, n: int, m: int) -> Choice:
-    numbers = [float(v) for v in variances]
-    model = {
-        "process_noise_cov": tuple(numbers[:n]),
-        "measurement_noise_cov": numbers[n] if m == 1 else tuple(numbers[n:]),
-    }
-    return Choice(filter_name, model, {})

@@ -10,7 +10,9 @@ from optuna.distributions import BaseDistribution
 
 from filters.engine.batch import run
 from filters.registry import filter_class
-from tuning.problems.find import Data, Scenario
+from tuning.problems.data import Data
+from tuning.problems.problem import Problem
+from tuning.search.parameters import places_in
 from tuning.search.space import Choice, choice_of, parameters_of, untuned_choice
 
 KNOWN_WITHIN = np.log(10.0)  # a 95 % interval that reaches beyond a factor of ten determines nothing
@@ -54,9 +56,11 @@ class Identifiability(NamedTuple):
 
 
 def identify(
-    choice: Choice, scenarios: Sequence[Scenario], data: Sequence[Data], space: Mapping[str, BaseDistribution]
+    choice: Choice, scenarios: Sequence[Problem], data: Sequence[Data], space: Mapping[str, BaseDistribution]
 ) -> Identifiability | None:
-    """How well the innovations determine Q's variances, R and P_0's scale of a choice; None without a covariance.
+    """How well the innovations determine a choice's numbers of the model; None without a covariance.
+
+    By default these are Q's variances, R and the scale of P_0.
 
     It works for every filter with a covariance: only its innovations' log-likelihood is needed.
 
@@ -67,7 +71,8 @@ def identify(
         space: numbers that were searched with their ranges, `Plan.space`.
     """
     own = parameters_of(choice)
-    names = tuple(name for name in space if name in own and (name in ("R", "P0") or name.startswith("Q")))
+    places = places_in(choice)  # of the model's numbers, among which correlations have no logarithm
+    names = tuple(name for name, range_ in space.items() if name in places and getattr(range_, "log", False))
     if not names or not filter_class(choice.name).has_covariance:
         return None
 

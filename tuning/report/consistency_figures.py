@@ -1,8 +1,8 @@
-"""One picture of whether a filter's covariance is honest: a panel for each check of `filters.consistency`."""
+"""One picture of whether a filter's covariance is consistent: a panel for each check of `filters.consistency`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -13,12 +13,15 @@ from filters.consistency.nees import SquaresCheck
 from filters.consistency.report import ConsistencyReport
 from filters.consistency.scores import LEVELS
 from filters.consistency.verdicts import probability_text, rounded
-from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from numerics.plots import BLUE, DARK, RUST, panels, save_figure
+from tuning.report.panels import COLUMNS, shown_states
 
 FOUND = BLUE
-STATES = (BLUE, RUST, "#5a8f3c", "#7a5195", "#9aa5ad", "#c9a227")  # colours
+COLOURS = (BLUE, RUST, "#5a8f3c", "#7a5195", "#9aa5ad", "#c9a227")  # of states
+CHANNEL_COLOURS = ("#44aa99", "#cc6677", "#999933", "#882255", "#ddaa33", "#332288")
 PANEL = (4.0, 3.0)  # [inch]
-COLUMNS = 3
+MOST_HANDLES = 5  # of a legend side by side
+MOST_VALUES = 3  # in the title of a panel
 LOGARITHMIC_FROM = 20  # times the right value
 
 
@@ -27,53 +30,68 @@ def consistency_figure(
     report: ConsistencyReport,
     title: str,
     comparison: Mapping[str, tuple[Interval, ...]] | None = None,
+    scored: Collection[int] | None = None,
 ) -> Path:
-    """Draw a consistency report; dashed lines show what is right, grey bands what chance allows.
+    """Draw a consistency report; dashed lines show the expected value, grey bands what chance allows.
+
+    Of many states some are drawn; without truth the checks are those of the innovations.
 
     Args:
         path: PNG file to write.
         report: the checks of one filter.
         title: said above the picture.
         comparison: RMSE ratios by state, from `intervals.rmse_ratios`, under the names of the pairs.
+        scored: places of the states that count in the score, which come first where not all are drawn.
 
     Raises:
         ValueError: if there is nothing to draw, or nothing can be written.
     """
-    panels = _panels(report, comparison)
-    if not panels:
+    places, left_out = shown_states(report.states, scored)
+    checks = _panels(report, comparison, places)
+    if not checks:
         raise ValueError("a figure needs something to draw, but the filter gives no covariance")
-    columns = min(COLUMNS, len(panels))
-    rows = -(-len(panels) // columns)
-    figure = new_figure((PANEL[0] * COLUMNS, PANEL[1] * rows + 0.4))
-    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
-    tidy(axes)
-    for axis, draw in zip(axes, panels, strict=False):
+    figure, axes = panels(len(checks), COLUMNS, PANEL, extra=0.4)
+    for axis, draw in zip(axes, checks, strict=True):
         draw(axis)
         axis.title.set_fontsize(10)
-    for axis in axes[len(panels) :]:
-        axis.remove()
-    _legend(figure, report)
+    _legend(figure, report, places, left_out)
     figure.suptitle(title, fontsize=11)
     return save_figure(figure, path)
 
 
-def _panels(report: ConsistencyReport, comparison: Mapping | None) -> list[Callable]:
+def _panels(report: ConsistencyReport, comparison: Mapping | None, places: Sequence[int]) -> list[Callable]:
     """A function on axes for each check of which there are numbers."""
     squares = [check for check in (report.nees, report.nis) if not np.isnan(check.mean.value)]
-    panels: list[Callable] = [partial(_squares, check=check, report=report) for check in squares]
+    found: list[Callable] = [partial(_squares, check=check, report=report) for check in squares]
     if report.whiteness.statistic > 0:
-        panels.append(partial(_correlations, report=report))
-    panels += [partial(_distribution, check=check) for check in squares]
+        found.append(partial(_correlations, report=report))
+    found += [partial(_distribution, check=check) for check in squares]
     if not np.isnan(report.coverage_by_level).all():
-        panels += [partial(_coverage, report=report), partial(_crps, report=report)]
+        shares = {"found": report.coverage, "by_level": report.coverage_by_level}
+        found.append(partial(_coverage, what="truth", colours=_of_states(places), **shares))
+        found.append(partial(_crps, report=report, places=places))
+    elif not (report.has_truth or np.isnan(report.innovation_coverage_by_level).all()):
+        shares = {"found": report.innovation_coverage, "by_level": report.innovation_coverage_by_level}
+        found.append(partial(_coverage, what="measurements", colours=_of_channels(report), **shares))
     if report.ensemble is not None:
-        panels.append(partial(_ranks, report=report))
+        found.append(partial(_ranks, report=report, places=places))
     if comparison:
-        panels.append(partial(_comparison, comparison=comparison))
-    return panels
+        found.append(partial(_comparison, comparison=comparison, places=places))
+    return found
 
 
-def _legend(figure, report: ConsistencyReport) -> None:
+def _of_states(places: Sequence[int]) -> dict[int, str]:
+    """Colours of the states that are drawn."""
+    return {i: COLOURS[row % len(COLOURS)] for row, i in enumerate(places)}
+
+
+def _of_channels(report: ConsistencyReport) -> dict[int, str]:
+    """Colours of the channels, others than those of states; a single one has that of all that was found."""
+    count = len(report.channels)
+    return {j: FOUND if count == 1 else CHANNEL_COLOURS[j % len(CHANNEL_COLOURS)] for j in range(count)}
+
+
+def _legend(figure, report: ConsistencyReport, places: Sequence[int], left_out: str) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -81,13 +99,14 @@ def _legend(figure, report: ConsistencyReport) -> None:
         Line2D([], [], color=DARK, linestyle="--", linewidth=1, label="what is right"),
         Patch(color=DARK, alpha=0.15, linewidth=0, label="95 % of chance"),
         Line2D([], [], color=FOUND, linewidth=1, label=f"found in {report.runs} runs"),
-        *(Line2D([], [], color=_colour(i), marker="o", label=name) for i, name in enumerate(report.states)),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
-
-
-def _colour(i: int) -> str:
-    return STATES[i % len(STATES)]
+    named = {report.states[i]: colour for i, colour in _of_states(places).items()} if report.has_truth else {}
+    if len(report.channels) > 1:
+        named |= {report.channels[j]: colour for j, colour in _of_channels(report).items()}
+    handles += [Line2D([], [], color=colour, marker="o", label=name) for name, colour in named.items()]
+    title = left_out if report.has_truth and left_out else None
+    options = {"ncols": min(len(handles), MOST_HANDLES), "frameon": False, "title": title}
+    figure.legend(handles=handles, loc="outside lower center", **options)
 
 
 def _steps(report: ConsistencyReport) -> np.ndarray:
@@ -116,9 +135,8 @@ def _squares(axis, check: SquaresCheck, report: ConsistencyReport) -> None:
 def _correlations(axis, report: ConsistencyReport) -> None:
     found = report.whiteness
     lags, channels = np.arange(1, len(found.correlations) + 1), found.correlations.shape[1]
-    for i in range(channels):
-        places = lags + (i - (channels - 1) / 2) * 0.6 / channels
-        values, colour = found.correlations[:, i, i], FOUND if channels == 1 else _colour(i)
+    for i, colour in _of_channels(report).items():
+        places, values = lags + (i - (channels - 1) / 2) * 0.6 / channels, found.correlations[:, i, i]
         axis.vlines(places, 0, values, color=colour, linewidth=1.5)
         axis.plot(places, values, "o", color=colour, markersize=3)
     half = found.half_widths[:, 0, 0]
@@ -143,31 +161,40 @@ def _distribution(axis, check: SquaresCheck) -> None:
     axis.set_ylabel("frequency over the right one")
 
 
-def _coverage(axis, report: ConsistencyReport) -> None:
+def _coverage(
+    axis, found: Sequence[Interval], by_level: np.ndarray, what: str, colours: Mapping[int, str]
+) -> None:
     axis.plot([0, 100], [0, 100], color=DARK, linestyle="--", linewidth=1)
-    for i in range(len(report.states)):
-        axis.plot(100 * LEVELS, 100 * report.coverage_by_level[:, i], ".-", linewidth=1, color=_colour(i))
-    shares = ", ".join(f"{100 * part.value:.1f} %" for part in report.coverage)
-    axis.set_title(f"95 % intervals hold {shares}")
+    for i, colour in colours.items():
+        axis.plot(100 * LEVELS, 100 * by_level[:, i], ".-", linewidth=1, color=colour)
+    axis.set_title(f"95 % intervals hold {_told([100 * part.value for part in found], '{:.1f} %'.format)}")
     axis.set_xlabel("level of the interval [%]")
-    axis.set_ylabel("truth found in it [%]")
+    axis.set_ylabel(f"{what} found in it [%]")
 
 
-def _crps(axis, report: ConsistencyReport) -> None:
-    for i in range(len(report.states)):
-        axis.plot(_steps(report), report.crps_ratio[:, i], color=_colour(i), linewidth=0.8)
+def _told(values: Sequence[float], form: Callable[[float], str]) -> str:
+    """Few values as they are, many as their range."""
+    if len(values) <= MOST_VALUES:
+        return ", ".join(map(form, values))
+    return f"{form(np.nanmin(values))} to {form(np.nanmax(values))}"
+
+
+def _crps(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
+    for i, colour in _of_states(places).items():
+        axis.plot(_steps(report), report.crps_ratio[:, i], color=colour, linewidth=0.8)
     _right(axis, 1)
     axis.set_ylim(bottom=0)
-    axis.set_title(f"mean CRPS {', '.join(rounded(part.value) for part in report.crps)}")
+    axis.set_title(f"mean CRPS {_told([part.value for part in report.crps], rounded)}")
     axis.set_xlabel("step")
     axis.set_ylabel("CRPS over its expectation")
     axis.margins(x=0.01)
 
 
-def _ranks(axis, report: ConsistencyReport) -> None:
+def _ranks(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
     size = report.ensemble.size
-    for i, found in enumerate(report.ensemble.ranks):
-        axis.stairs(found.frequencies, found.edges * (size + 1), color=_colour(i), linewidth=1.4)
+    for i, colour in _of_states(places).items():
+        found = report.ensemble.ranks[i]
+        axis.stairs(found.frequencies, found.edges * (size + 1), color=colour, linewidth=1.4)
     _right(axis, 1)
     axis.set_ylim(bottom=0)
     axis.set_title(f"rank of the truth among {size} members")
@@ -175,12 +202,13 @@ def _ranks(axis, report: ConsistencyReport) -> None:
     axis.set_ylabel("frequency over the right one")
 
 
-def _comparison(axis, comparison: Mapping[str, tuple[Interval, ...]]) -> None:
+def _comparison(axis, comparison: Mapping[str, tuple[Interval, ...]], places: Sequence[int]) -> None:
+    apart = min(0.2, 0.8 / len(places))
     for place, ratios in enumerate(comparison.values()):
-        for i, ratio in enumerate(ratios):
-            height = -place - 0.2 * (i - (len(ratios) - 1) / 2)
-            axis.plot([ratio.low, ratio.high], [height, height], "|-", color=_colour(i))
-            axis.plot(ratio.value, height, "o", color=_colour(i))
+        for row, (i, colour) in enumerate(_of_states(places).items()):
+            ratio, height = ratios[i], -place - apart * (row - (len(places) - 1) / 2)
+            axis.plot([ratio.low, ratio.high], [height, height], "|-", color=colour)
+            axis.plot(ratio.value, height, "o", color=colour)
     axis.axvline(1, color=DARK, linestyle="--", linewidth=1)
     axis.set_yticks(-np.arange(len(comparison)), list(comparison))
     axis.set_ylim(0.5 - len(comparison), 0.5)

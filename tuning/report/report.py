@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,20 +11,19 @@ from numerics.files import check_target, write_whole
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.sizes import ensemble_sizes, sufficient_size
 from tuning.likelihood.identifiability import identify, sentences
+from tuning.problems.problem import Problem
 from tuning.report.page import Section, Words, html_page, markdown_page
 from tuning.report.parts import (
     Sketchbook,
     advice,
-    errors_table,
     facts_section,
-    known_table,
-    numbers_table,
-    proof_section,
+    held_out_section,
     run_sections,
     search_section,
     sizes_section,
 )
 from tuning.report.subject import find_subject, is_file
+from tuning.report.tables import errors_table, known_table, numbers_table
 from tuning.search.objectives import nis_ratio
 from tuning.search.space import has_ensemble
 from tuning.search.trials import measure
@@ -37,18 +37,21 @@ class Report(NamedTuple):
     advice: str
 
 
-def write_report(source: str | Path, storage: str, out: str | Path | None = None) -> Report:
+def write_report(
+    source: str | Path, storage: str, out: str | Path | None = None, problems: Sequence[Problem] = ()
+) -> Report:
     """Write a page, NAME.html, and its tables, NAME.md, on a tuned file or a study; all metrics are computed anew.
 
     Args:
         source: a tuned file, or the name of a study.
         storage: where the study is; without it a page on a tuned file leaves the search out.
         out: folder of the two files, by default that of the tuned file, or `out`.
+        problems: what it is of, where that is code: nothing that a file or a study names is imported.
 
     Raises:
         ValueError: if the tuned file is refused, there is no such study, or the folder cannot be written.
     """
-    subject = find_subject(source, storage)
+    subject = find_subject(source, storage, problems)
     plan, choice = subject.plan, subject.choice
     folder = Path(out) if out is not None else Path(source).parent if is_file(source) else Path("out")
     name = Path(source).stem if is_file(source) else subject.name
@@ -61,7 +64,7 @@ def write_report(source: str | Path, storage: str, out: str | Path | None = None
         choice = choice.with_size(sufficient_size(sizes, subject.consistent))
         subject = subject._replace(choice=choice)
     proofs = [prove(choice, scenario, plan.seed, subject.seeds) for scenario in plan.scenarios]
-    title = f"{choice.name} tuned on {', '.join(Path(scenario.name).stem for scenario in plan.scenarios)}"
+    title = f"{choice.name} tuned on {', '.join(_short(scenario.name) for scenario in plan.scenarios)}"
     said = advice(choice, plan, proofs)
     known = identify(choice, plan.scenarios, data, plan.space())
     nis = [nis_ratio(found) for found in measure(choice, plan, data)]
@@ -69,7 +72,7 @@ def write_report(source: str | Path, storage: str, out: str | Path | None = None
     with tempfile.TemporaryDirectory() as scratch:
         book = Sketchbook(Path(scratch))
         sections = [
-            proof_section(book, subject, proofs),
+            held_out_section(book, subject, proofs),
             Section("The numbers", [*numbers, *([Words(sentences(known))] if known else [])]),
             search_section(book, subject),
             *([sizes_section(book, subject, sizes)] if sizes else []),
@@ -80,3 +83,8 @@ def write_report(source: str | Path, storage: str, out: str | Path | None = None
     errors = [errors_table(scenario, proof) for scenario, proof in zip(plan.scenarios, proofs, strict=True)]
     write_whole(tables, markdown_page(title, said, [*errors, *numbers]))
     return Report(page, tables, said)
+
+
+def _short(name: str) -> str:
+    """A problem's name in a title: of a file its own name alone."""
+    return Path(name).stem if name.endswith(".toml") else name

@@ -10,15 +10,14 @@ import optuna
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.trial import FrozenTrial, TrialState
 
-from numerics.plots import BLUE, RUST, new_figure, save_figure, tidy
-from thruster_env.linear.figures import STATES
+from numerics.plots import BLUE, RUST, grid_of, new_figure, panels, save_figure, tidy
 from tuning.evaluation.sizes import SizeRow
 from tuning.report.figures import GREY, early_trials, limit_values
+from tuning.report.panels import COLUMNS, shown_states
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.space import KIND
 
 FEWEST_TRIALS = 10  # complete ones, for importances to mean anything
-COLUMNS = 3
 CROSS = {"color": GREY, "markersize": 4, "markeredgewidth": 0.8}
 
 
@@ -56,18 +55,14 @@ def importance_figure(path: Path, found: Mapping[str, float]) -> Path:
 def slices_figure(path: Path, trials: Sequence[FrozenTrial], label: str) -> Path:
     """First objective against each number, a panel a number; dashed is the best trial.
 
-    Hollow circles have a mean NIS outside its band; crosses ended early and stand at the mean of their seeds.
+    Hollow circles have a mean NIS outside its band; crosses were pruned and stand at the mean of their seeds.
     """
     done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     early, names = early_trials(trials), [name for name in done[0].params if name != KIND]
-    columns = min(COLUMNS, len(names))
-    rows = -(-len(names) // columns)
-    figure = new_figure((3.2 * columns, 2.7 * rows + 0.4))
-    axes = figure.subplots(rows, columns, squeeze=False, sharey=True)
-    tidy(axes.flat)
+    figure, axes = panels(len(names), COLUMNS, (3.2, 2.7), extra=0.4, sharey=True)
     best, values = best_trial(done), [trial.values[0] for trial in done]
     faces = [BLUE if is_consistent(trial) else "white" for trial in done]
-    for axis, name in zip(axes.flat, names, strict=False):
+    for axis, name in zip(axes, names, strict=True):
         places = [trial.params[name] for trial in done]
         axis.scatter(places, values, s=16, facecolors=faces, edgecolors=BLUE, linewidths=0.8, alpha=0.7)
         axis.plot([trial.params[name] for trial, _ in early], [value for _, value in early], "x", **CROSS)
@@ -77,11 +72,9 @@ def slices_figure(path: Path, trials: Sequence[FrozenTrial], label: str) -> Path
         if name == "N" or name.endswith(" N"):
             _size_axis(axis, sorted(trial.params[name] for trial in trials if name in trial.params))
         axis.set_xlabel(words(name))
-    limit_values(axes[0, 0], values)
-    for row in axes:
-        row[0].set_ylabel(label, fontsize=9)
-    for axis in axes.flat[len(names) :]:
-        axis.remove()
+    limit_values(axes[0], values)
+    for axis in axes[:: grid_of(len(names), COLUMNS)[1]]:
+        axis.set_ylabel(label, fontsize=9)
     return save_figure(figure, path)
 
 
@@ -111,11 +104,11 @@ def front_figure(
 
 def sizes_figure(path: Path, sizes: Sequence[SizeRow], kept: int) -> Path:
     """RMSE of every state against ensemble size with 95 % intervals; dashed is the size that was kept."""
-    figure = new_figure((8.0, 3.6))
-    axes = figure.subplots(1, len(STATES))
-    tidy(axes)
-    numbers = [row.size for row in sizes]
-    for i, (axis, (label, unit)) in enumerate(zip(axes, STATES, strict=True)):
+    states, numbers = sizes[0].evaluation.states, [row.size for row in sizes]
+    places, left_out = shown_states(states, sizes[0].evaluation.scored)
+    width = 4.0 if len(places) > 1 else 5.2
+    figure, axes = panels(len(places), COLUMNS, (width, 3.6))
+    for axis, i in zip(axes, places, strict=True):
         found = np.array([row.evaluation.rmse[i] for row in sizes])
         axis.fill_between(numbers, found[:, 1], found[:, 2], color=BLUE, alpha=0.2, linewidth=0)
         axis.plot(numbers, found[:, 0], "o-", color=BLUE, markersize=4, linewidth=1)
@@ -124,7 +117,9 @@ def sizes_figure(path: Path, sizes: Sequence[SizeRow], kept: int) -> Path:
         axis.annotate(f"N = {kept}", (kept, 1), (4, -10), **place, color=RUST, fontsize=9)
         _size_axis(axis, numbers)
         axis.set_xlabel("ensemble size N")
-        axis.set_ylabel(f"RMSE of {label} [{unit}]")
+        axis.set_ylabel(f"RMSE of {states[i].plot_label}")
+    if left_out:
+        figure.supxlabel(left_out, fontsize=9)
     return save_figure(figure, path)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -11,8 +11,9 @@ import optuna
 
 from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least, shown
-from tuning.evaluation.tuned import read_tuned, scenario_in
-from tuning.problems.find import Scenario, find_scenario
+from tuning.evaluation.tuned import problem_in, read_tuned
+from tuning.problems.find import find_given
+from tuning.problems.problem import Problem
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.space import Choice, choice_of
@@ -32,17 +33,18 @@ class Subject(NamedTuple):
     consistent: bool = False  # whether its mean NIS is in its band, where it has to be
 
 
-def find_subject(source: str | Path, storage: str) -> Subject:
+def find_subject(source: str | Path, storage: str, problems: Sequence[Problem] = ()) -> Subject:
     """The subject of a report.
 
     Args:
         source: a tuned file (what ends in .json, or is a file), or the name of a study.
         storage: where the study is; a tuned file may come without.
+        problems: what it is of, where that is code: nothing that a file or a study names is imported.
 
     Raises:
         ValueError: if the tuned file is refused, or there is no such study or none of its trials is complete.
     """
-    return _of_file(source, storage) if is_file(source) else _of_study(str(source), storage)
+    return (_of_file if is_file(source) else _of_study)(str(source), storage, problems)
 
 
 def is_file(source: str | Path) -> bool:
@@ -50,11 +52,11 @@ def is_file(source: str | Path) -> bool:
     return Path(source).suffix == ".json" or Path(source).is_file()
 
 
-def _of_file(path: str | Path, storage: str) -> Subject:
-    content, (choice, scenario, _) = read_tuned_file(path), read_tuned(path)
+def _of_file(path: str, storage: str, problems: Sequence[Problem]) -> Subject:
+    content, (choice, scenario, _) = read_tuned_file(path), read_tuned(path, problems)
     name, plan = (
         str(content["study"].get("name")),
-        _plan(content["study"], path, partial(scenario_in, content, path=path)),
+        _plan(content["study"], path, partial(problem_in, content, path=path, given=problems)),
     )
     study = _load(name, storage)
     if study is not None and study.user_attrs.get("identity") != plan.identity:
@@ -68,12 +70,13 @@ def _of_file(path: str | Path, storage: str) -> Subject:
     return Subject(name, plan, choice, study, count, chosen=True, consistent=consistent)
 
 
-def _of_study(name: str, storage: str) -> Subject:
+def _of_study(name: str, storage: str, problems: Sequence[Problem]) -> Subject:
     study = _load(name, storage)
     if study is None:
         where = shown_storage(storage)
         raise ValueError(f"a report must be of a tuned file or of a study in {where}, but got {name!r}")
-    plan = _plan(study.user_attrs.get("identity"), f"study {name!r}")
+    where = f"study {name!r}"
+    plan = _plan(study.user_attrs.get("identity"), where, partial(find_given, given=problems, where=where))
     best = best_trial(study.get_trials(deepcopy=False))
     if best is None:
         raise ValueError(f"a study must have a complete trial for a report, but {name!r} has none")
@@ -92,7 +95,7 @@ def _load(name: str, storage: str) -> optuna.Study | None:
         return None
 
 
-def _plan(identity, where: str | Path, find: Callable[[str], Scenario] = find_scenario) -> Plan:
+def _plan(identity, where: str | Path, find: Callable[[str], Problem]) -> Plan:
     """The plan of which an identity tells, its scenarios found by name."""
     try:
         scenarios = tuple(find(name) for name in identity["scenarios"])

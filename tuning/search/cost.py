@@ -9,7 +9,7 @@ import numpy as np
 
 from filters.engine.batch import run
 from filters.filter import Filter
-from tuning.problems.find import Data
+from tuning.problems.data import Data
 
 RUNS, STEPS = 32, 200  # of each timed call
 FEWEST, MOST = 3, 15  # timed calls, of which the median counts ...

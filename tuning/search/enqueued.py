@@ -42,7 +42,7 @@ def enqueue_followers(study: optuna.Study, plan: Plan, last: FrozenTrial) -> Non
         _enqueue_consistent_twin(study, plan, last)
     if plan.budget is not None and (last.number == 0 or UNTUNED in last.user_attrs):
         _enqueue_smaller_ensemble(study, plan, last)
-    if last.number == LIKELIEST_AFTER - 1 and not plan.hold_r:
+    if last.number == LIKELIEST_AFTER - 1 and not plan.hold_r and plan.tunes_noise:
         _enqueue_likeliest(study, plan)
     if len(plan.kinds) > 1 and _ends_a_round(last.number + 1, len(plan.kinds)):
         _enqueue_heirs(study, plan)
@@ -50,7 +50,7 @@ def enqueue_followers(study: optuna.Study, plan: Plan, last: FrozenTrial) -> Non
 
 
 def _asks_for_twins(plan: Plan) -> bool:
-    return plan.is_constrained and not plan.hold_r
+    return plan.is_constrained and not plan.hold_r and plan.tunes_noise
 
 
 def _enqueue_untuned(study: optuna.Study, plan: Plan) -> None:
@@ -86,11 +86,11 @@ def _enqueue_consistent_twin(study: optuna.Study, plan: Plan, last: FrozenTrial)
     best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
     if is_consistent(best) and best.values[0] < last.values[0]:
         return
-    space, factor = plan.space(), last.user_attrs[NIS]
+    parameters, factor = plan.parameters(), last.user_attrs[NIS]
     scaled = {
-        name: float(np.clip(factor * value, space[name].low, space[name].high))
+        name: float(np.clip(factor * value, parameters[name].low, parameters[name].high))
         for name, value in last.params.items()
-        if name in ("R", "P0") or name.startswith("Q")
+        if name in parameters and parameters[name].place.is_variance
     }
     twin = {TWIN: last.user_attrs.get(TWIN, 0) + 1, f"{TWIN} of": last.number}
     study.enqueue_trial({**last.params, **scaled}, user_attrs=twin, skip_if_exists=True)
@@ -120,7 +120,7 @@ def _enqueue_likeliest(study: optuna.Study, plan: Plan) -> None:
     if best is None:
         return
     name = "kf" if plan.kinds == ("kf",) else "ekf"
-    found = maximise_likelihood(name, plan.scenarios[0], plan.training_data()[0], [(1.0, 1.0, 1.0)])
+    found = maximise_likelihood(name, plan.scenarios[0], plan.training_data()[0], [1.0])
     space = plan.space()
     likeliest = {
         name: float(np.clip(value, space[name].low, space[name].high))

@@ -1,17 +1,19 @@
-"""What a study makes small, and what it has to keep within bounds."""
+"""What a study minimises, and what it has to keep within bounds."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from numerics.checks import one_of
+from numerics.checks import one_of, shown
 from tuning.evaluation.evaluate import Evaluation
+from tuning.problems.problem import Problem
 
-NIS_BAND = (0.8, 1.25)  # of the mean NIS over the number of channels: what a constrained study calls consistent
+NIS_BAND = (0.8, 1.25)  # of the mean NIS over what is right: what a constrained study calls consistent
 DIVERGENCE_PENALTY = 10.0  # added for each run that had to restart
 LARGEST = 1e6  # an error beyond this is this: studies want finite numbers
+OUTPUT = "output:"  # what objectives on derived outputs begin with
 
 
 class Objective(NamedTuple):
@@ -20,41 +22,82 @@ class Objective(NamedTuple):
     about: str
     value: Callable[[Evaluation, float], float]  # of an evaluation and its microseconds a step
     needs_covariance: bool = False
+    needs_truth: bool = False
+    output: str = ""  # symbol of the derived output that it needs
+
+
+def nis_ratio(evaluation: Evaluation) -> float:
+    """The mean NIS over the mean number of channels that were there: 1 is right, NaN without a covariance."""
+    return evaluation.nis.value / evaluation.expected_nis
+
+
+def _nis_inconsistency(evaluation: Evaluation, _: float) -> float:
+    """|log(NIS / m)| of the mean."""
+    return abs(math.log(nis_ratio(evaluation)))
 
 
 def _inconsistency(evaluation: Evaluation, _: float) -> float:
     """|log(NEES / n)| + |log(NIS / m)| of the means: zero for a filter as sure of itself as it may be."""
-    pairs = (evaluation.nees.value, len(evaluation.rmse)), (evaluation.nis.value, evaluation.channels)
-    return sum(abs(math.log(value / expected)) for value, expected in pairs)
+    of_errors = abs(math.log(evaluation.nees.value / len(evaluation.rmse)))
+    return of_errors + _nis_inconsistency(evaluation, _)
+
+
+def output_objective(symbol: str, about: str = "") -> Objective:
+    """The RMSE of a derived output of the model, in its unit."""
+    return Objective(
+        about or f"RMSE of the output {symbol}",
+        lambda evaluation, _: evaluation.output_rmse[symbol].value,
+        needs_truth=True,
+        output=symbol,
+    )
 
 
 OBJECTIVES = {
     "score": Objective(
-        "mean over states of RMSE over the scenario's scale [-]", lambda evaluation, _: evaluation.score.value
+        "mean over states of RMSE over the scenario's scale [-]",
+        lambda evaluation, _: evaluation.score.value,
+        needs_truth=True,
     ),
-    "thrust": Objective("RMSE of thrust [N]", lambda evaluation, _: evaluation.thrust_rmse.value),
+    "thrust": output_objective("T", "RMSE of thrust [N]"),
     "likelihood": Objective(
         "negative log-likelihood of the innovations, a run", lambda e, _: -e.log_likelihood, needs_covariance=True
     ),
-    "consistency": Objective("|log(mean NEES / n)| + |log(mean NIS / m)|", _inconsistency, needs_covariance=True),
+    "nis": Objective("|log(mean NIS / m)|", _nis_inconsistency, needs_covariance=True),
+    "consistency": Objective(
+        "|log(mean NEES / n)| + |log(mean NIS / m)|", _inconsistency, needs_covariance=True, needs_truth=True
+    ),
     "cost": Objective("microseconds a step of one run, of one core", lambda _, microseconds: microseconds),
 }
 
 
 def find_objective(name: str) -> Objective:
-    """An objective by name; ValueError for an unknown one."""
-    return OBJECTIVES[one_of("objective", name, tuple(OBJECTIVES))]
+    """An objective by name, "output:SYMBOL" for that of a derived output; ValueError for an unknown one."""
+    if isinstance(name, str) and name.startswith(OUTPUT) and name != OUTPUT:
+        return output_objective(name.removeprefix(OUTPUT))
+    return OBJECTIVES[one_of("objective", name, (*OBJECTIVES, f"{OUTPUT}SYMBOL"))]
+
+
+def check_objectives(names: Iterable[str], problem: Problem) -> None:
+    """Raise ValueError if an objective needs the truth, or a derived output, and a problem has none such."""
+    for name in names:
+        objective = find_objective(name)
+        if objective.needs_truth and problem.scale is None:
+            free = ", ".join(known for known, one in OBJECTIVES.items() if not one.needs_truth)
+            raise ValueError(
+                f"an objective on {problem.name}, which has no truth, must be one of {free}, but got {shown(name)}"
+            )
+        outputs = tuple(problem.model().outputs) if objective.output else ()
+        if objective.output and objective.output not in outputs:
+            has = ", ".join(f"{OUTPUT}{symbol}" for symbol in outputs) or "none"
+            raise ValueError(
+                f"an objective on a derived output of {problem.name} must be one of {has}, but got {shown(name)}"
+            )
 
 
 def penalised(value: float, evaluation: Evaluation) -> float:
     """A finite value for a study: that of a filter which diverged is large."""
     value = min(value, LARGEST) if value == value else LARGEST
     return value + DIVERGENCE_PENALTY * evaluation.divergences
-
-
-def nis_ratio(evaluation: Evaluation) -> float:
-    """The mean NIS over the number of channels: 1 is right, NaN without a covariance."""
-    return evaluation.nis.value / evaluation.channels
 
 
 def nis_violation(evaluation: Evaluation) -> float:

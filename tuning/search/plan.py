@@ -9,10 +9,12 @@ from optuna.distributions import BaseDistribution
 
 from filters.registry import filter_class
 from numerics.checks import positive
-from tuning.problems.find import Data, Scenario
+from tuning.problems.data import Data
+from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Problem
 from tuning.problems.seeds import held_out_seeds, size_seeds, training_seeds
-from tuning.search.objectives import Objective, find_objective
-from tuning.search.space import AUTO, AUTO_KINDS, has_search_space, joint_distributions
+from tuning.search.objectives import Objective, check_objectives, find_objective
+from tuning.search.space import AUTO, AUTO_KINDS, has_search_space, joint_distributions, joint_parameters
 
 TRAINING_SEEDS = 32
 HELD_OUT_SEEDS = 200
@@ -23,7 +25,7 @@ class Plan(NamedTuple):
     """A filter, what to tune it on, what to make small and how to search."""
 
     filter: str  # a name, or "auto" for the best of many kinds
-    scenarios: tuple[Scenario, ...]
+    scenarios: tuple[Problem, ...]
     seed: int = 0
     objectives: tuple[str, ...] = ("score",)
     consistent: bool = True  # whether the mean NIS has to be within its band
@@ -79,6 +81,14 @@ class Plan(NamedTuple):
                 raise ValueError(
                     f"the objective {name!r} needs a filter with a covariance, but got {self.filter!r}"
                 )
+        for problem in self.scenarios:
+            check_objectives(self.objectives, problem)
+        if not self.tunes_noise and (self.full_q or self.hold_r):
+            names = ", ".join(one.name for one in self.scenarios[0].parameters)
+            raise ValueError(
+                f"a full Q or an R that is held must be asked of a problem that tunes Q and R, but "
+                f"{self.scenarios[0].name} tunes {names}"
+            )
         if self.full_q and not all(filter_class(kind).has_covariance for kind in self.kinds):
             raise ValueError(f"a full Q needs a filter with a covariance, but got {self.filter!r}")
         if self.budget is not None:
@@ -99,9 +109,21 @@ class Plan(NamedTuple):
 
         The scale of P_0 is among it where a scenario counts the start-up.
         """
-        prior = any(scenario.counts_start_up for scenario in self.scenarios)
-        options = {"hold_r": self.hold_r, "full_q": self.full_q, "prior": prior}
-        return joint_distributions(self.kinds, self.scenarios[0], **options)
+        return joint_distributions(self.kinds, self.scenarios[0], **self._options)
+
+    def parameters(self) -> dict[str, Parameter]:
+        """What a trial may choose beside the kind of filter, by the names that trials have for it."""
+        return joint_parameters(self.kinds, self.scenarios[0], **self._options)
+
+    @property
+    def tunes_noise(self) -> bool:
+        """Whether the variances of Q and R are tuned, and no parameters of the problem's own."""
+        return self.scenarios[0].parameters is None
+
+    @property
+    def _options(self) -> dict:
+        prior = self.tunes_noise and any(scenario.counts_start_up for scenario in self.scenarios)
+        return {"hold_r": self.hold_r, "full_q": self.full_q, "prior": prior}
 
     def training_data(self) -> list[Data]:
         """Data that every trial shares, one for each scenario."""

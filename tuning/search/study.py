@@ -11,7 +11,7 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
-from tuning.problems.find import Data
+from tuning.problems.data import Data
 from tuning.search.cost import COST
 from tuning.search.enqueued import enqueue_followers, enqueue_what_is_left
 from tuning.search.interruption import stop_on_interrupt
@@ -165,7 +165,7 @@ def run_study(
     sizes, consistent = [], plan.is_constrained and is_consistent(best)
     if has_ensemble(choice.name) and len(plan.objectives) == 1:
         sizes = ensemble_sizes(choice, plan, data, consistent)
-        choice = choice.with_size(sufficient_size(sizes, consistent))
+        choice = choice.with_size(sufficient_size(sizes, consistent)) if sizes else choice
     complete = [trial.values[0] for trial in present if trial.state == TrialState.COMPLETE]
     return StudyResult(
         choice,

@@ -12,8 +12,8 @@ import optuna
 
 from filters.engine.batch import Estimates, run
 from filters.filter import Filter
-from tuning.evaluation.evaluate import Evaluation, judge, run_scores
-from tuning.problems.find import Data
+from tuning.evaluation.evaluate import Evaluation, compute_metrics, run_scores
+from tuning.problems.data import Data
 from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
 from tuning.search.objectives import LARGEST, nis_ratio, nis_violation, penalised
 from tuning.search.plan import Plan
@@ -84,7 +84,7 @@ def measure(
     size = count if trial is None else BLOCK
     parts: list[list[Estimates]] = [[] for _ in filters]
     for first in range(0, count, size):
-        block = [Data(*(part[first : first + size] for part in one)) for one in data]
+        block = [one.slice(first, first + size) for one in data]
         for estimates, filter_, one in zip(parts, filters, block, strict=True):
             estimates.append(run(filter_, one.filter_keys, one.inputs, one.measurements))
         if trial is not None:
@@ -93,7 +93,7 @@ def measure(
                 raise optuna.TrialPruned
     whole = [Estimates(*map(np.concatenate, zip(*estimates, strict=True))) for estimates in parts]
     rows = zip(filters, whole, data, plan.scenarios, strict=True)
-    return [judge(filter_, estimates, one, scenario.scale) for filter_, estimates, one, scenario in rows]
+    return [compute_metrics(filter_, estimates, one, scenario.scale) for filter_, estimates, one, scenario in rows]
 
 
 def _report(

@@ -21,7 +21,8 @@ from contextlib import suppress
 import optuna
 
 from numerics.threads import cores
-from tuning.problems.find import Data, find_scenario
+from tuning.problems.data import Data
+from tuning.problems.find import find_same
 from tuning.search.interruption import stop_on_interrupt, without_interrupts
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage, retry_orphans, this_process
@@ -57,6 +58,7 @@ def run_in_workers(
     names = [scenario.name for scenario in plan.scenarios]
     orders = {"study": study.study_name, "storage": storage, "trials": trials, "workers": workers}
     orders["plan"] = plan._replace(scenarios=names)._asdict()
+    orders["digests"] = [scenario.digest for scenario in plan.scenarios]
     # Places that no other host has, whichever starts first, so that no two workers propose the same.
     first = zlib.crc32(this_process().encode())
     processes: dict[int, subprocess.Popen] = {}
@@ -132,7 +134,8 @@ def main() -> None:
     quiet_optuna()
     plan = Plan(**orders["plan"])
     try:
-        scenarios, objectives = tuple(map(find_scenario, plan.scenarios)), tuple(plan.objectives)
+        scenarios = tuple(map(find_same, plan.scenarios, orders["digests"]))
+        objectives = tuple(plan.objectives)
         plan = plan._replace(scenarios=scenarios, objectives=objectives)
         study = open_study(orders["study"], plan, open_storage(orders["storage"]), worker=orders["place"])
         run_trials(study, plan, plan.training_data(), orders["trials"], stop=_parent_says_stop)

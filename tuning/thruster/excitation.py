@@ -1,20 +1,12 @@
-"""Excitations: voltages that stir a thruster so that a filter has something to tell, drawn anew for every seed.
-
-An excitation is a frozen dataclass of plain numbers, registered by name. Its `voltages` are a function of the
-plant and of the episodes' keys alone, so that all filters meet the same ones.
-"""
+"""Voltages of the thruster's scenarios: any excitation of one input, and the closed loop that only it has."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from numerics.checks import at_least, finite, positive, vector
-from numerics.streams import EXCITATION, uniform_block
-from plants.disturbances.effects import LONGEST, Effect, Registry, set_field
-from plants.disturbances.sensors import probability
+from plants.disturbances.effects import Effect, set_field
 from thruster_env.control.controllers import PIController
 from thruster_env.control.gains import lambda_gains
 from thruster_env.effects.reference import REFERENCE_SIGNALS
@@ -23,98 +15,14 @@ from thruster_env.engine.memory import NEXT_REFERENCE, READINGS
 from thruster_env.linear.operating import operating_points
 from thruster_env.plant import Plant
 from thruster_env.task import Task
-
-EXCITATIONS = Registry("excitation")
-
-
-class Excitation(Effect):
-    """Base of all excitations; fields of the dataclass are the arguments."""
-
-    def voltages(self, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
-        """Voltages (B, steps) [V] for keys (B, 2); those beyond the plant's range are to be cut off."""
-        raise TypeError(f"{type(self).__name__} has no voltages: use one of its subclasses")
+from tuning.problems.excitation import EXCITATIONS, Excitation
 
 
-@EXCITATIONS.register("steps")
-@dataclass(frozen=True)
-class Steps(Excitation):
-    """Levels uniform within plus and minus `amplitude` [V], each held for `hold` steps."""
-
-    amplitude: float = 12.0
-    hold: int = 25
-
-    def __post_init__(self):
-        """Check the arguments."""
-        set_field(self, "amplitude", positive("amplitude", self.amplitude, zero_allowed=True))
-        set_field(self, "hold", at_least("hold", self.hold, 1, LONGEST))
-
-    def voltages(self, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
-        """Voltages (B, steps) [V]."""
-        return held_levels(keys, self.amplitude, self.hold, steps)
-
-
-@EXCITATIONS.register("prbs")
-@dataclass(frozen=True)
-class BinarySequence(Steps):
-    """Pseudo-random binary sequence: plus or minus `amplitude` [V] with equal chance, drawn every `hold` steps."""
-
-    def voltages(self, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
-        """Voltages (B, steps) [V]."""
-        return self.amplitude * np.sign(held_levels(keys, 1.0, self.hold, steps))
-
-
-@EXCITATIONS.register("multi-sine")
-@dataclass(frozen=True)
-class MultiSine(Excitation):
-    """Sines of equal `amplitude` [V], given `periods` [s] and drawn phases, added to `offset` [V]."""
-
-    amplitude: float = 4.0
-    offset: float = 0.0
-    periods: tuple[float, ...] = (2.3, 0.9, 0.4)
-
-    def __post_init__(self):
-        """Check the arguments."""
-        set_field(self, "amplitude", positive("amplitude", self.amplitude, zero_allowed=True))
-        set_field(self, "offset", finite("offset", self.offset))
-        periods = tuple(positive("periods", period) for period in vector("periods", self.periods).tolist())
-        set_field(self, "periods", periods)
-
-    def voltages(self, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
-        """Voltages (B, steps) [V]."""
-        turns = plant.dt * np.arange(steps)[:, None] / np.array(self.periods)  # (steps, sines)
-        phases, *_ = _uniforms(keys, np.arange(len(self.periods)))
-        sines = np.sin(2.0 * math.pi * (turns[None] + phases[:, None, :]))
-        return self.offset + self.amplitude * sines.sum(axis=2)
-
-
-@EXCITATIONS.register("dwells")
-@dataclass(frozen=True)
-class Dwells(Excitation):
-    """Slow crossings of zero and dwells there.
-
-    Straight lines of `ramp` steps lead from level to level, where the voltage stays for `dwell` steps. A level is
-    zero with probability `zeros`, else uniform within plus and minus `amplitude` [V].
-    """
-
-    amplitude: float = 1.0
-    ramp: int = 50
-    dwell: int = 25
-    zeros: float = 0.5
-
-    def __post_init__(self):
-        """Check the arguments."""
-        set_field(self, "amplitude", positive("amplitude", self.amplitude, zero_allowed=True))
-        set_field(self, "ramp", at_least("ramp", self.ramp, 1, LONGEST))
-        set_field(self, "dwell", at_least("dwell", self.dwell, 0, LONGEST))
-        set_field(self, "zeros", probability("zeros", self.zeros))
-
-    def voltages(self, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
-        """Voltages (B, steps) [V]."""
-        part, place = np.divmod(np.arange(steps), self.ramp + self.dwell)
-        share, place, *_ = _uniforms(keys, np.arange(part[-1] + 2)), np.maximum(place - self.dwell, 0) / self.ramp
-        chance, level, *_ = share
-        levels = np.where(chance < self.zeros, 0.0, self.amplitude * (2.0 * level - 1.0))
-        return levels[:, part] + place * (levels[:, part + 1] - levels[:, part])
+def voltages_of(excitation: Excitation, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
+    """Voltages (B, steps) [V] for keys (B, 2); those beyond the plant's range are to be cut off."""
+    if isinstance(excitation, ClosedLoop):
+        return excitation.voltages(plant, keys, steps)
+    return excitation.inputs(keys, steps, plant.dt, 1)[..., 0]
 
 
 @EXCITATIONS.register("pi")
@@ -147,6 +55,10 @@ class ClosedLoop(Excitation):
         levels = {"low": self.low, "high": self.high, "hold_time": self.hold_time}
         return REFERENCE_SIGNALS.make({"name": "steps", **levels})
 
+    def inputs(self, keys: np.ndarray, steps: int, dt: float, count: int) -> np.ndarray:
+        """There are none without a thruster: ValueError."""
+        raise ValueError("the excitation 'pi' must be a thruster's, for it is a loop closed through its sensor")
+
     def voltages(self, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
         """Voltages (B, steps) [V]; ValueError if the plant does not measure its thrust."""
         if "thrust" not in plant.channels:
@@ -164,14 +76,3 @@ class ClosedLoop(Excitation):
             out[:, k] = action[:, 0]
             report = copies.step(out[:, k])
         return out
-
-
-def held_levels(keys: np.ndarray, amplitude: float, hold: int, steps: int) -> np.ndarray:
-    """Voltages (B, steps) [V]: levels uniform within plus and minus amplitude, each held for `hold` steps."""
-    u, *_ = _uniforms(keys, np.arange(steps) // hold)
-    return amplitude * (2.0 * u - 1.0)
-
-
-def _uniforms(keys: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Four uniform numbers in (0, 1), each (B, K), for keys (B, 2) and numbers (K,) of what is drawn."""
-    return uniform_block(0, numbers[None, :], EXCITATION, keys[:, :1], keys[:, 1:])

@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from numerics.checks import shown
-from tuning.problems.scale import computed_scale
+from tuning.thruster.scale import computed_scale
 from tuning.thruster.scenario import Scenario
 
 FILE_SEQUENCES = 200  # voltage sequences for the scale of a file that gives none

@@ -7,8 +7,8 @@ import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
+from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,34 +22,20 @@ from thruster_env.linear.linear_plant import make_linear_plant
 from thruster_env.linear.steady_state import state_range
 from thruster_env.model import model_of_plant
 from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_PROCESS_NOISE, Plant, make_plant
+from thruster_env.plant_data import check_same_plant, plant_data
 from thruster_env.simulation import simulate
-from tuning.thruster.excitation import EXCITATIONS, Excitation, Steps
+from tuning.problems.data import FIRST_SCORED_STEP, Data
+from tuning.problems.excitation import EXCITATIONS, Excitation, Steps
+from tuning.problems.problem import Problem
+from tuning.thruster.excitation import voltages_of
 
 DEEPEST = 10  # levels of mappings and lists in a scenario
 MOST_STEPS = 1_000_000
-FIRST_SCORED_STEP = 50  # RMSE counts steps 50 to 500; start-up is reported apart
 UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as part of each state's range
 
 
-class Data(NamedTuple):
-    """What a scenario makes for B seeds and K steps."""
-
-    seeds: tuple[int, ...]
-    inputs: np.ndarray  # (B, K, 1) [V]
-    states: np.ndarray  # (B, K + 1, 2)
-    thrusts: np.ndarray  # (B, K + 1) [N]
-    measurements: np.ndarray  # (B, K + 1, 1), NaN where missing
-    filter_keys: np.ndarray  # (B, 2)
-    first_scored: np.ndarray  # (B,) the first step of each run that counts, the same for all
-
-    @property
-    def scored(self) -> slice:
-        """The steps that count."""
-        return slice(int(self.first_scored[0]), None)
-
-
 @dataclass(frozen=True, kw_only=True)
-class Scenario:
+class Scenario(Problem):
     """A plant, an excitation and what a filter assumes of the plant.
 
     A filter's model is the plant's, but for `parameter_factors`; it knows the distribution of the initial state
@@ -58,7 +44,8 @@ class Scenario:
     Attributes:
         name: its name; that of its file if it was read from one.
         about: one line for tables and help.
-        measurement_noise_cov: the plant's R, the variance of the sensor's sheet [N^2, or the channel's unit^2].
+        measurement_noise_cov: the plant's R, the variance of the sensor's sheet [N^2, or the channel's unit^2]; of
+            several channels one each.
         process_noise_cov: the plant's Q, two variances a step [(rad/s)^2, (m/s)^2].
         scale: bound on the standard error of each state, (omega_m [rad/s], U_a [m/s]), of the scenario's Gaussian
             core: fixed numbers that errors are measured in, made by `scale.computed_scale`.
@@ -73,7 +60,7 @@ class Scenario:
         max_voltage: voltages are clipped to plus and minus this [V].
         ambient_velocity: constant flow U_0 [m/s].
         initial_state: None, two numbers, or a mapping.
-        sensors: one channel, a list of its name or a mapping from it to a list of effects.
+        sensors: channels, a list of their names or a mapping from each to a list of effects.
         flow: list of signals.
         amplifier: list of effects.
         uncertainty: distributions of factors on parameters, drawn anew for each seed.
@@ -82,7 +69,7 @@ class Scenario:
     name: str
     about: str = ""
     process_noise_cov: tuple[float, float] = DEFAULT_PROCESS_NOISE
-    measurement_noise_cov: float = CHANNELS["thrust"].variance
+    measurement_noise_cov: float | Sequence[float] = CHANNELS["thrust"].variance
     scale: tuple[float, float]
     parameter_factors: Mapping[str, float] = field(default_factory=dict)
     excitation: Excitation | Mapping = field(default_factory=Steps)
@@ -106,14 +93,16 @@ class Scenario:
         for name, kind, called in (("about", str, "text"), ("parameter_factors", Mapping, "a mapping")):
             if not isinstance(getattr(self, name), kind):
                 raise ValueError(f"{name} must be {called}, but got {shown(getattr(self, name))}")
-        if isinstance(self.sensors, str) or not isinstance(self.sensors, Collection) or len(self.sensors) != 1:
-            raise ValueError(f"sensors of a scenario must be one channel, but got {shown(self.sensors)}")
+        if isinstance(self.sensors, str) or not isinstance(self.sensors, Collection) or not self.sensors:
+            raise ValueError(
+                f"sensors of a scenario must be one channel or several, but got {shown(self.sensors)}"
+            )
         scale = vector("scale", self.scale, 2)
         if not (scale > 0).all():
             raise ValueError(f"scale must be positive in every state, but got {scale.tolist()}")
         checked = {
             "process_noise_cov": vector("process_noise_cov", self.process_noise_cov, 2).tolist(),
-            "measurement_noise_cov": positive("measurement_noise_cov", self.measurement_noise_cov),
+            "measurement_noise_cov": _variances(self.measurement_noise_cov, len(self.sensors)),
             "scale": scale.tolist(),
             "steps": at_least("steps", self.steps, FIRST_SCORED_STEP + 1, MOST_STEPS),
             "first_scored_step": at_least("first_scored_step", self.first_scored_step, 0),
@@ -170,6 +159,21 @@ class Scenario:
         }
 
     @property
+    def held(self) -> dict:
+        """What the filter's model gets wrong of the plant's parameters."""
+        return {"parameter_factors": dict(self.parameter_factors)}
+
+    @property
+    def plant_data(self) -> dict:
+        """The plant as data, for comparison with an env's."""
+        return plant_data(self.plant)
+
+    def check_tuned_for(self, plant: Mapping | None, file: str | Path) -> None:
+        """Raise ValueError if a tuned file is for another thruster, dt or sensor."""
+        if plant is not None:
+            check_same_plant(plant, self.plant, file)
+
+    @property
     def counts_start_up(self) -> bool:
         """Whether the first steps count, in which P_0 is felt."""
         return self.first_scored_step < FIRST_SCORED_STEP
@@ -188,7 +192,7 @@ class Scenario:
         return hashlib.sha256(json.dumps(content, sort_keys=True, default=repr).encode()).hexdigest()[:12]
 
     def as_mapping(self) -> dict:
-        """All that it says but for its name, as JSON can hold it; `scenario_files.scenario_of` reads it."""
+        """All that it says but for its name, as JSON can hold it; `files.scenario_of` reads it."""
         content = {
             entry.name: as_data(getattr(self, entry.name)) for entry in fields(self) if entry.name != "name"
         }
@@ -221,16 +225,27 @@ class Scenario:
 @lru_cache(maxsize=8)
 def _data(scenario: Scenario, seeds: tuple[int, ...]) -> Data:
     keys, plant = episode_keys(seeds), scenario.plant
-    voltages = scenario.excitation.voltages(plant, keys, scenario.steps)
+    voltages = voltages_of(scenario.excitation, plant, keys, scenario.steps)
     voltages = np.clip(voltages, -plant.max_voltage, plant.max_voltage)  # as the env does
     simulation = simulate(plant, keys, voltages).checked(f"the plant of scenario {scenario.name}")
     measurements = np.where(simulation.valid, simulation.measurements, np.nan)  # as filters take missing ones
-    truth = simulation.states, simulation.thrusts
-    first = np.full(len(seeds), scenario.first_scored_step)
-    data = Data(seeds, voltages[..., None], *truth, measurements, filter_keys(seeds), first)
-    for array in data[1:]:
-        array.setflags(write=False)
-    return data
+    return Data(
+        seeds,
+        voltages[..., None],
+        measurements,
+        filter_keys(seeds),
+        scenario.first_scored_step,
+        simulation.states,
+        {"T": simulation.thrusts},
+    ).read_only()
+
+
+def _variances(given, channels: int) -> float | tuple[float, ...]:
+    """R as a scenario holds it: one variance of one channel, or a variance for each of several."""
+    if channels == 1 and not isinstance(given, list | tuple | np.ndarray):
+        return positive("measurement_noise_cov", given)
+    each = tuple(positive("measurement_noise_cov", v) for v in vector("measurement_noise_cov", given, channels))
+    return each[0] if channels == 1 else each
 
 
 def _range(plant: Plant) -> np.ndarray:

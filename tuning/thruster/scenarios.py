@@ -10,8 +10,9 @@ from __future__ import annotations
 import sys
 
 from numerics.checks import one_of
-from tuning.problems.scale import computed_scale
-from tuning.thruster.excitation import BinarySequence, ClosedLoop, Dwells, MultiSine
+from tuning.problems.excitation import BinarySequence, Dwells, MultiSine
+from tuning.thruster.excitation import ClosedLoop
+from tuning.thruster.scale import computed_scale
 from tuning.thruster.scenario import Scenario
 
 # Bounds from 1200 voltage sequences and 100 truths each, good to half a per cent; a test computes them anew.

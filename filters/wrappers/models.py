@@ -1,0 +1,42 @@
+"""Where a wrapper's model comes from: the env, a factory that the caller names, or the caller's own hands."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+
+from numerics.checks import shown
+from plants.state_space import StateSpaceModel
+
+
+def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | StateSpaceModel]:
+    """What a model is called in messages, and what makes it: the env, or the "module:factory" named; or itself.
+
+    Raises ValueError if there is none.
+    """
+    if model is None:
+        make = getattr(env.unwrapped, "state_space_model", None)
+        if make is None:
+            raise ValueError(f"an env that offers no state_space_model must come with a model, but got {env}")
+        return f"the model of {env.unwrapped}", make
+    if isinstance(model, StateSpaceModel):
+        return "the model", model
+    module, _, name = str(model).partition(":")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError):
+        raise ValueError(
+            f"model must be 'module:factory' that can be imported, or a StateSpaceModel, but got {model!r}"
+        ) from None
+    return f"model {model!r}", found
+
+
+def made(what: str, make: Callable, arguments: Mapping) -> StateSpaceModel:
+    """The model that is made of some arguments; ValueError if there is none."""
+    try:
+        found = make(**arguments)
+    except TypeError as error:
+        raise ValueError(f"{what} must take the given arguments: {error}") from None
+    if not isinstance(found, StateSpaceModel):
+        raise ValueError(f"{what} must be a StateSpaceModel, but it is {shown(found)}")
+    return found

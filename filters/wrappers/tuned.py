@@ -1,0 +1,93 @@
+"""The filter of a tuned file, with the model of the env, or of the caller, that it is put on."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+
+from filters.filter import Filter
+from filters.registry import make_filter
+from filters.tuned_file import NEEDED, read_tuned_file
+from filters.tuned_model import check_same_model, check_same_quantities
+from filters.wrappers.models import made, maker_of
+from plants.state_space import StateSpaceModel
+
+PRIOR = "prior_cov_factor"
+NOISE = {*NEEDED, PRIOR}
+
+
+def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:
+    """The filter of a tuned file, whose numbers a model has taken on.
+
+    Nothing is imported that the file names: the model is the env's own, or what the caller gives. It has to be the
+    one that the file is for. A file that holds its plant as data is compared with the env's plant, if no model is
+    given, and by states, inputs and sensors; others by these, dt and the model's digest. Files of before version 4
+    are compared by the plant alone.
+
+    Args:
+        env: that is wrapped.
+        model: as `EstimateState` takes it.
+        file: the path.
+
+    Raises:
+        ValueError: with what differs, if the model is another one; or if the file is a bad one.
+    """
+    content = read_tuned_file(file)
+    plant, check = content.get("plant"), getattr(env.unwrapped, "check_tuned_for", None)
+    if model is None and check is not None:
+        check(plant, file)
+    entry, tuned_for = content["filter"], content.get("model")
+    dt = None if plant is not None else sample_time(env)
+
+    def fits(found: StateSpaceModel) -> None:
+        if tuned_for is not None:
+            check_same_quantities(tuned_for, found, dt, file)
+
+    by_digest = tuned_for is not None and plant is None
+    found = _with_numbers(*maker_of(env, model), entry["model"], fits, by_digest)
+    if by_digest:
+        check_same_model(tuned_for, found, dt, file)
+    return make_filter(entry["name"], found, **entry["numbers"])
+
+
+def sample_time(env) -> float | None:
+    """An env's `dt` [s], None where it says none."""
+    dt = getattr(env.unwrapped, "dt", None)
+    return float(dt) if isinstance(dt, float | int) and not isinstance(dt, bool) and dt > 0 else None
+
+
+def _with_numbers(
+    what: str,
+    make: Callable | StateSpaceModel,
+    numbers: Mapping,
+    fits: Callable[[StateSpaceModel], None],
+    by_digest: bool,
+) -> StateSpaceModel:
+    """A model with the numbers of a tuned file: Q and R, the factor on P_0, and what else the maker takes by name.
+
+    Other numbers are left out only where the model's digest then tells whether that makes another model.
+    """
+    if isinstance(make, StateSpaceModel):
+        fits(make)
+        return _with_noise(make, numbers)
+    own = {name: value for name, value in numbers.items() if name not in NOISE}
+    if by_digest:
+        own = {name: value for name, value in own.items() if name in _arguments_of(make)}
+    plain = made(what, make, own)
+    fits(plain)  # before Q and R of other sizes are
+    return _with_noise(plain, numbers) if by_digest else made(what, make, numbers)
+
+
+def _with_noise(model: StateSpaceModel, numbers: Mapping) -> StateSpaceModel:
+    changes = {name: numbers[name] for name in NEEDED}
+    if PRIOR in numbers:
+        changes["prior_cov"] = numbers[PRIOR] * model.prior_cov
+    return model.replace(**changes)
+
+
+def _arguments_of(make: Callable) -> set[str]:
+    """Names of the arguments that a function takes, none if it does not tell."""
+    try:
+        return set(inspect.signature(make).parameters)
+    except (TypeError, ValueError):  # some are written in C
+        return set()

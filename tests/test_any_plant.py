@@ -1,0 +1,246 @@
+"""Evaluation, tables, reports and figures of any number of states and channels, with and without truth."""
+
+import io
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from filters.consistency.nees import normalized_squares
+from filters.consistency.verdicts import NO_TRUTH, sentences
+from filters.engine.batch import run
+from numerics.compiled import interpreted
+from tests.linear_problem import LinearProblem
+from thruster_cli import consistency, leaderboard
+from thruster_cli.error_tables import comparison_table
+from thruster_cli.tables import choice_table
+from tuning.evaluation.compare import compare, contender
+from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
+from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.sizes import ensemble_sizes
+from tuning.evaluation.tuned import summary
+from tuning.evaluation.worth import worth
+from tuning.report.consistency_figures import consistency_figure
+from tuning.report.figures import comparison_figure
+from tuning.report.panels import shown_states
+from tuning.report.parts import advice, held_out_section
+from tuning.report.subject import Subject
+from tuning.report.tables import errors_table, numbers_table
+from tuning.report.time_figures import estimates_figure
+from tuning.search.objectives import check_objectives, find_objective, nis_ratio
+from tuning.search.plan import Plan
+from tuning.search.space import true_choice, untuned_choice
+
+SEEDS = range(8)
+
+
+def proof_on(problem):
+    """Rule of thumb, oracle in the tuned filter's place, and oracle on a problem, none of them compiled."""
+    choices = [untuned_choice("kf", problem), true_choice("kf", problem), true_choice("kf", problem)]
+    with interpreted():
+        data = problem.data(SEEDS)
+        found = [evaluate(choice.filter(problem), data, problem.scale) for choice in choices]
+    bound = np.full(problem.n, 0.1 if problem.truth else np.nan)
+    return Comparison(*found, bound=bound, seeds=SEEDS)
+
+
+@pytest.fixture(scope="module")
+def proofs():
+    """By number of states and whether there is truth."""
+    problems = [LinearProblem(), LinearProblem(truth=False), LinearProblem(1, 1), LinearProblem(8)]
+    return {(one.n, one.truth): (one, proof_on(one)) for one in problems}
+
+
+def printed(*parts, width=80):
+    """What a terminal shows."""
+    console = Console(file=io.StringIO(), width=width, markup=False, highlight=False)
+    for part in parts:
+        console.print(part)
+    return console.file.getvalue()
+
+
+def test_an_evaluation_has_one_of_everything_for_each_state_channel_and_output(proofs):
+    problem, proof = proofs[3, True]
+    found, data = proof.true, problem.data(SEEDS)
+    with interpreted():
+        estimates = run(
+            true_choice("kf", problem).filter(problem), data.filter_keys, data.inputs, data.measurements
+        )
+    late, errors = slice(10, None), estimates.means - data.states
+    np.testing.assert_allclose([part.value for part in found.rmse], np.sqrt((errors[:, late] ** 2).mean((0, 1))))
+    assert [state.symbol for state in found.states] == ["p", "v", "b"] and found.channels == 2
+    energies = 0.5 * estimates.means[..., 1] ** 2 - data.outputs["E"]
+    assert found.output_rmse["E"].value == pytest.approx(np.sqrt((energies[:, late] ** 2).mean()), rel=1e-12)
+    assert summary(found)["energy_rmse"] == list(found.output_rmse["E"])
+    # Of two channels one measurement in ten is missing: the mean NIS of a filter that is right is less than two.
+    there = (~np.isnan(data.measurements[:, late])).sum(-1)
+    assert found.expected_nis == there[there > 0].mean() and 1.7 < found.expected_nis < 1.9
+    squares = normalized_squares(estimates.innovations[:, late], estimates.innovation_covs[:, late])
+    assert found.nis.value == pytest.approx(squares[there > 0].mean()) and found.nis.covers(found.expected_nis)
+    assert found.nees.covers(3) and nis_ratio(found) == found.nis.value / found.expected_nis
+
+
+def test_states_with_an_infinite_scale_do_not_count():
+    problem = LinearProblem(scale=(0.5, np.inf, 0.25))
+    with interpreted():
+        found = evaluate(true_choice("kf", problem).filter(problem), problem.data(SEEDS), problem.scale)
+    assert found.score.value == pytest.approx((found.rmse[0].value / 0.5 + found.rmse[2].value / 0.25) / 2)
+    assert found.scored == [0, 2]
+    filter_, data = true_choice("kf", problem).filter(problem), problem.data(SEEDS)
+    for scale, rule in (((0.5, 0.5), "one number a state, 3"), ((np.inf,) * 3, "finite in some state")):
+        with interpreted(), pytest.raises(ValueError, match=f"scale must be {rule}"):
+            evaluate(filter_, data, scale)
+
+
+def test_without_truth_the_innovations_stay(proofs):
+    (_, known), (_, blind) = proofs[3, True], proofs[3, False]
+    with_truth, without = known.true, blind.true
+    assert with_truth.has_truth and not without.has_truth
+    assert (without.nis, without.log_likelihood) == (with_truth.nis, with_truth.log_likelihood)
+    assert np.isnan(without.rmse).all() and len(without.rmse) == 3 and np.isnan(without.score).all()
+    said = summary(without)
+    assert said["rmse"] == [None] * 3 and said["score"] is said["nees"] is None and said["nis"] is not None
+    gain = likelihood_gain(blind.true, blind.untuned)
+    assert 0 < gain.low < gain.value == pytest.approx(without.log_likelihood - blind.untuned.log_likelihood)
+    assert worth(blind).startswith("changes the log-likelihood of a run by +")
+
+
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        ((1, True), ["RMSE on here", "p above filter [m] [%] NEES NIS", "Ideal: NEES 1, NIS 1."]),
+        ((3, True), ["v [m/s]", "b [m]", "E [J]", "above", "rule of thumb"]),
+        ((8, True), ["q_8 [K]", "E [J]", "bound"]),
+        ((3, False), ["Innovations on here", "log L NIS div.", "Ideal: NIS 1.8"]),
+    ],
+)
+def test_tables_fit_a_terminal_and_say_what_each_number_is(proofs, case, words):
+    problem, proof = proofs[case]
+    shown = printed(comparison_table(proof.evaluations, proof.bound, "here"))
+    for word in words:
+        assert word in " ".join(shown.split())
+    assert max(map(len, shown.splitlines())) <= 80 and "nan" not in shown and "omega" not in shown
+    choices = {"rule of thumb": untuned_choice("kf", problem)}
+    numbers = printed(choice_table(choices, problem))
+    assert "Q11 [m^2]" in numbers and ("R11 [m^2]" if problem.m > 1 else "R [m^2]") in numbers
+    if problem.n == 8:
+        assert "Q88 [K^2]" in numbers
+
+
+def test_the_tables_of_a_report_grow_downwards_with_the_states(proofs):
+    few, many, blind = (errors_table(*proofs[case]) for case in ((3, True), (8, True), (3, False)))
+    assert list(few.columns[1:5]) == ["RMSE p [m]", "RMSE v [m/s]", "RMSE b [m]", "RMSE energy [J]"]
+    assert [row[0] for row in many.rows][:3] == ["RMSE p [m]", "RMSE v [m/s]", "RMSE b [m]"]
+    assert len(many.rows) == 8 + 1 + 4 and {len(row) for row in many.rows} == {len(many.columns)}
+    assert {len(row) for row in few.rows} == {len(few.columns)}
+    assert "log-likelihood of a run" in blind.columns and "nan" not in blind.markdown()
+
+
+def test_a_leaderboard_ranks_without_truth_by_the_likelihood():
+    filters = [contender("kf", "untuned"), contender("ekf"), contender("low-pass")]
+    with interpreted():
+        boards, _ = compare(filters, [LinearProblem(truth=False), LinearProblem(8)], SEEDS)
+    blind, many = boards
+    assert [row.verdict for row in blind.rows] == ["tie", "better", "unknown"]
+    said = printed(*leaderboard.report(blind))
+    assert "has no truth: filters are compared by" in said and "nan" not in said
+    assert "by the log-likelihood: better: ekf; not to be told: low-pass." in " ".join(said.split())
+    said = printed(*leaderboard.report(many))
+    assert "q_8 [K]" in said and "start-up" in said and max(map(len, said.splitlines())) <= 80
+    content = leaderboard.as_json(boards)
+    assert content["states"] == ["p [m]", "v [m/s]", "b [m]"]
+    assert content["scenarios"]["linear-8"]["states"][-1] == "q_8 [K]"
+
+
+def test_consistency_without_truth_is_that_of_the_innovations(tmp_path):
+    problem = LinearProblem(truth=False)
+    with interpreted():
+        data = problem.data(range(30))
+        report = check_consistency(true_choice("enkf", problem).with_size(5).filter(problem), data)
+        known = check_consistency(true_choice("kf", problem).filter(problem), LinearProblem().data(range(30)))
+    said = sentences(report)
+    assert said[0] == NO_TRUTH and not any("NEES" in one or "CRPS" in one for one in said)
+    assert any(one.startswith("The 95 % interval of the expected range [m] holds the measurement") for one in said)
+    assert report.channels == ("range [m]", "speed [m/s]") and report.ensemble is None
+    for coverage in known.innovation_coverage:
+        assert coverage.covers(0.95)
+    assert np.isnan(report.coverage).all() and consistency.as_data(report)["states"] == (
+        "p [m]",
+        "v [m/s]",
+        "b [m]",
+    )
+    assert known.coverage[0].value == pytest.approx(0.95, abs=0.03) and len(sentences(known)) >= 5 + 6
+    for name, one in (("without", report), ("with", known)):
+        assert consistency_figure(tmp_path / f"{name}.png", one, "title").stat().st_size > 10_000
+
+
+def test_of_many_states_sentences_tell_the_worst():
+    problem = LinearProblem(8)
+    with interpreted():
+        report = check_consistency(true_choice("kf", problem).filter(problem), problem.data(range(25)))
+    assert sum("holds the truth" in one for one in sentences(report)) == 6
+    assert any(
+        one.startswith("Of 8 states these are the 6 whose coverage is furthest off") for one in sentences(report)
+    )
+
+
+@pytest.mark.parametrize("case", [(1, True), (3, True), (8, True), (3, False)])
+def test_figures_are_drawn_for_any_plant(proofs, case, tmp_path):
+    problem, proof = proofs[case]
+    filters = {
+        "one": untuned_choice("kf", problem).filter(problem),
+        "two": true_choice("kf", problem).filter(problem),
+    }
+    with interpreted():
+        estimates_figure(tmp_path / "run.png", filters, problem.data(SEEDS), 1, problem.dt, sharey="row")
+    assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
+    if problem.truth:
+        assert comparison_figure(tmp_path / "rmse.png", proof, "a title").is_file()
+    else:
+        with pytest.raises(ValueError, match="needs the truth, but there is none"):
+            comparison_figure(tmp_path / "rmse.png", proof, "a title")
+
+
+def test_of_many_states_the_scored_ones_have_panels_first():
+    states = LinearProblem(8).model().states
+    assert shown_states(states[:6]) == ([0, 1, 2, 3, 4, 5], "")
+    assert shown_states(states) == ([0, 1, 2, 3, 4, 5], "2 of 8 states are left out")
+    assert shown_states(states, [2, 7]) == ([0, 1, 2, 3, 4, 7], "2 of 8 states are left out")
+
+
+def test_objectives_say_what_they_need(proofs):
+    (problem, proof), blind = proofs[3, True], proofs[3, False][0]
+    assert find_objective("output:E").value(proof.true, 0.0) == proof.true.output_rmse["E"].value
+    assert find_objective("nis").value(proof.true, 0.0) == abs(np.log(nis_ratio(proof.true)))
+    assert find_objective("thrust").output == "T" == find_objective("output:T").output
+    check_objectives(("likelihood", "nis", "cost"), blind)
+    for objective in ("score", "consistency", "output:E"):
+        with pytest.raises(ValueError, match="no truth, must be one of likelihood, nis, cost, but got"):
+            Plan("kf", (blind,), objectives=(objective,)).checked()
+    with pytest.raises(ValueError, match="derived output of linear-3 must be one of output:E, but got 'thrust'"):
+        Plan("kf", (problem,), objectives=("thrust",)).checked()
+    with pytest.raises(
+        ValueError, match="objective must be one of score, thrust, .*output:SYMBOL, but got 'output:'"
+    ):
+        find_objective("output:")
+
+
+def test_a_report_without_truth_says_so_and_has_no_errors(proofs):
+    problem, proof = proofs[3, False]
+    plan, choice = Plan("kf", (problem,), objectives=("likelihood",)), true_choice("kf", problem)
+    assert advice(choice, plan, [proof]).endswith(
+        "the covariance is consistent (mean NIS 1.76 where 1.81 is right)."
+    )
+    said, table = held_out_section(None, Subject("s", plan, choice, None, 8, True), [proof]).parts
+    assert said.sentences[0].startswith("linear-3 has no truth: filters are compared by how well they predict")
+    assert table == errors_table(problem, proof)
+    assert ensemble_sizes(true_choice("enkf", problem), plan, []) == []
+
+
+def test_numbers_of_a_filter_have_the_units_of_their_states(proofs, monkeypatch):
+    problem, _ = proofs[3, False]
+    choice = true_choice("kf", problem)
+    found = {"rule of thumb": untuned_choice("kf", problem), "oracle": choice}
+    monkeypatch.setattr("tuning.report.tables.baselines", lambda *arguments: found)
+    rows = numbers_table(choice, problem, 0).rows
+    assert [row[0] for row in rows] == ["Q11 [m²]", "Q22 [(m/s)²]", "Q33 [m²]", "R11 [m²]", "R22 [(m/s)²]"]

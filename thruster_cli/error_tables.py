@@ -1,0 +1,136 @@
+"""Tables of what filters achieve: any number of states, derived outputs and channels, with or without truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import inf, isfinite, isnan, log10
+
+import numpy as np
+from rich.table import Table
+
+from filters.consistency.intervals import Interval
+from plants.quantities import Quantity
+from thruster_cli.output import table
+from tuning.evaluation.evaluate import Evaluation
+
+MOST_COLUMNS = 5  # of errors, that fit into 80 columns with their intervals
+
+
+def comparison_table(evaluations: Mapping[str, Evaluation], bound: np.ndarray, where: str) -> Table:
+    """Metrics of filters on the same seeds: RMSE, distance from the bound and consistency.
+
+    A row is a filter. Where states are more than fit side by side, a row is a state of a filter; without truth the
+    metrics are those of the innovations.
+
+    Args:
+        evaluations: by what the filters are called.
+        bound: (n,), NaN where there is none.
+        where: on what seeds of what, for the title.
+    """
+    first = next(iter(evaluations.values()))
+    if not first.has_truth:
+        return _innovations_table(evaluations, where)
+    outputs = {symbol: one for found in evaluations.values() for symbol, one in found.outputs.items()}
+    layout = _across if 2 * len(first.states) + len(outputs) <= MOST_COLUMNS else _below
+    columns, rows = layout(evaluations, bound, outputs)
+    caption = f"above: the bound. ±: half of the 95 % interval. Ideal: NEES {len(bound)}, NIS {right_nis(first)}."
+    return table(f"RMSE on {where}", columns, rows, caption=caption)
+
+
+def _across(evaluations: Mapping[str, Evaluation], bound: np.ndarray, outputs: Mapping[str, Quantity]) -> tuple:
+    """Columns and rows with all states side by side."""
+    first = next(iter(evaluations.values()))
+    digits, rows = decimals(first), []
+    for name, found in evaluations.items():
+        above = [unless_blank(part, "+.0f") for part in above_bound(found, bound)]
+        pairs = zip(found.rmse, digits, above, strict=True)
+        states = [cell for rmse, places, over in pairs for cell in (about(rmse, places), over)]
+        rows.append([name, *states, *(_output(found, symbol) for symbol in outputs), *consistency_cells(found)])
+    limits = [
+        cell for limit, places in zip(bound, digits, strict=True) for cell in (limit_cell(limit, places), "")
+    ]
+    rows.append(["bound", *limits, *("" for _ in outputs), str(len(bound)), right_nis(first)])
+    heads = [head for state in first.states for head in (two_lines(state), "above\n[%]")]
+    return ["filter", *heads, *map(two_lines, outputs.values()), "NEES", "NIS"], rows
+
+
+def _below(evaluations: Mapping[str, Evaluation], bound: np.ndarray, outputs: Mapping[str, Quantity]) -> tuple:
+    """Columns and rows with a filter's states and outputs one below the other."""
+    first = next(iter(evaluations.values()))
+    digits, rows = decimals(first), []
+    for name, found in evaluations.items():
+        above = [unless_blank(part, "+.0f") for part in above_bound(found, bound)]
+        columns = found.states, found.rmse, digits, above
+        block = [[s.short_label, about(rmse, d), over] for s, rmse, d, over in zip(*columns, strict=True)]
+        block += [[outputs[symbol].short_label, _output(found, symbol), ""] for symbol in outputs]
+        heads = [[name, *consistency_cells(found)]] + [["", "", ""]] * (len(block) - 1)
+        rows += [[head[0], *cells, *head[1:]] for head, cells in zip(heads, block, strict=True)]
+    limits = [[s.short_label, limit_cell(b, d), ""] for s, b, d in zip(first.states, bound, digits, strict=True)]
+    limits = limits if any(cells[1] for cells in limits) else [["", "", ""]]
+    heads = [["bound", str(len(bound)), right_nis(first)]] + [["", "", ""]] * (len(limits) - 1)
+    rows += [[head[0], *cells, *head[1:]] for head, cells in zip(heads, limits, strict=True)]
+    return ["filter", "state", "RMSE", "above\n[%]", "NEES", "NIS"], rows
+
+
+def _innovations_table(evaluations: Mapping[str, Evaluation], where: str) -> Table:
+    """What the innovations alone say of filters, a row each."""
+    first = next(iter(evaluations.values()))
+    rows = [
+        [name, unless_blank(found.log_likelihood, ".2f"), consistency_cells(found)[1], str(found.divergences)]
+        for name, found in evaluations.items()
+    ]
+    caption = f"log L: of a run, the more the better. Ideal: NIS {right_nis(first)}. div.: restarts."
+    return table(f"Innovations on {where}", ["filter", "log L", "NIS", "div."], rows, caption=caption)
+
+
+def above_bound(found: Evaluation, bound: np.ndarray) -> list[float]:
+    """By how many percent each state's RMSE is above the bound; NaN where there is none."""
+    return [100.0 * (rmse.value / limit - 1.0) for rmse, limit in zip(found.rmse, bound, strict=True)]
+
+
+def decimals(found: Evaluation) -> list[int]:
+    """Decimals of each state's RMSE: three where its scale, or without one its RMSE, is about one, four at 0.1."""
+    sizes = [s if isfinite(s) else rmse.value for s, rmse in zip(found.scale, found.rmse, strict=True)]
+    return [max(0, 3 - round(log10(size))) if 0 < size < inf else 3 for size in sizes]
+
+
+def consistency_cells(found: Evaluation) -> list[str]:
+    """Mean NEES and NIS; empty without a covariance or, of NEES, without truth."""
+    return [unless_blank(mean.value, ".3g") for mean in (found.nees, found.nis)]
+
+
+def right_nis(found: Evaluation) -> str:
+    """What the mean NIS should be: the mean number of channels that were there."""
+    return unless_blank(found.expected_nis, ".3g")
+
+
+def two_lines(quantity: Quantity) -> str:
+    """Symbol above unit, as columns of tables have it."""
+    return f"{quantity.symbol}\n[{quantity.unit}]" if quantity.unit else f"{quantity.symbol}\n"
+
+
+def limit_cell(bound: float, digits: int) -> str:
+    """A bound with so many decimals; empty where there is none."""
+    return unless_blank(bound, f".{digits}f")
+
+
+def _output(found: Evaluation, symbol: str) -> str:
+    """RMSE of a derived output; empty where the filter's model has none."""
+    rmse = found.output_rmse.get(symbol)
+    return "" if rmse is None else about(rmse, 3) if rmse.value >= 0.01 else f"{rmse.value:.3g}"
+
+
+def about(value: Interval, digits: int) -> str:
+    """A value with half of its 95 % interval; empty if there is no value."""
+    half_width = (value.high - value.low) / 2
+    return "" if isnan(value.value) else f"{value.value:.{digits}f} ±{half_width:.{digits}f}"
+
+
+def span(value: Interval, digits: int) -> str:
+    """A value with its 95 % interval in brackets."""
+    return f"{value.value:.{digits}f} [{value.low:.{digits}f}, {value.high:.{digits}f}]"
+
+
+def unless_blank(value: float, form: str) -> str:
+    """A value in a form; empty if there is no value."""
+    return "" if isnan(value) else format(value, form)

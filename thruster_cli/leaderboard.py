@@ -1,0 +1,182 @@
+"""What `thruster compare` says of filters on one scenario: tables, a sentence on who wins, or plain data."""
+
+from __future__ import annotations
+
+from math import isnan
+
+from rich.table import Table
+
+from thruster_cli.error_tables import (
+    MOST_COLUMNS,
+    about,
+    consistency_cells,
+    decimals,
+    limit_cell,
+    right_nis,
+    two_lines,
+    unless_blank,
+)
+from thruster_cli.output import table
+from tuning.evaluation.compare import Leaderboard, Row
+from tuning.evaluation.tuned import summary
+from tuning.evaluation.worth import without_truth
+
+VERDICTS = {"better": "better", "worse": "worse", "tie": "no different", "unknown": "not to be told"}
+
+
+def report(board: Leaderboard) -> list:
+    """Two tables of a scenario, one without truth, and a sentence on who wins."""
+    scenario, evaluation = board.scenario, board.rows[0].evaluation
+    title = f"{scenario.name}: {scenario.about}" if scenario.about else scenario.name
+    seeds = f"held-out seeds {board.seeds[0]} to {board.seeds[-1]}"
+    if not evaluation.has_truth:
+        shown = [_predictions(board, f"{title}\nInnovations on {seeds}")]
+        said = [without_truth(scenario.name), winners(board)]
+    else:
+        errors = _errors_across if 2 * len(evaluation.states) < MOST_COLUMNS else _errors_below
+        shown, said = [errors(board, f"{title}\nRMSE on {seeds}"), _against(board)], [winners(board)]
+    for one in shown:
+        one.columns[0].overflow = "fold"
+    return [*shown, *said]
+
+
+def winners(board: Leaderboard) -> str:
+    """Who is significantly better or worse than the first filter."""
+    first, *others = board.rows
+    if not others:
+        return f"On {board.scenario.name} there is nothing to compare {first.label} with."
+    said = []
+    for verdict, words in VERDICTS.items():
+        names = [row.label for row in others if row.verdict == verdict]
+        said += [f"{words}: {', '.join(names)}"] if names else []
+    by = "score" if first.evaluation.has_truth else "log-likelihood"
+    return f"On {board.scenario.name}, against {first.label} by the {by}: {'; '.join(said)}.\n"
+
+
+def _errors_across(board: Leaderboard, title: str) -> Table:
+    """RMSE of all states side by side, a row a filter."""
+    states, digits = board.rows[0].evaluation.states, decimals(board.rows[0].evaluation)
+    rows = []
+    for row in board.rows:
+        cells = []
+        for rmse, above, places in zip(row.evaluation.rmse, row.above_bound, digits, strict=True):
+            cells += [about(rmse, places), unless_blank(100.0 * above, "+.0f")]
+        rows.append([row.label, *cells, *map(_start_up, row.evaluation.start_up_rmse)])
+    limits = [
+        cell for bound, places in zip(board.bound, digits, strict=True) for cell in (limit_cell(bound, places), "")
+    ]
+    rows.append(["bound", *limits, *("" for _ in states)])
+    heads = [head for state in states for head in (two_lines(state), "above\n[%]")]
+    begun = [f"{'' if i else 'start-up'}\n{f'[{s.unit}]' if s.unit else ''}" for i, s in enumerate(states)]
+    return table(title, ["filter", *heads, *begun], rows, caption=_CAPTION)
+
+
+def _errors_below(board: Leaderboard, title: str) -> Table:
+    """RMSE of many states, a row a state of a filter."""
+    states, digits, rows = board.rows[0].evaluation.states, decimals(board.rows[0].evaluation), []
+    for row in board.rows:
+        first = row.label == board.rows[0].label
+        found = row.evaluation
+        columns = states, found.rmse, digits, row.above_bound, found.start_up_rmse, row.ratios
+        block = [
+            [state.short_label, about(rmse, places), unless_blank(100.0 * above, "+.0f"), _start_up(begun)]
+            + ["1" if first else about(ratio, 3)]
+            for state, rmse, places, above, begun, ratio in zip(*columns, strict=True)
+        ]
+        rows += [[row.label if i == 0 else "", *cells] for i, cells in enumerate(block)]
+    limits = zip(states, board.bound, digits, strict=True)
+    bounds = [[state.short_label, limit_cell(bound, places), "", "", ""] for state, bound, places in limits]
+    if any(cells[1] for cells in bounds):
+        rows += [["bound" if i == 0 else "", *cells] for i, cells in enumerate(bounds)]
+    heads = ["filter", "state", "RMSE", "above\n[%]", "start-up", f"over\n{board.rows[0].label}"]
+    return table(title, heads, rows, caption=_CAPTION)
+
+
+_CAPTION = "above: the bound. ±: half of the 95 % interval. start-up: the first 50 steps."
+
+
+def _start_up(rmse: float) -> str:
+    return unless_blank(rmse, ".3g")
+
+
+def _against(board: Leaderboard) -> Table:
+    """Errors over those of the first filter, consistency and cost; errors of few states only."""
+    states, first, n = board.rows[0].evaluation.states, board.rows[0].label, len(board.bound)
+    shown = states if 2 * n < MOST_COLUMNS else ()
+    rows = []
+    for row in board.rows:
+        ratios = [*row.ratios[: len(shown)], row.score_ratio]
+        cells = ["1" if row.label == first else about(ratio, 3) for ratio in ratios]
+        nees, nis = consistency_cells(row.evaluation)
+        if nees:
+            nees = f"{'~' if row.nees_is_median else ''}{row.nees:.3g}"
+        cost = [str(row.evaluation.divergences), f"{row.microseconds:.3g}"]
+        rows.append([row.label, *cells, nees, nis, *cost])
+    medians = any(row.nees_is_median for row in board.rows)
+    right = f"NEES {n}, NIS {right_nis(board.rows[0].evaluation)}{_median(n) if medians else ''}"
+    heads = ["filter", *(state.symbol for state in shown), "score", "NEES", "NIS", "div.", "us/step"]
+    caption = f"±: half of the 95 % interval. Ideal: {right}. div.: restarts."
+    return table(f"Over {first}, paired; consistency and cost", heads, rows, caption=caption)
+
+
+def _median(n: int) -> str:
+    """What the median of the NEES of n states should be, of chi-square's distribution."""
+    from scipy.special import chdtri
+
+    return f" (~ median NEES, {chdtri(n, 0.5):.2f})"
+
+
+def _predictions(board: Leaderboard, title: str) -> Table:
+    """How well filters predict the measurements, and their cost."""
+    first, rows = board.rows[0].label, []
+    for row in board.rows:
+        found = row.evaluation
+        gain = (
+            "0" if row.label == first and not isnan(row.likelihood_gain.value) else about(row.likelihood_gain, 2)
+        )
+        cells = [unless_blank(found.log_likelihood, ".2f"), gain, consistency_cells(found)[1]]
+        rows.append([row.label, *cells, str(found.divergences), f"{row.microseconds:.3g}"])
+    right = right_nis(board.rows[0].evaluation)
+    caption = f"log L: of a run. ±: half of the 95 % interval. Ideal: NIS {right}. div.: restarts."
+    return table(
+        title, ["filter", "log L", f"less that\nof {first}", "NIS", "div.", "us/step"], rows, caption=caption
+    )
+
+
+def as_json(boards: list[Leaderboard]) -> dict:
+    """The leaderboards as plain data."""
+    return {
+        "seeds": [boards[0].seeds[0], boards[0].seeds[-1] + 1],
+        "states": [state.short_label for state in boards[0].rows[0].evaluation.states],
+        "scenarios": {
+            board.scenario.name: {
+                "about": board.scenario.about,
+                "bound": board.bound,
+                "scale": board.scenario.scale,
+                **_own_states(board, boards[0]),
+                "filters": {row.label: _row_as_json(row) for row in board.rows},
+            }
+            for board in boards
+        },
+    }
+
+
+def _own_states(board: Leaderboard, first: Leaderboard) -> dict:
+    """The names of a scenario's states where they are not those of the first one."""
+    names, known = ([state.short_label for state in one.rows[0].evaluation.states] for one in (board, first))
+    return {} if names == known else {"states": names}
+
+
+def _row_as_json(row: Row) -> dict:
+    gain = {} if row.evaluation.has_truth else {"log_likelihood_less_first": row.likelihood_gain}
+    return {
+        "filter": row.filter_name,
+        **summary(row.evaluation),
+        "median_nees": row.evaluation.median_nees,
+        "above_bound": row.above_bound,
+        "microseconds_a_step": row.microseconds,
+        "rmse_over_first": row.ratios,
+        "score_over_first": row.score_ratio,
+        **gain,
+        "verdict": row.verdict,
+    }

@@ -1,0 +1,85 @@
+"""Q and R of a model as functions of the numbers that are tuned, with their slopes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from filters.registry import make_filter
+from plants.state_space import StateSpaceModel
+from tuning.problems.data import Data
+from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Problem
+from tuning.search.parameters import MeasurementVariance, ProcessVariance
+from tuning.search.space import Choice
+
+STEP = 1e-4  # in the logarithms, of the differences of Q and R
+
+
+def noise_family(choice: Choice, problem: Problem, parameters: Sequence[Parameter]) -> Callable:
+    """The function noise_at(values, data) that gives the arguments of `filters.likelihood`.
+
+    These are the model with the Q and R that follow from positive values (p,), the data's inputs and measurements,
+    and dQ, dR along the logarithm of each value: exact for variances, else central differences of the model's.
+
+    Args:
+        choice: of a Kalman filter, whose model is changed.
+        problem: whose model it is.
+        parameters: the numbers, p of them.
+
+    Raises:
+        ValueError: if a parameter is not on a logarithmic scale, or changes more of the model than Q and R.
+    """
+    model = make_filter(choice.name, problem.model(**choice.model)).kernel_model
+    if all(isinstance(one.place, ProcessVariance | MeasurementVariance) for one in parameters):
+        return _variances(model, parameters)
+    for one in parameters:
+        if not one.log:
+            raise ValueError(f"parameters of a gradient must be on logarithmic scales, but {one.name} is not")
+
+    def model_at(values: np.ndarray) -> StateSpaceModel:
+        changed = choice
+        for one, value in zip(parameters, values.tolist(), strict=True):
+            changed = one.set(changed, value)
+        return make_filter(changed.name, problem.model(**changed.model)).kernel_model
+
+    def noise_at(values: np.ndarray, data: Data):
+        pairs = [
+            [model_at(values * np.exp(sign * step)) for sign in (1, -1)] for step in STEP * np.eye(len(values))
+        ]
+        for one, (above, below) in zip(parameters, pairs, strict=True):
+            if not _differ_in_noise_alone(above, below):
+                raise ValueError(
+                    f"parameters of a gradient must change Q and R alone, but {one.name} changes more"
+                )
+        q, r = (
+            np.array([(getattr(above, name) - getattr(below, name)) / (2 * STEP) for above, below in pairs])
+            for name in ("process_noise_cov", "measurement_noise_cov")
+        )
+        return model_at(values), data.inputs, data.measurements, q, r
+
+    return noise_at
+
+
+def _variances(model: StateSpaceModel, parameters: Sequence[Parameter]) -> Callable:
+    n, m, count = model.n, model.m, len(parameters)
+    diagonal = np.append(np.diag(model.process_noise_cov), np.diag(model.measurement_noise_cov))
+    places = [one.place.index + n * isinstance(one.place, MeasurementVariance) for one in parameters]
+
+    def noise_at(values: np.ndarray, data: Data):
+        variances = diagonal.copy()
+        variances[places] = values
+        slopes = np.zeros((count, n + m, n + m))
+        slopes[range(count), places, places] = values
+        q, r = np.diag(variances[:n]), np.diag(variances[n:])
+        changed = model.replace(process_noise_cov=q, measurement_noise_cov=r)
+        return changed, data.inputs, data.measurements, slopes[:, :n, :n], slopes[:, n:, n:]
+
+    return noise_at
+
+
+def _differ_in_noise_alone(one: StateSpaceModel, other: StateSpaceModel) -> bool:
+    noise = {"process_noise_cov": one.process_noise_cov, "measurement_noise_cov": one.measurement_noise_cov}
+    changed = other.replace(**noise)
+    return changed.transition is one.transition and np.array_equal(changed.numbers, one.numbers)

@@ -1,0 +1,216 @@
+"""What problems of any plant share: the model that filters assume, the rule of thumb, and what is tuned."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from numerics.checks import at_least, positive, shown
+from plants.state_space import StateSpaceModel
+from tuning.problems.check import check_data
+from tuning.problems.data import FIRST_SCORED_STEP, Data
+from tuning.problems.parameter import Parameter
+from tuning.problems.problem import NOISE, Problem
+
+RANGE_SEEDS = range(8)  # whose runs tell each state's range, where the model does not
+RANGE_FRACTION = 0.01  # standard deviation of the rule of thumb's Q, as part of each state's range
+MOST_STEPS = 1_000_000
+PRIOR = "prior_cov_factor"
+
+
+class AssumedProblem(Problem):
+    """A problem whose filters assume a `StateSpaceModel`, or what a function makes of the problem's parameters.
+
+    Args:
+        assumed: the model, or a function of keyword arguments, the names of `parameters`, that makes it.
+        steps: length K of a run.
+        first_scored_step: where errors begin to count; below 50 the start-up counts, too, and a study then tunes
+            the scale of P_0.
+        scale: what errors of each state are measured in; found from the truth if None.
+        parameters: what a study tunes of the model, in place of the variances of Q and R.
+        untuned: arguments of the model before any tuning; by rule of thumb if None.
+        true: arguments of the model that knows the plant's own Q and R, if they are known.
+        dt: sample time [s], if there is one.
+        name: by which messages call it; that under which it is found takes its place.
+        about: one line for tables.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
+
+    def __init__(
+        self,
+        assumed: StateSpaceModel | Callable[..., StateSpaceModel],
+        *,
+        steps: int,
+        first_scored_step: int,
+        scale: Sequence[float] | None,
+        parameters: Sequence[Parameter] | None,
+        untuned: Mapping | None,
+        true: Mapping | None,
+        dt: float | None,
+        name: str,
+        about: str,
+    ):
+        """Check the arguments; see the class."""
+        self.name, self.about = name, about
+        self.steps = at_least("steps", steps, 2, MOST_STEPS)
+        self.first_scored_step = at_least("first_scored_step", first_scored_step, 0)
+        if self.first_scored_step >= self.steps:
+            raise ValueError(
+                f"first_scored_step must be below the number of steps, {self.steps}, but got {first_scored_step}"
+            )
+        self._assumed, self._scale = assumed, None if scale is None else tuple(map(float, scale))
+        self._parameters = _checked_parameters(parameters)
+        self._untuned, self._true = _mapping("untuned", untuned), _mapping("true", true)
+        self._dt = None if dt is None else positive("dt", dt)
+        if self._parameters is not None and isinstance(assumed, StateSpaceModel):
+            raise ValueError(f"a model with parameters must be a function of them, but got {shown(assumed)}")
+        self.model()
+
+    @abstractmethod
+    def make(self, seeds: tuple[int, ...]) -> Data:
+        """The data of some seeds, before they are checked."""
+
+    @abstractmethod
+    def found_scale(self) -> np.ndarray:
+        """What errors are measured in where no scale is given."""
+
+    def model(self, **changes) -> StateSpaceModel:
+        """The assumed model, but for the changes; see `Problem.model`."""
+        noise = {key: changes.pop(key) for key in (*NOISE, PRIOR) if key in changes}
+        given = {one.name: one.start for one in self._parameters or ()} | changes
+        model = self._assumed
+        if not isinstance(model, StateSpaceModel):
+            model = self._made(given)
+        elif given:
+            raise ValueError(
+                f"arguments of the model of problem {self.name} must be among {', '.join((*NOISE, PRIOR))}, "
+                f"but got {', '.join(given)}"
+            )
+        factor = noise.pop(PRIOR, None)
+        if factor is not None:
+            noise["prior_cov"] = positive(PRIOR, factor) * model.prior_cov
+        return model.replace(**noise) if noise else model
+
+    def data(self, seeds: Sequence[int]) -> Data:
+        """Inputs, measurements and, where it is known, truth for seeds."""
+        return _data(self, tuple(int(seed) for seed in seeds))
+
+    @cached_property
+    def scale(self) -> tuple[float, ...] | None:
+        """What errors of each state are measured in, as it is given or else found; None without truth."""
+        if self._scale is not None:
+            return self._scale
+        return None if self.data(RANGE_SEEDS).states is None else tuple(self.found_scale().tolist())
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...] | None:
+        """What a study tunes of the model; None for the variances of Q and R."""
+        return self._parameters
+
+    @property
+    def untuned(self) -> dict:
+        """Arguments of the model before any tuning: as given, the parameters' defaults, or by rule of thumb."""
+        if self._parameters is not None:
+            return {one.name: one.start for one in self._parameters} | (self._untuned or {})
+        return self._thumb | (self._untuned or {})
+
+    @property
+    def true(self) -> dict | None:
+        """Arguments of the model that knows the plant's own Q and R; None if they are unknown."""
+        return self._true
+
+    @property
+    def counts_start_up(self) -> bool:
+        """Whether the first steps count, in which P_0 is felt."""
+        return self.first_scored_step < FIRST_SCORED_STEP and bool(self.model().prior_cov.any())
+
+    @property
+    def dt(self) -> float | None:
+        """Sample time [s]."""
+        return self._dt
+
+    @property
+    def assumptions(self) -> tuple:
+        """All that is said of it beside where the data come from, for its digest."""
+        of_runs = self.steps, self.first_scored_step, self._scale, self._dt
+        return self._assumed, self._parameters, self._untuned, self._true, *of_runs
+
+    @cached_property
+    def _thumb(self) -> dict:
+        """R of the assumed model, which is the data sheet's, and Q = diag((1 % of each state's range)^2)."""
+        model = self.model()
+        deviations = np.sqrt(np.diag(model.process_noise_cov))
+        if model.state_low is not None and model.state_high is not None:
+            deviations = RANGE_FRACTION * (model.state_high - model.state_low)
+        elif (states := self.data(RANGE_SEEDS).states) is not None:
+            deviations[: states.shape[-1]] = RANGE_FRACTION * np.ptp(wrapped(states, model), axis=0)
+        variances = tuple(float(v) for v in deviations**2)
+        return {"process_noise_cov": variances, "measurement_noise_cov": as_argument(model.measurement_noise_cov)}
+
+    def _made(self, given: Mapping) -> StateSpaceModel:
+        try:
+            model = self._assumed(**given)
+        except Exception as error:
+            said = " ".join(f"{type(error).__name__}: {error}".split())
+            wanted = ", ".join(given) or "no arguments"
+            raise ValueError(
+                f"the model of problem {self.name} must be made of {wanted}, but raised {said}"
+            ) from error
+        if not isinstance(model, StateSpaceModel):
+            raise ValueError(
+                f"the model of problem {self.name} must be a StateSpaceModel, but it is {shown(model)}"
+            )
+        return model
+
+
+@lru_cache(maxsize=8)
+def _data(problem: AssumedProblem, seeds: tuple[int, ...]) -> Data:
+    data = problem.make(seeds)
+    check_data(data, problem.model(), problem.name)
+    return data.read_only()
+
+
+def wrapped(states: np.ndarray, model: StateSpaceModel) -> np.ndarray:
+    """True states of all runs and steps, one a row, angles within -pi and pi."""
+    rows = states.reshape(-1, states.shape[-1]).copy()
+    for i, state in enumerate(model.states[: rows.shape[1]]):
+        if state.angle:
+            rows[:, i] = np.arctan2(np.sin(rows[:, i]), np.cos(rows[:, i]))
+    return rows
+
+
+def as_argument(cov: np.ndarray):
+    """A covariance as a choice holds it: one variance, some, or the rows of a matrix."""
+    if np.count_nonzero(cov - np.diag(np.diag(cov))):
+        return tuple(map(tuple, cov.tolist()))
+    variances = tuple(np.diag(cov).tolist())
+    return variances[0] if len(variances) == 1 else variances
+
+
+def rows_argument(cov: np.ndarray):
+    """As `as_argument`, but of one state a tuple, too, as a choice holds Q."""
+    found = as_argument(cov)
+    return found if isinstance(found, tuple) else (found,)
+
+
+def _checked_parameters(given) -> tuple[Parameter, ...] | None:
+    if given is None:
+        return None
+    found = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
+    if not found or not all(isinstance(one, Parameter) for one in found):
+        raise ValueError(f"parameters must be some of tuning.problems.parameter.Parameter, but got {shown(given)}")
+    names = [one.name for one in found]
+    if len(set(names)) < len(names):
+        raise ValueError(f"names of parameters must differ from one another, but got {', '.join(names)}")
+    return found
+
+
+def _mapping(name: str, given) -> dict | None:
+    if given is not None and not isinstance(given, Mapping):
+        raise ValueError(f"{name} must map arguments of the model to values, but got {shown(given)}")
+    return None if given is None else dict(given)

@@ -1,0 +1,146 @@
+"""Whether a problem is one: its model and its data have to fit each other in shape, names and units."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from numerics.checks import shown
+from plants.quantities import Quantity
+from plants.state_space import StateSpaceModel
+from tuning.problems.data import Data
+from tuning.problems.problem import Problem
+
+SEEDS = (0, 1)  # of the data that a problem is tried with
+
+
+def checked_problem(problem, name: str | None = None) -> Problem:
+    """A problem as it is given, tried with the data of two seeds.
+
+    Args:
+        problem: what has to be one.
+        name: what messages call it, its own name if None.
+
+    Raises:
+        ValueError: in one line, for what is no `Problem`, or one whose model, data, names, units or scale are not
+            of the same shape, or whose numbers are not finite.
+    """
+    if not isinstance(problem, Problem):
+        raise ValueError(
+            f"a problem must be a tuning.problems.problem.Problem, but {shown(name)} is {shown(problem)}"
+        )
+    name = problem.name if name is None else name
+    model = problem.model(**problem.untuned)
+    if not isinstance(model, StateSpaceModel):
+        raise ValueError(f"the model of problem {name} must be a StateSpaceModel, but it is {shown(model)}")
+    data = problem.data(SEEDS)
+    check_data(data, model, name)
+    check_model(model, data, name)
+    _check_scale(problem, data, name)
+    return problem
+
+
+def check_data(data: Data, model: StateSpaceModel, name: str) -> None:
+    """Raise ValueError unless data have the shapes of a model, and no number is infinite, or NaN but as a gap."""
+    count, steps = len(data.seeds), np.shape(data.inputs)[1] if np.ndim(data.inputs) == 3 else 0
+    wanted = {
+        "inputs": (count, steps, model.inputs),
+        "measurements": (count, steps + 1, model.m),
+        "filter_keys": (count, 2),
+    }
+    parts = {entry: getattr(data, entry) for entry in wanted}
+    if data.states is not None:
+        known = np.shape(data.states)[-1] if np.ndim(data.states) == 3 else 0
+        parts["states"], wanted["states"] = data.states, (count, steps + 1, min(max(known, 1), model.n))
+    for entry, one in (data.outputs or {}).items():
+        parts[f"output {entry}"], wanted[f"output {entry}"] = one, (count, steps + 1)
+    for entry, one in parts.items():
+        if np.shape(one) != wanted[entry]:
+            raise ValueError(
+                f"{entry} of problem {name} must have the shape {wanted[entry]} of its model, "
+                f"but got {np.shape(one)}"
+            )
+        finite = np.isfinite(one) if entry != "measurements" else ~np.isinf(one)
+        if not finite.all():
+            rule = "finite or NaN" if entry == "measurements" else "finite"
+            run, step = np.argwhere(~finite)[0][:2]
+            raise ValueError(
+                f"{entry} of problem {name} must be {rule}, "
+                f"but those of seed {data.seeds[run]} are not from step {step} on"
+            )
+    if not 0 <= data.first_scored <= steps:
+        raise ValueError(
+            f"first_scored of problem {name} must be from 0 to the number of steps, {steps}, "
+            f"but got {data.first_scored}"
+        )
+
+
+def check_model(model: StateSpaceModel, data: Data, name: str) -> None:
+    """Raise ValueError unless f and h of a model are finite where the data begin."""
+    points = {"its prior mean": model.prior_mean}
+    if data.states is not None and data.states.shape[-1] == model.n:
+        points["the first true state"] = data.states[0, 0]
+    control = tuple(data.inputs[0, 0].tolist()) if data.steps else (0.0,) * model.inputs
+    for where, point in points.items():
+        x = tuple(point.tolist())
+        functions = {
+            "transition": lambda x=x: model.transition(x, control, model.constants),
+            "observe": lambda x=x: model.observe(x, model.constants),
+        }
+        for function, value in functions.items():
+            try:
+                with np.errstate(all="ignore"):
+                    result = np.asarray(value(), dtype=np.float64)
+            except ArithmeticError as error:
+                result = error
+            if isinstance(result, ArithmeticError) or not np.isfinite(result).all():
+                got = result if isinstance(result, ArithmeticError) else tuple(result.tolist())
+                raise ValueError(
+                    f"{function} of the model of problem {name} must be finite at {where}, but got {got}"
+                )
+
+
+def _check_scale(problem: Problem, data: Data, name: str) -> None:
+    if data.states is None or problem.scale is None:
+        if data.states is not None or problem.scale is not None:
+            raise ValueError(
+                f"problem {name} must have a scale where its data have a truth, and none where they have none"
+            )
+        return
+    scale = np.asarray(problem.scale, dtype=np.float64)
+    if scale.shape != data.states.shape[-1:] or not (scale > 0).all() or not np.isfinite(scale).any():
+        raise ValueError(
+            f"scale of problem {name} must be {data.states.shape[-1]} positive numbers, infinite for states that "
+            f"do not count, but got {shown(problem.scale)}"
+        )
+
+
+def check_quantities(
+    kind: str, ones: tuple[Quantity, ...], others: tuple[Quantity, ...], whose: str, other: str
+) -> None:
+    """Raise ValueError, with the first that differs, unless two vectors have the same symbols and units.
+
+    Args:
+        kind: of the vectors: "measurements".
+        ones: quantities of the first.
+        others: those of the second.
+        whose: what the first are of, for messages ...
+        other: ... and the second.
+    """
+    if len(ones) != len(others):
+        raise ValueError(
+            f"{kind} of {whose} and {other} must be as many, but got {_listed(ones)} and {_listed(others)}"
+        )
+    for one, another in zip(ones, others, strict=True):
+        if (one.symbol, one.unit, one.angle) != (another.symbol, another.unit, another.angle):
+            raise ValueError(
+                f"{kind} of {whose} and {other} must have the same symbols and units, "
+                f"but got {_said(one)} and {_said(another)}"
+            )
+
+
+def _listed(ones: tuple[Quantity, ...]) -> str:
+    return f"{len(ones)} ({', '.join(one.symbol for one in ones)})"
+
+
+def _said(one: Quantity) -> str:
+    return f"{one.symbol} [{one.unit}]" + (" (an angle)" if one.angle else "")

@@ -1,0 +1,52 @@
+"""`Data`: inputs and measurements of many runs and, where there is a truth, its states and outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+FIRST_SCORED_STEP = 50  # RMSE counts steps 50 to 500; start-up is reported apart
+
+
+class Data(NamedTuple):
+    """What a problem makes for B seeds and K steps; filters update with measurement k + 1 after input k."""
+
+    seeds: tuple[int, ...]
+    inputs: np.ndarray  # (B, K, p)
+    measurements: np.ndarray  # (B, K + 1, m), NaN where missing
+    filter_keys: np.ndarray  # (B, 2), of the filters' random numbers
+    first_scored: int = FIRST_SCORED_STEP  # the first step that counts
+    states: np.ndarray | None = None  # (B, K + 1, n), the first states of the model; None where there is no truth
+    outputs: Mapping[str, np.ndarray] | None = None  # (B, K + 1) each, by symbol; None where there is no truth
+
+    @property
+    def scored(self) -> slice:
+        """The steps that count."""
+        return slice(self.first_scored, None)
+
+    @property
+    def steps(self) -> int:
+        """Number K of steps."""
+        return self.inputs.shape[1]
+
+    def slice(self, first: int, last: int) -> Data:
+        """The runs from `first` up to, but without, `last`."""
+        part = slice(first, last)
+        return self._replace(
+            seeds=self.seeds[part],
+            inputs=self.inputs[part],
+            measurements=self.measurements[part],
+            filter_keys=self.filter_keys[part],
+            states=None if self.states is None else self.states[part],
+            outputs=None if self.outputs is None else {name: one[part] for name, one in self.outputs.items()},
+        )
+
+    def read_only(self) -> Data:
+        """The same data, whose arrays cannot be written to: those who share them see the same."""
+        arrays = [self.inputs, self.measurements, self.filter_keys, self.states, *(self.outputs or {}).values()]
+        for array in arrays:
+            if array is not None:
+                array.setflags(write=False)
+        return self

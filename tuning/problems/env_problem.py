@@ -1,0 +1,241 @@
+"""`EnvProblem`: any Gymnasium env under a policy, and what filters assume of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+
+from numerics.checks import covariance, covariance_root, shown
+from numerics.streams import MEASUREMENT, episode_keys, filter_keys, normal_block
+from plants.state_space import StateSpaceModel
+from tuning.problems.assumed import AssumedProblem, as_argument, wrapped
+from tuning.problems.data import FIRST_SCORED_STEP, Data
+from tuning.problems.digest import digest_of
+from tuning.problems.excitation import EXCITATIONS, Excitation
+from tuning.problems.parameter import Parameter
+
+SCALE_SEEDS = range(16)  # whose true states' spread is the scale, where none is given
+Policy = str | Mapping | Excitation | Callable
+
+
+class EnvProblem(AssumedProblem):
+    """Runs of a Gymnasium env under a policy, one episode a seed, with the true state kept.
+
+    The inputs are the policy's actions, clipped to the action space as `EstimateState` clips them. The policy sees
+    the env's observations, not a filter's: all filters meet the same runs.
+
+    Args:
+        env: an env; its id; or a function that makes it.
+        policy: "random" for actions that are uniform over the action space; a function of the observation, or an
+            object with `predict(observation)` as Stable-Baselines3 has it; or an excitation, or a mapping with its
+            name.
+        model: what filters assume: a `StateSpaceModel`, or a function of `parameters` that makes it.
+        steps: length K of a run; that of the env's spec if None. No episode may end before.
+        state_of: a function of the unwrapped env that gives its state (n,); `info["state"]` if None.
+        measure: a function of (observation, info) that gives the measurement (m,); if None
+            `info["measurement"]` (missing where `info["measurement_valid"]` is false), else the observation.
+        measurement_noise_cov: R of normal noise that is added to what the env shows; none if None.
+        has_truth: whether there is a state to compare with; without it only the innovations are judged.
+        scale: what errors of each state are measured in, infinite for states that do not count; if None the
+            standard deviation of each true state over 16 seeds: a score of 1 is then as good as knowing nothing.
+        env_arguments: of the id or the function.
+        first_scored_step, parameters, untuned, true, dt, name, about: those of `AssumedProblem`.
+
+    Raises:
+        ValueError: if env, policy and model do not fit, or an argument is off.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env | str | Callable[..., gym.Env],
+        policy: Policy,
+        model: StateSpaceModel | Callable[..., StateSpaceModel],
+        *,
+        steps: int | None = None,
+        state_of: Callable | None = None,
+        measure: Callable | None = None,
+        measurement_noise_cov=None,
+        has_truth: bool = True,
+        env_arguments: Mapping | None = None,
+        first_scored_step: int = FIRST_SCORED_STEP,
+        scale: Sequence[float] | None = None,
+        parameters: Sequence[Parameter] | None = None,
+        untuned: Mapping | None = None,
+        true: Mapping | None = None,
+        dt: float | None = None,
+        name: str = "an env",
+        about: str = "",
+    ):
+        """Make the env once, to see that all fits; see the class for the arguments."""
+        self.env, self.env_arguments = env, dict(env_arguments or {})
+        self.state_of, self.measure, self.has_truth = state_of, measure, bool(has_truth)
+        self.policy = _checked_policy(policy)
+        made = self._make_env(name)
+        try:
+            space = made.action_space
+            if not isinstance(space, gym.spaces.Box):
+                raise ValueError(f"the action space of problem {name} must be a Box, but got {space}")
+            if steps is None:
+                steps = getattr(made.spec, "max_episode_steps", None) or 500
+            if dt is None and isinstance(getattr(made.unwrapped, "dt", None), float):
+                dt = made.unwrapped.dt
+        finally:
+            self._close(made)
+        super().__init__(
+            model,
+            steps=steps,
+            first_scored_step=first_scored_step,
+            scale=scale,
+            parameters=parameters,
+            untuned=untuned,
+            true=true,
+            dt=dt,
+            name=name,
+            about=about,
+        )
+        assumed = self.model()
+        if int(np.prod(space.shape)) != assumed.inputs:
+            raise ValueError(
+                f"the action space of problem {name} must have the model's {assumed.inputs} entries, "
+                f"but got {space}"
+            )
+        self._noise = None
+        if measurement_noise_cov is not None:
+            self._noise = covariance("measurement_noise_cov", measurement_noise_cov, assumed.m)
+
+    @property
+    def digest(self) -> str:
+        """A hash of the env's id or function, the policy, the model and all else that makes the data."""
+        env = self.env
+        if isinstance(env, gym.Env):
+            env = env.spec.to_json() if env.spec is not None else type(env.unwrapped).__qualname__
+        shown_by = self.state_of, self.measure, self.has_truth, self._noise
+        return digest_of(env, self.env_arguments, self.policy, shown_by, self.assumptions)
+
+    @property
+    def untuned(self) -> dict:
+        """As of any problem, with the noise that is added to the measurements as the data sheet's R."""
+        if self._noise is None or self._parameters is not None:
+            return super().untuned
+        return super().untuned | {"measurement_noise_cov": as_argument(self._noise)} | (self._untuned or {})
+
+    def make(self, seeds: tuple[int, ...]) -> Data:
+        """Runs of the env, one a seed."""
+        keys, env = episode_keys(seeds), self._make_env(self.name)
+        given = None
+        if isinstance(self.policy, Excitation):
+            size = int(np.prod(env.action_space.shape))
+            given = self.policy.inputs(keys, self.steps, self._dt or 1.0, size)
+        try:
+            runs = [self._run(env, seed, None if given is None else given[i]) for i, seed in enumerate(seeds)]
+        finally:
+            self._close(env)
+        inputs, measurements, states = (np.array(part, dtype=np.float64) for part in zip(*runs, strict=True))
+        if self._noise is not None:
+            measurements = measurements + _noise(keys, measurements.shape, self._noise)
+        states = states if self.has_truth else None
+        outputs = None if states is None else self._outputs(states)
+        return Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, states, outputs)
+
+    def found_scale(self) -> np.ndarray:
+        """The standard deviation of each true state over the scored steps of 16 seeds."""
+        data = self.data(SCALE_SEEDS)
+        scale = wrapped(data.states[:, data.scored], self.model()).std(axis=0)
+        if not (scale > 0).all():
+            raise ValueError(
+                f"the scale of problem {self.name} must be given where a state does not move, "
+                f"but its true states have the standard deviations {scale.tolist()}"
+            )
+        return scale
+
+    def _outputs(self, states: np.ndarray) -> dict[str, np.ndarray]:
+        model = self.model()
+        whole = states.shape[-1] == model.n
+        return {symbol: model.output(symbol, states) for symbol in model.outputs} if whole else {}
+
+    def _run(self, env: gym.Env, seed: int, given: np.ndarray | None) -> tuple[list, list, list]:
+        """Inputs (K, p), measurements (K + 1, m) and states (K + 1, n) of one episode."""
+        space, inputs = env.action_space, []
+        observation, info = env.reset(seed=seed)
+        measurements, states = [self._measured(observation, info)], [self._state(env, info)]
+        choose = _chooser(self.policy, space, seed)
+        for k in range(self.steps):
+            action = choose(observation) if given is None else given[k]
+            action = np.asarray(action, dtype=space.dtype).reshape(space.shape)
+            inputs.append(np.clip(np.ravel(action).astype(np.float64), np.ravel(space.low), np.ravel(space.high)))
+            observation, _, terminated, _, info = env.step(action)
+            measurements.append(self._measured(observation, info))
+            states.append(self._state(env, info))
+            if terminated and k + 1 < self.steps:
+                raise ValueError(
+                    f"episodes of problem {self.name} must last {self.steps} steps, "
+                    f"but that of seed {seed} ended after {k + 1}"
+                )
+        return inputs, measurements, states
+
+    def _measured(self, observation, info: Mapping) -> np.ndarray:
+        if self.measure is not None:
+            return np.ravel(np.asarray(self.measure(observation, info), dtype=np.float64))
+        if "measurement" not in info:
+            return np.ravel(np.asarray(observation, dtype=np.float64))
+        z = np.ravel(np.asarray(info["measurement"], dtype=np.float64))
+        return np.where(np.ravel(info.get("measurement_valid", True)), z, np.nan)
+
+    def _state(self, env: gym.Env, info: Mapping) -> np.ndarray:
+        if not self.has_truth:
+            return np.zeros(0)
+        if self.state_of is None and "state" not in info:
+            raise ValueError(
+                f'the env of problem {self.name} must show its state in info["state"], or state_of must tell it, '
+                f"but info has {', '.join(info) or 'nothing'}"
+            )
+        state = info["state"] if self.state_of is None else self.state_of(env.unwrapped)
+        return np.ravel(np.asarray(state, dtype=np.float64)).copy()
+
+    def _make_env(self, name: str) -> gym.Env:
+        if isinstance(self.env, gym.Env):
+            return self.env
+        try:
+            make = partial(gym.make, self.env) if isinstance(self.env, str) else self.env
+            made = make(**self.env_arguments)
+        except (gym.error.Error, TypeError, ImportError) as error:
+            said = " ".join(f"{type(error).__name__}: {error}".split())
+            raise ValueError(f"the env of problem {name} must be one that can be made, but {said}") from error
+        if not isinstance(made, gym.Env):
+            raise ValueError(f"the env of problem {name} must be a gymnasium.Env, but it is {shown(made)}")
+        return made
+
+    def _close(self, env: gym.Env) -> None:
+        if env is not self.env:
+            env.close()
+
+
+def _checked_policy(given: Policy) -> str | Excitation | Callable:
+    if isinstance(given, Excitation | Mapping):
+        return EXCITATIONS.make([given])[0]
+    if given != "random" and not callable(given) and not hasattr(given, "predict"):
+        rule = "policy must be 'random', a function of the observation, what has predict, or an excitation"
+        raise ValueError(f"{rule}, but got {shown(given)}")
+    return given
+
+
+def _chooser(policy, space: gym.spaces.Box, seed: int) -> Callable:
+    """The policy as a function of the observation, for one episode."""
+    if isinstance(policy, str):
+        generator = np.random.default_rng([seed, 0])
+        low, high = (np.clip(end, -1e3, 1e3) for end in (space.low, space.high))
+        return lambda observation: generator.uniform(low, high)
+    if hasattr(policy, "predict"):
+        return lambda observation: policy.predict(observation)[0]
+    return policy
+
+
+def _noise(keys: np.ndarray, shape: tuple[int, ...], cov: np.ndarray) -> np.ndarray:
+    """Normal noise (B, K + 1, m) of a covariance, a function of each episode's key and the step alone."""
+    steps = np.arange(shape[1])[None, :]
+    blocks = [normal_block(b, steps, MEASUREMENT, keys[:, :1], keys[:, 1:]) for b in range(-(-shape[2] // 4))]
+    draws = np.stack([one for block in blocks for one in block][: shape[2]], axis=-1)
+    return draws @ covariance_root(cov).T

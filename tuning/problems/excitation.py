@@ -1,0 +1,143 @@
+"""Excitations: inputs that stir a plant so that a filter has something to tell, drawn anew for every seed.
+
+An excitation is a frozen dataclass of plain numbers, registered by name. What it gives is a function of the
+episodes' keys alone, so that all filters meet the same inputs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from numerics.checks import at_least, finite, positive, vector
+from numerics.streams import EXCITATION, uniform_block
+from plants.disturbances.effects import LONGEST, Effect, Registry, set_field
+from plants.disturbances.sensors import probability
+
+EXCITATIONS = Registry("excitation")
+Levels = float | tuple[float, ...]  # one for all inputs, or one each, in their units
+
+
+class Excitation(Effect):
+    """Base of all excitations; fields of the dataclass are the arguments."""
+
+    def inputs(self, keys: np.ndarray, steps: int, dt: float, count: int) -> np.ndarray:
+        """Inputs (B, steps, count) for keys (B, 2) and a sample time [s]."""
+        for name in ("amplitude", "offset"):
+            given = getattr(self, name, 0.0)
+            if isinstance(given, tuple) and len(given) != count:
+                raise ValueError(f"{name} must be one number, or one for each of {count} inputs, but got {given}")
+        each = [self.input(keys, steps, dt, number) for number in range(count)]
+        return np.stack(each, axis=2) if each else np.zeros((len(keys), steps, 0))
+
+    def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
+        """One of the inputs, (B, steps), by its number from 0."""
+        raise TypeError(f"{type(self).__name__} has no inputs: use one of its subclasses")
+
+
+@EXCITATIONS.register("steps")
+@dataclass(frozen=True)
+class Steps(Excitation):
+    """Levels uniform within plus and minus `amplitude`, each held for `hold` steps."""
+
+    amplitude: Levels = 12.0
+    hold: int = 25
+
+    def __post_init__(self):
+        """Check the arguments."""
+        set_field(self, "amplitude", levels("amplitude", self.amplitude))
+        set_field(self, "hold", at_least("hold", self.hold, 1, LONGEST))
+
+    def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
+        """One of the inputs, (B, steps)."""
+        return held_levels(keys, level_of(self.amplitude, number), self.hold, steps, number)
+
+
+@EXCITATIONS.register("prbs")
+@dataclass(frozen=True)
+class BinarySequence(Steps):
+    """Pseudo-random binary sequence: plus or minus `amplitude` with equal chance, drawn every `hold` steps."""
+
+    def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
+        """One of the inputs, (B, steps)."""
+        return level_of(self.amplitude, number) * np.sign(held_levels(keys, 1.0, self.hold, steps, number))
+
+
+@EXCITATIONS.register("multi-sine")
+@dataclass(frozen=True)
+class MultiSine(Excitation):
+    """Sines of equal `amplitude`, given `periods` [s] and drawn phases, added to `offset`."""
+
+    amplitude: Levels = 4.0
+    offset: Levels = 0.0
+    periods: tuple[float, ...] = (2.3, 0.9, 0.4)
+
+    def __post_init__(self):
+        """Check the arguments."""
+        set_field(self, "amplitude", levels("amplitude", self.amplitude))
+        set_field(self, "offset", levels("offset", self.offset, signed=True))
+        periods = tuple(positive("periods", period) for period in vector("periods", self.periods).tolist())
+        set_field(self, "periods", periods)
+
+    def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
+        """One of the inputs, (B, steps)."""
+        turns = dt * np.arange(steps)[:, None] / np.array(self.periods)  # (steps, sines)
+        phases, *_ = uniforms(keys, np.arange(len(self.periods)), number)
+        sines = np.sin(2.0 * math.pi * (turns[None] + phases[:, None, :]))
+        return level_of(self.offset, number) + level_of(self.amplitude, number) * sines.sum(axis=2)
+
+
+@EXCITATIONS.register("dwells")
+@dataclass(frozen=True)
+class Dwells(Excitation):
+    """Slow crossings of zero and dwells there.
+
+    Straight lines of `ramp` steps lead from level to level, where the input stays for `dwell` steps. A level is
+    zero with probability `zeros`, else uniform within plus and minus `amplitude`.
+    """
+
+    amplitude: Levels = 1.0
+    ramp: int = 50
+    dwell: int = 25
+    zeros: float = 0.5
+
+    def __post_init__(self):
+        """Check the arguments."""
+        set_field(self, "amplitude", levels("amplitude", self.amplitude))
+        set_field(self, "ramp", at_least("ramp", self.ramp, 1, LONGEST))
+        set_field(self, "dwell", at_least("dwell", self.dwell, 0, LONGEST))
+        set_field(self, "zeros", probability("zeros", self.zeros))
+
+    def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
+        """One of the inputs, (B, steps)."""
+        part, place = np.divmod(np.arange(steps), self.ramp + self.dwell)
+        share = uniforms(keys, np.arange(part[-1] + 2), number)
+        place = np.maximum(place - self.dwell, 0) / self.ramp
+        chance, level, *_ = share
+        amplitude = level_of(self.amplitude, number)
+        found = np.where(chance < self.zeros, 0.0, amplitude * (2.0 * level - 1.0))
+        return found[:, part] + place * (found[:, part + 1] - found[:, part])
+
+
+def held_levels(keys: np.ndarray, amplitude: float, hold: int, steps: int, number: int = 0) -> np.ndarray:
+    """Inputs (B, steps): levels uniform within plus and minus amplitude, each held for `hold` steps."""
+    u, *_ = uniforms(keys, np.arange(steps) // hold, number)
+    return amplitude * (2.0 * u - 1.0)
+
+
+def uniforms(keys: np.ndarray, draws: np.ndarray, number: int = 0) -> tuple[np.ndarray, ...]:
+    """Four uniform numbers in (0, 1), each (B, K), for keys (B, 2), the draws (K,) and the input's number."""
+    return uniform_block(number, draws[None, :], EXCITATION, keys[:, :1], keys[:, 1:])
+
+
+def levels(name: str, given, *, signed: bool = False) -> Levels:
+    """One level for all inputs, or one each; ValueError unless finite and, if not signed, not negative."""
+    check = finite if signed else (lambda name, value: positive(name, value, zero_allowed=True))
+    return tuple(check(name, one) for one in given) if isinstance(given, list | tuple) else check(name, given)
+
+
+def level_of(given: Levels, number: int) -> float:
+    """The level of one input."""
+    return given[number] if isinstance(given, tuple) else given

@@ -1,0 +1,181 @@
+"""`ModelProblem`: a plant that is a model itself, and what filters assume of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from filters.baselines.baselines import OpenLoop
+from filters.bounds import posterior_bound
+from filters.engine.batch import run
+from numerics.checks import shown
+from numerics.streams import episode_keys, filter_keys
+from plants.simulate import simulate
+from plants.state_space import StateSpaceModel
+from tuning.problems.assumed import AssumedProblem, as_argument, rows_argument
+from tuning.problems.check import check_quantities
+from tuning.problems.data import FIRST_SCORED_STEP, Data
+from tuning.problems.digest import digest_of
+from tuning.problems.excitation import EXCITATIONS, Excitation
+from tuning.problems.parameter import Parameter
+
+SCALE_SEEDS = range(200)  # whose inputs the scale is the bound of, where none is given
+Inputs = np.ndarray | Sequence | Mapping | Excitation | Callable | None
+
+
+class ModelProblem(AssumedProblem):
+    """Data drawn from one state-space model, for filters that assume the same or another one.
+
+    The states that both have by symbol are compared; they come first in the assumed model. Measurements and
+    inputs are the same in both.
+
+    Args:
+        truth: draws states and measurements, `plants.simulate.simulate` with the keys of the seeds.
+        assumed: what filters assume: a model, or a function of `parameters` that makes it; the truth if None.
+        inputs: an array (K, p) that all seeds share (or (K,) for one input); an excitation, or a mapping with its
+            name ("steps", "prbs", "multi-sine", "dwells"); or a function of (seeds, steps) that gives (B, K, p).
+            None for a model without inputs.
+        steps: length K of a run; that of the array if None, else 500.
+        scale: what errors of each state are measured in, infinite for states that do not count; if None the bound
+            of the true model over 200 seeds, or where Q is singular the RMSE of the open loop.
+        first_scored_step, parameters, untuned, true, dt, name, about: those of `AssumedProblem`. The rule of thumb
+            has R of the assumed model, and the true choice Q and R of the truth, if both have the same states.
+
+    Raises:
+        ValueError: if the two models do not fit, or an argument is off.
+    """
+
+    def __init__(
+        self,
+        truth: StateSpaceModel,
+        assumed: StateSpaceModel | Callable[..., StateSpaceModel] | None = None,
+        inputs: Inputs = None,
+        *,
+        steps: int | None = None,
+        first_scored_step: int = FIRST_SCORED_STEP,
+        scale: Sequence[float] | None = None,
+        parameters: Sequence[Parameter] | None = None,
+        untuned: Mapping | None = None,
+        true: Mapping | None = None,
+        dt: float | None = None,
+        name: str = "a pair of models",
+        about: str = "",
+    ):
+        """Check that the models fit; see the class for the arguments."""
+        if not isinstance(truth, StateSpaceModel):
+            raise ValueError(f"the truth of problem {name} must be a StateSpaceModel, but it is {shown(truth)}")
+        self.truth, self.inputs = truth, _checked_inputs(inputs, truth.inputs)
+        length = len(self.inputs) if isinstance(self.inputs, np.ndarray) else 500
+        super().__init__(
+            truth if assumed is None else assumed,
+            steps=length if steps is None else steps,
+            first_scored_step=first_scored_step,
+            scale=scale,
+            parameters=parameters,
+            untuned=untuned,
+            true=true,
+            dt=dt,
+            name=name,
+            about=about,
+        )
+        if isinstance(self.inputs, np.ndarray) and len(self.inputs) != self.steps:
+            raise ValueError(f"inputs must have a row for each of {self.steps} steps, but got {len(self.inputs)}")
+        model = self.model()
+        for kind in ("input_quantities", "measurements"):
+            pair = getattr(model, kind), getattr(truth, kind)
+            check_quantities(kind.replace("input_quantities", "inputs"), *pair, "the assumed model", "the truth")
+        self._shared = self._shared_states(model)
+        if self._true is None and self._shared == list(range(model.n)) and model.n == truth.n:
+            r = as_argument(truth.measurement_noise_cov)
+            self._true = {"process_noise_cov": rows_argument(truth.process_noise_cov), "measurement_noise_cov": r}
+
+    def _shared_states(self, model: StateSpaceModel) -> list[int]:
+        """Places in the truth of the assumed model's first states."""
+        places = {state.symbol: place for place, state in enumerate(self.truth.states)}
+        known = [state.symbol in places for state in model.states]
+        if not known[0] or any(later and not before for before, later in zip(known, known[1:], strict=False)):
+            symbols = ", ".join(places)
+            raise ValueError(
+                f"states of the assumed model must begin with some of the truth's, {symbols}, "
+                f"but got {', '.join(state.symbol for state in model.states)}"
+            )
+        shared = [places[state.symbol] for state in model.states if state.symbol in places]
+        pair = model.states[: len(shared)], tuple(self.truth.states[place] for place in shared)
+        check_quantities("states", *pair, "the assumed model", "the truth")
+        return shared
+
+    @property
+    def digest(self) -> str:
+        """A hash of both models, the inputs and all else that makes the data and the score."""
+        return digest_of(self.truth, self.inputs, self.assumptions)
+
+    def make(self, seeds: tuple[int, ...]) -> Data:
+        """Truth and measurements under the inputs of each seed."""
+        inputs = self._inputs_of(seeds)
+        truth = simulate(self.truth, episode_keys(seeds), inputs)
+        outputs = {
+            symbol: self.truth.output(symbol, truth.states)
+            for symbol in self.truth.outputs
+            if symbol in self.model().outputs
+        }
+        states = np.ascontiguousarray(truth.states[..., self._shared])
+        return Data(seeds, inputs, truth.measurements, filter_keys(seeds), self.first_scored_step, states, outputs)
+
+    def bound(self, data: Data) -> np.ndarray:
+        """The posterior Cramér-Rao bound of the truth on these inputs, (n,); NaN where its Q is singular."""
+        return self._bound(data, 100)
+
+    def found_scale(self) -> np.ndarray:
+        """The bound over 200 seeds or, where there is none, the RMSE of the open loop of the truth."""
+        data = self.data(SCALE_SEEDS)
+        scale = self._bound(data, 100)
+        if np.isnan(scale).any():
+            with np.errstate(all="ignore"):
+                estimates = run(OpenLoop(model=self.truth), data.filter_keys, data.inputs, data.measurements)
+                errors = (estimates.means[..., self._shared] - data.states)[:, data.scored]
+                scale = np.sqrt((errors**2).mean(axis=(0, 1)))
+        if not (np.isfinite(scale).all() and (scale > 0).all()):
+            raise ValueError(
+                f"the scale of problem {self.name} must be given where neither a bound nor the error of the open "
+                f"loop is finite and positive in every state, but the latter is {scale.tolist()}"
+            )
+        return scale
+
+    def _bound(self, data: Data, truths: int) -> np.ndarray:
+        if not np.linalg.eigvalsh(self.truth.process_noise_cov)[0] > 0:
+            return np.full(len(self._shared), np.nan)
+        variances = np.einsum("bkii->bki", posterior_bound(self.truth, data.inputs, truths=truths))
+        return np.sqrt(variances[:, data.scored, self._shared].mean(axis=(0, 1)))
+
+    def _inputs_of(self, seeds: tuple[int, ...]) -> np.ndarray:
+        shape = len(seeds), self.steps, self.truth.inputs
+        if self.inputs is None:
+            return np.zeros(shape)
+        if isinstance(self.inputs, Excitation):
+            return self.inputs.inputs(episode_keys(seeds), self.steps, self._dt or 1.0, self.truth.inputs)
+        if isinstance(self.inputs, np.ndarray):
+            return np.ascontiguousarray(np.broadcast_to(self.inputs, shape))
+        found = np.array(self.inputs(seeds, self.steps), dtype=np.float64)
+        if found.shape != shape:
+            raise ValueError(f"inputs of problem {self.name} must have the shape {shape}, but got {found.shape}")
+        return found
+
+
+def _checked_inputs(given: Inputs, count: int) -> np.ndarray | Excitation | Callable | None:
+    """The inputs as an array (K, p), an excitation or a function; ValueError for others."""
+    if given is None and count == 0:
+        return None
+    if isinstance(given, Excitation | Mapping):
+        return EXCITATIONS.make([given])[0]
+    if callable(given):
+        return given
+    try:
+        array = np.array(given, dtype=np.float64)
+        array = array[:, None] if array.ndim == 1 and count == 1 else array
+        if array.ndim != 2 or array.shape[1] != count or not len(array) or not np.isfinite(array).all():
+            raise ValueError
+    except (TypeError, ValueError):
+        rule = f"inputs must be finite numbers (K, {count}), an excitation, or a function of (seeds, steps)"
+        raise ValueError(f"{rule}, but got {shown(given)}") from None
+    return array

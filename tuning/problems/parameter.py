@@ -1,0 +1,115 @@
+"""`Parameter`: one number that a study may choose, with its range, its unit and where it stands in a choice."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+from optuna.distributions import FloatDistribution, IntDistribution
+
+from numerics.checks import at_least, finite, shown
+
+
+class Place(Protocol):
+    """Where a number stands in a `Choice`."""
+
+    is_variance: bool  # whether noise of k times the variance has k times the number
+
+    def get(self, choice) -> float | None:
+        """The number, None if the choice does not have it."""
+
+    def set(self, choice, value):
+        """The same choice with another number."""
+
+
+@dataclass(frozen=True)
+class Argument:
+    """An argument of the problem's model, by name."""
+
+    name: str
+    is_variance: bool = False
+
+    def get(self, choice) -> float | None:
+        """The argument's value in a choice; None if it has none."""
+        return choice.model.get(self.name)
+
+    def set(self, choice, value):
+        """The same choice with another value."""
+        return choice._replace(model={**choice.model, self.name: value})
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number that a study may choose.
+
+    Args:
+        name: of the trials' parameter; by default the argument of the problem's model, too.
+        low: the smallest value.
+        high: the largest one.
+        unit: of SI, for tables.
+        log: whether it is chosen on a logarithmic scale.
+        integer: whether it is a whole number.
+        default: before any tuning; the middle of the range on its scale if None.
+        place: where it stands in a choice; the argument of the model of the same name if None.
+
+    Raises:
+        ValueError: for a range that is none, or a default outside it.
+    """
+
+    name: str
+    low: float
+    high: float
+    unit: str = ""
+    log: bool = True
+    integer: bool = False
+    default: float | None = None
+    place: Place | None = None
+
+    def __post_init__(self):
+        """Check the range and fill in what is left out."""
+        if not isinstance(self.name, str) or not self.name or " " in self.name:
+            raise ValueError(f"a parameter must have a name without spaces, but got {shown(self.name)}")
+        check = at_least if self.integer else finite
+        arguments = (-(10**9),) if self.integer else ()
+        for end in ("low", "high"):
+            object.__setattr__(self, end, check(f"{end} of {self.name}", getattr(self, end), *arguments))
+        if not self.low < self.high or (self.log and self.low <= 0):
+            rule = "positive and below high" if self.log else "below high"
+            raise ValueError(f"low of {self.name} must be {rule}, but got {self.low:g} and {self.high:g}")
+        if self.default is not None:
+            default = check(f"default of {self.name}", self.default, *arguments)
+            if not self.low <= default <= self.high:
+                raise ValueError(
+                    f"default of {self.name} must be within {self.low:g} and {self.high:g}, but got {default:g}"
+                )
+            object.__setattr__(self, "default", default)
+        if self.place is None:
+            object.__setattr__(self, "place", Argument(self.name))
+
+    @property
+    def start(self) -> float | int:
+        """The value before any tuning."""
+        if self.default is not None:
+            return self.default
+        middle = math.sqrt(self.low * self.high) if self.log else (self.low + self.high) / 2
+        return round(middle) if self.integer else middle
+
+    @property
+    def distribution(self) -> FloatDistribution | IntDistribution:
+        """The range as Optuna takes it."""
+        kind = IntDistribution if self.integer else FloatDistribution
+        return kind(self.low, self.high, log=self.log)
+
+    def get(self, choice) -> float | None:
+        """The number in a choice, None if it does not have it."""
+        return self.place.get(choice)
+
+    def set(self, choice, value):
+        """The same choice with another number."""
+        return self.place.set(choice, value)
+
+
+def squared(unit: str) -> str:
+    """The unit of a variance: "(rad/s)^2" of "rad/s"; empty for a pure number."""
+    return f"({unit})^2" if set(unit) & set("/ ^*") else f"{unit}^2" if unit else ""

@@ -1,0 +1,111 @@
+"""`Problem`: what a study, an evaluation and a report need to know of a plant, and nothing else of it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from plants.quantities import Quantities
+from plants.state_space import StateSpaceModel
+from tuning.problems.data import Data
+from tuning.problems.parameter import Parameter
+
+NOISE = ("process_noise_cov", "measurement_noise_cov")  # arguments that every problem's model takes
+
+
+class Problem(ABC):
+    """A plant that makes data, and a family of models that filters may assume of it.
+
+    Scenarios of the thruster are problems, and so are a `ModelProblem` and an `EnvProblem`. What is listed first
+    each problem has to say; the rest has a default.
+
+    Attributes:
+        name: by which it is found: of a built-in one, FILE.toml, or "module:object".
+        about: one line for tables and help.
+        scale: what the score measures the error of each state in, (n,): positive, infinite for states that do not
+            count; None where the data have no truth. It depends on no filter and on no assumed model.
+    """
+
+    name: str
+    about: str
+    scale: Sequence[float] | None
+
+    @property
+    @abstractmethod
+    def digest(self) -> str:
+        """A short hash of all that the problem is, but for its name and what it is about."""
+
+    @abstractmethod
+    def model(self, **changes) -> StateSpaceModel:
+        """What a filter assumes: exactly what is believed of the plant, but for the changes.
+
+        Every problem takes `process_noise_cov`, `measurement_noise_cov` and `prior_cov_factor`, a factor on P_0;
+        and the names of its `parameters`.
+        """
+
+    @abstractmethod
+    def data(self, seeds: Sequence[int]) -> Data:
+        """Inputs, measurements and, where it is known, truth for seeds: the same for the same seeds."""
+
+    @property
+    @abstractmethod
+    def untuned(self) -> Mapping:
+        """Arguments of the model by rule of thumb: R from the data sheet, Q from 1 % of each state's range."""
+
+    @property
+    def true(self) -> Mapping | None:
+        """Arguments of the model of the filter that knows the plant's own Q and R; None if they are unknown."""
+        return None
+
+    def bound(self, data: Data) -> np.ndarray:
+        """Bound on the standard error of each state over scored steps, (n,); NaN where there is none."""
+        return np.full(self.model().n if self.scale is None else len(self.scale), np.nan)
+
+    @property
+    def quantities(self) -> Quantities:
+        """Names, symbols and units of states, inputs and measurements."""
+        return self.model().quantities
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...] | None:
+        """What a study tunes of the model; None for the variances of Q and R."""
+        return None
+
+    @property
+    def counts_start_up(self) -> bool:
+        """Whether the first steps count, in which P_0 is felt: a study then tunes its scale, too."""
+        return False
+
+    @property
+    def dt(self) -> float | None:
+        """Sample time [s]; None if it has none."""
+        return None
+
+    @property
+    def held(self) -> Mapping:
+        """Arguments by which `model` differs from the plant in every choice, for those who make it from an env."""
+        return {}
+
+    @property
+    def plant_data(self) -> Mapping | None:
+        """The plant as data, which tuned files keep for `check_tuned_for`, here and of envs; None without."""
+        return None
+
+    def check_tuned_for(self, plant: Mapping | None, file: str | Path) -> None:
+        """Raise ValueError if what a tuned file holds as `plant_data` is another plant; None is not compared."""
+        return None
+
+    def as_mapping(self) -> Mapping | None:
+        """All that makes the problem anew, as JSON can hold it; None if it is code, or known by its name."""
+        return None
+
+
+def scored_states(problem: Problem) -> tuple[str, ...]:
+    """Symbols of the states that count in the score; none without truth."""
+    if problem.scale is None:
+        return ()
+    states = problem.quantities.states[: len(problem.scale)]
+    return tuple(state.symbol for state, scale in zip(states, problem.scale, strict=True) if np.isfinite(scale))

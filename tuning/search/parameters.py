@@ -1,0 +1,222 @@
+"""The list of what a study may choose: each number's name, range, unit and place in a choice."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from filters.registry import filter_class, tunable_numbers
+from numerics.checks import covariance
+from tuning.problems.parameter import Argument, Parameter, Place, squared
+from tuning.problems.problem import NOISE, Problem
+from tuning.search.correlations import correlations_of, full_covariance
+
+Q, R = NOISE  # arguments of the model
+Q_FACTORS = (1e-5, 1e2)  # range of each process noise variance, as factors on the untuned one
+R_FACTORS = (1e-2, 1e3)  # range of each measurement noise variance, as factors on the sensor sheet's
+CORRELATIONS = (-0.99, 0.99)  # range of each correlation in a full Q
+PRIOR_FACTORS = (1e-4, 1e2)  # range of P_0, as a factor on the covariance of the plant's initial state
+
+
+@dataclass(frozen=True)
+class ProcessVariance:
+    """Variance of one state in Q, which keeps its correlations."""
+
+    index: int
+    is_variance: ClassVar[bool] = True
+
+    def get(self, choice) -> float | None:
+        """The variance in a choice."""
+        variances = _diagonal(choice.model.get(Q))
+        return None if variances is None else float(variances[self.index])
+
+    def set(self, choice, value):
+        """The choice with another variance."""
+        return _with_variance(choice, Q, self.index, value)
+
+
+@dataclass(frozen=True)
+class ProcessCorrelation:
+    """One of the numbers of `correlations.full_covariance` that make a full Q."""
+
+    index: int
+    is_variance: ClassVar[bool] = False
+
+    def get(self, choice) -> float:
+        """The correlation in a choice; zero where Q is diagonal."""
+        q = choice.model.get(Q)
+        return 0.0 if q is None or np.ndim(q) < 2 else correlations_of(np.asarray(q))[self.index]
+
+    def set(self, choice, value):
+        """The choice with another correlation, and so with a full Q."""
+        variances = _diagonal(choice.model[Q])
+        count = len(variances) * (len(variances) - 1) // 2
+        given = correlations_of(np.asarray(choice.model[Q])) if np.ndim(choice.model[Q]) == 2 else [0.0] * count
+        q = full_covariance(variances, _replaced(given, self.index, value))
+        return choice._replace(model={**choice.model, Q: tuple(map(tuple, q.tolist()))})
+
+
+@dataclass(frozen=True)
+class MeasurementVariance:
+    """Variance of one channel in R."""
+
+    index: int
+    is_variance: ClassVar[bool] = True
+
+    def get(self, choice) -> float | None:
+        """The variance in a choice."""
+        r = choice.model.get(R)
+        return r if r is None or np.ndim(r) == 0 else float(_diagonal(r)[self.index])
+
+    def set(self, choice, value):
+        """The choice with another variance."""
+        return _with_variance(choice, R, self.index, value)
+
+
+@dataclass(frozen=True)
+class FilterNumber:
+    """One of the filter's own numbers."""
+
+    name: str
+    is_variance: ClassVar[bool] = False
+
+    def get(self, choice) -> float | int | None:
+        """The number in a choice."""
+        return choice.numbers.get(self.name)
+
+    def set(self, choice, value):
+        """The choice with another number."""
+        return choice._replace(numbers={**choice.numbers, self.name: value})
+
+
+PRIOR = Argument("prior_cov_factor", is_variance=True)
+
+
+def _own(name: str, low: float, high: float, **options) -> Parameter:
+    return Parameter(name, low, high, **{"log": False, **options}, place=FilterNumber(name))
+
+
+# Ranges of numbers that filters have beside Q, R and N; they hold the defaults of all filters.
+OWN_NUMBERS = {
+    one.name: one
+    for one in (
+        _own("inflation", 1.0, 1.3),
+        _own("relaxation", 0.0, 0.9),
+        _own("iterations", 1, 8, integer=True),
+        _own("alpha", 0.05, 2.0, log=True),
+        _own("resampling_threshold", 0.1, 1.0),
+        _own("forgetting_factor", 0.9, 0.9999),
+        _own("prior_weight", 1.0, 100.0, log=True),
+        _own("degrees_of_freedom", 2.5, 50.0, log=True),
+        _own("time_constant", 0.2, 50.0, log=True, unit="steps"),
+    )
+}
+
+
+def filter_parameters(name: str, sizes: tuple[int, int] | None) -> list[Parameter]:
+    """What a study may choose of a filter itself: N from `sizes`, if it has an ensemble, and its own numbers."""
+    size = [] if sizes is None else [Parameter("N", *sizes, integer=True, place=FilterNumber("ensemble_size"))]
+    known = tunable_numbers(name)
+    return size + [one for number, one in OWN_NUMBERS.items() if number in known]
+
+
+def model_parameters(
+    problem: Problem, *, hold_r: bool = False, full_q: bool = False, prior: bool = False
+) -> list[Parameter]:
+    """What a study may choose of a problem's model: its own `parameters`, or the variances of Q and R.
+
+    Args:
+        problem: the ranges are made of its untuned values.
+        hold_r: leave R at the sensor's sheet.
+        full_q: choose the correlations of Q, too (`correlations.full_covariance`).
+        prior: choose the scale of P_0, too.
+    """
+    if problem.parameters is not None:
+        return list(problem.parameters)
+    untuned, quantities, found = problem.untuned, problem.quantities, []
+    variances, count = _diagonal(untuned[Q]), len(quantities.states)
+    scales = [*(() if problem.scale is None else problem.scale), *[0.0] * count]
+    for i, (variance, state) in enumerate(zip(variances, quantities.states, strict=True)):
+        if variance > 0:  # else the state has no noise, and no range of it
+            # Where the input hardly moves a state, noise may move it more.
+            scale = scales[i] if np.isfinite(scales[i]) else 0.0
+            low, high = Q_FACTORS[0] * variance, Q_FACTORS[1] * max(variance, scale**2)
+            found.append(Parameter(f"Q{i + 1}{i + 1}", low, high, squared(state.unit), place=ProcessVariance(i)))
+    if full_q:
+        names = correlation_names(count)
+        found += [
+            Parameter(name, *CORRELATIONS, log=False, place=ProcessCorrelation(k)) for k, name in enumerate(names)
+        ]
+    if not hold_r:
+        channels = quantities.measurements
+        for i, (variance, channel) in enumerate(zip(_diagonal(untuned[R]), channels, strict=True)):
+            low, high = (variance * factor for factor in R_FACTORS)
+            place = MeasurementVariance(i)
+            found.append(Parameter(r_name(i, len(channels)), low, high, squared(channel.unit), place=place))
+    if prior:
+        found.append(Parameter("P0", *PRIOR_FACTORS, place=PRIOR))
+    return found
+
+
+def places_in(choice) -> dict[str, Place]:
+    """Where the numbers of a choice's model stand, by the names of their parameters.
+
+    Correlations and P0 are among them where the choice has a full Q and a factor on P_0.
+    """
+    found: dict[str, Place] = {}
+    if not filter_class(choice.name).has_covariance:
+        return found
+    q, r = choice.model.get(Q), choice.model.get(R)
+    found |= {name: Argument(name) for name in choice.model if name not in (Q, R, PRIOR.name)}
+    if q is not None:
+        found |= {f"Q{i + 1}{i + 1}": ProcessVariance(i) for i in range(len(q))}
+        if np.ndim(q) == 2:
+            found |= {name: ProcessCorrelation(k) for k, name in enumerate(correlation_names(len(q)))}
+    if r is not None:
+        count = np.size(_diagonal(r))
+        found |= {r_name(i, count): MeasurementVariance(i) for i in range(count)}
+    if PRIOR.name in choice.model:
+        found["P0"] = PRIOR
+    return found
+
+
+def correlation_names(states: int) -> list[str]:
+    """Trial parameters that are correlations of Q, in the order of `correlations.full_covariance`."""
+    between = "" if states < 10 else "_"
+    return [f"correlation_{j}{between}{i}" for i in range(2, states + 1) for j in range(1, i)]
+
+
+def r_name(index: int, channels: int) -> str:
+    """The trial parameter that is a channel's variance in R: "R" of a single channel, else "R11", "R22", ..."""
+    return "R" if channels == 1 else f"R{index + 1}{index + 1}"
+
+
+def _diagonal(cov) -> tuple | None:
+    """Variances of a covariance as a choice has it: one variance, some, or the rows of a matrix."""
+    if cov is None or np.ndim(cov) == 1:
+        return cov if cov is None else tuple(cov)
+    return (cov,) if np.ndim(cov) == 0 else tuple(np.diag(covariance("a covariance", cov, len(cov))).tolist())
+
+
+def _with_variance(choice, argument: str, index: int, value: float):
+    """A choice with another variance in Q or R, whose correlations stay."""
+    before = choice.model[argument]
+    if np.ndim(before) == 0:
+        after = value
+    elif np.ndim(before) == 1:
+        after = _replaced(tuple(before), index, value)
+    else:
+        cov = np.array(before)
+        factor = np.sqrt(value / cov[index, index])
+        cov[index] *= factor
+        cov[:, index] *= factor
+        cov[index, index] = value
+        after = tuple(map(tuple, cov.tolist()))
+    return choice._replace(model={**choice.model, argument: after})
+
+
+def _replaced(values: Sequence[float], index: int, value: float) -> tuple[float, ...]:
+    return (*values[:index], value, *values[index + 1 :])
