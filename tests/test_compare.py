@@ -173,7 +173,7 @@ def test_the_command_takes_tuned_files(thruster, tmp_path):
     ("arguments", "line"),
     [
         (("--filter", "none"), "filter must be one of kf, "),
-        (("--scenario", "none"), "scenario must be one of nominal, "),
+        (("--scenario", "none"), "problem must be one of nominal, "),
         (("--scenario", "no.toml"), "a scenario file must be readable, but no.toml is not"),
         (("--knows", "all"), "knows must be one of true, scaled, untuned, but got 'all'"),
         (("--seeds", "1"), "held-out seeds must be a whole number of at least 2, but got 1"),
