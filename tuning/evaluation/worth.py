@@ -61,5 +61,5 @@ def scaling_sentence(proof: Comparison) -> str:
     oracle = f"; the {ORACLE} has the plant's own Q and R" if proof.true is not None else ""
     return (
         f"The {SCALED} is the {RULE} with its Q times {found.factor:.4g}, which brings the mean NIS on the "
-        f"training runs to {found.nis * proof.tuned.channels:.2f}{oracle}."
+        f"training runs to {found.nis * proof.tuned.expected_nis:.2f}{oracle}."
     )
