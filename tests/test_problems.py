@@ -221,6 +221,15 @@ BAD = {
         lambda: checked_problem(ModelProblem(line(), line(nowhere_else), steps=60, scale=(1.0,))),
         r"transition of the model of problem .* must be finite at the first true state, but got \(nan,\)",
     ),
+    "own names": (
+        lambda: checked_problem(Stranger(wide_model(), None, np.ones((60, 2)), scale=(1.0, 1.0, 1.0))),
+        r"states of problem .* and its model must have the same symbols and units, but got a \[\] and x_1",
+    ),
+    "study": (lambda: Plan("ekf", (3,)).checked(), "a study must be of .*problem.Problem, but got 3"),
+    "mixed study": (
+        lambda: Plan("ekf", (thruster(), pair())).checked(),
+        "problems of one study must have as many states and .* but nominal and a pair of models have",
+    ),
     "argument": (
         lambda: pair().model(sigma=3.0),
         "arguments of the model of problem .* must be among process_noise_cov, .*, but got sigma",
@@ -273,6 +282,12 @@ def car():
         transition=lambda x, u, c: x, observe=lambda x, c: x, process_noise_cov=[1.0, 1.0],
         measurement_noise_cov=[1.0, 1.0], prior_mean=[0.0, 0.0], prior_cov=[1.0, 1.0],
     )  # fmt: skip
+
+
+class Stranger(ModelProblem):
+    """One that says of itself what its model does not."""
+
+    quantities = wide_model(states=["a", "b", "c"]).quantities
 
 
 @pytest.mark.parametrize(("make", "line"), BAD.values(), ids=list(BAD))

@@ -21,7 +21,7 @@ from plants.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
 from tuning.problems.find import built_in, find_given, find_problem, problem_from_mapping
-from tuning.problems.problem import NOISE, Problem
+from tuning.problems.problem import NOISE, PRIOR, Problem
 from tuning.search.objectives import NIS_BAND
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
@@ -163,6 +163,12 @@ def read_tuned(path: str | Path, problems: Sequence[Problem] = ()) -> tuple[Choi
             f"the model of a tuned file must be that of its scenario, {found.held.get(FACTORS, {})}, "
             f"but {path} has {shown(given)}"
         )
+    known = {*NOISE, PRIOR, *found.held, *(one.name for one in found.parameters or ())}
+    if set(given) - known:
+        raise ValueError(
+            f"arguments of the model in a tuned file must be among {', '.join(sorted(known))}, "
+            f"but {path} has {', '.join(sorted(set(given) - known))}"
+        )
     return _choice(content, found), found, seed
 
 
@@ -189,8 +195,8 @@ def _choice(content: Mapping, problem: Problem) -> Choice:
             name: _noise(name, entry["model"][name], size, positive_definite=name == "measurement_noise_cov")
             for name, size in zip(NOISE, (model.n, model.m), strict=True)
         }
-    if "prior_cov_factor" in entry["model"]:
-        chosen["prior_cov_factor"] = positive("prior_cov_factor", entry["model"]["prior_cov_factor"])
+    if PRIOR in entry["model"]:
+        chosen[PRIOR] = positive(PRIOR, entry["model"][PRIOR])
     choice = Choice(entry["name"], chosen, dict(entry["numbers"]))
     choice.filter(problem)  # a clear error for numbers that the filter does not take
     return choice

@@ -13,12 +13,11 @@ from plants.state_space import StateSpaceModel
 from tuning.problems.check import check_data
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.parameter import Parameter
-from tuning.problems.problem import NOISE, Problem
+from tuning.problems.problem import NOISE, PRIOR, Problem
 
 RANGE_SEEDS = range(8)  # whose runs tell each state's range, where the model does not
 RANGE_FRACTION = 0.01  # standard deviation of the rule of thumb's Q, as part of each state's range
 MOST_STEPS = 1_000_000
-PRIOR = "prior_cov_factor"
 
 
 class AssumedProblem(Problem):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from numerics.checks import shown
-from plants.quantities import Quantity
+from plants.quantities import Quantities, Quantity
 from plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
@@ -32,6 +32,8 @@ def checked_problem(problem, name: str | None = None) -> Problem:
     model = problem.model(**problem.untuned)
     if not isinstance(model, StateSpaceModel):
         raise ValueError(f"the model of problem {name} must be a StateSpaceModel, but it is {shown(model)}")
+    for kind, ones, others in zip(Quantities._fields, problem.quantities, model.quantities, strict=True):
+        check_quantities(kind.removesuffix("_quantities"), ones, others, f"problem {name}", "its model")
     data = problem.data(SEEDS)
     check_data(data, model, name)
     check_model(model, data, name)

@@ -8,7 +8,7 @@ import optuna
 from optuna.distributions import BaseDistribution
 
 from filters.registry import filter_class
-from numerics.checks import positive
+from numerics.checks import positive, shown
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
@@ -74,6 +74,7 @@ class Plan(NamedTuple):
             raise ValueError(f"filter must be one that has something to tune, but got {self.filter!r}")
         if not self.scenarios:
             raise ValueError("a study must have at least one scenario, but got none")
+        self._check_problems()
         if not 1 <= len(self.objectives) <= 2 or len(set(self.objectives)) < len(self.objectives):
             raise ValueError(f"objectives must be one, or two different ones, but got {list(self.objectives)}")
         for name, objective in zip(self.objectives, self.found_objectives(), strict=True):
@@ -99,6 +100,20 @@ class Plan(NamedTuple):
                 "enkf of 30 members 0.7, a pf of 1000 particles 20) or the objective 'cost', but got neither"
             )
         return self
+
+    def _check_problems(self) -> None:
+        """Raise ValueError unless all problems are such, and one choice of numbers has a meaning for each."""
+        shapes = []
+        for one in self.scenarios:
+            if not isinstance(one, Problem):
+                raise ValueError(f"a study must be of tuning.problems.problem.Problem, but got {shown(one)}")
+            sizes = len(one.quantities.states), len(one.quantities.measurements)
+            shapes.append((sizes, [parameter.name for parameter in one.parameters or ()]))
+            if shapes[-1] != shapes[0]:
+                raise ValueError(
+                    "problems of one study must have as many states and measurements, and the same parameters, "
+                    f"but {self.scenarios[0].name} and {one.name} have not"
+                )
 
     def found_objectives(self) -> list[Objective]:
         """The objectives themselves."""
