@@ -27,20 +27,21 @@ FASTMATH = frozenset({"contract", "reassoc", "arcp", "nsz", "afn"})
 
 _packages: dict[str, tuple[str, ...]] = {}  # see `may_be_inlined`
 
-_waiting: list[Callable] = []
+_waiting: list[tuple[Callable, bool]] = []
 _marked: set[Callable] = set()
 _interpreting = False
 
 
-def inlined(function: Callable) -> Callable:
+def inlined(function: Callable, *, into_callers: bool = True) -> Callable:
     """Mark a plain function so that compiled functions may call it; it is inlined into all of them.
 
     So are functions that it calls by name. Inside a loop over members or copies this makes vector code, which
-    no call may interrupt.
+    no call may interrupt. With into_callers=False a function is compiled once and called: what loops over large
+    arrays gains nothing by being inlined, and is compiled anew in each caller otherwise.
     """
     if function not in _marked:
         _marked.add(function)
-        _waiting.append(function)
+        _waiting.append((function, into_callers))
         for callee in _callees(function):  # a user's model may call helpers of its own
             inlined(callee)
     return function
@@ -85,8 +86,8 @@ def compiled(function: Callable) -> Callable:
     from numba.extending import register_jitable
 
     while _waiting:
-        # By itself LLVM inlines small functions only.
-        register_jitable(forceinline=True)(_waiting.pop())
+        function_called, into_callers = _waiting.pop()
+        register_jitable(forceinline=into_callers)(function_called)  # by itself LLVM inlines small ones only
     return keep_code(numba.njit(nogil=True, fastmath=set(FASTMATH), error_model="numpy")(function))
 
 

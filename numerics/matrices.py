@@ -1,7 +1,7 @@
-"""Small dense matrices as tuples of rows, with every operation written out for its size.
+"""Dense matrices as tuples of rows, with every operation written out for its size, and large ones as arrays.
 
-Compiled, they stay in registers and cost nanoseconds where a library call costs hundreds. Meant for models of
-up to about ten states: the written-out source grows with the cube of the size.
+Compiled, small ones stay in registers and cost nanoseconds where a library call costs hundreds. The source of large
+ones, which would grow with the cube of the size, has loops instead (`numerics.sources`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ import math
 from collections.abc import Callable
 from functools import cache
 
-from numerics.tuples import matrix_of, tuple_of, written_out
+from numerics import arrays
+from numerics.sources import Local, Source, is_array
 
 RESOLUTION = 1e-15  # of the difference of two float64, relative to them
 
@@ -18,75 +19,86 @@ RESOLUTION = 1e-15  # of the difference of two float64, relative to them
 @cache
 def multiplier(rows: int, inner: int, columns: int) -> Callable:
     """Return `multiply(a, b)`: a b for shapes (rows, inner) and (inner, columns)."""
-    return written_out(
-        "multiply",
-        "a, b",
-        matrix_of(rows, columns, lambda i, j: " + ".join(f"a[{i}][{k}] * b[{k}][{j}]" for k in range(inner))),
-    )
+    shapes = {"result": (rows, columns), "a": (rows, inner), "b": (inner, columns)}
+    if all(is_array(*shape) for shape in shapes.values()):
+        return arrays.product
+    source = Source("multiply", "a, b", **shapes, work=rows * inner * columns)
+    entry = lambda i, j: source.sum(lambda k: f"a[{i}][{k}] * b[{k}][{j}]", inner)  # noqa: E731
+    return source.function(source.matrix(rows, columns, entry))
 
 
 @cache
 def transposed_multiplier(rows: int, inner: int, columns: int) -> Callable:
     """Return `multiply(a, b)`: a b' for shapes (rows, inner) and (columns, inner)."""
-    return written_out(
-        "multiply",
-        "a, b",
-        matrix_of(rows, columns, lambda i, j: " + ".join(f"a[{i}][{k}] * b[{j}][{k}]" for k in range(inner))),
-    )
+    shapes = {"result": (rows, columns), "a": (rows, inner), "b": (columns, inner)}
+    if all(is_array(*shape) for shape in shapes.values()):
+        return arrays.product_of_rows
+    source = Source("multiply", "a, b", **shapes, work=rows * inner * columns)
+    entry = lambda i, j: source.sum(lambda k: f"a[{i}][{k}] * b[{j}][{k}]", inner)  # noqa: E731
+    return source.function(source.matrix(rows, columns, entry))
 
 
 @cache
 def vector_multiplier(rows: int, inner: int) -> Callable:
     """Return `multiply(a, x)`: the tuple a x for shapes (rows, inner) and (inner,)."""
-    return written_out(
-        "multiply",
-        "a, x",
-        tuple_of(" + ".join(f"a[{i}][{k}] * x[{k}]" for k in range(inner)) for i in range(rows)),
-    )
+    source = Source("multiply", "a, x", result=(rows,), a=(rows, inner), x=(inner,), work=rows * inner)
+    return source.function(source.vector(rows, lambda i: source.sum(lambda k: f"a[{i}][{k}] * x[{k}]", inner)))
 
 
 @cache
 def quadratic_form(rows: int, columns: int) -> Callable:
     """Return `form(a, w)`: a' w a for a of shape (rows, columns) and w of shape (rows, rows)."""
+    shapes = {"result": (columns, columns), "a": (rows, columns), "w": (rows, rows)}
+    source = Source("form", "a, w", **shapes, work=rows * rows * columns)
+    if source.loops:
+        half = source.local("half", rows, columns)  # w a
+        for p in source.range(rows):
+            for j in source.range(columns):
+                source.line(f"{half[p, j]} = {source.sum(lambda q: f'w[{p}][{q}] * a[{q}][{j}]', rows)}")  # noqa: B023
+        entry = lambda i, j: source.sum(lambda p: f"a[{p}][{i}] * {half[p, j]}", rows)  # noqa: E731
+        return source.function(source.matrix(columns, columns, entry))
 
     def entry(i, j):
         return " + ".join(f"a[{p}][{i}] * w[{p}][{q}] * a[{q}][{j}]" for p in range(rows) for q in range(rows))
 
-    return written_out("form", "a, w", matrix_of(columns, columns, entry))
+    return source.function(source.matrix(columns, columns, entry))
 
 
 @cache
 def symmetric_sum(size: int) -> Callable:
     """Return `add(a, b)`: the symmetric part of a + b, exactly symmetric."""
-    places = [(i, j) for i in range(size) for j in range(i + 1)]
-    lines = (f"s{i}_{j} = 0.5 * (a[{i}][{j}] + a[{j}][{i}] + b[{i}][{j}] + b[{j}][{i}])" for i, j in places)
-    return written_out("add", "a, b", *lines, matrix_of(size, size, lambda i, j: f"s{max(i, j)}_{min(i, j)}"))
+    shape = size, size
+    source = Source("add", "a, b", result=shape, a=shape, b=shape)
+    entry = lambda i, j: f"0.5 * (a[{i}][{j}] + a[{j}][{i}] + b[{i}][{j}] + b[{j}][{i}])"  # noqa: E731
+    return source.function(source.symmetric("s", size, entry))
 
 
 @cache
 def identity_less(size: int) -> Callable:
     """Return `subtract(a)`: I - a."""
-    return written_out(
-        "subtract", "a", matrix_of(size, size, lambda i, j: f"{1.0 if i == j else 0.0} - a[{i}][{j}]")
-    )
+    source = Source("subtract", "a", result=(size, size), a=(size, size))
+    entry = lambda i, j: f"{source.if_same(i, j, '1.0', '0.0')} - a[{i}][{j}]"  # noqa: E731
+    return source.function(source.matrix(size, size, entry))
 
 
 @cache
 def innovation(size: int, first: int = 0) -> Callable:
     """Return `subtract(z, y)`: z - y[first:], zero in channels that are NaN in z."""
-    entries = (f"z[{i}] - y[{first + i}] if z[{i}] == z[{i}] else 0.0" for i in range(size))
-    return written_out("subtract", "z, y", tuple_of(entries))
+    source = Source("subtract", "z, y", result=(size,), z=(size,), y=(first + size,))
+    entry = lambda i: f"z[{i}] - y[{first + i}] if z[{i}] == z[{i}] else 0.0"  # noqa: E731
+    return source.function(source.vector(size, entry))
 
 
 @cache
 def masked(size: int) -> Callable:
     """Return `mask(r, z)`: the covariance r without its correlations to channels that are NaN in z."""
+    source = Source("mask", "r, z", result=(size, size), r=(size, size), z=(size,))
 
     def entry(i, j):
         here = f"r[{i}][{j}]"
-        return here if i == j else f"({here} if z[{i}] == z[{i}] and z[{j}] == z[{j}] else 0.0)"
+        return source.if_same(i, j, here, f"({here} if z[{i}] == z[{i}] and z[{j}] == z[{j}] else 0.0)")
 
-    return written_out("mask", "r, z", matrix_of(size, size, entry))
+    return source.function(source.matrix(size, size, entry))
 
 
 def pivoted_factor(size: int, diagonal: str, **names: float) -> Callable:
@@ -100,17 +112,15 @@ def pivoted_factor(size: int, diagonal: str, **names: float) -> Callable:
         diagonal: source of l_ii, in which `{d}` stands for d_i and `{a}` for a_ii.
         names: other names that it uses, with their values.
     """
-    lines = []
-    for i in range(size):
-        for j in range(i + 1):
-            rest = "".join(f" - l{i}_{k} * l{j}_{k}" for k in range(j))
-            if i == j:
-                lines.append(f"d{i} = a[{i}][{i}]{rest}")
-                lines.append(f"l{i}_{i} = " + diagonal.format(d=f"d{i}", a=f"a[{i}][{i}]"))
-            else:
-                lines.append(f"l{i}_{j} = (a[{i}][{j}]{rest}) / l{j}_{j}")
-    result = matrix_of(size, size, lambda i, j: f"l{i}_{j}" if j <= i else "0.0")
-    return written_out("factor", "a", *lines, result, **names)
+    source = Source("factor", "a", result=(size, size), a=(size, size), work=size**3 // 6)
+    l, d = source.local("l", size, size), source.local("d", size)  # noqa: E741
+    for i in source.range(size):
+        for j in source.range(i):
+            rest = source.less(f"a[{i}][{j}]", lambda k: f"{l[i, k]} * {l[j, k]}", j)  # noqa: B023
+            source.line(f"{l[i, j]} = ({rest}) / {l[j, j]}")
+        source.line(f"{d[i]} = " + source.less(f"a[{i}][{i}]", lambda k: f"{l[i, k]} * {l[i, k]}", i))  # noqa: B023
+        source.line(f"{l[i, i]} = " + diagonal.format(d=d[i], a=f"a[{i}][{i}]"))
+    return source.function(source.lower(l), **names)
 
 
 @cache
@@ -125,90 +135,121 @@ def semidefinite_factor(size: int) -> Callable:
 
     A column whose pivot is no more than rounding is zero.
     """
-    lines = []
-    for j in range(size):
-        rest = "".join(f" - l{j}_{k} * l{j}_{k}" for k in range(j))
-        lines.append(f"d = a[{j}][{j}]{rest}")
-        lines.append(f"l{j}_{j} = d ** 0.5 if not d <= {RESOLUTION} * a[{j}][{j}] else 0.0")
-        lines.append(f"r = 1.0 / l{j}_{j} if l{j}_{j} != 0.0 else 0.0")
-        for i in range(j + 1, size):
-            rest = "".join(f" - l{i}_{k} * l{j}_{k}" for k in range(j))
-            lines.append(f"l{i}_{j} = (a[{i}][{j}]{rest}) * r")
-    result = matrix_of(size, size, lambda i, j: f"l{i}_{j}" if j <= i else "0.0")
-    return written_out("factor", "a", *lines, result)
+    source = Source("factor", "a", result=(size, size), a=(size, size), work=size**3 // 6)
+    l = source.local("l", size, size)  # noqa: E741
+    for j in source.range(size):
+        source.line("d = " + source.less(f"a[{j}][{j}]", lambda k: f"{l[j, k]} * {l[j, k]}", j))  # noqa: B023
+        source.line(f"{l[j, j]} = d ** 0.5 if not d <= {RESOLUTION} * a[{j}][{j}] else 0.0")
+        source.line(f"r = 1.0 / {l[j, j]} if {l[j, j]} != 0.0 else 0.0")
+        for i in source.range(j + 1, size):
+            rest = source.less(f"a[{i}][{j}]", lambda k: f"{l[i, k]} * {l[j, k]}", j)  # noqa: B023
+            source.line(f"{l[i, j]} = ({rest}) * r")
+    return source.function(source.lower(l))
 
 
 @cache
 def row_solver(rows: int, size: int) -> Callable:
     """Return `solve(b, l)`: b (l l')^-1, for b of shape (rows, size) and l lower triangular."""
-    lines = []
-    for r in range(rows):
-        for i in range(size):
-            rest = "".join(f" - l[{i}][{k}] * y{r}_{k}" for k in range(i))
-            lines.append(f"y{r}_{i} = (b[{r}][{i}]{rest}) / l[{i}][{i}]")
-        for i in reversed(range(size)):
-            rest = "".join(f" - l[{k}][{i}] * x{r}_{k}" for k in range(i + 1, size))
-            lines.append(f"x{r}_{i} = (y{r}_{i}{rest}) / l[{i}][{i}]")
-    return written_out("solve", "b, l", *lines, matrix_of(rows, size, lambda r, i: f"x{r}_{i}"))
+    if is_array(rows, size) and is_array(size, size):
+        return arrays.solve_rows
+    shape = rows, size
+    source = Source("solve", "b, l", result=shape, b=shape, l=(size, size), work=rows * size * size)
+    y, x = source.local("y", rows, size), source.local("x", rows, size)
+    for r in source.range(rows):
+        for i in source.range(size):
+            rest = source.less(f"b[{r}][{i}]", lambda k: f"l[{i}][{k}] * {y[r, k]}", i)  # noqa: B023
+            source.line(f"{y[r, i]} = ({rest}) / l[{i}][{i}]")
+        for i in source.reversed(size):
+            rest = source.less(y[r, i], lambda k: f"l[{k}][{i}] * {x[r, k]}", size, i + 1)  # noqa: B023
+            source.line(f"{x[r, i]} = ({rest}) / l[{i}][{i}]")
+    return source.function(source.whole(x))
 
 
 @cache
 def triangle_divider(rows: int, size: int) -> Callable:
     """Return `divide(b, l)`: b l^-1, for b of shape (rows, size) and l lower triangular."""
-    lines = []
-    for r in range(rows):
-        for i in reversed(range(size)):
-            rest = "".join(f" - l[{k}][{i}] * x{r}_{k}" for k in range(i + 1, size))
-            lines.append(f"x{r}_{i} = (b[{r}][{i}]{rest}) / l[{i}][{i}]")
-    return written_out("divide", "b, l", *lines, matrix_of(rows, size, lambda r, i: f"x{r}_{i}"))
+    shape = rows, size
+    source = Source("divide", "b, l", result=shape, b=shape, l=(size, size), work=rows * size * size // 2)
+    x = source.local("x", rows, size)
+    for r in source.range(rows):
+        for i in source.reversed(size):
+            rest = source.less(f"b[{r}][{i}]", lambda k: f"l[{k}][{i}] * {x[r, k]}", size, i + 1)  # noqa: B023
+            source.line(f"{x[r, i]} = ({rest}) / l[{i}][{i}]")
+    return source.function(source.whole(x))
+
+
+def _forward(source: Source, size: int, each: Callable = lambda i, y: None, missing: str = "") -> Local:
+    """y = l^-1 v by substitution, `each(i, y)` called behind every component; `missing` follows its source."""
+    y = source.local("y", size)
+    for i in source.range(size):
+        rest = source.less(f"v[{i}]", lambda k: f"l[{i}][{k}] * {y[k]}", i)  # noqa: B023
+        source.line(f"{y[i]} = ({rest}) / l[{i}][{i}]" + missing.format(i=i))
+        each(i, y)
+    return y
 
 
 @cache
 def forward_solver(size: int) -> Callable:
     """Return `solve(l, v)`: the tuple l^-1 v, for l lower triangular and v of `size` components."""
-    lines = []
-    for i in range(size):
-        rest = "".join(f" - l[{i}][{k}] * y{k}" for k in range(i))
-        lines.append(f"y{i} = (v[{i}]{rest}) / l[{i}][{i}]")
-    return written_out("solve", "l, v", *lines, tuple_of(f"y{i}" for i in range(size)))
+    source = Source("solve", "l, v", result=(size,), l=(size, size), v=(size,), work=size * size // 2)
+    return source.function(source.whole(_forward(source, size)))
 
 
 @cache
 def innovation_likelihood(size: int) -> Callable:
     """Return `log_likelihood(v, l, z)`: log N(v; 0, l l') over the channels that are not NaN in z."""
-    lines = ["total = 0.0"]
-    for i in range(size):
-        rest = "".join(f" - l[{i}][{k}] * y{k}" for k in range(i))
-        lines.append(f"y{i} = (v[{i}]{rest}) / l[{i}][{i}]")
-        lines.append(f"if z[{i}] == z[{i}]:")
-        lines.append(f"    total -= 0.5 * y{i} * y{i} + log(l[{i}][{i}]) + {0.5 * math.log(2.0 * math.pi)!r}")
-    return written_out("log_likelihood", "v, l, z", *lines, "total", log=math.log)
+    shapes = {"v": (size,), "l": (size, size), "z": (size,)}
+    source = Source("log_likelihood", "v, l, z", **shapes, work=size * size // 2)
+    source.line("total = 0.0")
+
+    def add(i, y):
+        for _ in source.inside(f"if z[{i}] == z[{i}]:"):
+            half = f"0.5 * {y[i]} * {y[i]} + log(l[{i}][{i}])"
+            source.line(f"total -= {half} + {0.5 * math.log(2.0 * math.pi)!r}")
+
+    _forward(source, size, add)
+    return source.function("total", log=math.log)
+
+
+@cache
+def log_density(size: int) -> tuple[Callable, Callable]:
+    """Functions `half_square(v, l, z)` and `constant(l, z)`: log N(v; 0, l l') = constant - half_square.
+
+    Channels that are NaN in z are left out; l must be the factor of a covariance without correlations to them.
+    """
+    shapes = {"v": (size,), "l": (size, size), "z": (size,)}
+    source = Source("half_square", "v, l, z", **shapes, work=size * size // 2)
+    y = _forward(source, size, missing=" if z[{i}] == z[{i}] else 0.0")
+    half_square = source.function("0.5 * (" + source.sum(lambda i: f"{y[i]} * {y[i]}", size) + ")")
+    source = Source("constant", "l, z", l=(size, size), z=(size,))
+    level = 0.5 * math.log(2.0 * math.pi)
+    term = lambda i: f"(-log(l[{i}][{i}]) - {level!r} if z[{i}] == z[{i}] else 0.0)"  # noqa: E731
+    return half_square, source.function(source.sum(term, size), log=math.log)
 
 
 @cache
 def square(rows: int, columns: int) -> Callable:
     """Return `square(a)`: a a', exactly symmetric, for a of shape (rows, columns)."""
-    lines = (
-        f"p{i}_{j} = " + " + ".join(f"a[{i}][{k}] * a[{j}][{k}]" for k in range(columns))
-        for i in range(rows)
-        for j in range(i + 1)
-    )
-    return written_out("square", "a", *lines, matrix_of(rows, rows, lambda i, j: f"p{max(i, j)}_{min(i, j)}"))
+    if is_array(rows, rows) and is_array(rows, columns):
+        return arrays.square_of_rows
+    work = rows * rows * columns // 2
+    source = Source("square", "a", result=(rows, rows), a=(rows, columns), work=work)
+    entry = lambda i, j: source.sum(lambda k: f"a[{i}][{k}] * a[{j}][{k}]", columns)  # noqa: E731
+    return source.function(source.symmetric("p", rows, entry))
 
 
 @cache
 def factored_inverse(size: int) -> Callable:
     """Return `invert(l)`: (l l')^-1 = W' W with W = l^-1, exactly symmetric, for l lower triangular."""
-    lines = []
-    for j in range(size):
-        lines.append(f"w{j}_{j} = 1.0 / l[{j}][{j}]")
-        for i in range(j + 1, size):
-            rest = " + ".join(f"l[{i}][{k}] * w{k}_{j}" for k in range(j, i))
-            lines.append(f"w{i}_{j} = -({rest}) / l[{i}][{i}]")
-    for i in range(size):
-        for j in range(i + 1):
-            lines.append(f"p{i}_{j} = " + " + ".join(f"w{k}_{i} * w{k}_{j}" for k in range(i, size)))
-    return written_out("invert", "l", *lines, matrix_of(size, size, lambda i, j: f"p{max(i, j)}_{min(i, j)}"))
+    source = Source("invert", "l", result=(size, size), l=(size, size), work=size**3 // 3)
+    w = source.local("w", size, size)
+    for j in source.range(size):
+        source.line(f"{w[j, j]} = 1.0 / l[{j}][{j}]")
+        for i in source.range(j + 1, size):
+            rest = source.sum(lambda k: f"l[{i}][{k}] * {w[k, j]}", i, j)  # noqa: B023
+            source.line(f"{w[i, j]} = -({rest}) / l[{i}][{i}]")
+    entry = lambda i, j: source.sum(lambda k: f"{w[k, i]} * {w[k, j]}", size, i)  # noqa: E731
+    return source.function(source.symmetric("p", size, entry))
 
 
 @cache
@@ -219,14 +260,21 @@ def triangular_root(rows: int, columns: int) -> Callable:
     L is as accurate as Householder's. Source: Bjorck (1967), "Solving linear least squares problems by
     Gram-Schmidt orthogonalization".
     """
-    lines = [f"a{i}_{j} = a[{i}][{j}]" for i in range(rows) for j in range(columns)]
-    for i in range(rows):
-        lines.append(f"l{i}_{i} = ({' + '.join(f'a{i}_{j} * a{i}_{j}' for j in range(columns))}) ** 0.5")
-        lines.append(f"r = 1.0 / l{i}_{i} if l{i}_{i} != 0.0 else 0.0")
-        lines += [f"a{i}_{j} = a{i}_{j} * r" for j in range(columns)]
-        for k in range(i + 1, rows):
-            lines.append(f"l{k}_{i} = " + " + ".join(f"a{i}_{j} * a{k}_{j}" for j in range(columns)))
-            lines += [f"a{k}_{j} = a{k}_{j} - l{k}_{i} * a{i}_{j}" for j in range(columns)]
-    return written_out(
-        "triangle", "a", *lines, matrix_of(rows, rows, lambda i, j: f"l{i}_{j}" if j <= i else "0.0")
-    )
+    given = rows, columns
+    source = Source("triangle", "a", result=(rows, rows), a=given, work=rows * rows * columns // 2)
+    b, l = source.local("b", rows, columns), source.local("l", rows, rows)  # noqa: E741
+    for i in source.range(rows):
+        for j in source.range(columns):
+            source.line(f"{b[i, j]} = a[{i}][{j}]")
+    for i in source.range(rows):
+        total = source.sum(lambda j: f"{b[i, j]} * {b[i, j]}", columns)  # noqa: B023
+        source.line(f"{l[i, i]} = ({total}) ** 0.5")
+        source.line(f"r = 1.0 / {l[i, i]} if {l[i, i]} != 0.0 else 0.0")
+        for j in source.range(columns):
+            source.line(f"{b[i, j]} = {b[i, j]} * r")
+        for k in source.range(i + 1, rows):
+            total = source.sum(lambda j: f"{b[i, j]} * {b[k, j]}", columns)  # noqa: B023
+            source.line(f"{l[k, i]} = {total}")
+            for j in source.range(columns):
+                source.line(f"{b[k, j]} = {b[k, j]} - {l[k, i]} * {b[i, j]}")
+    return source.function(source.lower(l))
