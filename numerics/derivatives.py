@@ -1,16 +1,44 @@
-"""Jacobians of functions on tuples: analytic where given, else by complex steps or central differences."""
+"""Jacobians of functions on vectors: analytic where given, else by complex steps or central differences."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
 
+import numpy as np
+
 from numerics.compiled import inlined
 from numerics.pickling import makes_functions
-from numerics.tuples import matrix_of, tuple_of, written_out
+from numerics.sources import LONGEST_TEXT, is_array, matrix_of, tuple_of, written_out
 
 RELATIVE_STEP = 6e-6  # cube root of the float64 resolution balances truncation and rounding
 COMPLEX_STEP = 1e-100  # nothing is subtracted, so it may be as small as one likes
+
+
+@cache
+def array_valued(function: Callable, arguments: str, *shape: int) -> Callable:
+    """Return a function whose result is an array where vectors or matrices of its shape are (`is_array`).
+
+    So a user's function may return tuples, or arrays, of any size.
+    """
+    if not is_array(*shape):
+        return function
+    stores = _stores("", "value", shape)
+    result = f"value = function({arguments})", f"out = np.empty({shape})", *stores, "out"
+    return written_out("array_valued", arguments, *result, _loops=True, function=inlined(function), np=np)
+
+
+def _stores(column: str, value: str, shape: tuple[int, ...], entry: str = "{}") -> list[str]:
+    """Lines that put a result, of whatever form, into an array: entry by entry, for tuples may mix types."""
+    if np.prod(shape) <= 8 * LONGEST_TEXT:
+        places = ("".join(f"[{i}]" for i in place) for place in np.ndindex(*shape))
+        return [
+            f"out[{place[1:-1].replace('][', ', ')}{column}] = {entry.format(value + place)}" for place in places
+        ]
+    if len(shape) == 1:
+        return [f"for i in range({shape[0]}):", f"    out[i{column}] = {entry.format(value + '[i]')}"]
+    lines = f"for i in range({shape[0]}):", f"    row = {value}[i]", f"    for k in range({shape[1]}):"
+    return [*lines, f"        out[i, k] = {entry.format('row[k]')}"]
 
 
 @makes_functions
@@ -27,6 +55,8 @@ def complex_step(function: Callable, rows: int, columns: int, arguments: str) ->
 
     Source: Squire, Trapp (1998), "Using complex variables to estimate derivatives of real functions", SIAM Review.
     """
+    if is_array(rows, columns) or is_array(columns):
+        return _complex_step_in_loops(function, rows, columns, arguments)
     lines = []
     for j in range(columns):
         point = tuple_of(f"complex(x[{i}], {COMPLEX_STEP if i == j else 0.0})" for i in range(columns))
@@ -35,6 +65,47 @@ def complex_step(function: Callable, rows: int, columns: int, arguments: str) ->
     made = written_out("jacobian", f"x, {arguments}", *lines, source, function=inlined(function))
     made.differentiates = function
     return made
+
+
+def _complex_step_in_loops(function: Callable, rows: int, columns: int, arguments: str) -> Callable:
+    if is_array(columns):
+        point = "point = x + 0j", f"point[j] = complex(x[j], {COMPLEX_STEP})"
+    else:
+        step = f"{COMPLEX_STEP} if j == {{0}} else 0.0"
+        point = ("point = " + tuple_of(f"complex(x[{i}], {step.format(i)})" for i in range(columns)),)
+    stores = _stores(", j", "y", (rows,), f"(0j + {{}}).imag / {COMPLEX_STEP}")
+    body = *point, f"y = function(point, {arguments})", *stores
+    lines = (
+        f"out = np.empty(({rows}, {columns}))",
+        f"for j in range({columns}):",
+        *(f"    {line}" for line in body),
+    )
+    made = written_out(
+        "jacobian", f"x, {arguments}", *lines, "out", _loops=True, function=inlined(function), np=np
+    )
+    made.differentiates = function
+    return made
+
+
+def _differences_in_loops(function: Callable, rows: int, columns: int, arguments: str) -> Callable:
+    sides = []
+    for name, sign in (("above", "+"), ("below", "-")):
+        if is_array(columns):
+            sides += ["point = x.copy()", f"point[j] {sign}= h"]
+        else:
+            shifted = (f"x[{i}] {sign} h if j == {i} else x[{i}]" for i in range(columns))
+            sides.append("point = " + tuple_of(shifted))
+        sides += [f"{name} = function(point, {arguments})"]
+    size = "x[j]" if is_array(columns) else "sizes[j]"
+    scale = "scales[j]" if is_array(columns) else "steps[j]"
+    copies = [] if is_array(columns) else ["sizes, steps = np.array(x), np.array(scales)"]
+    differences = _stores(", j", "above", (rows,), "{} / (2.0 * h)")
+    opposite = [line.replace("above", "below").replace("] = ", "] -= ") for line in differences]
+    body = f"h = {RELATIVE_STEP} * (abs({size}) + {scale})", *sides, *differences, *opposite
+    start = f"out = np.empty(({rows}, {columns}))", *copies, f"for j in range({columns}):"
+    lines = *start, *(f"    {line}" for line in body)
+    names = {"function": inlined(function), "np": np}
+    return written_out("jacobian", f"x, scales, {arguments}", *lines, "out", _loops=True, **names)
 
 
 @cache
@@ -53,6 +124,8 @@ def jacobian(function: Callable, analytic: Callable | None, rows: int, columns: 
     signature = f"x, scales, {arguments}"
     if analytic is not None:
         return written_out("jacobian", signature, f"analytic(x, {arguments})", analytic=inlined(analytic))
+    if is_array(rows, columns) or is_array(columns):
+        return _differences_in_loops(function, rows, columns, arguments)
     lines = []
     for j in range(columns):
         lines.append(f"h{j} = {RELATIVE_STEP} * (abs(x[{j}]) + scales[{j}])")

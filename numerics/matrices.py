@@ -1,7 +1,7 @@
 """Dense matrices as tuples of rows, with every operation written out for its size, and large ones as arrays.
 
-Compiled, small ones stay in registers and cost nanoseconds where a library call costs hundreds. The source of large
-ones, which would grow with the cube of the size, has loops instead (`numerics.sources`).
+Compiled, small ones stay in registers and cost nanoseconds where a library call costs hundreds. The source of
+large ones, which would grow with the cube of the size, has loops instead (`numerics.sources`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ def multiplier(rows: int, inner: int, columns: int) -> Callable:
     if all(is_array(*shape) for shape in shapes.values()):
         return arrays.product
     source = Source("multiply", "a, b", **shapes, work=rows * inner * columns)
-    entry = lambda i, j: source.sum(lambda k: f"a[{i}][{k}] * b[{k}][{j}]", inner)  # noqa: E731
+
+    def entry(i, j):
+        return source.sum(f"a[{i}][{k}] * b[{k}][{j}]" for k in source.range(inner))
+
     return source.function(source.matrix(rows, columns, entry))
 
 
@@ -34,15 +37,27 @@ def transposed_multiplier(rows: int, inner: int, columns: int) -> Callable:
     if all(is_array(*shape) for shape in shapes.values()):
         return arrays.product_of_rows
     source = Source("multiply", "a, b", **shapes, work=rows * inner * columns)
-    entry = lambda i, j: source.sum(lambda k: f"a[{i}][{k}] * b[{j}][{k}]", inner)  # noqa: E731
+
+    def entry(i, j):
+        return source.sum(f"a[{i}][{k}] * b[{j}][{k}]" for k in source.range(inner))
+
     return source.function(source.matrix(rows, columns, entry))
+
+
+@cache
+def transposer(rows: int, columns: int) -> Callable:
+    """Return `transpose(a)`: a' for a of shape (rows, columns)."""
+    source = Source("transpose", "a", result=(columns, rows), a=(rows, columns))
+    return source.function(source.matrix(columns, rows, lambda i, j: f"a[{j}][{i}]"))
 
 
 @cache
 def vector_multiplier(rows: int, inner: int) -> Callable:
     """Return `multiply(a, x)`: the tuple a x for shapes (rows, inner) and (inner,)."""
     source = Source("multiply", "a, x", result=(rows,), a=(rows, inner), x=(inner,), work=rows * inner)
-    return source.function(source.vector(rows, lambda i: source.sum(lambda k: f"a[{i}][{k}] * x[{k}]", inner)))
+    return source.function(
+        source.vector(rows, lambda i: source.sum(f"a[{i}][{k}] * x[{k}]" for k in source.range(inner)))
+    )
 
 
 @cache
@@ -54,8 +69,13 @@ def quadratic_form(rows: int, columns: int) -> Callable:
         half = source.local("half", rows, columns)  # w a
         for p in source.range(rows):
             for j in source.range(columns):
-                source.line(f"{half[p, j]} = {source.sum(lambda q: f'w[{p}][{q}] * a[{q}][{j}]', rows)}")  # noqa: B023
-        entry = lambda i, j: source.sum(lambda p: f"a[{p}][{i}] * {half[p, j]}", rows)  # noqa: E731
+                source.line(
+                    f"{half[p, j]} = {source.sum(f'w[{p}][{q}] * a[{q}][{j}]' for q in source.range(rows))}"
+                )
+
+        def entry(i, j):
+            return source.sum(f"a[{p}][{i}] * {half[p, j]}" for p in source.range(rows))
+
         return source.function(source.matrix(columns, columns, entry))
 
     def entry(i, j):
@@ -69,7 +89,10 @@ def symmetric_sum(size: int) -> Callable:
     """Return `add(a, b)`: the symmetric part of a + b, exactly symmetric."""
     shape = size, size
     source = Source("add", "a, b", result=shape, a=shape, b=shape)
-    entry = lambda i, j: f"0.5 * (a[{i}][{j}] + a[{j}][{i}] + b[{i}][{j}] + b[{j}][{i}])"  # noqa: E731
+
+    def entry(i, j):
+        return f"0.5 * (a[{i}][{j}] + a[{j}][{i}] + b[{i}][{j}] + b[{j}][{i}])"
+
     return source.function(source.symmetric("s", size, entry))
 
 
@@ -77,7 +100,10 @@ def symmetric_sum(size: int) -> Callable:
 def identity_less(size: int) -> Callable:
     """Return `subtract(a)`: I - a."""
     source = Source("subtract", "a", result=(size, size), a=(size, size))
-    entry = lambda i, j: f"{source.if_same(i, j, '1.0', '0.0')} - a[{i}][{j}]"  # noqa: E731
+
+    def entry(i, j):
+        return f"{source.if_same(i, j, '1.0', '0.0')} - a[{i}][{j}]"
+
     return source.function(source.matrix(size, size, entry))
 
 
@@ -85,7 +111,10 @@ def identity_less(size: int) -> Callable:
 def innovation(size: int, first: int = 0) -> Callable:
     """Return `subtract(z, y)`: z - y[first:], zero in channels that are NaN in z."""
     source = Source("subtract", "z, y", result=(size,), z=(size,), y=(first + size,))
-    entry = lambda i: f"z[{i}] - y[{first + i}] if z[{i}] == z[{i}] else 0.0"  # noqa: E731
+
+    def entry(i):
+        return f"z[{i}] - y[{first + i}] if z[{i}] == z[{i}] else 0.0"
+
     return source.function(source.vector(size, entry))
 
 
@@ -113,14 +142,16 @@ def pivoted_factor(size: int, diagonal: str, **names: float) -> Callable:
         names: other names that it uses, with their values.
     """
     source = Source("factor", "a", result=(size, size), a=(size, size), work=size**3 // 6)
-    l, d = source.local("l", size, size), source.local("d", size)  # noqa: E741
+    root, d = source.local("l", size, size), source.local("d", size)
     for i in source.range(size):
         for j in source.range(i):
-            rest = source.less(f"a[{i}][{j}]", lambda k: f"{l[i, k]} * {l[j, k]}", j)  # noqa: B023
-            source.line(f"{l[i, j]} = ({rest}) / {l[j, j]}")
-        source.line(f"{d[i]} = " + source.less(f"a[{i}][{i}]", lambda k: f"{l[i, k]} * {l[i, k]}", i))  # noqa: B023
-        source.line(f"{l[i, i]} = " + diagonal.format(d=d[i], a=f"a[{i}][{i}]"))
-    return source.function(source.lower(l), **names)
+            rest = source.less(f"a[{i}][{j}]", (f"{root[i, k]} * {root[j, k]}" for k in source.range(j)))
+            source.line(f"{root[i, j]} = ({rest}) / {root[j, j]}")
+        source.line(
+            f"{d[i]} = " + source.less(f"a[{i}][{i}]", (f"{root[i, k]} * {root[i, k]}" for k in source.range(i)))
+        )
+        source.line(f"{root[i, i]} = " + diagonal.format(d=d[i], a=f"a[{i}][{i}]"))
+    return source.function(source.lower(root), **names)
 
 
 @cache
@@ -136,15 +167,17 @@ def semidefinite_factor(size: int) -> Callable:
     A column whose pivot is no more than rounding is zero.
     """
     source = Source("factor", "a", result=(size, size), a=(size, size), work=size**3 // 6)
-    l = source.local("l", size, size)  # noqa: E741
+    root = source.local("l", size, size)
     for j in source.range(size):
-        source.line("d = " + source.less(f"a[{j}][{j}]", lambda k: f"{l[j, k]} * {l[j, k]}", j))  # noqa: B023
-        source.line(f"{l[j, j]} = d ** 0.5 if not d <= {RESOLUTION} * a[{j}][{j}] else 0.0")
-        source.line(f"r = 1.0 / {l[j, j]} if {l[j, j]} != 0.0 else 0.0")
+        source.line(
+            "d = " + source.less(f"a[{j}][{j}]", (f"{root[j, k]} * {root[j, k]}" for k in source.range(j)))
+        )
+        source.line(f"{root[j, j]} = d ** 0.5 if not d <= {RESOLUTION} * a[{j}][{j}] else 0.0")
+        source.line(f"r = 1.0 / {root[j, j]} if {root[j, j]} != 0.0 else 0.0")
         for i in source.range(j + 1, size):
-            rest = source.less(f"a[{i}][{j}]", lambda k: f"{l[i, k]} * {l[j, k]}", j)  # noqa: B023
-            source.line(f"{l[i, j]} = ({rest}) * r")
-    return source.function(source.lower(l))
+            rest = source.less(f"a[{i}][{j}]", (f"{root[i, k]} * {root[j, k]}" for k in source.range(j)))
+            source.line(f"{root[i, j]} = ({rest}) * r")
+    return source.function(source.lower(root))
 
 
 @cache
@@ -157,10 +190,10 @@ def row_solver(rows: int, size: int) -> Callable:
     y, x = source.local("y", rows, size), source.local("x", rows, size)
     for r in source.range(rows):
         for i in source.range(size):
-            rest = source.less(f"b[{r}][{i}]", lambda k: f"l[{i}][{k}] * {y[r, k]}", i)  # noqa: B023
+            rest = source.less(f"b[{r}][{i}]", (f"l[{i}][{k}] * {y[r, k]}" for k in source.range(i)))
             source.line(f"{y[r, i]} = ({rest}) / l[{i}][{i}]")
         for i in source.reversed(size):
-            rest = source.less(y[r, i], lambda k: f"l[{k}][{i}] * {x[r, k]}", size, i + 1)  # noqa: B023
+            rest = source.less(y[r, i], (f"l[{k}][{i}] * {x[r, k]}" for k in source.range(i + 1, size)))
             source.line(f"{x[r, i]} = ({rest}) / l[{i}][{i}]")
     return source.function(source.whole(x))
 
@@ -173,16 +206,16 @@ def triangle_divider(rows: int, size: int) -> Callable:
     x = source.local("x", rows, size)
     for r in source.range(rows):
         for i in source.reversed(size):
-            rest = source.less(f"b[{r}][{i}]", lambda k: f"l[{k}][{i}] * {x[r, k]}", size, i + 1)  # noqa: B023
+            rest = source.less(f"b[{r}][{i}]", (f"l[{k}][{i}] * {x[r, k]}" for k in source.range(i + 1, size)))
             source.line(f"{x[r, i]} = ({rest}) / l[{i}][{i}]")
     return source.function(source.whole(x))
 
 
 def _forward(source: Source, size: int, each: Callable = lambda i, y: None, missing: str = "") -> Local:
-    """y = l^-1 v by substitution, `each(i, y)` called behind every component; `missing` follows its source."""
+    """The numbers y = l^-1 v; `each(i, y)` is called behind every one, and `missing` follows its source."""
     y = source.local("y", size)
     for i in source.range(size):
-        rest = source.less(f"v[{i}]", lambda k: f"l[{i}][{k}] * {y[k]}", i)  # noqa: B023
+        rest = source.less(f"v[{i}]", (f"l[{i}][{k}] * {y[k]}" for k in source.range(i)))
         source.line(f"{y[i]} = ({rest}) / l[{i}][{i}]" + missing.format(i=i))
         each(i, y)
     return y
@@ -220,11 +253,11 @@ def log_density(size: int) -> tuple[Callable, Callable]:
     shapes = {"v": (size,), "l": (size, size), "z": (size,)}
     source = Source("half_square", "v, l, z", **shapes, work=size * size // 2)
     y = _forward(source, size, missing=" if z[{i}] == z[{i}] else 0.0")
-    half_square = source.function("0.5 * (" + source.sum(lambda i: f"{y[i]} * {y[i]}", size) + ")")
+    half_square = source.function("0.5 * (" + source.sum(f"{y[i]} * {y[i]}" for i in source.range(size)) + ")")
     source = Source("constant", "l, z", l=(size, size), z=(size,))
     level = 0.5 * math.log(2.0 * math.pi)
-    term = lambda i: f"(-log(l[{i}][{i}]) - {level!r} if z[{i}] == z[{i}] else 0.0)"  # noqa: E731
-    return half_square, source.function(source.sum(term, size), log=math.log)
+    terms = (f"(-log(l[{i}][{i}]) - {level!r} if z[{i}] == z[{i}] else 0.0)" for i in source.range(size))
+    return half_square, source.function(source.sum(terms), log=math.log)
 
 
 @cache
@@ -234,7 +267,10 @@ def square(rows: int, columns: int) -> Callable:
         return arrays.square_of_rows
     work = rows * rows * columns // 2
     source = Source("square", "a", result=(rows, rows), a=(rows, columns), work=work)
-    entry = lambda i, j: source.sum(lambda k: f"a[{i}][{k}] * a[{j}][{k}]", columns)  # noqa: E731
+
+    def entry(i, j):
+        return source.sum(f"a[{i}][{k}] * a[{j}][{k}]" for k in source.range(columns))
+
     return source.function(source.symmetric("p", rows, entry))
 
 
@@ -246,9 +282,12 @@ def factored_inverse(size: int) -> Callable:
     for j in source.range(size):
         source.line(f"{w[j, j]} = 1.0 / l[{j}][{j}]")
         for i in source.range(j + 1, size):
-            rest = source.sum(lambda k: f"l[{i}][{k}] * {w[k, j]}", i, j)  # noqa: B023
+            rest = source.sum(f"l[{i}][{k}] * {w[k, j]}" for k in source.range(j, i))
             source.line(f"{w[i, j]} = -({rest}) / l[{i}][{i}]")
-    entry = lambda i, j: source.sum(lambda k: f"{w[k, i]} * {w[k, j]}", size, i)  # noqa: E731
+
+    def entry(i, j):
+        return source.sum(f"{w[k, i]} * {w[k, j]}" for k in source.range(i, size))
+
     return source.function(source.symmetric("p", size, entry))
 
 
@@ -262,19 +301,19 @@ def triangular_root(rows: int, columns: int) -> Callable:
     """
     given = rows, columns
     source = Source("triangle", "a", result=(rows, rows), a=given, work=rows * rows * columns // 2)
-    b, l = source.local("b", rows, columns), source.local("l", rows, rows)  # noqa: E741
+    b, root = source.local("b", rows, columns), source.local("l", rows, rows)
     for i in source.range(rows):
         for j in source.range(columns):
             source.line(f"{b[i, j]} = a[{i}][{j}]")
     for i in source.range(rows):
-        total = source.sum(lambda j: f"{b[i, j]} * {b[i, j]}", columns)  # noqa: B023
-        source.line(f"{l[i, i]} = ({total}) ** 0.5")
-        source.line(f"r = 1.0 / {l[i, i]} if {l[i, i]} != 0.0 else 0.0")
+        total = source.sum(f"{b[i, j]} * {b[i, j]}" for j in source.range(columns))
+        source.line(f"{root[i, i]} = ({total}) ** 0.5")
+        source.line(f"r = 1.0 / {root[i, i]} if {root[i, i]} != 0.0 else 0.0")
         for j in source.range(columns):
             source.line(f"{b[i, j]} = {b[i, j]} * r")
         for k in source.range(i + 1, rows):
-            total = source.sum(lambda j: f"{b[i, j]} * {b[k, j]}", columns)  # noqa: B023
-            source.line(f"{l[k, i]} = {total}")
+            total = source.sum(f"{b[i, j]} * {b[k, j]}" for j in source.range(columns))
+            source.line(f"{root[k, i]} = {total}")
             for j in source.range(columns):
-                source.line(f"{b[k, j]} = {b[k, j]} - {l[k, i]} * {b[i, j]}")
-    return source.function(source.lower(l))
+                source.line(f"{b[k, j]} = {b[k, j]} - {root[k, i]} * {b[i, j]}")
+    return source.function(source.lower(root))

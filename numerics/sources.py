@@ -1,4 +1,4 @@
-"""Source text of functions for fixed sizes: written out entry by entry where that is short, else loops over arrays.
+"""Source text of functions for fixed sizes: written out by entries where that is short, else loops over arrays.
 
 A function is described once, as the entries of its result and the sums in them. Small, it is written out, as
 `collections.namedtuple` does for its classes: vectors are tuples of components, matrices tuples of rows, which the
@@ -17,7 +17,9 @@ import numpy as np
 
 from numerics.compiled import inlined
 
-LARGEST_TUPLE = 36  # entries of a vector or matrix that is a tuple; as many have the nine sigma points of four states
+LARGEST_TUPLE = (
+    36  # entries of a vector or matrix that is a tuple; as many have the nine sigma points of four states
+)
 LARGEST_SIDE = 5  # of a matrix that is one
 LONGEST_TEXT = 128  # products that are written out: those of two matrices of five rows
 
@@ -182,23 +184,19 @@ class Source:
             self.line(f"{name} = np.zeros({shape})")
         return Local(name, shape, self.loops)
 
-    def sum(self, term: Callable, stop, start=0) -> str:
-        """Source of term(start) + ... + term(stop - 1); "0.0" if there is none."""
-        if not self.loops:
-            return " + ".join(term(k) for k in range(start, stop)) or "0.0"
-        return self._total("0.0", "+", term, start, stop)
+    def sum(self, terms: Iterable[str]) -> str:
+        """Source of the sum of terms, whose indices come from `range`; "0.0" if there is none."""
+        return self._total("0.0", "+", terms) if self.loops else " + ".join(terms) or "0.0"
 
-    def less(self, first: str, term: Callable, stop, start=0, sign: str = "-") -> str:
-        """Source of first - term(start) - ... - term(stop - 1), or with another sign."""
-        if not self.loops:
-            return first + "".join(f" {sign} {term(k)}" for k in range(start, stop))
-        return self._total(first, sign, term, start, stop)
+    def less(self, first: str, terms: Iterable[str], sign: str = "-") -> str:
+        """Source of what is left of the first after all terms, or of the first and all terms with sign="+"."""
+        return self._total(first, sign, terms) if self.loops else first + "".join(f" {sign} {t}" for t in terms)
 
-    def _total(self, first: str, sign: str, term: Callable, start, stop) -> str:
+    def _total(self, first: str, sign: str, terms: Iterable[str]) -> str:
         total = self._fresh("t")
         self.line(f"{total} = {first}")
-        for k in self.range(start, stop):
-            self.line(f"{total} {sign}= {term(k)}")
+        for term in terms:  # one, in the body of the loop that `range` begins when it is asked for
+            self.line(f"{total} {sign}= {term}")
         return str(total)
 
     def if_same(self, i, j, same: str, other: str) -> str:

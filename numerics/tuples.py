@@ -14,8 +14,17 @@ from functools import cache
 from numerics.sources import Source, is_array, matrix_of, tuple_of, written_out
 
 __all__ = [
-    *("column_reader", "column_writer", "vector_reader", "vector_writer", "matrix_reader", "matrix_writer"),
-    *("scaled_sum", "part_of", "matrix_of", "tuple_of", "written_out"),
+    "column_reader",
+    "column_writer",
+    "matrix_of",
+    "matrix_reader",
+    "matrix_writer",
+    "part_of",
+    "scaled_sum",
+    "tuple_of",
+    "vector_reader",
+    "vector_writer",
+    "written_out",
 ]
 
 
