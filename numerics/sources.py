@@ -29,6 +29,12 @@ def is_array(*shape: int) -> bool:
     return int(np.prod(shape)) > LARGEST_TUPLE or (len(shape) == 2 and min(shape) > LARGEST_SIDE)
 
 
+def as_value(values) -> tuple | np.ndarray:
+    """A vector of numbers in the form that functions take: a tuple of floats, or an array if it is large."""
+    values = np.asarray(values)
+    return values if is_array(len(values)) else tuple(values)
+
+
 def tuple_of(expressions: Iterable[str]) -> str:
     """Source of a tuple with the given expressions."""
     return "(" + "".join(f"{expression}, " for expression in expressions) + ")"

@@ -10,7 +10,7 @@ import numpy as np
 
 from numerics.checks import covariance_root
 from numerics.tuples import tuple_of, written_out
-from plants.shape import Shape
+from plants.shape import Shape, constants_are_array
 
 LANES = 8  # float64 in the widest vector register: ensembles are padded, so that loops have no remainder
 
@@ -55,6 +55,8 @@ def starts_of(*lengths: int) -> list[int]:
 def constants_reader(shape: Shape) -> Callable:
     """Return `read(numbers)`: the model's constants as its functions take them."""
     start = number_places(shape.n, shape.m).constants
+    if constants_are_array(shape.form):
+        return written_out("read", "row", f"row[{start}:{start + shape.constants}]")
     values = [f"row[{start + i}]" for i in range(shape.constants)]
     if isinstance(shape.form, int):
         return written_out("read", "row", tuple_of(values))

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from numerics.checks import as_floats, shown
+from numerics.sources import as_value, is_array
 
 
 def checked_constants(given) -> tuple:
@@ -57,7 +58,8 @@ def _check_arguments(name: str, function: Callable, arguments: str) -> None:
 
 def _check_result(name: str, function: Callable, model, arguments: str, shape: tuple, rule: str) -> None:
     for point in (model.prior_mean, model.prior_mean + model.scales):
-        given = {"x": tuple(point.tolist()), "u": (0.0,) * model.inputs, "c": model.constants}
+        x = point if is_array(model.n) else tuple(point.tolist())
+        given = {"x": x, "u": as_value(np.zeros(model.inputs)), "c": model.given_constants}
         try:
             with np.errstate(all="ignore"):
                 result = function(*(given[argument] for argument in arguments.split(", ")))
