@@ -44,10 +44,9 @@ def product_of_rows(a, b):
 
 
 @called
-def product(a, b):
-    """A b: four rows of b at a time are added to a row of the result."""
+def add_product(out, a, b):
+    """Add a b to the first rows of an array: four rows of b at a time are added to a row of it."""
     rows, inner, columns = a.shape[0], b.shape[0], b.shape[1]
-    out = np.zeros((rows, columns))
     whole = inner - inner % 4
     for i in range(rows):
         for k in range(0, whole, 4):
@@ -58,6 +57,41 @@ def product(a, b):
             x_0 = a[i, k]
             for j in range(columns):
                 out[i, j] += x_0 * b[k, j]
+
+
+@called
+def product(a, b):
+    """A b."""
+    out = np.zeros((a.shape[0], b.shape[1]))
+    add_product(out, a, b)
+    return out
+
+
+@called
+def deviations(table, first, rows, means, size):
+    """Distances from means (rows,) in so many rows of a table from the first on, and `size` columns."""
+    out = np.empty((rows, size))
+    for i in range(rows):
+        for j in range(size):
+            out[i, j] = table[first + i, j] - means[i]
+    return out
+
+
+@called
+def weighted_square_of_rows(d, table, weights):
+    """The sum of w d d' over columns d with weights w from a row of a table, exactly symmetric."""
+    rows, size = d.shape
+    scaled = np.empty((rows, size))
+    for i in range(rows):
+        for j in range(size):
+            scaled[i, j] = table[weights, j] * d[i, j]
+    out = np.empty((rows, rows))
+    for i in range(rows):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(size):
+                total += scaled[i, k] * d[j, k]
+            out[i, j] = out[j, i] = total
     return out
 
 

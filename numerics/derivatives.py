@@ -15,7 +15,7 @@ RELATIVE_STEP = 6e-6  # cube root of the float64 resolution balances truncation 
 COMPLEX_STEP = 1e-100  # nothing is subtracted, so it may be as small as one likes
 
 
-@cache
+@makes_functions
 def array_valued(function: Callable, arguments: str, *shape: int) -> Callable:
     """Return a function whose result is an array where vectors or matrices of its shape are (`is_array`).
 

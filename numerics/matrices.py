@@ -199,6 +199,17 @@ def row_solver(rows: int, size: int) -> Callable:
 
 
 @cache
+def vector_solver(size: int) -> Callable:
+    """Return `solve(v, l)`: (l l')^-1 v, for v of `size` components and l lower triangular."""
+    source = Source("solve", "v, l", result=(size,), v=(size,), l=(size, size), work=size * size)
+    y, x = _forward(source, size), source.local("x", size)
+    for i in source.reversed(size):
+        rest = source.less(y[i], (f"l[{k}][{i}] * {x[k]}" for k in source.range(i + 1, size)))
+        source.line(f"{x[i]} = ({rest}) / l[{i}][{i}]")
+    return source.function(source.whole(x))
+
+
+@cache
 def triangle_divider(rows: int, size: int) -> Callable:
     """Return `divide(b, l)`: b l^-1, for b of shape (rows, size) and l lower triangular."""
     shape = rows, size

@@ -40,6 +40,11 @@ def tuple_of(expressions: Iterable[str]) -> str:
     return "(" + "".join(f"{expression}, " for expression in expressions) + ")"
 
 
+def lower_pairs(size: int) -> list[tuple[int, int]]:
+    """Places (i, j) on and below the diagonal."""
+    return [(i, j) for i in range(size) for j in range(i + 1)]
+
+
 def matrix_of(rows: int, columns: int, entry: Callable[[int, int], str]) -> str:
     """Source of a matrix, a tuple of rows, whose entries have the sources entry(i, j)."""
     return tuple_of(tuple_of(entry(i, j) for j in range(columns)) for i in range(rows))
@@ -80,11 +85,10 @@ class Index(str):
     def __add__(self, other) -> Index:
         return Index(f"({self} + {other})") if other != 0 else self
 
-    def __radd__(self, other) -> Index:
-        return Index(f"({other} + {self})") if other != 0 else self
-
     def __sub__(self, other) -> Index:
         return Index(f"({self} - {other})")
+
+    __radd__ = __add__
 
     def __mul__(self, other) -> Index:
         return Index(f"({self} * {other})")
@@ -184,6 +188,48 @@ class Source:
         yield
         self._depth -= 1
 
+    def rows_of_members(self, count: int) -> Iterator:
+        """Rows 0 ... count - 1 of a table, for each of its columns j: rows run within columns, or round them."""
+        members = "for j in range(table.shape[1]):"
+        if self.loops:
+            for i in self.range(count):
+                yield from (i for _ in self.inside(members))
+        else:
+            for _ in self.inside(members):
+                yield from range(count)
+
+    def totals(self, size: str, places, term: Callable, each: Iterable[str] = ()) -> Local:
+        """Sums of terms over members j < size, one for each place.
+
+        Args:
+            size: source of the number of members.
+            places: number of places i, or pairs (i, j) of them.
+            term: term(i) or term(i, j) is the source of a term.
+            each: lines that come first for each member, where the function is written out.
+        """
+        if self.loops:
+            out = self.local("s", places)
+            for i in self.range(places):
+                self.line("total = 0.0")
+                self.line(f"for j in range({size}):")
+                self.line(f"    total += {term(i)}")
+                self.line(f"{out[i]} = total")
+            return out
+        places = [(i,) for i in range(places)] if isinstance(places, int) else places
+        out = Local("s", tuple(max(place) + 1 for place in zip(*places, strict=True)), False)
+        for place in places:
+            self.line(f"{out[place]} = 0.0")
+        for _ in self.inside(f"for j in range({size}):"):
+            for text in each:
+                self.line(text)
+            for place in places:
+                self.line(f"{out[place]} += {term(*place)}")
+        return out
+
+    def array_of(self, argument: str) -> str:
+        """In loops, the name of the array that holds an argument."""
+        return self._renamed.get(argument, argument)
+
     def local(self, name: str, *shape: int) -> Local:
         """Numbers to be worked out, one a place; zero at first in an array."""
         if self.loops:
@@ -197,6 +243,10 @@ class Source:
     def less(self, first: str, terms: Iterable[str], sign: str = "-") -> str:
         """Source of what is left of the first after all terms, or of the first and all terms with sign="+"."""
         return self._total(first, sign, terms) if self.loops else first + "".join(f" {sign} {t}" for t in terms)
+
+    def product(self, factors: Iterable[str]) -> str:
+        """Source of the product of factors, as `sum` of terms."""
+        return self._total("1.0", "*", factors) if self.loops else " * ".join(factors)
 
     def _total(self, first: str, sign: str, terms: Iterable[str]) -> str:
         total = self._fresh("t")
@@ -265,3 +315,11 @@ class Source:
         """The function, which returns the expression `result`; `names` are its globals."""
         lines = *self._lines, self._rewritten(result)
         return written_out(self._name, self._arguments, *lines, _loops=self.loops, **self._names, **names)
+
+
+def entrywise(
+    name: str, arguments: str, shape: tuple[int, ...], entry: Callable, *, work: int = 0, **shapes: tuple[int, ...]
+) -> Callable:
+    """Return the function of a vector or matrix whose entries have the sources entry(i) or entry(i, j)."""
+    source = Source(name, arguments, result=shape, work=work, **shapes)
+    return source.function((source.vector if len(shape) == 1 else source.matrix)(*shape, entry))

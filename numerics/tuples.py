@@ -11,20 +11,26 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
-from numerics.sources import Source, is_array, matrix_of, tuple_of, written_out
+import numpy as np
+
+from numerics.sources import Source, entrywise, is_array, matrix_of, tuple_of, written_out
 
 __all__ = [
+    "assembled",
     "column_reader",
     "column_writer",
+    "joiner",
     "matrix_of",
     "matrix_reader",
     "matrix_writer",
     "part_of",
     "scaled_sum",
     "tuple_of",
+    "vector_part",
     "vector_reader",
     "vector_writer",
     "written_out",
+    "zeros_of",
 ]
 
 
@@ -83,6 +89,56 @@ def scaled_sum(count: int) -> Callable:
     if is_array(count):
         return written_out("add", "x, a, y", "x + a * y", _loops=True)  # of any type: also of complex numbers
     return written_out("add", "x, a, y", tuple_of(f"x[{i}] + a * y[{i}]" for i in range(count)))
+
+
+@cache
+def vector_part(count: int, whole: int, first: int = 0) -> Callable:
+    """Return `part(x)`: the `count` components from the first on, of a vector of `whole`."""
+    source = Source("part", "x", result=(count,), x=(whole,))
+    return source.function(source.vector(count, lambda i: f"x[{i + first}]"))
+
+
+@cache
+def joiner(first: int, second: int) -> Callable:
+    """Return `join(x, y)`: one vector of the components of two."""
+    source = Source("join", "x, y", result=(first + second,), x=(first,), y=(second,))
+    both = source.local("z", first + second)
+    for i in source.range(first):
+        source.line(f"{both[i]} = x[{i}]")
+    for i in source.range(second):
+        source.line(f"{both[i + first]} = y[{i}]")
+    return source.function(source.whole(both))
+
+
+def assembled(name: str, arguments: str, shape: tuple[int, int], parts: dict) -> Callable:
+    """Return the function of a matrix of a shape that is made of parts, zero elsewhere.
+
+    Args:
+        name: of the function.
+        arguments: names of the parts, comma separated.
+        shape: rows and columns of the result.
+        parts: of each part its shape, and the row and column at which it begins.
+    """
+    source = Source(name, arguments, result=shape, **{part: size for part, (size, _, _) in parts.items()})
+    if not source.loops:
+        entries = {
+            (top + i, left + j): f"{part}[{i}][{j}]"
+            for part, (size, top, left) in parts.items()
+            for i, j in np.ndindex(*size)
+        }
+        return source.function(matrix_of(*shape, lambda i, j: entries.get((i, j), "0.0")))
+    whole = source.local("whole", *shape)
+    for part, (size, top, left) in parts.items():
+        for i in source.range(size[0]):
+            for j in source.range(size[1]):
+                source.line(f"{whole[i + top, j + left]} = {part}[{i}][{j}]")
+    return source.function(source.whole(whole))
+
+
+@cache
+def zeros_of(*shape: int) -> Callable:
+    """Return `zeros()`: a vector (count,) or matrix (rows, columns) of zeros."""
+    return entrywise("zeros", "", shape, lambda *place: "0.0")
 
 
 @cache

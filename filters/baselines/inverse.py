@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import lru_cache
 
 from numerics.compiled import inlined
-from numerics.tuples import tuple_of, written_out
+from numerics.sources import Source
 
 INTERVALS = 100  # on either side, in which a sign change is looked for
 HALVINGS = 60  # of such an interval; and steps of the golden section, each of which leaves 0.618 of it
@@ -21,8 +21,8 @@ def component_solver(observe: Callable, n: int, component: int, channel: int) ->
     of 100 equal steps on either side. If there is none, it is the value at which h comes nearest to z, as found by
     a golden section about the nearest step.
     """
-    entries = ("v" if i == component else f"x[{i}]" for i in range(n))
-    place = written_out("place", "x, v", tuple_of(entries))
+    source = Source("place", "x, v", result=(n,), x=(n,))
+    place = source.function(source.vector(n, lambda i: source.if_same(i, component, "v", f"x[{i}]")))
 
     @inlined
     def misfit(x, v, z, c):
