@@ -137,10 +137,14 @@ def _augmented_functions(
         ones = {f"one{q}": ((1, 1), n + q, n + q) for q in range(added) if identity}
         for q in range(added):
             lines.append(f"slope{q} = difference(above{q}, below{q}, step{q})")
-        entry = lambda i, j: f"(above[{i}] - below[{i}]) / (2.0 * h)"  # noqa: E731
+
+        def rise(i, j):
+            return f"(above[{i}] - below[{i}]) / (2.0 * h)"
+
         sides = {"above": (size,), "below": (size,)}
         tools = {
-            "difference": entrywise("difference", "above, below, h", (size, 1), entry, **sides),
+            "difference": entrywise("difference", "above, below, h", (size, 1), rise, **sides),
+            "one": entrywise("one", "", (1, 1), lambda i, j: "1.0"),
             "whole": assembled(
                 "whole",
                 ", ".join([*parts, *slopes, *ones]),
@@ -148,7 +152,7 @@ def _augmented_functions(
                 {**parts, **slopes, **ones},
             ),
         }
-        values = ", ".join(["a", *slopes, *["((1.0,),)"] * len(ones)])
+        values = ", ".join(["a", *slopes, *["one()"] * len(ones)])
         return written_out(
             name, f"x, {arguments}c", *lines, f"whole({values})", analytic=inlined(analytic), **names, **tools
         )
