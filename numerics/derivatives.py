@@ -9,36 +9,17 @@ import numpy as np
 
 from numerics.compiled import inlined
 from numerics.pickling import makes_functions
-from numerics.sources import LONGEST_TEXT, is_array, matrix_of, tuple_of, written_out
+from numerics.sources import is_array, matrix_of, tuple_of, written_out
 
 RELATIVE_STEP = 6e-6  # cube root of the float64 resolution balances truncation and rounding
 COMPLEX_STEP = 1e-100  # nothing is subtracted, so it may be as small as one likes
 
 
-@makes_functions
-def array_valued(function: Callable, arguments: str, *shape: int) -> Callable:
-    """Return a function whose result is an array where vectors or matrices of its shape are (`is_array`).
-
-    So a user's function may return tuples, or arrays, of any size.
-    """
-    if not is_array(*shape):
-        return function
-    stores = _stores("", "value", shape)
-    result = f"value = function({arguments})", f"out = np.empty({shape})", *stores, "out"
-    return written_out("array_valued", arguments, *result, _loops=True, function=inlined(function), np=np)
-
-
-def _stores(column: str, value: str, shape: tuple[int, ...], entry: str = "{}") -> list[str]:
-    """Lines that put a result, of whatever form, into an array: entry by entry, for tuples may mix types."""
-    if np.prod(shape) <= 8 * LONGEST_TEXT:
-        places = ("".join(f"[{i}]" for i in place) for place in np.ndindex(*shape))
-        return [
-            f"out[{place[1:-1].replace('][', ', ')}{column}] = {entry.format(value + place)}" for place in places
-        ]
-    if len(shape) == 1:
-        return [f"for i in range({shape[0]}):", f"    out[i{column}] = {entry.format(value + '[i]')}"]
-    lines = f"for i in range({shape[0]}):", f"    row = {value}[i]", f"    for k in range({shape[1]}):"
-    return [*lines, f"        out[i, k] = {entry.format('row[k]')}"]
+def _stores(value: str, rows: int, entry: str = "{}", sign: str = "") -> list[str]:
+    """Lines that put a vector of `rows` components, as entry says, into column j of `out`."""
+    if is_array(rows):
+        return [f"for i in range({rows}):", f"    out[i, j] {sign}= {entry.format(value + '[i]')}"]
+    return [f"out[{i}, j] {sign}= {entry.format(f'{value}[{i}]')}" for i in range(rows)]
 
 
 @makes_functions
@@ -99,9 +80,8 @@ def _differences_in_loops(function: Callable, rows: int, columns: int, arguments
     size = "x[j]" if is_array(columns) else "sizes[j]"
     scale = "scales[j]" if is_array(columns) else "steps[j]"
     copies = [] if is_array(columns) else ["sizes, steps = np.array(x), np.array(scales)"]
-    differences = _stores(", j", "above", (rows,), "{} / (2.0 * h)")
-    opposite = [line.replace("above", "below").replace("] = ", "] -= ") for line in differences]
-    body = f"h = {RELATIVE_STEP} * (abs({size}) + {scale})", *sides, *differences, *opposite
+    stores = *_stores("above", rows, "{} / (2.0 * h)"), *_stores("below", rows, "{} / (2.0 * h)", "-")
+    body = f"h = {RELATIVE_STEP} * (abs({size}) + {scale})", *sides, *stores
     start = f"out = np.empty(({rows}, {columns}))", *copies, f"for j in range({columns}):"
     lines = *start, *(f"    {line}" for line in body)
     names = {"function": inlined(function), "np": np}

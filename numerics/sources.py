@@ -79,6 +79,11 @@ def _shown_in_tracebacks(name: str, text: str) -> str:
     return file
 
 
+def made_here(function: Callable) -> bool:
+    """Whether a function was written out, and so returns what is large as an array."""
+    return getattr(function, "__module__", None) == __name__
+
+
 class Index(str):
     """The name of a loop's index, with which one may count as with a number."""
 

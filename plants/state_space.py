@@ -11,8 +11,9 @@ import numpy as np
 
 from numerics.checks import at_least, covariance, covariance_root, one_of, vector
 from numerics.compiled import inlined
-from numerics.derivatives import array_valued, complex_step
+from numerics.derivatives import complex_step
 from numerics.pickling import as_function, as_made
+from numerics.results import array_valued
 from numerics.sources import is_array
 from plants.model_check import check_functions, checked_constants
 from plants.quantities import Quantities, outputs, quantities
