@@ -31,7 +31,7 @@ _packages: dict[str, tuple[str, ...]] = {}  # see `may_be_inlined`
 _waiting: list[Callable] = []
 _marked: set[Callable] = set()
 _called: set[Callable] = set()  # of these, functions that are called and not inlined
-_lessons: list[Callable[[], None]] = [lambda: optimise_once(_called.__contains__)]
+_lessons: list[Callable[[], None]] = [lambda: optimise_once(_called.__contains__, _is_large)]
 _interpreting = False
 
 
@@ -51,6 +51,11 @@ def inlined(function: Callable, *, into_callers: bool = True) -> Callable:
             _called.add(function)
         _waiting.append(function)
     return function
+
+
+def _is_large(function: Callable) -> bool:
+    """Whether a function calls one that is called and not inlined."""
+    return not _called.isdisjoint(_callees(function))
 
 
 def overloaded(function: Callable) -> Callable:

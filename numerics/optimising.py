@@ -8,14 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+LEVEL = 2  # of LLVM's optimisation of large functions: of the third, loops over long rows gain a tenth
 
-def optimise_once(is_called: Callable[[Callable], bool]) -> None:
-    """Leave functions as they are when they are compiled for a caller; those that are asked for are optimised.
 
-    Without the place in numba that this needs, everything still works, and takes longer to compile.
+def optimise_once(is_called: Callable[[Callable], bool], is_large: Callable[[Callable], bool]) -> None:
+    """Leave called functions as they are when they are compiled for a caller; what is asked for is optimised.
+
+    Without the places in numba that this needs, everything still works, and takes longer to compile.
 
     Args:
         is_called: whether a plain function is one to leave.
+        is_large: whether a function that is asked for calls such functions.
     """
     from numba.core import codegen, event
 
@@ -34,8 +37,16 @@ def optimise_once(is_called: Callable[[Callable], bool]) -> None:
 
     event.register("numba:compile", Compiling())
 
-    def optimise_unless_called(self):
-        if not (compiling and is_called(compiling[-1])):
+    def optimise_outermost(self):
+        if not compiling or not (is_called(compiling[-1]) or is_large(compiling[-1])):
             optimise(self)
+        elif not is_called(compiling[-1]):
+            options = self._codegen
+            before = getattr(options, "_opt_level", None)
+            try:
+                options._opt_level = LEVEL if before == 3 else before
+                optimise(self)
+            finally:
+                options._opt_level = before
 
-    library._optimize_final_module = optimise_unless_called
+    library._optimize_final_module = optimise_outermost

@@ -7,7 +7,7 @@ from functools import cache, wraps
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
-from numerics.sources import made_here
+from numerics.written import made_here
 
 _MADE: WeakKeyDictionary[Callable, Made] = WeakKeyDictionary()
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from numerics.compiled import inlined, overloaded, when_compiling
 from numerics.pickling import makes_functions
-from numerics.sources import is_array, made_here, written_out
+from numerics.sources import is_array
+from numerics.written import made_here, written_out
 
 
 @overloaded

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -31,8 +32,8 @@ def check_functions(model) -> None:
     states, measured = _count(n, "state"), _count(m, "measurement")
     by_states, by_noise = f"as prior_mean has {n}", f"as measurement_noise_cov is {m} x {m}"
     rules = {
-        "transition": ("x, u, c", (n,), f"a tuple of {states}, {by_states}"),
-        "observe": ("x, c", (m,), f"a tuple of {measured}, {by_noise}"),
+        "transition": ("x, u, c", (n,), f"a tuple{_or_array(n)} of {states}, {by_states}"),
+        "observe": ("x, c", (m,), f"a tuple{_or_array(m)} of {measured}, {by_noise}"),
         "transition_jacobian": ("x, u, c", (n, n), f"{_count(n, 'row')} of {n}, {by_states}"),
         "observe_jacobian": ("x, c", (m, n), f"{_count(m, 'row')} of {n}, {by_noise}"),
     }
@@ -61,14 +62,15 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
         x = point if is_array(model.n) else tuple(point.tolist())
         given = {"x": x, "u": as_value(np.zeros(model.inputs)), "c": model.given_constants}
         try:
-            with np.errstate(all="ignore"):
+            with np.errstate(all="ignore"), warnings.catch_warnings():
+                warnings.simplefilter("error", np.exceptions.ComplexWarning)  # of a derivative that is lost
                 result = function(*(given[argument] for argument in arguments.split(", ")))
         except ArithmeticError:  # machine code has infinity there
             continue
         except Exception as error:
             if str(error).startswith("math "):  # "math domain error", where machine code has NaN
                 continue
-            sizes = f"{_count(model.n, 'state')} and {_count(model.inputs, 'input')}"
+            sizes = f"{_count(model.n, 'state')}{_form(model.n)} and {_count(model.inputs, 'input')}"
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise ValueError(f"{name} must work for {sizes}, but raised {reason}") from error
         found = _shape(result)
@@ -91,6 +93,14 @@ def _said(shape: tuple[int, ...] | None, result) -> str:
     if len(shape) == 1:
         return _count(shape[0], "entry").replace("entrys", "entries")
     return f"{shape[0]} x {shape[1]} numbers" if shape else f"the number {shown(result)}"
+
+
+def _form(count: int) -> str:
+    return f" (x is an array of {count} numbers)" if is_array(count) else ""
+
+
+def _or_array(count: int) -> str:
+    return " or array" if is_array(count) else ""
 
 
 def _count(count: int, noun: str) -> str:
