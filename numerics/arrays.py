@@ -17,30 +17,42 @@ def called(function):
 
 
 @called
-def product_of_rows(a, b):
-    """A b', of arrays by rows: four rows of b at a time share what is read of a."""
+def _products_of_rows(a, b, lower):
+    """A b', or its part on and below the diagonal: two rows and four share what is read, the last ones again.
+
+    So there is one loop, and no further ones for what is left over at the ends.
+    """
     rows, columns, inner = a.shape[0], b.shape[0], a.shape[1]
     out = np.empty((rows, columns))
-    whole = columns - columns % 4
-    for i in range(rows):
-        for j in range(0, whole, 4):
-            s_0 = s_1 = s_2 = s_3 = 0.0
+    for i in range(0, rows, 2):
+        i_1 = min(i + 1, rows - 1)
+        for j in range(0, i + 2 if lower else columns, 4):
+            j_0, j_1, j_2, j_3 = (
+                min(j, columns - 1),
+                min(j + 1, columns - 1),
+                min(j + 2, columns - 1),
+                min(j + 3, columns - 1),
+            )
+            p_0 = p_1 = p_2 = p_3 = q_0 = q_1 = q_2 = q_3 = 0.0
             for k in range(inner):
-                x = a[i, k]
-                s_0 += x * b[j, k]
-                s_1 += x * b[j + 1, k]
-                s_2 += x * b[j + 2, k]
-                s_3 += x * b[j + 3, k]
-            out[i, j] = s_0
-            out[i, j + 1] = s_1
-            out[i, j + 2] = s_2
-            out[i, j + 3] = s_3
-        for j in range(whole, columns):
-            s_0 = 0.0
-            for k in range(inner):
-                s_0 += a[i, k] * b[j, k]
-            out[i, j] = s_0
+                x, y = a[i, k], a[i_1, k]
+                p_0 += x * b[j_0, k]
+                p_1 += x * b[j_1, k]
+                p_2 += x * b[j_2, k]
+                p_3 += x * b[j_3, k]
+                q_0 += y * b[j_0, k]
+                q_1 += y * b[j_1, k]
+                q_2 += y * b[j_2, k]
+                q_3 += y * b[j_3, k]
+            out[i, j_0], out[i, j_1], out[i, j_2], out[i, j_3] = p_0, p_1, p_2, p_3
+            out[i_1, j_0], out[i_1, j_1], out[i_1, j_2], out[i_1, j_3] = q_0, q_1, q_2, q_3
     return out
+
+
+@called
+def product_of_rows(a, b):
+    """A b'."""
+    return _products_of_rows(a, b, False)
 
 
 @called
@@ -85,44 +97,40 @@ def weighted_square_of_rows(d, table, weights):
     for i in range(rows):
         for j in range(size):
             scaled[i, j] = table[weights, j] * d[i, j]
-    out = np.empty((rows, rows))
+    out = _products_of_rows(scaled, d, True)
     for i in range(rows):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(size):
-                total += scaled[i, k] * d[j, k]
-            out[i, j] = out[j, i] = total
+        for j in range(i):
+            out[j, i] = out[i, j]
     return out
 
 
 @called
 def square_of_rows(a):
     """A a', exactly symmetric."""
-    rows, inner = a.shape
-    out = np.empty((rows, rows))
-    for i in range(rows):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(inner):
-                total += a[i, k] * a[j, k]
-            out[i, j] = out[j, i] = total
+    out = _products_of_rows(a, a, True)
+    for i in range(a.shape[0]):
+        for j in range(i):
+            out[j, i] = out[i, j]
     return out
 
 
 @called
 def solve_rows(b, factor):
-    """B (l l')^-1 for a lower triangular l: forwards with its rows, then backwards with them once more."""
+    """B (l l')^-1 for a lower triangular l, of all rows of b at a time: forwards, then backwards."""
     rows, size = b.shape
-    out = b.copy()
-    for r in range(rows):
-        for i in range(size):
-            total = out[r, i]
-            for k in range(i):
-                total -= factor[i, k] * out[r, k]
-            out[r, i] = total / factor[i, i]
-        for i in range(size - 1, -1, -1):
-            x = out[r, i] / factor[i, i]
-            out[r, i] = x
-            for k in range(i):
-                out[r, k] -= factor[i, k] * x
-    return out
+    turned = b.T.copy()
+    for i in range(size):
+        for k in range(i):
+            x = factor[i, k]
+            for r in range(rows):
+                turned[i, r] -= x * turned[k, r]
+        for r in range(rows):
+            turned[i, r] /= factor[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            x = factor[k, i]
+            for r in range(rows):
+                turned[i, r] -= x * turned[k, r]
+        for r in range(rows):
+            turned[i, r] /= factor[i, i]
+    return turned.T.copy()

@@ -10,6 +10,8 @@ from collections.abc import Callable
 
 LEVEL = 2  # of LLVM's optimisation of large functions: of the third, loops over long rows gain a tenth
 
+LEVEL_INSIDE = 1  # of what becomes part of these, and is then optimised once more
+
 
 def optimise_once(is_called: Callable[[Callable], bool], is_large: Callable[[Callable], bool]) -> None:
     """Leave called functions as they are when they are compiled for a caller; what is asked for is optimised.
@@ -38,13 +40,13 @@ def optimise_once(is_called: Callable[[Callable], bool], is_large: Callable[[Cal
     event.register("numba:compile", Compiling())
 
     def optimise_outermost(self):
-        if not compiling or not (is_called(compiling[-1]) or is_large(compiling[-1])):
+        if not compiling or not is_large(compiling[0]):
             optimise(self)
         elif not is_called(compiling[-1]):
             options = self._codegen
             before = getattr(options, "_opt_level", None)
             try:
-                options._opt_level = LEVEL if before == 3 else before
+                options._opt_level = before and min(before, LEVEL if len(compiling) == 1 else LEVEL_INSIDE)
                 optimise(self)
             finally:
                 options._opt_level = before

@@ -231,5 +231,8 @@ def test_a_nonlinear_model_without_a_range_is_refused():
 
 
 def test_more_rules_than_sense_are_refused():
-    with pytest.raises(ValueError, match="at most 8 states, but got 9"):
-        FuzzyKalmanFilter(model=random_affine(9, p=1))
+    model = random_affine(9, p=1)
+    with pytest.raises(ValueError, match="premises must name 1 to 8 different states, .* but got"):
+        FuzzyKalmanFilter(model=model, premises=range(9))
+    assert len(FuzzyKalmanFilter(model=model, premises=(2, -1)).rules) == 4
+    assert FuzzyKalmanFilter(model=model).premises == (0,)  # the rules of an affine model are all alike
