@@ -7,9 +7,15 @@ import numpy as np
 import pytest
 
 from filters.bounds import posterior_bound
+from filters.likelihood import likelihood
 from plants.state_space import StateSpaceModel
 from tests import pendulum_problem
 from tests.models import wide_model
+from tests.tuned_files import write_untuned
+from tuning.evaluation import held_out
+from tuning.evaluation.baselines import Scaled
+from tuning.evaluation.tuned import read_choice, read_tuned
+from tuning.likelihood.noise import noise_family
 from tuning.problems import model_problem
 from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem
@@ -169,6 +175,32 @@ def test_policies_act_on_what_the_env_shows():
     drawn = EnvProblem("Pendulum-v1", "random", pendulum_problem.model(), steps=60, state_of=lambda env: env.state)
     inputs = drawn.data([1, 2]).inputs
     assert np.abs(inputs).max() <= 2.0 and inputs.std() > 1.0 and not np.array_equal(*inputs)
+
+
+@pytest.mark.parametrize("make", [MAKERS["two sensors"], pair], ids=["two sensors", "pair"])
+def test_several_sensors_are_kept_by_a_tuned_file(make, tmp_path, monkeypatch):
+    monkeypatch.setattr(held_out, "scaled_default", lambda *_: Scaled(None, None, None, "not here"))
+    problem = make(name="mine")
+    path = write_untuned(tmp_path / "t.json", problem)
+    assert read_tuned(path, [problem]) == (untuned_choice("ekf", problem), problem, 0)
+    assert read_choice(path, problem) == untuned_choice("ekf", problem)
+
+
+def test_the_gradient_of_correlated_sensors_is_that_of_their_likelihood():
+    problem = pair(steps=20, first_scored_step=5)
+    data, choice, numbers = problem.data([1]), untuned_choice("ekf", problem), parameters("ekf", problem)
+    noise_at = noise_family(choice, problem, numbers)
+    values = np.array([one.get(choice) for one in numbers])
+
+    def log_likelihood(logarithms):
+        return likelihood(*noise_at(values * np.exp(logarithms), data)).values[0]
+
+    steps = 1e-4 * np.eye(len(values))
+    differences = [(log_likelihood(step) - log_likelihood(-step)) / 2e-4 for step in steps]
+    found = likelihood(*noise_at(values, data)).gradients[0]
+    np.testing.assert_allclose(found, differences, rtol=1e-4, atol=1e-5)
+    model = noise_at(values, data)[0]
+    np.testing.assert_allclose(model.measurement_noise_cov, problem.truth.measurement_noise_cov)
 
 
 def line(transition=lambda x, u, c: (0.9 * x[0],), **changes):
