@@ -11,7 +11,7 @@ from numerics.angles import kept
 from numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
 from numerics.derivatives import RELATIVE_STEP
 from numerics.formulas import formula
-from numerics.matrices import cholesky_factor, innovation, innovation_likelihood, masked, row_solver
+from numerics.matrices import cholesky_factor, innovation_likelihood, masked, row_solver
 from numerics.threads import spread
 from numerics.tuples import (
     matrix_of,
@@ -23,7 +23,7 @@ from numerics.tuples import (
     written_out,
 )
 from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape, observation_slopes, transition_slopes
+from plants.shape import Functions, Shape, innovation_of, observation_slopes, transition_slopes
 from plants.state_space import StateSpaceModel
 
 
@@ -99,7 +99,7 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
     mean_slope, cov_slope = vector_reader(n), matrix_reader(n, n, n)  # a parameter's row: dx, then dP
     store_mean_slope, store_cov_slope = vector_writer(n), matrix_writer(n, n, n)
     difference, root_of, log_likelihood = (
-        innovation(m, shape.measurement_angles),
+        innovation_of(shape),
         cholesky_factor(m),
         innovation_likelihood(m),
     )

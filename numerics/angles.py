@@ -69,8 +69,8 @@ def kept(function: Callable, arguments: str, angles: tuple[bool, ...]) -> Callab
     """A function of the arguments that returns a vector, with its angles in (-pi, pi]."""
     if not any(angles):
         return function
-    entries = (short_way(f"y[{i}]", i, angles) for i in range(len(angles)))
-    call = f"y = function({arguments})"
+    entries = (short_way(f"found[{i}]", i, angles) for i in range(len(angles)))
+    call = f"found = function({arguments})"
     return written_out("kept", arguments, call, tuple_of(entries), function=inlined(function), **NAMES)
 
 

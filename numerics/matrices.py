@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable
 from functools import cache
 
-from numerics.angles import NAMES, short_way
 from numerics.tuples import matrix_of, tuple_of, written_out
 
 RESOLUTION = 1e-15  # of the difference of two float64, relative to them
@@ -73,14 +72,10 @@ def identity_less(size: int) -> Callable:
 
 
 @cache
-def innovation(size: int, angles: tuple[bool, ...] = (), first: int = 0) -> Callable:
-    """Return `subtract(z, y)`: z - y[first:], zero in channels that are NaN in z.
-
-    It is in (-pi, pi] in those that are angles, a tuple of bool.
-    """
-    differences = (short_way(f"z[{i}] - y[{first + i}]", i, angles) for i in range(size))
-    entries = (f"{difference} if z[{i}] == z[{i}] else 0.0" for i, difference in enumerate(differences))
-    return written_out("subtract", "z, y", tuple_of(entries), **NAMES)
+def innovation(size: int, first: int = 0) -> Callable:
+    """Return `subtract(z, y)`: z - y[first:], zero in channels that are NaN in z."""
+    entries = (f"z[{i}] - y[{first + i}] if z[{i}] == z[{i}] else 0.0" for i in range(size))
+    return written_out("subtract", "z, y", tuple_of(entries))
 
 
 @cache

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+from numerics import matrices
+from numerics.angles import kept
 from numerics.derivatives import jacobian
 
 
@@ -31,6 +33,11 @@ class Functions(NamedTuple):
     transition_jacobian: Callable | None
     observe: Callable
     observe_jacobian: Callable | None
+
+
+def innovation_of(shape: Shape, first: int = 0) -> Callable:
+    """Return `subtract(z, y)`: z - y[first:], angles the short way round, zero in channels that are NaN in z."""
+    return kept(matrices.innovation(shape.m, first), "z, y", shape.measurement_angles)
 
 
 def constants_form(constants: tuple) -> type | int:

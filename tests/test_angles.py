@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from filters import FILTERS, StateSpaceModel, Unknown, affine_model, augmented_model, make_filter, run, smooth
+from filters.baselines.inverse import component_solver
 from filters.consistency.report import consistency_report
 from filters.ensembles.recording import record_members
 from filters.gaussian.mixture import part_aligner
@@ -281,11 +282,11 @@ def test_a_sample_is_put_on_the_branch_of_its_weighted_circular_mean(compiling):
 @pytest.mark.usefixtures("as_python")
 def test_weights_decide_where_the_mean_is(name, numbers):
     """Nearly all weight lies opposite to where the belief was on average, on both sides of the cut there."""
-    model = turning(prior_cov=[1e-4, 4.0], measurement_noise_cov=[1e-3, 1.0])
+    model = turning(prior_cov=[1e-4, 4.0], measurement_noise_cov=[0.04, 1.0])
     filter_ = make_filter(name, model, **numbers)
     belief, _ = filter_.update(filter_.init((1, 2)), [3.1, 0.2])
-    assert abs(difference(belief.mean, [0.2, 3.1], (False, True))[1]) < 0.02
-    assert belief.cov[1, 1] == pytest.approx(1e-3, rel=0.3)
+    assert abs(difference(belief.mean, [0.2, 3.1], (False, True))[1]) < 0.05
+    assert belief.cov[1, 1] == pytest.approx(0.04, rel=0.3)
 
 
 @pytest.mark.usefixtures("as_python")
@@ -309,6 +310,13 @@ def test_consistency_is_judged_alike_across_the_cut():
     np.testing.assert_allclose(found.ensemble.crps, reference.ensemble.crps, rtol=1e-9)
     for one, other in zip(found.ensemble.ranks, reference.ensemble.ranks, strict=True):
         np.testing.assert_array_equal(one.frequencies, other.frequencies)
+
+
+def test_the_jump_of_a_measured_angle_is_not_taken_for_a_root():
+    """From heading 0 a bearing of 3 is met at 3, though h - z changes its sign, by a jump, at 3 - pi."""
+    solve = component_solver(sight, 2, 1, 0, True)
+    assert solve((0.0, 0.0), 3.0, (), 4.0) == pytest.approx((0.0, 3.0))
+    assert component_solver(sight_and_wrap, 2, 1, 0, True)((0.0, 0.0), 3.0, (), 4.0) == pytest.approx((0.0, 3.0))
 
 
 def test_differences_of_angles_go_the_short_way_round():

@@ -9,7 +9,7 @@ from filters.gaussian.extended import silenced
 from numerics import matrices
 from numerics.compiled import inlined
 from numerics.tuples import matrix_of, written_out
-from plants.shape import Shape
+from plants.shape import Shape, innovation_of
 
 
 @lru_cache(maxsize=64)
@@ -23,7 +23,7 @@ def measurement_noise_moment(shape: Shape) -> Callable:
     """
     n, m = shape.n, shape.m
     mask, factor, solve = matrices.masked(m), matrices.cholesky_factor(m), matrices.row_solver(m, m)
-    silent, difference = silenced(m, n), matrices.innovation(m, shape.measurement_angles)
+    silent, difference = silenced(m, n), innovation_of(shape)
     p_ht, h_p_ht = matrices.transposed_multiplier(n, n, m), matrices.multiplier(m, n, m)
     present = written_out(
         "present", "r, z", matrix_of(m, m, lambda i, j: f"(r[{i}][{j}] if z[{j}] == z[{j}] else 0.0)")

@@ -12,13 +12,12 @@ from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
 from filters.gaussian.extended import nothing_to_summarise
-from numerics import matrices
-from numerics.angles import angle_writer, wrapped
+from numerics.angles import wrapped
 from numerics.checks import at_least, positive
 from numerics.compiled import inlined
-from numerics.tuples import vector_reader
+from numerics.tuples import vector_reader, vector_writer
 from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape
+from plants.shape import Functions, Shape, innovation_of
 
 
 @inlined
@@ -48,14 +47,14 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     places, source, own = memory_places(n, m), number_places(n, m), own_place(shape)
     substeps_place, step_place, likelihood_place = source.substeps, places.step, places.log_likelihood
     smooth_place, known_place, reach_place, kept_place = places.extras + n, places.extras + n + 1, own, own + 1
-    read_open, store_open = vector_reader(n, places.extras), angle_writer(places.extras, shape.state_angles)
+    read_open, store_open = vector_reader(n, places.extras), vector_writer(n, places.extras)
     (read_mean, _), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     prior_mean, constants, control = (
         vector_reader(n, source.prior_mean),
         constants_reader(shape),
         vector_reader(shape.inputs),
     )
-    measured, difference = vector_reader(m), matrices.innovation(m, shape.measurement_angles)
+    measured, difference = vector_reader(m), innovation_of(shape)
     component, channel = inverted or (0, 0)
     angle, inverts = shape.measurement_angles[channel], inverted is not None
     solve = component_solver(observe, n, component, channel, angle)

@@ -26,7 +26,7 @@ from numerics.tuples import (
     written_out,
 )
 from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape
+from plants.shape import Functions, Shape, innovation_of
 
 LARGEST_ENSEMBLE = 1_000_000
 
@@ -49,7 +49,7 @@ def measurement_moments(observe: Callable, shape: Shape) -> Callable:
     read_r, mask, add = matrix_reader(m, m, source.r), matrices.masked(m), matrices.symmetric_sum(m)
     _, _, (store_innovation, store_s) = row_access(shape)
     factor, likelihood = matrices.cholesky_factor(m), matrices.innovation_likelihood(m)
-    difference, measured = matrices.innovation(m, shape.measurement_angles), vector_reader(m)
+    difference, measured = innovation_of(shape), vector_reader(m)
 
     silence = silencer(n, shape.measurement_angles)
 

@@ -17,7 +17,7 @@ from numerics.checks import at_least
 from numerics.compiled import inlined
 from numerics.tuples import column_writer, tuple_of, vector_reader, written_out
 from plants.layout import constants_reader
-from plants.shape import Shape
+from plants.shape import Shape, innovation_of
 
 MOST_ITERATIONS = 1000
 
@@ -49,7 +49,7 @@ def iterated_analysis(observe: Callable, shape: Shape) -> Callable:
     slopes, iterations_place = n + m, own_place(shape) + 2  # Y lies in rows n + m ... of the table
     compare, gain, geometric = measurement_moments(observe, shape), transform_gain(n, m), geometric_mean(m)
     constants, measured = constants_reader(shape), vector_reader(m)
-    difference = matrices.innovation(m, shape.measurement_angles, n)
+    difference = innovation_of(shape, n)
     store_state, store_predicted, store_slopes = column_writer(n), column_writer(m, n), column_writer(m, slopes)
     moved, undone, predict = moved_member(n, m, slopes), transform_undone(n, m), linear_prediction(m)
     add, factor, solve = matrices.symmetric_sum(m), matrices.cholesky_factor(m), matrices.row_solver(m, m)

@@ -14,7 +14,7 @@ from numerics import matrices
 from numerics.compiled import inlined
 from numerics.tuples import matrix_of, matrix_reader, matrix_writer, scaled_sum, vector_reader, written_out
 from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape, observation_slopes, transition_slopes
+from plants.shape import Functions, Shape, innovation_of, observation_slopes, transition_slopes
 from plants.state_space import StateSpaceModel
 
 
@@ -51,7 +51,7 @@ def gaussian_innovation(shape: Shape) -> Callable:
     mask, factor, present, silent = (
         matrices.masked(m),
         matrices.cholesky_factor(m),
-        matrices.innovation(m, shape.measurement_angles),
+        innovation_of(shape),
         silenced(m, n),
     )
     p_ht, s_part, add = (

@@ -22,7 +22,7 @@ from numerics.tuples import (
     written_out,
 )
 from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape
+from plants.shape import Functions, Shape, innovation_of
 from plants.state_space import StateSpaceModel
 
 
@@ -146,7 +146,7 @@ def sigma_point_kernels(functions: Functions, shape: Shape, centre: bool) -> Ker
     state_scatter, measured_scatter, cross = scatter(n, 2 * n), scatter(m, 2 * n), cross_scatter(n, m)
     add_n, add_m = matrices.symmetric_sum(n), matrices.symmetric_sum(m)
     silence, silence_shift, mask = silenced_columns(2 * n, m), silenced_columns(1, m), matrices.masked(m)
-    present, factor = matrices.innovation(m, shape.measurement_angles), matrices.cholesky_factor(m)
+    present, factor = innovation_of(shape), matrices.cholesky_factor(m)
     rest, apply, likelihood = residuals(n, m), matrices.vector_multiplier(n, m), matrices.innovation_likelihood(m)
     k_r, k_r_kt = matrices.multiplier(n, m, m), matrices.transposed_multiplier(n, m, n)
     solve, corrected = matrices.row_solver(n, m), scaled_sum(n)

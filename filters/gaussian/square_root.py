@@ -18,7 +18,7 @@ from numerics.tuples import (
     written_out,
 )
 from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape, observation_slopes, transition_slopes
+from plants.shape import Functions, Shape, innovation_of, observation_slopes, transition_slopes
 
 
 @lru_cache(maxsize=64)
@@ -53,7 +53,7 @@ def square_root_kernels(functions: Functions, shape: Shape) -> Kernels:
     square_n, square_m = matrices.square(n, n), matrices.square(m, m)
     triangle_n, triangle = matrices.triangular_root(n, 2 * n), matrices.triangular_root(m + n, m + n)
     mask, factor, silent = matrices.masked(m), matrices.cholesky_factor(m), silenced(m, n)
-    present, likelihood = matrices.innovation(m, shape.measurement_angles), matrices.innovation_likelihood(m)
+    present, likelihood = innovation_of(shape), matrices.innovation_likelihood(m)
     solve, apply, moved = matrices.forward_solver(m), matrices.vector_multiplier(n, m), scaled_sum(n)
     beside = written_out(
         "beside", "a, b", matrix_of(n, 2 * n, lambda i, j: f"a[{i}][{j}]" if j < n else f"b[{i}][{j - n}]")

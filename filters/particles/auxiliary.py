@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import ClassVar
 
 from filters.engine.belief import Kernels
@@ -14,19 +13,12 @@ from filters.ensembles.members import add_noise, ensemble_motion
 from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
 from filters.particles.weights import normalise, read_weights, systematic_resampler, weighted_squares
 from numerics import matrices
-from numerics.angles import NAMES, short_way
+from numerics.angles import kept
 from numerics.compiled import inlined
 from numerics.streams import FILTER_MEASUREMENT, uniform_block
-from numerics.tuples import column_reader, column_writer, matrix_reader, tuple_of, written_out
+from numerics.tuples import column_reader, column_writer, matrix_reader, scaled_sum
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape
-
-
-@cache
-def less(count: int, angles: tuple[bool, ...]) -> Callable:
-    """Return `less(x, y)`: the tuple x - y, the short way round where it is an angle."""
-    entries = (short_way(f"x[{i}] + a * y[{i}]", i, angles) for i in range(count))
-    return written_out("less", "x, y", "a = -1.0", tuple_of(entries), **NAMES)
 
 
 @lru_cache(maxsize=64)
@@ -51,7 +43,7 @@ def auxiliary_kernels(functions: Functions, shape: Shape) -> Kernels:
     )
     far = scratch + 2 * m
     foreseen, store_foreseen = column_reader(m, scratch + m), column_writer(m, scratch + m)
-    apart, add = less(m, shape.measurement_angles), matrices.symmetric_sum(m)
+    add_scaled, add = kept(scaled_sum(m), "x, a, y", shape.measurement_angles), matrices.symmetric_sum(m)
     read_r, choose = matrix_reader(m, m, source.r), systematic_resampler(n + 1, weights, scratch)
 
     @inlined
@@ -87,7 +79,7 @@ def auxiliary_kernels(functions: Functions, shape: Shape) -> Kernels:
             for j in range(table.shape[1]):
                 y = observe(state(table, j), c)
                 store_foreseen(table, j, y)
-                store_effect(table, j, apart(predicted(table, j), y))
+                store_effect(table, j, add_scaled(predicted(table, j), -1.0, y))
             read_weights(table, logarithms, weights, size)
             foresight = normal(z, add(effects(table, size), read_r(numbers)))
             for j in range(table.shape[1]):

@@ -19,7 +19,7 @@ from numerics.checks import at_least
 from numerics.compiled import inlined
 from numerics.tuples import column_reader, column_writer, matrix_reader, vector_reader
 from plants.layout import constants_reader, number_places
-from plants.shape import Shape
+from plants.shape import Shape, innovation_of
 
 
 class ParticleParts(NamedTuple):
@@ -54,7 +54,7 @@ def particle_parts(observe: Callable, shape: Shape, weights: int) -> ParticlePar
         matrices.symmetric_sum(m),
         matrices.cholesky_factor(m),
     )
-    difference, measured = matrices.innovation(m, shape.measurement_angles), vector_reader(m)
+    difference, measured = innovation_of(shape), vector_reader(m)
     half_square, constant = log_density(m)
     silence = silencer(scratch, shape.measurement_angles, weights)
     of_states = means, covariances
