@@ -49,4 +49,4 @@ class ModelledEnv:
         if tuned_for is not None:
             others = self.tuned_differences(tuned_for, file)
             if others:
-                warnings.warn(f"{file} was tuned for {', '.join(others)}", stacklevel=4)
+                warnings.warn(f"{file} was tuned for {', '.join(others)}", stacklevel=5)

@@ -7,32 +7,25 @@ import numpy as np
 import pytest
 
 from filters.bounds import posterior_bound
-from plants.state_space import StateSpaceModel
+from filters.likelihood import likelihood
 from tests import pendulum_problem
 from tests.models import wide_model
+from tests.small_problems import pair, thruster
+from tests.tuned_files import write_untuned
+from tuning.evaluation import held_out
+from tuning.evaluation.baselines import Scaled
+from tuning.evaluation.tuned import read_choice, read_tuned
+from tuning.likelihood.noise import noise_family
 from tuning.problems import model_problem
 from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem
-from tuning.problems.excitation import BinarySequence, MultiSine, Steps
+from tuning.problems.excitation import BinarySequence, MultiSine
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.parameter import Parameter
 from tuning.problems.problem import NOISE, scored_states
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters, parameters_of, true_choice, untuned_choice
-from tuning.thruster.find import find_scenario
 
-UNITS = {"states": ["p", ("q", "q", "m"), "r"], "measurements": [("one", "a", "N"), "b"]}
 pytestmark = pytest.mark.usefixtures("as_python")
-
-
-def thruster(**changes):
-    return find_scenario("nominal").replace(steps=60, **changes)
-
-
-def pair(**changes):
-    model = wide_model(**UNITS)
-    given = {"inputs": Steps(amplitude=(1.0, 2.0), hold=5), "steps": 60, "scale": (0.5, np.inf, 1.0)}
-    return ModelProblem(model, **{"assumed": model, **given, **changes})
 
 
 MAKERS = {
@@ -171,127 +164,27 @@ def test_policies_act_on_what_the_env_shows():
     assert np.abs(inputs).max() <= 2.0 and inputs.std() > 1.0 and not np.array_equal(*inputs)
 
 
-def line(transition=lambda x, u, c: (0.9 * x[0],), **changes):
-    return StateSpaceModel(
-        transition=transition, observe=lambda x, c: (x[0],), inputs=0, process_noise_cov=[0.1],
-        measurement_noise_cov=[1.0], prior_mean=[1.0], prior_cov=[1.0], **changes,
-    )  # fmt: skip
+@pytest.mark.parametrize("make", [MAKERS["two sensors"], pair], ids=["two sensors", "pair"])
+def test_several_sensors_are_kept_by_a_tuned_file(make, tmp_path, monkeypatch):
+    monkeypatch.setattr(held_out, "scaled_default", lambda *_: Scaled(None, None, None, "not here"))
+    problem = make(name="mine")
+    path = write_untuned(tmp_path / "t.json", problem)
+    assert read_tuned(path, [problem]) == (untuned_choice("ekf", problem), problem, 0)
+    assert read_choice(path, problem) == untuned_choice("ekf", problem)
 
 
-def nowhere_else(x, u, c):  # than at the prior mean
-    return (x[0] if x[0] == 1.0 else float("nan"),)
+def test_the_gradient_of_correlated_sensors_is_that_of_their_likelihood():
+    problem = pair(steps=20, first_scored_step=5)
+    data, choice, numbers = problem.data([1]), untuned_choice("ekf", problem), parameters("ekf", problem)
+    noise_at = noise_family(choice, problem, numbers)
+    values = np.array([one.get(choice) for one in numbers])
 
+    def log_likelihood(logarithms):
+        return likelihood(*noise_at(values * np.exp(logarithms), data)).values[0]
 
-BAD = {
-    "no model": (lambda: ModelProblem(3), "the truth of problem .* must be a StateSpaceModel, but it is 3"),
-    "sensors": (
-        lambda: pair(assumed=wide_model()),
-        r"measurements of the assumed model and the truth must have the same symbols and units, but got z_1 .* a",
-    ),
-    "sizes": (lambda: ModelProblem(line(), wide_model()), "inputs of .* and the truth must be as many, but"),
-    "units": (
-        lambda: ModelProblem(line(states=[("x", "x", "m")]), line(states=[("x", "x", "km")])),
-        r"states of .* must have the same symbols and units, but got x \[km\] and x \[m\]",
-    ),
-    "names": (
-        lambda: ModelProblem(line(states=["x"]), line(states=["y"])),
-        "states of the assumed model must begin with some of the truth's, x, but got y",
-    ),
-    "no inputs": (lambda: pair(inputs=None), r"inputs must be finite numbers \(K, 2\), an excitation, or"),
-    "inputs": (lambda: pair(inputs=np.ones((60, 3))), r"inputs must be finite numbers \(K, 2\), an excitation"),
-    "rows": (lambda: pair(inputs=np.ones((9, 2))), "inputs must have a row for each of 60 steps, but got 9"),
-    "function": (
-        lambda: pair(inputs=lambda seeds, steps: np.ones(3)).data([1]),
-        r"inputs of problem a pair of models must have the shape \(1, 60, 2\), but got \(3,\)",
-    ),
-    "levels": (
-        lambda: pair(inputs=Steps(amplitude=(1.0, 2.0, 3.0))).data([1]),
-        r"amplitude must be one number, or one for each of 2 inputs, but got \(1.0, 2.0, 3.0\)",
-    ),
-    "steps": (lambda: pair(steps=0), "steps must be a whole number of at least 2, but got 0"),
-    "scale": (
-        lambda: checked_problem(pair(scale=(1.0, -1.0, 1.0))),
-        "scale of problem a pair of models must be 3 positive numbers, infinite for states that do not count",
-    ),
-    "true NaN": (
-        lambda: ModelProblem(line(nowhere_else), steps=60).data([5]),
-        "states of problem a pair of models must be finite, but those of seed 5 are not from step 1 on",
-    ),
-    "assumed NaN": (
-        lambda: checked_problem(ModelProblem(line(), line(nowhere_else), steps=60, scale=(1.0,))),
-        r"transition of the model of problem .* must be finite at the first true state, but got \(nan,\)",
-    ),
-    "own names": (
-        lambda: checked_problem(Stranger(wide_model(), None, np.ones((60, 2)), scale=(1.0, 1.0, 1.0))),
-        r"states of problem .* and its model must have the same symbols and units, but got a \[\] and x_1",
-    ),
-    "study": (lambda: Plan("ekf", (3,)).checked(), "a study must be of .*problem.Problem, but got 3"),
-    "mixed study": (
-        lambda: Plan("ekf", (thruster(), pair())).checked(),
-        "problems of one study must have as many states and .* but nominal and a pair of models have",
-    ),
-    "argument": (
-        lambda: pair().model(sigma=3.0),
-        "arguments of the model of problem .* must be among process_noise_cov, .*, but got sigma",
-    ),
-    "parameters": (
-        lambda: pair(parameters=[Parameter("sigma", 0.1, 1.0)]),
-        "a model with parameters must be a function of them, but got",
-    ),
-    "maker": (
-        lambda: ModelProblem(line(), lambda sigma: line(), parameters=[Parameter("other", 0.1, 1.0)]),
-        "the model of problem .* must be made of other, but raised TypeError: .*unexpected keyword",
-    ),
-    "made": (
-        lambda: ModelProblem(line(), lambda sigma: sigma, parameters=[Parameter("sigma", 1.0, 4.0)]),
-        "the model of problem a pair of models must be a StateSpaceModel, but it is 2.0",
-    ),
-    "range": (lambda: Parameter("sigma", 0.0, 1.0), "low of sigma must be positive and below high, but got 0"),
-    "env": (
-        lambda: EnvProblem("Nowhere-v0", "random", pendulum_problem.model()),
-        "the env of problem an env must be one that can be made, but NameNotFound",
-    ),
-    "policy": (lambda: EnvProblem("Pendulum-v1", 3, pendulum_problem.model()), "policy must be 'random', .*3"),
-    "state": (
-        lambda: pendulum_problem.problem(state_of=None).data([1]),
-        r'must show its state in info\["state"\], or state_of must tell it, but info has nothing',
-    ),
-    "short": (
-        lambda: EnvProblem(
-            "MountainCarContinuous-v0", lambda seen: np.sign(seen[1:2]), car(), steps=400, has_truth=False
-        ).data([1]),
-        "episodes of problem an env must last 400 steps, but that of seed 1 ended after [0-9]+$",
-    ),
-    "measured": (
-        lambda: pendulum_problem.problem(measure=two_of_three, measurement_noise_cov=None).data([1]),
-        r"measurements of problem an env must have the shape \(1, 81, 3\) of its model, but got \(1, 81, 2\)",
-    ),
-    "actions": (
-        lambda: EnvProblem("Pendulum-v1", "random", line()),
-        "the action space of problem an env must have the model's 0 entries, but got Box",
-    ),
-}  # fmt: skip
-
-
-def two_of_three(seen, info):
-    return seen[:2]
-
-
-def car():
-    return StateSpaceModel(
-        transition=lambda x, u, c: x, observe=lambda x, c: x, process_noise_cov=[1.0, 1.0],
-        measurement_noise_cov=[1.0, 1.0], prior_mean=[0.0, 0.0], prior_cov=[1.0, 1.0],
-    )  # fmt: skip
-
-
-class Stranger(ModelProblem):
-    """One that says of itself what its model does not."""
-
-    quantities = wide_model(states=["a", "b", "c"]).quantities
-
-
-@pytest.mark.parametrize(("make", "line"), BAD.values(), ids=list(BAD))
-def test_what_does_not_fit_is_one_clear_line(make, line):
-    with pytest.raises(ValueError, match=line) as caught:
-        make()
-    assert "\n" not in str(caught.value)
+    steps = 1e-4 * np.eye(len(values))
+    differences = [(log_likelihood(step) - log_likelihood(-step)) / 2e-4 for step in steps]
+    found = likelihood(*noise_at(values, data)).gradients[0]
+    np.testing.assert_allclose(found, differences, rtol=1e-4, atol=1e-5)
+    model = noise_at(values, data)[0]
+    np.testing.assert_allclose(model.measurement_noise_cov, problem.truth.measurement_noise_cov)

@@ -32,7 +32,8 @@ def noise_family(choice: Choice, problem: Problem, parameters: Sequence[Paramete
         ValueError: if a parameter is not on a logarithmic scale, or changes more of the model than Q and R.
     """
     model = make_filter(choice.name, problem.model(**choice.model)).kernel_model
-    if all(isinstance(one.place, ProcessVariance | MeasurementVariance) for one in parameters):
+    of_noise = all(isinstance(one.place, ProcessVariance | MeasurementVariance) for one in parameters)
+    if of_noise and all(map(_is_diagonal, (model.process_noise_cov, model.measurement_noise_cov))):
         return _variances(model, parameters)
     for one in parameters:
         if not one.log:
@@ -77,6 +78,10 @@ def _variances(model: StateSpaceModel, parameters: Sequence[Parameter]) -> Calla
         return changed, data.inputs, data.measurements, slopes[:, :n, :n], slopes[:, n:, n:]
 
     return noise_at
+
+
+def _is_diagonal(cov: np.ndarray) -> bool:
+    return np.array_equal(cov, np.diag(np.diag(cov)))
 
 
 def _differ_in_noise_alone(one: StateSpaceModel, other: StateSpaceModel) -> bool:
