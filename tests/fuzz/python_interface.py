@@ -21,8 +21,8 @@ from filters import FILTERS, EstimateState, EstimateStates, make_filter, run, th
 from filters.engine.belief import Belief, LostBelief
 from filters.registry import tunable_numbers
 from numerics.compiled import interpreted
-from tests.test_copies import assert_alike
-from tests.test_robustness import random_arguments, run_random_episode
+from tests.robustness.test_copies import assert_alike
+from tests.thruster_env.test_robustness import random_arguments, run_random_episode
 
 WAYS = (
     copy.deepcopy,

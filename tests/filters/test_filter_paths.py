@@ -1,0 +1,203 @@
+"""One result on every path: compiled or not, batch or loop, by init, predict and update, in a session, wrapped."""
+
+import numpy as np
+import pytest
+
+from filters import FILTERS, make_filter, run, thruster_model
+from filters.engine.session import Session
+from numerics.compiled import interpreted
+from numerics.streams import episode_keys, filter_keys
+from tests.filters.test_wrapper import ADDED, infos_of, played, voltages, wrapped
+from tests.models import KEY, MODELS, scalar_model, simulated, small, varying_noise
+from tests.oracles import equal
+from thruster_env.plant import make_plant
+from thruster_env.simulation import simulate
+
+
+def stepped(filter_, key, inputs, measurements):
+    """The beliefs and innovations of one trajectory, by init, predict and update."""
+    belief, innovation = filter_.update(filter_.init(key), measurements[0])
+    found = [(belief, innovation)]
+    for u, z in zip(inputs, measurements[1:], strict=True):
+        belief, innovation = filter_.update(filter_.predict(belief, u), z)
+        found.append((belief, innovation))
+    return found
+
+
+def in_session(filter_, key, inputs, measurements):
+    """Rows (mean, cov, innovation, its cov) of one trajectory, by a session."""
+    session = Session(filter_)
+    parts = session.mean, session.cov, session.innovation, session.innovation_cov
+    session.start(key, measurements[0])
+    rows = [[part.copy() for part in parts]]
+    for u, z in zip(inputs, measurements[1:], strict=True):
+        session.step(u, z)
+        rows.append([part.copy() for part in parts])
+    return [np.array(part) for part in zip(*rows, strict=True)]
+
+
+@pytest.fixture(params=list(FILTERS))
+def name(request):
+    return request.param
+
+
+@pytest.fixture(params=list(MODELS))
+def model(request):
+    return MODELS[request.param]()
+
+
+def assert_paths_agree(filter_, key, inputs, measurements):
+    """Batch, loop and session give one trajectory alike."""
+    close = {"rtol": 1e-12, "atol": 1e-12}
+    estimates = run(filter_, np.array([key]), inputs, measurements)
+    found = stepped(filter_, key, inputs[0], measurements[0])
+    np.testing.assert_allclose(estimates.means[0], [belief.mean for belief, _ in found], **close)
+    np.testing.assert_allclose(estimates.covs[0], [belief.cov for belief, _ in found], **close)
+    np.testing.assert_allclose(estimates.innovations[0], [i.value for _, i in found], **close)
+    np.testing.assert_allclose(estimates.innovation_covs[0], [i.cov for _, i in found], **close)
+    np.testing.assert_allclose(estimates.log_likelihoods[0], [i.log_likelihood for _, i in found], **close)
+    for part, of_session in zip(estimates[:4], in_session(filter_, key, inputs[0], measurements[0]), strict=True):
+        np.testing.assert_allclose(part[0], of_session, **close)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_batch_loop_and_session_agree(name, model):
+    filter_ = small(name, model)
+    inputs, measurements = simulated(model, 20)
+    measurements[0, 3] = measurements[0, 7, 0] = np.nan
+    assert_paths_agree(filter_, KEY, inputs, measurements)
+
+
+def diverging(name):
+    """A filter whose model overflows every second step, or every step if it needs a steady gain, with data."""
+    a, b = (0.5, 1e200) if name == "kf-steady" else (1e180, 1.0)
+    model = scalar_model(a=[[a]], b=[[b]], c=[[1.0]], prior_mean=[1.0])
+    return small(name, model), np.full((1, 6, 1), b), np.ones((1, 7, 1))
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # Python says so when a number overflows
+def test_a_diverging_filter_restarts_and_counts_and_is_never_nan(name):
+    filter_, inputs, measurements = diverging(name)
+    estimates = run(filter_, np.array([KEY]), inputs, measurements)
+    found = stepped(filter_, KEY, inputs[0], measurements[0])
+    assert estimates.divergences.tolist() == [found[-1][0].divergences]
+    assert 1 <= estimates.divergences[0] <= 6
+    for part in estimates:
+        assert not np.isnan(part).any()
+    assert np.isfinite(estimates.means).all() and np.isfinite(estimates.covs).all()
+    np.testing.assert_array_equal(estimates.means[0], [belief.mean for belief, _ in found])
+    np.testing.assert_array_equal(estimates.covs[0], [belief.cov for belief, _ in found])
+    assert all(np.isfinite(innovation.value).all() for _, innovation in found)
+
+
+def assert_compiled_as_python(filter_, *data, **noise):
+    """Compiled and as Python, a batch is the same."""
+    compiled = run(filter_, *data, **noise)
+    with interpreted():
+        as_python = run(filter_, *data, **noise)
+    for one, other in zip(compiled, as_python, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["thruster", "wide affine"])
+def test_compiled_and_interpreted_agree(name, kind):
+    model = MODELS[kind]()
+    filter_ = small(name, model)
+    inputs, measurements = simulated(model, 25)
+    measurements[0, 3] = measurements[0, 7, 0] = np.nan
+    data = np.array([KEY]), inputs, measurements
+    assert_compiled_as_python(filter_, *data)
+    if filter_.varying_noise:
+        assert_compiled_as_python(filter_, *data, **varying_noise(model, 25))
+
+
+@pytest.mark.parametrize("name", ["enkf", "ienkf"])
+def test_compiled_and_interpreted_agree_where_ensembles_are_stretched(name):
+    model = thruster_model()
+    filter_ = make_filter(name, model, ensemble_size=10, inflation=1.05, relaxation=0.4)
+    inputs, measurements = simulated(model, 12, count=3)
+    measurements[0, 3] = measurements[0, 6, 0] = np.nan
+    assert_compiled_as_python(filter_, filter_keys(range(3)), inputs, measurements)
+
+
+@pytest.mark.parametrize("blending", ["moments", "output"])
+def test_compiled_and_interpreted_agree_however_rules_are_blended(blending):
+    filter_ = make_filter("fuzzy", thruster_model(), blending=blending)
+    inputs, measurements = simulated(filter_.model, 12, count=3)
+    measurements[0, 3] = np.nan
+    assert_compiled_as_python(filter_, filter_keys(range(3)), inputs, measurements)
+
+
+def test_compiled_batch_loop_and_session_agree_over_500_steps(name):
+    model = thruster_model()
+    inputs, measurements = simulated(model, 500, level=8.0)
+    measurements[0, 100:120] = np.nan
+    assert_paths_agree(small(name, model), KEY, inputs, measurements)
+
+
+def test_a_wrapped_run_is_the_batch_run(name):
+    seed, actions = 11, voltages(500)
+    env = wrapped(name)
+    _, _, infos = played(env, actions, seed)
+    drawn = simulate(make_plant(), episode_keys([seed]), actions.T.astype(np.float64))
+    np.testing.assert_allclose(infos_of("measurement", infos), drawn.measurements[0], rtol=1e-12, atol=1e-12)
+    numbers = {"ensemble_size": 20} if name == "enkf" else {}
+    inputs = actions[None].astype(np.float64)
+    estimates = run(
+        make_filter(name, thruster_model(), **numbers), filter_keys([seed]), inputs, drawn.measurements
+    )
+    for part, estimate in zip(ADDED, estimates, strict=False):
+        np.testing.assert_allclose(infos_of(part, infos), estimate[0], rtol=1e-12, atol=1e-12, err_msg=part)
+
+
+def test_a_trajectory_does_not_depend_on_its_company(name):
+    model = thruster_model()
+    inputs, measurements = simulated(model, 30, count=19)
+    keys, filter_ = filter_keys(range(19)), small(name, model)
+    together = run(filter_, keys, inputs, measurements)
+    backwards = run(filter_, keys[::-1], inputs[::-1], measurements[::-1])
+    assert equal(together, [part[::-1] for part in backwards])
+    for b in range(19):
+        alone = run(filter_, keys[b : b + 1], inputs[b : b + 1], measurements[b : b + 1])
+        assert equal(alone, [part[b : b + 1] for part in together])
+
+
+def test_the_same_key_gives_the_same_numbers_and_only_ensembles_use_it(name):
+    model = thruster_model()
+    inputs, measurements = simulated(model, 30)
+    filter_ = small(name, model)
+    first, again, other = (run(filter_, filter_keys([s]), inputs, measurements) for s in (1, 1, 2))
+    assert equal(first, again)
+    assert (filter_.size > 0) == (not np.array_equal(first.means, other.means))
+
+
+@pytest.mark.parametrize(
+    ("keys", "inputs", "measurements", "rule"),
+    [
+        ((3, 2), (2, 5, 1), (2, 6, 1), "shapes"),
+        ((2, 1), (2, 5, 1), (2, 6, 1), "shapes"),
+        ((2, 2), (2, 6, 1), (2, 6, 1), "shapes"),
+        ((2, 2), (2, 5, 2), (2, 6, 1), "shapes"),
+        ((2, 2), (2, 5, 1), (2, 6, 2), "shapes"),
+        ((2, 2), (2, 5), (2, 6), "shapes"),
+        ((2, 2), (2, 0, 1), (2, 0, 1), "shapes"),
+    ],
+)
+def test_a_batch_whose_shapes_do_not_fit_is_refused(keys, inputs, measurements, rule):
+    data = np.zeros(keys), np.zeros(inputs), np.zeros(measurements)
+    with pytest.raises(ValueError, match=rule):
+        run(make_filter("ekf", thruster_model()), *data)
+
+
+@pytest.mark.parametrize(("u", "z"), [(np.nan, 0.0), (np.inf, 0.0), (0.0, np.inf)])
+def test_a_batch_with_numbers_that_are_not_finite_is_refused(u, z):
+    with pytest.raises(ValueError, match="inputs must be finite, and measurements finite or NaN"):
+        run(make_filter("ekf", thruster_model()), np.zeros((1, 2)), np.full((1, 1, 1), u), np.full((1, 2, 1), z))
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_batch_of_no_trajectories_gives_no_estimates(name):
+    estimates = run(small(name, thruster_model()), np.zeros((0, 2)), np.zeros((0, 5, 1)), np.zeros((0, 6, 1)))
+    assert estimates.means.shape == (0, 6, 2)
+    assert estimates.divergences.shape == (0,)

@@ -1,0 +1,121 @@
+"""Filters on vector envs: every copy is what a single wrapped env would be."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+
+from filters import FILTERS, EstimateState, EstimateStates
+from filters.wrappers.ids import ALIASES, filtered_id
+
+COPIES, STEPS = 3, 30
+MODES = ["NextStep", "SameStep", "Disabled"]
+DROPOUT = {"sensors": {"thrust": [{"name": "dropout", "probability": 0.3}]}}
+
+
+def pair(filter_name, mode, **arguments):
+    """A wrapped vector env and as many wrapped single envs, with episodes of seven steps."""
+    numbers = {"ensemble_size": 20} if filter_name == "enkf" else {}
+    kind = {"filter": filter_name, "observation": "belief", **numbers}
+    name = "BowThrusterTracking-v0"
+    vector = gym.make_vec(name, num_envs=COPIES, max_episode_steps=7, autoreset_mode=mode, **arguments)
+    singles = [EstimateState(gym.make(name, max_episode_steps=7, **arguments), **kind) for _ in range(COPIES)]
+    return EstimateStates(vector, **kind), singles
+
+
+def assert_copy(vector, i, single):
+    observations, info = vector
+    observation, expected = single
+    np.testing.assert_allclose(observations[i], observation, rtol=1e-5, atol=1e-6)
+    for key in ("estimate", "estimate_cov", "innovation", "innovation_cov", "estimate_divergences"):
+        np.testing.assert_allclose(info[key][i], expected[key], rtol=1e-9, atol=1e-12)
+        assert info[f"_{key}"][i]
+
+
+@pytest.mark.parametrize("arguments", [{}, DROPOUT], ids=["plain", "dropout"])
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("filter_name", ["ekf", "enkf"])
+def test_a_copy_is_a_single_wrapped_env_over_several_episodes(filter_name, mode, arguments):
+    vector, singles = pair(filter_name, mode, **arguments)
+    start = vector.reset(seed=5)
+    for i, single in enumerate(singles):
+        assert_copy(start, i, single.reset(seed=5 + i))
+    ended = np.zeros(COPIES, dtype=bool)
+    for actions in np.random.default_rng(0).uniform(-30, 30, (STEPS, COPIES, 1)).astype(np.float32):
+        observations, _, terminated, truncated, info = vector.step(actions)
+        for i, single in enumerate(singles):
+            if mode == "NextStep" and ended[i]:
+                assert_copy((observations, info), i, single.reset())
+                continue
+            observation, _, *ends, expected = single.step(actions[i])
+            if mode == "SameStep" and any(ends):
+                np.testing.assert_allclose(info["final_obs"][i], observation, rtol=1e-5, atol=1e-6)
+                np.testing.assert_allclose(info["final_info"]["estimate"][i], expected["estimate"], rtol=1e-9)
+                observation, expected = single.reset()
+            assert_copy((observations, info), i, (observation, expected))
+        ended = terminated | truncated
+        if mode == "Disabled" and ended.any():
+            begun = vector.reset(options={"reset_mask": ended})
+            for i in np.flatnonzero(ended):
+                assert_copy(begun, i, singles[i].reset())
+
+
+def test_many_copies_on_all_cores_are_the_few():
+    many = EstimateStates(gym.make_vec("BowThruster-v0", num_envs=600), "enkf", ensemble_size=10)
+    few = EstimateStates(gym.make_vec("BowThruster-v0", num_envs=2), "enkf", ensemble_size=10)
+    many.reset(seed=1), few.reset(seed=1)
+    for _ in range(5):
+        of_many, of_few = many.step(np.full((600, 1), 9.0)), few.step(np.full((2, 1), 9.0))
+    np.testing.assert_allclose(of_many[-1]["estimate"][:2], of_few[-1]["estimate"], rtol=1e-12)
+
+
+def test_a_third_party_vector_env_takes_a_filter_too():
+    env = gym.make_vec("Pendulum-v1", num_envs=2, vectorization_mode="sync")
+    wrapped = EstimateStates(env, "ekf", model="tests.filters.test_vector_wrapper:still")
+    wrapped.reset(seed=0)
+    observation, *_, info = wrapped.step(np.zeros((2, 1), dtype=np.float32))
+    assert observation.shape == (2, 3) and info["estimate_cov"].shape == (2, 3, 3)
+
+
+def still():
+    from filters import affine_model
+
+    return affine_model(
+        a=np.eye(3),
+        b=np.zeros((3, 1)),
+        c=np.eye(3),
+        process_noise_cov=[0.1] * 3,
+        measurement_noise_cov=[0.1] * 3,
+        prior_mean=[0.0] * 3,
+        prior_cov=[1.0] * 3,
+    )
+
+
+# The checker would like a bare env with actions in [-1, 1] and bounded observations; volts and a filter are meant.
+@pytest.mark.filterwarnings(r"ignore:.*(symmetric and normalized|probably too|is different from the):UserWarning")
+@pytest.mark.parametrize("task", ["", "Tracking", "Linear"])
+def test_filtered_ids_make_single_and_vector_envs(task):
+    name = f"filters:BowThruster{task}-EKF-v0"
+    env = gym.make(name, observation="belief")
+    check_env(env, skip_render_check=True)
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    vector = gym.make_vec(name, num_envs=2, observation="belief")
+    first = env.reset(seed=4)[0]
+    np.testing.assert_array_equal(again.reset(seed=4)[0], first)
+    np.testing.assert_allclose(vector.reset(seed=4)[0][0], first, rtol=1e-6)
+
+
+def test_every_task_has_an_id_that_takes_any_filter_and_some_short_ones():
+    assert filtered_id("BowThruster-v0", "EnKF") == "BowThruster-EnKF-v0"
+    for task in ("", "Tracking", "Reversal", "Linear"):
+        for word in ("Filtered", *ALIASES.values()):
+            assert filtered_id(f"BowThruster{task}-v0", word) in gym.registry
+    assert set(ALIASES) <= set(FILTERS)
+    env = gym.make("filters:BowThruster-Filtered-v0", filter="denkf", filter_arguments={"ensemble_size": 7})
+    assert (env.unwrapped.spec.id, env.get_wrapper_attr("filter").size) == ("BowThruster-Filtered-v0", 7)
+
+
+def test_filter_arguments_must_be_a_mapping():
+    with pytest.raises(ValueError, match="filter_arguments must be a mapping"):
+        gym.make("filters:BowThruster-EKF-v0", filter_arguments=[1])

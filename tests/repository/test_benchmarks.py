@@ -1,0 +1,77 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.jax_enkf import NORMALS, array_filter
+from benchmarks.rows import Row
+from benchmarks.timing import Timing
+from filters import EnsembleKalmanFilter, thruster_model
+from numerics.compiled import interpreted
+from numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
+from thruster_env.plant import make_plant
+
+
+def test_the_quick_benchmark_measures_every_row():
+    pytest.importorskip("filterpy")
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks", "--quick", "--json", "-"],
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    rows = found["rows"]
+    assert len(rows) >= 20
+    assert all(row["ours_seconds"] > 0 for row in rows)
+    assert {"FilterPy", "FilterPy's UKF", "FilterPy's KF"} < {row["peer"] for row in rows}
+    assert found["study_resident_megabytes"] is None or 50 < found["study_resident_megabytes"] < 500
+    (outside,) = [row["ratio"] for row in rows if "outside filters" in row["what"]]
+    assert 0 < outside < 1
+    assert any(row["peer"] in ("JAX", "JAX is not installed") for row in rows)
+
+
+@pytest.mark.parametrize("process_noise_cov", [[1.0, 4e-4], [[1.0, 0.01], [0.01, 4e-4]]])
+def test_the_filter_written_for_jax_is_ours_given_our_random_numbers(process_noise_cov):
+    size, key, arguments = 64, (7, 11), {"process_noise_cov": process_noise_cov}
+    plant = make_plant(**arguments)
+    peer, ours = (
+        array_filter(plant, np),
+        EnsembleKalmanFilter(model=thruster_model(**arguments), ensemble_size=size),
+    )
+
+    def normals(step, of_states):
+        states, measurement = np.zeros(2 * size), np.zeros(size)
+        fill_normals(states, len(states), step, of_states, *key)
+        fill_normals(measurement, size, step, FILTER_MEASUREMENT, *key)
+        return np.concatenate([states, measurement]).reshape(NORMALS, size)
+
+    with interpreted():
+        belief, _ = ours.update(ours.init(key), [3.0])
+        members = peer.start(normals(0, FILTER_PRIOR), 3.0)
+        for step in range(1, 6):
+            voltage, z = 20.0 - 8.0 * step, 15.0 * step
+            belief, _ = ours.update(ours.predict(belief, [voltage]), [z])
+            members = peer.step(members, voltage, normals(step, FILTER_PROCESS), z)
+        mean, cov = peer.moments(members)
+    np.testing.assert_allclose(mean, belief.mean, rtol=1e-9)
+    np.testing.assert_allclose(cov, belief.cov, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("row", "shown"),
+    [
+        (
+            Row("a", "b", Timing(1e-6, 4e-6, 0.25), ratio_goal=1 / 3),
+            ["a; b", "1 us", "4 us", "0.25", "0.33", "yes"],
+        ),
+        (Row("a", None, Timing(2e-9, None, None), time_goal=1e-9), ["a", "2 ns", "-", "-", "1 ns", "no"]),
+        (Row("a", "b is not installed", Timing(0.5, None, None)), ["a; b is not installed", "500 ms", *"----"]),
+    ],
+)
+def test_a_row_says_whether_its_goal_is_met(row, shown):
+    assert row.cells() == shown

@@ -1,0 +1,229 @@
+"""docs/plant.md and docs/filters.md say what the code does: examples, tables and pictures are the code's."""
+
+import ast
+import dataclasses
+import importlib
+import importlib.util
+import inspect
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import thruster_env  # noqa: F401 - registers the envs
+from filters.registry import FILTERS
+from filters.wrappers.arguments import OBSERVATIONS
+from plants.disturbances.sensors import SENSOR_EFFECTS
+from thruster_env.channels import CHANNELS
+from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
+from thruster_env.effects.flow import FLOW_SIGNALS
+from thruster_env.effects.reference import REFERENCE_SIGNALS
+from thruster_env.effects.uncertainty import DISTRIBUTIONS
+from thruster_env.env import BowThrusterEnv
+from thruster_env.model import thruster_model
+from thruster_env.parameters import PRESETS
+from thruster_env.tasks import BowThrusterLinearEnv
+from thruster_env.vector_env import BowThrusterVectorEnv
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "plant.md").read_text()
+EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
+NUMBER = r"(\d+(?:\.\d+)?(?:e-?\d+)?)"
+FILTER_PAGE = (ROOT / "docs" / "filters.md").read_text()
+TUNING_PAGE = (ROOT / "docs" / "tuning.md").read_text()
+PAGES = {"plant": PAGE, "filters": FILTER_PAGE, "tuning": TUNING_PAGE}
+SCRIPTS = {"plant": "docs.plant_figures", "filters": "docs.filter_figures", "tuning": "docs.tuning_figures"}
+FILTER_EXAMPLES = re.findall(r"```python\n(.*?)```", FILTER_PAGE, flags=re.DOTALL)
+every_page = pytest.mark.parametrize("page", PAGES)
+KINDS = {
+    "Reference signals": REFERENCE_SIGNALS.effects,
+    "Sensors": SENSOR_EFFECTS.effects,
+    "Flow": FLOW_SIGNALS.effects,
+    "Amplifier": AMPLIFIER_EFFECTS.effects,
+    "Initial state and uncertain parameters": DISTRIBUTIONS,
+}
+EFFECTS = [(section, name) for section, effects in KINDS.items() for name in effects]
+
+
+def pictures_of(page):
+    return set(re.findall(r"!\[.*?\]\((.*?)\)", PAGES[page]))
+
+
+def rows_of(section):
+    """Cells of the table rows of a section by their first cell, which stands in backticks."""
+    text = re.split(r"^##+ ", PAGE.partition(f"# {section}\n")[2], maxsplit=1, flags=re.MULTILINE)[0]
+    rows = [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in text.splitlines() if "|" in line]
+    return {cells[0].strip("`"): cells[1:] for cells in rows if cells[0].startswith("`")}
+
+
+def state_after_a_step(env):
+    env.reset(seed=5)
+    return env.step([6.0])[4]["state"].tolist()
+
+
+@pytest.mark.parametrize("code", EXAMPLES, ids=range(len(EXAMPLES)))
+def test_an_example_runs_and_json_holds_its_arguments(code, capsys):
+    if "render_mode" in code:
+        pytest.importorskip("pygame")
+    names = {}
+    exec(compile(code, "docs/plant.md", "exec"), names)
+    if "env" in names:
+        again = gym.make(gym.envs.registration.EnvSpec.from_json(names["env"].spec.to_json()))
+        assert state_after_a_step(again) == state_after_a_step(names["env"])
+    else:
+        assert isinstance(names["envs"], BowThrusterVectorEnv)
+
+
+def test_every_section_on_what_can_be_chosen_has_an_example():
+    for section in (*KINDS, "Presets", "Linear plants", "In number", "Rendering", "Baselines", "The environments"):
+        text = PAGE.partition(f"# {section}\n")[2]
+        assert "gym.make" in text.partition("```python")[2].partition("```")[0], section
+
+
+@pytest.mark.parametrize(("section", "name"), EFFECTS)
+def test_the_page_has_every_effect_with_its_arguments_and_defaults(section, name):
+    told = dict(re.findall(r"`(\w+)`(?: = `([^`]+)`)?", rows_of(section)[name][-1]))
+    fields = dataclasses.fields(KINDS[section][name])
+    assert list(told) == [field.name for field in fields]
+    for field in fields:
+        if field.default is dataclasses.MISSING:
+            assert told[field.name] == ""
+        else:
+            assert ast.literal_eval(told[field.name]) == field.default
+
+
+def test_the_page_has_no_effect_that_is_not_there():
+    for section, known in KINDS.items():
+        assert set(rows_of(section)) - set(CHANNELS) == set(known)
+
+
+def test_the_page_has_every_argument_with_its_default():
+    told = rows_of("Arguments")
+    known = inspect.signature(BowThrusterEnv).parameters
+    assert set(told) == set(known)
+    for name, parameter in known.items():
+        assert ast.literal_eval(told[name][0].strip("`")) == parameter.default
+
+
+def test_the_page_names_the_arguments_of_the_other_envs():
+    for cls in (BowThrusterLinearEnv, BowThrusterVectorEnv):
+        assert all(f"`{name}`" in PAGE for name in inspect.signature(cls).parameters if name != "arguments")
+
+
+def test_the_page_has_every_channel_with_unit_and_variance():
+    rows = rows_of("Sensors")
+    told = {name: (rows[name][1], float(rows[name][2])) for name in CHANNELS}
+    assert told == {name: (channel.quantity.unit, channel.variance) for name, channel in CHANNELS.items()}
+
+
+def test_the_page_names_every_env_and_every_preset():
+    ids = [name for name in gym.registry if re.fullmatch(r"BowThruster\w*-v0", name)]
+    assert len(ids) >= 4
+    assert all(f"| `{name}` |" in PAGE for name in (*ids, *rows_of("The environments")))
+    assert all(f"`{name}`" in PAGE for name in PRESETS)
+
+
+@every_page
+def test_every_link_leads_somewhere(page):
+    text = PAGES[page]
+    headings = re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)
+    anchors = {re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings}
+    for target in re.findall(r"\]\((?!http)([^)]+)\)", text):
+        assert target[1:] in anchors if target.startswith("#") else (ROOT / "docs" / target).exists(), target
+
+
+@every_page
+def test_the_page_shows_what_its_script_draws_and_has_the_tables_it_makes(page):
+    script = importlib.import_module(SCRIPTS[page])
+    assert set(script.FIGURES) <= pictures_of(page)
+    assert set(script.TABLES) <= set(re.findall(r"<!-- table (\w+) -->", PAGES[page]))
+    assert all((ROOT / "docs" / name).stat().st_size < 150_000 for name in script.FIGURES)
+
+
+@pytest.mark.parametrize("code", FILTER_EXAMPLES, ids=range(len(FILTER_EXAMPLES)))
+def test_an_example_of_a_filter_runs(code, capsys, tmp_path, monkeypatch):
+    """As a module of its own: what compiles is kept under the name of its module."""
+    path = tmp_path / "filters_example.py"
+    path.write_text(code)
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, path.stem, module)
+    spec.loader.exec_module(module)
+    names = vars(module)
+    if "Pendulum" in code:
+        assert sum(line != "" for line in code.splitlines()) < 30
+        assert names["angle"] < 0.5 * names["raw_angle"] and names["speed"] < 0.5 * names["raw_speed"]
+
+
+def test_every_family_of_filters_has_an_example_and_a_picture():
+    sections = re.split(r"^## ", FILTER_PAGE.partition("## All filters")[2], flags=re.MULTILINE)[1:]
+    families = sections[: [section.startswith("Around an env") for section in sections].index(True)]
+    assert len(families) == 11
+    for section in families:
+        assert "```python" in section and "](filters_" in section, section.partition("\n")[0]
+        assert "*Works" in section and "*Fails" in section, section.partition("\n")[0]
+
+
+def test_the_table_of_all_filters_is_that_of_the_code():
+    from docs.filter_tables import kinds
+
+    table = kinds()
+    assert table in FILTER_PAGE
+    assert [line.split("`")[1] for line in table.splitlines()[2:]] == list(FILTERS)
+    assert all(f"`{kind.__name__}`" in table for kind in FILTERS.values())
+
+
+def test_the_thrust_of_the_tunnel_falls_with_the_flow_velocity_as_the_page_says():
+    model = thruster_model()
+    states = [(speed, flow) for speed in (-190.0, -5.0, 5.0, 190.0) for flow in np.linspace(-40.0, 40.0, 801)]
+    assert max(model.observe_jacobian(state, model.constants)[0][1] for state in states) < 0
+
+
+def test_the_table_of_info_is_that_of_the_wrapper():
+    env = gym.make("filters:BowThruster-EKF-v0")
+    _, with_filter = env.reset(seed=0)
+    _, without = env.unwrapped.reset(seed=0)
+    told = re.findall(r"^\| `(\w+)` \|", FILTER_PAGE.partition("| `info` |")[2], flags=re.MULTILINE)
+    assert set(told) == set(with_filter) - set(without)
+    assert all(f'| `"{form}"` |' in FILTER_PAGE for form in OBSERVATIONS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["plant", "filters"])
+def test_pictures_and_tables_are_those_of_the_code(page, tmp_path):
+    pytest.importorskip("pygame")
+    shutil.copy(ROOT / "docs" / f"{page}.md", tmp_path)
+    subprocess.run([sys.executable, "-m", SCRIPTS[page], str(tmp_path)], cwd=ROOT, check=True)
+    anew, here = (re.split(NUMBER, text) for text in ((tmp_path / f"{page}.md").read_text(), PAGES[page]))
+    assert anew[::2] == here[::2]
+    assert [float(n) for n in here[1::2]] == pytest.approx([float(n) for n in anew[1::2]], rel=0.03)
+    assert {path.name for path in tmp_path.glob("*.png")} == set(importlib.import_module(SCRIPTS[page]).FIGURES)
+    assert all(path.stat().st_size < 150_000 for path in tmp_path.glob("*.png"))
+
+
+def test_the_page_on_tuning_holds_what_its_script_makes():
+    import docs.tuning_figures as script
+
+    assert script.likeliest() in TUNING_PAGE
+    lines = script.earned(["outliers"], trials=8).splitlines()[2:]
+    assert [line.split(" | ")[1] for line in lines] == ["`kf`", "`ekf`", "`enkf`"]
+    ratios = [[float(cell.split()[0]) for cell in line.split(" | ")[2:4]] for line in lines]
+    assert all(ratio < 1 for pair in ratios for ratio in pair)  # over scaled default and rule of thumb
+
+
+def test_the_tables_on_tuning_say_what_the_page_says():
+    rows = [line.strip("| ").split(" | ") for line in TUNING_PAGE.splitlines() if "`" in line and " ± " in line]
+    published = {row[0].strip("`"): float(row[2].split()[0]) for row in rows if len(row) == 3}
+    assert set(published) == {"published_tunnel", "published_open_bladed"}
+    assert all(abs(ratio - 1) < 0.005 for ratio in published.values())
+    earned = [[float(cell.split()[0]) for cell in row if "±" in cell] for row in rows if len(row) > 6]
+    assert len(earned) == 12 and all(len(row) == 3 and max(row) < 1 for row in earned)
+    bought = {row[0]: float(row[1].split()[0]) for row in rows if len(row) == 6}
+    others = [ratio for name, ratio in bought.items() if " + " not in name and " with " not in name]
+    assert bought["`ekf` + lift and K2"] < 0.4 < 0.85 < min(others) and bought["`ekf`, scaled default"] == 1.0
+    assert len(bought) == 13 and max(bought.values()) == 1.0

@@ -1,0 +1,137 @@
+"""Who may know whom, read from the imports of every file."""
+
+import ast
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from tuning.problems import find
+
+ROOT = Path(__file__).resolve().parents[2]
+ROOMS = (
+    "numerics",
+    "plants",
+    "thruster_env",
+    "filters",
+    "tuning",
+    "training",
+    "studies",
+    "thruster_cli",
+)
+PLANTS = {"thruster_env"}
+FILES = [path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
+every_room = pytest.mark.parametrize("room", ROOMS)
+
+ALLOWED = {
+    "numerics": set(),
+    "plants": {"numerics"},
+    "thruster_env": {"numerics", "plants"},
+    "filters": {"numerics", "plants"},
+    "tuning": {"numerics", "plants", "filters"},
+    "training": {"numerics", "plants", "thruster_env", "filters", "tuning"},
+    "studies": {"numerics", "plants", "thruster_env", "filters", "tuning"},
+    "thruster_cli": set(ROOMS),
+}
+TUNING_OF_PLANTS = {"tuning/thruster": {"thruster_env"}}  # the rooms of tuning that know a plant
+LEARNING = {"stable_baselines3", "sb3_contrib", "rl_zoo3", "torch"}
+
+
+@cache
+def imports_of(path, source=None):
+    """Modules that a file imports, anywhere in it, by full name: `from a import b` gives a and a.b."""
+    found = set()  # a caller must not change it: it is remembered
+    package = path.relative_to(ROOT).parent.parts
+    for node in ast.walk(ast.parse(path.read_text() if source is None else source)):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            home = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join([*home, *([node.module] if node.module else [])])
+            found |= {module} | {f"{module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def packages_of(path):
+    return {name.partition(".")[0] for name in imports_of(path)}
+
+
+def test_imports_are_found_wherever_they_hide():
+    source = "import a.b\nfrom c import d\nfrom . import e\nfrom .f import g\ndef h():\n    import i as j\n"
+    found = imports_of(ROOT / "filters" / "some.py", source)
+    assert found == {"a.b", "c", "c.d", "filters", "filters.e", "filters.f", "filters.f.g", "i"}
+
+
+def test_there_is_something_to_read():
+    assert ROOT / "plants" / "state_space.py" in FILES and len(FILES) > 20
+
+
+def those(condition):
+    """Names of the files for which a condition holds."""
+    return [path.relative_to(ROOT).as_posix() for path in FILES if condition(path)]
+
+
+def room_of(path):
+    return path.relative_to(ROOT).parts[0]
+
+
+def known_to(path):
+    """Our packages that a file may import."""
+    room = path.relative_to(ROOT).parent.as_posix()
+    return ALLOWED[room_of(path)] | {room_of(path)} | TUNING_OF_PLANTS.get(room, set())
+
+
+def test_a_room_knows_only_the_rooms_below():
+    assert not those(lambda path: packages_of(path) & set(ROOMS) - known_to(path))
+
+
+def test_rooms_of_tuning_know_those_of_plants_by_the_finder_alone():
+    rooms = {room.replace("/", ".") for room in TUNING_OF_PLANTS}
+    outside = [path for path in FILES if path.relative_to(ROOT).parent.as_posix() not in TUNING_OF_PLANTS]
+    knowing = [path for path in outside if room_of(path) == "tuning" and imports_of(path) & rooms]
+    assert not knowing and set(find.ROOMS) == {f"{room}.find" for room in rooms}
+
+
+def test_only_tuning_imports_optuna():
+    assert not those(lambda path: "optuna" in packages_of(path) and room_of(path) != "tuning")
+
+
+def test_only_training_imports_packages_that_learn_policies():
+    assert not those(lambda path: packages_of(path) & LEARNING and room_of(path) != "training")
+
+
+def test_a_file_is_at_most_300_lines_long():
+    assert not those(lambda path: len(path.read_text().splitlines()) > 300)
+
+
+def opens_bytes(call):
+    return len(call.args) > 1 and "b" in getattr(call.args[1], "value", "")
+
+
+def test_text_files_are_utf_8_whatever_the_terminal_has():
+    for path in FILES:
+        for call in (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)):
+            opens = isinstance(call.func, ast.Name) and call.func.id == "open" and not opens_bytes(call)
+            if opens or getattr(call.func, "attr", "") in ("read_text", "write_text"):
+                assert "encoding" in {keyword.arg for keyword in call.keywords}, f"{path}:{call.lineno}"
+
+
+@every_room
+def test_a_package_says_that_it_is_typed(room):
+    assert (ROOT / room / "__init__.py").is_file()
+    assert (ROOT / room / "py.typed").is_file()
+
+
+def test_the_command_line_starts_without_packages_that_learn_policies():
+    code = f"import sys, thruster_cli.app; print([name for name in {sorted(LEARNING)} if name in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"
+
+
+def test_importing_the_env_stays_light():
+    heavy = ["numba", "scipy", "matplotlib", "optuna", "torch", "filters", "tuning"]
+    code = f"import sys, thruster_env; print([name for name in {heavy} if name in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"

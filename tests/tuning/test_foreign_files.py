@@ -1,0 +1,162 @@
+"""Files that somebody else wrote run no code: tuned files and setups of policies are data, checked before use."""
+# ruff: noqa: F811 - fixtures come by import and go by name
+
+import json
+import pickle
+
+import gymnasium as gym
+import pytest
+
+import thruster_env  # noqa: F401 - registers the envs
+from filters import EstimateState, EstimateStates
+from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
+from tests.tuned_files import rewrite, write_untuned
+from training.setup import in_scenario, make_setup, setup_from_json
+from tuning.evaluation.tuned import read_tuned
+from tuning.evaluation.verify import verify
+from tuning.report.report import write_report
+from tuning.thruster.find import find_scenario
+
+TRAP = f"{__name__}:trap"
+SPRUNG = []
+
+
+def trap(*arguments, **named):
+    """What an attacker would have run."""
+    SPRUNG.append(named)
+
+
+class Trap:
+    """Springs when it is unpickled."""
+
+    def __reduce__(self):
+        return trap, ()
+
+
+@pytest.fixture(autouse=True)
+def nothing_sprung():
+    SPRUNG.clear()
+    yield
+    assert not SPRUNG
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    return write_untuned(tmp_path_factory.mktemp("whole") / "ekf.json").read_text()
+
+
+def in_model(content):
+    content["filter"]["model"] |= {"model": TRAP}
+
+
+def in_numbers(content):
+    content["filter"]["numbers"] |= {"model": TRAP}
+
+
+@pytest.fixture(params=[in_model, in_numbers])
+def file(request, whole, tmp_path):
+    """A tuned file that names a function, its hash in order."""
+    path = tmp_path / "ekf.json"
+    path.write_text(whole)
+    return rewrite(path, request.param)
+
+
+RULE = r"must be .*but got 'model' \(in the tuned file .*ekf.json\)"
+
+
+def test_a_tuned_file_that_names_code_is_refused_by_all_that_take_one(file):
+    scenario, path = find_scenario("medium_noise"), str(file)
+    takers = [
+        lambda: EstimateState(gym.make("BowThruster-v0"), tuned=path),
+        lambda: EstimateStates(gym.make_vec("BowThruster-v0", num_envs=2), tuned=path),
+        lambda: EstimateState(gym.make("Pendulum-v1"), tuned=path, model=f"{__name__}:never"),
+        lambda: make_setup("tracking", scenario, "ekf", tuned=path),
+        lambda: read_tuned(path),
+        lambda: verify(path),
+        lambda: write_report(path, "none.journal"),
+    ]
+    for take in takers:
+        with pytest.raises(ValueError, match=RULE) as error:
+            take()
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("train", "--tuned"), ("evaluate", "--tuned"), ("verify",), ("report",), ("compare",)],
+    ids=lambda command: command[0],
+)
+def test_every_command_refuses_it(command, file, thruster, tmp_path):
+    done = thruster(*command, "ekf.json")
+    assert done.returncode == 2 and "but got 'model' (in the tuned file ekf.json)" in done.stderr
+    assert "Traceback" not in done.stderr and [path.name for path in tmp_path.iterdir()] == ["ekf.json"]
+
+
+SETUP = make_setup("tracking", find_scenario("medium_noise"), "ekf", steps=256, num_envs=4)
+DOCTORED = {
+    "a model": (
+        {"filter_arguments": {"model": TRAP}},
+        "filter_arguments of observe='ekf' must be among .*'model'",
+    ),
+    "a tuned file": ({"filter_arguments": {"tuned": "x.json"}}, "filter_arguments of .* must be among .*'tuned'"),
+    "arguments of no filter": (
+        {"observe": "raw", "filter_arguments": {"alpha": 1.0}},
+        "among none, but got 'alpha'",
+    ),
+    "a module": ({"env_id": f"{__name__}:BowThrusterTracking-v0"}, "env_id must be one of BowThrusterTracking-v0"),
+    "another env": (
+        {"env_id": "Pendulum-v1"},
+        "env_id must be one of BowThrusterTracking-v0, but got 'Pendulum-v1'",
+    ),
+    "a task": ({"task": TRAP}, "task must be one of tracking"),
+    "an algorithm": ({"algo": TRAP}, "algo must be one of ppo"),
+    "a window": (
+        {"env_arguments": {"render_mode": "human"}},
+        "env_arguments must be among preset, .*'render_mode'",
+    ),
+    "a folder": (
+        {"hyperparameters": {"tensorboard_log": "/"}},
+        "hyperparameters must be among .*'tensorboard_log'",
+    ),
+    "a class": (
+        {"hyperparameters": {"policy_kwargs": {"features_extractor_class": TRAP}}},
+        "policy_kwargs must be among .*'features_extractor_class'",
+    ),
+    "no number": ({"hyperparameters": {"gamma": float("nan")}}, "hyperparameters, gamma must be data: .* got nan"),
+    "no mapping": ({"env_arguments": ["dt"]}, r"env_arguments must be a mapping, but got \['dt'\]"),
+    "no steps": ({"steps": "many"}, "steps must be a finite number, but got 'many'"),
+    "an assumed plant": ({"assumed_plant": {"dt": 0.01}}, "must hold the setup of a policy"),
+    "an entry": ({"module": TRAP}, "must hold the setup of a policy"),
+}
+
+
+def doctored(change):
+    return json.dumps({**json.loads(SETUP.as_json()), **change})
+
+
+@pytest.mark.parametrize(("change", "rule"), DOCTORED.values(), ids=list(DOCTORED))
+def test_a_setup_holds_nothing_but_what_is_known(change, rule):
+    with pytest.raises(ValueError, match=rule) as error:
+        setup_from_json(doctored(change), "setup.json")
+    assert "setup.json" in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("command", [("score",), ("play",), ("train", "--task", "tracking", "--out")])
+def test_a_policy_s_setup_is_checked_before_any_other_of_its_files_is_opened(command, thruster, tmp_path):
+    pytest.importorskip("sb3_contrib")
+    pytest.importorskip("pygame")
+    folder = tmp_path / "policy" / "final"
+    folder.mkdir(parents=True)
+    for place in (folder, folder.parent):
+        (place / "setup.json").write_text(doctored({"filter_arguments": {"model": TRAP}}))
+    for name in ("policy.zip", "normalisation.pkl", "replay.pkl"):
+        (folder / name).write_bytes(pickle.dumps(Trap()))
+    done = thruster(*command, "policy")
+    assert done.returncode == 2 and "filter_arguments of observe='ekf' must be among" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_filter_that_goes_on_assuming_its_plant_is_no_text_in_a_file():
+    there = in_scenario(SETUP, find_scenario("ambient"))
+    assert "model" not in there.filter_arguments and there.assumed_plant["dt"] == 0.01
+    assert "assumed_plant" not in there.as_json() and "filters." not in there.as_json()

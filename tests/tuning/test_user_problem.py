@@ -1,0 +1,236 @@
+"""From a user's own file to a tuned filter around an env, by the command line and by Python."""
+# ruff: noqa: F811 - fixtures come by import and go by name
+
+import json
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import optuna
+import pytest
+
+from filters import EstimateState
+from filters.engine.batch import run
+from filters.tuned_file import read_tuned_file
+from numerics.compiled import interpreted
+from tests import pendulum_problem
+from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
+from tests.tuned_files import rewrite
+from tuning.evaluation.held_out import prove
+from tuning.evaluation.tuned import read_choice, read_tuned, write_tuned
+from tuning.evaluation.verify import verify
+from tuning.likelihood.gradient import maximise_likelihood
+from tuning.problems.check import checked_problem
+from tuning.problems.find import find_problem, find_same
+from tuning.search.plan import Plan
+from tuning.search.space import choice_of, parameters
+from tuning.search.study import open_study, run_study
+from tuning.thruster.find import find_scenario
+
+NAME = "my_pendulum:of_one_number"
+
+
+@pytest.fixture
+def mine(thruster, tmp_path, monkeypatch):
+    """The user's file in the working folder, which no other test has imported."""
+    shutil.copy(pendulum_problem.__file__, tmp_path / "my_pendulum.py")
+    yield thruster
+    sys.modules.pop("my_pendulum", None)
+
+
+@pytest.fixture(scope="module")
+def tuned(tmp_path_factory):
+    """A tuned file of the pendulum's one number, by Python."""
+    problem = find_problem("tests.pendulum_problem:of_one_number")
+    plan = Plan("ekf", (problem,))
+    result = run_study(open_study("s", plan, optuna.storages.InMemoryStorage()), plan, 8)
+    path = tmp_path_factory.mktemp("pendulum") / "ekf.json"
+    write_tuned(path, plan, result, [prove(result.choice, problem, 0, 4)], "s")
+    return path, result, problem
+
+
+def test_by_the_command_line_a_module_of_one_s_own_is_tuned_evaluated_verified_and_wrapped(mine):
+    done = mine("tune", "--problem", NAME, "--filter", "ekf", "--trials", 3, "--no-consistency", "--out", "t.json")
+    assert done.returncode == 0 and "sigma [rad/s]" in done.stdout and "theta" in done.stdout, done.stderr
+    for command in (("verify", "t.json"), ("report", "t.json"), ("evaluate", "--tuned", "t.json", "--seeds", 2)):
+        del sys.modules["my_pendulum"]
+        refused = mine(*command)
+        assert refused.returncode == 2 and "my_pendulum" not in sys.modules
+        assert (
+            "a problem that is code must be given, but t.json only names 'my_pendulum:of_one_number'"
+            in refused.stderr
+        )
+        done = mine(*command, "--problem", NAME)
+        assert done.returncode == 0, done.stderr
+    from my_pendulum import model
+
+    env = EstimateState(gym.make("Pendulum-v1"), tuned="t.json", model=model())
+    sigma = json.loads(Path("t.json").read_text())["filter"]["model"]["sigma"]
+    np.testing.assert_allclose(env.filter.model.process_noise_cov[1, 1], sigma**2, rtol=1e-12)
+    env.reset(seed=1)
+    for _ in range(10):
+        info = env.step(np.array([1.0], dtype=np.float32))[-1]
+    wrong = np.array(info["estimate"]) - env.unwrapped.state
+    assert abs(np.angle(np.exp(1j * wrong[0]))) < 0.1 and abs(wrong[1]) < 0.5
+
+
+def test_by_python_a_study_of_one_number_comes_near_its_most_likely_value(tuned):
+    path, result, problem = tuned
+    assert set(result.trials[0].params) == {"sigma"} and set(result.choice.model) == {"sigma"}
+    assert read_tuned(path, [problem]) == (result.choice, problem, 0) and verify(path, [problem]).holds
+    content = read_tuned_file(path)
+    assert content["problem"] == problem.name and content["digest"] == problem.digest and content["plant"] is None
+    assert content["model"]["states"][0] == ["angle", "theta", "rad", True] and content["model"]["dt"] == 0.05
+    assert content["problems"] == {problem.name: {"digest": problem.digest, "content": None}}
+    (data,) = Plan("ekf", (problem,)).training_data()
+    found = maximise_likelihood("ekf", problem, data)
+    assert found.names == ("sigma",) and found.agree and found.identified.all()
+
+    def log_likelihood(factor):
+        choice = choice_of("ekf", {"sigma": factor * found.choice.model["sigma"]}, problem)
+        return run(choice.filter(problem), data.filter_keys, data.inputs, data.measurements).log_likelihoods.sum()
+
+    assert log_likelihood(1.0) == pytest.approx(found.best.log_likelihood, rel=1e-9)
+    assert log_likelihood(1.0) > max(log_likelihood(0.95), log_likelihood(1.05))
+
+
+def test_another_number_than_noise_has_no_gradient():
+    problem = pendulum_problem.problem(lambda dt: pendulum_problem.model(prior_cov=[dt, 1.0]),
+                                       parameters=[pendulum_problem.Parameter("dt", 0.1, 1.0)])  # fmt: skip
+    with pytest.raises(ValueError, match="parameters of a gradient must change Q and R alone, but dt changes"):
+        maximise_likelihood("ekf", problem, problem.data([1, 2]))
+
+
+def pendulum(dt=0.05, model=None):
+    env = gym.make("Pendulum-v1")
+    env.unwrapped.dt = dt
+    if model is not None:
+        env.unwrapped.state_space_model = model
+    return env
+
+
+def other_swing(x, u, c):
+    return (x[0] + 0.05 * x[1], x[1])
+
+
+def rate_alone(x, c):
+    return (x[1],)
+
+
+OTHERS = {
+    "dt": (lambda: pendulum(0.1), pendulum_problem.model, r"dt 0.05 \(here 0.1\)$"),
+    "states": (
+        pendulum,
+        lambda: pendulum_problem.model(states=["theta", ("rate", "omega", "deg/s")]),
+        r"states theta \[rad\], omega \[rad/s\] \(here theta, omega \[deg/s\]\)$",
+    ),
+    "sensors": (
+        pendulum,
+        lambda: pendulum_problem.model(observe=rate_alone, measurement_noise_cov=[0.1], measurements=["w"]),
+        r"measurements cosine, sine, rate \[rad/s\] \(here w\)$",
+    ),
+    "equations": (
+        pendulum,
+        lambda: pendulum_problem.model(transition=other_swing),
+        r"a model of digest [0-9a-f]{12} \(here [0-9a-f]{12}\)$",
+    ),
+}
+
+
+@pytest.mark.parametrize(("env", "model", "said"), OTHERS.values(), ids=list(OTHERS))
+@pytest.mark.parametrize("offered", [False, True], ids=["given", "offered"])
+def test_a_tuned_file_on_another_model_is_refused_and_the_difference_named(env, model, said, offered, tuned):
+    path, found = str(tuned[0]), model()
+    wrapped = env()
+    if offered:
+        wrapped.unwrapped.state_space_model = lambda **changes: found.replace(**changes)
+    with pytest.raises(
+        ValueError, match="a tuned file must be for the model it is put on, but .*ekf.json was tuned for " + said
+    ):
+        EstimateState(wrapped, tuned=path, model=None if offered else found)
+
+
+def test_a_tuned_file_takes_the_same_model_from_the_env_a_factory_or_the_caller(tuned):
+    path = str(tuned[0])
+    env = pendulum(model=pendulum_problem.model)
+    found = [EstimateState(env, tuned=path), EstimateState(env, tuned=path, model="tests.pendulum_problem:model")]
+    found.append(EstimateState(env, tuned=path, model=pendulum_problem.model()))
+    covs = [one.filter.model.process_noise_cov for one in found]
+    np.testing.assert_allclose(covs[1:], [covs[0]] * 2, rtol=1e-12)
+    with pytest.raises(ValueError, match="an env that offers no state_space_model must come with a model"):
+        EstimateState(gym.make("Pendulum-v1"), tuned=path)
+
+
+def test_a_problem_that_has_changed_is_not_what_a_file_was_tuned_on(tuned, tmp_path):
+    path, _, problem = tuned
+    changed = pendulum_problem.problem(pendulum_problem.model, parameters=problem.parameters, steps=61,
+                                       name=problem.name)  # fmt: skip
+    with pytest.raises(
+        ValueError, match=f"must be what it was tuned on, {problem.name} of digest {problem.digest}"
+    ):
+        read_tuned(path, [changed])
+    assert read_choice(path, changed).model.keys() == {"sigma"}, "it may be evaluated there all the same"
+    with pytest.raises(ValueError, match="was tuned for states theta"):
+        read_choice(path, find_scenario("nominal"))
+    with pytest.raises(ValueError, match="must be the same in all processes, of digest 0, but here it has "):
+        find_same("nominal", "0")
+
+    def module(content):
+        content["problem"] = "os:getcwd"
+        content["problems"] = {"os:getcwd": {"digest": "0", "content": None}}
+
+    copy = rewrite(Path(shutil.copy(path, tmp_path / "t.json")), module)
+    with pytest.raises(
+        ValueError, match="a problem that is code must be given, but .*t.json only names 'os:getcwd'"
+    ):
+        read_tuned(copy)
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "line"),
+    [
+        (
+            None,
+            "my_nothing:problem",
+            "that can be imported, but 'my_nothing:problem' is not: No module named",
+        ),
+        ("x = 1", "my_bad:problem", "that can be imported, but .* has no attribute 'problem'"),
+        (
+            "1 / 0",
+            "my_bad:problem",
+            "module must import, but 'my_bad:problem' raised ZeroDivisionError: ",
+        ),
+        ("x = (", "my_bad:problem", "module must import, but 'my_bad:problem' raised SyntaxError: "),
+        (
+            "def f():\n    raise KeyError('a')",
+            "my_bad:f",
+            "without arguments, but .* raised KeyError: 'a'",
+        ),
+        ("def f(seed): pass", "my_bad:f", "without arguments, but 'my_bad:f' raised TypeError: "),
+        ("x = 1", "my_bad:x", "a problem must be a tuning.problems.problem.Problem, but 'my_bad:x' is 1"),
+        ("def f(): return 'a\\nb'", "my_bad:f", "must be a tuning.problems.problem.Problem, but 'my_bad:f' is"),
+    ],
+)
+def test_what_is_no_problem_is_one_clear_line(text, name, line, thruster, tmp_path):
+    if text is not None:
+        (tmp_path / "my_bad.py").write_text(text)
+    with pytest.raises(ValueError, match=line) as caught:
+        find_problem(name)
+    assert "\n" not in str(caught.value)
+    done = thruster("evaluate", "--filter", "ekf", "--problem", name)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and done.stderr.startswith("thruster: ")
+    sys.modules.pop("my_bad", None)
+
+
+def test_the_problems_of_the_page_are_problems():
+    page = (Path(__file__).parents[2] / "docs" / "problems.md").read_text(encoding="utf-8")
+    names = {}
+    for code in re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL):
+        exec(compile(code, "docs/problems.md", "exec"), names)
+    with interpreted():
+        assert [one.symbol for one in checked_problem(names["problem"]).quantities.states] == ["theta", "omega"]
+        assert [one.name for one in parameters("kf", checked_problem(names["pair"]))] == ["Q11", "Q22", "R"]
+        assert [one.name for one in parameters("kf", checked_problem(names["one_number"]))] == ["sigma_a"]
