@@ -13,6 +13,8 @@ from filters.ensembles.ensemble import EnsembleKalmanFilter
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
 from filters.ensembles.serial import SerialSquareRootFilter
 from filters.ensembles.transform import EnsembleTransformFilter
+from filters.estimators.find import foreign_filter, is_foreign, parameters_of
+from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.gaussian.cubature import CubatureKalmanFilter
 from filters.gaussian.extended import ExtendedKalmanFilter
@@ -56,17 +58,26 @@ FILTERS: dict[str, type[Filter]] = {
 
 
 def filter_class(name: str) -> type[Filter]:
-    """The class of a filter by name; ValueError for an unknown one."""
+    """The class of a filter by name, of an estimator that of all; ValueError for an unknown name."""
+    if is_foreign(name):
+        return ForeignFilter
     return FILTERS[one_of("filter", name, tuple(FILTERS))]
 
 
 def tunable_numbers(name: str) -> tuple[str, ...]:
-    """Names of the numbers that a filter has beside its model."""
+    """Names of the numbers that a filter has beside its model, or that an estimator says it is tuned by."""
+    if is_foreign(name):
+        return tuple(one.name for one in parameters_of(name))
     return tuple(field.name for field in dataclasses.fields(filter_class(name)) if field.name != "model")
 
 
 def make_filter(name: str, model: StateSpaceModel, **numbers) -> Filter:
-    """A filter by name, for a model, with its own numbers; ValueError for an unknown name or number."""
+    """A filter by name, for a model, with its own numbers; ValueError for an unknown name or number.
+
+    In place of a name it takes what `filters.estimators.find.foreign_filter` does.
+    """
+    if is_foreign(name):
+        return foreign_filter(name, model, **numbers)
     known = tunable_numbers(name)
     for number in numbers:
         one_of(f"a number of filter {name!r}", number, known)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.engine.compile import batch, lanes, new_memory
+from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from numerics.checks import as_floats, covariance, shown
 from numerics.sources import is_array
@@ -37,7 +38,7 @@ def run(
     """Filter many trajectories in one compiled call that uses all cores.
 
     Args:
-        filter_: any filter.
+        filter_: any filter, or somebody else's estimator in the place of one.
         keys: random keys, one a trajectory, (B, 2).
         inputs: u, (B, K, p); the filter predicts with u[:, k] ...
         measurements: ... and updates with z[:, k + 1]; (B, K + 1, m), NaN where missing.
@@ -48,7 +49,7 @@ def run(
         `Estimates`, the same whatever the number of cores.
 
     Raises:
-        ValueError: if shapes do not fit or an input is not finite.
+        ValueError: if shapes do not fit or an input is not finite; or as `ForeignFilter.fill`.
     """
     filter_.check_noise(process_noise_covs)
     filter_.check_noise(measurement_noise_covs)
@@ -66,6 +67,9 @@ def run(
         _noise_rows("process_noise_covs", process_noise_covs, times - 1, n),
         _noise_rows("measurement_noise_covs", measurement_noise_covs, times, m),
     )
+    if isinstance(filter_, ForeignFilter):
+        filter_.fill(keys, inputs, z, tuple(out))
+        return out
     alone = filter_.size or is_array(n, n) or is_array(m, m)  # large ones fill vector registers by themselves
     run_all = _run_one_by_one if alone else _run_side_by_side
     run_all(filter_, (keys, inputs, z), noise, out)

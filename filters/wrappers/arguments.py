@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import gymnasium as gym
 import numpy as np
 
+from filters.estimators.find import is_foreign
 from filters.filter import Filter
 from filters.registry import make_filter, tunable_numbers
 from filters.wrappers.models import made, maker_of
@@ -18,7 +19,7 @@ OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
 APPENDED = "appended_entries"  # attribute of an env: entries of its observation after the measurement
 
 
-def filter_for(env, filter: str | None, model, tuned: str | None, model_arguments, numbers: dict) -> Filter:
+def filter_for(env, filter, model, tuned: str | None, model_arguments, numbers: dict) -> Filter:
     """The filter that a wrapper of env is told to run; its class says what the arguments mean.
 
     A tuned file is data: nothing in it becomes a model or another argument of the wrapper.
@@ -30,9 +31,9 @@ def filter_for(env, filter: str | None, model, tuned: str | None, model_argument
             raise ValueError("tuned must come without filter, numbers and model_arguments: its file holds them")
         return tuned_filter(env, model, tuned)
     filter = "ekf" if filter is None else filter
-    known = tunable_numbers(filter)
+    known = () if is_foreign(filter) else tunable_numbers(filter)
     for name in numbers:
-        if name not in known:
+        if name not in known and not is_foreign(filter):
             rule = f"a number of filter {filter!r} must be one of {', '.join(known) or 'none'}"
             raise ValueError(f"{rule} (what the model takes goes into model_arguments), but got {name!r}")
     arguments = {} if model_arguments is None else model_arguments
@@ -54,10 +55,15 @@ def model_for(env, model: str | StateSpaceModel | None, arguments: Mapping) -> S
 class ModelInSpec:
     """A model as an env's spec keeps it. JSON refuses it by its class's name, which says what to do."""
 
-    def __init__(self, content: StateSpaceModel):
+    def __init__(self, content):
         self.content = content
 
 
+class EstimatorInSpec(ModelInSpec):
+    """An estimator as an env's spec keeps it, likewise."""
+
+
+EstimatorInSpec.__name__ = "Estimator (give filter='module:object' instead)"
 ModelInSpec.__name__ = "StateSpaceModel (give model='module:factory' instead)"
 
 

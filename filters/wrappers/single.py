@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import gymnasium as gym
 import numpy as np
 
 from filters.engine.checks import checked_actions
-from filters.engine.session import Session
-from filters.wrappers.arguments import APPENDED, OBSERVATIONS, ModelInSpec, check_spaces, filter_for
+from filters.estimators.estimator import Estimator
+from filters.wrappers.arguments import (
+    APPENDED,
+    OBSERVATIONS,
+    EstimatorInSpec,
+    ModelInSpec,
+    check_spaces,
+    filter_for,
+)
 from numerics.checks import one_of, shown
 from numerics.checks import seed as checked_seed
 from numerics.streams import draw_key, filter_generator
@@ -38,7 +45,9 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
     Args:
         env: any env with Box actions and observations.
-        filter: name of a filter in `filters.FILTERS`, which `thruster filters` lists; "ekf" if None.
+        filter: name of a filter in `filters.FILTERS`, which `thruster filters` lists; "ekf" if None. Or somebody
+            else's `filters.estimators.estimator.Estimator`, a function that makes one of a model, or
+            "module:object" for either; what it does not give, covariances or innovations, is zero.
         observation: one of the three forms above.
         model: None for the model that the env itself offers by `env.unwrapped.state_space_model(**arguments)`,
             as a bow thruster does; "module:factory" of a function that returns a `StateSpaceModel`; or a
@@ -47,7 +56,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         model_arguments: what the env's own model or the factory takes, a mapping: for a bow thruster
             `process_noise_cov`, `measurement_noise_cov`, `prior_cov_factor`, `parameter_factors`,
             `operating_voltage`.
-        **numbers: the filter's own numbers, such as `ensemble_size`.
+        **numbers: the filter's own numbers, such as `ensemble_size`, or what a function takes beside the model.
 
     Raises:
         ValueError: if an argument is unknown or off, or spaces and model do not fit.
@@ -56,7 +65,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     def __init__(
         self,
         env: gym.Env,
-        filter: str | None = None,
+        filter: str | Estimator | Callable | None = None,
         observation: str = "estimate",
         model: str | StateSpaceModel | None = None,
         tuned: str | None = None,
@@ -66,7 +75,9 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         """Build model and filter; see the class for the arguments."""
         model = model.content if isinstance(model, ModelInSpec) else model
         held = ModelInSpec(model) if isinstance(model, StateSpaceModel) else model
-        recorded = {"filter": filter, "observation": observation, "model": held, "tuned": tuned, **numbers}
+        filter = filter.content if isinstance(filter, EstimatorInSpec) else filter
+        kept = filter if filter is None or isinstance(filter, str) else EstimatorInSpec(filter)
+        recorded = {"filter": kept, "observation": observation, "model": held, "tuned": tuned, **numbers}
         recorded["model_arguments"] = model_arguments
         gym.utils.RecordConstructorArgs.__init__(self, **recorded)
         gym.Wrapper.__init__(self, env)
@@ -78,7 +89,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self._appended = env.get_wrapper_attr(APPENDED) if env.has_wrapper_attr(APPENDED) else 0
         length = {"estimate": n, "measurement+estimate": m + n, "belief": 2 * n}[observation] + self._appended
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
-        self._session = Session(self.filter)
+        self._session = self.filter.session()
         self._generator = filter_generator(None)
         if hasattr(env.unwrapped, "overlay"):  # it draws the estimate beside the truth
             env.unwrapped.render_overlay = self._overlay

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -12,6 +12,9 @@ from gymnasium.vector.utils import batch_space
 
 from filters.engine.batch_session import Beliefs
 from filters.engine.checks import checked_actions
+from filters.estimators.estimator import Estimator
+from filters.estimators.foreign import ForeignFilter
+from filters.estimators.session import EstimatorBeliefs
 from filters.wrappers.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for
 from numerics.checks import one_of, shown
 from numerics.keys import EpisodeKeys, reset_mask
@@ -41,7 +44,7 @@ class EstimateStates(gym.vector.VectorWrapper):
     def __init__(
         self,
         env: gym.vector.VectorEnv,
-        filter: str | None = None,
+        filter: str | Estimator | Callable | None = None,
         observation: str = "estimate",
         model: str | StateSpaceModel | None = None,
         tuned: str | None = None,
@@ -62,7 +65,8 @@ class EstimateStates(gym.vector.VectorWrapper):
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, shape=shape, dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.autoreset_mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
-        self._beliefs = Beliefs(self.filter, self.num_envs)
+        beliefs = EstimatorBeliefs if isinstance(self.filter, ForeignFilter) else Beliefs
+        self._beliefs = beliefs(self.filter, self.num_envs)
         self._keys = EpisodeKeys(self.num_envs, filter_generator)
         self._held = np.zeros((self.num_envs, self._m))
         self._done = np.zeros(self.num_envs, dtype=bool)

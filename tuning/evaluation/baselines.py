@@ -9,7 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 
-from filters.registry import filter_class
 from tuning.evaluation.evaluate import evaluate
 from tuning.problems.problem import Problem
 from tuning.problems.seeds import training_seeds
@@ -61,7 +60,7 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
         The choice with its factor and mean NIS; without them, and with the reason, for a filter that has no NIS,
         or whose mean NIS no factor between 1e-8 and 1e8 brings to 1.
     """
-    if not filter_class(name).has_covariance:
+    if not rule_of_thumb(name, scenario).filter(scenario).has_covariance:
         return Scaled(None, None, None, f"{name} has no NIS by which its Q could be scaled")
     data = scenario.data(training_seeds(seed, TRAINING_SEEDS))
     start = _with_q(rule_of_thumb(name, scenario), scenario)

@@ -11,6 +11,7 @@ import numpy as np
 from filters.augmented import Unknown, augmented_model
 from filters.consistency.intervals import Interval, rmse_ratios
 from filters.engine.batch import Estimates, run
+from filters.estimators.find import is_foreign, label_of
 from filters.filter import Filter
 from filters.particles.weighted import WeightedFilter
 from filters.registry import filter_class, make_filter
@@ -37,15 +38,15 @@ class Contender(NamedTuple):
 
     def filter(self, scenario: Problem) -> Filter:
         """The filter, with what the scenario lets it assume of the plant."""
-        filter_ = self.choose(scenario).filter(scenario)
+        choice = self.choose(scenario)
+        filter_ = choice.filter(scenario)
         if not self.unknown:
             return filter_
-        numbers = {name: getattr(filter_, name) for name in self.choose(scenario).numbers}
         constants, beliefs = filter_.model.constants, {}
         for name, belief in self.unknown.items():
             one_of("a constant to estimate", name, getattr(constants, "_fields", ()))
             beliefs[name] = default_belief(name, getattr(constants, name)) if belief is None else belief
-        return make_filter(filter_.name, augmented_model(filter_.model, beliefs), **numbers)
+        return make_filter(choice.name, augmented_model(filter_.model, beliefs), **choice.numbers)
 
 
 class Row(NamedTuple):
@@ -91,7 +92,7 @@ def contender(
     """A filter by name.
 
     Args:
-        name: of the filter.
+        name: of the filter; or an estimator, what makes one of a model, or "module:object" for either.
         knows: "true" for the plant's own Q and R (the oracle), "scaled" for the scaled default, whose Q the mean
             NIS on the training runs tells, "untuned" for the rule of thumb.
         unknown: constants of the model to estimate with the states; None as a belief for `default_belief`.
@@ -113,7 +114,9 @@ def contender(
     size = [str(numbers.get("ensemble_size", ensemble_sizes_of(name).untuned))] if has_ensemble(name) else []
     others = [f"{key} {value:g}" for key, value in numbers.items() if key != "ensemble_size"]
     added = [f"+ {SYMBOLS.get(constant, constant)}" for constant in unknown]
-    return Contender(" ".join([name, *size, *others, *added]), chosen, unknown)
+    return Contender(
+        " ".join([label_of(name) if is_foreign(name) else name, *size, *others, *added]), chosen, unknown
+    )
 
 
 def _known(knows: str, name: str, scenario: Problem, seed: int) -> Choice:

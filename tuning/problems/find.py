@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import copy
 import importlib
-import os
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 
 from numerics.checks import shown
+from numerics.modules import is_code, object_named, said
 from tuning.problems.check import checked_problem
 from tuning.problems.problem import Problem
 
@@ -24,11 +23,6 @@ def built_in() -> dict[str, ModuleType]:
     """Names of the problems that come with the package, and the room of each."""
     rooms = [importlib.import_module(room) for room in ROOMS]
     return {name: room for room in rooms for name in room.NAMES}
-
-
-def is_code(name) -> bool:
-    """Whether a name is that of an object in a module, "module:object", which only a user may have imported."""
-    return isinstance(name, str) and ":" in name and not name.endswith(".toml")
 
 
 def find_problem(name: str) -> Problem:
@@ -90,23 +84,13 @@ def problem_from_mapping(content: Mapping, name: str, file: str | Path) -> Probl
 
 
 def _from_module(name: str) -> Problem:
-    module_name, _, path = name.partition(":")
-    try:
-        found = _module(module_name)
-        for part in path.split("."):
-            found = getattr(found, part)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(
-            f"problem must be 'module:object' that can be imported, but {name!r} is not: {error}"
-        ) from None
-    except Exception as error:
-        raise ValueError(f"a problem's module must import, but {name!r} raised {_said(error)}") from error
+    found = object_named(name, "problem")
     if not isinstance(found, Problem) and callable(found):
         try:
             found = found()
         except Exception as error:
             raise ValueError(
-                f"a problem's function must give it without arguments, but {name!r} raised {_said(error)}"
+                f"a problem's function must give it without arguments, but {name!r} raised {said(error)}"
             ) from error
     return named(checked_problem(found, name), name)
 
@@ -118,19 +102,3 @@ def named(problem: Problem, name: str) -> Problem:
     other = copy.copy(problem)
     object.__setattr__(other, "name", name)
     return other
-
-
-def _module(name: str) -> ModuleType:
-    """A module, which may lie in the working folder, as the user's own do."""
-    folder = os.getcwd()
-    if folder in sys.path or "" in sys.path:
-        return importlib.import_module(name)
-    sys.path.append(folder)
-    try:
-        return importlib.import_module(name)
-    finally:
-        sys.path.remove(folder)
-
-
-def _said(error: BaseException) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())

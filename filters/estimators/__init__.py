@@ -1,0 +1,1 @@
+"""Other people's estimators in the place of a filter."""

@@ -1,0 +1,144 @@
+"""What an estimator gives, checked: shapes, finite numbers, covariances that are some."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from filters.estimators.estimator import Output
+from numerics.checks import as_floats, shown
+
+PARTS = {"mean": "n", "cov": "nn", "innovation": "m", "innovation_cov": "mm"}
+CALLED = {
+    "mean": "mean",
+    "cov": "covariance",
+    "innovation": "innovation",
+    "innovation_cov": "covariance of the innovation",
+}
+ROUNDING = 1e-6  # of a covariance, as part of its largest entry: single precision leaves less
+
+
+class Checks:
+    """Checks of what one estimator gives, whose messages name it.
+
+    Args:
+        name: of the estimator.
+        n: states.
+        m: measurements.
+        has_covariance: whether it has to give covariances.
+    """
+
+    def __init__(self, name: str, n: int, m: int, has_covariance: bool):
+        self.name, self._sizes, self._has_covariance = name, {"n": (n,), "m": (m,)}, has_covariance
+
+    def output(self, given, where: str, leading: tuple[int, ...] = ()) -> Output:
+        """The parts of an output as float64 arrays of shape (*leading, ...); ValueError if one is wrong.
+
+        Args:
+            given: what the estimator returned `where`.
+            where: for messages, such as "step 3".
+            leading: shape of all before the states: () of one step, (B, K + 1) of many runs.
+        """
+        parts = given if isinstance(given, tuple) else (given,)
+        if not 1 <= len(parts) <= len(PARTS):
+            raise ValueError(
+                f"{self._of} must give a mean, or a tuple of mean, covariance, innovation and its covariance, "
+                f"but gave a tuple of {len(parts)} at {where}"
+            )
+        found = Output(*parts)
+        if self._has_covariance and found.cov is None:
+            raise ValueError(
+                f"{self._of} must give a covariance, or say has_covariance = False, but gave none at {where}"
+            )
+        checked = {
+            name: None if value is None else self._part(name, value, where, leading)
+            for name, value in found._asdict().items()
+        }
+        return Output(**checked)
+
+    @property
+    def _of(self) -> str:
+        return f"the estimator {self.name!r}"
+
+    def _part(self, name: str, value, where: str, leading: tuple[int, ...]) -> np.ndarray:
+        size = self._sizes[PARTS[name][0]]
+        is_cov = len(PARTS[name]) == 2
+        shape = (*leading, *size, *size) if is_cov else (*leading, *size)
+        try:
+            array = np.atleast_1d(as_floats(value))
+        except ValueError:
+            array = np.empty(0)
+        if is_cov and array.shape == (*leading, *size) != shape:
+            array = array[..., None] * np.eye(*size)
+        if array.shape != shape:
+            got = f"shape {array.shape}" if array.size else shown(value)
+            raise ValueError(
+                f"{CALLED[name]} of {self._of} must be numbers of shape {shape}, but got {got} at {where}"
+            )
+        if not np.isfinite(array).all():
+            place = _first(~np.isfinite(array), leading)
+            raise ValueError(f"{CALLED[name]} of {self._of} must be finite, but it is not at {place or where}")
+        return self._covariance(name, array, where, leading) if is_cov else array
+
+    def _covariance(self, name: str, covs: np.ndarray, where: str, leading: tuple[int, ...]) -> np.ndarray:
+        """The covariances (..., d, d), made exactly symmetric."""
+        turned = covs.swapaxes(-1, -2)
+        largest = np.abs(covs).max(axis=(-1, -2))
+        wrong = np.abs(covs - turned).max(axis=(-1, -2)) > ROUNDING * largest
+        covs = 0.5 * (covs + turned)
+        wrong |= np.linalg.eigvalsh(covs)[..., 0] < -ROUNDING * largest
+        if wrong.any():
+            place = _first(wrong, leading)
+            raise ValueError(
+                f"{CALLED[name]} of {self._of} must be symmetric and positive semidefinite, "
+                f"but it is not at {place or where}"
+            )
+        return covs
+
+
+def _first(wrong: np.ndarray, leading: tuple[int, ...]) -> str:
+    """Where the first wrong entry of many runs is; empty of a single step."""
+    if not leading:
+        return ""
+    run, step, *_ = np.argwhere(wrong)[0]
+    return f"step {step} of run {run}"
+
+
+def log_likelihoods(
+    innovations: np.ndarray, covs: np.ndarray, measurements: np.ndarray, gaussian: bool
+) -> np.ndarray:
+    """Log-likelihood of measurements, log N(innovation; 0, S) over the channels that are there, (B, K + 1).
+
+    It is 0 where nothing was measured, and NaN where something was, but S is not told (all zero), not positive
+    definite, or no covariance of a Gaussian.
+
+    Args:
+        innovations: (B, K + 1, m), of which those of missing channels do not matter.
+        covs: S, (B, K + 1, m, m), likewise.
+        measurements: (B, K + 1, m), NaN where missing.
+        gaussian: whether the likelihood is Gaussian.
+    """
+    there = ~np.isnan(measurements)
+    pairs = there[..., :, None] & there[..., None, :]
+    s = np.where(pairs, covs, np.eye(covs.shape[-1]))
+    v = np.where(there, innovations, 0.0)
+    definite = np.linalg.eigvalsh(s)[..., 0] > 0.0
+    s = np.where(definite[..., None, None], s, np.eye(covs.shape[-1]))
+    squares = (v * np.linalg.solve(s, v[..., None])[..., 0]).sum(axis=-1)
+    found = -0.5 * (squares + np.linalg.slogdet(s).logabsdet + there.sum(axis=-1) * math.log(2.0 * math.pi))
+    return np.where(there.any(axis=-1), np.where(definite & gaussian, found, np.nan), 0.0)
+
+
+def without_missing(output: Output, z: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Innovation and S as filters have them where channels of z are NaN: zero, and no correlations to these."""
+    innovation, s = output.innovation, output.innovation_cov
+    there = ~np.isnan(z)
+    if there.all():
+        return innovation, s
+    if innovation is not None:
+        innovation = np.where(there, innovation, 0.0)
+    if s is not None:
+        pairs = there[..., :, None] & there[..., None, :]
+        s = np.where(pairs | np.eye(s.shape[-1], dtype=bool), s, 0.0)
+    return innovation, s

@@ -1,0 +1,58 @@
+"""The contract of an estimator: whatever maps inputs and measurements to means, and covariances if it has them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+
+class Output(NamedTuple):
+    """What an estimator gives after a measurement."""
+
+    mean: Any  # of the state, (n,)
+    cov: Any = None  # (n, n) or n variances; None of an estimator that has none
+    innovation: Any = None  # (m,), measurement less what was foreseen; None of one that does not tell
+    innovation_cov: Any = None  # S, (m, m) or m variances
+
+
+class Estimator:
+    """An estimator of one trajectory at a time; it keeps its belief, and what it draws follows from the key.
+
+    A subclass gives `reset` and `step`; any other object that has both does as well, and what it leaves out of the
+    rest is as here. Each may return an `Output`, a tuple of the first of its parts, such as (mean, cov), or an
+    array, which is a mean alone. A method `run(keys, inputs, measurements)`, of keys (B, 2), inputs (B, K, p) and
+    measurements (B, K + 1, m), may take the place of both in evaluations: it returns the same for all trajectories
+    and steps, means (B, K + 1, n), covariances (B, K + 1, n, n) and so on.
+
+    Attributes:
+        name: for tables; that under which it is found if None.
+        has_covariance: whether it gives covariances; NEES is left out where it does not.
+        gaussian_likelihood: whether the likelihood of a measurement is N(innovation; 0, S); it is left out if not.
+        parameters: what it is tuned by: `Parameter`s, each an argument of the function that makes it.
+    """
+
+    name: str | None = None
+    has_covariance: bool = True
+    gaussian_likelihood: bool = True
+    parameters: Sequence = ()
+
+    def reset(self, key: tuple[int, int], z) -> Output | tuple | Any:
+        """Begin a trajectory: the estimate at its first measurement z (m,), NaN where missing.
+
+        The key is two whole numbers below 2^32: with the same one an estimator draws the same.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no reset")
+
+    def step(self, u, z) -> Output | tuple | Any:
+        """The estimate one step later, after input u (p,) and measurement z (m,), NaN where missing."""
+        raise NotImplementedError(f"{type(self).__name__} has no step")
+
+
+def steps_alone(found) -> bool:
+    """Whether something estimates one trajectory step by step."""
+    return not isinstance(found, type) and all(callable(getattr(found, name, None)) for name in ("reset", "step"))
+
+
+def is_estimator(found) -> bool:
+    """Whether something is an estimator, of one trajectory or of many at once, rather than what makes one."""
+    return steps_alone(found) or (not isinstance(found, type) and callable(getattr(found, "run", None)))

@@ -1,0 +1,113 @@
+"""FilterPy's filters as estimators: `KalmanFilter`, `ExtendedKalmanFilter`, `UnscentedKalmanFilter` and their like."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from filters.estimators.estimator import Estimator, Output
+from plants.state_space import StateSpaceModel
+
+
+class FilterPyEstimator(Estimator):
+    """A filter of FilterPy, or any object with `predict`, `update`, `x`, `P`, `y`, `S` and `R` like its.
+
+    Each trajectory begins with a copy of the filter as it is given, whose x and P are the prior. It predicts with
+    the input, then updates with the measurement. Where some channels are missing it updates with the others, by
+    the `R`, and the `H` or `hx`, that FilterPy's `update` takes; where all are, it predicts only.
+
+    Args:
+        filter: of FilterPy, x, P, Q and R set.
+        predict: `predict(filter, u)`, where the filter's own `predict(u=u)` will not do.
+        update_arguments: further ones of its `update`, such as `HJacobian` and `Hx` of an extended filter.
+        name: for tables; that of its class if None.
+
+    Source: Labbe (2014), "Kalman and Bayesian filters in Python", and its library FilterPy.
+    """
+
+    def __init__(
+        self,
+        filter: Any,
+        predict: Callable | None = None,
+        update_arguments: Mapping | None = None,
+        name: str | None = None,
+    ):
+        """Keep the filter as it is given; see the class."""
+        self.name = name or f"filterpy {type(filter).__name__}"
+        self._given, self._predict = filter, predict or _predict
+        self._arguments = dict(update_arguments or {})
+        self.filter = copy.deepcopy(filter)
+
+    def reset(self, key, z) -> Output:
+        """The prior, updated with the first measurement; FilterPy's filters take no key."""
+        self.filter = copy.deepcopy(self._given)
+        points = getattr(self.filter, "points_fn", None)
+        if points is not None:  # a first update without a prediction needs sigma points
+            self.filter.sigmas_f = points.sigma_points(self.filter.x, self.filter.P)
+        return self._updated(z)
+
+    def step(self, u, z) -> Output:
+        """The filter's estimate after its prediction and its update."""
+        u = np.asarray(u, dtype=np.float64)
+        self._predict(self.filter, u[:, None] if np.ndim(self.filter.x) == 2 else u)
+        return self._updated(z)
+
+    def _updated(self, z) -> Output:
+        own, z = self.filter, np.asarray(z, dtype=np.float64)
+        there = ~np.isnan(z)
+        innovation, s = None, None
+        if there.any():
+            measured = z[there, None] if np.ndim(own.x) == 2 else z[there]
+            own.update(measured, **self._arguments, **({} if there.all() else self._of_some(there)))
+            # Channels that are missing have no innovation, and no correlation to the others.
+            innovation, s = np.zeros(len(z)), np.array(own.R, dtype=np.float64)
+            innovation[there] = np.ravel(own.y)
+            s[np.ix_(there, there)] = own.S
+        return Output(np.ravel(own.x).copy(), np.array(own.P), innovation, s)
+
+    def _of_some(self, there: np.ndarray) -> dict:
+        """Arguments of an update with some channels alone."""
+        own, given = self.filter, self._arguments
+        found = {"R": np.asarray(own.R)[np.ix_(there, there)]}
+        if "HJacobian" in given:
+            return found | {
+                "HJacobian": lambda x, *rest: np.asarray(given["HJacobian"](x, *rest))[there],
+                "Hx": lambda x, *rest: np.asarray(given["Hx"](x, *rest))[there],
+            }
+        if hasattr(own, "H"):
+            return found | {"H": np.asarray(own.H)[there]}
+        return found | {"hx": lambda x, **rest: np.asarray(own.hx(x, **rest))[there]}
+
+
+def _predict(filter: Any, u: np.ndarray) -> None:
+    filter.predict(u=u)
+
+
+def unscented(
+    model: StateSpaceModel, alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0
+) -> FilterPyEstimator:
+    """FilterPy's unscented filter of any model, `filters.estimators.filterpy:unscented` by name.
+
+    Args:
+        model: f, h, Q, R and the prior.
+        alpha, beta, kappa: of the scaled sigma points; those of the filter `ukf` by default.
+    """
+    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+
+    def advance(x, dt, u):
+        x = tuple(x)
+        for _ in range(model.substeps):
+            x = model.transition(x, tuple(u), model.constants)
+        return np.array(x)
+
+    def look(x):
+        return np.array(model.observe(tuple(x), model.constants))
+
+    points = MerweScaledSigmaPoints(model.n, alpha, beta, kappa)
+    found = UnscentedKalmanFilter(model.n, model.m, 1.0, hx=look, fx=advance, points=points)
+    found.x, found.P = model.prior_mean.copy(), model.prior_cov.copy()
+    found.Q, found.R = model.process_noise_cov.copy(), model.measurement_noise_cov.copy()
+    return FilterPyEstimator(found, name="filterpy ukf")

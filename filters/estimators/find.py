@@ -1,0 +1,80 @@
+"""Estimators that a user gives: an object, what makes one for a model, or "module:object" for either."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from filters.estimators.estimator import is_estimator
+from filters.estimators.foreign import ForeignFilter
+from filters.filter import Filter
+from numerics.checks import shown
+from numerics.modules import is_code, object_named, said
+from plants.state_space import StateSpaceModel
+
+
+def is_foreign(given) -> bool:
+    """Whether something stands for somebody else's estimator, and is not meant as the name of a filter."""
+    return is_code(given) or (not isinstance(given, str) and (is_estimator(given) or callable(given)))
+
+
+def label_of(given) -> str:
+    """What an estimator that a user gives is called: "module:object", its own name, or that of what makes it."""
+    if isinstance(given, str):
+        return given
+    for name in (getattr(given, "name", None), getattr(given, "__name__", None)):
+        if isinstance(name, str) and name:
+            return name
+    return type(given).__name__
+
+
+def parameters_of(given) -> tuple:
+    """What an estimator says that it is tuned by, `Parameter`s; none where it says nothing."""
+    found = getattr(_found(given), "parameters", ())
+    return tuple(found) if isinstance(found, list | tuple) else ()  # of a network in torch it is a method
+
+
+def foreign_filter(given, model: StateSpaceModel, **numbers) -> Filter:
+    """An estimator in the place of a filter.
+
+    Args:
+        given: an estimator; a function, or class, of a model (and of `numbers`) that makes one, or a `Filter`; or
+            "module:object" for any of these.
+        model: of states, inputs and measurements: what a function gets, and where names and angles come from.
+        **numbers: further arguments of the function.
+
+    Raises:
+        ValueError: states the rule and the value, if there is no such thing, or it is no estimator.
+    """
+    found, label = _found(given), label_of(given)
+    if not is_estimator(found):
+        found = _made(found, label, model, numbers)
+    elif numbers:
+        raise ValueError(
+            f"numbers are for what makes an estimator, but {label!r} is one already, and got {', '.join(numbers)}"
+        )
+    return found if isinstance(found, Filter) else ForeignFilter(model=model, estimator=found, label=label)
+
+
+def _found(given) -> Any:
+    return object_named(given, "estimator") if isinstance(given, str) else given
+
+
+def _made(make, label: str, model: StateSpaceModel, numbers: dict) -> Any:
+    what = f"estimator {label!r}"
+    if not callable(make):
+        raise ValueError(f"{what} must be an estimator, or make one of a model, but it is {shown(make)}")
+    try:
+        found = make(model=model, **numbers) if _is_filter_class(make) else make(model, **numbers)
+    except Exception as error:
+        wanted = ", ".join(["a model", *numbers])
+        raise ValueError(f"{what} must be made of {wanted}, but raised {said(error)}") from error
+    if not isinstance(found, Filter) and not is_estimator(found):
+        raise ValueError(
+            f"{what} must make what has reset(key, z) and step(u, z), or run(keys, inputs, measurements), "
+            f"but made {shown(found)}"
+        )
+    return found
+
+
+def _is_filter_class(make) -> bool:
+    return isinstance(make, type) and issubclass(make, Filter)

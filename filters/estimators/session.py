@@ -1,0 +1,96 @@
+"""Estimators at work beside envs: one trajectory, as `filters.engine.session.Session`, or one a copy of a vector env."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+
+from filters.engine.checks import checked_key, vector_like
+from filters.estimators.checked import Checks, without_missing
+from filters.estimators.estimator import steps_alone
+from numerics.modules import said
+
+
+class EstimatorSession:
+    """An estimator on one trajectory, on a copy of its own; every output is checked.
+
+    Attributes:
+        mean, cov, innovation, innovation_cov: (n,), (n, n), (m,), (m, m), of the last output; zero in the parts
+            that the estimator does not give.
+        divergences: 0: an estimator whose numbers are not finite is an error.
+    """
+
+    def __init__(self, filter_):
+        """Of a `filters.estimators.foreign.ForeignFilter`; `start` comes next."""
+        if not steps_alone(filter_.estimator):
+            raise ValueError(
+                f"the estimator {filter_.name!r} must have reset(key, z) and step(u, z) to run beside an env, "
+                "but it has not"
+            )
+        model = filter_.model
+        n, m = model.n, model.m
+        self._estimator = copy.deepcopy(filter_.estimator)
+        self._checks = Checks(filter_.name, n, m, filter_.has_covariance)
+        self._like = np.zeros(model.inputs), np.zeros(m)
+        self._steps = 0
+        self.divergences = 0
+        self.mean, self.cov = np.zeros(n), np.zeros((n, n))
+        self.innovation, self.innovation_cov = np.zeros(m), np.zeros((m, m))
+
+    def start(self, key, z) -> None:
+        """Begin with a random key (2,) and a first measurement z (m,)."""
+        z = vector_like("z", z, self._like[1], missing_allowed=True)
+        self._steps = 0
+        self._take("reset", checked_key(key), z)
+
+    def step(self, u, z) -> None:
+        """One step later, after input u (p,) and measurement z (m,); NaN marks a missing channel."""
+        u = vector_like("u", u, self._like[0], missing_allowed=False)
+        z = vector_like("z", z, self._like[1], missing_allowed=True)
+        self._steps += 1
+        self._take("step", u, z)
+
+    def _take(self, method: str, first, z: np.ndarray) -> None:
+        where = f"step {self._steps}"
+        given = z.copy()  # an estimator may write into it
+        try:
+            returned = getattr(self._estimator, method)(first, given)
+        except Exception as error:
+            raise ValueError(
+                f"the estimator {self._checks.name!r} must not raise, but its {method} raised {said(error)} at {where}"
+            ) from error
+        output = self._checks.output(returned, where)
+        innovation, s = without_missing(output, z)
+        for own, found in (
+            (self.mean, output.mean),
+            (self.cov, output.cov),
+            (self.innovation, innovation),
+            (self.innovation_cov, s),
+        ):
+            own[...] = 0.0 if found is None else found
+
+
+class EstimatorBeliefs:
+    """An estimator on N copies of a vector env, each on a copy of its own: `filters.engine.batch_session.Beliefs`."""
+
+    def __init__(self, filter_, count: int):
+        """Of a `ForeignFilter`; `start` comes next."""
+        self._sessions = [EstimatorSession(filter_) for _ in range(count)]
+
+    def start(self, which: np.ndarray, keys: np.ndarray, z: np.ndarray) -> None:
+        """Begin in some copies with keys (len(which), 2) and measurements z (N, m)."""
+        for i, key in zip(which, keys, strict=True):
+            self._sessions[i].start(tuple(int(word) for word in key), z[i])
+
+    def step(self, u: np.ndarray, z: np.ndarray, idle: np.ndarray | None = None) -> None:
+        """One step in all copies that are not idle, with inputs u (N, p) and measurements z (N, m)."""
+        for i, session in enumerate(self._sessions):
+            if idle is None or not idle[i]:
+                session.step(u[i], z[i])
+
+    def part(self, name: str, *shape: int) -> np.ndarray:
+        """A copy of a part of all sessions, such as "mean": (N, *shape)."""
+        return np.array(
+            [np.reshape(getattr(session, name), shape) for session in self._sessions], dtype=np.float64
+        )
