@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +13,10 @@ from numerics.checks import finite, positive
 from numerics.compiled import inlined
 from numerics.derivatives import RELATIVE_STEP
 from numerics.pickling import makes_functions
-from numerics.tuples import tuple_of, written_out
+from numerics.sources import Source, entrywise, tuple_of, written_out
+from numerics.tuples import assembled, joiner, vector_part
 from plants.quantities import Quantity
+from plants.shape import constants_are_array
 from plants.state_space import StateSpaceModel
 
 
@@ -90,34 +93,49 @@ def _block_diagonal(cov: np.ndarray, variances: list[float]) -> np.ndarray:
     return whole
 
 
+@cache
+def _filler(form, count: int, places: tuple[int, ...]) -> Callable:
+    """Return `fill(t, c)`: the model's constants, of which those at some places are t and the others c."""
+    if constants_are_array(form):
+        lines = f"filled = c[:{count}].copy()", *(f"filled[{place}] = t[{q}]" for q, place in enumerate(places))
+        return written_out("fill", "t, c", *lines, "filled")
+    values = [f"t[{places.index(i)}]" if i in places else f"c[{i}]" for i in range(count)]
+    source = tuple_of(values) if isinstance(form, int) else f"Constants({', '.join(values)})"
+    return written_out("fill", "t, c", source, Constants=form)
+
+
+@cache
+def _difference_quotient(size: int, angles: tuple[bool, ...]) -> Callable:
+    """Return `difference(above, below, h)`: a column (size, 1) of slopes, angles the short way round."""
+    source = Source("difference", "above, below, h", result=(size, 1), above=(size,), below=(size,))
+
+    def slope(i, j):
+        return short_way(f"(above[{i}] - below[{i}])", i, angles) + " / (2.0 * h)"
+
+    return source.function(source.matrix(size, 1, slope), **NAMES)
+
+
 @makes_functions
 def _augmented_functions(
     transition, transition_jacobian, observe, observe_jacobian, shape, places
 ) -> dict[str, Callable | None]:
     """Functions of the augmented model; its constants are the model's own, then the spread of each parameter."""
     n, m, form, count, added = shape.n, shape.m, shape.form, shape.constants, len(places)
-    values = [f"t[{places.index(i)}]" if i in places else f"c[{i}]" for i in range(count)]
-    source = tuple_of(values) if isinstance(form, int) else f"Constants({', '.join(values)})"
     names = {
         "f": transition,
         "h": observe,
-        "fill": written_out("fill", "t, c", source, Constants=form),
-        "states": written_out("states", "x", tuple_of(f"x[{i}]" for i in range(n))),
-        "parameters": written_out("parameters", "x", tuple_of(f"x[{n + q}]" for q in range(added))),
+        "fill": _filler(form, count, places),
+        "states": vector_part(n, n + added),
+        "parameters": vector_part(added, n + added, n),
+        "join": joiner(n, added),
     }
     begin = ("s = states(x)", "t = parameters(x)")
-    rows = [f"moved[{i}]" for i in range(n)] + [f"t[{q}]" for q in range(added)]
     functions = {
-        "transition": written_out(
-            "transition", "x, u, c", *begin, "moved = f(s, u, fill(t, c))", tuple_of(rows), **names
-        ),
+        "transition": written_out("transition", "x, u, c", *begin, "join(f(s, u, fill(t, c)), t)", **names),
         "observe": written_out("observe", "x, c", "h(states(x), fill(parameters(x), c))", **names),
         "transition_jacobian": None,
         "observe_jacobian": None,
     }
-
-    def slope(i, q, angles):
-        return short_way(f"(above{q}[{i}] - below{q}[{i}])", i, angles) + f" / (2.0 * step{q})"
 
     def jacobian(name, function, analytic, size, arguments, angles, identity):
         lines = [*begin, f"a = analytic(s, {arguments}fill(t, c))"]
@@ -126,14 +144,25 @@ def _augmented_functions(
             for side, sign in (("above", "+"), ("below", "-")):
                 shifted = tuple_of(f"t[{r}] {sign} step{q}" if r == q else f"t[{r}]" for r in range(added))
                 lines.append(f"{side}{q} = {function}(s, {arguments}fill({shifted}, c))")
-        known = [
-            [f"a[{i}][{j}]" for j in range(n)] + [slope(i, q, angles) for q in range(added)] for i in range(size)
-        ]
-        rest = (
-            [["1.0" if j == n + q else "0.0" for j in range(n + added)] for q in range(added)] if identity else []
+        parts = {"a": ((size, n), 0, 0)}
+        slopes = {f"slope{q}": ((size, 1), 0, n + q) for q in range(added)}
+        ones = {f"one{q}": ((1, 1), n + q, n + q) for q in range(added) if identity}
+        for q in range(added):
+            lines.append(f"slope{q} = difference(above{q}, below{q}, step{q})")
+        tools = {
+            "difference": _difference_quotient(size, angles),
+            "one": entrywise("one", "", (1, 1), lambda i, j: "1.0"),
+            "whole": assembled(
+                "whole",
+                ", ".join([*parts, *slopes, *ones]),
+                (size + len(ones), n + added),
+                {**parts, **slopes, **ones},
+            ),
+        }
+        values = ", ".join(["a", *slopes, *["one()"] * len(ones)])
+        return written_out(
+            name, f"x, {arguments}c", *lines, f"whole({values})", analytic=inlined(analytic), **names, **tools
         )
-        matrix = tuple_of(tuple_of(row) for row in known + rest)
-        return written_out(name, f"x, {arguments}c", *lines, matrix, analytic=inlined(analytic), **names, **NAMES)
 
     if transition_jacobian is not None:
         functions["transition_jacobian"] = jacobian(

@@ -9,9 +9,10 @@ import numpy as np
 from numerics.checks import at_least
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from numerics.matrices import multiplier, quadratic_form
+from numerics.sources import Source
 from numerics.streams import GROUP
 from numerics.threads import spread
-from numerics.tuples import matrix_reader, vector_reader, written_out
+from numerics.tuples import matrix_reader, vector_reader
 from plants.affine import AffineModel
 from plants.layout import constants_reader, number_places, padded
 from plants.shape import Functions, Shape, observation_slopes, transition_slopes
@@ -120,12 +121,11 @@ def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
     times, identity = multiplier(n, n, n), matrix_reader(n, n)
     read_weight_n, read_weight_m = matrix_reader(n, n), matrix_reader(m, m)
     quadratic_n, quadratic_m = quadratic_form(n, n), quadratic_form(m, n)
-    accumulate = written_out(
-        "accumulate",
-        "out, b, k, a",
-        *(f"out[b, k, {i}, {j}] += a[{i}][{j}]" for i in range(n) for j in range(n)),
-        "None",
-    )
+    adder = Source("accumulate", "out, b, k, a", a=(n, n))
+    for i in adder.range(n):
+        for j in adder.range(n):
+            adder.line(f"out[b, k, {i}, {j}] += a[{i}][{j}]")
+    accumulate = adder.function()
     fingerprint = function_fingerprint(transition, transition_matrix, observation_matrix, within=__name__)
 
     @inlined

@@ -8,20 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from numerics.angles import kept
-from numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from numerics.derivatives import RELATIVE_STEP
 from numerics.formulas import formula
-from numerics.matrices import cholesky_factor, innovation_likelihood, masked, row_solver
+from numerics.matrices import cholesky_factor, innovation_likelihood, masked, row_solver, vector_solver
+from numerics.sources import Source, entrywise, matrix_of, tuple_of, written_out
 from numerics.threads import spread
-from numerics.tuples import (
-    matrix_of,
-    matrix_reader,
-    matrix_writer,
-    tuple_of,
-    vector_reader,
-    vector_writer,
-    written_out,
-)
+from numerics.tuples import matrix_reader, matrix_writer, scaled_sum, vector_reader, vector_writer
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape, innovation_of, observation_slopes, transition_slopes
 from plants.state_space import StateSpaceModel
@@ -169,6 +162,17 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
 @cache
 def _slope_along(rows: int, columns: int, matrix, arguments: str):
     """`slope(x, scales, d, <arguments>)`: the derivative of a Jacobian along d, by central differences."""
+    arrays = {"result": (rows, columns), "x": (columns,), "scales": (columns,), "d": (columns,)}
+    source = Source("slope", f"x, scales, d, {arguments}", **arrays)
+    if source.loops:
+        source.line("h = 1e-300")
+        for i in source.range(columns):
+            source.line(f"h = max(h, abs(d[{i}]) / (abs(x[{i}]) + scales[{i}]))")
+        source.line(f"h = {RELATIVE_STEP} / h")
+        source.line(f"above = matrix(move(x, h, d), scales, {arguments})")
+        source.line(f"below = matrix(move(x, -h, d), scales, {arguments})")
+        entry = source.matrix(rows, columns, lambda i, j: f"(above[{i}, {j}] - below[{i}, {j}]) / (2.0 * h)")
+        return source.function(entry, matrix=matrix, move=scaled_sum(columns))
     sizes = ", ".join(f"abs(d[{i}]) / (abs(x[{i}]) + scales[{i}])" for i in range(columns))
     lines = [f"h = {RELATIVE_STEP} / max(1e-300, {sizes})"]
     for name, sign in (("above", "+"), ("below", "-")):
@@ -181,8 +185,10 @@ def _slope_along(rows: int, columns: int, matrix, arguments: str):
 @cache
 def _present_rows(rows: int, columns: int):
     """`keep(h, z)`: h with zeros in the rows of channels that are NaN in z."""
-    entry = matrix_of(rows, columns, lambda i, j: f"h[{i}][{j}] if z[{i}] == z[{i}] else 0.0")
-    return written_out("keep", "h, z", entry)
+    shape = rows, columns
+    return entrywise(
+        "keep", "h, z", shape, lambda i, j: f"h[{i}][{j}] if z[{i}] == z[{i}] else 0.0", h=shape, z=(rows,)
+    )
 
 
 @cache
@@ -191,11 +197,18 @@ def _log_likelihood_slope(size: int):
 
     It is -1/2 tr(S^-1 dS) + w' dy + 1/2 w' dS w with w = S^-1 v, over the channels that are not NaN in z.
     """
-    lines = ["w = divide_one((v,), l)[0]", "e = divide(ds, l)"]
-    places = range(size)
-    trace = " + ".join(f"(e[{i}][{i}] if z[{i}] == z[{i}] else 0.0)" for i in places)
-    shift = " + ".join(f"w[{i}] * dy[{i}]" for i in places)
-    square = " + ".join(f"w[{i}] * ds[{i}][{j}] * w[{j}]" for i in places for j in places)
-    result = f"0.5 * ({square} - ({trace})) + {shift}"
-    solvers = {"divide_one": row_solver(1, size), "divide": row_solver(size, size)}
-    return written_out("slope", "v, dy, l, ds, z", *lines, result, **solvers)
+    matrix, vector = (size, size), (size,)
+    shapes = {"w": vector, "e": matrix, "dy": vector, "ds": matrix, "z": vector}
+    source = Source("combine", "w, e, dy, ds, z", work=size * size, **shapes)
+    products = (f"w[{i}] * ds[{i}][{j}] * w[{j}]" for i in source.range(size) for j in source.range(size))
+    square = source.sum(products)
+    trace = source.sum(f"(e[{i}][{i}] if z[{i}] == z[{i}] else 0.0)" for i in source.range(size))
+    shift = source.sum(f"w[{i}] * dy[{i}]" for i in source.range(size))
+    combine = source.function(f"0.5 * ({square} - ({trace})) + {shift}")
+    divide_one, divide = vector_solver(size), row_solver(size, size)
+
+    @inlined
+    def slope(v, dy, root, ds, z):
+        return combine(divide_one(v, root), divide(ds, root), dy, ds, z)
+
+    return slope

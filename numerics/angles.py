@@ -18,7 +18,8 @@ from functools import cache
 import numpy as np
 
 from numerics.compiled import inlined
-from numerics.tuples import tuple_of, written_out
+from numerics.sources import Index, Source
+from numerics.written import written_out
 
 TURN = 2.0 * math.pi
 
@@ -49,9 +50,23 @@ def is_angle(index: int, angles: Sequence[bool]) -> bool:
     return index < len(angles) and angles[index]
 
 
-def short_way(expression: str, index: int, angles: Sequence[bool]) -> str:
+def places_of(angles: Sequence[bool], first: int = 0) -> tuple[int, ...]:
+    """Numbers of the components that are angles, counted from `first`."""
+    return tuple(first + i for i, angle in enumerate(angles) if angle)
+
+
+def at_angle(index: int | Index, angles: Sequence[bool], there: str, elsewhere: str) -> str:
+    """Source of `there` in components that are angles and of `elsewhere` in others; in loops it asks which."""
+    if not isinstance(index, Index):
+        return there if is_angle(index, angles) else elsewhere
+    if all(angles):
+        return there if angles else elsewhere
+    return f"({there} if {index} in {places_of(angles)} else {elsewhere})" if any(angles) else elsewhere
+
+
+def short_way(expression: str, index: int | Index, angles: Sequence[bool]) -> str:
     """Source of a difference in component `index`, wrapped where that is an angle; for functions with `NAMES`."""
-    return f"wrapped({expression})" if is_angle(index, angles) else expression
+    return at_angle(index, angles, f"wrapped({expression})", expression)
 
 
 def wrapped_where(x: np.ndarray, angles: Sequence[bool]) -> np.ndarray:
@@ -69,22 +84,36 @@ def kept(function: Callable, arguments: str, angles: tuple[bool, ...]) -> Callab
     """A function of the arguments that returns a vector, with its angles in (-pi, pi]."""
     if not any(angles):
         return function
-    entries = (short_way(f"found[{i}]", i, angles) for i in range(len(angles)))
-    call = f"found = function({arguments})"
-    return written_out("kept", arguments, call, tuple_of(entries), function=inlined(function), **NAMES)
+    source = Source("kept", arguments, result=(len(angles),))
+    source.line(f"found = function({arguments})")
+    entries = source.vector(len(angles), lambda i: short_way(f"found[{i}]", i, angles))
+    return source.function(entries, function=inlined(function), **NAMES)
 
 
 @cache
 def angle_writer(start: int, angles: tuple[bool, ...]) -> Callable:
-    """Return `store(row, x)`: write a tuple into row[start], row[start + 1], ..., its angles in (-pi, pi]."""
-    lines = (f"row[{start + i}] = {short_way(f'x[{i}]', i, angles)}" for i in range(len(angles)))
-    return written_out("store", "row, x", *lines, "None", **NAMES)
+    """Return `store(row, x)`: write a vector into row[start], row[start + 1], ..., its angles in (-pi, pi]."""
+    source = Source("store", "row, x", x=(len(angles),))
+    for i in source.range(len(angles)):
+        source.line(f"row[{start + i}] = {short_way(f'x[{i}]', i, angles)}")
+    return source.function(**NAMES)
 
 
-def circular_mean(values: Sequence[str]) -> str:
-    """Source of the direction [rad] of the sum of unit vectors in the directions `values`."""
-    sums = (" + ".join(f"{name}({value})" for value in values) for name in ("sin", "cos"))
-    return f"arctan2({', '.join(sums)})"
+@cache
+def row_brancher(count: int, angles: tuple[bool, ...]) -> Callable:
+    """Return `align(y)`: rows y (count, d), each angle on the branch of its circular mean; there must be some."""
+    size = len(angles)
+    source = Source("align", "y", result=(count, size), y=(count, size))
+    middle = source.local("middle", size)
+    for a in source.among(places_of(angles)):
+        sums = [source.sum(f"{name}(y[{i}][{a}])" for i in source.range(count)) for name in ("sin", "cos")]
+        source.line(f"{middle[a]} = arctan2({', '.join(sums)})")
+
+    def entry(i, a):
+        value = f"y[{i}][{a}]"
+        return at_angle(a, angles, f"{middle[a]} + wrapped({value} - {middle[a]})", value)
+
+    return source.function(source.matrix(count, size, entry), **NAMES)
 
 
 @cache
@@ -97,15 +126,14 @@ def row_aligner(first: int, angles: tuple[bool, ...], weights: int | None = None
         weights: row of the entries' weights; if None, all are alike.
     """
     factor = "" if weights is None else f"table[{weights}, j] * "
-    lines = []
-    for row in (first + i for i, angle in enumerate(angles) if angle):
-        lines += [
-            "s = c = 0.0",
-            "for j in range(size):",
-            f"    s += {factor}sin(table[{row}, j])",
-            f"    c += {factor}cos(table[{row}, j])",
-            "middle = arctan2(s, c)",
-            "for j in range(table.shape[1]):",
-            f"    table[{row}, j] -= whole_turns(table[{row}, j] - middle)",
-        ]
+    lines = (
+        f"for i in {places_of(angles, first)}:",
+        "    s = c = 0.0",
+        "    for j in range(size):",
+        f"        s += {factor}sin(table[i, j])",
+        f"        c += {factor}cos(table[i, j])",
+        "    middle = arctan2(s, c)",
+        "    for j in range(table.shape[1]):",
+        "        table[i, j] -= whole_turns(table[i, j] - middle)",
+    )
     return written_out("align", "table, size", *lines, "None", **NAMES)

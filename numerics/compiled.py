@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from numerics.code_cache import keep_code
+from numerics.optimising import optimise_once
 
 # No "nnan" and "ninf": with them isfinite and isnan are compiled away, and failures would pass unseen.
 FASTMATH = frozenset({"contract", "reassoc", "arcp", "nsz", "afn"})
@@ -29,27 +30,44 @@ _packages: dict[str, tuple[str, ...]] = {}  # see `may_be_inlined`
 
 _waiting: list[Callable] = []
 _marked: set[Callable] = set()
+_called: set[Callable] = set()  # of these, functions that are called and not inlined
+_lessons: list[Callable[[], None]] = [lambda: optimise_once(_called.__contains__, _is_large)]
 _interpreting = False
 
 
-def inlined(function: Callable) -> Callable:
+def inlined(function: Callable, *, into_callers: bool = True) -> Callable:
     """Mark a plain function so that compiled functions may call it; it is inlined into all of them.
 
     So are functions that it calls by name. Inside a loop over members or copies this makes vector code, which
-    no call may interrupt.
+    no call may interrupt. With into_callers=False a function is called instead, and so are those that call it:
+    what loops over large arrays gains nothing by being inlined, and would be optimised anew in each caller.
     """
     if function not in _marked:
         _marked.add(function)
-        _waiting.append(function)
-        for callee in _callees(function):  # a user's model may call helpers of its own
+        callees = _callees(function)
+        for callee in callees:  # a user's model may call helpers of its own
             inlined(callee)
+        if not into_callers or not _called.isdisjoint(callees):
+            _called.add(function)
+        _waiting.append(function)
     return function
+
+
+def _is_large(function: Callable) -> bool:
+    """Whether a function calls one that is called and not inlined."""
+    return not _called.isdisjoint(_callees(function))
 
 
 def overloaded(function: Callable) -> Callable:
     """Mark a plain function in whose place compiled functions have machine code, by `numba.extending.overload`."""
     _marked.add(function)
     return function
+
+
+def when_compiling(teach: Callable[[], None]) -> Callable[[], None]:
+    """Mark what numba has to be taught before it compiles anything, which is when it is imported."""
+    _lessons.append(teach)
+    return teach
 
 
 def _callees(function: Callable) -> list[Callable]:
@@ -84,9 +102,11 @@ def compiled(function: Callable) -> Callable:
     import numba
     from numba.extending import register_jitable
 
+    while _lessons:
+        _lessons.pop()()
     while _waiting:
-        # By itself LLVM inlines small functions only.
-        register_jitable(forceinline=True)(_waiting.pop())
+        inner = _waiting.pop()
+        register_jitable(forceinline=inner not in _called)(inner)  # by itself LLVM inlines small ones only
     return keep_code(numba.njit(nogil=True, fastmath=set(FASTMATH), error_model="numpy")(function))
 
 

@@ -1,17 +1,26 @@
-"""Jacobians of functions on tuples: analytic where given, else by complex steps or central differences."""
+"""Jacobians of functions on vectors: analytic where given, else by complex steps or central differences."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
 
+import numpy as np
+
 from numerics.angles import NAMES, short_way
 from numerics.compiled import inlined
 from numerics.pickling import makes_functions
-from numerics.tuples import matrix_of, tuple_of, written_out
+from numerics.sources import Index, is_array, matrix_of, tuple_of, written_out
 
 RELATIVE_STEP = 6e-6  # cube root of the float64 resolution balances truncation and rounding
 COMPLEX_STEP = 1e-100  # nothing is subtracted, so it may be as small as one likes
+
+
+def _stores(rows: int, entry: Callable) -> list[str]:
+    """Lines that set column j of `out`, of `rows` components with the sources entry(i)."""
+    if is_array(rows):
+        return [f"for i in range({rows}):", f"    out[i, j] = {entry(Index('i'))}"]
+    return [f"out[{i}, j] = {entry(i)}" for i in range(rows)]
 
 
 @makes_functions
@@ -28,6 +37,8 @@ def complex_step(function: Callable, rows: int, columns: int, arguments: str) ->
 
     Source: Squire, Trapp (1998), "Using complex variables to estimate derivatives of real functions", SIAM Review.
     """
+    if is_array(rows, columns) or is_array(columns):
+        return _complex_step_in_loops(function, rows, columns, arguments)
     lines = []
     for j in range(columns):
         point = tuple_of(f"complex(x[{i}], {COMPLEX_STEP if i == j else 0.0})" for i in range(columns))
@@ -36,6 +47,48 @@ def complex_step(function: Callable, rows: int, columns: int, arguments: str) ->
     made = written_out("jacobian", f"x, {arguments}", *lines, source, function=inlined(function))
     made.differentiates = function
     return made
+
+
+def _complex_step_in_loops(function: Callable, rows: int, columns: int, arguments: str) -> Callable:
+    if is_array(columns):
+        point = "point = x + 0j", f"point[j] = complex(x[j], {COMPLEX_STEP})"
+    else:
+        step = f"{COMPLEX_STEP} if j == {{0}} else 0.0"
+        point = ("point = " + tuple_of(f"complex(x[{i}], {step.format(i)})" for i in range(columns)),)
+    stores = _stores(rows, lambda i: f"(0j + y[{i}]).imag / {COMPLEX_STEP}")
+    body = *point, f"y = function(point, {arguments})", *stores
+    lines = (
+        f"out = np.empty(({rows}, {columns}))",
+        f"for j in range({columns}):",
+        *(f"    {line}" for line in body),
+    )
+    made = written_out(
+        "jacobian", f"x, {arguments}", *lines, "out", _loops=True, function=inlined(function), np=np
+    )
+    made.differentiates = function
+    return made
+
+
+def _differences_in_loops(
+    function: Callable, rows: int, columns: int, arguments: str, angles: tuple[bool, ...]
+) -> Callable:
+    sides = []
+    for name, sign in (("above", "+"), ("below", "-")):
+        if is_array(columns):
+            sides += ["point = x.copy()", f"point[j] {sign}= h"]
+        else:
+            shifted = (f"x[{i}] {sign} h if j == {i} else x[{i}]" for i in range(columns))
+            sides.append("point = " + tuple_of(shifted))
+        sides += [f"{name} = function(point, {arguments})"]
+    size = "x[j]" if is_array(columns) else "sizes[j]"
+    scale = "scales[j]" if is_array(columns) else "steps[j]"
+    copies = [] if is_array(columns) else ["sizes, steps = np.array(x), np.array(scales)"]
+    stores = _stores(rows, lambda i: short_way(f"(above[{i}] - below[{i}])", i, angles) + " / (2.0 * h)")
+    body = f"h = {RELATIVE_STEP} * (abs({size}) + {scale})", *sides, *stores
+    start = f"out = np.empty(({rows}, {columns}))", *copies, f"for j in range({columns}):"
+    lines = *start, *(f"    {line}" for line in body)
+    names = {"function": inlined(function), "np": np, **NAMES}
+    return written_out("jacobian", f"x, scales, {arguments}", *lines, "out", _loops=True, **names)
 
 
 @cache
@@ -62,6 +115,8 @@ def jacobian(
     signature = f"x, scales, {arguments}"
     if analytic is not None:
         return written_out("jacobian", signature, f"analytic(x, {arguments})", analytic=inlined(analytic))
+    if is_array(rows, columns) or is_array(columns):
+        return _differences_in_loops(function, rows, columns, arguments, angles)
     lines = []
     for j in range(columns):
         lines.append(f"h{j} = {RELATIVE_STEP} * (abs(x[{j}]) + scales[{j}])")

@@ -1,232 +1,165 @@
-"""Small dense matrices as tuples of rows, with every operation written out for its size.
+"""Dense matrices as tuples of rows, with every operation written out for its size, and large ones as arrays.
 
-Compiled, they stay in registers and cost nanoseconds where a library call costs hundreds. Meant for models of
-up to about ten states: the written-out source grows with the cube of the size.
+Compiled, small ones stay in registers and cost nanoseconds where a library call costs hundreds. The source of
+large ones, which would grow with the cube of the size, has loops instead (`numerics.sources`).
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import cache
 
-from numerics.tuples import matrix_of, tuple_of, written_out
+from numerics import arrays
+from numerics.sources import Source, is_array
+from numerics.triangles import (
+    cholesky_factor,
+    factored_inverse,
+    forward_solver,
+    innovation_likelihood,
+    log_density,
+    pivoted_factor,
+    row_solver,
+    semidefinite_factor,
+    square,
+    triangle_divider,
+    triangular_root,
+    vector_solver,
+)
 
-RESOLUTION = 1e-15  # of the difference of two float64, relative to them
+__all__ = [
+    "cholesky_factor",
+    "factored_inverse",
+    "forward_solver",
+    "identity_less",
+    "innovation",
+    "innovation_likelihood",
+    "log_density",
+    "masked",
+    "multiplier",
+    "pivoted_factor",
+    "quadratic_form",
+    "row_solver",
+    "semidefinite_factor",
+    "square",
+    "symmetric_sum",
+    "transposed_multiplier",
+    "transposer",
+    "triangle_divider",
+    "triangular_root",
+    "vector_multiplier",
+    "vector_solver",
+]
 
 
 @cache
 def multiplier(rows: int, inner: int, columns: int) -> Callable:
     """Return `multiply(a, b)`: a b for shapes (rows, inner) and (inner, columns)."""
-    return written_out(
-        "multiply",
-        "a, b",
-        matrix_of(rows, columns, lambda i, j: " + ".join(f"a[{i}][{k}] * b[{k}][{j}]" for k in range(inner))),
-    )
+    shapes = {"result": (rows, columns), "a": (rows, inner), "b": (inner, columns)}
+    if all(is_array(*shape) for shape in shapes.values()):
+        return arrays.product
+    source = Source("multiply", "a, b", **shapes, work=rows * inner * columns)
+
+    def entry(i, j):
+        return source.sum(f"a[{i}][{k}] * b[{k}][{j}]" for k in source.range(inner))
+
+    return source.function(source.matrix(rows, columns, entry))
 
 
 @cache
 def transposed_multiplier(rows: int, inner: int, columns: int) -> Callable:
     """Return `multiply(a, b)`: a b' for shapes (rows, inner) and (columns, inner)."""
-    return written_out(
-        "multiply",
-        "a, b",
-        matrix_of(rows, columns, lambda i, j: " + ".join(f"a[{i}][{k}] * b[{j}][{k}]" for k in range(inner))),
-    )
+    shapes = {"result": (rows, columns), "a": (rows, inner), "b": (columns, inner)}
+    if all(is_array(*shape) for shape in shapes.values()):
+        return arrays.product_of_rows
+    source = Source("multiply", "a, b", **shapes, work=rows * inner * columns)
+
+    def entry(i, j):
+        return source.sum(f"a[{i}][{k}] * b[{j}][{k}]" for k in source.range(inner))
+
+    return source.function(source.matrix(rows, columns, entry))
+
+
+@cache
+def transposer(rows: int, columns: int) -> Callable:
+    """Return `transpose(a)`: a' for a of shape (rows, columns)."""
+    source = Source("transpose", "a", result=(columns, rows), a=(rows, columns))
+    return source.function(source.matrix(columns, rows, lambda i, j: f"a[{j}][{i}]"))
 
 
 @cache
 def vector_multiplier(rows: int, inner: int) -> Callable:
     """Return `multiply(a, x)`: the tuple a x for shapes (rows, inner) and (inner,)."""
-    return written_out(
-        "multiply",
-        "a, x",
-        tuple_of(" + ".join(f"a[{i}][{k}] * x[{k}]" for k in range(inner)) for i in range(rows)),
+    source = Source("multiply", "a, x", result=(rows,), a=(rows, inner), x=(inner,), work=rows * inner)
+    return source.function(
+        source.vector(rows, lambda i: source.sum(f"a[{i}][{k}] * x[{k}]" for k in source.range(inner)))
     )
 
 
 @cache
 def quadratic_form(rows: int, columns: int) -> Callable:
     """Return `form(a, w)`: a' w a for a of shape (rows, columns) and w of shape (rows, rows)."""
+    shapes = {"result": (columns, columns), "a": (rows, columns), "w": (rows, rows)}
+    source = Source("form", "a, w", **shapes, work=rows * rows * columns)
+    if source.loops:
+        half = source.local("half", rows, columns)  # w a
+        for p in source.range(rows):
+            for j in source.range(columns):
+                source.line(
+                    f"{half[p, j]} = {source.sum(f'w[{p}][{q}] * a[{q}][{j}]' for q in source.range(rows))}"
+                )
+
+        def entry(i, j):
+            return source.sum(f"a[{p}][{i}] * {half[p, j]}" for p in source.range(rows))
+
+        return source.function(source.matrix(columns, columns, entry))
 
     def entry(i, j):
         return " + ".join(f"a[{p}][{i}] * w[{p}][{q}] * a[{q}][{j}]" for p in range(rows) for q in range(rows))
 
-    return written_out("form", "a, w", matrix_of(columns, columns, entry))
+    return source.function(source.matrix(columns, columns, entry))
 
 
 @cache
 def symmetric_sum(size: int) -> Callable:
     """Return `add(a, b)`: the symmetric part of a + b, exactly symmetric."""
-    places = [(i, j) for i in range(size) for j in range(i + 1)]
-    lines = (f"s{i}_{j} = 0.5 * (a[{i}][{j}] + a[{j}][{i}] + b[{i}][{j}] + b[{j}][{i}])" for i, j in places)
-    return written_out("add", "a, b", *lines, matrix_of(size, size, lambda i, j: f"s{max(i, j)}_{min(i, j)}"))
+    shape = size, size
+    source = Source("add", "a, b", result=shape, a=shape, b=shape)
+
+    def entry(i, j):
+        return f"0.5 * (a[{i}][{j}] + a[{j}][{i}] + b[{i}][{j}] + b[{j}][{i}])"
+
+    return source.function(source.symmetric("s", size, entry))
 
 
 @cache
 def identity_less(size: int) -> Callable:
     """Return `subtract(a)`: I - a."""
-    return written_out(
-        "subtract", "a", matrix_of(size, size, lambda i, j: f"{1.0 if i == j else 0.0} - a[{i}][{j}]")
-    )
+    source = Source("subtract", "a", result=(size, size), a=(size, size))
+
+    def entry(i, j):
+        return f"{source.if_same(i, j, '1.0', '0.0')} - a[{i}][{j}]"
+
+    return source.function(source.matrix(size, size, entry))
 
 
 @cache
 def innovation(size: int, first: int = 0) -> Callable:
     """Return `subtract(z, y)`: z - y[first:], zero in channels that are NaN in z."""
-    entries = (f"z[{i}] - y[{first + i}] if z[{i}] == z[{i}] else 0.0" for i in range(size))
-    return written_out("subtract", "z, y", tuple_of(entries))
+    source = Source("subtract", "z, y", result=(size,), z=(size,), y=(first + size,))
+
+    def entry(i):
+        return f"z[{i}] - y[{first + i}] if z[{i}] == z[{i}] else 0.0"
+
+    return source.function(source.vector(size, entry))
 
 
 @cache
 def masked(size: int) -> Callable:
     """Return `mask(r, z)`: the covariance r without its correlations to channels that are NaN in z."""
+    source = Source("mask", "r, z", result=(size, size), r=(size, size), z=(size,))
 
     def entry(i, j):
         here = f"r[{i}][{j}]"
-        return here if i == j else f"({here} if z[{i}] == z[{i}] and z[{j}] == z[{j}] else 0.0)"
+        return source.if_same(i, j, here, f"({here} if z[{i}] == z[{i}] and z[{j}] == z[{j}] else 0.0)")
 
-    return written_out("mask", "r, z", matrix_of(size, size, entry))
-
-
-def pivoted_factor(size: int, diagonal: str, **names: float) -> Callable:
-    """Return `factor(a)`: the lower triangular L of Cholesky's method, row by row, with a diagonal of one's own.
-
-        l_ij = (a_ij - sum_k l_ik l_jk) / l_jj for j < i, the sum over k < j
-        d_i = a_ii - sum_k l_ik^2, the sum over k < i, of which l_ii is the root where there is one
-
-    Args:
-        size: rows and columns of a.
-        diagonal: source of l_ii, in which `{d}` stands for d_i and `{a}` for a_ii.
-        names: other names that it uses, with their values.
-    """
-    lines = []
-    for i in range(size):
-        for j in range(i + 1):
-            rest = "".join(f" - l{i}_{k} * l{j}_{k}" for k in range(j))
-            if i == j:
-                lines.append(f"d{i} = a[{i}][{i}]{rest}")
-                lines.append(f"l{i}_{i} = " + diagonal.format(d=f"d{i}", a=f"a[{i}][{i}]"))
-            else:
-                lines.append(f"l{i}_{j} = (a[{i}][{j}]{rest}) / l{j}_{j}")
-    result = matrix_of(size, size, lambda i, j: f"l{i}_{j}" if j <= i else "0.0")
-    return written_out("factor", "a", *lines, result, **names)
-
-
-@cache
-def cholesky_factor(size: int) -> Callable:
-    """Return `factor(a)`: the lower triangular L with L L' = a; NaN where a is not positive definite."""
-    return pivoted_factor(size, "({d} if {d} > 0.0 else nan) ** 0.5", nan=math.nan)
-
-
-@cache
-def semidefinite_factor(size: int) -> Callable:
-    """Return `factor(a)`: the lower triangular L with L L' = a, for a that may be singular.
-
-    A column whose pivot is no more than rounding is zero.
-    """
-    lines = []
-    for j in range(size):
-        rest = "".join(f" - l{j}_{k} * l{j}_{k}" for k in range(j))
-        lines.append(f"d = a[{j}][{j}]{rest}")
-        lines.append(f"l{j}_{j} = d ** 0.5 if not d <= {RESOLUTION} * a[{j}][{j}] else 0.0")
-        lines.append(f"r = 1.0 / l{j}_{j} if l{j}_{j} != 0.0 else 0.0")
-        for i in range(j + 1, size):
-            rest = "".join(f" - l{i}_{k} * l{j}_{k}" for k in range(j))
-            lines.append(f"l{i}_{j} = (a[{i}][{j}]{rest}) * r")
-    result = matrix_of(size, size, lambda i, j: f"l{i}_{j}" if j <= i else "0.0")
-    return written_out("factor", "a", *lines, result)
-
-
-@cache
-def row_solver(rows: int, size: int) -> Callable:
-    """Return `solve(b, l)`: b (l l')^-1, for b of shape (rows, size) and l lower triangular."""
-    lines = []
-    for r in range(rows):
-        for i in range(size):
-            rest = "".join(f" - l[{i}][{k}] * y{r}_{k}" for k in range(i))
-            lines.append(f"y{r}_{i} = (b[{r}][{i}]{rest}) / l[{i}][{i}]")
-        for i in reversed(range(size)):
-            rest = "".join(f" - l[{k}][{i}] * x{r}_{k}" for k in range(i + 1, size))
-            lines.append(f"x{r}_{i} = (y{r}_{i}{rest}) / l[{i}][{i}]")
-    return written_out("solve", "b, l", *lines, matrix_of(rows, size, lambda r, i: f"x{r}_{i}"))
-
-
-@cache
-def triangle_divider(rows: int, size: int) -> Callable:
-    """Return `divide(b, l)`: b l^-1, for b of shape (rows, size) and l lower triangular."""
-    lines = []
-    for r in range(rows):
-        for i in reversed(range(size)):
-            rest = "".join(f" - l[{k}][{i}] * x{r}_{k}" for k in range(i + 1, size))
-            lines.append(f"x{r}_{i} = (b[{r}][{i}]{rest}) / l[{i}][{i}]")
-    return written_out("divide", "b, l", *lines, matrix_of(rows, size, lambda r, i: f"x{r}_{i}"))
-
-
-@cache
-def forward_solver(size: int) -> Callable:
-    """Return `solve(l, v)`: the tuple l^-1 v, for l lower triangular and v of `size` components."""
-    lines = []
-    for i in range(size):
-        rest = "".join(f" - l[{i}][{k}] * y{k}" for k in range(i))
-        lines.append(f"y{i} = (v[{i}]{rest}) / l[{i}][{i}]")
-    return written_out("solve", "l, v", *lines, tuple_of(f"y{i}" for i in range(size)))
-
-
-@cache
-def innovation_likelihood(size: int) -> Callable:
-    """Return `log_likelihood(v, l, z)`: log N(v; 0, l l') over the channels that are not NaN in z."""
-    lines = ["total = 0.0"]
-    for i in range(size):
-        rest = "".join(f" - l[{i}][{k}] * y{k}" for k in range(i))
-        lines.append(f"y{i} = (v[{i}]{rest}) / l[{i}][{i}]")
-        lines.append(f"if z[{i}] == z[{i}]:")
-        lines.append(f"    total -= 0.5 * y{i} * y{i} + log(l[{i}][{i}]) + {0.5 * math.log(2.0 * math.pi)!r}")
-    return written_out("log_likelihood", "v, l, z", *lines, "total", log=math.log)
-
-
-@cache
-def square(rows: int, columns: int) -> Callable:
-    """Return `square(a)`: a a', exactly symmetric, for a of shape (rows, columns)."""
-    lines = (
-        f"p{i}_{j} = " + " + ".join(f"a[{i}][{k}] * a[{j}][{k}]" for k in range(columns))
-        for i in range(rows)
-        for j in range(i + 1)
-    )
-    return written_out("square", "a", *lines, matrix_of(rows, rows, lambda i, j: f"p{max(i, j)}_{min(i, j)}"))
-
-
-@cache
-def factored_inverse(size: int) -> Callable:
-    """Return `invert(l)`: (l l')^-1 = W' W with W = l^-1, exactly symmetric, for l lower triangular."""
-    lines = []
-    for j in range(size):
-        lines.append(f"w{j}_{j} = 1.0 / l[{j}][{j}]")
-        for i in range(j + 1, size):
-            rest = " + ".join(f"l[{i}][{k}] * w{k}_{j}" for k in range(j, i))
-            lines.append(f"w{i}_{j} = -({rest}) / l[{i}][{i}]")
-    for i in range(size):
-        for j in range(i + 1):
-            lines.append(f"p{i}_{j} = " + " + ".join(f"w{k}_{i} * w{k}_{j}" for k in range(i, size)))
-    return written_out("invert", "l", *lines, matrix_of(size, size, lambda i, j: f"p{max(i, j)}_{min(i, j)}"))
-
-
-@cache
-def triangular_root(rows: int, columns: int) -> Callable:
-    """Return `triangle(a)`: the lower triangular L (rows, rows) with L L' = a a', for a of shape (rows, columns).
-
-    Its rows are those of a in the basis that Gram and Schmidt's method makes of them: the modified method, whose
-    L is as accurate as Householder's. Source: Bjorck (1967), "Solving linear least squares problems by
-    Gram-Schmidt orthogonalization".
-    """
-    lines = [f"a{i}_{j} = a[{i}][{j}]" for i in range(rows) for j in range(columns)]
-    for i in range(rows):
-        lines.append(f"l{i}_{i} = ({' + '.join(f'a{i}_{j} * a{i}_{j}' for j in range(columns))}) ** 0.5")
-        lines.append(f"r = 1.0 / l{i}_{i} if l{i}_{i} != 0.0 else 0.0")
-        lines += [f"a{i}_{j} = a{i}_{j} * r" for j in range(columns)]
-        for k in range(i + 1, rows):
-            lines.append(f"l{k}_{i} = " + " + ".join(f"a{i}_{j} * a{k}_{j}" for j in range(columns)))
-            lines += [f"a{k}_{j} = a{k}_{j} - l{k}_{i} * a{i}_{j}" for j in range(columns)]
-    return written_out(
-        "triangle", "a", *lines, matrix_of(rows, rows, lambda i, j: f"l{i}_{j}" if j <= i else "0.0")
-    )
+    return source.function(source.matrix(size, size, entry))

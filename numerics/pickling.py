@@ -7,7 +7,7 @@ from functools import cache, wraps
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
-from numerics import tuples
+from numerics.written import made_here
 
 _MADE: WeakKeyDictionary[Callable, Made] = WeakKeyDictionary()
 
@@ -32,7 +32,7 @@ def makes_functions(maker: Callable) -> Callable:
         else:
             entries = dict(enumerate(result)) if isinstance(result, tuple) else {None: result}
         for key, function in entries.items():
-            if getattr(function, "__module__", None) == tuples.__name__:  # others are found by their names
+            if made_here(function):  # others are found by their names
                 _MADE.setdefault(function, Made(make, arguments, key))
         return result
 

@@ -12,30 +12,44 @@ import numpy as np
 from numerics.checks import covariance, vector
 from numerics.derivatives import jacobian
 from numerics.pickling import makes_functions
-from numerics.tuples import tuple_of, written_out
-from plants.shape import observation_slopes, transition_slopes
+from numerics.sources import Source, as_value
+from plants.layout import starts_of
+from plants.shape import constants_are_array, observation_slopes, transition_slopes
 from plants.state_space import StateSpaceModel
 
 
 @makes_functions
 def affine_functions(n: int, m: int, p: int) -> dict[str, Callable]:
     """Functions of an affine model whose constants c are, by rows and in this order, A, B, a, C, d."""
-    places = iter(range(n * (n + p + 1) + m * (n + 1)))
-    a, b, offset, c, shift = (
-        [[f"c[{next(places)}]" for _ in range(columns)] for _ in range(rows)]
-        for rows, columns in ((n, n), (n, p), (n, 1), (m, n), (m, 1))
-    )
+    starts = starts_of(n * n, n * p, n, m * n)  # of A, B, a, C, d
+    sizes = {"x": (n,), "u": (p,), "c": (starts[-1] + m,)}
+    if constants_are_array(starts[-1] + m):
+        del sizes["c"]  # whatever its size, it is an array
 
-    def sums(matrix, vector):
-        return [" + ".join(f"{entry} * {vector}[{j}]" for j, entry in enumerate(row)) or "0.0" for row in matrix]
+    def function(name: str, arguments: str, rows: int, matrices: dict, offset: int) -> Callable:
+        """The sum of products of matrices, by their first places and columns, with vectors, and of the offset."""
+        shapes = {argument: sizes[argument] for argument in arguments.split(", ") if argument in sizes}
+        source = Source(name, arguments, result=(rows,), work=rows * (n + p), **shapes)
 
-    state = [f"{x} + {u} + {k[0]}" for x, u, k in zip(sums(a, "x"), sums(b, "u"), offset, strict=True)]
-    output = [f"{x} + {k[0]}" for x, k in zip(sums(c, "x"), shift, strict=True)]
+        def entry(i):
+            terms = (
+                source.sum(f"c[{i * columns + j + first}] * {vector}[{j}]" for j in source.range(columns))
+                for vector, (first, columns) in matrices.items()
+            )
+            return " + ".join((*terms, f"c[{i + offset}]"))
+
+        return source.function(source.vector(rows, entry))
+
+    def slopes(name: str, arguments: str, rows: int, first: int) -> Callable:
+        source = Source(name, arguments, result=(rows, n), **{key: sizes[key] for key in "c" if key in sizes})
+        return source.function(source.matrix(rows, n, lambda i, j: f"c[{i * n + j + first}]"))
+
+    a, b, state_offset, c, measurement_offset = starts
     return {
-        "transition": written_out("transition", "x, u, c", tuple_of(state)),
-        "observe": written_out("observe", "x, c", tuple_of(output)),
-        "transition_jacobian": written_out("transition_jacobian", "x, u, c", tuple_of(map(tuple_of, a))),
-        "observe_jacobian": written_out("observe_jacobian", "x, c", tuple_of(map(tuple_of, c))),
+        "transition": function("transition", "x, u, c", n, {"x": (a, n), "u": (b, p)}, state_offset),
+        "observe": function("observe", "x, c", m, {"x": (c, n)}, measurement_offset),
+        "transition_jacobian": slopes("transition_jacobian", "x, u, c", n, a),
+        "observe_jacobian": slopes("observe_jacobian", "x, c", m, c),
     }
 
 
@@ -120,23 +134,24 @@ def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
     """
     if isinstance(model, AffineModel):
         return model
-    x, u, c = np.array(state, dtype=np.float64), np.array(control, dtype=np.float64), model.constants
+    x, u, c = np.array(state, dtype=np.float64), np.array(control, dtype=np.float64), model.given_constants
     n, p = model.n, model.inputs
-    a, b, point, v = np.eye(n), np.zeros((n, p)), tuple(x), tuple(u)
-    scales, input_scales = tuple(model.scales), tuple(np.where(u == 0, 1.0, np.abs(u)))
-    step = transition_slopes(model.functions, model.shape)
-    by_input = jacobian(_input_first(model.transition), None, n, p, "state, c", model.shape.state_angles)
+    a, b, point, v = np.eye(n), np.zeros((n, p)), as_value(x), as_value(u)
+    scales, input_scales = as_value(model.scales), as_value(np.where(u == 0, 1.0, np.abs(u)))
+    functions = model.functions
+    step = transition_slopes(functions, model.shape)
+    by_input = jacobian(_input_first(functions.transition), None, n, p, "state, c", model.shape.state_angles)
     for _ in range(model.substeps):
         f = np.array(step(point, scales, v, c))
         a, b = f @ a, f @ b + np.array(by_input(v, input_scales, point, c)).reshape(n, p)
-        point = model.transition(point, v, c)
-    h = np.array(observation_slopes(model.functions, model.shape)(tuple(x), scales, c))
+        point = functions.transition(point, v, c)
+    h = np.array(observation_slopes(functions, model.shape)(as_value(x), scales, c))
     return affine_model(
         a=a,
         b=b,
         c=h,
         state_offset=np.array(point) - a @ x - b @ u,
-        measurement_offset=np.array(model.observe(tuple(x), c)) - h @ x,
+        measurement_offset=np.array(functions.observe(as_value(x), c)) - h @ x,
         process_noise_cov=model.process_noise_cov,
         measurement_noise_cov=model.measurement_noise_cov,
         prior_mean=model.prior_mean,

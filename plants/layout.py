@@ -10,7 +10,7 @@ import numpy as np
 
 from numerics.checks import covariance_root
 from numerics.tuples import tuple_of, written_out
-from plants.shape import Shape
+from plants.shape import Shape, constants_are_array
 
 LANES = 8  # float64 in the widest vector register: ensembles are padded, so that loops have no remainder
 
@@ -52,9 +52,22 @@ def starts_of(*lengths: int) -> list[int]:
 
 
 @cache
+def affine_constants(count: int, start: int) -> tuple[Callable, Callable]:
+    """Functions `read(row)` and `store(row, c)` of an affine model's constants, in a filter's own memory."""
+    if constants_are_array(count):
+        read = written_out("read", "row", f"row[{start}:{start + count}].copy()")
+        lines = f"for i in range({count}):", f"    row[{start} + i] = c[i]"
+        return read, written_out("store", "row, c", *lines, "None", _loops=True)
+    read = written_out("read", "row", tuple_of(f"row[{start + i}]" for i in range(count)))
+    return read, written_out("store", "row, c", *(f"row[{start + i}] = c[{i}]" for i in range(count)), "None")
+
+
+@cache
 def constants_reader(shape: Shape) -> Callable:
     """Return `read(numbers)`: the model's constants as its functions take them."""
     start = number_places(shape.n, shape.m).constants
+    if constants_are_array(shape.form):
+        return written_out("read", "row", f"row[{start}:{start + shape.constants}]")
     values = [f"row[{start + i}]" for i in range(shape.constants)]
     if isinstance(shape.form, int):
         return written_out("read", "row", tuple_of(values))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Callable
 
 import numpy as np
 
 from numerics.checks import as_floats, shown
+from numerics.sources import as_value, is_array
 
 
 def checked_constants(given) -> tuple:
@@ -30,8 +32,8 @@ def check_functions(model) -> None:
     states, measured = _count(n, "state"), _count(m, "measurement")
     by_states, by_noise = f"as prior_mean has {n}", f"as measurement_noise_cov is {m} x {m}"
     rules = {
-        "transition": ("x, u, c", (n,), f"a tuple of {states}, {by_states}"),
-        "observe": ("x, c", (m,), f"a tuple of {measured}, {by_noise}"),
+        "transition": ("x, u, c", (n,), f"a tuple{_or_array(n)} of {states}, {by_states}"),
+        "observe": ("x, c", (m,), f"a tuple{_or_array(m)} of {measured}, {by_noise}"),
         "transition_jacobian": ("x, u, c", (n, n), f"{_count(n, 'row')} of {n}, {by_states}"),
         "observe_jacobian": ("x, c", (m, n), f"{_count(m, 'row')} of {n}, {by_noise}"),
     }
@@ -58,9 +60,11 @@ def _check_arguments(name: str, function: Callable, arguments: str) -> None:
 def _check_result(name: str, function: Callable, model, arguments: str, shape: tuple, rule: str) -> None:
     for point in (model.prior_mean, model.prior_mean + model.scales):
         must_be_known = point is model.prior_mean and not name.endswith("jacobian")
-        given = {"x": tuple(point.tolist()), "u": (0.0,) * model.inputs, "c": model.constants}
+        x = point if is_array(model.n) else tuple(point.tolist())
+        given = {"x": x, "u": as_value(np.zeros(model.inputs)), "c": model.given_constants}
         try:
-            with np.errstate(all="ignore"):
+            with np.errstate(all="ignore"), warnings.catch_warnings():
+                warnings.simplefilter("error", np.exceptions.ComplexWarning)  # of a derivative that is lost
                 result = function(*(given[argument] for argument in arguments.split(", ")))
         except ArithmeticError:  # machine code has infinity there
             continue
@@ -69,7 +73,7 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
                 if must_be_known:
                     raise ValueError(_not_nan(name, str(error))) from None
                 continue
-            sizes = f"{_count(model.n, 'state')} and {_count(model.inputs, 'input')}"
+            sizes = f"{_count(model.n, 'state')}{_form(model.n)} and {_count(model.inputs, 'input')}"
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             raise ValueError(f"{name} must work for {sizes}, but raised {reason}") from error
         found = _shape(result)
@@ -98,6 +102,14 @@ def _said(shape: tuple[int, ...] | None, result) -> str:
     if len(shape) == 1:
         return _count(shape[0], "entry").replace("entrys", "entries")
     return f"{shape[0]} x {shape[1]} numbers" if shape else f"the number {shown(result)}"
+
+
+def _form(count: int) -> str:
+    return f" (x is an array of {count} numbers)" if is_array(count) else ""
+
+
+def _or_array(count: int) -> str:
+    return " or array" if is_array(count) else ""
 
 
 def _count(count: int, noun: str) -> str:

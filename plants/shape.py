@@ -9,6 +9,8 @@ from numerics import matrices
 from numerics.angles import kept
 from numerics.derivatives import jacobian
 
+MOST_CONSTANTS = 96  # in a tuple that compiled functions pass on
+
 
 class Shape(NamedTuple):
     """Sizes of a model, and what else compiled code has to know of it beforehand."""
@@ -43,6 +45,11 @@ def innovation_of(shape: Shape, first: int = 0) -> Callable:
 def constants_form(constants: tuple) -> type | int:
     """What a `Shape` tells of a model's constants."""
     return type(constants) if hasattr(constants, "_fields") else len(constants)
+
+
+def constants_are_array(form: type | int) -> bool:
+    """Whether functions get the constants as an array."""
+    return isinstance(form, int) and form > MOST_CONSTANTS
 
 
 def transition_slopes(functions: Functions, shape: Shape) -> Callable:

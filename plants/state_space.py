@@ -14,10 +14,12 @@ from numerics.checks import at_least, covariance, covariance_root, one_of, vecto
 from numerics.compiled import inlined
 from numerics.derivatives import complex_step
 from numerics.pickling import as_function, as_made
+from numerics.results import array_valued
+from numerics.sources import is_array
 from plants.model_check import check_functions, checked_constants
 from plants.model_digest import digest_of
 from plants.quantities import Quantities, outputs, quantities
-from plants.shape import Functions, Shape, constants_form
+from plants.shape import Functions, Shape, constants_are_array, constants_form
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,6 +32,11 @@ class StateSpaceModel:
     `transition(x, u, c)`, `observe(x, c)` and, if known, their Jacobians as tuples of rows
     (n rows of n, m rows of n). Written with arithmetic and `math` or `numpy` scalar functions they compile;
     others run as Python, slower, with the same results.
+
+    More than 36 states or inputs, or 96 constants in a plain tuple, are no tuple of numbers: then x, u or c is an
+    array of float64, or of complex numbers where a Jacobian is found by complex steps (`np.empty_like(x)` makes
+    another such). It is indexed alike, and functions may return arrays or tuples whatever the size; a Jacobian of
+    more than a thousand entries should be an array, or a tuple of rows that hold floats only.
 
     Models, and filters and wrapped envs with them, can be copied and pickled. Pickle holds functions by name, so
     those of a user must stand in a module; functions within functions, and lambdas, need cloudpickle.
@@ -144,9 +151,17 @@ class StateSpaceModel:
 
     @property
     def functions(self) -> Functions:
-        """The model's functions, ready for compiled code."""
-        f, h = inlined(self.transition), inlined(self.observe)
-        return Functions(f, self.transition_jacobian, h, self.observe_jacobian)
+        """The model's functions, ready for compiled code: large results are arrays, whatever they return."""
+        n, m, slopes = self.n, self.m, (self.transition_jacobian, self.observe_jacobian)
+        f = array_valued(inlined(self.transition), "x, u, c", n)
+        h = array_valued(inlined(self.observe), "x, c", m)
+        by_state = slopes[0] and array_valued(slopes[0], "x, u, c", n, n)
+        return Functions(f, by_state, h, slopes[1] and array_valued(slopes[1], "x, c", m, n))
+
+    @property
+    def given_constants(self) -> tuple | np.ndarray:
+        """The constants as functions get them: an array where there are more than fit into a tuple."""
+        return np.array(self.constants) if constants_are_array(self.shape.form) else self.constants
 
     def replace(self, **changes) -> StateSpaceModel:
         """The same model with some fields changed."""
@@ -165,7 +180,9 @@ class StateSpaceModel:
     def output(self, symbol: str, states: np.ndarray) -> np.ndarray:
         """The output of a symbol at states (..., n), (...); ValueError if there is none."""
         one_of("output", symbol, tuple(self.outputs))
-        return self.outputs[symbol].function(tuple(np.moveaxis(states, -1, 0)), self.constants)
+        components = np.moveaxis(states, -1, 0)
+        x = components if is_array(self.n) else tuple(components)
+        return self.outputs[symbol].function(x, self.given_constants)
 
     @property
     def numbers(self) -> np.ndarray:

@@ -68,7 +68,7 @@ def test_memberships_are_products_and_sum_to_one(n):
     rng = np.random.default_rng(n)
     low, high = -rng.uniform(1.0, 2.0, n), rng.uniform(1.0, 3.0, n)
     for x in rng.uniform(-4.0, 4.0, size=(50, n)):  # outside of the range as well
-        found = memberships(n)(x, low, high)
+        found = memberships(tuple(range(n)))(x, low, high)
         of_high = np.clip((x - low) / (high - low), 0.0, 1.0)
         # Bit i of the rule's number belongs to state i, so state 0 changes fastest.
         products = [
@@ -81,7 +81,7 @@ def test_memberships_are_products_and_sum_to_one(n):
 
 
 def test_in_a_corner_one_rule_holds():
-    weights = memberships(2)((5.0, -1.0), (1.0, -1.0), (5.0, 2.0))
+    weights = memberships((0, 1))((5.0, -1.0), (1.0, -1.0), (5.0, 2.0))
     assert weights == (0.0, 1.0, 0.0, 0.0)  # high in state 0, low in state 1
 
 
@@ -127,10 +127,10 @@ def test_it_is_the_naive_recursion(blending, offsets):
     found = run(filter_, KEYS, inputs, z)
     mean, cov = model.prior_mean, model.prior_cov
     own = [(mean, cov)] * 4
-    weights = np.array(memberships(2)(mean, filter_.low, filter_.high))
+    weights = np.array(memberships((0, 1))(mean, filter_.low, filter_.high))
     for k in range(41):
         if k > 0:
-            weights = np.array(memberships(2)(mean, filter_.low, filter_.high))
+            weights = np.array(memberships((0, 1))(mean, filter_.low, filter_.high))
             moved = []
             for (a, b, offset, _, _), (x, p) in zip(rules, own, strict=True):
                 x, p = (x, p) if blending == "output" else (mean, cov)
@@ -231,5 +231,8 @@ def test_a_nonlinear_model_without_a_range_is_refused():
 
 
 def test_more_rules_than_sense_are_refused():
-    with pytest.raises(ValueError, match="at most 8 states, but got 9"):
-        FuzzyKalmanFilter(model=random_affine(9, p=1))
+    model = random_affine(9, p=1)
+    with pytest.raises(ValueError, match="premises must name 1 to 8 different states, .* but got"):
+        FuzzyKalmanFilter(model=model, premises=range(9))
+    assert len(FuzzyKalmanFilter(model=model, premises=(2, -1)).rules) == 4
+    assert FuzzyKalmanFilter(model=model).premises == (0,)  # the rules of an affine model are all alike

@@ -1,5 +1,7 @@
 """Random rotations of an ensemble about its mean."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -11,13 +13,18 @@ from numerics.compiled import compiled
 N = 9
 
 
+@cache
+def compiled_rotator(n):
+    return compiled(rotator(n, 1))
+
+
 def rotated(members, key, step=3):
     n, size = members.shape
     row = np.zeros(memory_places(n, 1).extras)
     places = memory_places(n, 1)
     row[places.key_0], row[places.key_1], row[places.step] = *key, step
     table = np.hstack([members, np.full((n, 3), 7.0)])
-    compiled(rotator(n, 1))((row, table, np.zeros(32)), size)
+    compiled_rotator(n)((row, table, np.zeros(32)), size)
     assert (table[:, size:] == 7.0).all()
     return table[:, :size]
 

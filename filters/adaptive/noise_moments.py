@@ -8,7 +8,7 @@ from functools import cache, lru_cache
 from filters.gaussian.extended import silenced
 from numerics import matrices
 from numerics.compiled import inlined
-from numerics.tuples import matrix_of, written_out
+from numerics.sources import Source, entrywise
 from plants.shape import Shape, innovation_of
 
 
@@ -25,8 +25,9 @@ def measurement_noise_moment(shape: Shape) -> Callable:
     mask, factor, solve = matrices.masked(m), matrices.cholesky_factor(m), matrices.row_solver(m, m)
     silent, difference = silenced(m, n), innovation_of(shape)
     p_ht, h_p_ht = matrices.transposed_multiplier(n, n, m), matrices.multiplier(m, n, m)
-    present = written_out(
-        "present", "r, z", matrix_of(m, m, lambda i, j: f"(r[{i}][{j}] if z[{j}] == z[{j}] else 0.0)")
+    mm = m, m
+    present = entrywise(
+        "present", "r, z", mm, lambda i, j: f"(r[{i}][{j}] if z[{j}] == z[{j}] else 0.0)", r=mm, z=(m,)
     )
     times, times_transposed = matrices.multiplier(m, m, m), matrices.transposed_multiplier(m, m, m)
     square, less, add, apply = (
@@ -51,12 +52,33 @@ def measurement_noise_moment(shape: Shape) -> Callable:
 @cache
 def outer(size: int) -> Callable:
     """Return `square(x)`: the matrix x x' of a tuple."""
-    return written_out("square", "x", matrix_of(size, size, lambda i, j: f"x[{i}] * x[{j}]"))
+    return entrywise("square", "x", (size, size), lambda i, j: f"x[{i}] * x[{j}]", x=(size,))
 
 
 @cache
 def mixer(size: int) -> Callable:
     """Return `mix(a, x, b, y)`: the matrix a x + b y for scalars a, b and square matrices x, y."""
-    return written_out(
-        "mix", "a, x, b, y", matrix_of(size, size, lambda i, j: f"a * x[{i}][{j}] + b * y[{i}][{j}]")
+    shape = size, size
+    return entrywise(
+        "mix", "a, x, b, y", shape, lambda i, j: f"a * x[{i}][{j}] + b * y[{i}][{j}]", x=shape, y=shape
     )
+
+
+@cache
+def present_part(size: int) -> Callable:
+    """Return `part(a, z)`: the matrix a with zeros in rows and columns of channels that are NaN in z."""
+    return entrywise(
+        "of_present",
+        "a, z",
+        (size, size),
+        lambda i, j: f"(a[{i}][{j}] if z[{i}] == z[{i}] and z[{j}] == z[{j}] else 0.0)",
+        a=(size, size),
+        z=(size,),
+    )
+
+
+@cache
+def trace_of(size: int) -> Callable:
+    """Return `trace(a)`, the sum of the diagonal."""
+    source = Source("trace", "a", a=(size, size))
+    return source.function(source.sum(f"a[{i}][{i}]" for i in source.range(size)))

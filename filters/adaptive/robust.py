@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
 
-from filters.adaptive.noise_moments import measurement_noise_moment, mixer
+from filters.adaptive.noise_moments import measurement_noise_moment, mixer, present_part, trace_of
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
@@ -14,7 +14,8 @@ from filters.gaussian.extended import extended_kernels, gaussian_update, kernels
 from numerics import matrices
 from numerics.checks import at_least, positive
 from numerics.compiled import inlined
-from numerics.tuples import matrix_of, matrix_reader, vector_reader, written_out
+from numerics.sources import Source
+from numerics.tuples import matrix_reader, vector_reader
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape, observation_slopes
 
@@ -39,13 +40,9 @@ def robust_kernels(functions: Functions, shape: Shape) -> Kernels:
         mixer(m),
         matrices.masked(m),
     )
-    of_present = written_out(
-        "of_present",
-        "a, z",
-        matrix_of(m, m, lambda i, j: f"(a[{i}][{j}] if z[{i}] == z[{i}] and z[{j}] == z[{j}] else 0.0)"),
-    )
-    trace = written_out("trace", "a", " + ".join(f"a[{i}][{i}]" for i in range(m)))
-    count = written_out("count", "z", " + ".join(f"(1.0 if z[{i}] == z[{i}] else 0.0)" for i in range(m)))
+    of_present, trace, counting = present_part(m), trace_of(m), Source("count", "z", z=(m,))
+    ones = (f"(1.0 if z[{i}] == z[{i}] else 0.0)" for i in counting.range(m))
+    count = counting.function(counting.sum(ones))
 
     @inlined
     def start(memory, numbers, size):

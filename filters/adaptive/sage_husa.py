@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters.adaptive.noise_moments import mixer, outer
+from filters.adaptive.noise_moments import mixer, outer, present_part, trace_of
 from filters.engine.belief import Belief, Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
@@ -23,7 +23,8 @@ from filters.gaussian.extended import (
 from numerics import matrices
 from numerics.checks import finite
 from numerics.compiled import inlined
-from numerics.tuples import matrix_of, matrix_reader, matrix_writer, scaled_sum, vector_reader, written_out
+from numerics.sources import entrywise
+from numerics.tuples import matrix_reader, matrix_writer, scaled_sum, vector_reader
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape, observation_slopes
 
@@ -36,11 +37,15 @@ def bounded_step(size: int) -> Callable:
     the result is at least A/2. A matrix A that is not positive definite stays as it is.
     """
     factor, solve = matrices.cholesky_factor(size), matrices.row_solver(size, size)
-    trace = written_out("trace", "a", " + ".join(f"a[{i}][{i}]" for i in range(size)))
-    add = written_out(
+    trace, shape = trace_of(size), (size, size)
+    add = entrywise(
         "add",
         "a, more, less, d",
-        matrix_of(size, size, lambda i, j: f"a[{i}][{j}] + d * (more[{i}][{j}] - less[{i}][{j}])"),
+        shape,
+        lambda i, j: f"a[{i}][{j}] + d * (more[{i}][{j}] - less[{i}][{j}])",
+        a=shape,
+        more=shape,
+        less=shape,
     )
 
     @inlined
@@ -70,11 +75,7 @@ def sage_husa_kernels(functions: Functions, shape: Shape) -> Kernels:
     move = extended_prediction(functions, shape)
     step_r, step_q, square_m, square_n = bounded_step(m), bounded_step(n), outer(m), outer(n)
     mix, change = mixer(n), scaled_sum(n)
-    of_present = written_out(
-        "of_present",
-        "a, z",
-        matrix_of(m, m, lambda i, j: f"(a[{i}][{j}] if z[{i}] == z[{i}] and z[{j}] == z[{j}] else 0.0)"),
-    )
+    of_present = present_part(m)
 
     @inlined
     def start(memory, numbers, size):

@@ -15,7 +15,7 @@ from filters.gaussian.extended import nothing_to_summarise
 from numerics.angles import wrapped
 from numerics.checks import at_least, positive
 from numerics.compiled import inlined
-from numerics.tuples import vector_reader, vector_writer
+from numerics.tuples import vector_reader, vector_writer, zeros_of
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape, innovation_of
 
@@ -59,7 +59,7 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     angle, inverts = shape.measurement_angles[channel], inverted is not None
     solve = component_solver(observe, n, component, channel, angle)
     blend = blend_angles if angle else blend_numbers
-    no_cov, no_s = ((0.0,) * n,) * n, ((0.0,) * m,) * m
+    no_cov, no_s = zeros_of(n, n), zeros_of(m, m)
 
     @inlined
     def estimate(row, numbers):
@@ -75,7 +75,7 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
         store_open(row, prior_mean(numbers))
         row[smooth_place] = row[known_place] = 0.0
         estimate(row, numbers)
-        store_cov(row, no_cov)
+        store_cov(row, no_cov())
 
     @inlined
     def predict(memory, u, numbers, size):
@@ -91,7 +91,7 @@ def baseline_kernels(functions: Functions, shape: Shape, inverted: tuple[int, in
     def update(memory, z, numbers, size):
         row, _, _ = memory
         store_innovation(row, difference(measured(z), observe(read_mean(row), constants(numbers))))
-        store_s(row, no_s)
+        store_s(row, no_s())
         row[likelihood_place] = 0.0
         if inverts and z[channel] == z[channel]:
             kept = numbers[kept_place] * row[known_place]

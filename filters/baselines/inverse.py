@@ -8,7 +8,7 @@ from functools import lru_cache
 
 from numerics.angles import wrapped
 from numerics.compiled import inlined
-from numerics.tuples import tuple_of, written_out
+from numerics.sources import Source
 
 INTERVALS = 100  # on either side, in which a sign change is looked for
 HALVINGS = 60  # of such an interval; and steps of the golden section, each of which leaves 0.618 of it
@@ -24,8 +24,8 @@ def component_solver(observe: Callable, n: int, component: int, channel: int, an
     a golden section about the nearest step. Where the channel is an `angle`, h_i(x) - z goes the short way round,
     and its jump half a turn away is no root.
     """
-    entries = ("v" if i == component else f"x[{i}]" for i in range(n))
-    place = written_out("place", "x, v", tuple_of(entries))
+    source = Source("place", "x, v", result=(n,), x=(n,))
+    place = source.function(source.vector(n, lambda i: source.if_same(i, component, "v", f"x[{i}]")))
 
     @inlined
     def misfit_of_number(x, v, z, c):

@@ -9,6 +9,7 @@ import numpy as np
 from filters.engine.compile import batch, lanes, new_memory
 from filters.filter import Filter
 from numerics.checks import as_floats, covariance, shown
+from numerics.sources import is_array
 from numerics.threads import spread
 from plants.layout import LANES, with_root
 
@@ -65,7 +66,8 @@ def run(
         _noise_rows("process_noise_covs", process_noise_covs, times - 1, n),
         _noise_rows("measurement_noise_covs", measurement_noise_covs, times, m),
     )
-    run_all = _run_one_by_one if filter_.size else _run_side_by_side
+    alone = filter_.size or is_array(n, n) or is_array(m, m)  # large ones fill vector registers by themselves
+    run_all = _run_one_by_one if alone else _run_side_by_side
     run_all(filter_, (keys, inputs, z), noise, out)
     return out
 

@@ -8,7 +8,7 @@ from functools import cache
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
 from numerics.compiled import inlined
-from numerics.tuples import written_out
+from numerics.sources import Source
 from plants.layout import number_places
 
 LARGEST = 1e300  # what the numbers of a belief may add up to
@@ -22,10 +22,19 @@ def row_magnitude(n: int, m: int) -> Callable:
     LARGEST, and so does NaN.
     """
     places = memory_places(n, m)
+    beyond = 10 * LARGEST
     variances = [places.cov + i * (n + 1) for i in range(n)]
+    source = Source("magnitude", "row", work=places.gain)
+    if source.loops:
+        of_all = source.sum(f"abs(row[{i}])" for i in source.range(places.gain))
+        of_variances = source.sum(
+            f"(0.0 if row[{place}] >= 0.0 else {beyond})"
+            for place in (i * (n + 1) + places.cov for i in source.range(n))
+        )
+        return source.function(f"{of_all} + {of_variances}")
     terms = [f"abs(row[{i}])" for i in range(places.gain) if i not in variances]
-    terms += [f"(row[{i}] if row[{i}] >= 0.0 else {10 * LARGEST})" for i in variances]
-    return written_out("magnitude", "row", " + ".join(terms))
+    terms += [f"(row[{i}] if row[{i}] >= 0.0 else {beyond})" for i in variances]
+    return source.function(" + ".join(terms))
 
 
 @cache

@@ -10,10 +10,11 @@ from typing import ClassVar
 from filters.engine.belief import Kernels
 from filters.ensembles.ensemble import EnsembleFilter, measurement_moments
 from filters.ensembles.rotation import with_rotation
-from numerics import matrices
+from numerics import arrays, matrices
 from numerics.checks import at_least
 from numerics.compiled import inlined
-from numerics.tuples import column_writer, matrix_of, tuple_of, written_out
+from numerics.sources import Source, entrywise
+from numerics.tuples import column_writer
 from plants.shape import Shape
 
 
@@ -23,10 +24,38 @@ def moved_member(n: int, m: int, first: int) -> Callable:
 
     Shapes: shift (n,), g (n, m), means (m,).
     """
-    lines = [f"d{i} = table[{first + i}, j] - means[{i}]" for i in range(m)]
-    products = ("".join(f" - g[{a}][{i}] * d{i}" for i in range(m)) for a in range(n))
-    result = tuple_of(f"table[{a}, j] + shift[{a}]{product}" for a, product in enumerate(products))
-    return written_out("moved", "table, j, shift, g, means", *lines, result)
+    shapes = {"result": (n,), "shift": (n,), "g": (n, m), "means": (m,)}
+    source = Source("moved", "table, j, shift, g, means", **shapes)
+    d = source.local("d", m)
+    for i in source.range(m):
+        source.line(f"{d[i]} = table[{first + i}, j] - means[{i}]")
+
+    def entry(a):
+        return source.less(f"table[{a}, j] + shift[{a}]", (f"g[{a}][{i}] * {d[i]}" for i in source.range(m)))
+
+    return source.function(source.vector(n, entry))
+
+
+@cache
+def member_mover(n: int, m: int, first: int) -> Callable:
+    """Return `move(table, shift, g, means)`, which puts `moved_member` in the place of every member."""
+    shapes = {"shift": (n,), "g": (n, m), "means": (m,)}
+    source = Source("move", "table, shift, g, means", **shapes)
+    if source.loops:
+        shift, g, means = (source.array_of(name) for name in shapes)
+        source.line(f"d = deviations(table, {first}, {m}, {means}, table.shape[1])")
+        source.line(f"add_product(table, -{g}, d)")
+        for a in source.rows_of_members(n):
+            source.line(f"table[{a}, j] += {shift}[{a}]")
+        return source.function(deviations=arrays.deviations, add_product=arrays.add_product)
+    moved, store = moved_member(n, m, first), column_writer(n)
+
+    @inlined
+    def move(table, shift, g, means):
+        for j in range(table.shape[1]):
+            store(table, j, moved(table, j, shift, g, means))
+
+    return move
 
 
 @lru_cache(maxsize=64)
@@ -38,15 +67,14 @@ def deterministic_analysis(gain: Callable, observe: Callable, shape: Shape) -> C
     """
     n, m = shape.n, shape.m
     compare, solve = measurement_moments(observe, shape), matrices.row_solver(n, m)
-    apply, store, moved = matrices.vector_multiplier(n, m), column_writer(n), moved_member(n, m, n)
+    apply, move = matrices.vector_multiplier(n, m), member_mover(n, m, n)
 
     @inlined
     def analyse(memory, z, numbers, size):
         means, innovation, cross, s, r, root = compare(memory, z, numbers, size)
         _, table, _ = memory
         shift, g = apply(solve(cross, root), innovation), gain(cross, s, r, root)
-        for j in range(table.shape[1]):
-            store(table, j, moved(table, j, shift, g, means))
+        move(table, shift, g, means)
 
     return analyse
 
@@ -78,7 +106,7 @@ class DeterministicUpdateFilter(EnsembleFilter):
 def half_gain(n: int, m: int) -> Callable:
     """Return `gain(cross, s, r, root)`: half of K = cross S^-1."""
     solve = matrices.row_solver(n, m)
-    half = written_out("half", "k", matrix_of(n, m, lambda i, j: f"0.5 * k[{i}][{j}]"))
+    half = entrywise("half", "k", (n, m), lambda i, j: f"0.5 * k[{i}][{j}]", k=(n, m))
 
     @inlined
     def gain(cross, s, r, root):

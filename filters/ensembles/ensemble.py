@@ -12,18 +12,18 @@ from filters.engine.layout import memory_places, row_access
 from filters.ensembles.inflation import with_spread_control
 from filters.ensembles.members import add_noise, drawer, ensemble_motion, row_covariances, row_means
 from filters.filter import Filter
-from numerics import matrices
-from numerics.angles import row_aligner
+from numerics import arrays, matrices
+from numerics.angles import at_angle, row_aligner
 from numerics.checks import at_least, positive, shown
 from numerics.compiled import inlined
+from numerics.sources import Source, entrywise
 from numerics.streams import FILTER_MEASUREMENT
 from numerics.tuples import (
     column_reader,
     column_writer,
     matrix_reader,
-    tuple_of,
+    part_of,
     vector_reader,
-    written_out,
 )
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape, innovation_of
@@ -44,8 +44,8 @@ def measurement_moments(observe: Callable, shape: Shape) -> Callable:
     likelihood_place = places.log_likelihood
     constants, state, store = constants_reader(shape), column_reader(n), column_writer(m, n)
     means_of_all, covariances_with_predicted = row_means(n + m), row_covariances(0, n + m, n, m)
-    of_states = written_out("of_states", "c", tuple_of(f"c[{i}]" for i in range(n)))
-    of_predicted = written_out("of_predicted", "c", tuple_of(f"c[{n + i}]" for i in range(m)))
+    expected_of = entrywise("expected_of", "c", (m,), lambda i: f"c[{n + i}]", c=(n + m,))
+    of_states, of_predicted = part_of(n, m, (n + m, m)), part_of(m, m, (n + m, m), n)
     read_r, mask, add = matrix_reader(m, m, source.r), matrices.masked(m), matrices.symmetric_sum(m)
     _, _, (store_innovation, store_s) = row_access(shape)
     factor, likelihood = matrices.cholesky_factor(m), matrices.innovation_likelihood(m)
@@ -62,7 +62,7 @@ def measurement_moments(observe: Callable, shape: Shape) -> Callable:
         silence(table, z, size)
         means = means_of_all(table, size)
         covariances = covariances_with_predicted(table, size, means)
-        present, expected = measured(z), of_predicted(means)
+        present, expected = measured(z), expected_of(means)
         r = mask(read_r(numbers), present)
         s = add(of_predicted(covariances), r)
         root = factor(s)
@@ -178,20 +178,43 @@ class EnsembleFilter(Filter):
         return plain if neutral else with_spread_control(plain, model.shape)
 
 
+@cache
+def nudger(n: int, m: int) -> Callable:
+    """Return `nudge(table, k, z)`: x_j += K (z - y_j), x in the first n rows of the table and y behind them."""
+    source = Source("nudge", "table, k, z", k=(n, m), z=(m,))
+    if source.loops:
+        source.line(f"d = -deviations(table, {n}, {m}, {source.array_of('z')}, table.shape[1])")
+        source.line(f"add_product(table, {source.array_of('k')}, d)")
+        return source.function(deviations=arrays.deviations, add_product=arrays.add_product)
+    for _ in source.inside("for j in range(table.shape[1]):"):
+        for i in range(m):
+            source.line(f"d{i} = z[{i}] - table[{n + i}, j]")
+        for a in range(n):
+            source.line(f"table[{a}, j] += {source.sum(f'k[{a}][{i}] * d{i}' for i in range(m))}")
+    return source.function()
+
+
+@cache
+def filler(angles: tuple[bool, ...]) -> Callable:
+    """Return `fill(z, y, v)`: z for the members to be drawn to, zero in channels that are NaN in z.
+
+    Angles are z = y + v, on the branch of what the members expect, y with the innovation v.
+    """
+    vector = (len(angles),)
+
+    def entry(i):
+        return f"{at_angle(i, angles, f'y[{i}] + v[{i}]', f'z[{i}]')} if z[{i}] == z[{i}] else 0.0"
+
+    return entrywise("fill", "z, y, v", vector, entry, z=vector, y=vector, v=vector)
+
+
 @lru_cache(maxsize=64)
 def perturbed_analysis(observe: Callable, shape: Shape) -> Callable:
     """Return `analyse(memory, z, numbers, size)` of the stochastic ensemble Kalman filter."""
     n, m = shape.n, shape.m
     r_root_place = number_places(n, m).r_root
     compare, draw, solve = measurement_moments(observe, shape), drawer(n, m), matrices.row_solver(n, m)
-    # Where it is an angle, z on the branch of what the members expect.
-    there = [f"y[{i}] + v[{i}]" if angle else f"z[{i}]" for i, angle in enumerate(shape.measurement_angles)]
-    entries = (f"{source} if z[{i}] == z[{i}] else 0.0" for i, source in enumerate(there))
-    filled = written_out("filled", "z, y, v", tuple_of(entries))
-    lines = [f"    d{i} = z[{i}] - table[{n + i}, j]" for i in range(m)]
-    for a in range(n):
-        lines.append(f"    table[{a}, j] += {' + '.join(f'k[{a}][{i}] * d{i}' for i in range(m))}")
-    nudge = written_out("nudge", "table, k, z", "for j in range(table.shape[1]):", *lines, "None")
+    filled, nudge = filler(shape.measurement_angles), nudger(n, m)
 
     @inlined
     def analyse(memory, z, numbers, size):

@@ -9,15 +9,18 @@ from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
 from filters.ensembles.members import row_covariances, row_means
 from numerics.compiled import inlined
-from numerics.tuples import tuple_of, vector_reader, written_out
+from numerics.sources import Source, entrywise
+from numerics.tuples import vector_reader
 from plants.shape import Shape
 
 
 @cache
 def spread_scaler(n: int) -> Callable:
     """Return `scale(table, means, factors)`: x_a = mean_a + factor_a (x_a - mean_a) in rows a = 0 ... n - 1."""
-    lines = (f"    table[{a}, j] = means[{a}] + factors[{a}] * (table[{a}, j] - means[{a}])" for a in range(n))
-    return written_out("scale", "table, means, factors", "for j in range(table.shape[1]):", *lines, "None")
+    source = Source("scale", "table, means, factors", means=(n,), factors=(n,))
+    for a in source.rows_of_members(n):
+        source.line(f"table[{a}, j] = means[{a}] + factors[{a}] * (table[{a}, j] - means[{a}])")
+    return source.function()
 
 
 @lru_cache(maxsize=64)
@@ -46,11 +49,17 @@ def with_spread_control(kernels: Kernels, shape: Shape) -> Kernels:
         return means_of(table, size)
 
     centre = centre_on_the_branch if any(shape.state_angles) else centre_as_kept
-    variances = written_out("variances", "row", tuple_of(f"row[{cov_place + i * (n + 1)}]" for i in range(n)))
-    diagonal = written_out("diagonal", "p", tuple_of(f"p[{i}][{i}]" for i in range(n)))
-    alike = written_out("alike", "factor", tuple_of(["factor"] * n))
-    ratios = (f"1.0 + part * ((b[{i}] / a[{i}]) ** 0.5 - 1.0) if a[{i}] > 0.0 else 1.0" for i in range(n))
-    towards = written_out("towards", "a, b, part", tuple_of(ratios))
+    variances = entrywise("variances", "row", (n,), lambda i: f"row[{i * (n + 1) + cov_place}]")
+    diagonal = entrywise("diagonal", "p", (n,), lambda i: f"p[{i}][{i}]", p=(n, n))
+    alike = entrywise("alike", "factor", (n,), lambda i: "factor")
+    towards = entrywise(
+        "towards",
+        "a, b, part",
+        (n,),
+        lambda i: f"1.0 + part * ((b[{i}] / a[{i}]) ** 0.5 - 1.0) if a[{i}] > 0.0 else 1.0",
+        a=(n,),
+        b=(n,),
+    )
 
     @inlined
     def predict(memory, u, numbers, size):

@@ -8,14 +8,15 @@ from functools import cache, lru_cache
 from typing import ClassVar
 
 from filters.engine.layout import own_place
-from filters.ensembles.deterministic import moved_member
+from filters.ensembles.deterministic import member_mover, moved_member
 from filters.ensembles.ensemble import EnsembleFilter, measurement_moments, silencer
 from filters.ensembles.members import row_covariances, row_means
 from filters.ensembles.transform import geometric_mean, transform_gain
 from numerics import matrices
 from numerics.checks import at_least
 from numerics.compiled import inlined
-from numerics.tuples import column_writer, tuple_of, vector_reader, written_out
+from numerics.sources import Source, entrywise
+from numerics.tuples import column_writer, vector_reader, zeros_of
 from plants.layout import constants_reader
 from plants.shape import Shape, innovation_of
 
@@ -28,18 +29,29 @@ def transform_undone(n: int, m: int) -> Callable:
 
     The means are those of the rows, d is (m, m).
     """
-    products = ("".join(f" + d[{i}][{k}] * table[{n + m + k}, j]" for k in range(m)) for i in range(m))
-    result = tuple_of(f"table[{n + i}, j] - means[{n + i}]{product}" for i, product in enumerate(products))
-    return written_out("undone", "table, j, means, d", result)
+    source = Source("undone", "table, j, means, d", result=(m,), means=(n + 2 * m,), d=(m, m))
+
+    def entry(i):
+        first = f"table[{n + i}, j] - means[{n + i}]"
+        return source.less(first, (f"d[{i}][{k}] * table[{n + m + k}, j]" for k in source.range(m)), "+")
+
+    return source.function(source.vector(m, entry))
 
 
 @cache
 def linear_prediction(m: int) -> Callable:
     """Return `predict(e, d, s, r, w)`: (E + D (S - R)) w, (m,), what the latest slopes make of the last move."""
-    places = range(m)
-    lines = [f"v{i} = {' + '.join(f'(s[{i}][{k}] - r[{i}][{k}]) * w[{k}]' for k in places)}" for i in places]
-    sums = (" + ".join(f"e[{i}][{k}] * w[{k}] + d[{i}][{k}] * v{k}" for k in places) for i in places)
-    return written_out("predict", "e, d, s, r, w", *lines, tuple_of(sums))
+    square = m, m
+    source = Source("predict", "e, d, s, r, w", result=(m,), e=square, d=square, s=square, r=square, w=(m,))
+    v = source.local("v", m)
+    for i in source.range(m):
+        terms = (f"(s[{i}][{k}] - r[{i}][{k}]) * w[{k}]" for k in source.range(m))
+        source.line(f"{v[i]} = {source.sum(terms)}")
+
+    def entry(i):
+        return source.sum(f"e[{i}][{k}] * w[{k}] + d[{i}][{k}] * {v[k]}" for k in source.range(m))
+
+    return source.function(source.vector(m, entry))
 
 
 @lru_cache(maxsize=64)
@@ -48,18 +60,27 @@ def iterated_analysis(observe: Callable, shape: Shape) -> Callable:
     n, m = shape.n, shape.m
     slopes, iterations_place = n + m, own_place(shape) + 2  # Y lies in rows n + m ... of the table
     compare, gain, geometric = measurement_moments(observe, shape), transform_gain(n, m), geometric_mean(m)
-    constants, measured = constants_reader(shape), vector_reader(m)
-    difference = innovation_of(shape, n)
-    store_state, store_predicted, store_slopes = column_writer(n), column_writer(m, n), column_writer(m, slopes)
-    moved, undone, predict = moved_member(n, m, slopes), transform_undone(n, m), linear_prediction(m)
+    constants, measured, difference = constants_reader(shape), vector_reader(m), innovation_of(shape, n)
+    store_predicted, store_slopes = column_writer(m, n), column_writer(m, slopes)
+    move, moved, undone, predict = (
+        member_mover(n, m, slopes),
+        moved_member(n, m, slopes),
+        transform_undone(n, m),
+        linear_prediction(m),
+    )
     add, factor, solve = matrices.symmetric_sum(m), matrices.cholesky_factor(m), matrices.row_solver(m, m)
-    apply, solve_one, means_of = matrices.vector_multiplier(n, m), matrices.row_solver(1, m), row_means(n + m)
+    apply, solve_one, means_of = matrices.vector_multiplier(n, m), matrices.vector_solver(m), row_means(n + m)
     of_predicted_and_slopes, of_slopes = row_covariances(n, m, slopes, m), row_covariances(slopes, m, slopes, m)
-    of_states_and_slopes, none = row_covariances(0, n, slopes, m), (0.0,) * m
-    known = [*(f"means[{i}]" for i in range(n + m)), *["0.0"] * m]
-    with_slopes = written_out("with_slopes", "means", tuple_of(known))
+    of_states_and_slopes, none = row_covariances(0, n, slopes, m), zeros_of(m)
     silence = silencer(n, shape.measurement_angles)
-    total = written_out("total", "a, b", tuple_of(f"a[{i}] + b[{i}]" for i in range(m)))
+    total = entrywise("total", "a, b", (m,), lambda i: f"a[{i}] + b[{i}]", a=(m,), b=(m,))
+    with_slopes = Source("with_slopes", "means", result=(n + 2 * m,), means=(n + m,))
+    known = with_slopes.local("known", n + 2 * m)
+    for i in with_slopes.range(n + m):
+        with_slopes.line(f"{known[i]} = means[{i}]")
+    for i in with_slopes.range(n + m, n + 2 * m):
+        with_slopes.line(f"{known[i]} = 0.0")
+    with_slopes = with_slopes.function(with_slopes.whole(known))
 
     @inlined
     def analyse(memory, z, numbers, size):
@@ -69,11 +90,11 @@ def iterated_analysis(observe: Callable, shape: Shape) -> Callable:
             for j in range(table.shape[1]):
                 table[slopes + i, j] = table[n + i, j] - expected[i]
         c, present = constants(numbers), measured(z)
-        w = solve_one((innovation,), root)[0]
+        w = solve_one(innovation, root)
         shift, g = apply(cross, w), gain(cross, s, r, root)
         for _ in range(1, int(numbers[iterations_place])):
             for j in range(table.shape[1]):
-                store_predicted(table, j, observe(moved(table, j, shift, g, none), c))
+                store_predicted(table, j, observe(moved(table, j, shift, g, none()), c))
             silence(table, z, size)
             means = with_slopes(means_of(table, size))
             e = of_predicted_and_slopes(table, size, means)
@@ -84,10 +105,9 @@ def iterated_analysis(observe: Callable, shape: Shape) -> Callable:
             cross = of_states_and_slopes(table, size, means)
             s = add(of_slopes(table, size, means), r)
             root = factor(s)
-            w = solve_one((misfit,), root)[0]
+            w = solve_one(misfit, root)
             shift, g = apply(cross, w), gain(cross, s, r, root)
-        for j in range(table.shape[1]):
-            store_state(table, j, moved(table, j, shift, g, none))
+        move(table, shift, g, none())
 
     return analyse
 

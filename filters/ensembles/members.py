@@ -7,10 +7,12 @@ from functools import cache, lru_cache
 from typing import NamedTuple
 
 from filters.engine.layout import memory_places, row_access
+from numerics import arrays
 from numerics.angles import row_aligner
 from numerics.compiled import inlined
+from numerics.sources import Source
 from numerics.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
-from numerics.tuples import column_reader, column_writer, matrix_of, tuple_of, vector_reader, written_out
+from numerics.tuples import column_reader, column_writer, vector_reader
 from plants.layout import constants_reader, number_places
 from plants.shape import Shape
 
@@ -43,15 +45,9 @@ def drawer(n: int, m: int) -> Callable:
 @cache
 def row_means(rows: int) -> Callable:
     """Return `means(table, size)`: means of the first `size` entries of rows 0 ... rows - 1, in one loop."""
-    places = range(rows)
-    return written_out(
-        "means",
-        "table, size",
-        *(f"s{i} = 0.0" for i in places),
-        "for j in range(size):",
-        *(f"    s{i} += table[{i}, j]" for i in places),
-        tuple_of(f"s{i} / size" for i in places),
-    )
+    source = Source("means", "table, size", result=(rows,))
+    totals = source.totals("size", rows, lambda i: f"table[{i}, j]")
+    return source.function(source.vector(rows, lambda i: f"{totals[i]} / size"))
 
 
 @cache
@@ -60,21 +56,24 @@ def row_covariances(first: int, rows: int, second: int, columns: int) -> Callabl
 
     Entry (i, j) belongs to rows first + i and second + j; means are those of `row_means`, the divisor is size - 1.
     """
+    last = max(first + rows, second + columns)
+    source = Source("covariances", "table, size, means", result=(rows, columns), means=(last,))
+    if source.loops:
+        source.line(f"a = deviations(table, {first}, {rows}, {source.array_of('means')}[{first}:], size)")
+        source.line(f"b = deviations(table, {second}, {columns}, {source.array_of('means')}[{second}:], size)")
+        source.line("sums = product_of_rows(a, b)" if first != second else "sums = square_of_rows(a)")
+        result = source.matrix(rows, columns, lambda i, j: f"sums[{i}, {j}] / (size - 1)")
+        names = {"deviations": arrays.deviations, "product_of_rows": arrays.product_of_rows}
+        return source.function(result, square_of_rows=arrays.square_of_rows, **names)
     pairs = [(i, j) for i in range(rows) for j in range(columns) if first != second or j <= i]
     used = sorted({first + i for i, _ in pairs} | {second + j for _, j in pairs})
+    each = (f"d{k} = table[{k}, j] - means[{k}]" for k in used)
+    totals = source.totals("size", pairs, lambda i, j: f"d{first + i} * d{second + j}", each)
 
     def entry(i, j):
-        return f"s{i}_{j}" if (i, j) in pairs else f"s{j}_{i}"
+        return f"{totals[i, j] if (i, j) in pairs else totals[j, i]} / (size - 1)"
 
-    return written_out(
-        "covariances",
-        "table, size, means",
-        *(f"s{i}_{j} = 0.0" for i, j in pairs),
-        "for j in range(size):",
-        *(f"    d{k} = table[{k}, j] - means[{k}]" for k in used),
-        *(f"    s{i}_{j} += d{first + i} * d{second + j}" for i, j in pairs),
-        matrix_of(rows, columns, lambda i, j: f"{entry(i, j)} / (size - 1)"),
-    )
+    return source.function(source.matrix(rows, columns, entry))
 
 
 def _aligned(start: Callable, predict: Callable, align: Callable) -> tuple[Callable, Callable]:

@@ -10,7 +10,7 @@ from typing import ClassVar
 from filters.ensembles.deterministic import DeterministicUpdateFilter, deterministic_analysis
 from numerics import matrices
 from numerics.compiled import inlined
-from numerics.tuples import matrix_of, written_out
+from numerics.sources import entrywise
 from plants.shape import Shape
 
 
@@ -22,7 +22,7 @@ def serial_gain(n: int, m: int) -> Callable:
     """
     solve, times, divide = matrices.row_solver(n, m), matrices.multiplier(n, m, m), matrices.triangle_divider(n, m)
     factor = matrices.cholesky_factor(m)
-    add = written_out("add", "a, b", matrix_of(m, m, lambda i, j: f"a[{i}][{j}] + b[{i}][{j}]"))
+    add = entrywise("add", "a, b", (m, m), lambda i, j: f"a[{i}][{j}] + b[{i}][{j}]", a=(m, m), b=(m, m))
 
     @inlined
     def gain(cross, s, r, root):

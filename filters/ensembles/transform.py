@@ -10,7 +10,7 @@ from typing import ClassVar
 from filters.ensembles.deterministic import DeterministicUpdateFilter, deterministic_analysis
 from numerics import matrices
 from numerics.compiled import inlined
-from numerics.tuples import matrix_of, written_out
+from numerics.sources import Source, entrywise
 from plants.shape import Shape
 
 ROUNDS = 14  # enough for condition numbers of 1e16: at the end each round doubles the figures
@@ -27,13 +27,13 @@ def geometric_mean(size: int) -> Callable:
     of Matrices, section 6.5.
     """
     if size == 1:
-        return written_out("mean", "a, b", "(((a[0][0] * b[0][0]) ** 0.5,),)")
+        return entrywise("mean", "a, b", (1, 1), lambda i, j: "(a[0][0] * b[0][0]) ** 0.5", a=(1, 1), b=(1, 1))
     rounds = 1 if size == 2 else ROUNDS
     factor, solve = matrices.cholesky_factor(size), matrices.row_solver(size, size)
     times, add = matrices.multiplier(size, size, size), matrices.symmetric_sum(size)
-    powers = (f"l[{i}][{i}] ** {2.0 / size!r}" for i in range(size))
-    unit = written_out("unit", "l", " * ".join(powers))  # l l' over this has determinant 1
-    scaled = written_out("scaled", "a, f", matrix_of(size, size, lambda i, j: f"f * a[{i}][{j}]"))
+    unit = Source("unit", "l", l=(size, size))  # l l' over this has determinant 1
+    unit = unit.function(unit.product(f"l[{i}][{i}] ** {2.0 / size!r}" for i in unit.range(size)))
+    scaled = entrywise("scaled", "a, f", (size, size), lambda i, j: f"f * a[{i}][{j}]", a=(size, size))
 
     @inlined
     def mean(a, b):

@@ -12,7 +12,8 @@ from filters.engine.layout import memory_places, row_access
 from filters.filter import Filter
 from numerics import matrices
 from numerics.compiled import inlined
-from numerics.tuples import matrix_of, matrix_reader, matrix_writer, scaled_sum, vector_reader, written_out
+from numerics.sources import entrywise
+from numerics.tuples import matrix_reader, matrix_writer, scaled_sum, vector_reader
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape, innovation_of, observation_slopes, transition_slopes
 from plants.state_space import StateSpaceModel
@@ -111,8 +112,10 @@ def gaussian_update(shape: Shape) -> Callable:
 @cache
 def silenced(m: int, columns: int) -> Callable:
     """Return `silent(h, z)`: the matrix h (m, columns) with zero rows for channels that are NaN in z."""
-    source = matrix_of(m, columns, lambda i, j: f"(h[{i}][{j}] if z[{i}] == z[{i}] else 0.0)")
-    return written_out("silent", "h, z", source)
+    shape = m, columns
+    return entrywise(
+        "silent", "h, z", shape, lambda i, j: f"(h[{i}][{j}] if z[{i}] == z[{i}] else 0.0)", h=shape, z=(m,)
+    )
 
 
 @lru_cache(maxsize=64)

@@ -9,32 +9,34 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from filters.baselines.baselines import place_of
 from filters.engine.belief import Belief, Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
 from filters.gaussian.extended import gaussian_update, nothing_to_summarise
-from filters.gaussian.mixture import blender, part_matrix, part_vector
+from filters.gaussian.mixture import blender, part_constants, part_matrix, part_vector
 from numerics import matrices
 from numerics.checks import one_of, shown, vector
 from numerics.compiled import inlined
-from numerics.tuples import matrix_reader, tuple_of, vector_reader, written_out
+from numerics.sources import tuple_of, written_out
+from numerics.tuples import matrix_reader, vector_reader
 from plants.affine import AffineModel, affine_functions, linearize
 from plants.layout import number_places
 from plants.shape import Shape
 
-MOST_STATES = 8  # 256 rules
+MOST_STATES = 8  # that rules ask for: 256 rules
 BLENDINGS = ("weights", "moments", "output")
 
 
 @cache
-def memberships(n: int) -> Callable:
-    """Return `weigh(x, low, high)`: memberships of the state x in the 2^n rules, a tuple that sums to one.
+def memberships(premises: tuple[int, ...]) -> Callable:
+    """Return `weigh(x, low, high)`: memberships of the state x in the 2^k rules, a tuple that sums to one.
 
-    That of rule r is the product over all states i of (high_i - x_i)/(high_i - low_i), or of one less that where
-    bit i of r is set; each factor is held within 0 and 1.
+    That of rule r is the product over all k premises i of (high_i - x_i)/(high_i - low_i), or of one less that
+    where the bit of r that belongs to i is set; each factor is held within 0 and 1.
     """
     lines, products = [], []
-    for i in range(n):
+    for i in premises:
         lines.append(f"part = (x[{i}] - low[{i}]) / (high[{i}] - low[{i}])")
         lines.append(f"of_high{i} = 0.0 if part < 0.0 else 1.0 if part > 1.0 else part")
         lines.append(f"of_low{i} = 1.0 - of_high{i}")
@@ -48,11 +50,19 @@ def memberships(n: int) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def fuzzy_kernels(shape: Shape, blending: str) -> Kernels:
-    """Kernels for a shape and one of `BLENDINGS`; the rules' models are numbers. Extras: `rule_length` a rule."""
+def fuzzy_kernels(shape: Shape, blending: str, premises: tuple[int, ...]) -> Kernels:
+    """Kernels for a shape, one of `BLENDINGS` and the states that rules ask for; the rules' models are numbers.
+
+    Extras: `rule_length` numbers a rule.
+    """
     n, m, inputs = shape.n, shape.m, shape.inputs
     places, source, own = memory_places(n, m), number_places(n, m), own_place(shape)
-    step_place, likelihood_place, rules, stride = places.step, places.log_likelihood, 2**n, rule_length(n, m)
+    step_place, likelihood_place, rules, stride = (
+        places.step,
+        places.log_likelihood,
+        2 ** len(premises),
+        rule_length(n, m),
+    )
     means = places.extras
     covs, weights, seen = means + n, means + n + n * n, means + n + n * n + 1
     seen_covs = seen + m
@@ -66,12 +76,12 @@ def fuzzy_kernels(shape: Shape, blending: str) -> Kernels:
     of_innovations = blender(m, seen, seen_covs, weights, stride, shape.measurement_angles, between)
     transition, observe, transition_jacobian, observe_jacobian = affine_functions(n, m, inputs).values()
     length = n * (n + inputs + 1) + m * (n + 1)  # of an affine model's constants
-    (rule_constants, _), low, high = (
-        part_vector(length, own + 2 * n, length),
+    rule_constants, low, high = (
+        part_constants(length, own + 2 * n, length),
         vector_reader(n, own),
         vector_reader(n, own + n),
     )
-    weigh = memberships(n)
+    weigh = memberships(premises)
     store_weights = written_out(
         "store_weights", "row, w", *(f"row[{weights + stride * r}] = w[{r}]" for r in range(rules)), "None"
     )
@@ -157,9 +167,9 @@ def rule_length(n: int, m: int) -> int:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FuzzyKalmanFilter(Filter):
-    """Takagi-Sugeno fuzzy Kalman filter: 2^n Kalman filters, one for each corner of the range of the states.
+    """Takagi-Sugeno fuzzy Kalman filter: 2^k Kalman filters, one for each corner of the range of k states.
 
-        rule r:  if each state i is low or high, as bit i of r says, then x' = A_r x + B_r u + a_r + w and
+        rule r:  if each of these states is low or high, as the bits of r say, then x' = A_r x + B_r u + a_r + w,
                  z = C_r x + d_r + v: the model linearised at that corner, Q and R the model's
         w_r:     product over i of (high_i - x_i)/(high_i - low_i) or (x_i - low_i)/(high_i - low_i), each within
                  0 and 1, of the last estimate x
@@ -184,6 +194,8 @@ class FuzzyKalmanFilter(Filter):
         low: the smallest states (n,); the model's `state_low` if None.
         high: the largest states (n,); the model's `state_high` if None.
         blending: "weights", "moments" or "output", see above.
+        premises: numbers of the states that rules ask for, at most 8; if None, all of at most 8 states, and the
+            first of more states of an affine model. Rules are linearised at the middle of the others' range.
         offsets: whether rules have the offset a_r that makes them exact at their corners; the sources print none.
 
     Source: Ngatini, Apriliani, Nurhadi (2017), "Ensemble and fuzzy Kalman filter for position estimation of an
@@ -199,6 +211,7 @@ class FuzzyKalmanFilter(Filter):
     high: Any = None
     blending: str = "weights"
     offsets: bool = True
+    premises: Any = None
 
     def __post_init__(self):
         """Check the range and the choices; raise ValueError that states the rule and the value."""
@@ -206,8 +219,7 @@ class FuzzyKalmanFilter(Filter):
         one_of("blending", self.blending, BLENDINGS)
         if not isinstance(self.offsets, bool):
             raise ValueError(f"offsets must be True or False, but got {shown(self.offsets)}")
-        if model.n > MOST_STATES:
-            raise ValueError(f"a fuzzy filter must have at most {MOST_STATES} states, but got {model.n}")
+        object.__setattr__(self, "premises", self._checked_premises())
         low = model.state_low if self.low is None else self.low
         high = model.state_high if self.high is None else self.high
         if isinstance(model, AffineModel):  # its rules are all alike, whatever the range
@@ -224,15 +236,36 @@ class FuzzyKalmanFilter(Filter):
         object.__setattr__(self, "low", low)
         object.__setattr__(self, "high", high)
 
+    def _checked_premises(self) -> tuple[int, ...]:
+        """Places of the states that rules ask for."""
+        n, given = self.model.n, self.premises
+        if given is None and n > MOST_STATES and isinstance(self.model, AffineModel):
+            given = (0,)  # all rules are alike
+        given = range(n) if given is None else given
+        try:
+            places = tuple(place_of("premises", place, n) for place in given)
+        except TypeError:
+            places = ()
+        if not 1 <= len(places) <= MOST_STATES or len(set(places)) < len(places):
+            rule = f"premises must name 1 to {MOST_STATES} different states, for there is a rule for each corner"
+            count = f"all {n} states" if self.premises is None else shown(self.premises)
+            raise ValueError(f"{rule} of their range, but got {count}")
+        return places
+
     @cached_property
     def rules(self) -> tuple[AffineModel, ...]:
         """The affine model of each rule."""
         model = self.model
         control = np.zeros(model.inputs) if model.operating_input is None else model.operating_input
-        ends = np.array([self.low, self.high])
-        corners = (ends[[rule >> i & 1 for i in range(model.n)], range(model.n)] for rule in range(2**model.n))
-        rules = (linearize(model, corner, control) for corner in corners)
+        rules = (linearize(model, self._corner(rule), control) for rule in range(2 ** len(self.premises)))
         return tuple(rules) if self.offsets else tuple(_without_offset(rule) for rule in rules)
+
+    def _corner(self, rule: int) -> np.ndarray:
+        """The state (n,) about which a rule is linearised: its bits say of each premise whether it is high."""
+        corner = (self.low + self.high) / 2
+        for bit, i in enumerate(self.premises):
+            corner[i] = (self.high if rule >> bit & 1 else self.low)[i]
+        return corner
 
     @property
     def own_numbers(self) -> tuple[float, ...]:
@@ -241,12 +274,14 @@ class FuzzyKalmanFilter(Filter):
 
     def kernels(self) -> Kernels:
         """Kernels for the model's shape; see `Filter.kernels`."""
-        return fuzzy_kernels(self.kernel_model.shape, self.blending)
+        return fuzzy_kernels(self.kernel_model.shape, self.blending, self.premises)
 
     def rule_estimates(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Means (2^n, n), covariances (2^n, n, n) and memberships (2^n,) of the rules of a belief."""
+        """Means (2^k, n), covariances (2^k, n, n) and memberships (2^k,) of the rules of a belief."""
         n = self.model.n
-        means, covs, weights, _ = np.split(belief.extras.reshape(2**n, -1), [n, n + n * n, n + n * n + 1], axis=1)
+        means, covs, weights, _ = np.split(
+            belief.extras.reshape(2 ** len(self.premises), -1), [n, n + n * n, n + n * n + 1], axis=1
+        )
         return means.copy(), covs.reshape(-1, n, n).copy(), weights[:, 0].copy()
 
 

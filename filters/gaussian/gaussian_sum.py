@@ -19,7 +19,8 @@ from filters.gaussian.mixture import blender, part_matrix, part_vector
 from filters.particles.weighted import anything_measured
 from numerics.checks import at_least
 from numerics.compiled import inlined
-from numerics.tuples import matrix_reader, scaled_sum, tuple_of, vector_reader, written_out
+from numerics.sources import entrywise
+from numerics.tuples import matrix_reader, scaled_sum, vector_reader
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape, observation_slopes
 
@@ -44,9 +45,7 @@ def gaussian_sum_kernels(functions: Functions, shape: Shape, *, parts) -> Kernel
     component_place, variance_place, nodes_place, shares_place = own, own + 1, own + 2, own + 2 + parts
     (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     read_r = matrix_reader(m, m, source.r)
-    column = written_out(
-        "column", "row, i, factor", tuple_of(f"factor * row[{places.cov + n * j} + i]" for j in range(n))
-    )
+    column = entrywise("column", "row, i, factor", (n,), lambda j: f"factor * row[{j * n + places.cov} + i]")
     measured, read_scales = vector_reader(m), vector_reader(n, source.scales)
     constants, observation_matrix = constants_reader(shape), observation_slopes(functions, shape)
     plain = extended_kernels(functions, shape)

@@ -9,7 +9,7 @@ from filters.engine.layout import memory_places, row_access
 from filters.gaussian.extended import extended_kernels, gaussian_innovation
 from numerics import matrices
 from numerics.compiled import inlined
-from numerics.tuples import matrix_of, matrix_reader, scaled_sum, vector_reader, written_out
+from numerics.tuples import matrix_reader, scaled_sum, vector_reader
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape, observation_slopes
 
@@ -34,7 +34,7 @@ def information_kernels(functions: Functions, shape: Shape) -> Kernels:
     observation_matrix, compare = observation_slopes(functions, shape), gaussian_innovation(shape)
     factor_n, factor_m = matrices.cholesky_factor(n), matrices.cholesky_factor(m)
     invert, likelihood = matrices.factored_inverse(n), matrices.innovation_likelihood(m)
-    transposed = written_out("transposed", "h", matrix_of(n, m, lambda i, j: f"h[{j}][{i}]"))
+    transposed = matrices.transposer(m, n)
     weigh, times, add = matrices.row_solver(n, m), matrices.multiplier(n, m, n), matrices.symmetric_sum(n)
     apply_n, apply_m, moved = matrices.vector_multiplier(n, n), matrices.vector_multiplier(n, m), scaled_sum(n)
 

@@ -12,7 +12,8 @@ from filters.filter import Filter
 from filters.gaussian.extended import extended_kernels, gaussian_update, kernels_of
 from numerics.checks import at_least
 from numerics.compiled import inlined
-from numerics.tuples import matrix_reader, tuple_of, vector_reader, written_out
+from numerics.sources import Source, is_array, written_out
+from numerics.tuples import matrix_reader, vector_reader
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape, observation_slopes
 
@@ -28,18 +29,25 @@ def iterated_kernels(iterations, functions: Functions, shape: Shape) -> Kernels:
     constants, measured, read_r = constants_reader(shape), vector_reader(m), matrix_reader(m, m, source.r)
     read_scales, likelihood_place = vector_reader(n, source.scales), places.log_likelihood
     observation_matrix, condition = observation_slopes(functions, shape), gaussian_update(shape)
-    rises = [" + ".join(f"h[{i}][{j}] * (mean[{j}] - x[{j}])" for j in range(n)) for i in range(m)]
-    on_tangent = written_out(
-        "on_tangent", "y, h, x, mean", tuple_of(f"y[{i}] + {rise}" for i, rise in enumerate(rises))
-    )
+    tangent = Source("on_tangent", "y, h, x, mean", result=(m,), y=(m,), h=(m, n), x=(n,), mean=(n,))
+
+    def on_tangent_at(i):
+        rise = (f"h[{i}][{j}] * (mean[{j}] - x[{j}])" for j in tangent.range(n))
+        return tangent.less(f"y[{i}]", rise, "+")
+
+    on_tangent = tangent.function(tangent.vector(m, on_tangent_at))
     once_more = (
         "h = observation_matrix(x, scales, c)",
         "x, reduced, _, _, _ = condition(mean, p, z, on_tangent(observe(x, c), h, x, mean), h, r)",
     )
+    if is_array(n, n):
+        again = f"for _ in range({iterations - 1}):", *(f"    {line}" for line in once_more)
+    else:
+        again = once_more * (iterations - 1)  # a loop would keep batches from being vector code
     refine = written_out(
         "refine",
         "x, reduced, mean, p, z, r, scales, c",
-        *once_more * (iterations - 1),  # a loop would keep batches from being vector code
+        *again,
         "(x, reduced)",
         observation_matrix=observation_matrix,
         condition=condition,

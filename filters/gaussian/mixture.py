@@ -5,28 +5,60 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
-from numerics.angles import NAMES
+from numerics.angles import NAMES, places_of
 from numerics.compiled import inlined
-from numerics.tuples import matrix_of, tuple_of, written_out
+from numerics.sources import Source, lower_pairs, tuple_of, written_out
+from plants.shape import constants_are_array
 
 
 @cache
 def part_vector(count: int, first: int, stride: int) -> tuple[Callable, Callable]:
     """Functions `read(row, j)` and `store(row, j, x)`: the entries of part j from row[first + stride j] on."""
-    place = f"k = {first} + {stride} * j"
-    read = written_out("read", "row, j", place, tuple_of(f"row[k + {i}]" for i in range(count)))
-    stores = (f"row[k + {i}] = x[{i}]" for i in range(count))
-    return read, written_out("store", "row, j, x", place, *stores, "None")
+    read, store = Source("read", "row, j", result=(count,)), Source("store", "row, j, x", x=(count,))
+    for source in (read, store):
+        source.line(f"k = {first} + {stride} * j")
+    for i in store.range(count):
+        store.line(f"row[k + {i}] = x[{i}]")
+    return read.function(read.vector(count, lambda i: f"row[k + {i}]")), store.function()
+
+
+@cache
+def part_constants(count: int, first: int, stride: int) -> Callable:
+    """Return `read(row, j)`: the constants of an affine model, a part of a filter's numbers."""
+    if constants_are_array(count):
+        place = f"{first} + {stride} * j"
+        return written_out("read", "row, j", f"row[{place} : {place} + {count}]")
+    entries = tuple_of(f"row[k + {i}]" for i in range(count))
+    return written_out("read", "row, j", f"k = {first} + {stride} * j", entries)
 
 
 @cache
 def part_matrix(size: int, first: int, stride: int) -> tuple[Callable, Callable]:
     """Functions `read(row, j)` and `store(row, j, a)`: a square matrix of part j, by rows."""
-    place = f"k = {first} + {stride} * j"
-    places = [(i, j) for i in range(size) for j in range(size)]
-    read = written_out("read", "row, j", place, matrix_of(size, size, lambda i, j: f"row[k + {i * size + j}]"))
-    stores = (f"row[k + {i * size + j}] = a[{i}][{j}]" for i, j in places)
-    return read, written_out("store", "row, j, a", place, *stores, "None")
+    shape = size, size
+    read, store = Source("read", "row, j", result=shape), Source("store", "row, j, a", a=shape)
+    for source in (read, store):
+        source.line(f"k = {first} + {stride} * j")
+    for i in store.range(size):
+        for j in store.range(size):
+            store.line(f"row[k + {i * size + j}] = a[{i}][{j}]")
+    return read.function(read.matrix(size, size, lambda i, j: f"row[k + {i * size + j}]")), store.function()
+
+
+@cache
+def _mean_blender(count: int, means: int, weights: int, stride: int) -> Callable:
+    """Return `mean_of(row, parts)`."""
+    source = Source("mean_of", "row, parts", result=(count,))
+    total = source.local("s", count)
+    if not source.loops:
+        for i in range(count):
+            source.line(f"{total[i]} = 0.0")
+    for _ in source.inside("for part in range(parts):"):
+        source.line(f"k = {stride} * part")
+        source.line(f"w = row[k + {weights}]")
+        for i in source.range(count):
+            source.line(f"{total[i]} += w * row[k + {means + i}]")
+    return source.function(source.whole(total))
 
 
 @cache
@@ -45,29 +77,23 @@ def blender(
     within them alone, sum of w P. The means, covariances and weights of the first part lie from row[means],
     row[covs] and row[weights] on. Means of parts that are angles are put on one branch (`numerics.angles`).
     """
-    pairs = [(i, j) for i in range(count) for j in range(i + 1)]
-    spread = " + d{} * d{}" if between else ""
-    mean_of = written_out(
-        "mean_of",
-        "row, parts",
-        *(f"s{i} = 0.0" for i in range(count)),
-        "for part in range(parts):",
-        f"    k = {stride} * part",
-        f"    w = row[k + {weights}]",
-        *(f"    s{i} += w * row[k + {means + i}]" for i in range(count)),
-        tuple_of(f"s{i}" for i in range(count)),
-    )
-    cov_of = written_out(
-        "cov_of",
-        "row, parts, mean",
-        *(f"s{i}_{j} = 0.0" for i, j in pairs),
-        "for part in range(parts):",
-        f"    k = {stride} * part",
-        f"    w = row[k + {weights}]",
-        *(f"    d{i} = row[k + {means + i}] - mean[{i}]" for i in range(count) if between),
-        *(f"    s{i}_{j} += w * (row[k + {covs + i * count + j}]{spread.format(i, j)})" for i, j in pairs),
-        matrix_of(count, count, lambda i, j: f"s{max(i, j)}_{min(i, j)}"),
-    )
+    mean_of = _mean_blender(count, means, weights, stride)
+    cov_of = Source("cov_of", "row, parts, mean", result=(count, count), mean=(count,))
+    total, d = cov_of.local("s", count, count), cov_of.local("d", count)
+    if not cov_of.loops:
+        for i, j in lower_pairs(count):
+            cov_of.line(f"{total[i, j]} = 0.0")
+    for _ in cov_of.inside("for part in range(parts):"):
+        cov_of.line(f"k = {stride} * part")
+        cov_of.line(f"w = row[k + {weights}]")
+        if between:
+            for i in cov_of.range(count):
+                cov_of.line(f"{d[i]} = row[k + {means + i}] - mean[{i}]")
+        for i in cov_of.range(count):
+            for j in cov_of.range(i + 1):
+                apart = f" + {d[i]} * {d[j]}" if between else ""
+                cov_of.line(f"{total[i, j]} += w * (row[k + {covs + i * count + j}]{apart})")
+    cov_of = cov_of.function(cov_of.mirrored(total))
 
     @inlined
     def blend(row, parts):
@@ -89,17 +115,16 @@ def blender(
 @cache
 def part_aligner(means: int, weights: int, stride: int, angles: tuple[bool, ...]) -> Callable:
     """Return `align(row, parts)`: put means of parts that are angles on the branch of their circular mean."""
-    lines = []
-    for place in (means + i for i, angle in enumerate(angles) if angle):
-        lines += [
-            "s = c = 0.0",
-            "for part in range(parts):",
-            f"    k = {stride} * part",
-            f"    s += row[k + {weights}] * sin(row[k + {place}])",
-            f"    c += row[k + {weights}] * cos(row[k + {place}])",
-            "middle = arctan2(s, c)",
-            "for part in range(parts):",
-            f"    k = {stride} * part + {place}",
-            "    row[k] -= whole_turns(row[k] - middle)",
-        ]
+    lines = (
+        f"for place in {places_of(angles, means)}:",
+        "    s = c = 0.0",
+        "    for part in range(parts):",
+        f"        k = {stride} * part",
+        f"        s += row[k + {weights}] * sin(row[k + place])",
+        f"        c += row[k + {weights}] * cos(row[k + place])",
+        "    middle = arctan2(s, c)",
+        "    for part in range(parts):",
+        f"        k = {stride} * part + place",
+        "        row[k] -= whole_turns(row[k] - middle)",
+    )
     return written_out("align", "row, parts", *lines, "None", **NAMES)

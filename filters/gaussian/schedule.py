@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache, lru_cache
 
+import numpy as np
+
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.gaussian.extended import (
@@ -16,10 +18,11 @@ from filters.gaussian.extended import (
 )
 from numerics.compiled import inlined
 from numerics.matrices import multiplier, transposed_multiplier
-from numerics.tuples import matrix_reader, tuple_of, vector_reader, vector_writer, written_out
+from numerics.sources import tuple_of, written_out
+from numerics.tuples import matrix_reader, vector_reader
 from plants.affine import affine_functions
-from plants.layout import number_places
-from plants.shape import Shape
+from plants.layout import affine_constants, number_places
+from plants.shape import Shape, constants_are_array
 
 
 @cache
@@ -38,6 +41,13 @@ def interpolator(points: int, count: int, first: int) -> Callable:
             sides.append(f"({inputs[s + 1]} - u) / ({inputs[s + 1]} - {inputs[s]})")
         lines.append(f"w{s} = max(0.0, min(1.0, {', '.join(sides)}))")
     table = first + points
+    if constants_are_array(count):
+        weights = f"weights = np.array({tuple_of(f'w{s}' for s in range(points))})"
+        loops = f"for s in range({points}):", f"    for i in range({count}):"
+        add = f"        c[i] += weights[s] * numbers[{table} + s * {count} + i]"
+        return written_out(
+            "blend", "numbers, u", *lines, weights, f"c = np.zeros({count})", *loops, add, "c", np=np
+        )
     sums = (" + ".join(f"w{s} * numbers[{table + s * count + i}]" for s in range(points)) for i in range(count))
     return written_out("blend", "numbers, u", *lines, tuple_of(sums))
 
@@ -52,7 +62,7 @@ def scheduled_kernels(points: int, shape: Shape) -> Kernels:
     places, source = memory_places(n, m), number_places(n, m)
     transition, observe, transition_matrix, observation_matrix = affine_functions(n, m, 1).values()
     blend = interpolator(points, count, own_place(shape))
-    read_constants, store_constants = vector_reader(count, places.extras), vector_writer(count, places.extras)
+    read_constants, store_constants = affine_constants(count, places.extras)
     (read_mean, read_cov), (store_mean, store_cov), _ = row_access(shape)
     read_q, read_r, measured = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r), vector_reader(m)
     times, times_transposed, control = multiplier(n, n, n), transposed_multiplier(n, n, n), vector_reader(1)

@@ -9,18 +9,11 @@ from typing import NamedTuple
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.gaussian.extended import gaussian_start, in_stages, nothing_to_summarise
-from numerics import matrices
-from numerics.angles import NAMES, circular_mean, is_angle, short_way
+from numerics import arrays, matrices
+from numerics.angles import NAMES, row_brancher, short_way
 from numerics.compiled import inlined
-from numerics.tuples import (
-    matrix_of,
-    matrix_reader,
-    matrix_writer,
-    scaled_sum,
-    tuple_of,
-    vector_reader,
-    written_out,
-)
+from numerics.sources import Source, entrywise, tuple_of
+from numerics.tuples import matrix_reader, matrix_writer, scaled_sum, vector_reader
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape, innovation_of
 from plants.state_space import StateSpaceModel
@@ -40,8 +33,37 @@ class PointSet(NamedTuple):
 @cache
 def points_around(n: int, centre: bool) -> Callable:
     """Return `points(mean, l, spread)`: the mean first, if it is a point, then mean + and mean - spread L_i."""
-    points = [tuple_of(f"x[{a}] {sign} s * l[{a}][{i}]" for a in range(n)) for sign in "+-" for i in range(n)]
-    return written_out("points", "x, l, s", tuple_of(["x"] * centre + points))
+    first, count = int(centre), 2 * n + centre
+    source = Source("points", "x, l, s", result=(count, n), x=(n,), l=(n, n))
+    if not source.loops:
+        points = [tuple_of(f"x[{a}] {sign} s * l[{a}][{i}]" for a in range(n)) for sign in "+-" for i in range(n)]
+        return source.function(tuple_of(["x"] * centre + points))
+    points = source.local("points", count, n)
+    for a in source.range(n):
+        source.line(f"{points[0, a]} = x[{a}]")
+    for i in source.range(n):
+        for a in source.range(n):
+            source.line(f"{points[i + first, a]} = x[{a}] + s * l[{a}][{i}]")
+            source.line(f"{points[i + (n + first), a]} = x[{a}] - s * l[{a}][{i}]")
+    return source.function(source.whole(points))
+
+
+@cache
+def at_points(function: Callable, arguments: str, size: int, results: int, count: int) -> Callable:
+    """Return `values(x, ...)`: the values (count, results) of a function at points x (count, size)."""
+    name, others = ("transition", "u, c") if arguments == "x, u, c" else ("observe", "c")
+    source = Source("values", arguments, result=(count, results), x=(count, size))
+    if not source.loops:
+        values = tuple_of(f"{name}(x[{i}], {others})" for i in range(count))
+        return source.function(values, **{name: function})
+    values = source.local("values", count, results)
+    for i in source.range(count):
+        source.line(f"store({values.name}, {i}, {name}(point({source.array_of('x')}, {i}), {others}))")
+    store = Source("store", "out, i, y", y=(results,))
+    for a in store.range(results):
+        store.line(f"out[i, {a}] = y[{a}]")
+    point = entrywise("point", "x, i", (size,), lambda a: f"x[i, {a}]")
+    return source.function(source.whole(values), store=store.function(), point=point, **{name: function})
 
 
 @cache
@@ -52,75 +74,85 @@ def deviations(size: int, count: int, centre: bool, angles: tuple[bool, ...] = (
     d_i = y_i - mean, shift = 0. Of angles d_i are taken the short way round from y_0; without a centre the y_i are
     put on the branch of their circular mean before.
     """
-    places, first = range(size), int(centre)
-    values = range(first, first + count)
-    lines = []
-
-    def value(i, a):
-        return f"y{i}_{a}" if is_angle(a, angles) else f"y[{i}][{a}]"
-
-    for a in places:
+    first = int(centre)
+    source = Source("deviate", "y, w", result=(count, size), y=(count + first, size))
+    shift, mean = source.local("s", size), source.local("m", size)
+    for a in source.range(size):
+        values = source.range(first, first + count)
         if centre:
             apart = (short_way(f"(y[{i}][{a}] - y[0][{a}])", a, angles) for i in values)
-            lines.append(f"s{a} = w * ({' + '.join(apart)})")
-            lines.append(f"m{a} = y[0][{a}] + s{a}")
+            source.line(f"{shift[a]} = w * ({source.sum(apart)})")
+            source.line(f"{mean[a]} = y[0][{a}] + {shift[a]}")
         else:
-            lines.append(f"s{a} = 0.0")
-            if is_angle(a, angles):
-                lines.append(f"r{a} = {circular_mean([f'y[{i}][{a}]' for i in values])}")
-                lines += [f"y{i}_{a} = r{a} + wrapped(y[{i}][{a}] - r{a})" for i in values]
-            lines.append(f"m{a} = w * ({' + '.join(value(i, a) for i in values)})")
+            source.line(f"{shift[a]} = 0.0")
+            source.line(f"{mean[a]} = w * ({source.sum(f'y[{i}][{a}]' for i in values)})")
 
     def distance(i, a):
-        return short_way(f"y[{i}][{a}] - y[0][{a}]", a, angles) if centre else f"{value(i, a)} - m{a}"
+        value = f"y[{i + first}][{a}]"
+        return short_way(f"{value} - y[0][{a}]", a, angles) if centre else f"{value} - {mean[a]}"
 
-    apart = (tuple_of(distance(i, a) for a in places) for i in values)
-    mean, shift = (tuple_of(f"{name}{a}" for a in places) for name in "ms")
-    return written_out("deviate", "y, w", *lines, f"({mean}, {shift}, {tuple_of(apart)})", **NAMES)
+    apart = source.matrix(count, size, distance)
+    deviate = source.function(f"({source.whole(mean)}, {source.whole(shift)}, {apart})", **NAMES)
+    if centre or not any(angles):
+        return deviate
+    on_one_branch = row_brancher(count, angles)
+
+    @inlined
+    def deviate_on_one_branch(y, w):
+        return deviate(on_one_branch(y), w)
+
+    return deviate_on_one_branch
 
 
 @cache
 def scatter(size: int, count: int) -> Callable:
     """Return `scatter(d, shift, w, b)`: w sum d_i d_i' + b shift shift', exactly symmetric, (size, size)."""
-    lines = []
-    for a in range(size):
-        for b in range(a + 1):
-            products = " + ".join(f"d[{i}][{a}] * d[{i}][{b}]" for i in range(count))
-            lines.append(f"p{a}_{b} = w * ({products}) + b * (shift[{a}] * shift[{b}])")
-    return written_out(
-        "scatter", "d, shift, w, b", *lines, matrix_of(size, size, lambda i, j: f"p{max(i, j)}_{min(i, j)}")
-    )
+    shapes = {"d": (count, size), "shift": (size,)}
+    source = Source("scatter", "d, shift, w, b", result=(size, size), work=size * size * count // 2, **shapes)
+    if source.loops:
+        source.line(f"sums = square_of_rows({source.array_of('d')}.T.copy())")
+
+    def entry(a, b):
+        if source.loops:
+            return f"w * sums[{a}, {b}] + b * (shift[{a}] * shift[{b}])"
+        products = source.sum(f"d[{i}][{a}] * d[{i}][{b}]" for i in source.range(count))
+        return f"w * ({products}) + b * (shift[{a}] * shift[{b}])"
+
+    return source.function(source.symmetric("p", size, entry), square_of_rows=arrays.square_of_rows)
 
 
 @cache
 def cross_scatter(n: int, m: int) -> Callable:
     """Return `cross(l, e, f)`: f sum_i L_i (e_i - e_{n+i})', (n, m), for f = weight times spread."""
+    source = Source("cross", "l, e, f", result=(n, m), l=(n, n), e=(2 * n, m), work=n * n * m)
 
     def entry(a, c):
-        return f"f * ({' + '.join(f'l[{a}][{i}] * (e[{i}][{c}] - e[{n + i}][{c}])' for i in range(n))})"
+        products = (f"l[{a}][{i}] * (e[{i}][{c}] - e[{n + i}][{c}])" for i in source.range(n))
+        return f"f * ({source.sum(products)})"
 
-    return written_out("cross", "l, e, f", matrix_of(n, m, entry))
+    return source.function(source.matrix(n, m, entry))
 
 
 @cache
 def residuals(n: int, m: int) -> Callable:
     """Return `rest(l, s, k, e)`: what the gain k (n, m) leaves of the points' deviations, +-s L_i - K e_i."""
-    lines = (
-        tuple_of(
-            f"{sign}s * l[{a}][{i}] - (" + " + ".join(f"k[{a}][{c}] * e[{first + i}][{c}]" for c in range(m)) + ")"
-            for a in range(n)
-        )
-        for sign, first in (("", 0), ("-", n))
-        for i in range(n)
-    )
-    return written_out("rest", "l, s, k, e", tuple_of(lines))
+    shapes = {"l": (n, n), "k": (n, m), "e": (2 * n, m)}
+    source = Source("rest", "l, s, k, e", result=(2 * n, n), work=2 * n * n * m, **shapes)
+    left = source.local("x", 2 * n, n)
+    for sign, first in (("", 0), ("-", n)):
+        for i in source.range(n):
+            for a in source.range(n):
+                known = source.sum(f"k[{a}][{c}] * e[{i + first}][{c}]" for c in source.range(m))
+                source.line(f"{left[i + first, a]} = {sign}s * l[{a}][{i}] - ({known})")
+    return source.function(source.whole(left))
 
 
 @cache
 def silenced_columns(count: int, m: int) -> Callable:
     """Return `silence(d, z)`: vectors d (count, m) with zeros in the channels that are NaN in z."""
-    return written_out(
-        "silence", "d, z", matrix_of(count, m, lambda i, c: f"(d[{i}][{c}] if z[{c}] == z[{c}] else 0.0)")
+    shape = count, m
+    return entrywise(
+        "silence", "d, z", shape, lambda i, c: f"(d[{i}][{c}] if z[{c}] == z[{c}] else 0.0)", d=shape, z=(m,)
     )
 
 
@@ -136,17 +168,17 @@ def sigma_point_kernels(functions: Functions, shape: Shape, centre: bool) -> Ker
     read_q, read_r = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r)
     constants, control, measured = constants_reader(shape), vector_reader(shape.inputs), vector_reader(m)
     read_set = vector_reader(3, own)
-    moved = written_out(
-        "moved", "x, u, c", tuple_of(f"transition(x[{i}], u, c)" for i in range(count)), transition=transition
-    )
-    seen = written_out("seen", "x, c", tuple_of(f"observe(x[{i}], c)" for i in range(count)), observe=observe)
+    moved, seen = at_points(transition, "x, u, c", n, n, count), at_points(observe, "x, c", n, m, count)
     root_of, around = matrices.semidefinite_factor(n), points_around(n, centre)
     state_deviations = deviations(n, 2 * n, centre, shape.state_angles)
     measured_deviations = deviations(m, 2 * n, centre, shape.measurement_angles)
     state_scatter, measured_scatter, cross = scatter(n, 2 * n), scatter(m, 2 * n), cross_scatter(n, m)
     add_n, add_m = matrices.symmetric_sum(n), matrices.symmetric_sum(m)
-    silence, silence_shift, mask = silenced_columns(2 * n, m), silenced_columns(1, m), matrices.masked(m)
-    present, factor = innovation_of(shape), matrices.cholesky_factor(m)
+    silence, mask = silenced_columns(2 * n, m), matrices.masked(m)
+    silence_shift = entrywise(
+        "silence", "d, z", (m,), lambda c: f"(d[{c}] if z[{c}] == z[{c}] else 0.0)", d=(m,), z=(m,)
+    )
+    present, factor, solve = innovation_of(shape), matrices.cholesky_factor(m), matrices.row_solver(n, m)
     rest, apply, likelihood = residuals(n, m), matrices.vector_multiplier(n, m), matrices.innovation_likelihood(m)
     k_r, k_r_kt = matrices.multiplier(n, m, m), matrices.transposed_multiplier(n, m, n)
     solve, corrected = matrices.row_solver(n, m), scaled_sum(n)
@@ -177,7 +209,7 @@ def sigma_point_kernels(functions: Functions, shape: Shape, centre: bool) -> Ker
         spread, weight, bend = read_set(numbers)
         mean, root, z = read_mean(row), root_of(read_cov(row)), measured(z)
         y, shift, e = measured_deviations(seen(around(mean, root, spread), constants(numbers)), weight)
-        e, (shift,) = silence(e, z), silence_shift((shift,), z)
+        e, shift = silence(e, z), silence_shift(shift, z)
         r, innovation = mask(read_r(numbers), z), present(z, y)
         s = add_m(measured_scatter(e, shift, weight, bend), r)
         s_root = factor(s)

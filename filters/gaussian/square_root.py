@@ -10,12 +10,12 @@ from filters.gaussian.extended import gaussian_start, in_stages, nothing_at_firs
 from numerics import matrices
 from numerics.compiled import inlined
 from numerics.tuples import (
-    matrix_of,
+    assembled,
     matrix_reader,
     matrix_writer,
+    part_of,
     scaled_sum,
     vector_reader,
-    written_out,
 )
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape, innovation_of, observation_slopes, transition_slopes
@@ -55,19 +55,10 @@ def square_root_kernels(functions: Functions, shape: Shape) -> Kernels:
     mask, factor, silent = matrices.masked(m), matrices.cholesky_factor(m), silenced(m, n)
     present, likelihood = innovation_of(shape), matrices.innovation_likelihood(m)
     solve, apply, moved = matrices.forward_solver(m), matrices.vector_multiplier(n, m), scaled_sum(n)
-    beside = written_out(
-        "beside", "a, b", matrix_of(n, 2 * n, lambda i, j: f"a[{i}][{j}]" if j < n else f"b[{i}][{j - n}]")
-    )
-
-    def of_both(i, j):
-        if j < m:
-            return f"r[{i}][{j}]" if i < m else "0.0"
-        return f"hl[{i}][{j - m}]" if i < m else f"l[{i - m}][{j - m}]"
-
-    stacked = written_out("stacked", "r, hl, l", matrix_of(m + n, m + n, of_both))
-    top_left = written_out("top_left", "a", matrix_of(m, m, lambda i, j: f"a[{i}][{j}]"))
-    bottom_left = written_out("bottom_left", "a", matrix_of(n, m, lambda i, j: f"a[{m + i}][{j}]"))
-    bottom_right = written_out("bottom_right", "a", matrix_of(n, n, lambda i, j: f"a[{m + i}][{m + j}]"))
+    nn, mm, mn, both = (n, n), (m, m), (m, n), (m + n, m + n)
+    beside = assembled("beside", "a, b", (n, 2 * n), {"a": (nn, 0, 0), "b": (nn, 0, n)})
+    stacked = assembled("stacked", "r, hl, l", both, {"r": (mm, 0, 0), "hl": (mn, 0, m), "l": (nn, m, m)})
+    top_left, bottom_left, bottom_right = part_of(m, m, both), part_of(n, m, both, m), part_of(n, n, both, m, m)
 
     @inlined
     def store_root(row, root):

@@ -13,9 +13,10 @@ from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.gaussian.extended import extended_kernels, gaussian_innovation, joseph_form, kernels_of
 from filters.gaussian.kalman import AffineFilter
+from filters.gaussian.sigma_points import silenced_columns
 from numerics import matrices
 from numerics.compiled import inlined
-from numerics.tuples import matrix_of, matrix_reader, scaled_sum, vector_reader, written_out
+from numerics.tuples import matrix_reader, scaled_sum, vector_reader
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape
 
@@ -30,9 +31,7 @@ def steady_kernels(functions: Functions, shape: Shape) -> Kernels:
     (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     constants, measured, read_r = constants_reader(shape), vector_reader(m), matrix_reader(m, m, source.r)
     read_gain, likelihood_place = matrix_reader(n, m, own_place(shape)), places.log_likelihood
-    gain_of_present = written_out(
-        "gain_of_present", "k, z", matrix_of(n, m, lambda i, j: f"(k[{i}][{j}] if z[{j}] == z[{j}] else 0.0)")
-    )
+    gain_of_present = silenced_columns(n, m)
     compare, reduce, likelihood = gaussian_innovation(shape), joseph_form(n, m), matrices.innovation_likelihood(m)
     apply, moved = matrices.vector_multiplier(n, m), scaled_sum(n)
 

@@ -12,7 +12,7 @@ from filters.engine.belief import Belief
 from filters.engine.layout import memory_places, row_access
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE, silencer
 from filters.filter import Filter
-from filters.particles.weights import log_density, normalise, read_weights, weighted_covariances, weighted_means
+from filters.particles.weights import normalise, read_weights, weighted_covariances, weighted_means
 from numerics import matrices
 from numerics.angles import row_aligner
 from numerics.checks import at_least
@@ -55,7 +55,7 @@ def particle_parts(observe: Callable, shape: Shape, weights: int) -> ParticlePar
         matrices.cholesky_factor(m),
     )
     difference, measured = innovation_of(shape), vector_reader(m)
-    half_square, constant = log_density(m)
+    half_square, constant = matrices.log_density(m)
     silence = silencer(scratch, shape.measurement_angles, weights)
     of_states = means, covariances
     if any(shape.state_angles):

@@ -8,8 +8,10 @@ from functools import cache
 
 import numpy as np
 
+from numerics import arrays
 from numerics.compiled import inlined
-from numerics.tuples import column_reader, column_writer, matrix_of, tuple_of, written_out
+from numerics.sources import Source, entrywise, lower_pairs
+from numerics.tuples import column_reader, column_writer
 
 _LOWEST = -46.0  # e^-46 = 1e-20 is nothing beside 1, and still tells how far the others are off
 _LN_2, _PER_LN_2 = math.log(2.0), 1.0 / math.log(2.0)
@@ -80,15 +82,10 @@ def normalise(table, logarithms, weights, size):
 @cache
 def weighted_means(first: int, rows: int, weights: int) -> Callable:
     """Return `means(table, size)`: of rows first, first + 1, ..., with the weights in row `weights`."""
-    return written_out(
-        "means",
-        "table, size",
-        *(f"s{i} = 0.0" for i in range(rows)),
-        "for j in range(size):",
-        f"    w = table[{weights}, j]",
-        *(f"    s{i} += w * table[{first + i}, j]" for i in range(rows)),
-        tuple_of(f"s{i}" for i in range(rows)),
-    )
+    source = Source("means", "table, size", result=(rows,))
+    each, w = [f"w = table[{weights}, j]"], f"table[{weights}, j]" if source.loops else "w"
+    totals = source.totals("size", rows, lambda i: f"{w} * table[{first + i}, j]", each)
+    return source.function(source.whole(totals))
 
 
 @cache
@@ -98,40 +95,44 @@ def weighted_covariances(first: int, rows: int, weights: int) -> Callable:
     It is sum of w (x - mean)(x - mean)' over 1 - sum of w^2, which is unbiased for weights that do not depend on
     x; for equal ones the divisor is N - 1. Where one weight is all, it is what the others say.
     """
-    pairs = [(i, j) for i in range(rows) for j in range(i + 1)]
-    return written_out(
-        "covariances",
-        "table, size, means",
-        # 1 - sum of w^2 is the sum of w (1 - w). For a weight near 1 the others tell 1 - w without cancellation.
-        "rest = others = 0.0",
-        *(f"s{i}_{j} = 0.0" for i, j in pairs),
-        "for j in range(size):",
-        f"    w = table[{weights}, j]",
-        "    other = w if w <= 0.5 else 0.0",
-        "    others += other",
-        "    rest += other * (1.0 - other)",
-        *(f"    d{i} = table[{first + i}, j] - means[{i}]" for i in range(rows)),
-        *(f"    s{i}_{j} += w * d{i} * d{j}" for i, j in pairs),
-        "rest += others * (1.0 - others)",
-        matrix_of(rows, rows, lambda i, j: f"s{max(i, j)}_{min(i, j)} / rest"),
-    )
+    source = Source("covariances", "table, size, means", result=(rows, rows), means=(rows,))
+    # 1 - sum of w^2 is the sum of w (1 - w). For a weight near 1 the others tell 1 - w without cancellation.
+    source.line("rest = others = 0.0")
+    each = [
+        f"w = table[{weights}, j]",
+        "other = w if w <= 0.5 else 0.0",
+        "others += other",
+        "rest += other * (1.0 - other)",
+    ]
+    if source.loops:
+        for _ in source.inside("for j in range(size):"):
+            for text in each:
+                source.line(text)
+        source.line("rest += others * (1.0 - others)")
+        source.line(f"d = deviations(table, {first}, {rows}, {source.array_of('means')}, size)")
+        source.line(f"sums = weighted_square_of_rows(d, table, {weights})")
+        names = {"deviations": arrays.deviations, "weighted_square_of_rows": arrays.weighted_square_of_rows}
+        return source.function(source.matrix(rows, rows, lambda i, j: f"sums[{i}, {j}] / rest"), **names)
+    each += [f"d{i} = table[{first + i}, j] - means[{i}]" for i in range(rows)]
+    totals = source.totals("size", lower_pairs(rows), lambda i, j: f"w * d{i} * d{j}", each)
+    source.line("rest += others * (1.0 - others)")
+    return source.function(source.matrix(rows, rows, lambda i, j: f"{totals[max(i, j), min(i, j)]} / rest"))
 
 
 @cache
 def weighted_squares(first: int, rows: int, weights: int) -> Callable:
     """Return `squares(table, size)`: sum of w x x' over rows first, first + 1, ..."""
-    pairs = [(i, j) for i in range(rows) for j in range(i + 1)]
-    return written_out(
-        "squares",
-        "table, size",
-        *(f"s{i}_{j} = 0.0" for i, j in pairs),
-        "for j in range(size):",
-        *(
-            f"    s{i}_{j} += table[{weights}, j] * table[{first + i}, j] * table[{first + j}, j]"
-            for i, j in pairs
-        ),
-        matrix_of(rows, rows, lambda i, j: f"s{max(i, j)}_{min(i, j)}"),
-    )
+    source = Source("squares", "table, size", result=(rows, rows))
+    if source.loops:
+        source.line(f"d = deviations(table, {first}, {rows}, np.zeros({rows}), size)")
+        source.line(f"sums = weighted_square_of_rows(d, table, {weights})")
+        names = {"deviations": arrays.deviations, "weighted_square_of_rows": arrays.weighted_square_of_rows}
+        return source.function(source.matrix(rows, rows, lambda i, j: f"sums[{i}, {j}]"), **names)
+
+    def term(i, j):
+        return f"table[{weights}, j] * table[{first + i}, j] * table[{first + j}, j]"
+
+    return source.function(source.mirrored(source.totals("size", lower_pairs(rows), term)))
 
 
 @cache
@@ -146,7 +147,7 @@ def systematic_resampler(rows: int, weights: int, scratch: int) -> Callable:
     J. Computational and Graphical Statistics 5(1), appendix.
     """
     read, store, keep = column_reader(rows), column_writer(rows), column_writer(rows, scratch)
-    kept = written_out("kept", "array, j", tuple_of(f"array[{scratch + i}, j]" for i in range(rows)))
+    kept = entrywise("kept", "array, j", (rows,), lambda i: f"array[{i + scratch}, j]")
     sums, parents = scratch + rows, scratch + rows + 1
 
     @inlined
@@ -177,22 +178,3 @@ def systematic_resampler(rows: int, weights: int, scratch: int) -> Callable:
             store(table, j, kept(table, 0))
 
     return resample
-
-
-@cache
-def log_density(m: int) -> tuple[Callable, Callable]:
-    """Functions `half_square(v, l, z)` and `constant(l, z)`: log N(v; 0, l l') = constant - half_square.
-
-    Channels that are NaN in z are left out; l must be the factor of a covariance without correlations to them.
-    """
-    lines = []
-    for i in range(m):
-        rest = "".join(f" - l[{i}][{k}] * y{k}" for k in range(i))
-        lines.append(f"y{i} = (v[{i}]{rest}) / l[{i}][{i}] if z[{i}] == z[{i}] else 0.0")
-    half_square = written_out(
-        "half_square", "v, l, z", *lines, "0.5 * (" + " + ".join(f"y{i} * y{i}" for i in range(m)) + ")"
-    )
-    parts = (
-        f"(-log(l[{i}][{i}]) - {0.5 * math.log(2.0 * math.pi)!r} if z[{i}] == z[{i}] else 0.0)" for i in range(m)
-    )
-    return half_square, written_out("constant", "l, z", " + ".join(parts), log=math.log)

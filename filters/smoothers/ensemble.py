@@ -14,10 +14,10 @@ from filters.engine.layout import memory_places
 from filters.engine.restart import restart_if_lost
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.ensembles.members import row_covariances, row_means
-from numerics.angles import NAMES, short_way
+from filters.smoothers.rts import step_writers
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from numerics.threads import spread
-from numerics.tuples import tuple_of, written_out
+from numerics.tuples import joiner, vector_part, written_out
 from plants.state_space import StateSpaceModel
 
 
@@ -57,7 +57,7 @@ def smooth_ensembles(
 def _paired_model(model: StateSpaceModel) -> StateSpaceModel:
     """The model of a state (x_k, x_l): the first half moves and is measured, the second stays."""
     nothing = np.zeros((model.n, model.n))
-    transition, observe = _paired_functions(inlined(model.transition), inlined(model.observe), model.n)
+    transition, observe = _paired_functions(model.functions.transition, model.functions.observe, model.n)
     return StateSpaceModel(
         transition=transition,
         observe=observe,
@@ -74,9 +74,10 @@ def _paired_model(model: StateSpaceModel) -> StateSpaceModel:
 
 @cache
 def _paired_functions(transition: Callable, observe: Callable, n: int) -> tuple[Callable, Callable]:
-    now, past = (tuple_of(f"x[{i}]" for i in part) for part in (range(n), range(n, 2 * n)))
-    moves = written_out("moves", "x, u, c", f"transition({now}, u, c) + {past}", transition=transition)
-    return moves, written_out("observe", "x, c", f"measure({now}, c)", measure=observe)
+    now, past = (vector_part(n, 2 * n, first) for first in (0, n))
+    names = {"now": now, "past": past, "join": joiner(n, n)}
+    moves = written_out("moves", "x, u, c", "join(f(now(x), u, c), past(x))", f=transition, **names)
+    return moves, written_out("observe", "x, c", "h(now(x), c)", h=observe, now=now)
 
 
 @lru_cache(maxsize=64)
@@ -89,10 +90,7 @@ def _smoother(
     key_0, key_1, step, divergences = places.key_0, places.key_1, places.step, places.divergences
     pair_key_0, pair_key_1, pair_step = pair_places.key_0, pair_places.key_1, pair_places.step
     means_of, covariances_of = row_means(n), row_covariances(0, n, 0, n)
-    entries = (f"out[b, k, {i}] = {short_way(f'x[{i}]', i, angles)}" for i in range(n))
-    write_mean = written_out("write", "out, b, k, x", *entries, "None", **NAMES)
-    entries = (f"out[b, k, {i}, {j}] = p[{i}][{j}]" for i in range(n) for j in range(n))
-    write_cov = written_out("write", "out, b, k, p", *entries, "None")
+    write_mean, write_cov = step_writers(n, angles)
     fingerprint = function_fingerprint(start, predict, update, analyse_pair, within=__name__)
 
     @inlined

@@ -14,8 +14,9 @@ from filters.gaussian.schedule import interpolator
 from numerics import matrices
 from numerics.angles import NAMES, difference, kept, short_way
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from numerics.sources import Source, entrywise
 from numerics.threads import spread
-from numerics.tuples import matrix_of, matrix_reader, tuple_of, vector_reader, written_out
+from numerics.tuples import matrix_reader, vector_reader, zeros_of
 from plants.affine import affine_functions
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape, transition_slopes
@@ -98,7 +99,8 @@ def extended_relation(functions: Functions, shape: Shape) -> Callable:
     substeps_place, constants, control = source.substeps, constants_reader(shape), vector_reader(shape.inputs)
     read_q, read_scales = matrix_reader(n, n, source.q), vector_reader(n, source.scales)
     slopes, times = transition_slopes(functions, shape), matrices.multiplier(n, n, n)
-    identity = written_out("identity", "", matrix_of(n, n, lambda i, j: "1.0" if i == j else "0.0"))
+    identity = Source("identity", "", result=(n, n))
+    identity = identity.function(identity.matrix(n, n, lambda i, j: identity.if_same(i, j, "1.0", "0.0")))
     link = linear_link(n)
 
     @inlined
@@ -130,27 +132,41 @@ def scheduled_relation(points: int, shape: Shape) -> Callable:
     return relate
 
 
+@cache
+def step_writers(n: int, angles: tuple[bool, ...] = ()) -> tuple[Callable, Callable]:
+    """Functions `write(a, b, k, x)`: a vector (n,), its angles in (-pi, pi], and a matrix (n, n), into a[b, k]."""
+    vector, matrix = Source("write", "a, b, k, x", x=(n,)), Source("write", "a, b, k, x", x=(n, n))
+    for i in vector.range(n):
+        vector.line(f"a[b, k, {i}] = {short_way(f'x[{i}]', i, angles)}")
+    for i in matrix.range(n):
+        for j in matrix.range(n):
+            matrix.line(f"a[b, k, {i}, {j}] = x[{i}][{j}]")
+    return vector.function(**NAMES), matrix.function()
+
+
 @lru_cache(maxsize=64)
 def _smoother(relate: Callable, n: int, angles: tuple[bool, ...], interpreting: bool) -> CompiledOrPython:
-    entries = [(i, j) for i in range(n) for j in range(n)]
-    read_vector = written_out("read", "a, b, k", tuple_of(f"a[b, k, {i}]" for i in range(n)))
-    read_matrix = written_out("read", "a, b, k", matrix_of(n, n, lambda i, j: f"a[b, k, {i}, {j}]"))
-    write_vector = written_out("write", "a, b, k, x", *(f"a[b, k, {i}] = x[{i}]" for i in range(n)), "None")
-    write_matrix = written_out(
-        "write", "a, b, k, x", *(f"a[b, k, {i}, {j}] = x[{i}][{j}]" for i, j in entries), "None"
-    )
-    sizes = [f"abs(x[{i}])" for i in range(n)] + [f"abs(g[{i}][{j}])" for i, j in entries]
-    total = written_out("total", "x, g", " + ".join(sizes))
-    no_mean = written_out("nothing", "", tuple_of(["0.0"] * n))
-    no_gain = written_out("nothing", "", matrix_of(n, n, lambda i, j: "0.0"))
+    read_vector = entrywise("read", "a, b, k", (n,), lambda i: f"a[b, k, {i}]")
+    read_matrix = entrywise("read", "a, b, k", (n, n), lambda i, j: f"a[b, k, {i}, {j}]")
+    write_vector, write_matrix = step_writers(n)
+    source = Source("total", "x, g", x=(n,), g=(n, n))
+    sizes = source.sum(f"abs(x[{i}])" for i in source.range(n))
+    all_sizes = (f"abs(g[{i}][{j}])" for i in source.range(n) for j in source.range(n))
+    total = source.function(f"{sizes} + {source.sum(all_sizes)}")
+    no_mean, no_gain = zeros_of(n), zeros_of(n, n)
     add, times, times_transposed = (
         matrices.symmetric_sum(n),
         matrices.multiplier(n, n, n),
         matrices.transposed_multiplier(n, n, n),
     )
-    apart = [short_way(f"(s[{j}] - e[{j}])", j, angles) for j in range(n)]
-    sums = (" + ".join([f"x[{i}]", *(f"g[{i}][{j}] * {apart[j]}" for j in range(n))]) for i in range(n))
-    corrected = kept(written_out("corrected", "x, g, s, e", tuple_of(sums), **NAMES), "x, g, s, e", angles)
+    vectors = dict.fromkeys("xse", (n,))
+    source = Source("corrected", "x, g, s, e", result=(n,), g=(n, n), **vectors)
+
+    def sums(i):
+        apart = ((j, short_way(f"(s[{j}] - e[{j}])", j, angles)) for j in source.range(n))
+        return source.less(f"x[{i}]", (f"g[{i}][{j}] * {distance}" for j, distance in apart), "+")
+
+    corrected = kept(source.function(source.vector(n, sums), **NAMES), "x, g, s, e", angles)
     fingerprint = function_fingerprint(relate, within=__name__)
 
     @inlined

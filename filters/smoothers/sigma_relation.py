@@ -6,11 +6,19 @@ from collections.abc import Callable
 from functools import lru_cache
 
 from filters.engine.layout import own_place
-from filters.gaussian.sigma_points import PointSet, cross_scatter, deviations, points_around, residuals, scatter
+from filters.gaussian.sigma_points import (
+    PointSet,
+    at_points,
+    cross_scatter,
+    deviations,
+    points_around,
+    residuals,
+    scatter,
+)
 from filters.smoothers.rts import careful_factor
 from numerics import matrices
 from numerics.compiled import inlined
-from numerics.tuples import matrix_reader, tuple_of, vector_reader, written_out
+from numerics.tuples import matrix_reader, vector_reader
 from plants.layout import constants_reader, number_places
 from plants.shape import Shape
 
@@ -33,9 +41,7 @@ def sigma_relation(transition: Callable, shape: Shape, centre: bool) -> Callable
     source, own, count = number_places(n, m), own_place(shape), 2 * n + centre
     substeps_place, constants, control = source.substeps, constants_reader(shape), vector_reader(shape.inputs)
     read_q, read_set = matrix_reader(n, n, source.q), vector_reader(len(PointSet._fields), own)
-    moved = written_out(
-        "moved", "x, u, c", tuple_of(f"transition(x[{i}], u, c)" for i in range(count)), transition=transition
-    )
+    moved = at_points(transition, "x, u, c", n, n, count)
     root_of, around, deviate = (
         matrices.semidefinite_factor(n),
         points_around(n, centre),

@@ -1,0 +1,136 @@
+"""Products and quotients of large matrices, as loops over arrays of float64 that run along contiguous memory.
+
+They are compiled once for all sizes. Loops, and no calls of BLAS: its threads would compete with those that share
+out trajectories, and its sums depend on the machine.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from numerics.compiled import inlined
+
+
+def called(function):
+    """Mark a function that compiled functions call; see `numerics.compiled.inlined`."""
+    return inlined(function, into_callers=False)
+
+
+@called
+def _products_of_rows(a, b, lower):
+    """A b', or its part on and below the diagonal: two rows and four share what is read, the last ones again.
+
+    So there is one loop, and no further ones for what is left over at the ends.
+    """
+    rows, columns, inner = a.shape[0], b.shape[0], a.shape[1]
+    out = np.empty((rows, columns))
+    for i in range(0, rows, 2):
+        i_1 = min(i + 1, rows - 1)
+        for j in range(0, i + 2 if lower else columns, 4):
+            j_0, j_1, j_2, j_3 = (
+                min(j, columns - 1),
+                min(j + 1, columns - 1),
+                min(j + 2, columns - 1),
+                min(j + 3, columns - 1),
+            )
+            p_0 = p_1 = p_2 = p_3 = q_0 = q_1 = q_2 = q_3 = 0.0
+            for k in range(inner):
+                x, y = a[i, k], a[i_1, k]
+                p_0 += x * b[j_0, k]
+                p_1 += x * b[j_1, k]
+                p_2 += x * b[j_2, k]
+                p_3 += x * b[j_3, k]
+                q_0 += y * b[j_0, k]
+                q_1 += y * b[j_1, k]
+                q_2 += y * b[j_2, k]
+                q_3 += y * b[j_3, k]
+            out[i, j_0], out[i, j_1], out[i, j_2], out[i, j_3] = p_0, p_1, p_2, p_3
+            out[i_1, j_0], out[i_1, j_1], out[i_1, j_2], out[i_1, j_3] = q_0, q_1, q_2, q_3
+    return out
+
+
+@called
+def product_of_rows(a, b):
+    """A b'."""
+    return _products_of_rows(a, b, False)
+
+
+@called
+def add_product(out, a, b):
+    """Add a b to the first rows of an array: four rows of b at a time are added to a row of it."""
+    rows, inner, columns = a.shape[0], b.shape[0], b.shape[1]
+    whole = inner - inner % 4
+    for i in range(rows):
+        for k in range(0, whole, 4):
+            x_0, x_1, x_2, x_3 = a[i, k], a[i, k + 1], a[i, k + 2], a[i, k + 3]
+            for j in range(columns):
+                out[i, j] += x_0 * b[k, j] + x_1 * b[k + 1, j] + x_2 * b[k + 2, j] + x_3 * b[k + 3, j]
+        for k in range(whole, inner):
+            x_0 = a[i, k]
+            for j in range(columns):
+                out[i, j] += x_0 * b[k, j]
+
+
+@called
+def product(a, b):
+    """A b."""
+    out = np.zeros((a.shape[0], b.shape[1]))
+    add_product(out, a, b)
+    return out
+
+
+@called
+def deviations(table, first, rows, means, size):
+    """Distances from means (rows,) in so many rows of a table from the first on, and `size` columns."""
+    out = np.empty((rows, size))
+    for i in range(rows):
+        for j in range(size):
+            out[i, j] = table[first + i, j] - means[i]
+    return out
+
+
+@called
+def weighted_square_of_rows(d, table, weights):
+    """The sum of w d d' over columns d with weights w from a row of a table, exactly symmetric."""
+    rows, size = d.shape
+    scaled = np.empty((rows, size))
+    for i in range(rows):
+        for j in range(size):
+            scaled[i, j] = table[weights, j] * d[i, j]
+    out = _products_of_rows(scaled, d, True)
+    for i in range(rows):
+        for j in range(i):
+            out[j, i] = out[i, j]
+    return out
+
+
+@called
+def square_of_rows(a):
+    """A a', exactly symmetric."""
+    out = _products_of_rows(a, a, True)
+    for i in range(a.shape[0]):
+        for j in range(i):
+            out[j, i] = out[i, j]
+    return out
+
+
+@called
+def solve_rows(b, factor):
+    """B (l l')^-1 for a lower triangular l, of all rows of b at a time: forwards, then backwards."""
+    rows, size = b.shape
+    turned = b.T.copy()
+    for i in range(size):
+        for k in range(i):
+            x = factor[i, k]
+            for r in range(rows):
+                turned[i, r] -= x * turned[k, r]
+        for r in range(rows):
+            turned[i, r] /= factor[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
+            x = factor[k, i]
+            for r in range(rows):
+                turned[i, r] -= x * turned[k, r]
+        for r in range(rows):
+            turned[i, r] /= factor[i, i]
+    return turned.T.copy()

@@ -1,0 +1,247 @@
+"""Models of any size: what is written out for small ones is looped over arrays for large ones."""
+
+import linecache
+import sys
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from filters import StateSpaceModel, bounds, likelihood, make_filter, run
+from filters.augmented import augmented_model
+from filters.registry import FILTERS, tunable_numbers
+from filters.smoothers.smooth import smooth
+from numerics import matrices, sources
+from numerics.compiled import interpreted
+from numerics.streams import episode_keys
+from plants import shape
+from plants.simulate import simulate
+from tests.models import (
+    lonely_model,
+    pendulum,
+    random_affine,
+    simulated,
+    thruster_model,
+    varying_noise,
+    wide_model,
+)
+
+MODELS = {"wide affine": wide_model, "pendulum": pendulum, "thruster": thruster_model, "no input": lonely_model}
+FORMS = {
+    "kf, information": ("kf", {"form": "information"}),
+    "kf, square-root": ("kf", {"form": "square-root"}),
+    "kf, scheduled": ("kf", {"schedule": 5}),
+    "fuzzy, by moments": ("fuzzy", {"blending": "moments"}),
+    "enkf, inflated": ("enkf", {"inflation": 1.1, "relaxation": 0.3}),
+}
+CASES = {**{name: (name, {}) for name in FILTERS}, **FORMS}
+
+
+def forget_functions():
+    """Empty the caches of all makers, which do not know of limits that a test has changed."""
+    for name, module in list(sys.modules.items()):
+        if name.partition(".")[0] in ("numerics", "plants", "filters"):
+            for value in list(vars(module).values()):
+                getattr(value, "cache_clear", lambda: None)()
+
+
+@contextmanager
+def arrays_only():
+    """Within this context every vector and matrix is an array, and every sum a loop."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("LARGEST_TUPLE", "LARGEST_SIDE", "LONGEST_TEXT"):
+            patch.setattr(sources, name, 0)
+        patch.setattr(shape, "MOST_CONSTANTS", 0)
+        forget_functions()
+        yield
+    forget_functions()
+
+
+def everything(model_name):
+    """What all filters and what stands beside them make of a model, by name."""
+    model = MODELS[model_name]()
+    inputs, z = simulated(model, 6, count=2, level=1.0, missing=0.2)
+    keys, found = episode_keys([3, 4]), {}
+    found["simulate"] = simulate(model, keys, inputs)
+    for name, (kind, numbers) in CASES.items():
+        if "ensemble_size" in tunable_numbers(kind):
+            numbers = {**numbers, "ensemble_size": 10}
+        try:
+            made = make_filter(kind, model, **numbers)
+        except ValueError:  # the model has no operating points, or no range of states
+            continue
+        noise = varying_noise(model, 6) if made.varying_noise else {}
+        found[name] = run(made, keys, inputs, z, **noise)
+        belief, _ = made.update(made.predict(made.init((1, 2)), inputs[0, 0]), z[0, 1])
+        found[f"{name}, a step"] = belief.mean, belief.cov, belief.members, belief.extras
+        try:
+            found[f"{name}, smoothed"] = smooth(made, keys, inputs, z, lag=3)
+        except ValueError:  # it has no smoother
+            continue
+    slopes = [np.stack([np.eye(size), np.ones((size, size))]) for size in (model.n, model.m)]
+    found["likelihood"] = likelihood.likelihood(model, inputs, z, *slopes)
+    found["bound"] = (bounds.posterior_bound(model, inputs, truths=2),)
+    if len(model.constants):
+        known = {getattr(model.constants, "_fields", range(9))[1]: (0.1, 0.01)}
+        joint = augmented_model(model, known)
+        found["augmented"] = run(make_filter("ekf", joint), keys, inputs, z)
+    return found
+
+
+@pytest.fixture(scope="module")
+def both():
+    """The same twice: by tuples, and by arrays."""
+    with interpreted():
+        tuples = {name: everything(name) for name in MODELS}
+        with arrays_only():
+            return tuples, {name: everything(name) for name in MODELS}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_loops_over_arrays_are_what_is_written_out_for_tuples(both, model):
+    tuples, arrays = (form[model] for form in both)
+    assert list(tuples) == list(arrays) and len(arrays) > 25
+    for name, expected in tuples.items():
+        for one, other in zip(expected, arrays[name], strict=True):
+            close = 1e-6 if name == "likelihood" else 1e-9  # it has differences of differences
+            atol = close * np.nanmax(np.abs(one), initial=1e-3)  # some entries are small differences of large ones
+            np.testing.assert_allclose(other, one, rtol=close, atol=atol, err_msg=f"{model}, {name}")
+
+
+def linear(n, m):
+    """A stable affine model of n states and m measurements with correlated noise."""
+    return random_affine(n, m, 2, seed=5)
+
+
+def kalman_step(model, mean, p, u, z):
+    """The textbook's Kalman filter, without a thought for rounding."""
+    a, b, offset, c, shift = model.matrices()
+    mean, p = a @ mean + b @ u + offset, a @ p @ a.T + model.process_noise_cov
+    s = c @ p @ c.T + model.measurement_noise_cov
+    gain = p @ c.T @ np.linalg.inv(s)
+    return mean + gain @ (z - c @ mean - shift), p - gain @ s @ gain.T
+
+
+GAUSSIAN = {
+    **{name: (name, {}) for name in ("kf", "ekf", "iekf", "ukf", "ckf", "fuzzy")},
+    "information": ("kf", {"form": "information"}),
+    "square-root": ("kf", {"form": "square-root"}),
+    "sage-husa": ("sage-husa", {"forgetting_factor": 1.0}),
+    "ekf-robust": ("ekf-robust", {"degrees_of_freedom": 1e12}),
+    "vb": ("vb", {"forgetting_factor": 1.0, "prior_weight": 1e12}),
+}
+
+
+@pytest.mark.parametrize("name", GAUSSIAN)
+def test_a_filter_of_twelve_states_is_the_kalman_filter_on_an_affine_model(name):
+    model, (kind, numbers) = linear(12, 4), GAUSSIAN[name]
+    u, z = np.array([0.5, -1.0]), np.arange(4.0)
+    with interpreted():
+        made = make_filter(kind, model, **numbers)
+        belief, _ = made.update(made.predict(made.init(), u), z)
+    mean, p = kalman_step(model, model.prior_mean, model.prior_cov, u, z)
+    np.testing.assert_allclose(belief.mean, mean, rtol=1e-7, atol=1e-8)
+    np.testing.assert_allclose(belief.cov, p, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["kf", "ekf", "kf-steady"])
+def test_a_filter_of_forty_states_is_the_kalman_filter_on_an_affine_model(name):
+    model = linear(40, 40)
+    u, z = np.array([0.5, -1.0]), np.linspace(-1.0, 1.0, 40)
+    if name == "kf-steady":
+        a, _, _, c, _ = model.matrices()
+        predicted, posterior = bounds.riccati_covariances(model)
+        model = model.replace(prior_cov=posterior)  # A P A' + Q is the solution of Riccati's equation
+    with interpreted():
+        made = make_filter(name, model)
+        belief, _ = made.update(made.predict(made.init(), u), z)
+    mean, p = kalman_step(model, model.prior_mean, model.prior_cov, u, z)
+    np.testing.assert_allclose(belief.mean, mean, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(belief.cov, p, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize(("n", "m"), [(12, 4), (40, 40)])
+@pytest.mark.parametrize("name", ["enkf", "etkf", "ensrf", "denkf", "ienkf"])
+def test_an_ensemble_of_a_large_model_is_updated_by_the_moments_of_its_members(name, n, m):
+    model, z = linear(n, m), np.linspace(-1.0, 1.0, m)
+    with interpreted():
+        made = make_filter(name, model, ensemble_size=6, **({"iterations": 1} if name == "ienkf" else {}))
+        before = made.init((1, 2))
+        after, innovation = made.update(before, z)
+    _, _, _, c, shift = model.matrices()
+    x, y = before.members, c @ before.members + shift[:, None]
+    covs = np.cov(np.vstack([x, y]))
+    s = covs[n:, n:] + model.measurement_noise_cov
+    gain = covs[:n, n:] @ np.linalg.inv(s)
+    np.testing.assert_allclose(innovation.cov, s, rtol=1e-9)
+    np.testing.assert_allclose(innovation.value, z - y.mean(axis=1), rtol=1e-9)
+    np.testing.assert_allclose(after.cov, np.cov(after.members), rtol=1e-9, atol=1e-12)
+    if name == "enkf":  # z - v_j - y_j, whatever v_j: each member moves along the columns of the gain
+        moves = after.members - x
+        along = gain @ np.linalg.lstsq(gain, moves, rcond=1e-10)[0]
+        np.testing.assert_allclose(along, moves, atol=1e-7)
+        return
+    np.testing.assert_allclose(after.mean, x.mean(axis=1) + gain @ (z - y.mean(axis=1)), rtol=1e-7, atol=1e-8)
+    expected = covs[:n, :n] - gain @ s @ gain.T
+    if name == "denkf":  # half the gain: P - K H P + K H P H'K'/4
+        expected = covs[:n, :n] - gain @ covs[n:, :n] + gain @ covs[n:, n:] @ gain.T / 4
+    np.testing.assert_allclose(after.cov, expected, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["pf", "apf"])
+def test_particles_of_a_large_model_weigh_what_their_measurements_say(name):
+    model, z = linear(12, 4), np.zeros(4)
+    with interpreted():
+        made = make_filter(name, model, ensemble_size=30)
+        before = made.init((1, 2))
+        after, _ = made.update(before, z)
+    _, _, _, c, shift = model.matrices()
+    x = after.members[:12]
+    misfit = z[:, None] - c @ (x if name == "apf" else before.members[:12]) - shift[:, None]
+    logs = -0.5 * np.einsum("ij,ik,kj->j", misfit, np.linalg.inv(model.measurement_noise_cov), misfit)
+    weights = np.exp(after.members[12])
+    if name == "pf":
+        np.testing.assert_allclose(
+            weights, np.exp(logs - logs.max()) / np.exp(logs - logs.max()).sum(), atol=1e-12
+        )
+    np.testing.assert_allclose(after.mean, x @ weights, rtol=1e-9, atol=1e-9)
+    assert weights.sum() == pytest.approx(1.0)
+
+
+def test_a_traceback_shows_the_source_of_what_was_written_out_and_its_size():
+    with pytest.raises(IndexError) as caught:
+        matrices.multiplier(3, 2, 3)(((1.0, 2.0),) * 3, ((1.0, 2.0),) * 2)
+    place = caught.traceback[-1]
+    assert "multiply" in str(place.path) and "multiplier(3, 2, 3)" in str(place.path)
+    line = linecache.getline(place.frame.code.raw.co_filename, 2)
+    assert "a[0][0] * b[0][0] + a[0][1] * b[1][0]" in line
+
+
+def ring(x, u, c):
+    """A state that goes round, of any number of components."""
+    return np.roll(x, 1) if isinstance(x, np.ndarray) else (x[-1], *x[:-1])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"transition": lambda x, u: x}, r"transition must be a function of \(x, u, c\), but takes \(x, u\)"),
+        ({"transition": lambda x, u, c: 1.0}, "must return a tuple or array of 40 states, .* the number 1.0"),
+        (
+            {"transition": lambda x, u, c: x[1:]},
+            "must return a tuple or array of 40 states, .* returned 39 entries",
+        ),
+        (
+            {"observe": lambda x, c: x.first},
+            r"must work for 40 states \(x is an array of 40 numbers\) and 1 input",
+        ),
+        ({"observe": lambda x, c: x}, "observe must return a tuple of 2 measurements, .* returned 40 entries"),
+    ],
+)
+def test_a_wrong_function_of_a_large_model_is_told_in_one_sentence(changes, message):
+    functions = {"transition": ring, "observe": lambda x, c: (x[0], x[1])}
+    numbers = {"process_noise_cov": np.ones(40), "measurement_noise_cov": [1.0, 1.0]}
+    prior = {"prior_mean": np.zeros(40), "prior_cov": np.ones(40)}
+    assert StateSpaceModel(**functions, **numbers, **prior).m == 2
+    with pytest.raises(ValueError, match=message):
+        StateSpaceModel(**{**functions, **changes}, **numbers, **prior)
