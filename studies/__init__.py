@@ -8,6 +8,10 @@ from studies.kiki2020 import TABLE as KIKI_2020
 from studies.nurhadi2022 import TABLE as NURHADI_2022
 
 STUDIES = {table.name: table for table in (NURHADI_2022, KIKI_2020)}
-BENCHMARKS = {"lorenz63": "studies.lorenz63", "range-bearing": "studies.range_bearing"}  # modules by name
+BENCHMARKS = {
+    "lorenz63": "studies.lorenz63",
+    "lorenz96": "studies.lorenz96",
+    "range-bearing": "studies.range_bearing",
+}  # modules by name
 
 __all__ = ["BENCHMARKS", "KIKI_2020", "NURHADI_2022", "STUDIES"]
