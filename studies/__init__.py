@@ -1,8 +1,17 @@
-"""Published experiments, one `authorYEAR.py` each, with the published numbers in it."""
+"""Published experiments and standard problems, with the published numbers beside ours.
+
+Papers on the bow thruster are in `authorYEAR.py` each. Standard problems are modules with a `BENCHMARK`, and a
+`problem` for `thruster tune --problem studies.NAME:problem`.
+"""
 
 from studies.kiki2020 import TABLE as KIKI_2020
 from studies.nurhadi2022 import TABLE as NURHADI_2022
 
 STUDIES = {table.name: table for table in (NURHADI_2022, KIKI_2020)}
+BENCHMARKS = {
+    "lorenz63": "studies.lorenz63",
+    "lorenz96": "studies.lorenz96",
+    "range-bearing": "studies.range_bearing",
+}  # modules by name
 
-__all__ = ["KIKI_2020", "NURHADI_2022", "STUDIES"]
+__all__ = ["BENCHMARKS", "KIKI_2020", "NURHADI_2022", "STUDIES"]

@@ -1,4 +1,4 @@
-"""`thruster reproduce`: the published tables of the bow thruster papers against many runs of our own."""
+"""`thruster reproduce`: published tables, and those of standard problems, against many runs of our own."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from typing import Annotated
 
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 from rich.text import Text
 
 from numerics.checks import at_least, one_of
 from numerics.files import check_target
-from studies import STUDIES
+from studies import BENCHMARKS, STUDIES
+from studies.benchmark import RUNS as BENCHMARK_RUNS
 from studies.comparison import LARGEST_ENSEMBLE, MEMBERS, MOST_RUNS, RUNS, compare_all
 from studies.findings import findings, general_statements, study_statements
 from studies.series import all_series, series_figure
+from thruster_cli.benchmark import fitted, list_of, reproduce_benchmark
 from thruster_cli.output import (
     JsonOption,
     SeedOption,
@@ -30,11 +31,23 @@ LINES = "In each cell first omega_m [rad/s], below it U_a [m/s]."
 
 
 def command(
-    study: Annotated[str, typer.Argument(help=f"{', '.join(STUDIES)} or {ALL}.")],
+    study: Annotated[
+        str,
+        typer.Argument(
+            help=f"A paper on the bow thruster: {', '.join(STUDIES)}, or {ALL} of them; "
+            f"or a standard problem: {', '.join(BENCHMARKS)}."
+        ),
+    ],
     runs: Annotated[
-        int, typer.Option(help="Independent runs of 100 steps, at least 2; below 200 the intervals are wide.")
-    ] = RUNS,
-    members: Annotated[int, typer.Option(help="Ensemble size N of the EnKF, at least 2.")] = MEMBERS,
+        int | None,
+        typer.Option(
+            help=f"Independent runs, at least 2; {RUNS} of 100 steps for a paper by default, and {BENCHMARK_RUNS} "
+            "for a standard problem; with fewer the intervals are wide."
+        ),
+    ] = None,
+    members: Annotated[
+        int | None, typer.Option(help=f"Ensemble size N of the papers' EnKF, at least 2; {MEMBERS} by default.")
+    ] = None,
     series: Annotated[
         Path | None,
         typer.Option(
@@ -58,10 +71,21 @@ def command(
     distances in standard deviations of a single run, and a word on why it
     differs.
 
+    A standard problem shows our filters beside what is published of it, or
+    beside another package on the same data.
+
     Example: thruster reproduce nurhadi2022 --series series.png --json table.json
+
+    Example: thruster reproduce lorenz63
     """
-    names = tuple(STUDIES) if one_of("study", study, (*STUDIES, ALL)) == ALL else (study,)
-    runs, members = at_least("runs", runs, 2, MOST_RUNS), at_least("members", members, 2, LARGEST_ENSEMBLE)
+    if one_of("study", study, (*STUDIES, ALL, *BENCHMARKS)) in BENCHMARKS:
+        if members is not None or series is not None:
+            raise ValueError(f"--members and --series must come with a paper on the thruster, but got {study!r}")
+        emit(*reproduce_benchmark(study, BENCHMARK_RUNS if runs is None else runs, seed), json)
+        return
+    names = tuple(STUDIES) if study == ALL else (study,)
+    runs = at_least("runs", RUNS if runs is None else runs, 2, MOST_RUNS)
+    members = at_least("members", MEMBERS if members is None else members, 2, LARGEST_ENSEMBLE)
     if series is not None:
         if series.suffix != ".png":
             raise ValueError(f"--series must end in .png, but got {str(series)!r}")
@@ -93,13 +117,13 @@ def reproduce(names: tuple[str, ...], runs: int = RUNS, members: int = MEMBERS, 
         for case in dict.fromkeys(f.case for f in found):
             shown += [_published_table(name, case, [f for f in found if f.case == case]), blank]
         statements = study_statements(STUDIES[name], found)
-        shown += [Text(f"{name}: {STUDIES[name].source}"), _list(statements), blank]
+        shown += [Text(f"{name}: {STUDIES[name].source}"), list_of(statements), blank]
         data["studies"][name] = {
             "source": STUDIES[name].source,
             "rows": [_plain_finding(f) for f in found],
             "statements": statements,
         }
-    return [*shown, Text("What the runs say"), _list(general)], data
+    return [*shown, Text("What the runs say"), list_of(general)], data
 
 
 def _compare(runs: int, members: int, seed: int):
@@ -124,7 +148,7 @@ def _own_table(case: str, comparisons: list, runs: int, members: int):
     columns = ["q", "P_0", "Riccati optimum", "KF, 95 % interval", "EnKF, 95 % interval", "EnKF / KF"]
     title = f"{case}: RMSE of {runs} runs of 100 steps, EnKF with {members} members"
     caption = f"{LINES} P_0: covariance of x_0 and of the filter's prior."
-    return _fitted(table(title, columns, rows, caption=caption), rows)
+    return fitted(table(title, columns, rows, caption=caption), rows)
 
 
 def _published_table(name: str, case: str, found: list):
@@ -149,19 +173,7 @@ def _published_table(name: str, case: str, found: list):
         "Un-updated ensemble: a wrong filter, see below."
     )
     out = table(f"{name}, {case}: published RMSE against ours", columns, rows, caption=caption)
-    return _fitted(out, rows, flexible=why)
-
-
-def _fitted(out, rows: list[list[str]], flexible: str = ""):
-    """The table with numbers that never wrap, and a blank line between rows of two lines."""
-    out.leading = 1
-    for place, column in enumerate(out.columns):
-        if str(column.header) == flexible:
-            column.justify = "left"
-        else:
-            lines = [line for row in rows for line in row[place].split("\n")]
-            column.width = max(len(text) for text in lines + str(column.header).split())
-    return out
+    return fitted(out, rows, flexible=why)
 
 
 def _lines(values, form: str = ".4f") -> str:
@@ -179,13 +191,6 @@ def _distances(centre, distances) -> str:
     return "\n".join(
         f"{value:.4f} ({round(sd, 1) + 0.0:+.1f})" for value, sd in zip(centre, distances, strict=True)
     )
-
-
-def _list(statements: list[str]) -> Table:
-    out = Table.grid(padding=(0, 1))
-    for statement in statements:
-        out.add_row("-", Text(statement))
-    return out
 
 
 def _plain_comparison(c) -> dict:

@@ -1,0 +1,136 @@
+"""Standard problems that others have solved, with what they have found beside what our filters give.
+
+The score of data assimilation is "rmse.a": after each analysis the root of the mean square error over the states,
+then the mean of these over time, without the burn-in. The RMSE of our tables is pooled instead: the root of the
+mean square over runs, steps and states, so that moments in which a filter is lost weigh more. Both are told.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from filters import StateSpaceModel, make_filter, run
+from filters.consistency.intervals import Interval, mean_interval
+from numerics.checks import at_least, one_of
+from studies import BENCHMARKS
+from tuning.evaluation.evaluate import state_errors
+from tuning.problems.model_problem import ModelProblem
+
+RUNS = 16  # of 1000 analyses each; what is published rests on one such run, as far as is told
+MOST_RUNS = 10_000
+CLOSE = 0.05  # relative difference within which two scores count as the same
+NUMBERS = {"ensemble_size": "N = {0}", "rotations": "rotations"}  # in words
+
+
+class Row(NamedTuple):
+    """What one filter achieved, beside what somebody else's did."""
+
+    label: str
+    theirs: float
+    ours: Interval
+    pooled: float  # root of the mean square error over runs, scored steps and states
+    divergences: int  # restarts from the prior
+    known: str  # the reason for a difference, if one is known
+
+    @property
+    def ratio(self) -> float:
+        """Ours over theirs."""
+        return self.ours.value / self.theirs
+
+    @property
+    def why(self) -> str:
+        """The column "why different"."""
+        if abs(self.ratio - 1.0) <= CLOSE:
+            return f"the same to {100 * CLOSE:.0f} %"
+        return self.known or "no reason known to us"
+
+    def cells(self) -> list[str]:
+        """Label, theirs, ours with its interval, their ratio, the pooled RMSE and why they differ, as text."""
+        ours = f"{self.ours.value:.3f} [{self.ours.low:.3f}, {self.ours.high:.3f}]"
+        return [self.label, f"{self.theirs:.4g}", ours, f"{self.ratio:.3f}", f"{self.pooled:.3f}", self.why]
+
+
+OnRow = Callable[[Row], None]
+
+
+class Benchmark(NamedTuple):
+    """A standard problem, and how it is solved.
+
+    `rows(seeds, on_row)` gives the rows for some seeds, one after the other to `on_row`, too.
+    """
+
+    name: str
+    about: str
+    theirs: str  # what `Row.theirs` is
+    score: str  # what is compared
+    source: str
+    remarks: tuple[str, ...]
+    rows: Callable[[Sequence[int], OnRow], list[Row]]
+
+    def reproduce(self, runs: int = RUNS, seed: int = 0, on_row: OnRow = lambda row: None) -> list[Row]:
+        """All rows over so many seeds from `seed` on; ValueError for fewer than two."""
+        first, count = at_least("seed", seed, 0), at_least("runs", runs, 2, MOST_RUNS)
+        return self.rows(range(first, first + count), on_row)
+
+
+class Published(NamedTuple):
+    """A published score, and the filter of ours that stands beside it."""
+
+    filter: str
+    numbers: Mapping[str, float]  # of the filter
+    value: float
+    model: Mapping[str, float] = {}  # arguments of the model that the filter assumes
+    why: str = ""  # reason for a difference
+
+    @property
+    def label(self) -> str:
+        """Filter and numbers in words."""
+        given = {**self.numbers, **self.model}.items()
+        return ", ".join([self.filter, *(NUMBERS.get(name, f"{name} {{0:g}}").format(one) for name, one in given)])
+
+
+def find_benchmark(name: str) -> Benchmark:
+    """A benchmark by name; ValueError for an unknown one."""
+    return importlib.import_module(BENCHMARKS[one_of("benchmark", name, tuple(BENCHMARKS))]).BENCHMARK
+
+
+def noise_free_problem(truth: StateSpaceModel, **arguments) -> ModelProblem:
+    """A problem whose filters assume the truth, with a Q of zero: a study tunes what a filter has of its own."""
+    r = tuple(np.diag(truth.measurement_noise_cov).tolist())
+    untuned = {"process_noise_cov": (0.0,) * truth.n, "measurement_noise_cov": r}
+    return ModelProblem(truth, untuned=untuned, **arguments)
+
+
+def mean_of_roots(errors: np.ndarray) -> np.ndarray:
+    """rmse.a of each run, (B,), from its errors at the analyses that count (B, K, n)."""
+    return np.sqrt(np.square(errors).mean(axis=2)).mean(axis=1)
+
+
+def against_published(
+    problem: ModelProblem, model: Callable[..., StateSpaceModel], published: Sequence[Published]
+) -> Callable[[Sequence[int], OnRow], list[Row]]:
+    """`Benchmark.rows` for published values of rmse.a.
+
+    Args:
+        problem: makes the data.
+        model: gives what filters assume, from the arguments `Published.model`.
+        published: one a row.
+    """
+
+    def rows(seeds: Sequence[int], on_row: OnRow) -> list[Row]:
+        data, found = problem.data(seeds), []
+        for one in published:
+            filter_ = make_filter(one.filter, model(**one.model), **one.numbers)
+            estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
+            errors = state_errors(filter_, estimates, data)[:, data.scored]
+            pooled, lost = np.sqrt(np.square(errors).mean()), estimates.divergences.sum()
+            score = mean_interval(mean_of_roots(errors))
+            found.append(Row(one.label, one.value, score, float(pooled), int(lost), one.why))
+            on_row(found[-1])
+        return found
+
+    return rows

@@ -1,0 +1,63 @@
+"""Standard problems on the terminal: what others have found beside ours, and why it differs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.table import Table
+from rich.text import Text
+
+from studies.benchmark import Benchmark, Row, find_benchmark
+from thruster_cli.output import announce_compilation, progress_console, table
+
+WHY = "why different"
+
+
+def reproduce_benchmark(name: str, runs: int, seed: int) -> tuple[list, dict]:
+    """Solve a standard problem; return what to show, a list, and it as plain data."""
+    announce_compilation()
+    benchmark = find_benchmark(name)
+    with progress_console.status("...") as status:
+        rows = benchmark.reproduce(runs, seed, lambda row: status.update(f"done: {row.label}"))
+    shown = [_table(benchmark, rows, runs), Text(""), Text(f"{name}: {benchmark.source}")]
+    if benchmark.remarks:
+        shown.append(list_of(benchmark.remarks))
+    return shown, {
+        "settings": {"runs": runs, "seed": seed},
+        "source": benchmark.source,
+        "score": benchmark.score,
+        "theirs": benchmark.theirs,
+        "rows": [row._asdict() | {"ratio": row.ratio, "why": row.why} for row in rows],
+        "statements": list(benchmark.remarks),
+    }
+
+
+def _table(benchmark: Benchmark, rows: list[Row], runs: int) -> Table:
+    columns = ["filter", benchmark.theirs, f"ours ({runs} runs)", "ratio", "pooled", WHY]
+    cells = [row.cells() for row in rows]
+    for row in cells:
+        row[2] = row[2].replace(" [", "\n[")
+    caption = f"Compared is {benchmark.score}, ours with its 95 % interval. Pooled: RMSE over runs, steps, states."
+    out = fitted(table(benchmark.about, columns, cells, caption=caption), cells, flexible=WHY)
+    out.columns[0].width = None
+    return out
+
+
+def fitted(out: Table, rows: list[list[str]], flexible: str = "") -> Table:
+    """The table with numbers that never wrap, and a blank line between rows of two lines."""
+    out.leading = 1
+    for place, column in enumerate(out.columns):
+        if str(column.header) == flexible:
+            column.justify = "left"
+        else:
+            lines = [line for row in rows for line in row[place].split("\n")]
+            column.width = max(len(text) for text in lines + str(column.header).split())
+    return out
+
+
+def list_of(statements: Sequence[str]) -> Table:
+    """Statements as a list."""
+    out = Table.grid(padding=(0, 1))
+    for statement in statements:
+        out.add_row("-", Text(statement))
+    return out
