@@ -66,6 +66,7 @@ def test_a_worker_says_in_a_line_that_the_disk_is_full(tmp_path, data):
     study = open_study("s", PLAN, open_storage(str(path)))
     plan = PLAN._replace(scenarios=["mismatch"])._asdict()
     orders = {"study": "s", "storage": str(path), "trials": 3, "workers": 1, "worker": 0, "place": 5, "plan": plan}
+    orders["digests"] = [scenario.digest for scenario in PLAN.scenarios]
     with room_for(path.stat().st_size + 10):
         done = subprocess.run(
             [sys.executable, "-m", "tuning.search.workers"],
