@@ -27,6 +27,8 @@ from tests.models import (
     wide_model,
 )
 from tests.numerics.test_angles import turned, turning, turntable
+from tuning.problems.check import check_model
+from tuning.problems.data import Data
 
 MODELS = {
     "wide affine": wide_model,
@@ -276,6 +278,18 @@ def test_slopes_of_a_large_analytic_model_are_exact():
     expected[0, [0, 39]], expected[1, 1] = (x[39], x[0]), 1.0
     np.testing.assert_allclose(model.transition_jacobian(x, (0.0,), ()), np.diag(2 * x), rtol=1e-15)
     np.testing.assert_allclose(model.observe_jacobian(x, ()), expected, rtol=1e-15)
+
+
+def test_what_a_large_model_is_and_whether_it_fits_its_data_is_found_with_arrays():
+    """Its functions multiply whole states, which tuples refuse."""
+    noise = {"process_noise_cov": np.ones(40), "measurement_noise_cov": [1.0]}
+    prior = {"prior_mean": np.ones(40), "prior_cov": np.ones(40)}
+    model = StateSpaceModel(transition=lambda x, u, c: x * x, observe=lambda x, c: (x[0],), **noise, **prior)
+    assert model.digest != model.replace(transition=lambda x, u, c: x * x * x).digest
+    data = Data((1,), np.zeros((1, 2, 1)), np.ones((1, 3, 1)), np.zeros((1, 2)), states=np.ones((1, 3, 40)))
+    check_model(model, data, "large")
+    with pytest.raises(ValueError, match="transition of the model of problem large must be finite"):
+        check_model(model.replace(transition=lambda x, u, c: x / u[0]), data, "large")
 
 
 def test_a_traceback_shows_the_source_of_what_was_written_out_and_its_size():
