@@ -124,8 +124,8 @@ BENCHMARK = Benchmark(
         "variance R/N, moves the estimate. DAPPER gives 0.65 +- 0.02 over 12 runs as it is, and 0.76 +- 0.05 with "
         "perturbations that are not shifted.",
         "Without process noise particles die out. The published filter spreads them after resampling, in "
-        "proportion to their own spread. Ours has none of that: it is given process noise, one variance (jitter) at "
-        "every step, and as little as loses no run.",
+        "proportion to their own spread. Ours has none of that: it is given process noise, one variance (jitter) "
+        "at every step, and as little as loses no run.",
     ),
     rows=against_published(problem, model, PUBLISHED),
 )

@@ -134,7 +134,7 @@ BENCHMARK = Benchmark(
         "Our inflation acts on the forecast, the published one on the analysis: without process noise the two "
         "differ by one forecast.",
         "The EKF's inflation is a factor on its covariance in one unit of time, here within the Jacobian. With "
-        "exp(0.05 dx'/dx) at the forecast in place of the step's own Jacobian, as DAPPER has it, ours gives 0.235.",
+        "exp(0.05 dx'/dx) at the forecast for the step's own Jacobian, as DAPPER has it, ours gives 0.235.",
     ),
     rows=against_published(problem, model, PUBLISHED),
 )
