@@ -34,6 +34,7 @@ class Row(NamedTuple):
     ours: Interval
     pooled: float  # root of the mean square error over runs, scored steps and states
     divergences: int  # restarts from the prior
+    run_std: float  # standard deviation of our score in a single run
     known: str  # the reason for a difference, if one is known
 
     @property
@@ -46,7 +47,10 @@ class Row(NamedTuple):
         """The column "why different"."""
         if abs(self.ratio - 1.0) <= CLOSE:
             return f"the same to {100 * CLOSE:.0f} %"
-        return self.known or "no reason known to us"
+        if self.known:
+            return self.known
+        scatters = abs(self.ours.value - self.theirs) < 2.0 * self.run_std
+        return "within the scatter of a single run" if scatters else "no reason known to us"
 
     def cells(self) -> list[str]:
         """Label, theirs, ours with its interval, their ratio, the pooled RMSE and why they differ, as text."""
@@ -128,8 +132,9 @@ def against_published(
             estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
             errors = state_errors(filter_, estimates, data)[:, data.scored]
             pooled, lost = np.sqrt(np.square(errors).mean()), estimates.divergences.sum()
-            score = mean_interval(mean_of_roots(errors))
-            found.append(Row(one.label, one.value, score, float(pooled), int(lost), one.why))
+            scores = mean_of_roots(errors)
+            row = mean_interval(scores), float(pooled), int(lost), float(scores.std(ddof=1)), one.why
+            found.append(Row(one.label, one.value, *row))
             on_row(found[-1])
         return found
 

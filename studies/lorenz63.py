@@ -120,12 +120,12 @@ BENCHMARK = Benchmark(
         "Our inflation acts on the forecast, the published one on the analysis: without process noise the two "
         "differ by one forecast.",
         "The EKF's inflation is a factor on its covariance in one unit of time, here within the Jacobian.",
-        "The published EnKF shifts its perturbations of the measurements to mean zero. The mean of ours, of variance "
-        "R/N, moves the estimate. DAPPER gives 0.65 +- 0.02 over 12 runs as it is, and 0.76 +- 0.05 with "
+        "The published EnKF shifts its perturbations of the measurements to mean zero. The mean of ours, of "
+        "variance R/N, moves the estimate. DAPPER gives 0.65 +- 0.02 over 12 runs as it is, and 0.76 +- 0.05 with "
         "perturbations that are not shifted.",
-        "Without process noise particles die out. The published filter spreads them after resampling, in proportion "
-        "to their own spread. Ours has none of that: it is given process noise, one variance (jitter) at every step, "
-        "and as little as loses no run.",
+        "Without process noise particles die out. The published filter spreads them after resampling, in "
+        "proportion to their own spread. Ours has none of that: it is given process noise, one variance (jitter) "
+        "at every step, and as little as loses no run.",
     ),
     rows=against_published(problem, model, PUBLISHED),
 )

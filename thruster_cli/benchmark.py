@@ -37,7 +37,7 @@ def _table(benchmark: Benchmark, rows: list[Row], runs: int) -> Table:
     cells = [row.cells() for row in rows]
     for row in cells:
         row[2] = row[2].replace(" [", "\n[")
-    caption = f"Compared is {benchmark.score}, ours with its 95 % interval. Pooled: RMSE over runs, steps, states."
+    caption = f"Compared is {benchmark.score}, ours with its 95 % interval. Pooled: the RMSE of our tables."
     out = fitted(table(benchmark.about, columns, cells, caption=caption), cells, flexible=WHY)
     out.columns[0].width = None
     return out

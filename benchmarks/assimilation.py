@@ -1,0 +1,84 @@
+"""A study on Lorenz-96, forty states: a hundred trials of an EnKF, beside the same runs of DAPPER's.
+
+DAPPER does without our versions of NumPy and SciPy, so it is asked for in an environment of its own: DAPPER_PYTHON is
+the path of that interpreter. Without it there is no peer.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Iterator
+from time import perf_counter
+from unittest import mock
+
+import numpy as np
+import optuna
+
+from benchmarks.rows import Row
+from benchmarks.timing import Timing
+from studies.lorenz96 import STEPS, problem
+from tuning.search import plan as plans
+from tuning.search import space
+from tuning.search.plan import Plan
+from tuning.search.study import open_study, quiet_optuna, run_study
+
+INTERPRETER = "DAPPER_PYTHON"
+TRIALS, SEEDS, LARGEST = 100, 8, 60
+PEER_SIZES = (10, 35, 60)  # its time a run is a line over N
+GOAL = 1 / 20
+PEER = """
+import json, sys
+from time import perf_counter
+import dapper.da_methods as methods
+import dapper.tools.progressbar as bar
+from dapper.mods.Lorenz96.sakov2008 import HMM
+from dapper.tools.seeding import set_seed
+bar.disable_progbar = True
+HMM.tseq.Ko = int(sys.argv[1])
+seconds = []
+for size in [int(sys.argv[2])] + [int(size) for size in sys.argv[2:]]:
+    set_seed(3)
+    truth, measurements = HMM.simulate()
+    filter_ = methods.EnKF("PertObs", N=size, infl=1.06)
+    begin = perf_counter()
+    filter_.assimilate(HMM, truth, measurements, liveplots=False)
+    filter_.stats.average_in_time()
+    seconds.append(perf_counter() - begin)
+print(json.dumps(seconds[1:]))
+"""
+
+
+def rows(seed: int, quick: bool) -> Iterator[Row]:
+    """The study, and what DAPPER would take for its runs."""
+    count, seeds = (3, 2) if quick else (TRIALS, SEEDS)
+    ours, sizes = study_seconds(seed, count, seeds)
+    what = f"a study on Lorenz-96: {count} trials, EnKF, N up to {LARGEST}, {seeds} seeds, {STEPS} steps"
+    if os.environ.get(INTERPRETER):
+        peer = seeds * float(np.polyval(peer_line(100 if quick else STEPS), sizes).sum())
+        yield Row(what, "DAPPER, extrapolated", Timing(ours, peer, ours / peer), ratio_goal=GOAL)
+    else:
+        yield Row(what, f"no DAPPER: {INTERPRETER} is not set", Timing(ours, None, None))
+
+
+def study_seconds(seed: int, count: int, seeds: int) -> tuple[float, list[int]]:
+    """Seconds of a study of so many trials on so many seeds, without pruning, and the N of each trial."""
+    quiet_optuna()
+    few = mock.patch.multiple(plans, TRAINING_SEEDS=seeds, SIZE_SEEDS=seeds)
+    sizes = mock.patch.object(space, "KALMAN_SIZES", space.Sizes(30, 5, LARGEST))
+    with few, sizes:
+        plan = Plan("enkf", (problem,), seed, hold_r=True, prune=False)
+        study = open_study("lorenz96", plan, optuna.storages.InMemoryStorage())
+        plan.training_data()  # drawing the truth is no part of the study, nor of the peer's runs
+        begin = perf_counter()
+        result = run_study(study, plan, count)
+        return perf_counter() - begin, [trial.params["N"] for trial in result.trials]
+
+
+def peer_line(steps: int) -> np.ndarray:
+    """Slope and offset over N of the seconds that DAPPER takes for a run of 1000 analyses."""
+    command = [os.environ[INTERPRETER], "-c", PEER, *map(str, (steps, *PEER_SIZES))]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    seconds = np.array(json.loads(done.stdout.splitlines()[-1])) * STEPS / steps
+    return np.polyfit(PEER_SIZES, seconds, 1)

@@ -1,0 +1,65 @@
+"""Gymnasium's Pendulum-v1 seen through noisy cosine and sine: from a user's file to a tuned filter around the env.
+
+    thruster tune --problem studies.pendulum:problem --filter ekf --trials 30 --out pendulum.json
+    thruster report pendulum.json --problem studies.pendulum:problem
+    env = EstimateState(gym.make("Pendulum-v1"), tuned="pendulum.json", model=studies.pendulum.model())
+
+Filters take 9.81 m/s^2 for gravity, where the env has 10: what is tuned is how little they trust themselves.
+"""
+
+import math
+
+from filters import StateSpaceModel
+from tuning.problems.env_problem import EnvProblem
+from tuning.problems.excitation import Steps
+from tuning.problems.parameter import Parameter
+
+DT, VARIANCE = 0.05, 0.01
+
+
+def swing(x, u, c):
+    """The angle from upright and its rate one step later."""
+    rate = x[1] + DT * (1.5 * 9.81 * math.sin(x[0]) + 3.0 * u[0])
+    rate = min(max(rate, -8.0), 8.0)
+    return (x[0] + DT * rate, rate)
+
+
+def look(x, c):
+    """What the sensors show."""
+    return (math.cos(x[0]), math.sin(x[0]))
+
+
+def model(sigma=0.1):
+    """What filters assume, with noise of the rate of sigma [rad/s] a step."""
+    return StateSpaceModel(
+        transition=swing,
+        observe=look,
+        process_noise_cov=[(DT * sigma) ** 2, sigma**2],
+        measurement_noise_cov=[VARIANCE] * 2,
+        prior_mean=[0.0, 0.0],
+        prior_cov=[3.0, 0.5],
+        states=[("angle", "theta", "rad", True), ("angular rate", "omega", "rad/s")],
+        input_quantities=[("torque", "tau", "N m")],
+        measurements=["cosine", "sine"],
+    )
+
+
+def state(env):
+    """The truth."""
+    return env.state
+
+
+def cosine_and_sine(observation, info):
+    """The measurement, without the rate."""
+    return observation[:2]
+
+
+problem = EnvProblem(
+    "Pendulum-v1",
+    Steps(amplitude=2.0, hold=10),
+    model,
+    state_of=state,
+    measure=cosine_and_sine,
+    measurement_noise_cov=[VARIANCE] * 2,
+    parameters=[Parameter("sigma", 1e-3, 1.0, unit="rad/s", default=0.3)],
+)
