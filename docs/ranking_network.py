@@ -4,20 +4,23 @@ It stands beside the filters in docs/ranking.md, by Python or by name:
 
     thruster compare --filter ekf --filter docs.ranking_network:for_mismatch --scenario mismatch
 
-which trains it first, in some minutes on one core. It needs torch (the extra "rl").
+which trains it first, in some minutes on one core, and keeps it in out/networks. It needs torch (the extra "rl").
 """
 
 from __future__ import annotations
 
+import io
 import time
 from collections.abc import Callable
 from functools import lru_cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import nn
 
+from numerics.files import write_whole
 from plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
@@ -27,7 +30,8 @@ from tuning.thruster.find import find_scenario
 UNITS = 32  # of the hidden state
 RUNS = 512  # of training: seeds 0 to 511, of which a study has the first 32
 WINDOW, UNSCORED = 150, 50  # steps that are unrolled, and those of them in which the hidden state finds its place
-BATCH, UPDATES = 64, 3000
+BATCH, UPDATES = 64, 2000
+KEPT = Path("out") / "networks"
 RATE = 4e-3  # of Adam at first; it falls to zero along half a cosine
 
 
@@ -75,6 +79,8 @@ class NetworkEstimator:
 
     Attributes:
         name: for tables.
+        network: that was trained.
+        moments: of inputs, measurements and states, by which all is standardised.
         seconds: that its training took.
     """
 
@@ -83,29 +89,29 @@ class NetworkEstimator:
     def __init__(self, name: str, network: Network, moments: tuple[Moments, Moments, Moments], seconds: float):
         """Of a network and the moments of inputs, measurements and states by which all is standardised."""
         self.name, self.seconds = name, seconds
-        self._network, self._moments = network, moments
+        self.network, self.moments = network, moments
         self._hidden: torch.Tensor | None = None
 
     def reset(self, key, z):
         """The estimate (n,) after the first measurement; the input before it counts as zero volts."""
         self._hidden = None
-        return self.step(np.zeros(len(self._moments[0].mean)), z)
+        return self.step(np.zeros(len(self.moments[0].mean)), z)
 
     def step(self, u, z):
         """The estimate (n,) after input u (p,) and measurement z (m,), NaN where missing."""
-        given = rows_of(np.asarray(u)[None], np.asarray(z)[None], self._moments)
+        given = rows_of(np.asarray(u)[None], np.asarray(z)[None], self.moments)
         with torch.no_grad():
-            found, self._hidden = self._network(torch.from_numpy(given)[None], self._hidden)
+            found, self._hidden = self.network(torch.from_numpy(given)[None], self._hidden)
         return self._in_units(found)[0, 0]
 
     def run(self, keys, inputs, measurements):
         """The estimates (B, K + 1, n) of many runs at once."""
         with torch.no_grad():
-            found, _ = self._network(torch.from_numpy(rows_of(inputs, measurements, self._moments)))
+            found, _ = self.network(torch.from_numpy(rows_of(inputs, measurements, self.moments)))
         return self._in_units(found)
 
     def _in_units(self, found: torch.Tensor) -> np.ndarray:
-        mean, std = self._moments[2]
+        mean, std = self.moments[2]
         return mean + std * found.numpy().astype(np.float64)
 
 
@@ -175,9 +181,31 @@ def trained(
 
 @lru_cache(maxsize=4)
 def trained_on(scenario: str, seed: int = 0) -> NetworkEstimator:
-    """The network that has learnt from RUNS training seeds of a scenario, one name, `gru 32`, whatever it is."""
+    """The network that has learnt from RUNS training seeds of a scenario, or that was kept of it."""
     problem: Problem = find_scenario(scenario)
-    return trained(f"gru {UNITS}", problem.data(training_seeds(seed, RUNS)), seed)
+    kept = KEPT / f"{scenario}-{problem.digest}-{UNITS}-{RUNS}-{UPDATES}-{seed}.npz"
+    if kept.exists():
+        return _read(kept)
+    found = trained(f"gru {UNITS}", problem.data(training_seeds(seed, RUNS)), seed)
+    write_whole(kept, _as_bytes(found))
+    return found
+
+
+def _as_bytes(estimator: NetworkEstimator) -> bytes:
+    parts = {f"weight {key}": value.numpy() for key, value in estimator.network.state_dict().items()}
+    parts |= {f"moments {i}": np.stack(one) for i, one in enumerate(estimator.moments)}
+    with io.BytesIO() as file:
+        np.savez(file, seconds=estimator.seconds, **parts)
+        return file.getvalue()
+
+
+def _read(path: Path) -> NetworkEstimator:
+    with np.load(path, allow_pickle=False) as kept:
+        moments = tuple(Moments(*kept[f"moments {i}"]) for i in range(3))
+        network = Network(*(len(one.mean) for one in moments))
+        weights = {key.removeprefix("weight "): kept[key] for key in kept if key.startswith("weight ")}
+        network.load_state_dict({key: torch.from_numpy(value) for key, value in weights.items()})
+        return NetworkEstimator(f"gru {UNITS}", network.eval(), moments, float(kept["seconds"]))
 
 
 def for_mismatch(model: StateSpaceModel) -> NetworkEstimator:

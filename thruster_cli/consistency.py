@@ -8,7 +8,7 @@ from filters.consistency.intervals import rmse_ratios
 from filters.consistency.nees import SquaresCheck
 from filters.consistency.report import ConsistencyReport
 from filters.consistency.verdicts import MOST_STATES, comparison_sentence, sentences
-from filters.registry import filter_class
+from filters.filter import Filter
 from numerics.files import check_target
 from tuning.evaluation.baselines import ORACLE
 from tuning.evaluation.evaluate import check_consistency
@@ -18,12 +18,12 @@ from tuning.report.consistency_figures import consistency_figure
 from tuning.search.space import Choice
 
 
-def check_request(path: Path, filter_name: str) -> None:
+def check_request(path: Path, filter_: Filter) -> None:
     """Raise ValueError if a filter has no covariance to check, or its picture not be written there."""
     if path.suffix != ".png":
         raise ValueError(f"--consistency must end in .png, but got {str(path)!r}")
-    if not filter_class(filter_name).has_covariance:
-        raise ValueError(f"--consistency must be for a filter with a covariance, but got {filter_name!r}")
+    if not filter_.has_covariance:
+        raise ValueError(f"--consistency must be for a filter with a covariance, but got {filter_.name!r}")
     check_target(path)
 
 

@@ -70,7 +70,7 @@ def command(
         chosen = find_problem(scenario or "nominal")
         choice = rule_of_thumb(filter_name, chosen)
     if consistency is not None:
-        check_request(consistency, choice.name)
+        check_request(consistency, choice.filter(chosen))
     announce_compilation()
     with progress_console.status(f"{choice.name} on {seeds} seeds of {chosen.name} ..."):
         proof = prove(choice, chosen, seed, seeds)

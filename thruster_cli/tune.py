@@ -25,7 +25,7 @@ from thruster_cli.output import (
 )
 from thruster_cli.tuning_report import Tuning, as_json, report
 from tuning.evaluation.held_out import prove
-from tuning.evaluation.tuned import write_tuned
+from tuning.evaluation.tuned import check_keepable, write_tuned
 from tuning.likelihood.gradient import DIFFERENTIABLE, maximise_likelihood
 from tuning.likelihood.identifiability import identify
 from tuning.problems.find import find_problem
@@ -104,6 +104,7 @@ def command(
     Example: thruster tune --filter auto --budget 2 --scenario published_noise --trials 100
     """
     one_of("method", method, METHODS)
+    check_keepable(filter_name)
     scenarios = tuple(find_problem(name) for name in scenario or ["mismatch"])
     objectives = tuple(objective or ["score"])
     plan = Plan(

@@ -52,7 +52,7 @@ class Checks:
                 f"{self._of} must give a covariance, or say has_covariance = False, but gave none at {where}"
             )
         checked = {
-            name: None if value is None else self._part(name, value, where, leading)
+            name: None if value is None and name != "mean" else self._part(name, value, where, leading)
             for name, value in found._asdict().items()
         }
         return Output(**checked)

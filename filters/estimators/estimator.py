@@ -18,6 +18,8 @@ class Output(NamedTuple):
 class Estimator:
     """An estimator of one trajectory at a time; it keeps its belief, and what it draws follows from the key.
 
+    Runs and envs work on deep copies of it.
+
     A subclass gives `reset` and `step`; any other object that has both does as well, and what it leaves out of the
     rest is as here. Each may return an `Output`, a tuple of the first of its parts, such as (mean, cov), or an
     array, which is a mean alone. A method `run(keys, inputs, measurements)`, of keys (B, 2), inputs (B, K, p) and

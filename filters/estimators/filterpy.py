@@ -1,4 +1,4 @@
-"""FilterPy's filters as estimators: `KalmanFilter`, `ExtendedKalmanFilter`, `UnscentedKalmanFilter` and their like."""
+"""FilterPy's filters as estimators: linear, extended, unscented and their like."""
 
 from __future__ import annotations
 
@@ -86,14 +86,14 @@ def _predict(filter: Any, u: np.ndarray) -> None:
     filter.predict(u=u)
 
 
-def unscented(
-    model: StateSpaceModel, alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0
-) -> FilterPyEstimator:
+def unscented(model: StateSpaceModel, alpha=1.0, beta=2.0, kappa=0.0) -> FilterPyEstimator:
     """FilterPy's unscented filter of any model, `filters.estimators.filterpy:unscented` by name.
 
     Args:
         model: f, h, Q, R and the prior.
-        alpha, beta, kappa: of the scaled sigma points; those of the filter `ukf` by default.
+        alpha: how far out the scaled sigma points lie; these three are those of the filter `ukf` by default.
+        beta: what is known of the distribution beyond its moments.
+        kappa: moves the points further out.
     """
     from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 

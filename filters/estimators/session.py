@@ -1,4 +1,4 @@
-"""Estimators at work beside envs: one trajectory, as `filters.engine.session.Session`, or one a copy of a vector env."""
+"""Estimators at work beside envs: on one trajectory, or on one a copy of a vector env."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numerics.modules import said
 
 
 class EstimatorSession:
-    """An estimator on one trajectory, on a copy of its own; every output is checked.
+    """What a `Session` is to a filter: an estimator on one trajectory, on a copy of its own, outputs checked.
 
     Attributes:
         mean, cov, innovation, innovation_cov: (n,), (n, n), (m,), (m, m), of the last output; zero in the parts
@@ -58,7 +58,8 @@ class EstimatorSession:
             returned = getattr(self._estimator, method)(first, given)
         except Exception as error:
             raise ValueError(
-                f"the estimator {self._checks.name!r} must not raise, but its {method} raised {said(error)} at {where}"
+                f"the estimator {self._checks.name!r} must not raise, but its {method} raised {said(error)} "
+                f"at {where}"
             ) from error
         output = self._checks.output(returned, where)
         innovation, s = without_missing(output, z)
@@ -72,7 +73,7 @@ class EstimatorSession:
 
 
 class EstimatorBeliefs:
-    """An estimator on N copies of a vector env, each on a copy of its own: `filters.engine.batch_session.Beliefs`."""
+    """An estimator on N copies of a vector env, each on a copy of its own; see `batch_session.Beliefs`."""
 
     def __init__(self, filter_, count: int):
         """Of a `ForeignFilter`; `start` comes next."""

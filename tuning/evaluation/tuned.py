@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from filters.consistency.intervals import Interval
+from filters.estimators.find import is_foreign, label_of
 from filters.tuned_file import FACTORS, FILE_FORMAT, FILE_VERSION, read_tuned_file, sealed
 from filters.tuned_model import check_same_quantities, model_data
 from numerics.checks import at_least, covariance, positive, shown
@@ -49,9 +50,10 @@ def write_tuned(
         method: what made the choice, "optuna" or "gradient".
 
     Raises:
-        ValueError: if the folder cannot be written.
+        ValueError: if the folder cannot be written, or the filter is an estimator that is code.
     """
     choice, problem = result.choice, plan.scenarios[0]
+    check_keepable(choice.name)
     model = problem.model(**choice.model)
     content = {
         "format": FILE_FORMAT,
@@ -79,6 +81,15 @@ def write_tuned(
         "held_out": {one.name: metrics(proof) for one, proof in zip(plan.scenarios, proofs, strict=True)},
     }
     write_whole(Path(path), json.dumps(sealed(content), indent=2) + "\n")
+
+
+def check_keepable(name) -> None:
+    """Raise ValueError for an estimator that is code: reading a tuned file must import nothing that it names."""
+    if is_foreign(name):
+        raise ValueError(
+            f"a tuned file must be of a filter of filters.FILTERS, but got {label_of(name)!r}: "
+            "tune an estimator by tuning.search.study.run_study, and keep its choice yourself"
+        )
 
 
 def _noise_of(model: StateSpaceModel) -> dict:

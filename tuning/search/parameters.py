@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
+from filters.estimators.find import is_foreign, parameters_of
 from filters.registry import filter_class, tunable_numbers
 from numerics.checks import covariance
 from tuning.problems.parameter import Argument, Parameter, Place, squared
@@ -117,7 +118,12 @@ OWN_NUMBERS = {
 
 
 def filter_parameters(name: str, sizes: tuple[int, int] | None) -> list[Parameter]:
-    """What a study may choose of a filter itself: N from `sizes`, if it has an ensemble, and its own numbers."""
+    """What a study may choose of a filter itself: N from `sizes`, if it has an ensemble, and its own numbers.
+
+    Of an estimator that is what it says it is tuned by.
+    """
+    if is_foreign(name):
+        return [replace(one, place=FilterNumber(one.name)) for one in parameters_of(name)]
     size = [] if sizes is None else [Parameter("N", *sizes, integer=True, place=FilterNumber("ensemble_size"))]
     known = tunable_numbers(name)
     return size + [one for number, one in OWN_NUMBERS.items() if number in known]

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import optuna
 from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
 
+from filters.estimators.find import is_foreign
 from filters.filter import Filter
 from filters.particles.weighted import WeightedFilter
 from filters.registry import FILTERS, filter_class, make_filter, tunable_numbers
@@ -77,6 +78,8 @@ def size_ladder(name: str) -> tuple[int, ...]:
 
 
 def _default_numbers(name: str) -> dict:
+    if is_foreign(name):
+        return {one.name: one.start for one in _of_filter(name)}
     numbers = {"ensemble_size": ensemble_sizes_of(name).untuned} if has_ensemble(name) else {}
     others = [one.name for one in _of_filter(name) if one.name != "N"]
     return numbers | {number: getattr(filter_class(name), number) for number in others}
