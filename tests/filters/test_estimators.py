@@ -25,7 +25,7 @@ from tuning.search.space import choice_of, distributions
 from tuning.thruster.find import find_scenario
 
 NOMINAL, SEEDS = find_scenario("nominal"), held_out_seeds(0, 4)
-HERE = "tests.test_estimators"
+HERE = "tests.filters.test_estimators"
 
 
 class Textbook(Estimator):
