@@ -1,4 +1,4 @@
-"""Inflation found by a study like any other, on a standard problem whose published scores rest on inflation by hand."""
+"""Inflation found by a study like any other number, on problems whose published scores rest on it."""
 
 from __future__ import annotations
 
