@@ -28,9 +28,8 @@ def is_array(*shape: int) -> bool:
 
 
 def as_value(values) -> tuple | np.ndarray:
-    """A vector of numbers in the form that functions take: a tuple of floats, or an array if it is large."""
-    values = np.asarray(values)
-    return values if is_array(len(values)) else tuple(values)
+    """A vector of numbers in the form that functions take: a tuple of them, or an array if it is large."""
+    return np.asarray(values) if is_array(len(values)) else tuple(values)
 
 
 def lower_pairs(size: int) -> list[tuple[int, int]]:

@@ -60,8 +60,8 @@ def _check_arguments(name: str, function: Callable, arguments: str) -> None:
 def _check_result(name: str, function: Callable, model, arguments: str, shape: tuple, rule: str) -> None:
     for point in (model.prior_mean, model.prior_mean + model.scales):
         must_be_known = point is model.prior_mean and not name.endswith("jacobian")
-        x = point if is_array(model.n) else tuple(point.tolist())
-        given = {"x": x, "u": as_value(np.zeros(model.inputs)), "c": model.given_constants}
+        x, u = as_value(point.tolist()), as_value([0.0] * model.inputs)
+        given = {"x": x, "u": u, "c": model.given_constants}
         try:
             with np.errstate(all="ignore"), warnings.catch_warnings():
                 warnings.simplefilter("error", np.exceptions.ComplexWarning)  # of a derivative that is lost

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from numerics.sources import as_value
+
 if TYPE_CHECKING:
     from plants.state_space import StateSpaceModel
 
@@ -59,7 +61,7 @@ def _values(function: Callable, model: StateSpaceModel, sizes: tuple[int, ...]) 
     for point in _points(sizes):
         try:
             with np.errstate(all="ignore"):
-                values = [float(value) for value in function(*point, model.constants)]
+                values = [float(value) for value in function(*map(as_value, point), model.given_constants)]
         except Exception as error:  # a point where the model is not defined, which is a trait of it, too
             found.append(type(error).__name__)
             continue

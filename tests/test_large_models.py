@@ -15,6 +15,7 @@ from numerics import matrices, sources
 from numerics.compiled import interpreted
 from numerics.streams import episode_keys
 from plants import shape
+from plants.quantities import Quantity
 from plants.simulate import simulate
 from tests.models import (
     lonely_model,
@@ -25,8 +26,18 @@ from tests.models import (
     varying_noise,
     wide_model,
 )
+from tests.test_angles import turned, turning, turntable
+from tuning.problems.check import check_model
+from tuning.problems.data import Data
 
-MODELS = {"wide affine": wide_model, "pendulum": pendulum, "thruster": thruster_model, "no input": lonely_model}
+MODELS = {
+    "wide affine": wide_model,
+    "pendulum": pendulum,
+    "thruster": thruster_model,
+    "no input": lonely_model,
+    "angles": lambda: turning(3.0, wraps=True),
+    "angles, affine": lambda: turntable(3.0),
+}
 FORMS = {
     "kf, information": ("kf", {"form": "information"}),
     "kf, square-root": ("kf", {"form": "square-root"}),
@@ -82,7 +93,8 @@ def everything(model_name):
     found["likelihood"] = likelihood.likelihood(model, inputs, z, *slopes)
     found["bound"] = (bounds.posterior_bound(model, inputs, truths=2),)
     if len(model.constants):
-        known = {getattr(model.constants, "_fields", range(9))[1]: (0.1, 0.01)}
+        names = getattr(model.constants, "_fields", range(len(model.constants)))
+        known = {names[min(1, len(names) - 1)]: (0.1, 0.01)}
         joint = augmented_model(model, known)
         found["augmented"] = run(make_filter("ekf", joint), keys, inputs, z)
     return found
@@ -206,6 +218,78 @@ def test_particles_of_a_large_model_weigh_what_their_measurements_say(name):
         )
     np.testing.assert_allclose(after.mean, x @ weights, rtol=1e-9, atol=1e-9)
     assert weights.sum() == pytest.approx(1.0)
+
+
+def headings(x, u, c):
+    """Forty directions, each of which goes on by a constant, as numbers between -pi and pi."""
+    return tuple(turned(direction + c[0]) for direction in x)
+
+
+def compasses(x, c):
+    return tuple(turned(direction + c[0]) for direction in x)
+
+
+def test_slopes_of_many_angles_are_those_of_an_angle_at_the_cut():
+    """By central differences, of states and of a joint parameter, in half the components: others jump there."""
+    half = [Quantity(f"heading {i}", f"psi_{i}", "rad", i % 2 == 0) for i in range(40)]
+    eye = np.eye(40)
+    model = StateSpaceModel(
+        transition=headings,
+        observe=compasses,
+        process_noise_cov=np.ones(40),
+        measurement_noise_cov=np.ones(40),
+        prior_mean=np.full(40, np.pi - 0.5),
+        prior_cov=np.ones(40),
+        states=half,
+        measurements=half,
+        constants=(0.5,),
+    )
+    angles, x, scales = np.arange(40) % 2 == 0, model.prior_mean, model.scales
+    with interpreted():
+        by_state = shape.transition_slopes(model.functions, model.shape)(x, scales, (0.0,), model.constants)
+        measured = shape.observation_slopes(model.functions, model.shape)(x, scales, model.constants)
+        known = {"transition_jacobian": lambda x, u, c: eye, "observe_jacobian": lambda x, c: eye}
+        joint = augmented_model(model.replace(**known), {0: (0.1, 0.01)})
+        z = np.append(x, 0.5)
+        of_motion = joint.transition_jacobian(z, (0.0,), joint.constants)
+        of_compass = joint.observe_jacobian(z, joint.constants)
+    for found in (by_state, measured):
+        np.testing.assert_allclose(found[angles], eye[angles], atol=1e-7)
+        assert (np.diag(found)[~angles] < -1e4).all()
+    for found in (of_motion[:40], of_compass):
+        np.testing.assert_allclose(found[angles, 40], 1.0, atol=1e-7)
+        assert (found[~angles, 40] < -1e4).all()
+
+
+def test_slopes_of_a_large_analytic_model_are_exact():
+    def grow(x, u, c):
+        return x * x
+
+    model = StateSpaceModel(
+        transition=grow,
+        observe=lambda x, c: (x[0] * x[39], x[1]),
+        process_noise_cov=np.ones(40),
+        measurement_noise_cov=[1.0, 1.0],
+        prior_mean=np.arange(40.0),
+        prior_cov=np.ones(40),
+        analytic=True,
+    )
+    x, expected = model.prior_mean, np.zeros((2, 40))
+    expected[0, [0, 39]], expected[1, 1] = (x[39], x[0]), 1.0
+    np.testing.assert_allclose(model.transition_jacobian(x, (0.0,), ()), np.diag(2 * x), rtol=1e-15)
+    np.testing.assert_allclose(model.observe_jacobian(x, ()), expected, rtol=1e-15)
+
+
+def test_what_a_large_model_is_and_whether_it_fits_its_data_is_found_with_arrays():
+    """Its functions multiply whole states, which tuples refuse."""
+    noise = {"process_noise_cov": np.ones(40), "measurement_noise_cov": [1.0]}
+    prior = {"prior_mean": np.ones(40), "prior_cov": np.ones(40)}
+    model = StateSpaceModel(transition=lambda x, u, c: x * x, observe=lambda x, c: (x[0],), **noise, **prior)
+    assert model.digest != model.replace(transition=lambda x, u, c: x * x * x).digest
+    data = Data((1,), np.zeros((1, 2, 1)), np.ones((1, 3, 1)), np.zeros((1, 2)), states=np.ones((1, 3, 40)))
+    check_model(model, data, "large")
+    with pytest.raises(ValueError, match="transition of the model of problem large must be finite"):
+        check_model(model.replace(transition=lambda x, u, c: x / u[0]), data, "large")
 
 
 def test_a_traceback_shows_the_source_of_what_was_written_out_and_its_size():

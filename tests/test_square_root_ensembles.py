@@ -14,6 +14,7 @@ from filters import (
 )
 from filters.ensembles.transform import geometric_mean
 from numerics.compiled import interpreted
+from numerics.sources import is_array
 from numerics.streams import filter_keys
 from tests.models import KEY, simulated, wide_model
 from tests.oracles import convergence
@@ -157,7 +158,9 @@ def test_the_geometric_mean_is_the_middle_of_two_covariances(size, decades):
     a = np.eye(size) + 0.5 * np.ones((size, size))
     b = turn @ np.diag(10.0 ** generator.uniform(0, decades, size=size)) @ turn.T
     middle = units @ a @ sqrtm(np.linalg.solve(a, b)).real @ units
-    mean = np.array(geometric_mean(size)(*(tuple(map(tuple, units @ c @ units)) for c in (a, b))))
+    scaled = (units @ c @ units for c in (a, b))
+    form = np.array if is_array(size, size) else lambda c: tuple(map(tuple, c))
+    mean = np.array(geometric_mean(size)(*map(form, scaled)))
     spread = np.sqrt(np.diag(middle))
     np.testing.assert_allclose(mean / np.outer(spread, spread), middle / np.outer(spread, spread), atol=1e-9)
     np.testing.assert_array_equal(mean, mean.T)

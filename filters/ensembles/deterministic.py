@@ -13,7 +13,7 @@ from filters.ensembles.rotation import with_rotation
 from numerics import arrays, matrices
 from numerics.checks import at_least
 from numerics.compiled import inlined
-from numerics.sources import Source, entrywise
+from numerics.sources import Source, entrywise, is_array
 from numerics.tuples import column_writer
 from plants.shape import Shape
 
@@ -67,14 +67,19 @@ def deterministic_analysis(gain: Callable, observe: Callable, shape: Shape) -> C
     """
     n, m = shape.n, shape.m
     compare, solve = measurement_moments(observe, shape), matrices.row_solver(n, m)
-    apply, move = matrices.vector_multiplier(n, m), member_mover(n, m, n)
+    apply, store, moved = matrices.vector_multiplier(n, m), column_writer(n), moved_member(n, m, n)
+    at_once, move = is_array(n, m), member_mover(n, m, n)
 
     @inlined
     def analyse(memory, z, numbers, size):
         means, innovation, cross, s, r, root = compare(memory, z, numbers, size)
         _, table, _ = memory
         shift, g = apply(solve(cross, root), innovation), gain(cross, s, r, root)
-        move(table, shift, g, means)
+        if at_once:
+            move(table, shift, g, means)
+        else:
+            for j in range(table.shape[1]):
+                store(table, j, moved(table, j, shift, g, means))
 
     return analyse
 

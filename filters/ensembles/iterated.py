@@ -15,7 +15,7 @@ from filters.ensembles.transform import geometric_mean, transform_gain
 from numerics import matrices
 from numerics.checks import at_least
 from numerics.compiled import inlined
-from numerics.sources import Source, entrywise
+from numerics.sources import Source, entrywise, is_array
 from numerics.tuples import column_writer, vector_reader, zeros_of
 from plants.layout import constants_reader
 from plants.shape import Shape, innovation_of
@@ -82,6 +82,8 @@ def iterated_analysis(observe: Callable, shape: Shape) -> Callable:
         with_slopes.line(f"{known[i]} = 0.0")
     with_slopes = with_slopes.function(with_slopes.whole(known))
 
+    at_once, store_state = is_array(n, m), column_writer(n)
+
     @inlined
     def analyse(memory, z, numbers, size):
         expected, innovation, cross, s, r, root = compare(memory, z, numbers, size)
@@ -107,7 +109,11 @@ def iterated_analysis(observe: Callable, shape: Shape) -> Callable:
             root = factor(s)
             w = solve_one(misfit, root)
             shift, g = apply(cross, w), gain(cross, s, r, root)
-        move(table, shift, g, none())
+        if at_once:
+            move(table, shift, g, none())
+        else:
+            for j in range(table.shape[1]):
+                store_state(table, j, moved(table, j, shift, g, none()))
 
     return analyse
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from numerics.checks import shown
+from numerics.sources import as_value
 from plants.quantities import Quantities, Quantity
 from plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
@@ -81,12 +82,12 @@ def check_model(model: StateSpaceModel, data: Data, name: str) -> None:
     points = {"its prior mean": model.prior_mean}
     if data.states is not None and data.states.shape[-1] == model.n:
         points["the first true state"] = data.states[0, 0]
-    control = tuple(data.inputs[0, 0].tolist()) if data.steps else (0.0,) * model.inputs
+    control = as_value(data.inputs[0, 0].tolist() if data.steps else [0.0] * model.inputs)
     for where, point in points.items():
-        x = tuple(point.tolist())
+        x, c = as_value(point.tolist()), model.given_constants
         functions = {
-            "transition": lambda x=x: model.transition(x, control, model.constants),
-            "observe": lambda x=x: model.observe(x, model.constants),
+            "transition": lambda x=x, c=c: model.transition(x, control, c),
+            "observe": lambda x=x, c=c: model.observe(x, c),
         }
         for function, value in functions.items():
             try:
