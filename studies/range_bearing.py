@@ -67,7 +67,8 @@ def model(sigma_a: float = TRUE_SIGMA) -> StateSpaceModel:
 
 
 SIGMA = Parameter("sigma_a", 0.01, 10.0, unit="m/s^1.5", default=2.0)  # the default is a guess, as users make one
-problem = ModelProblem(model(), model, steps=STEPS, dt=DT, parameters=[SIGMA])
+SCALE = (2.0, 0.5, 2.0, 0.5)  # what errors are measured in: about those of a good filter [m, m/s]
+problem = ModelProblem(model(), model, steps=STEPS, dt=DT, parameters=[SIGMA], scale=SCALE)
 
 
 def tuned_sigma(trials: int = TRIALS, seed: int = 0) -> float:
