@@ -1,7 +1,7 @@
 """A study on Lorenz-96, forty states: a hundred trials of an EnKF, beside the same runs of DAPPER's.
 
-DAPPER does without our versions of NumPy and SciPy, so it is asked for in an environment of its own: DAPPER_PYTHON
-is the path of that interpreter. Without it there is no peer.
+DAPPER does not go with our versions of NumPy and SciPy, so it is run in an environment of its own: DAPPER_PYTHON
+is the path of that one's interpreter. Without it there is no peer.
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 
     python -m docs.benchmark_tables [FOLDER]
 
-The tables between the comments of FOLDER/benchmarks.md are written anew, in some minutes. Every run gives the
-same.
+The tables between the comments of FOLDER/benchmarks.md are written anew, in some minutes; always the same.
 """
 
 from __future__ import annotations

@@ -19,7 +19,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import optuna
 
 from filters import StateSpaceModel, make_filter, run
 from filters.consistency.intervals import rmse_intervals
@@ -67,14 +66,15 @@ def model(sigma_a: float = TRUE_SIGMA) -> StateSpaceModel:
 
 
 SIGMA = Parameter("sigma_a", 0.01, 10.0, unit="m/s^1.5", default=2.0)  # the default is a guess, as users make one
-problem = ModelProblem(model(), model, steps=STEPS, dt=DT, parameters=[SIGMA])
+SCALE = (2.0, 0.5, 2.0, 0.5)  # what errors are measured in: about those of a good filter [m, m/s]
+problem = ModelProblem(model(), model, steps=STEPS, dt=DT, parameters=[SIGMA], scale=SCALE)
 
 
 def tuned_sigma(trials: int = TRIALS, seed: int = 0) -> float:
     """The sigma_a [m/s^1.5] that a study of so many trials finds for an extended Kalman filter."""
     quiet_optuna()
     plan = Plan("ekf", (problem,), seed)
-    study = open_study("range-bearing", plan, optuna.storages.InMemoryStorage())
+    study = open_study("range-bearing", plan)
     return run_study(study, plan, trials).choice.model["sigma_a"]
 
 

@@ -66,7 +66,11 @@ class StudyResult(NamedTuple):
 
 
 def open_study(
-    name: str, plan: Plan, storage: optuna.storages.BaseStorage, start: Choice | None = None, worker: int = 0
+    name: str,
+    plan: Plan,
+    storage: optuna.storages.BaseStorage | None = None,
+    start: Choice | None = None,
+    worker: int = 0,
 ) -> optuna.Study:
     """Create a study or load it to go on; its first trial is `start`, by default the untuned filter.
 
@@ -75,7 +79,7 @@ def open_study(
     Args:
         name: of the study.
         plan: what the study is for.
-        storage: from `open_storage`.
+        storage: from `open_storage`; None for one that ends with the process.
         start: the first trial, in place of untuned ones.
         worker: place of this process among those that share the study; 0 if it may be the only one.
 
