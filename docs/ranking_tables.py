@@ -9,12 +9,13 @@ written anew; all of them take some ten minutes on two cores. Every run gives th
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from docs.page import with_tables
 from filters.consistency.intervals import Interval
 from numerics.files import write_whole
+from thruster_cli.error_tables import unless_blank
 from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender
 from tuning.problems.excitation import Steps
 from tuning.problems.seeds import held_out_seeds
@@ -37,44 +38,44 @@ COLUMNS = ("omega_m [rad/s]", "over {0}", "U_a [m/s]", "over {0}", "NEES", "NIS"
 def speed() -> str:
     """|speed| at slow crossings and dwells."""
     by_speed = contender("gsf", component=0)  # the sum is split along omega_m
-    return _table(_board(find_scenario("speed_magnitude"), [EKF, UKF, by_speed, ENKF, PF, MANY]))
+    return table_of(leaderboard(find_scenario("speed_magnitude"), [EKF, UKF, by_speed, ENKF, PF, MANY]))
 
 
 def fast() -> str:
     """|speed| at fast reversals."""
     slow = find_scenario("speed_magnitude")
     scenario = slow.replace(name="fast_reversals", excitation=Steps(12.0), measurement_noise_cov=25.0)
-    return _table(_board(scenario, [EKF, UKF, MANY]))
+    return table_of(leaderboard(scenario, [EKF, UKF, MANY]))
 
 
 def outliers() -> str:
     """Outliers in the thrust."""
-    return _table(_board(find_scenario("outliers"), [EKF, ROBUST, ENKF, PF]))
+    return table_of(leaderboard(find_scenario("outliers"), [EKF, ROBUST, ENKF, PF]))
 
 
 def ambient() -> str:
     """A flow that the filter does not know, and filters that estimate it."""
     joint = [contender("ekf", unknown=FLOW), contender("enkf", unknown=FLOW, ensemble_size=100)]
-    return _table(_board(find_scenario("ambient"), [EKF, joint[0], ENKF, joint[1]]))
+    return table_of(leaderboard(find_scenario("ambient"), [EKF, joint[0], ENKF, joint[1]]))
 
 
 def published() -> str:
     """The published noise."""
     ensembles = [SMALL, SMALL_INFLATED, ENKF, INFLATED, IENKF, IENKF_INFLATED]
-    return _table(_board(find_scenario("published_noise"), [EKF, IEKF, UKF, *ensembles, GSF, PF, MANY]))
+    return table_of(leaderboard(find_scenario("published_noise"), [EKF, IEKF, UKF, *ensembles, GSF, PF, MANY]))
 
 
 def reference() -> str:
     """The published noise, beside a particle filter with so many particles that more change nothing."""
     best = contender("pf", ensemble_size=REFERENCE_SIZE)
     filters = [best, EKF, IEKF, UKF, ENKF, IENKF, GSF, PF, MANY]
-    return _table(_board(find_scenario("published_noise"), filters, REFERENCE_SEEDS))
+    return table_of(leaderboard(find_scenario("published_noise"), filters, REFERENCE_SEEDS))
 
 
 def startup() -> str:
     """RMSE of the first 50 steps from an unknown state."""
     lines = ["| filter | omega_m [rad/s] | U_a [m/s] |", "|---|---|---|"]
-    for row in _board(find_scenario("startup"), [EKF, IEKF, UKF, ENKF, GSF, PF]).rows:
+    for row in leaderboard(find_scenario("startup"), [EKF, IEKF, UKF, ENKF, GSF, PF]).rows:
         speed_error, flow_error = row.evaluation.start_up_rmse
         lines.append(f"| {row.label} | {speed_error:.1f} | {flow_error:.3f} |")
     return "\n".join(lines)
@@ -83,12 +84,12 @@ def startup() -> str:
 def scores() -> str:
     """Scores over that of the EKF, a row a scenario."""
     filters = [EKF, ROBUST, IEKF, UKF, ENKF, GSF, PF]
-    boards = [_board(scenario, filters) for scenario in SCENARIOS.values()]
+    boards = [leaderboard(scenario, filters) for scenario in SCENARIOS.values()]
     labels = [one.label for one in filters[1:]]
     lines = [f"| scenario | ekf: score | {' | '.join(labels)} |", "|---" * (len(labels) + 2) + "|"]
     for board in boards:
         first, *others = board.rows
-        cells = [f"`{board.scenario.name}`", f"{first.evaluation.score.value:.2f}", *map(_ratio, others)]
+        cells = [f"`{board.scenario.name}`", f"{first.evaluation.score.value:.2f}", *map(ratio_cell, others)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -104,14 +105,15 @@ def scenarios() -> str:
     return "\n".join(lines)
 
 
-def _board(scenario: Scenario, filters: Sequence[Contender], seeds: int = SEEDS) -> Leaderboard:
+def leaderboard(scenario: Scenario, filters: Sequence[Contender], seeds: int = SEEDS) -> Leaderboard:
+    """Filters on a scenario's held-out seeds."""
     (board,), interrupted = compare(filters, [scenario], held_out_seeds(0, seeds))
     if interrupted:
         raise KeyboardInterrupt
     return board
 
 
-def _table(board: Leaderboard) -> str:
+def table_of(board: Leaderboard) -> str:
     """RMSE by state with its distance from the bound, the paired ratio, and consistency, a row a filter."""
     lines = [f"| filter | {' | '.join(COLUMNS).format(board.rows[0].label)} |", "|---" * 8 + "|"]
     for row in board.rows:
@@ -121,14 +123,15 @@ def _table(board: Leaderboard) -> str:
         ):
             cells.append(f"{_about(rmse, digits)} ({100 * above:+.0f} %)")
             cells.append("" if row is board.rows[0] else _about(ratio, 3))
-        nees = f"{row.nees:.2f} (median)" if row.nees_is_median else f"{row.nees:.3g}"
-        cells += [nees, f"{row.evaluation.nis.value:.3g}", f"{row.evaluation.log_likelihood:.0f}"]
+        nees = f"{row.nees:.2f} (median)" if row.nees_is_median else unless_blank(row.nees, ".3g")
+        cells += [nees, unless_blank(row.evaluation.nis.value, ".3g")]
+        cells.append(unless_blank(row.evaluation.log_likelihood, ".0f"))
         lines.append(f"| {' | '.join(cells)} |")
     bound = f"| bound | {board.bound[0]:.3f} | | {board.bound[1]:.4f} | | 2 (median 1.39) | 1 | |"
     return "\n".join([*lines, bound])
 
 
-def _ratio(row: Row) -> str:
+def ratio_cell(row: Row) -> str:
     """The ratio of scores; bold where the filter is significantly better, in brackets where no worse either."""
     text = f"{row.score_ratio.value:.3f}"
     return {"better": f"**{text}**", "worse": text, "tie": f"({text})"}[row.verdict]
@@ -144,14 +147,19 @@ TABLES: dict[str, Callable[[], str]] = {
 }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line."""
-    parser = argparse.ArgumentParser(prog="python -m docs.ranking_tables", description=__doc__.splitlines()[0])
+def main(
+    arguments: Sequence[str] | None = None,
+    tables: Mapping[str, Callable[[], str]] = TABLES,
+    module: str = "docs.ranking_tables",
+    about: str = __doc__,
+) -> None:
+    """Run the command line of a script that makes tables of the page."""
+    parser = argparse.ArgumentParser(prog=f"python -m {module}", description=about.splitlines()[0])
     parser.add_argument("page", nargs="?", type=Path, default=Path(__file__).parent / "ranking.md", metavar="PAGE")
-    parser.add_argument("--table", action="append", choices=list(TABLES), help="only this one; may be repeated")
+    parser.add_argument("--table", action="append", choices=list(tables), help="only this one; may be repeated")
     given = parser.parse_args(arguments)
-    for name in given.table or TABLES:  # written one by one, so that what is done stays
-        write_whole(given.page, with_tables(given.page.read_text(), {name: TABLES[name]}))
+    for name in given.table or tables:  # written one by one, so that what is done stays
+        write_whole(given.page, with_tables(given.page.read_text(), {name: tables[name]}))
 
 
 if __name__ == "__main__":

@@ -58,12 +58,11 @@ class FilterPyEstimator(Estimator):
     def _updated(self, z) -> Output:
         own, z = self.filter, np.asarray(z, dtype=np.float64)
         there = ~np.isnan(z)
-        innovation, s = None, None
+        # Channels that are missing have no innovation, and no correlation to the others.
+        innovation, s = np.zeros(len(z)), np.array(own.R, dtype=np.float64)
         if there.any():
             measured = z[there, None] if np.ndim(own.x) == 2 else z[there]
             own.update(measured, **self._arguments, **({} if there.all() else self._of_some(there)))
-            # Channels that are missing have no innovation, and no correlation to the others.
-            innovation, s = np.zeros(len(z)), np.array(own.R, dtype=np.float64)
             innovation[there] = np.ravel(own.y)
             s[np.ix_(there, there)] = own.S
         return Output(np.ravel(own.x).copy(), np.array(own.P), innovation, s)

@@ -65,10 +65,10 @@ class StoneSoupEstimator(Estimator):
         from stonesoup.types.detection import Detection
         from stonesoup.types.hypothesis import SingleHypothesis
 
-        innovation, s = None, None
+        model = self._updater.measurement_model
+        innovation, s = np.zeros(len(z)), np.array(model.covar(), dtype=np.float64)
         self._state = predicted
         if not np.isnan(z).any():
-            model = self._updater.measurement_model
             detection = Detection(StateVector(z), timestamp=self._now, measurement_model=model)
             foreseen = self._updater.predict_measurement(predicted)
             self._state = self._updater.update(SingleHypothesis(predicted, detection, foreseen))

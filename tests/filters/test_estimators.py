@@ -4,6 +4,7 @@
 import copy
 import json
 import math
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -319,7 +320,7 @@ def test_by_the_command_line(thruster):
     kinds = ("--filter", "ekf", "--filter", f"{HERE}:AtOnce", "--filter", f"{HERE}:scaled_gain")
     done = thruster("compare", *kinds, "--seeds", 2, "--json", "board.json")
     assert done.returncode == 0, done.stderr
-    rows = json.load(open("board.json", encoding="utf-8"))["scenarios"]["nominal"]["filters"]
+    rows = json.loads(Path("board.json").read_text())["scenarios"]["nominal"]["filters"]
     assert list(rows) == ["ekf", f"{HERE}:AtOnce", f"{HERE}:scaled_gain"]
     assert rows[f"{HERE}:AtOnce"]["nees"] is None and rows[f"{HERE}:AtOnce"]["verdict"] == "worse"
     done = thruster("evaluate", "--filter", f"{HERE}:AtOnce", "--seeds", 2)
@@ -331,4 +332,4 @@ def test_by_the_command_line(thruster):
         (("evaluate", "--filter", f"{HERE}:AtOnce", "--consistency", "a.png"), "for a filter with a covariance"),
     ):
         done = thruster(*arguments)
-        assert done.returncode == 2 and line in done.stderr and done.stderr.count("\n") == 1
+        assert done.returncode == 2 and line in done.stderr and "Traceback" not in done.stderr
