@@ -6,8 +6,8 @@ import pytest
 from filters import EstimateState, make_filter, run
 from filters.estimators.filterpy import FilterPyEstimator
 from filters.estimators.stonesoup import StoneSoupEstimator
+from tests.filters.test_gaussian_peers import stone_soup_models
 from tests.models import random_affine, simulated
-from tests.test_gaussian_peers import stone_soup_models
 from tuning.evaluation.compare import compare, contender
 from tuning.problems.data import Data
 from tuning.problems.seeds import held_out_seeds
