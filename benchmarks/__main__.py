@@ -41,12 +41,32 @@ def command(
         )
     check_installed()
     # After the checks: they import FilterPy, or Stable-Baselines3.
-    from benchmarks import batches, policies, processes, steps, studies, trajectories, vector_filters, vectors
+    from benchmarks import (
+        assimilation,
+        batches,
+        policies,
+        processes,
+        steps,
+        studies,
+        trajectories,
+        vector_filters,
+        vectors,
+    )
 
     announce_compilation()
     rows = []
     with progress_console.status("measuring ...") as status:
-        for part in (steps, vectors, vector_filters, batches, trajectories, studies, policies, processes):
+        for part in (
+            steps,
+            vectors,
+            vector_filters,
+            batches,
+            trajectories,
+            studies,
+            assimilation,
+            policies,
+            processes,
+        ):
             for row in part.rows(seed, quick):
                 rows.append(row)
                 status.update(f"measured: {row.what} ...")

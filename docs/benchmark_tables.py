@@ -1,16 +1,21 @@
 """Make the tables of docs/benchmarks.md: standard problems that others have solved, beside ours.
 
-    python -m docs.benchmark_tables [FOLDER]
+    python -m docs.benchmark_tables [PAGE] [--table NAME]...
 
-The tables between the comments of FOLDER/benchmarks.md are written anew, in some minutes; always the same.
+The tables between the comments of PAGE, docs/benchmarks.md by default, are written anew, in some minutes. Every
+run gives the same.
 """
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 
-from docs.page import make_page, table
+from docs.page import table
+from numerics.files import write_whole
+from numerics.markdown import with_tables
 from studies import BENCHMARKS
 from studies.benchmark import find_benchmark
 from studies.lorenz63 import problem as lorenz63
@@ -67,7 +72,14 @@ TABLES: dict[str, Callable[[], str]] = {
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
-    make_page("benchmarks", "docs.benchmark_tables", {}, TABLES, __doc__.splitlines()[0], arguments)
+    parser = argparse.ArgumentParser(prog="python -m docs.benchmark_tables", description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "page", nargs="?", type=Path, default=Path(__file__).parent / "benchmarks.md", metavar="PAGE"
+    )
+    parser.add_argument("--table", action="append", choices=list(TABLES), help="only this one; may be repeated")
+    given = parser.parse_args(arguments)
+    for name in given.table or TABLES:  # written one by one, so that what is done stays
+        write_whole(given.page, with_tables(given.page.read_text(), {name: TABLES[name]}))
 
 
 if __name__ == "__main__":

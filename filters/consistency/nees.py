@@ -11,6 +11,7 @@ from filters.consistency.intervals import Interval, mean_interval
 from filters.consistency.uniformity import Uniformity, uniformity
 
 SINGULAR = 1e-12  # a pivot of P below this part of its variance counts as zero
+LARGEST_BY_ENTRIES = 12  # beyond, the operations on single entries, d^3 of them, take longer than copies of columns
 
 
 def whitened(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
@@ -18,6 +19,15 @@ def whitened(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
 
     If the covariances are right, the result has independent components of variance one.
     """
+    with np.errstate(over="ignore", invalid="ignore"):  # of a filter that has diverged: NaN
+        if errors.shape[-1] <= LARGEST_BY_ENTRIES:
+            return _by_entries(errors, covs)
+        if errors.ndim > 2:
+            return np.stack([whitened(*pair) for pair in zip(errors, covs, strict=True)])
+        return _by_columns(errors, covs)
+
+
+def _by_entries(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     d = errors.shape[-1]
     root, solved = {}, []
     regular = np.ones(errors.shape[:-1], dtype=bool)
@@ -32,6 +42,20 @@ def whitened(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     return np.where(regular[..., None], np.stack(solved, axis=-1), np.nan)
 
 
+def _by_columns(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
+    root, solved = np.zeros(covs.shape), np.empty(errors.shape)
+    regular = np.ones(errors.shape[:-1], dtype=bool)
+    for j in range(errors.shape[-1]):
+        before = root[..., j, :j, None]
+        column = covs[..., j:, j] - (root[..., j:, :j] @ before)[..., 0]
+        regular &= column[..., 0] > SINGULAR * covs[..., j, j]
+        pivot = np.sqrt(np.where(regular, column[..., 0], 1.0))
+        root[..., j:, j] = column / pivot[..., None]
+        root[..., j, j] = pivot
+        solved[..., j] = (errors[..., j] - (solved[..., None, :j] @ before)[..., 0, 0]) / pivot
+    return np.where(regular[..., None], solved, np.nan)
+
+
 def normalized_squares(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     """E' P^-1 e for errors (..., d) and covariances (..., d, d); NaN where P is singular.
 
@@ -39,7 +63,8 @@ def normalized_squares(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     consistent filter each is chi-squared with d degrees of freedom. Source: Bar-Shalom, Li, Kirubarajan (2001),
     Estimation with Applications to Tracking and Navigation, section 5.4.
     """
-    return (whitened(errors, covs) ** 2).sum(axis=-1)
+    with np.errstate(over="ignore"):
+        return (whitened(errors, covs) ** 2).sum(axis=-1)
 
 
 class SquaresCheck(NamedTuple):

@@ -175,3 +175,21 @@ def test_the_bound_starts_from_a_prior_without_spread_and_refuses_a_singular_q()
     assert (bound[0] == 0).all() and np.linalg.eigvalsh(bound[1])[0] > 0
     with pytest.raises(ValueError, match="positive definite Q, but got"):
         posterior_bound(model.replace(process_noise_cov=[1.0, 0.0]), np.zeros((1, 3, 1)))
+
+
+@pytest.mark.filterwarnings("error")
+def test_many_states_are_whitened_as_few_are():
+    rng = np.random.default_rng(5)
+    parts, errors = rng.normal(size=(3, 4, 15, 20)), rng.normal(size=(3, 4, 15))
+    covs = parts @ np.swapaxes(parts, -1, -2)
+    expected = np.array(
+        [
+            [e @ np.linalg.solve(p, e) for e, p in zip(*pair, strict=True)]
+            for pair in zip(errors, covs, strict=True)
+        ]
+    )
+    np.testing.assert_allclose(normalized_squares(errors, covs), expected, rtol=1e-9)
+    covs[1, 2] = 0.0
+    errors[2], covs[2] = 1e200, 1e300 * covs[2]
+    found = normalized_squares(errors, covs)
+    assert np.isnan(found[1, 2]) and np.isfinite(found[:2]).sum() == 7
