@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from docs import ranking_estimators
 from docs.page import with_tables
 from docs.ranking_tables import TABLES, main, scenarios
 from tuning.evaluation.compare import compare, contender
@@ -87,7 +88,7 @@ def upper(cell):
 
 
 def test_the_page_has_every_table_and_they_show_the_claims_on_200_seeds():
-    assert set(re.findall(r"<!-- table (\w+) -->", PAGE)) == set(TABLES)
+    assert set(re.findall(r"<!-- table (\w+) -->", PAGE)) == {*TABLES, *ranking_estimators.TABLES}
     published = table("published")
     assert float(published["ekf"][4]) > 20
     assert upper(published["enkf 100"][3]) < 0.7
@@ -97,6 +98,9 @@ def test_the_page_has_every_table_and_they_show_the_claims_on_200_seeds():
     assert max(upper(table("ambient")["ekf + U_0"][i]) for i in (1, 3)) < 1
     assert upper(table("reference")["pf 1000"][3]) < 1.02
     assert len(table("scores")) == len(SCENARIOS)
+    assert upper(table("network_mismatch")["gru 32"][1]) < 0.3
+    rows = table("network_outliers")
+    assert upper(rows["ekf, tuned"][1]) < float(rows["gru 32"][1].split(" ± ")[0]) < 1
 
 
 def test_only_the_tables_that_are_asked_for_are_made_anew(tmp_path):
