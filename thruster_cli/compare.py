@@ -37,7 +37,9 @@ def command(
     filters: Annotated[
         list[str] | None,
         typer.Option(
-            "--filter", help=f"{', '.join(FILTERS)}; may be repeated. Without any, or a file: ekf, enkf, pf."
+            "--filter",
+            help=f"{', '.join(FILTERS)}, or module:object for somebody else's estimator; may be repeated. Without "
+            "any, or a file: ekf, enkf, pf.",
         ),
     ] = None,
     scenarios: Annotated[

@@ -97,6 +97,8 @@ def test_the_page_has_every_table_and_they_show_the_claims_on_200_seeds():
     assert max(upper(table("outliers")["ekf-robust"][i]) for i in (1, 3)) < 0.7
     assert max(upper(table("ambient")["ekf + U_0"][i]) for i in (1, 3)) < 1
     assert upper(table("reference")["pf 1000"][3]) < 1.02
+    elsewhere = table("network_elsewhere")
+    assert all(float(cell) > 5 for cell in elsewhere["`dropout`"]) and "**" in elsewhere["`mismatch`"][0]
     assert len(table("scores")) == len(SCENARIOS)
     assert upper(table("network_mismatch")["gru 32"][1]) < 0.3
     rows = table("network_outliers")
