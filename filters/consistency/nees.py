@@ -11,7 +11,9 @@ from filters.consistency.intervals import Interval, mean_interval
 from filters.consistency.uniformity import Uniformity, uniformity
 
 SINGULAR = 1e-12  # a pivot of P below this part of its variance counts as zero
-LARGEST_BY_ENTRIES = 12  # beyond, the operations on single entries, d^3 of them, take longer than copies of columns
+LARGEST_BY_ENTRIES = (
+    12  # beyond, the operations on single entries, d^3 of them, take longer than copies of columns
+)
 
 
 def whitened(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
