@@ -19,7 +19,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import optuna
 
 from filters import StateSpaceModel, make_filter, run
 from filters.consistency.intervals import rmse_intervals
@@ -75,7 +74,7 @@ def tuned_sigma(trials: int = TRIALS, seed: int = 0) -> float:
     """The sigma_a [m/s^1.5] that a study of so many trials finds for an extended Kalman filter."""
     quiet_optuna()
     plan = Plan("ekf", (problem,), seed)
-    study = open_study("range-bearing", plan, optuna.storages.InMemoryStorage())
+    study = open_study("range-bearing", plan, None)
     return run_study(study, plan, trials).choice.model["sigma_a"]
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import optuna
-
 from filters.consistency.intervals import Interval, mean_interval
 from filters.engine.batch import run
 from studies.benchmark import mean_of_roots
@@ -36,7 +34,7 @@ def tune_inflation(filter_name: str, problem: ModelProblem, trials: int, runs: i
     """
     quiet_optuna()
     plan = Plan(filter_name, (problem,), seed, hold_r=True)
-    study = open_study("inflation", plan, optuna.storages.InMemoryStorage())
+    study = open_study("inflation", plan, None)
     choice = run_study(study, plan, trials).choice
     data, filter_ = problem.data(held_out_seeds(seed, runs)), choice.filter(problem)
     estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
