@@ -14,7 +14,6 @@ from time import perf_counter
 from unittest import mock
 
 import numpy as np
-import optuna
 
 from benchmarks.rows import Row
 from benchmarks.timing import Timing
@@ -69,7 +68,7 @@ def study_seconds(seed: int, count: int, seeds: int) -> tuple[float, list[int]]:
     sizes = mock.patch.object(space, "KALMAN_SIZES", space.Sizes(30, 5, LARGEST))
     with few, sizes:
         plan = Plan("enkf", (problem,), seed, hold_r=True, prune=False)
-        study = open_study("lorenz96", plan, optuna.storages.InMemoryStorage())
+        study = open_study("lorenz96", plan, None)
         plan.training_data()  # drawing the truth is no part of the study, nor of the peer's runs
         begin = perf_counter()
         result = run_study(study, plan, count)

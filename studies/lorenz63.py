@@ -6,7 +6,7 @@ Runge-Kutta steps of 0.01, an analysis every 25 of them, all three states observ
 Nothing has a unit: time is in that of the equations.
 
     thruster reproduce lorenz63
-    thruster tune --problem studies.lorenz63:problem --filter etkf --trials 30
+    thruster tune --problem studies.lorenz63:problem --filter etkf --hold-r --trials 30
     thruster tune --problem studies.lorenz63:faded --filter ekf --trials 30
     thruster tune --problem studies.lorenz63:jittered --filter pf --trials 30
 

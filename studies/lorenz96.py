@@ -6,7 +6,7 @@ One Runge-Kutta step of 0.05 and an analysis of all forty states, R = I, no proc
 is in that of the equations.
 
     thruster reproduce lorenz96
-    thruster tune --problem studies.lorenz96:problem --filter etkf --trials 30
+    thruster tune --problem studies.lorenz96:problem --filter etkf --hold-r --trials 30
 
 Sources: E. N. Lorenz, K. A. Emanuel (1998), "Optimal sites for supplementary weather observations: simulation with
 a small model", J. Atmospheric Sciences 55, 399-414. The settings are those of P. Sakov, P. R. Oke (2008), "A
