@@ -42,7 +42,7 @@ class Filter:
 
     @property
     def own_numbers(self) -> tuple[float, ...]:
-        """Numbers of the filter itself that its kernels read, behind the model's: from `engine.layout.own_place` on."""
+        """Numbers of the filter itself that its kernels read, behind the model's: from `layout.own_place` on."""
         return ()
 
     @property
