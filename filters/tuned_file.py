@@ -22,9 +22,10 @@ FILE_VERSION = (
     4  # 4: any problem, and its model as data; 3: the plant, and scenarios of files, as data; 2: no such
 )
 READ_VERSIONS = (2, 3, 4)
-NEEDED = ("process_noise_cov", "measurement_noise_cov")
-MODEL_KEYS = (*NEEDED, "prior_cov_factor", "parameter_factors")  # what every plant with data of its own knows
+NOISE = ("process_noise_cov", "measurement_noise_cov")
+PRIOR = "prior_cov_factor"  # on P_0
 FACTORS = "parameter_factors"  # a mapping of names to factors
+MODEL_KEYS = (*NOISE, PRIOR, FACTORS)  # what every plant with data of its own knows
 
 
 def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -115,14 +116,14 @@ def _check_filter(entry, known: tuple[str, ...] | None) -> None:
             one_of("an argument of the model of a tuned file", key, known)
         elif not key.isidentifier():
             raise ValueError(f"an argument of the model of a tuned file must be a name, but got {shown(key)}")
-    for key in NEEDED:
+    for key in NOISE:
         if model.get(key) is None:
             raise ValueError(f"the model of a tuned file must have a {key}, but got {shown(model)}")
     for key, value in model.items():
         if key != FACTORS:
             _check_finite(key, value)
-    if "prior_cov_factor" in model:
-        positive("prior_cov_factor", model["prior_cov_factor"])
+    if PRIOR in model:
+        positive(PRIOR, model[PRIOR])
     for key, value in _mapping(FACTORS, model.get(FACTORS, {})).items():
         _check_finite(f"{FACTORS}, {key}", value)
         positive(f"{FACTORS}, {key}", value)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from numerics.checks import as_floats, shown
+from numerics.modules import said
 from numerics.sources import as_value, is_array
 
 
@@ -74,8 +75,7 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
                     raise ValueError(_not_nan(name, str(error))) from None
                 continue
             sizes = f"{_count(model.n, 'state')}{_form(model.n)} and {_count(model.inputs, 'input')}"
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            raise ValueError(f"{name} must work for {sizes}, but raised {reason}") from error
+            raise ValueError(f"{name} must work for {sizes}, but raised {said(error)}") from error
         found = _shape(result)
         if found != shape:
             raise ValueError(f"{name} must return {rule}, but returned {_said(found, result)}")

@@ -25,8 +25,11 @@ class ModelledEnv:
         raise NotImplementedError
 
     def tuned_differences(self, tuned_for: Mapping, file: str) -> list[str]:
-        """What a tuned file's plant differs in from the env's, and filters yet may run; ValueError for another."""
-        raise NotImplementedError
+        """What a tuned file's plant differs in from the env's, and filters yet may run; ValueError for another.
+
+        Nothing, unless the plant says more: states, inputs, sensors and dt are compared for every model.
+        """
+        return []
 
     def state_space_model(self, **changes) -> StateSpaceModel:
         """The model of the env's plant, exact unless changed; changes are those of its `model_maker`.

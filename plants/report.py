@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from numerics.written import written_out
+
 FLOAT32_ENDS = 3e38  # casting beyond 3.4e38 would warn on its way to infinity
 
 
@@ -74,7 +76,7 @@ def _info_maker(places: tuple[tuple[str, int | None], ...], drops: bool) -> Call
     ]
     if drops:
         entries.append(f"'measurement_valid': views[{len(vectors)}] > 0.0")
-    return eval(f"lambda report, views: {{{', '.join(entries)}}}")
+    return written_out("info", "report, views", f"{{{', '.join(entries)}}}")
 
 
 def infos_of(report: np.ndarray, rows: ReportRows, mask: np.ndarray) -> dict[str, np.ndarray]:

@@ -7,13 +7,10 @@ from collections.abc import Callable, Mapping
 
 from filters.filter import Filter
 from filters.registry import make_filter
-from filters.tuned_file import NEEDED, read_tuned_file
+from filters.tuned_file import NOISE, PRIOR, read_tuned_file
 from filters.tuned_model import check_same_model, check_same_quantities
 from filters.wrappers.models import made, maker_of
 from plants.state_space import StateSpaceModel
-
-PRIOR = "prior_cov_factor"
-NOISE = {*NEEDED, PRIOR}
 
 
 def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:
@@ -70,7 +67,7 @@ def _with_numbers(
     if isinstance(make, StateSpaceModel):
         fits(make)
         return _with_noise(make, numbers)
-    own = {name: value for name, value in numbers.items() if name not in NOISE}
+    own = {name: value for name, value in numbers.items() if name not in (*NOISE, PRIOR)}
     if by_digest:
         own = {name: value for name, value in own.items() if name in _arguments_of(make)}
     plain = made(what, make, own)
@@ -79,7 +76,7 @@ def _with_numbers(
 
 
 def _with_noise(model: StateSpaceModel, numbers: Mapping) -> StateSpaceModel:
-    changes = {name: numbers[name] for name in NEEDED}
+    changes = {name: numbers[name] for name in NOISE}
     if PRIOR in numbers:
         changes["prior_cov"] = numbers[PRIOR] * model.prior_cov
     return model.replace(**changes)

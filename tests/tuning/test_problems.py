@@ -8,6 +8,7 @@ import pytest
 
 from filters.bounds import posterior_bound
 from filters.likelihood import likelihood
+from filters.tuned_file import NOISE
 from tests import pendulum_problem
 from tests.models import wide_model
 from tests.small_problems import pair, thruster
@@ -21,7 +22,7 @@ from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem
 from tuning.problems.excitation import BinarySequence, MultiSine
 from tuning.problems.model_problem import ModelProblem
-from tuning.problems.problem import NOISE, scored_states
+from tuning.problems.problem import scored_states
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters, parameters_of, true_choice, untuned_choice
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from filters.consistency.intervals import Interval
 from filters.estimators.find import is_foreign, label_of
-from filters.tuned_file import FACTORS, FILE_FORMAT, FILE_VERSION, read_tuned_file, sealed
+from filters.tuned_file import FACTORS, FILE_FORMAT, FILE_VERSION, NOISE, PRIOR, read_tuned_file, sealed
 from filters.tuned_model import check_same_quantities, model_data
 from numerics.checks import at_least, covariance, positive, shown
 from numerics.files import write_whole
@@ -22,7 +22,7 @@ from plants.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
 from tuning.problems.find import built_in, find_given, find_problem, problem_from_mapping
-from tuning.problems.problem import NOISE, PRIOR, Problem
+from tuning.problems.problem import Problem
 from tuning.search.objectives import NIS_BAND
 from tuning.search.plan import Plan
 from tuning.search.space import Choice

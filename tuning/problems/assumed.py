@@ -8,12 +8,15 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
+from filters.tuned_file import NOISE, PRIOR
+from numerics.angles import wrapped_where
 from numerics.checks import at_least, positive, shown
+from numerics.modules import said
 from plants.state_space import StateSpaceModel
 from tuning.problems.check import check_data
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.parameter import Parameter
-from tuning.problems.problem import NOISE, PRIOR, Problem
+from tuning.problems.problem import Problem
 
 RANGE_SEEDS = range(8)  # whose runs tell each state's range, where the model does not
 RANGE_FRACTION = 0.01  # standard deviation of the rule of thumb's Q, as part of each state's range
@@ -147,7 +150,7 @@ class AssumedProblem(Problem):
         if model.state_low is not None and model.state_high is not None:
             deviations = RANGE_FRACTION * (model.state_high - model.state_low)
         elif (states := self.data(RANGE_SEEDS).states) is not None:
-            deviations[: states.shape[-1]] = RANGE_FRACTION * np.ptp(wrapped(states, model), axis=0)
+            deviations[: states.shape[-1]] = RANGE_FRACTION * np.ptp(rows_of(states, model), axis=0)
         variances = tuple(float(v) for v in deviations**2)
         return {"process_noise_cov": variances, "measurement_noise_cov": as_argument(model.measurement_noise_cov)}
 
@@ -155,10 +158,9 @@ class AssumedProblem(Problem):
         try:
             model = self._assumed(**given)
         except Exception as error:
-            said = " ".join(f"{type(error).__name__}: {error}".split())
             wanted = ", ".join(given) or "no arguments"
             raise ValueError(
-                f"the model of problem {self.name} must be made of {wanted}, but raised {said}"
+                f"the model of problem {self.name} must be made of {wanted}, but raised {said(error)}"
             ) from error
         if not isinstance(model, StateSpaceModel):
             raise ValueError(
@@ -174,13 +176,10 @@ def _data(problem: AssumedProblem, seeds: tuple[int, ...]) -> Data:
     return data.read_only()
 
 
-def wrapped(states: np.ndarray, model: StateSpaceModel) -> np.ndarray:
-    """True states of all runs and steps, one a row, angles within -pi and pi."""
-    rows = states.reshape(-1, states.shape[-1]).copy()
-    for i, state in enumerate(model.states[: rows.shape[1]]):
-        if state.angle:
-            rows[:, i] = np.arctan2(np.sin(rows[:, i]), np.cos(rows[:, i]))
-    return rows
+def rows_of(states: np.ndarray, model: StateSpaceModel) -> np.ndarray:
+    """True states of all runs and steps, one a row, angles in (-pi, pi]."""
+    rows = states.reshape(-1, states.shape[-1])
+    return wrapped_where(rows, model.shape.state_angles[: rows.shape[1]])
 
 
 def as_argument(cov: np.ndarray):

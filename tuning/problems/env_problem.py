@@ -9,9 +9,10 @@ import gymnasium as gym
 import numpy as np
 
 from numerics.checks import covariance, covariance_root, shown
+from numerics.modules import said
 from numerics.streams import MEASUREMENT, episode_keys, filter_keys, normal_block
 from plants.state_space import StateSpaceModel
-from tuning.problems.assumed import AssumedProblem, as_argument, wrapped
+from tuning.problems.assumed import AssumedProblem, as_argument, rows_of
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.digest import digest_of
 from tuning.problems.excitation import EXCITATIONS, Excitation
@@ -143,7 +144,7 @@ class EnvProblem(AssumedProblem):
     def found_scale(self) -> np.ndarray:
         """The standard deviation of each true state over the scored steps of 16 seeds."""
         data = self.data(SCALE_SEEDS)
-        scale = wrapped(data.states[:, data.scored], self.model()).std(axis=0)
+        scale = rows_of(data.states[:, data.scored], self.model()).std(axis=0)
         if not (scale > 0).all():
             raise ValueError(
                 f"the scale of problem {self.name} must be given where a state does not move, "
@@ -202,8 +203,9 @@ class EnvProblem(AssumedProblem):
             make = partial(gym.make, self.env) if isinstance(self.env, str) else self.env
             made = make(**self.env_arguments)
         except (gym.error.Error, TypeError, ImportError) as error:
-            said = " ".join(f"{type(error).__name__}: {error}".split())
-            raise ValueError(f"the env of problem {name} must be one that can be made, but {said}") from error
+            raise ValueError(
+                f"the env of problem {name} must be one that can be made, but {said(error)}"
+            ) from error
         if not isinstance(made, gym.Env):
             raise ValueError(f"the env of problem {name} must be a gymnasium.Env, but it is {shown(made)}")
         return made

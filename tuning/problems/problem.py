@@ -13,9 +13,6 @@ from plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 
-NOISE = ("process_noise_cov", "measurement_noise_cov")  # arguments that every problem's model takes ...
-PRIOR = "prior_cov_factor"  # ... and a factor on P_0
-
 
 class Problem(ABC):
     """A plant that makes data, and a family of models that filters may assume of it.

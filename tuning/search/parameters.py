@@ -10,9 +10,11 @@ import numpy as np
 
 from filters.estimators.find import is_foreign, parameters_of
 from filters.registry import filter_class, tunable_numbers
+from filters.tuned_file import NOISE
+from filters.tuned_file import PRIOR as PRIOR_FACTOR
 from numerics.checks import covariance
 from tuning.problems.parameter import Argument, Parameter, Place, squared
-from tuning.problems.problem import NOISE, Problem
+from tuning.problems.problem import Problem
 from tuning.search.correlations import correlations_of, full_covariance
 
 Q, R = NOISE  # arguments of the model
@@ -93,7 +95,7 @@ class FilterNumber:
         return choice._replace(numbers={**choice.numbers, self.name: value})
 
 
-PRIOR = Argument("prior_cov_factor", is_variance=True)
+PRIOR = Argument(PRIOR_FACTOR, is_variance=True)
 
 
 def _own(name: str, low: float, high: float, **options) -> Parameter:
