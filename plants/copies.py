@@ -10,8 +10,7 @@ import numpy as np
 
 from numerics.compiled import compiled, function_fingerprint, inlined, is_interpreting
 from numerics.threads import in_parts, worker_threads
-from plants.disturbances.layout import KEY_0, KEY_1
-from plants.memory import gathered, new_memory, scatter, set_row
+from plants.memory import KEY_0, KEY_1, gathered, new_memory, scatter, set_row
 
 THREADED_BLOCKS = 8  # fewer blocks are done before a second thread has woken up
 
@@ -39,7 +38,7 @@ class PlantCopies:
         Args:
             count: number of copies.
             numbers: what the compiled step knows of the plant.
-            rows: of the memory, those in front (`plants.disturbances.layout`) included.
+            rows: of the memory, those in front (`plants.memory.FRONT`) included.
         """
         self.count, self.numbers = count, numbers
         self.memory = new_memory(count, rows)

@@ -13,10 +13,10 @@ from numerics.checks import seed as checked_seed
 from numerics.streams import draw_key
 from plants.commands import one_number, some_numbers
 from plants.copies import PlantCopies
-from plants.disturbances.layout import REWARD, TERMINATED
+from plants.memory import REWARD, TERMINATED
 from plants.quantities import Quantity
 from plants.rendered import RenderedEnv
-from plants.report import ReportRows, info_maker, observation_of, views_of
+from plants.report import FLOAT32_ENDS, ReportRows, info_maker, observation_of, views_of
 
 # What `_set_views` makes.
 VIEWS = ("_memory", "_command", "_numbers", "_advance", "_report", "_views", "_info")
@@ -141,7 +141,7 @@ class PlantEnv(RenderedEnv):
         return self._observation(report), report[REWARD], report[TERMINATED] > 0.0, False, info
 
     def _observation(self, report: list[float]) -> np.ndarray:
-        if self._single and -3e38 < report[self._readings] < 3e38:
+        if self._single and -FLOAT32_ENDS < report[self._readings] < FLOAT32_ENDS:
             self._observation_buffer[0] = report[self._readings]
             return self._observation_buffer.copy()  # twice as fast as a new array of one number
         return observation_of([report[row] for row in self._observed])

@@ -1,13 +1,17 @@
 """The memory of many copies of a plant: one float64 array (blocks, rows, width), block by block.
 
 So a block's rows fit the fastest cache and every loop over copies is vector code. A single env is one block of
-width one. What lies in the first rows says `plants.disturbances.layout`.
+width one. The first rows of every plant hold what random draws depend on, and what is reported of a step; the
+plant's own follow. A measured channel has a row, and so many rows behind it (the plant's `Context.valid_offset`,
+the same for all its channels) one that says whether the measurement is valid.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+KEY_0, KEY_1, STEP, REWARD, TERMINATED, TIME = FRONT = range(6)
+FIRST_REPORTED = REWARD
 WIDTH = 128  # copies in a block: 23 rows of them are 23 KiB
 
 

@@ -7,7 +7,7 @@ from functools import cache
 
 from numerics.streams import normal_block
 from numerics.tuples import written_out
-from plants.disturbances.layout import KEY_0, KEY_1, STEP
+from plants.memory import KEY_0, KEY_1, STEP
 
 BLOCK = 4  # normals of one draw
 

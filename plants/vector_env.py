@@ -14,8 +14,8 @@ from gymnasium.vector.utils import batch_space
 from numerics.checks import at_least
 from numerics.keys import EpisodeKeys, reset_mask
 from plants.commands import of_copies
-from plants.disturbances.layout import REWARD, TERMINATED, TIME
 from plants.env import PlantEnv
+from plants.memory import REWARD, TERMINATED, TIME
 from plants.report import infos_of, observations_of
 
 MOST_ENVS = 1_000_000  # of some kilobytes each

@@ -21,9 +21,9 @@ from plants.channels import Channel, reader_of
 from plants.copies import PlantCopies, machine_code_of
 from plants.disturbances.chains import chain_of
 from plants.disturbances.effects import Context, encoded
-from plants.disturbances.layout import FIRST_REPORTED, FRONT, REWARD, STEP, TERMINATED, TIME
 from plants.disturbances.sensors import SENSOR_EFFECTS
 from plants.env import PlantEnv
+from plants.memory import FIRST_REPORTED, FRONT, REWARD, STEP, TERMINATED, TIME
 from plants.modelled import ModelledEnv
 from plants.noise import noise_adder
 from plants.quantities import Quantity

@@ -7,8 +7,8 @@ import numpy as np
 
 from numerics.checks import finite
 from plants.arguments import arguments_of, takes_arguments_of
-from plants.disturbances.layout import KEY_0, KEY_1, TIME
 from plants.env import PlantEnv
+from plants.memory import KEY_0, KEY_1, TIME
 from plants.report import ReportRows
 from thruster_env.effects.reference import Constant
 from thruster_env.effects.uncertainty import drawn_parameters

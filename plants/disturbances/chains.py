@@ -6,8 +6,14 @@ from collections.abc import Callable
 
 from numerics.compiled import inlined
 from numerics.tuples import written_out
-from plants.disturbances.effects import Effect
-from plants.disturbances.layout import EFFECT_KIND, EFFECT_NUMBER, EFFECT_PARAMETERS, EFFECT_ROWS, EFFECT_TARGET
+from plants.disturbances.effects import (
+    EFFECT_KIND,
+    EFFECT_NUMBER,
+    EFFECT_PARAMETERS,
+    EFFECT_ROWS,
+    EFFECT_TARGET,
+    Effect,
+)
 
 
 def _dispatch(effects: tuple[type[Effect], ...]) -> Callable:

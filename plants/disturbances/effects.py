@@ -21,8 +21,10 @@ import numpy as np
 from numerics.checks import shown
 from numerics.compiled import inlined
 from numerics.streams import CHANCE, DISTURBANCE, normal_block, uniform_block
-from plants.disturbances.layout import KEY_0, KEY_1, STEP
+from plants.memory import KEY_0, KEY_1, STEP
 
+# An effect in a row of numbers: its length, kind, row that it acts on, first row of its own, number, parameters.
+EFFECT_KIND, EFFECT_TARGET, EFFECT_ROWS, EFFECT_NUMBER, EFFECT_PARAMETERS = range(1, 6)
 MAGNITUDES = (1e-100, 1e100)  # of an effect's arguments and of what follows from them
 LONGEST = 1e9  # [s], and in steps: what an effect may hold
 

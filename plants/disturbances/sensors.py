@@ -14,7 +14,7 @@ import numpy as np
 from numerics.checks import at_least, finite, positive, within
 from numerics.compiled import inlined
 from plants.disturbances.effects import Context, Effect, Registry, normals, set_field, uniforms
-from plants.disturbances.layout import STEP
+from plants.memory import STEP
 
 SENSOR_EFFECTS = Registry("sensors")
 LONGEST_DELAY = 10_000  # steps, each of which takes two numbers of every copy's memory

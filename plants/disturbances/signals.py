@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from numerics.checks import finite, positive
 from numerics.compiled import inlined
 from plants.disturbances.effects import Context, Effect, normals, set_field, uniforms
-from plants.disturbances.layout import STEP
 from plants.disturbances.recorded import RecordedSeries, recorded_value
+from plants.memory import STEP
 
 
 @inlined

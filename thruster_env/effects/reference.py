@@ -15,8 +15,8 @@ from numerics.checks import finite, positive, shown, vector
 from numerics.compiled import inlined
 from numerics.streams import REFERENCE_SIGNAL, normal_block, uniform_block
 from plants.disturbances.effects import LONGEST, Effect, Registry, set_field
-from plants.disturbances.layout import KEY_0, KEY_1, STEP
 from plants.disturbances.recorded import RecordedSeries, recorded_value
+from plants.memory import KEY_0, KEY_1, STEP
 from thruster_env.effects.context import ThrusterContext
 from thruster_env.engine.memory import SAMPLE_TIME
 

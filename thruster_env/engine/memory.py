@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from plants.disturbances.layout import FRONT
+from plants.memory import FRONT
 from thruster_env.channels import MAX_CHANNELS
 from thruster_env.dynamics import Constants
 

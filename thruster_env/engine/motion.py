@@ -9,7 +9,7 @@ from __future__ import annotations
 from numerics.compiled import inlined
 from numerics.streams import INITIAL, PROCESS, normal_block
 from numerics.tuples import vector_reader, written_out
-from plants.disturbances.layout import KEY_0, KEY_1, REWARD, STEP
+from plants.memory import KEY_0, KEY_1, REWARD, STEP
 from thruster_env.dynamics import Constants, substep, thrust_and_torque
 from thruster_env.engine.memory import (
     AMBIENT,

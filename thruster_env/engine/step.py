@@ -17,7 +17,7 @@ from numerics.streams import MEASUREMENT, normal_block
 from numerics.threads import in_parts
 from plants.channels import Channel, reader_of
 from plants.disturbances.chains import chain_of
-from plants.disturbances.layout import FIRST_REPORTED, KEY_0, KEY_1, REWARD, STEP, TERMINATED, TIME
+from plants.memory import FIRST_REPORTED, KEY_0, KEY_1, REWARD, STEP, TERMINATED, TIME
 from thruster_env.channels import CHANNELS, MAX_CHANNELS, thrust
 from thruster_env.engine.memory import (
     AMBIENT,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from plants.disturbances.layout import TIME
+from plants.memory import TIME
 from plants.rendered import RenderedEnv
 from thruster_env.engine.memory import AMBIENT, COMMAND, FLOW, OMEGA, READINGS, REFERENCE, THRUST
 from thruster_env.linear.steady_state import state_range
