@@ -22,8 +22,8 @@ from training.extras import check_installed
 from training.observations import ARMS
 from training.setup import Setup, make_setup
 from training.tasks import TASKS
+from tuning.problems.plain import plain
 from tuning.thruster.find import find_scenario
-from tuning.thruster.scenario import plain
 from tuning.thruster.scenarios import SCENARIOS
 
 if TYPE_CHECKING:

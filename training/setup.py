@@ -16,7 +16,8 @@ from training.algorithms import find_algorithm
 from training.checks import check_setup
 from training.observations import find_arm
 from training.tasks import TASKS
-from tuning.thruster.scenario import Scenario, plain
+from tuning.problems.plain import plain
+from tuning.thruster.scenario import Scenario
 
 VERSION = 1
 MOST_ENVS = 100_000  # whose experience, of 100 steps each, takes a gigabyte

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tuning.problems import find
+from tuning.problems import rooms as rooms_of_plants
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = (
@@ -91,7 +91,7 @@ def test_rooms_of_tuning_know_those_of_plants_by_the_finder_alone():
     rooms = {room.replace("/", ".") for room in TUNING_OF_PLANTS}
     outside = [path for path in FILES if path.relative_to(ROOT).parent.as_posix() not in TUNING_OF_PLANTS]
     knowing = [path for path in outside if room_of(path) == "tuning" and imports_of(path) & rooms]
-    assert not knowing and set(find.ROOMS) == {f"{room}.find" for room in rooms}
+    assert not knowing and set(rooms_of_plants.ROOMS.values()) == {f"{room}.find" for room in rooms}
 
 
 def test_only_tuning_imports_optuna():

@@ -15,8 +15,8 @@ from studies.comparison import compare
 from thruster_cli.simulate import command
 from thruster_env.parameters import TUNNEL
 from training.setup import setup_from_json
+from tuning.problems.files import read_scenario
 from tuning.problems.seeds import held_out_seeds, training_seeds
-from tuning.thruster.files import read_scenario
 from tuning.thruster.scenarios import SCENARIOS
 
 pytestmark = pytest.mark.usefixtures("as_python")
@@ -135,4 +135,4 @@ def test_files_that_are_nested_without_end_are_refused(tmp_path):
     refused(lambda: read_tuned_file(tmp_path / "deep.json"), "a tuned file must be whole JSON")
     refused(lambda: setup_from_json(text, "policy.json"), "policy.json must hold the setup of a policy")
     (tmp_path / "deep.toml").write_text(f"steps = {text}")
-    refused(lambda: read_scenario(tmp_path / "deep.toml", SCENARIOS.get), "a scenario file must be TOML")
+    refused(lambda: read_scenario(tmp_path / "deep.toml"), "a scenario file must be TOML")

@@ -67,8 +67,9 @@ def test_a_tuned_filter_finds_the_file_of_its_scenario_again(file):
 
 
 BAD = {
-    "colour = 1": r"keys of a scenario must be among base, about, .*, but my.toml has \['colour'\]",
+    "colour = 1": r"keys of a scenario must be among plant, base, about, .*, but my.toml has \['colour'\]",
     "name = 'x'": r"keys of a scenario must be among .*, but my.toml has \['name'\]",
+    "plant = 'kite'": r"plant of a scenario must be one of thruster.*, but got 'kite' \(in my.toml\)",
     "a = [": "a scenario file must be TOML, but my.toml is not: ",
     "base = 'none'": r"scenario must be one of nominal, .*, but got 'none' \(in my.toml\)",
     "scale = [1.0, 0.0]": r"scale must be positive in every state, but got \[1.0, 0.0\] \(in my.toml\)",

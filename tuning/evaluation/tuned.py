@@ -21,8 +21,10 @@ from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
-from tuning.problems.find import built_in, find_given, find_problem, problem_from_mapping
+from tuning.problems.files import scenario_of
+from tuning.problems.find import find_given, find_problem
 from tuning.problems.problem import Problem
+from tuning.problems.rooms import built_in
 from tuning.search.objectives import NIS_BAND
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
@@ -130,7 +132,7 @@ def problem_in(content: Mapping, name, path: str | Path, given: Sequence[Problem
     mapping = kept.get("content") if isinstance(kept, Mapping) else kept
     if mapping is None:
         return find_given(name, (), path)
-    return problem_from_mapping(mapping, name, path)
+    return scenario_of(mapping, name, path)
 
 
 def _warn_of_changes(content: Mapping, path: str | Path) -> None:

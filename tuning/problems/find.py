@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 import copy
-import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
 
 from numerics.checks import shown
 from numerics.modules import is_code, object_named, said
 from tuning.problems.check import checked_problem
+from tuning.problems.files import read_scenario
 from tuning.problems.problem import Problem
-
-# Modules of the rooms that know a plant, imported when a name is looked for: each has NAMES of problems,
-# find_scenario(name or file) and from_mapping(content, name, file).
-ROOMS = ("tuning.thruster.find",)
-FILES_ARE_OF = ROOMS[0]  # whose files .toml are, and what tuned files keep as data
-
-
-def built_in() -> dict[str, ModuleType]:
-    """Names of the problems that come with the package, and the room of each."""
-    rooms = [importlib.import_module(room) for room in ROOMS]
-    return {name: room for room in rooms for name in room.NAMES}
+from tuning.problems.rooms import built_in
 
 
 def find_problem(name: str) -> Problem:
@@ -33,15 +22,15 @@ def find_problem(name: str) -> Problem:
     Raises:
         ValueError: states the rule and the value, where there is no such problem, or what is there is none.
     """
+    known = built_in()  # whose names may have a colon, too
+    if isinstance(name, str) and name in known:
+        return known[name].find_scenario(name)
     if is_code(name):
         return _from_module(name)
     if isinstance(name, str) and name.endswith(".toml"):
-        return importlib.import_module(FILES_ARE_OF).find_scenario(name)
-    known = built_in()
-    if not isinstance(name, str) or name not in known:
-        rule = f"problem must be one of {', '.join(known)}, a file that ends in .toml, or module:object"
-        raise ValueError(f"{rule}, but got {shown(name)}")
-    return known[name].find_scenario(name)
+        return read_scenario(name)
+    rule = f"problem must be one of {', '.join(known)}, a file that ends in .toml, or module:object"
+    raise ValueError(f"{rule}, but got {shown(name)}")
 
 
 def find_same(name: str, digest: str) -> Problem:
@@ -70,17 +59,12 @@ def find_given(name, given: Sequence[Problem], where: str | Path) -> Problem:
     for one in given:
         if one.name == name:
             return one
-    if not is_code(name):
+    if not is_code(name) or name in built_in():
         return find_problem(name)
     raise ValueError(
         f"a problem that is code must be given, but {where} only names {shown(name)}: "
         f"say --problem {name}, if you trust it"
     )
-
-
-def problem_from_mapping(content: Mapping, name: str, file: str | Path) -> Problem:
-    """The problem of which a tuned file keeps `Problem.as_mapping`; ValueError with the file if it is none."""
-    return importlib.import_module(FILES_ARE_OF).from_mapping(content, name, file)
 
 
 def _from_module(name: str) -> Problem:

@@ -2,31 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
-
 from numerics.checks import shown
-from tuning.thruster.files import read_scenario, scenario_of
+from tuning.problems.files import read_scenario
+from tuning.thruster.scale import computed_scale
 from tuning.thruster.scenario import Scenario
 from tuning.thruster.scenarios import SCENARIOS
 
+__all__ = ["NAMES", "NOMINAL", "Scenario", "computed_scale", "find_scenario"]
 NAMES = tuple(SCENARIOS)
+NOMINAL = "nominal"
 
 
 def find_scenario(name: str) -> Scenario:
     """A scenario by its name, or from a file that ends in .toml.
 
     Raises:
-        ValueError: for an unknown name, or a file that `files.read_scenario` refuses.
+        ValueError: for an unknown name, a file that `read_scenario` refuses, or one of another plant.
     """
     if isinstance(name, str) and name.endswith(".toml"):
-        return read_scenario(name, find_scenario)
+        found = read_scenario(name)
+        if not isinstance(found, Scenario):
+            raise ValueError(
+                f"scenario must be one of the thruster, but {name} is one of plant {found.plant_kind!r}"
+            )
+        return found
     if not isinstance(name, str) or name not in SCENARIOS:
         known = ", ".join(SCENARIOS)
         raise ValueError(f"scenario must be one of {known}, or a file that ends in .toml, but got {shown(name)}")
     return SCENARIOS[name]
-
-
-def from_mapping(content: Mapping, name: str, file: str | Path) -> Scenario:
-    """The scenario that a file holds as data; see `files.scenario_of`."""
-    return scenario_of(content, name, file)

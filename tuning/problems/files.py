@@ -7,20 +7,21 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
 
-from numerics.checks import shown
-from tuning.thruster.scale import computed_scale
-from tuning.thruster.scenario import Scenario
+from numerics.checks import one_of, shown
+from tuning.problems.rooms import ROOMS, room_of
+from tuning.problems.scenario import BaseScenario
 
-FILE_SEQUENCES = 200  # voltage sequences for the scale of a file that gives none
-KEYS = ("base", *(entry.name for entry in fields(Scenario) if entry.name != "name"))
+FILE_SEQUENCES = 200  # input sequences for the scale of a file that gives none
+PLANT = "plant"  # the key that says whose scenario it is
+BASE = "base"
 
 
-def read_scenario(path: str | Path, find_base: Callable[[str], Scenario]) -> Scenario:
+def read_scenario(path: str | Path) -> BaseScenario:
     """A scenario from a TOML file, named by the path.
 
-    Its keys are the fields of `Scenario` but for the name, and `base`: the scenario whose fields are taken where
-    the file has none of its own, "nominal" if it is left out. Where the file has no `scale`, it is computed
-    (`scale.computed_scale`).
+    Its keys are `plant`, one of `rooms.ROOMS`, "thruster" if it is left out; the fields of that plant's `Scenario`
+    but for the name; and `base`: the scenario whose fields are taken where the file has none of its own, the
+    plant's nominal one if it is left out. Where the file has no `scale`, it is computed.
 
         base = "outliers"
         about = "outliers under a binary sequence, with a flow that the filter does not know"
@@ -29,7 +30,6 @@ def read_scenario(path: str | Path, find_base: Callable[[str], Scenario]) -> Sce
 
     Args:
         path: the file.
-        find_base: gives the scenario that `base` names.
 
     Raises:
         ValueError: states the rule and the value, with the path.
@@ -40,24 +40,26 @@ def read_scenario(path: str | Path, find_base: Callable[[str], Scenario]) -> Sce
         raise ValueError(f"a scenario file must be readable, but {path} is not: {error.strerror}") from None
     except (ValueError, RecursionError) as error:  # not TOML, nested too deeply, or not even text
         raise ValueError(f"a scenario file must be TOML, but {path} is not: {error}") from None
-    unknown = sorted(set(content) - set(KEYS))
+    room = _room(content, path)
+    known = (PLANT, BASE, *_fields(room.Scenario))
+    unknown = sorted(set(content) - set(known))
     if unknown:
-        raise ValueError(f"keys of a scenario must be among {', '.join(KEYS)}, but {path} has {unknown}")
+        raise ValueError(f"keys of a scenario must be among {', '.join(known)}, but {path} has {unknown}")
     scale = content.pop("scale", None)
 
-    def make() -> Scenario:
-        base = find_base(content.pop("base", "nominal"))
+    def make() -> BaseScenario:
+        base = room.find_scenario(content.pop(BASE, room.NOMINAL))
         changes = {"about": "", **content, "name": str(path)}
         scenario = _checked(base.replace(**changes, scale=base.scale if scale is None else scale))
-        return (
-            scenario.replace(scale=tuple(computed_scale(scenario, FILE_SEQUENCES))) if scale is None else scenario
-        )
+        if scale is not None:
+            return scenario
+        return scenario.replace(scale=tuple(room.computed_scale(scenario, FILE_SEQUENCES)))
 
     return _made(make, content, path)
 
 
-def scenario_of(content, name: str, file: str | Path) -> Scenario:
-    """The scenario of which `Scenario.as_mapping` is the content, as a tuned file keeps it.
+def scenario_of(content, name: str, file: str | Path) -> BaseScenario:
+    """The scenario of which `BaseScenario.as_mapping` is the content, as a tuned file keeps it.
 
     Args:
         content: the mapping.
@@ -67,20 +69,34 @@ def scenario_of(content, name: str, file: str | Path) -> Scenario:
     Raises:
         ValueError: states the rule and the value, with the file.
     """
-    known = [key for key in KEYS if key != "base"]
-    if not isinstance(content, Mapping) or not set(content) <= set(known):
+    own = dict(content) if isinstance(content, Mapping) else {}
+    room = _room(own, file)
+    known = _fields(room.Scenario)
+    if not isinstance(content, Mapping) or not set(own) <= set(known):
         raise ValueError(
             f"a scenario in a file must be a mapping of {', '.join(known)}, but {file} has {shown(content)}"
         )
-    return _made(lambda: _checked(Scenario(name=name, **content)), content, file)
+    return _made(lambda: _checked(room.Scenario(name=name, **own)), own, file)
 
 
-def _checked(scenario: Scenario) -> Scenario:
+def _room(content: dict, path: str | Path):
+    """The room of the plant whose scenario a file's content is; takes the key away."""
+    try:
+        return room_of(one_of("plant of a scenario", content.pop(PLANT, next(iter(ROOMS))), tuple(ROOMS)))
+    except ValueError as error:
+        raise ValueError(f"{error} (in {path})") from None
+
+
+def _fields(scenario: type[BaseScenario]) -> list[str]:
+    return [entry.name for entry in fields(scenario) if entry.name != "name"]
+
+
+def _checked(scenario: BaseScenario) -> BaseScenario:
     scenario.model()  # which makes the plant: the rest is checked there
     return scenario
 
 
-def _made(make: Callable[[], Scenario], content: Mapping, path: str | Path) -> Scenario:
+def _made(make: Callable[[], BaseScenario], content: Mapping, path: str | Path) -> BaseScenario:
     """What `make` makes of a file's content; a ValueError with the path where that cannot be."""
     try:
         return make()

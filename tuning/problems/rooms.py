@@ -1,0 +1,20 @@
+"""The rooms of `tuning` that know a plant, named as text: they are imported when a name is looked for."""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
+# Each has the class Scenario, NAMES of scenarios, the NOMINAL one, find_scenario(name) and
+# computed_scale(scenario, sequences).
+ROOMS = {"thruster": "tuning.thruster.find"}
+
+
+def room_of(plant: str) -> ModuleType:
+    """The room of a plant by its key in `ROOMS`."""
+    return importlib.import_module(ROOMS[plant])
+
+
+def built_in() -> dict[str, ModuleType]:
+    """Names of the problems that come with the package, and the room of each."""
+    return {name: room for room in map(room_of, ROOMS) for name in room.NAMES}

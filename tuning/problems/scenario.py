@@ -1,0 +1,143 @@
+"""`BaseScenario`: a problem that is plain data, an immutable recipe which files hold whole."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
+from typing import ClassVar, Self
+
+from numerics.checks import at_least, shown, vector
+from tuning.problems.data import FIRST_SCORED_STEP, Data
+from tuning.problems.excitation import EXCITATIONS, Excitation, Steps
+from tuning.problems.plain import as_data, frozen, plain
+from tuning.problems.problem import Problem
+
+MOST_STEPS = 1_000_000
+
+
+@dataclass(frozen=True, kw_only=True)
+class BaseScenario(Problem):
+    """What the scenarios of all plants have in common; a plant's own adds the fields of its plant.
+
+    A subclass is a frozen dataclass of plain data, says what else there is to check in `own_checks`, and makes its
+    data in `make`.
+
+    Attributes:
+        plant_kind: key of its plant in `rooms.ROOMS`.
+        name: its name; that of its file if it was read from one.
+        about: one line for tables and help.
+        scale: what errors of each state are measured in, fixed numbers.
+        process_noise_cov: the plant's Q, a variance a state and step.
+        measurement_noise_cov: the plant's R, a variance a channel.
+        parameter_factors: factors on the plant's parameters in the filter's model.
+        excitation: makes the inputs; one of `excitation.EXCITATIONS`, or a mapping with its name.
+        steps: length of a run.
+        first_scored_step: where errors begin to count. Below 50 the start-up counts, too, and a study then tunes
+            the scale of P_0.
+    """
+
+    plant_kind: ClassVar[str]
+    name: str
+    about: str = ""
+    scale: Sequence[float]
+    process_noise_cov: Sequence[float]
+    measurement_noise_cov: float | Sequence[float]
+    parameter_factors: Mapping[str, float] = field(default_factory=dict)
+    excitation: Excitation | Mapping = field(default_factory=Steps)
+    steps: int = 500
+    first_scored_step: int = FIRST_SCORED_STEP
+
+    def __post_init__(self):
+        """Check what the plant, which is made when it is needed, does not."""
+        if not isinstance(self.excitation, Excitation):
+            object.__setattr__(self, "excitation", EXCITATIONS.make([self.excitation])[0])
+        for name, kind, called in (("about", str, "text"), ("parameter_factors", Mapping, "a mapping")):
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"{name} must be {called}, but got {shown(getattr(self, name))}")
+        checked = self.own_checks() | {
+            "steps": at_least("steps", self.steps, FIRST_SCORED_STEP + 1, MOST_STEPS),
+            "first_scored_step": at_least("first_scored_step", self.first_scored_step, 0),
+        }
+        if checked["first_scored_step"] >= checked["steps"]:
+            raise ValueError(
+                f"first_scored_step must be below the number of steps, {self.steps}, "
+                f"but got {self.first_scored_step}"
+            )
+        for entry in fields(self):
+            object.__setattr__(self, entry.name, frozen(checked.get(entry.name, getattr(self, entry.name))))
+
+    def own_checks(self) -> dict:
+        """Fields of the plant and `scale` as they are to be kept; ValueError for wrong ones."""
+        raise NotImplementedError
+
+    def make(self, seeds: tuple[int, ...]) -> Data:
+        """The data of some seeds; `data` keeps the last ones."""
+        raise NotImplementedError
+
+    def checked_scale(self, states: int) -> list[float]:
+        """The scale as one positive number a state; ValueError for another."""
+        scale = vector("scale", self.scale, states)
+        if not (scale > 0).all():
+            raise ValueError(f"scale must be positive in every state, but got {scale.tolist()}")
+        return scale.tolist()
+
+    def __getstate__(self) -> dict:
+        """The fields as dictionaries and lists, for copies and pickles: a mapping that cannot change has none."""
+        return {entry.name: plain(getattr(self, entry.name)) for entry in fields(self)}
+
+    def __setstate__(self, state: dict) -> None:
+        """The fields, so that they cannot be changed again."""
+        for name, value in state.items():
+            object.__setattr__(self, name, frozen(value))
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.process_noise_cov, self.measurement_noise_cov, self.excitation, self.steps))
+
+    @property
+    def true(self) -> dict:
+        """Model arguments of the filter that knows the plant's Q and R."""
+        return {
+            "process_noise_cov": self.process_noise_cov,
+            "measurement_noise_cov": self.measurement_noise_cov,
+        }
+
+    @property
+    def held(self) -> dict:
+        """What the filter's model gets wrong of the plant's parameters."""
+        return {"parameter_factors": dict(self.parameter_factors)}
+
+    @property
+    def counts_start_up(self) -> bool:
+        """Whether the first steps count, in which P_0 is felt."""
+        return self.first_scored_step < FIRST_SCORED_STEP
+
+    @property
+    def digest(self) -> str:
+        """The first part of a SHA-256 of all that the scenario says but for its name and what it is about."""
+        content = {entry.name: plain(getattr(self, entry.name)) for entry in fields(self)}
+        content |= {"excitation": self.excitation.as_mapping(), "scale": [f"{part:.6g}" for part in self.scale]}
+        del content["name"], content["about"]
+        return hashlib.sha256(json.dumps(content, sort_keys=True, default=repr).encode()).hexdigest()[:12]
+
+    def as_mapping(self) -> dict:
+        """All that it says but for its name, as JSON can hold it; `tuning.problems.files.scenario_of` reads it."""
+        content = {
+            entry.name: as_data(getattr(self, entry.name)) for entry in fields(self) if entry.name != "name"
+        }
+        return {"plant": self.plant_kind, **content, "excitation": self.excitation.as_mapping()}
+
+    def replace(self, **changes) -> Self:
+        """The same scenario with some fields changed."""
+        return replace(self, **changes)
+
+    def data(self, seeds: Sequence[int]) -> Data:
+        """Truth, inputs and measurements for seeds; the same as an env's that is reset with these seeds."""
+        return _data(self, tuple(int(seed) for seed in seeds))
+
+
+@lru_cache(maxsize=8)
+def _data(scenario: BaseScenario, seeds: tuple[int, ...]) -> Data:
+    return scenario.make(seeds).read_only()
