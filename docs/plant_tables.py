@@ -9,10 +9,10 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from docs.page import digits, table
+from plants.observe import ObserveStateVector
 from thruster_env.control.controllers import LQRController, PIController
 from thruster_env.dynamics import rates
 from thruster_env.linear.steady_state import jacobians, required_substeps, run_substeps, state_range, steady_state
-from thruster_env.observe import ObserveStateVector
 from thruster_env.parameters import PRESETS, ThrusterParameters, derive_constants
 from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_MEASUREMENT_NOISE
 

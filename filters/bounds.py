@@ -1,4 +1,4 @@
-"""How good an estimate can be: the Riccati covariance and the posterior Cramer-Rao bound."""
+"""How good an estimate can be: Riccati covariances and the posterior Cramer-Rao bound."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from functools import cache
 
 import numpy as np
 
+from filters.engine.batch import run
+from filters.gaussian.extended import ExtendedKalmanFilter
 from numerics.checks import at_least
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from numerics.matrices import multiplier, quadratic_form
@@ -16,7 +18,7 @@ from numerics.tuples import matrix_reader, vector_reader
 from plants.affine import AffineModel
 from plants.layout import constants_reader, number_places, padded
 from plants.shape import Functions, Shape, observation_slopes, transition_slopes
-from plants.simulate import truth_steps
+from plants.simulate import simulate, truth_steps
 from plants.state_space import StateSpaceModel
 
 
@@ -99,6 +101,37 @@ def posterior_bound(model: StateSpaceModel, inputs: np.ndarray, *, truths: int =
         j = q_inverse + information[:, k + 1] - np.swapaxes(d12, -1, -2) @ kept @ d12
         bound[:, k + 1] = np.linalg.inv((j + np.swapaxes(j, -1, -2)) / 2)
     return bound
+
+
+def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray | None = None) -> np.ndarray:
+    """Riccati covariance along the noise-free path of each input sequence, a reference for small noise.
+
+    With F and H at the states that follow from the prior mean without any noise,
+
+        P = F P F' + Q,  K = P H' (H P H' + R)^-1,  P = (I - K H) P
+
+    It is what an extended Kalman filter has that is right, and for a linear model the covariance of the optimum. It
+    is no bound where noise moves the state so far that F or H differ; but it holds where `posterior_bound` is
+    useless: where a state has hardly any process noise, E[F' Q^-1 F] takes the smallest differences of F between
+    truths for information, and for a singular Q.
+
+    Args:
+        model: the model that draws the truth.
+        inputs: (B, K, p), one sequence a row.
+        missing: whether each measurement is missing, (B, K + 1, m); none if None.
+
+    Returns:
+        P_k for every sequence and step, (B, K + 1, n, n); index 0 is after the first measurement.
+    """
+    inputs = np.ascontiguousarray(inputs, dtype=np.float64)
+    keys, nothing = np.zeros((len(inputs), 2)), np.zeros((model.n, model.n))
+    rounding = 1e-30 * model.measurement_noise_cov  # none at all is no covariance of a measurement
+    calm = model.replace(process_noise_cov=nothing, prior_cov=nothing, measurement_noise_cov=rounding)
+    measured = simulate(calm, keys, inputs).measurements
+    if missing is not None:
+        measured = np.where(missing, np.nan, measured)
+    # Measurements that are right leave the estimate on the path.
+    return run(ExtendedKalmanFilter(model=model), keys, inputs, measured).covs
 
 
 def _less_information(p: np.ndarray, information: np.ndarray) -> np.ndarray:

@@ -16,16 +16,16 @@ from thruster_cli.output import JsonOption, SeedOption, announce_compilation, em
 from thruster_cli.train import LEARNABLE
 from training.extras import check_installed
 from training.observations import find_arm
+from training.plants.find import plant_of
 from training.setup import Setup, in_scenario
+from tuning.problems.scenario import BaseScenario
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import HELD_OUT_SEEDS
-from tuning.thruster.find import find_scenario
-from tuning.thruster.scenario import Scenario
 
 if TYPE_CHECKING:
     from training.score import Scores
 
-PARTS = ("transient", "steady", "reversal", "observed")
+SEEN = "seen"  # heads the column of what the policy is shown
 
 
 class Scored(NamedTuple):
@@ -41,7 +41,7 @@ def command(
     models: Annotated[list[Path], typer.Argument(metavar="MODEL", help="Folders that `thruster train` made.")],
     scenario: Annotated[
         str | None,
-        typer.Option(help=f"Another plant than that of training: {', '.join(LEARNABLE)}, or a .toml file."),
+        typer.Option(help=f"Another plant than that of training: {LEARNABLE}, or a .toml file."),
     ] = None,
     classical: Annotated[
         list[str] | None,
@@ -71,14 +71,14 @@ def command(
     """
     check_installed()
     held_out = held_out_seeds(seed, seeds)
-    plant = None if scenario is None else find_scenario(scenario)
     with progress_console.status("loading torch ..."):
-        from training.classical import CONTROLLERS, FOR_STATES
         from training.saved import find_saved, read_setup
-    for name in classical or []:
-        one_of("classical", name, CONTROLLERS)
     folders = {model: find_saved(model) for model in models}
     setups = {model: read_setup(folder) for model, folder in folders.items()}
+    kind = plant_of(next(iter(setups.values())).task)
+    for name in classical or []:
+        one_of("classical", name, kind.controllers)
+    plant = None if scenario is None else kind.find_scenario(scenario)
     check_alike(list(setups.values()), plant)
     announce_compilation()
     scored = []
@@ -88,14 +88,14 @@ def command(
             scored.append(_learnt(model, folder, setups[model], plant, held_out))
         for name in classical or []:
             for setup in _each_arm(setups.values()):
-                if name in FOR_STATES and not find_arm(setup.observe).shows_state:
+                if name in kind.of_states and not find_arm(setup.observe).shows_state:
                     continue
                 status.update(f"scoring {name} on {setup.observe} ...")
                 scored.append(_classical(name, setup, plant, held_out))
     emit(report(scored, held_out), as_json(scored, held_out), json)
 
 
-def check_alike(setups: Sequence[Setup], plant: Scenario | None) -> None:
+def check_alike(setups: Sequence[Setup], plant: BaseScenario | None) -> None:
     """Raise ValueError unless all policies do the same task, on the same plant once a scenario is given."""
     for name in ("task", "env_id") + (("scenario",) if plant is None else ()):
         found = sorted({getattr(setup, name) for setup in setups})
@@ -106,7 +106,7 @@ def check_alike(setups: Sequence[Setup], plant: Scenario | None) -> None:
             )
 
 
-def _learnt(model: Path, folder: Path, setup: Setup, plant: Scenario | None, seeds: Sequence[int]) -> Scored:
+def _learnt(model: Path, folder: Path, setup: Setup, plant: BaseScenario | None, seeds: Sequence[int]) -> Scored:
     from training.environments import make_environments
     from training.saved import load
     from training.score import score
@@ -117,7 +117,7 @@ def _learnt(model: Path, folder: Path, setup: Setup, plant: Scenario | None, see
     return Scored(f"{setup.observe} {name}", model, setup, score(policy, met, seeds))
 
 
-def _classical(name: str, setup: Setup, plant: Scenario | None, seeds: Sequence[int]) -> Scored:
+def _classical(name: str, setup: Setup, plant: BaseScenario | None, seeds: Sequence[int]) -> Scored:
     from training.classical import classical_policy
     from training.score import score
 
@@ -137,18 +137,17 @@ def _each_arm(setups) -> list[Setup]:
 
 def report(scored: Sequence[Scored], seeds: range) -> list:
     """A table of policies, and where the learnt ones lie."""
-    rows, first = [], scored[0].scores.returns
+    kind = plant_of(scored[0].setup.task)
+    rows, first, shown_parts = [], scored[0].scores.returns, [part for part in kind.parts if part != "all"]
     for number, (label, _, _, scores) in enumerate(scored, start=1):
         over = "" if number == 1 else about(mean_interval(scores.returns - first), 3)
-        parts = [unless_blank(getattr(scores, part).rms, ".2f") for part in PARTS]
-        rows.append([f"{number} {label}", about(mean_interval(scores.returns), 3), over, *parts])
-    columns = ["policy", "mean return", "over the\nfirst", "transient\n[N]", "steady\n[N]", "reversal\n[N]"]
+        errors = [unless_blank(scores.parts[part].rms, ".2f") for part in shown_parts]
+        rows.append([f"{number} {label}", about(mean_interval(scores.returns), 3), over, *errors])
+    headers = [f"{SEEN if part == 'observed' else part}\n[{kind.parts[part]}]" for part in shown_parts]
+    columns = ["policy", "mean return", "over the\nfirst", *headers]
     title = f"Held-out episodes {seeds.start} to {seeds.stop - 1}, {scored[0].setup.task}"
-    caption = (
-        "±: half of the 95 % interval. [N]: root mean square error of thrust. "
-        "seen: of the thrust that the policy is shown; blank: no such step."
-    )
-    shown: list = [table(title, [*columns, "seen\n[N]"], rows, caption=caption)]
+    caption = f"±: half of the 95 % interval. Then root mean square errors: {kind.errors}; blank: no such step."
+    shown: list = [table(title, columns, rows, caption=caption)]
     learnt = [(number, one) for number, one in enumerate(scored, start=1) if one.folder is not None]
     return shown + [f"{number} {one.label}: {one.folder}" for number, one in learnt]
 
@@ -164,7 +163,7 @@ def as_json(scored: Sequence[Scored], seeds: range) -> dict:
                 "folder": None if folder is None else str(folder),
                 "mean_return": mean_interval(scores.returns)._asdict(),
                 "over_the_first": mean_interval(scores.returns - first)._asdict(),
-                **{f"{part}_rms": getattr(scores, part).rms for part in PARTS},
+                **{f"{name}_rms": part.rms for name, part in scores.parts.items()},
                 "returns": scores.returns,
             }
             for label, folder, _, scores in scored

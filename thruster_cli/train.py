@@ -16,22 +16,21 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least
 from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
-from thruster_env.control.predictive import HORIZONS
 from training.algorithms import ALGORITHMS
 from training.extras import check_installed
 from training.observations import ARMS
+from training.plants.find import PLANTS, TASKS, plant_of
 from training.setup import Setup, make_setup
-from training.tasks import TASKS
 from tuning.problems.plain import plain
-from tuning.thruster.find import find_scenario
-from tuning.thruster.scenarios import SCENARIOS
 
 if TYPE_CHECKING:
     from training.learn import Trained
 
 POLICIES = Path("out") / "policies"
 SHOWN_EVALUATIONS = 8
-LEARNABLE = [name for name, scenario in SCENARIOS.items() if scenario.system is None]
+LEARNABLE = ", ".join(name for plant in PLANTS.values() for name in plant.scenarios)
+DEFAULTS = ", ".join(f"{plant.scenario} for the {name}" for name, plant in PLANTS.items())
+CORRECTABLE = ", ".join(name for plant in PLANTS.values() for name in plant.correctable)
 FEWEST_STEPS = ", ".join(f"{name} {algorithm.steps}" for name, algorithm in ALGORITHMS.items())
 
 
@@ -43,8 +42,9 @@ def command(
         int | None, typer.Option(metavar="N", help=f"Steps of the env to learn from; by default {FEWEST_STEPS}.")
     ] = None,
     scenario: Annotated[
-        str, typer.Option(help=f"The plant and its noise: {', '.join(LEARNABLE)}, or a .toml file.")
-    ] = "medium_noise",
+        str | None,
+        typer.Option(help=f"The plant and its noise: {LEARNABLE}, or a .toml file; by default {DEFAULTS}."),
+    ] = None,
     tuned: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Tuned file of the filter, from `thruster tune`."),
@@ -55,7 +55,7 @@ def command(
     ] = False,
     controller: Annotated[
         str | None,
-        typer.Option(help=f"Let the policy correct one of {', '.join(HORIZONS)}, in place of acting alone."),
+        typer.Option(help=f"Let the policy correct one of {CORRECTABLE}, in place of acting alone."),
     ] = None,
     envs: Annotated[int | None, typer.Option(metavar="N", help="Copies of the env, stepped together.")] = None,
     evaluations: Annotated[
@@ -88,7 +88,9 @@ def command(
 
     Example: thruster train --task manoeuvre --observe enkf --seed 1
     """
-    chosen = find_scenario(scenario)
+    plant = plant_of(task)
+    scenario = plant.scenario if scenario is None else scenario
+    chosen = plant.find_scenario(scenario)
     if untuned and tuned is not None:
         raise ValueError("give either --tuned FILE or --untuned, but got both")
     setup = make_setup(

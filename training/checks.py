@@ -6,47 +6,39 @@ Gymnasium, a filter or Stable-Baselines3 that has not been looked at here, befor
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from filters.registry import tunable_numbers
 from numerics.checks import at_least, one_of, positive, shown
-from thruster_env.control.predictive import HORIZONS
-from thruster_env.env import BowThrusterEnv
-from thruster_env.model import MODEL_ARGUMENTS
 from training.algorithms import HYPERPARAMETERS, POLICY_ARGUMENTS, find_algorithm
 from training.observations import find_arm
-from training.tasks import TASKS
+from training.plants.find import plant_of
 
 if TYPE_CHECKING:
     from training.setup import Setup
 
-ENV_ARGUMENTS = tuple(
-    name for name in inspect.signature(BowThrusterEnv.__init__).parameters if name not in ("self", "render_mode")
-)
-
 
 def check_setup(setup: Setup) -> None:
     """Raise ValueError, with rule and value, if a setup holds anything that is no data or that nobody knows."""
-    task = TASKS[one_of("task", setup.task, tuple(TASKS))]
-    one_of("env_id", setup.env_id, (task.env_id,))
+    plant = plant_of(setup.task)
+    one_of("env_id", setup.env_id, (plant.tasks[setup.task].env_id,))
     arm, algorithm = find_arm(setup.observe), find_algorithm(setup.algo)
     if not isinstance(setup.scenario, str):
         raise ValueError(f"scenario must be a name, but got {shown(setup.scenario)}")
     for name, least in (("steps", 1), ("seed", 0), ("num_envs", 1)):
         at_least(name, getattr(setup, name), least)
     if setup.controller is not None:
-        one_of("controller", setup.controller, tuple(HORIZONS))
+        one_of("controller", setup.controller, plant.correctable)
         if not arm.shows_state:
             raise ValueError(f"{setup.controller} must observe a state, but got observe={setup.observe!r}")
     positive("share", setup.share)
-    own = () if arm.filter is None else (*tunable_numbers(arm.filter), *MODEL_ARGUMENTS)
-    _check_known("env_arguments", setup.env_arguments, ENV_ARGUMENTS)
+    own = () if arm.filter is None else (*tunable_numbers(arm.filter), *plant.model_arguments)
+    _check_known("env_arguments", setup.env_arguments, plant.env_arguments)
     _check_known(f"filter_arguments of observe={setup.observe!r}", setup.filter_arguments, own)
     if setup.assumed_plant is not None:
-        _check_known("assumed_plant", setup.assumed_plant, ENV_ARGUMENTS)
+        _check_known("assumed_plant", setup.assumed_plant, plant.env_arguments)
     known = (*HYPERPARAMETERS, *algorithm.hyperparameters)
     _check_known("hyperparameters", setup.hyperparameters, known)
     _check_known("policy_kwargs", setup.hyperparameters.get("policy_kwargs", {}), POLICY_ARGUMENTS)

@@ -1,66 +1,25 @@
-"""Classical policies for the same table: PI, LQR (LQG with an estimator), and the predictive controllers.
+"""Classical policies for the same tables: each observes what an arm of `training.observations` does.
 
-Each observes what an arm of `training.observations` does, so it stands beside the policy that learnt on that arm.
+So it stands beside the policy that learnt on that arm.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from itertools import product
-
-import numpy as np
-
 from numerics.checks import one_of
-from thruster_env.control.controllers import LQRController, PIController
-from thruster_env.control.predictive import HORIZONS
-from training.controllers import ClassicalPolicy, predictive
-from training.environments import make_single
+from training.controllers import ClassicalPolicy
 from training.observations import find_arm
-from training.score import score
+from training.plants.find import plant_of
 from training.setup import Setup
-from tuning.problems.seeds import training_seeds
-
-CONTROLLERS = ("pi", "lqr", *HORIZONS)
-FOR_STATES = CONTROLLERS[1:]  # those that must observe one, true or estimated
-GAINS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0)  # factors on the gains of `gains.lambda_gains`, tried for each arm
-GAIN_SEEDS = 16
-
-
-def lqr(setup: Setup) -> ClassicalPolicy:
-    """LQR on the true state, or on an estimate: certainty equivalence, so LQG."""
-    env = make_single(setup)
-    return ClassicalPolicy(LQRController.for_env(env), 1, env.unwrapped.plant.max_voltage)
-
-
-def pi(setup: Setup) -> ClassicalPolicy:
-    """PI with feed-forward on the thrust that an arm shows, with the gains that suit the arm best.
-
-    Factors `GAINS` on both gains of `lambda_gains` are tried on training seeds; the highest mean return wins.
-    """
-    env = make_single(setup)
-    usual, top = PIController.for_env(env), env.unwrapped.plant.max_voltage
-    tried = np.array(list(product(GAINS, GAINS))) * [usual.proportional_gain, usual.integral_gain]
-    # All pairs of gains at once, each on copies of its own: the controller takes arrays as it takes numbers.
-    each = np.repeat(tried, GAIN_SEEDS, axis=0).T
-    seeds = list(training_seeds(setup.seed, GAIN_SEEDS)) * len(tried)
-    returns = score(ClassicalPolicy(_with_gains(usual, *each), 0, top), setup, seeds).returns
-    best = tried[returns.reshape(len(tried), GAIN_SEEDS).mean(axis=1).argmax()]
-    return ClassicalPolicy(_with_gains(usual, *best.tolist()), 0, top)
-
-
-def _with_gains(controller: PIController, proportional, integral) -> PIController:
-    return replace(controller, proportional_gain=proportional, integral_gain=integral)
 
 
 def classical_policy(name: str, setup: Setup) -> ClassicalPolicy:
-    """A classical policy by the name of its controller.
+    """A classical policy by the name of its controller, on what a setup observes.
 
     Raises:
         ValueError: for an unknown name, or where a controller of states observes none.
     """
-    one_of("controller", name, CONTROLLERS)
-    if name in FOR_STATES and not find_arm(setup.observe).shows_state:
+    plant = plant_of(setup.task)
+    one_of("controller", name, plant.controllers)
+    if name in plant.of_states and not find_arm(setup.observe).shows_state:
         raise ValueError(f"{name} must observe a state, but got observe={setup.observe!r}")
-    if name in HORIZONS:
-        return predictive(name, make_single(setup).env)
-    return {"pi": pi, "lqr": lqr}[name](setup)
+    return plant.classical(name, setup)

@@ -1,49 +1,36 @@
-"""Controllers of `thruster_env` as policies, and policies that correct a controller."""
+"""Controllers of plants as policies, and policies that correct a controller."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from numerics.checks import one_of
-from thruster_env.control.controllers import LQRController, PIController
-from thruster_env.control.predictive import HORIZONS, PredictiveController
-from thruster_env.dynamics import Constants
+
+class Controller(Protocol):
+    """What acts on observations (n, d) as the env gives them, in the units of its inputs."""
+
+    def predict(self, observation, state=None, episode_start=None):
+        """Inputs (n, p), and what the controller remembers."""
 
 
 @dataclass(frozen=True)
 class ClassicalPolicy:
-    """A controller of `thruster_env` with the observations and actions of learnt policies."""
+    """A controller of a plant with the observations and actions of learnt policies."""
 
-    controller: PIController | LQRController | PredictiveController
+    controller: Controller
     skipped: int  # entries in front of what the controller reads
-    max_voltage: float
+    half: float | np.ndarray  # half of the range of each input, in its unit: the voltage's is max_voltage ...
+    middle: float | np.ndarray = 0.0  # ... about this
 
     def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
-        """Actions (n, 1) in [-1, 1] for observations (n, d), and what the controller remembers."""
+        """Actions (n, p) in [-1, 1] for observations (n, d), and what the controller remembers."""
         seen = np.asarray(observation)[..., self.skipped :]
-        voltage, state = self.controller.predict(seen, state, episode_start)
-        return voltage / self.max_voltage, state
-
-
-def predictive(name: str, env: gym.Env) -> ClassicalPolicy:
-    """A predictive controller by name, that believes in the thruster that the filter of an env does.
-
-    Args:
-        name: one of `HORIZONS`.
-        env: with the filter, if there is one, as its outermost wrapper.
-
-    Raises:
-        ValueError: for an unknown name.
-    """
-    horizon = HORIZONS[one_of("controller", name, tuple(HORIZONS))]
-    believed = getattr(getattr(env, "filter", None), "model", None)
-    constants = believed.constants if believed is not None and isinstance(believed.constants, Constants) else None
-    controller = PredictiveController.for_env(env, horizon, constants)
-    return ClassicalPolicy(controller, 1, env.unwrapped.plant.max_voltage)
+        inputs, state = self.controller.predict(seen, state, episode_start)
+        return (inputs - self.middle) / self.half, state
 
 
 class CorrectController(VecEnvWrapper):
@@ -73,7 +60,7 @@ class CorrectController(VecEnvWrapper):
     def step_async(self, actions: np.ndarray) -> None:
         """Correct what the controller does."""
         applied = np.clip(self._actions + self._share * np.clip(actions, -1.0, 1.0), -1.0, 1.0)
-        self._state[:, 0] = applied[:, 0] * self._controller.max_voltage  # the last voltage, as it really was
+        self._state[:, 0] = applied[:, 0] * self._controller.half  # the last voltage, as it really was
         self.venv.step_async(applied.astype(np.float32))
 
     def step_wait(self):

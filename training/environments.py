@@ -10,13 +10,13 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor
 
 from filters import EstimateState, EstimateStates
 from filters.registry import tunable_numbers
-from thruster_env.model import thruster_model
-from thruster_env.observe import ObserveState, ObserveStateVector
-from training.controllers import CorrectController, predictive
+from plants.observe import ObserveState, ObserveStateVector
+from training.controllers import CorrectController
 from training.observations import find_arm
+from training.plants.find import plant_of
 from training.setup import Setup
 from training.vec_env import NativeVecEnv
-from training.views import ShowHistory, ShowThrust
+from training.views import ShowHistory, ShowOutput
 
 
 def make_environments(
@@ -46,10 +46,12 @@ def make_environments(
     arm, one = find_arm(setup.observe), make_single(setup).env
     if arm.pairs:
         venv = ShowHistory(venv, arm.pairs, one.unwrapped.appended_entries)
-    if arm.shows_state:
-        venv = ShowThrust(venv, one.unwrapped.state_space_model() if arm.is_true else one.filter.model)
+    plant = plant_of(setup.task)
+    if arm.shows_state and plant.output is not None:
+        model = one.unwrapped.state_space_model() if arm.is_true else one.filter.model
+        venv = ShowOutput(venv, model, plant.output)
     if setup.controller is not None:
-        venv = CorrectController(venv, predictive(setup.controller, one), setup.share)
+        venv = CorrectController(venv, plant.corrected(setup.controller, one), setup.share)
     seed_episodes(venv, seeds)
     return VecMonitor(venv)
 
@@ -60,7 +62,7 @@ def seed_episodes(venv: VecEnv, seeds: Sequence[int]) -> None:
 
 
 def make_single(setup: Setup, render_mode: str | None = None) -> gym.Env:
-    """One env of a setup, with its filter; thrust and history are for `make_environments` to show."""
+    """One env of a setup, with its filter; outputs and history are for `make_environments` to show."""
     arm = find_arm(setup.observe)
     env = gym.make(setup.env_id, render_mode=render_mode, disable_env_checker=True, **setup.env_arguments)
     if arm.is_true:
@@ -78,7 +80,7 @@ def _filter_arguments(setup: Setup) -> dict:
     }
     if setup.assumed_plant is None:
         return {"model_arguments": arguments, **own}
-    return {"model": thruster_model(**{**setup.assumed_plant, **arguments}), **own}
+    return {"model": plant_of(setup.task).model(**{**setup.assumed_plant, **arguments}), **own}
 
 
 def _vector_env(setup: Setup, count: int, endless: bool) -> gym.vector.VectorEnv:

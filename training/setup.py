@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -10,14 +9,12 @@ from pathlib import Path
 
 from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least, one_of, shown
-from thruster_env.plant import make_plant
-from thruster_env.plant_data import check_same_plant
 from training.algorithms import find_algorithm
 from training.checks import check_setup
 from training.observations import find_arm
-from training.tasks import TASKS
+from training.plants.find import plant_of
 from tuning.problems.plain import plain
-from tuning.thruster.scenario import Scenario
+from tuning.problems.scenario import BaseScenario
 
 VERSION = 1
 MOST_ENVS = 100_000  # whose experience, of 100 steps each, takes a gigabyte
@@ -42,7 +39,7 @@ class Setup:
         num_envs: copies of the env.
         hyperparameters: of the algorithm.
         controller: name of the predictive controller that the policy corrects, if any.
-        share: the largest correction [V_max].
+        share: the largest correction, as a part of each action's range.
         assumed_plant: arguments of the plant that the filter assumes; None for the env's own. No file has one.
 
     Raises:
@@ -83,7 +80,7 @@ class Setup:
 
 def make_setup(
     task: str,
-    scenario: Scenario,
+    scenario: BaseScenario,
     observe: str,
     algo: str = "ppo",
     steps: int | None = None,
@@ -105,9 +102,10 @@ def make_setup(
         ValueError: for unknown names, a scenario of a linear plant, a tuned file of another filter than the arm's,
             or numbers out of range.
     """
-    chosen = TASKS[one_of("task", task, tuple(TASKS))]
+    kind = plant_of(task)
+    chosen = kind.tasks[task]
     arm, algorithm = find_arm(observe), find_algorithm(algo)
-    _check_plant(scenario)
+    kind.check_scenario(scenario)
     if arm.filter is None and (filter_arguments or tuned):
         raise ValueError(f"filter arguments must come with an arm that has a filter, but got {observe!r}")
     assumed = {"parameter_factors": plain(scenario.parameter_factors)} if scenario.parameter_factors else {}
@@ -116,8 +114,7 @@ def make_setup(
         content = read_tuned_file(tuned)
         found = content["filter"]
         one_of("filter of the tuned file", found["name"], (arm.filter,))
-        if content.get("plant") is not None:
-            check_same_plant(content["plant"], scenario.plant, tuned)
+        scenario.check_tuned_for(content.get("plant"), tuned)
         given |= {**found["numbers"], **found["model"]}
     given |= filter_arguments or {}
     return Setup(
@@ -137,16 +134,17 @@ def make_setup(
     )
 
 
-def in_scenario(setup: Setup, scenario: Scenario) -> Setup:
+def in_scenario(setup: Setup, scenario: BaseScenario) -> Setup:
     """The same observation on another scenario's plant, of which a filter is not told.
 
     The filter goes on assuming the plant of the setup, whatever the scenario says of its errors.
 
     Raises:
-        ValueError: for a scenario of a linear plant.
+        ValueError: for a scenario of another plant than the setup's, or a linear one.
     """
-    _check_plant(scenario)
-    of_plant = inspect.signature(make_plant).parameters
+    kind = plant_of(setup.task)
+    kind.check_scenario(scenario)
+    of_plant = kind.plant_arguments
     plant = {name: value for name, value in setup.env_arguments.items() if name in of_plant}
     task = {name: value for name, value in setup.env_arguments.items() if name not in of_plant}
     return replace(
@@ -155,11 +153,6 @@ def in_scenario(setup: Setup, scenario: Scenario) -> Setup:
         env_arguments={**scenario.plant_arguments, **task},
         assumed_plant=plant if setup.assumed_plant is None else setup.assumed_plant,
     )
-
-
-def _check_plant(scenario: Scenario) -> None:
-    if scenario.system is not None:
-        raise ValueError(f"scenario must be one of the thruster's equations, but {scenario.name!r} is linear")
 
 
 def setup_from_json(text: str, name: str) -> Setup:

@@ -1,4 +1,4 @@
-"""What a policy sees of an env, in number: the thrust of a state, or the last measurements and voltages."""
+"""What a policy sees of an env, in number: an output of a state, or the last measurements and actions."""
 
 from __future__ import annotations
 
@@ -7,36 +7,37 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from plants.state_space import StateSpaceModel
-from thruster_env.model import thrusts_of
 
 
-class ShowThrust(VecEnvWrapper):
-    """Put the thrust [N] that a model has at a state in front of an observation that begins with the state.
+class ShowOutput(VecEnvWrapper):
+    """Put an output that a model has at a state in front of an observation that begins with the state.
 
     Args:
-        venv: envs whose observations begin with omega_m and U_a.
-        model: of the thruster, as the one who observes it believes it to be.
+        venv: envs whose observations begin with the model's states.
+        model: of the plant, as the one who observes it believes it to be.
+        symbol: of the output, such as the thruster's T.
     """
 
-    def __init__(self, venv: VecEnv, model: StateSpaceModel):
+    def __init__(self, venv: VecEnv, model: StateSpaceModel, symbol: str):
         """Wrap the envs; see the class."""
-        self._model = model
+        self._model, self._symbol = model, symbol
         super().__init__(venv, _space(venv.observation_space.shape[0] + 1))
 
     def reset(self) -> np.ndarray:
         """Reset the envs."""
-        return self._with_thrust(self.venv.reset())
+        return self._with_output(self.venv.reset())
 
     def step_wait(self):
         """Step the envs."""
         observations, rewards, dones, infos = self.venv.step_wait()
         for i in np.flatnonzero(dones):
-            infos[i]["terminal_observation"] = self._with_thrust(infos[i]["terminal_observation"])
-        return self._with_thrust(observations), rewards, dones, infos
+            infos[i]["terminal_observation"] = self._with_output(infos[i]["terminal_observation"])
+        return self._with_output(observations), rewards, dones, infos
 
-    def _with_thrust(self, observations: np.ndarray) -> np.ndarray:
-        thrusts = thrusts_of(self._model, observations[..., :2].astype(np.float64))
-        return np.concatenate([thrusts[..., None].astype(np.float32), observations], axis=-1)
+    def _with_output(self, observations: np.ndarray) -> np.ndarray:
+        states = observations[..., : self._model.n].astype(np.float64)
+        values = self._model.output(self._symbol, states)
+        return np.concatenate([values[..., None].astype(np.float32), observations], axis=-1)
 
 
 class ShowHistory(VecEnvWrapper):

@@ -18,7 +18,9 @@ from training.comparison.runs import Result, run_comparison
 from training.comparison.statistics import as_interval, typical_error, typical_return
 from training.comparison.tables import HEADER, rows_of, summary_rows
 from training.environments import make_environments
-from training.score import FIRST_SCORED_STEP, Part, Scores, run_episodes, score
+from training.plants.plant import Part
+from training.plants.thruster import FIRST_SCORED_STEP, THRUSTER
+from training.score import Scores, run_episodes, score
 from training.setup import make_setup
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario
@@ -35,7 +37,12 @@ def result(observe, returns, kind="ppo", errors=1.0, seed=0):
     """A made-up result with these returns, and thrust errors of some size in all parts."""
     returns = np.asarray(returns, dtype=float)
     part = Part(np.full(returns.size, 100 * errors**2), np.full(returns.size, 100))
-    return Result(Run("medium", kind, "", setup(observe, seed)), Scores(returns, *[part] * 5), [], 1.0)
+    return Result(
+        Run("medium", kind, "", setup(observe, seed)),
+        Scores(returns, dict.fromkeys(THRUSTER.parts, part)),
+        [],
+        1.0,
+    )
 
 
 def test_the_interval_of_a_return_is_that_of_the_mean_over_episodes():
@@ -62,12 +69,16 @@ def test_episodes_are_shared_so_a_constant_difference_is_certain():
     assert as_interval(difference) == pytest.approx((0.25, 0.25, 0.25))
 
 
+def with_parts(made, **parts):
+    return made._replace(scores=made.scores._replace(parts={**made.scores.parts, **parts}))
+
+
 def test_thrust_errors_are_pooled_before_the_root():
     two = Part(np.array([3.0, 1.0]), np.array([1, 3]))
     made = result("ekf", [0.0, 0.0])
-    made = made._replace(scores=made.scores._replace(steady=two))
+    made = with_parts(made, steady=two)
     assert typical_error([made], "steady").value == pytest.approx(1.0)
-    none = made._replace(scores=made.scores._replace(reversal=Part(np.zeros(2), np.zeros(2, dtype=int))))
+    none = with_parts(made, reversal=Part(np.zeros(2), np.zeros(2, dtype=int)))
     assert np.isnan(typical_error([none], "reversal").value)
 
 
@@ -127,7 +138,8 @@ def test_scores_are_what_a_naive_loop_finds():
     policy = classical_policy("lqr", chosen)
     found = score(policy, chosen, SEEDS)
     venv = make_environments(chosen, SEEDS, endless=True)
-    returns, thrusts, references, shown = run_episodes(policy, venv, 500)
+    returns, (thrusts, references, shown), alive = run_episodes(policy, venv, 500, THRUSTER)
+    assert alive.all()
     assert np.array_equal(found.returns, returns)
     for b in range(len(SEEDS)):
         changes = [0] + [k for k, (r, s) in enumerate(pairwise(references[b]), start=1) if abs(s - r) > 1.0]
@@ -138,12 +150,14 @@ def test_scores_are_what_a_naive_loop_finds():
         assert 9 <= len(changes) <= 11 and crossed
         parts = {"transient": after, "steady": set(range(500)) - after, "reversal": reversal}
         for name, steps in parts.items():
-            part = getattr(found, name)
+            part = found.parts[name]
             assert part.steps[b] == len(steps) and part.squares[b] == pytest.approx(squares[sorted(steps)].sum())
         late = slice(FIRST_SCORED_STEP, None)
         seen = ((shown[b] - thrusts[b])[late] ** 2).sum()
-        assert found.observed.squares[b] == pytest.approx(seen) and found.observed.steps[b] == 450
-    assert found.all.steps.tolist() == [500] * 3
+        assert (
+            found.parts["observed"].squares[b] == pytest.approx(seen) and found.parts["observed"].steps[b] == 450
+        )
+    assert found.parts["all"].steps.tolist() == [500] * 3
 
 
 def test_pi_has_gains_that_do_better_than_the_usual_ones_on_held_out_episodes():

@@ -13,9 +13,9 @@ from training.comparison.answers import GOAL
 from training.comparison.plan import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
 from training.comparison.tables import HEADER, name_of
 from training.observations import ARMS
+from training.plants.find import TASKS
 from training.score import score
 from training.setup import make_setup
-from training.tasks import TASKS
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario
 
@@ -119,7 +119,7 @@ def test_classical_rows_are_those_of_the_code(name, kind, arm):
     row = rows_at("medium")[name]
     assert returned(row) == pytest.approx(found.returns.mean(), abs=6e-4)
     for part in ("transient", "steady", "reversal", "observed"):
-        assert float(row[part]) == pytest.approx(getattr(found, part).rms, abs=6e-3)
+        assert float(row[part]) == pytest.approx(found.parts[part].rms, abs=6e-3)
 
 
 def test_the_example_runs(capsys):

@@ -111,7 +111,7 @@ class LQRController:
     not. (On `tunnel`, whose flow lags far behind, the three tasks cost 0.4 to 0.6 of what they do with domega_m.)
 
     There is no integral: where the thruster is not the nominal one, an error stays. Observations begin with
-    omega_m and U_a, true (see `observe.ObserveState`) or estimated.
+    omega_m and U_a, true (see `plants.observe.ObserveState`) or estimated.
     """
 
     plant: Plant
@@ -174,7 +174,7 @@ def read_state(observation: np.ndarray, reference: float | None) -> np.ndarray:
     """The state (..., 2) that an observation (..., d) begins with; ValueError if it is too short to hold one."""
     if observation.shape[-1] < 2 + (reference is None):
         rule = "an observation must begin with the state"
-        raise ValueError(f"{rule}, but has {observation.shape[-1]} entries: see observe.ObserveState")
+        raise ValueError(f"{rule}, but has {observation.shape[-1]} entries: see plants.observe.ObserveState")
     return observation[..., :2]
 
 

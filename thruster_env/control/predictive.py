@@ -33,7 +33,7 @@ class PredictiveController:
     minimum can trap. Beyond, Gauss-Newton's method starts from it and the last plan (`planning.improve_plans`).
 
     There is no integral: where the thruster is not the model, an error stays. On an estimate this is certainty
-    equivalence. Observations begin with omega_m and U_a, true (see `observe.ObserveState`) or estimated.
+    equivalence. Observations begin with omega_m and U_a, true (see `plants.observe.ObserveState`) or estimated.
     """
 
     problem: Problem

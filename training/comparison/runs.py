@@ -21,8 +21,9 @@ from training.classical import classical_policy
 from training.comparison.plan import CLASSICAL, Comparison, Run, runs_of
 from training.environments import make_environments
 from training.learn import one_thread, train
+from training.plants.plant import Part
 from training.saved import FINAL, load
-from training.score import Part, Scores, score
+from training.score import Scores, score
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.interruption import without_interrupts
 
@@ -126,7 +127,7 @@ def _do(run: Run, folder: Path, episodes: int) -> None:
         "setup": json.loads(run.setup.as_json()),
         "episodes": episodes,
         "returns": scores.returns.tolist(),
-        "parts": {name: [part.squares.tolist(), part.steps.tolist()] for name, part in _parts(scores).items()},
+        "parts": {name: [part.squares.tolist(), part.steps.tolist()] for name, part in scores.parts.items()},
         "curve": curve,
         "seconds": seconds,
     }
@@ -143,7 +144,7 @@ def _read(folder: Path, run: Run, episodes: int) -> Result | None:
         if content["setup"] != json.loads(run.setup.as_json()) or content["episodes"] != episodes:
             return None
         parts = {name: Part(*map(np.array, pair)) for name, pair in content["parts"].items()}
-        scores = Scores(returns=np.array(content["returns"]), **parts)
+        scores = Scores(np.array(content["returns"]), parts)
         return Result(run, scores, [tuple(point) for point in content["curve"]], content["seconds"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path} must be a whole file of results, but cannot be read: {error}") from None
@@ -151,7 +152,3 @@ def _read(folder: Path, run: Run, episodes: int) -> Result | None:
 
 def _file(folder: Path, run: Run) -> Path:
     return folder / RUNS / f"{run.name}.json"
-
-
-def _parts(scores: Scores) -> dict[str, Part]:
-    return {name: part for name, part in scores._asdict().items() if isinstance(part, Part)}

@@ -78,7 +78,7 @@ def typical_return(results: Sequence[Result]) -> Figure:
 
 def typical_error(results: Sequence[Result], part: str) -> Figure:
     """Mean over seeds of the pooled thrust error in a part of `Scores`, RMS [N]; NaN where no step counts."""
-    parts = [getattr(result.scores, part) for result in results]
+    parts = [result.scores.parts[part] for result in results]
     squares, steps = (np.stack(columns, axis=1) for columns in zip(*parts, strict=True))
     with np.errstate(invalid="ignore"):
         of_seeds = np.sqrt(squares.sum(axis=0) / steps.sum(axis=0))

@@ -10,15 +10,10 @@ from gymnasium.vector.utils import batch_space
 class ObserveState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     """Observe the true state in place of the measurement.
 
-    | num | observation | min | max | unit |
-    |---|---|---|---|---|
-    | 0 | motor speed omega_m | -inf | inf | rad/s |
-    | 1 | section-average flow velocity U_a | -inf | inf | m/s |
-
-    What the env appends to its measurement (validity flags, the reference) stays at the end.
+    What the env appends to its measurement (validity flags, a reference) stays at the end.
 
     Args:
-        env: a bow thruster env.
+        env: an env of a plant, whose infos have the state.
     """
 
     def __init__(self, env: gym.Env):
@@ -26,7 +21,7 @@ class ObserveState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         gym.utils.RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
         self._appended = env.unwrapped.appended_entries
-        self.observation_space = _space(self._appended)
+        self.observation_space = _space(env.unwrapped, self._appended)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Reset the env."""
@@ -40,18 +35,17 @@ class ObserveState(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
 
 class ObserveStateVector(gym.vector.VectorWrapper):
-    """`ObserveState` for bow thruster envs in number, in all three autoreset modes.
+    """`ObserveState` for envs in number, in all three autoreset modes.
 
     Args:
-        env: a bow thruster vector env.
+        env: a plant's vector env.
     """
 
     def __init__(self, env: gym.vector.VectorEnv):
         """Wrap the envs; see the class."""
         super().__init__(env)
-        base = env.unwrapped
-        self._appended = base.single_observation_space.shape[0] - len(base.plant.channels)
-        self.single_observation_space = _space(self._appended)
+        self._appended = env.unwrapped.appended_entries
+        self.single_observation_space = _space(env.unwrapped, self._appended)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict | None = None):
@@ -69,12 +63,13 @@ class ObserveStateVector(gym.vector.VectorWrapper):
         return _observed(info["state"], observations, self._appended), *outcome, info
 
 
-def _space(appended: int) -> gym.spaces.Box:
-    return gym.spaces.Box(-np.inf, np.inf, shape=(2 + appended,), dtype=np.float32)
+def _space(env, appended: int) -> gym.spaces.Box:
+    rows = env.report_rows.info["state"]
+    return gym.spaces.Box(-np.inf, np.inf, shape=(rows.stop - rows.start + appended,), dtype=np.float32)
 
 
 def _observed(state: np.ndarray, observation: np.ndarray, appended: int) -> np.ndarray:
-    """State (..., 2), then the last entries of an observation (..., d), in float32."""
+    """State (..., n), then the last entries of an observation (..., d), in float32."""
     kept = observation[..., observation.shape[-1] - appended :]
     with np.errstate(over="ignore"):  # beyond 3.4e38 lies infinity
         return np.concatenate([state.astype(np.float32), kept], axis=-1)

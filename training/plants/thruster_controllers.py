@@ -1,0 +1,75 @@
+"""The thruster's classical policies: PI, LQR (LQG with an estimator), and the predictive controllers.
+
+Each observes what an arm of `training.observations` does, so it stands beside the policy that learnt on that arm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import gymnasium as gym
+import numpy as np
+
+from numerics.checks import one_of
+from thruster_env.control.controllers import LQRController, PIController
+from thruster_env.control.predictive import HORIZONS, PredictiveController
+from thruster_env.dynamics import Constants
+from training.controllers import ClassicalPolicy
+from training.environments import make_single
+from training.score import score
+from training.setup import Setup
+from tuning.problems.seeds import training_seeds
+
+GAINS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0)  # factors on the gains of `gains.lambda_gains`, tried for each arm
+GAIN_SEEDS = 16
+
+
+def predictive(name: str, env: gym.Env) -> ClassicalPolicy:
+    """A predictive controller by name, that believes in the thruster that the filter of an env does.
+
+    Args:
+        name: one of `HORIZONS`.
+        env: with the filter, if there is one, as its outermost wrapper.
+
+    Raises:
+        ValueError: for an unknown name.
+    """
+    horizon = HORIZONS[one_of("controller", name, tuple(HORIZONS))]
+    believed = getattr(getattr(env, "filter", None), "model", None)
+    constants = believed.constants if believed is not None and isinstance(believed.constants, Constants) else None
+    controller = PredictiveController.for_env(env, horizon, constants)
+    return ClassicalPolicy(controller, 1, env.unwrapped.plant.max_voltage)
+
+
+def lqr(setup: Setup) -> ClassicalPolicy:
+    """LQR on the true state, or on an estimate: certainty equivalence, so LQG."""
+    env = make_single(setup)
+    return ClassicalPolicy(LQRController.for_env(env), 1, env.unwrapped.plant.max_voltage)
+
+
+def pi(setup: Setup) -> ClassicalPolicy:
+    """PI with feed-forward on the thrust that an arm shows, with the gains that suit the arm best.
+
+    Factors `GAINS` on both gains of `lambda_gains` are tried on training seeds; the highest mean return wins.
+    """
+    env = make_single(setup)
+    usual, top = PIController.for_env(env), env.unwrapped.plant.max_voltage
+    tried = np.array(list(product(GAINS, GAINS))) * [usual.proportional_gain, usual.integral_gain]
+    # All pairs of gains at once, each on copies of its own: the controller takes arrays as it takes numbers.
+    each = np.repeat(tried, GAIN_SEEDS, axis=0).T
+    seeds = list(training_seeds(setup.seed, GAIN_SEEDS)) * len(tried)
+    returns = score(ClassicalPolicy(_with_gains(usual, *each), 0, top), setup, seeds).returns
+    best = tried[returns.reshape(len(tried), GAIN_SEEDS).mean(axis=1).argmax()]
+    return ClassicalPolicy(_with_gains(usual, *best.tolist()), 0, top)
+
+
+def _with_gains(controller: PIController, proportional, integral) -> PIController:
+    return replace(controller, proportional_gain=proportional, integral_gain=integral)
+
+
+def controller_of(name: str, setup: Setup) -> ClassicalPolicy:
+    """A classical policy of the thruster by the name of its controller."""
+    if name in HORIZONS:
+        return predictive(name, make_single(setup).env)
+    return {"pi": pi, "lqr": lqr}[name](setup)
