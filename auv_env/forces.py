@@ -102,6 +102,7 @@ class Constants(NamedTuple):
     r_of_Y: float
     r_of_K: float
     r_of_N: float
+    propeller_torque: float  # K_prop over X_prop [m], where that is no input
     substep: float  # time step of one integration step [s]
 
 

@@ -139,8 +139,14 @@ def parameters_of(given: Mapping) -> VehicleParameters:
         raise ValueError(f"a preset mapping must have the fields {names}: {error}") from None
 
 
-def derive_constants(p: VehicleParameters, substep: float = 0.0) -> Constants:
-    """Constants of the equations of motion for checked parameters and a time step [s]."""
+def derive_constants(p: VehicleParameters, substep: float = 0.0, propeller_torque: float = 0.0) -> Constants:
+    """Constants of the equations of motion for checked parameters.
+
+    Args:
+        p: the parameters.
+        substep: time step of one integration step [s].
+        propeller_torque: the propeller's torque over its thrust [m], where that is no input.
+    """
     m, x, z = p.m, p.xG, p.zG
     i = np.linalg.inv(mass_matrix(p)).tolist()
     return Constants(
@@ -202,6 +208,7 @@ def derive_constants(p: VehicleParameters, substep: float = 0.0) -> Constants:
         n_pq=p.Npq + p.Ix - p.Iy,
         n_uudr=p.Nuudr,
         **{f"{a}_of_{b}": i[row][column] for row, a in enumerate("uvwpqr") for column, b in _coupled(row)},
+        propeller_torque=propeller_torque,
         substep=substep,
     )
 
