@@ -1,4 +1,4 @@
-"""The Riccati covariance along the noise-free path: by naive loops, and where parts of a measurement are missing."""
+"""The Riccati covariance along the noise-free path: by naive loops, and with parts of measurements missing."""
 
 import numpy as np
 import pytest
