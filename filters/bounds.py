@@ -111,9 +111,9 @@ def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray |
         P = F P F' + Q,  K = P H' (H P H' + R)^-1,  P = (I - K H) P
 
     It is what an extended Kalman filter on the path has, and for a linear model the optimum. It is no bound where
-    noise moves the state so far that F or H differ; but it holds where `posterior_bound` does not: for a singular Q,
-    and where a state has hardly any process noise, so that E[F' Q^-1 F] takes the smallest differences of F between
-    truths for information.
+    noise moves the state so far that F or H differ; but it holds where `posterior_bound` does not: for a singular
+    Q, and where a state has hardly any process noise, for then E[F' Q^-1 F] takes the smallest differences of F
+    between truths for information.
 
     Args:
         model: the model that draws the truth.
