@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from plants.trajectories import check_finite, recorded
 from thruster_env.engine.copies import Copies
-from thruster_env.engine.memory import FLOW, OMEGA, READINGS, REPORTED, THRUST, VALID
+from thruster_env.engine.memory import FLOW, OMEGA, READINGS, THRUST, VALID
 from thruster_env.plant import Plant
 from thruster_env.task import Task
 
@@ -22,13 +23,7 @@ class Simulation(NamedTuple):
 
     def checked(self, what: str = "a simulation") -> Simulation:
         """The same; ValueError that names the first step at which a number is not finite."""
-        parts = (self.states, self.thrusts[..., None], self.measurements)
-        finite = np.all([np.isfinite(part).all(axis=(0, 2)) for part in parts], axis=0)
-        if not finite.all():
-            raise ValueError(
-                f"{what} must stay finite, but it is not from step {np.argmin(finite)} of {len(finite) - 1} on: "
-                "mind dt and the noise covariances"
-            )
+        check_finite(what, self.states, self.thrusts[..., None], self.measurements)
         return self
 
 
@@ -40,19 +35,11 @@ def simulate(plant: Plant, keys: np.ndarray, voltages: np.ndarray) -> Simulation
     Raises:
         ValueError: if shapes do not fit or a number is not finite.
     """
-    keys, voltages = (np.ascontiguousarray(a, dtype=np.float64) for a in (keys, voltages))
-    if keys.ndim != 2 or keys.shape[1] != 2 or not np.isfinite(keys).all():
-        raise ValueError(f"keys must be finite and of shape (B, 2), but got shape {keys.shape}")
-    if voltages.ndim != 2 or len(voltages) != len(keys) or np.isnan(voltages).any():
-        rule = f"without NaN and of shape ({len(keys)}, K), one row a key"
-        raise ValueError(f"voltages must be {rule}, but got shape {voltages.shape}")
-    copies = Copies(plant, Task(), len(keys))
-    record = np.empty((voltages.shape[1] + 1, REPORTED, len(keys)))
-    record[0] = copies.begin(keys)
-    for k, voltage in enumerate(voltages.T):
-        record[k + 1] = copies.step(voltage)
+    voltages = np.asarray(voltages, dtype=np.float64)
+    if voltages.ndim != 2:
+        raise ValueError(f"voltages must be of shape (B, K), one row a key, but got shape {voltages.shape}")
+    record = recorded(Copies(plant, Task(), len(keys)), keys, voltages[..., None])
     m = len(plant.channels)
-    record = np.ascontiguousarray(record.transpose(2, 0, 1))
     readings = record[..., READINGS : READINGS + m]
     valid = record[..., VALID : VALID + m] > 0 if plant.dropping_channels else np.ones(readings.shape, dtype=bool)
     return Simulation(record[..., OMEGA : FLOW + 1], record[..., THRUST], readings, valid)
