@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from numerics.compiled import inlined
+from numerics.trigonometry import cosine_and_sine_of_turns
 
 # Streams: what a draw is for. Two streams of one key are independent.
 PROCESS, MEASUREMENT, INITIAL, EXCITATION, FILTER_PROCESS, FILTER_MEASUREMENT, FILTER_PRIOR = range(1, 8)
@@ -22,7 +23,7 @@ _MULTIPLIER_0, _MULTIPLIER_1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
 _WEYL_0, _WEYL_1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
 _LOW, _SHIFT, _NONE = np.uint64(0xFFFFFFFF), np.uint64(32), np.uint64(0)
 _SQRT_HALF_BITS = int(np.float64(np.sqrt(0.5)).view(np.int64))
-_LN_2, _PI, _TWO_TO_MINUS_32 = float(np.log(2.0)), float(np.pi), 2.0**-32
+_LN_2, _TWO_TO_MINUS_32 = float(np.log(2.0)), 2.0**-32
 
 
 @inlined
@@ -97,34 +98,6 @@ def logarithm(x):
     series = series * t + 1.0 / 3.0
     series = series * t + 1.0
     return np.float64(exponent) * _LN_2 + 2.0 * s * series
-
-
-@inlined
-def cosine_and_sine_of_turns(turns):
-    """cos(2 pi turns) and sin(2 pi turns) for |turns| <= 1/2: Taylor series at half the angle, doubled."""
-    a = _PI * turns
-    q = a * a
-    s = -1.0 / 121645100408832000.0
-    s = s * q + 1.0 / 355687428096000.0
-    s = s * q - 1.0 / 1307674368000.0
-    s = s * q + 1.0 / 6227020800.0
-    s = s * q - 1.0 / 39916800.0
-    s = s * q + 1.0 / 362880.0
-    s = s * q - 1.0 / 5040.0
-    s = s * q + 1.0 / 120.0
-    s = s * q - 1.0 / 6.0
-    s = (s * q + 1.0) * a
-    c = -1.0 / 6402373705728000.0
-    c = c * q + 1.0 / 20922789888000.0
-    c = c * q - 1.0 / 87178291200.0
-    c = c * q + 1.0 / 479001600.0
-    c = c * q - 1.0 / 3628800.0
-    c = c * q + 1.0 / 40320.0
-    c = c * q - 1.0 / 720.0
-    c = c * q + 1.0 / 24.0
-    c = c * q - 0.5
-    c = c * q + 1.0
-    return 1.0 - 2.0 * s * s, 2.0 * s * c
 
 
 @inlined

@@ -15,13 +15,14 @@ ROOMS = (
     "numerics",
     "plants",
     "thruster_env",
+    "auv_env",
     "filters",
     "tuning",
     "training",
     "studies",
     "thruster_cli",
 )
-PLANTS = {"thruster_env"}
+PLANTS = {"thruster_env", "auv_env"}
 FILES = [path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))]
 every_room = pytest.mark.parametrize("room", ROOMS)
 
@@ -29,6 +30,7 @@ ALLOWED = {
     "numerics": set(),
     "plants": {"numerics"},
     "thruster_env": {"numerics", "plants"},
+    "auv_env": {"numerics", "plants"},
     "filters": {"numerics", "plants"},
     "tuning": {"numerics", "plants", "filters"},
     "training": {"numerics", "plants", "thruster_env", "filters", "tuning"},

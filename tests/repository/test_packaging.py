@@ -20,7 +20,7 @@ EXTRAS = {
     for extra, lines in PROJECT["optional-dependencies"].items()
 }
 PINNED = {line.partition("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line}
-ROOMS = ("thruster_env", "filters", "tuning", "training", "studies", "thruster_cli")
+ROOMS = ("thruster_env", "auv_env", "filters", "tuning", "training", "studies", "thruster_cli")
 NOT_PACKED = {".gitignore", ".ci/run"}
 
 

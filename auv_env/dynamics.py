@@ -1,0 +1,127 @@
+"""The motion of an underwater vehicle, as six, eight or twelve states, and how each steps and what its slopes are.
+
+Six velocities nu = (u, v, w, p, q, r) are moved by `forces`. With roll and pitch, of which weight and buoyancy
+depend, they are the smallest closed system; with yaw and position, to the north, to the east and down, everything.
+
+    nu' = M^-1 F(nu, phi, theta, u)
+    (phi, theta, psi)' = T(phi, theta) (p, q, r)
+    (x, y, z)' = R(phi, theta, psi) (u, v, w)
+"""
+
+from __future__ import annotations
+
+from auv_env.forces import accelerated, forces, forces_tangent
+from auv_env.kinematics import (
+    angle_rates,
+    angle_rates_tangent,
+    attitude_of,
+    attitude_tangent,
+    down,
+    down_tangent,
+    in_body_axes,
+    in_earth_axes,
+    in_earth_axes_tangent,
+)
+from numerics.compiled import inlined
+from numerics.integration import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
+
+
+@inlined
+def velocity_rates(x, u, c):
+    """Time derivatives of x = nu; u = (X_prop, K_prop, delta_s, delta_r, phi, theta)."""
+    return accelerated(forces(x, down(attitude_of(u[4], u[5])), u, c), c)
+
+
+@inlined
+def velocity_rates_tangent(x, dx, u, c):
+    """Directional derivative of `velocity_rates` at x along dx."""
+    return accelerated(forces_tangent(x, dx, (0.0, 0.0, 0.0), u, c), c)
+
+
+@inlined
+def motion_rates(x, u, c):
+    """Time derivatives of x = (nu, phi, theta); u = (X_prop, K_prop, delta_s, delta_r)."""
+    nu, attitude = (x[0], x[1], x[2], x[3], x[4], x[5]), attitude_of(x[6], x[7])
+    rolling, pitching, _ = angle_rates(attitude, x[3], x[4], x[5])
+    return accelerated(forces(nu, down(attitude), u, c), c) + (rolling, pitching)
+
+
+@inlined
+def motion_rates_tangent(x, dx, u, c):
+    """Directional derivative of `motion_rates` at x along dx."""
+    nu, attitude = (x[0], x[1], x[2], x[3], x[4], x[5]), attitude_of(x[6], x[7])
+    d_nu, d_attitude = (dx[0], dx[1], dx[2], dx[3], dx[4], dx[5]), attitude_tangent(attitude, dx[6], dx[7])
+    force = forces_tangent(nu, d_nu, down_tangent(attitude, d_attitude), u, c)
+    d_rolling, d_pitching, _ = angle_rates_tangent(attitude, d_attitude, x[4], x[5], dx[3], dx[4], dx[5])
+    return accelerated(force, c) + (d_rolling, d_pitching)
+
+
+@inlined
+def navigation_rates(x, u, c):
+    """Time derivatives of x = (nu, phi, theta, psi, x, y, z); u = (X_prop, K_prop, delta_s, delta_r)."""
+    nu, attitude = (x[0], x[1], x[2], x[3], x[4], x[5]), attitude_of(x[6], x[7])
+    turning = angle_rates(attitude, x[3], x[4], x[5])
+    path = in_earth_axes(attitude, x[8], x[0], x[1], x[2])
+    return accelerated(forces(nu, down(attitude), u, c), c) + turning + path
+
+
+@inlined
+def navigation_rates_tangent(x, dx, u, c):
+    """Directional derivative of `navigation_rates` at x along dx."""
+    nu, attitude = (x[0], x[1], x[2], x[3], x[4], x[5]), attitude_of(x[6], x[7])
+    d_nu, d_attitude = (dx[0], dx[1], dx[2], dx[3], dx[4], dx[5]), attitude_tangent(attitude, dx[6], dx[7])
+    force = forces_tangent(nu, d_nu, down_tangent(attitude, d_attitude), u, c)
+    turning = angle_rates_tangent(attitude, d_attitude, x[4], x[5], dx[3], dx[4], dx[5])
+    velocity, d_velocity = (x[0], x[1], x[2]), (dx[0], dx[1], dx[2])
+    path = in_earth_axes_tangent(attitude, d_attitude, x[8], dx[8], velocity, d_velocity)
+    return accelerated(force, c) + turning + path
+
+
+@inlined
+def current_rates(x, u, c):
+    """`navigation_rates` in a current; u = (X_prop, K_prop, delta_s, delta_r, north, east, down).
+
+    Forces are those of the velocity through the water, nu less the current; x holds the velocity over ground. The
+    current [m/s] is the same everywhere, and held over the step: in the body's axes it turns with them.
+    """
+    attitude = attitude_of(x[6], x[7])
+    along, across, below = in_body_axes(attitude, x[8], u[4], u[5], u[6])
+    p, q, r = x[3], x[4], x[5]
+    through_water = (x[0] - along, x[1] - across, x[2] - below, p, q, r)
+    moved = accelerated(forces(through_water, down(attitude), u, c), c)
+    return (
+        moved[0] + r * across - q * below,
+        moved[1] + p * below - r * along,
+        moved[2] + q * along - p * across,
+        moved[3],
+        moved[4],
+        moved[5],
+        *angle_rates(attitude, p, q, r),
+        *in_earth_axes(attitude, x[8], x[0], x[1], x[2]),
+    )
+
+
+velocity_substep = runge_kutta(velocity_rates, 6)
+"""`velocity_substep(x, u, c)`: six velocities after c.substep seconds of constant input and attitude."""
+
+motion_substep = runge_kutta(motion_rates, 8)
+"""`motion_substep(x, u, c)`: velocities, roll and pitch after c.substep seconds of constant input."""
+
+navigation_substep = runge_kutta(navigation_rates, 12)
+"""`navigation_substep(x, u, c)`: the same with yaw and position."""
+
+current_substep = runge_kutta(current_rates, 12)
+"""`current_substep(x, u, c)`: the same in a current, the last three inputs."""
+
+velocity_jacobian = runge_kutta_jacobian(velocity_rates, velocity_rates_tangent, 6)
+motion_jacobian = runge_kutta_jacobian(motion_rates, motion_rates_tangent, 8)
+navigation_jacobian = runge_kutta_jacobian(navigation_rates, navigation_rates_tangent, 12)
+
+velocity_euler = euler(velocity_rates, 6)
+"""`velocity_euler(x, u, c)`: `velocity_substep` by Euler's method, as the papers have it; ..."""
+
+motion_euler = euler(motion_rates, 8)
+navigation_euler = euler(navigation_rates, 12)
+velocity_euler_jacobian = euler_jacobian(velocity_rates_tangent, 6)
+motion_euler_jacobian = euler_jacobian(motion_rates_tangent, 8)
+navigation_euler_jacobian = euler_jacobian(navigation_rates_tangent, 12)
