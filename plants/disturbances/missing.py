@@ -16,6 +16,17 @@ LONGEST_INTERVAL = 1_000_000  # steps between two samples
 
 
 @inlined
+def hold_missing(memory, b, j, target, held, valid, missing, begin):
+    """Where copy j's measurement is missing repeat the last one, kept in row `held`, and mark it as not valid."""
+    if begin:
+        memory[b, held, j] = 0.0
+    if missing:
+        memory[b, target, j] = memory[b, held, j]
+        memory[b, valid, j] = 0.0
+    memory[b, held, j] = memory[b, target, j]
+
+
+@inlined
 def dropout(memory, b, target, rows, number, numbers, at, begin):
     """Lose measurements in runs: a chain of two states. A lost one repeats the last, and is not valid."""
     begins, ends, valid = numbers[at], numbers[at + 1], target + int(numbers[at + 2])
@@ -23,16 +34,12 @@ def dropout(memory, b, target, rows, number, numbers, at, begin):
     for j in range(memory.shape[2]):
         u, _, _, _ = uniforms(memory, b, j, number)
         if begin:
-            memory[b, held, j] = 0.0
             memory[b, lost, j] = 0.0
         if memory[b, lost, j] > 0.0:
             memory[b, lost, j] = 0.0 if u < ends else 1.0
         else:
             memory[b, lost, j] = 1.0 if u < begins else 0.0
-        if memory[b, lost, j] > 0.0:
-            memory[b, target, j] = memory[b, held, j]
-            memory[b, valid, j] = 0.0
-        memory[b, held, j] = memory[b, target, j]
+        hold_missing(memory, b, j, target, held, valid, memory[b, lost, j] > 0.0, begin)
 
 
 @inlined
@@ -40,12 +47,8 @@ def sample_every(memory, b, target, rows, number, numbers, at, begin):
     """Take a sample at steps first, first + steps, first + 2 steps, ...; between them the last is repeated."""
     steps, first, valid = int(numbers[at]), int(numbers[at + 1]), target + int(numbers[at + 2])
     for j in range(memory.shape[2]):
-        if begin:
-            memory[b, rows, j] = 0.0
-        if (int(memory[b, STEP, j]) - first) % steps != 0:
-            memory[b, target, j] = memory[b, rows, j]
-            memory[b, valid, j] = 0.0
-        memory[b, rows, j] = memory[b, target, j]
+        between = (int(memory[b, STEP, j]) - first) % steps != 0
+        hold_missing(memory, b, j, target, rows, valid, between, begin)
 
 
 @dataclass(frozen=True)
