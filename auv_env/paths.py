@@ -67,7 +67,7 @@ class Path(NamedTuple):
 
 
 def make_path(given, depth: float = 0.0) -> Path:
-    """A path from a manoeuvre's name, or from at least two points (north, east, down) [m], and a depth added to all.
+    """A path from a manoeuvre's name or from two or more points (north, east, down) [m], so much [m] deeper.
 
     Raises ValueError that states the rule and the value.
     """

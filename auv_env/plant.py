@@ -110,7 +110,8 @@ def make_plant(
             fixed speed straight ahead from the origin, 0 for rest, or {"mean": [..], "cov": [..]}.
         sensors: None for the suite "default", the name of a suite of `channels.SUITES`, a list of channels of
             `channels.CHANNELS`, or a mapping from channels to lists of effects. Suites and lists come at the rates
-            of their instruments, satellites near the surface; in a mapping "sample-every" and "near-surface" say so.
+            of their instruments, satellites near the surface; in a mapping, effects "sample-every" and
+            "near-surface" say so.
         current: three velocities (north, east, down) [m/s], or signals by direction; see `effects.current`.
         propeller_lag: time constant with which the thrust follows the command [s]; 0 for at once. (A small
             propeller's is some 1 s.)

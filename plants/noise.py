@@ -41,7 +41,8 @@ def noise_adder(size: int, first: int, root: int, stream: int) -> Callable:
 def add_noise(memory, b, numbers, size, first, root, stream, scratch):
     """Add w ~ N(0, L L') to rows of every copy, as `noise_adder` does, for a number of rows known at run time.
 
-    What is zero in L costs nothing. `scratch` is the first of `size` rows, up to a multiple of BLOCK, for the draws.
+    What is zero in L costs nothing. The draws go into `size` rows, rounded up to a multiple of BLOCK, from `scratch`
+    on.
     """
     for block in range((size + BLOCK - 1) // BLOCK):
         at = scratch + BLOCK * block
