@@ -24,12 +24,12 @@ class SegorogeniAUVPathEnv(SegorogeniAUVEnv):
     | -2 | its cosine | -inf | inf | - |
     | -1 | u less the speed to keep | -inf | inf | m/s |
 
-    These compare the path with what the vehicle itself can know, never with the true state: yaw, depth and speed as
-    they are measured, noise and all, and a position by dead reckoning from measured velocities and attitude, from
-    the start that is told. So they drift as the vehicle's own navigation does, by centimetres in half a minute with
-    the default sensors, and more in what others do not see. `info["path_errors"]` and the reward have the true
-    ones. Where a filter's estimate is in the observation, `control.depth_and_course` shows how to compare that
-    with the path in their place.
+    These compare the path with what the vehicle itself can know, never with the true state: yaw, depth and speed
+    as they are measured, noise and all, and a position by dead reckoning from measured velocities and attitude,
+    from the start that is told. So they drift as the vehicle's own navigation does, by decimetres in half a
+    minute with the default sensors, and more with others. `info["path_errors"]` and the reward have the true
+    ones. Where a filter's estimate is in the observation, `control.depth_and_course` compares that with the path
+    in their place.
 
     ## Reward
     The path's place is the one abreast of the vehicle: it is followed, not caught up with, so the time does not
@@ -50,10 +50,10 @@ class SegorogeniAUVPathEnv(SegorogeniAUVEnv):
 class SegorogeniAUVDepthEnv(SegorogeniAUVEnv):
     """An autonomous underwater vehicle: follow steps of the depth up and down, on a straight course north.
 
-    As `SegorogeniAUVPathEnv`, whose observation it has; the path's depth steps by `step_size` (2 m) up or down at
-    random every `hold_time` (15 s), within twice of that about `depth` (6 m), where the vehicle starts. Observation
-    k compares with the depth of time k + 1, the one that the reward of the next step compares with. Episodes are
-    truncated after 1200 steps (60 s).
+    As `SegorogeniAUVPathEnv`, whose observation it has; the path's depth steps by `step_size` (2 m) up or down
+    at random every `hold_time` (15 s), within twice of that about `depth` (6 m), where the vehicle starts.
+    Observation k compares with the depth of time k + 1, the one that the reward of the next step compares with.
+    Episodes are truncated after 1200 steps (60 s).
 
     ## Arguments
     The list is that of `auv_env.plant.make_plant` and of `auv_env.task.make_depth_task`; `render_mode` comes on
