@@ -105,7 +105,7 @@ class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
             "reckoned": slice(at.RECKONED, at.RECKONED + 4),
             "time": TIME,
         }
-        appended = tuple(range(at.ERRORS, at.ERRORS + 5)) if self.observes_errors else ()
+        appended = (at.PATH_DEPTH, *range(at.ERRORS, at.ERRORS + 5)) if self.observes_errors else ()
         rows = ReportRows(measurement, slice(at.VALID, at.VALID + m), plant.dropping_channels, appended, info)
         self._set_up(action_space(plant), rows, render_mode)
 

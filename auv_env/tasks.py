@@ -18,6 +18,7 @@ class SegorogeniAUVPathEnv(SegorogeniAUVEnv):
 
     | num | observation | min | max | unit |
     |---|---|---|---|---|
+    | -6 | depth of the path abreast of the vehicle | -inf | inf | m |
     | -5 | distance to starboard of the path | -inf | inf | m |
     | -4 | distance below the path | -inf | inf | m |
     | -3 | sine of yaw less the path's course | -inf | inf | - |
@@ -29,7 +30,7 @@ class SegorogeniAUVPathEnv(SegorogeniAUVEnv):
     from the start that is told. So they drift as the vehicle's own navigation does, by decimetres in half a
     minute with the default sensors, and more with others. `info["path_errors"]` and the reward have the true
     ones. Where a filter's estimate is in the observation, `control.depth_and_course` compares that with the path
-    in their place.
+    in their place, and with the depth.
 
     ## Reward
     The path's place is the one abreast of the vehicle: it is followed, not caught up with, so the time does not

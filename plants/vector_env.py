@@ -16,7 +16,7 @@ from numerics.keys import EpisodeKeys, reset_mask
 from plants.commands import of_copies
 from plants.env import PlantEnv
 from plants.memory import REWARD, TERMINATED, TIME
-from plants.report import infos_of, observations_of
+from plants.report import ReportRows, infos_of, observations_of
 
 MOST_ENVS = 1_000_000  # of some kilobytes each
 
@@ -70,6 +70,11 @@ class PlantVectorEnv(gym.vector.VectorEnv):
     def __copy__(self) -> PlantVectorEnv:
         """A deep copy: two envs with one memory would move one another."""
         return copy.deepcopy(self)
+
+    @property
+    def report_rows(self) -> ReportRows:
+        """What a report holds, and which of it makes observation and info."""
+        return self._rows
 
     @property
     def bytes_per_copy(self) -> int:

@@ -21,6 +21,7 @@ from auv_env.engine.memory import (
     MEAN,
     MEASURED_IN,
     OFFSET,
+    PATH_DEPTH,
     PHI,
     PIECE,
     PIECES,
@@ -154,6 +155,7 @@ def find_errors(memory, b, numbers, begin):
         piece = _piece(numbers, 0 if begin else int(memory[b, RECKONED_PIECE, j]), x, y, z)
         memory[b, RECKONED_PIECE, j] = piece
         memory[b, ERRORS, j], memory[b, ERRORS + 1, j], cosine, sine = _off_path(numbers, piece, x, y, z)
+        memory[b, PATH_DEPTH, j] = memory[b, RECKONED + 2, j] - memory[b, ERRORS + 1, j]
         along, across = cosine_and_sine(memory[b, RECKONED + 3, j])
         memory[b, ERRORS + 2, j] = across * cosine - along * sine
         memory[b, ERRORS + 3, j] = along * cosine + across * sine

@@ -26,9 +26,14 @@ from auv_env.engine.memory import (
 )
 from auv_env.forces import Constants
 from numerics.compiled import inlined
-from numerics.tuples import tuple_of, vector_reader, written_out
+from numerics.tuples import tuple_of, written_out
 
-read_constants = vector_reader(CONSTANT_COUNT)
+read_constants = written_out(
+    "constants",
+    "numbers",
+    f"Constants({', '.join(f'numbers[{i}]' for i in range(CONSTANT_COUNT))})",
+    Constants=Constants,
+)
 read_state = written_out("state", "memory, b, j", tuple_of(f"memory[b, {STATE + i}, j]" for i in range(N)))
 write_state = written_out(
     "store", "memory, b, j, x", *(f"memory[b, {STATE + i}, j] = x[{i}]" for i in range(N)), "None"
@@ -79,7 +84,7 @@ def take_commands(memory, b, numbers):
 @inlined
 def move(memory, b, numbers):
     """Integrate the equations of motion over one sample time, in the current."""
-    c = Constants(*read_constants(numbers))
+    c = read_constants(numbers)
     for _ in range(int(numbers[SUBSTEPS])):
         for j in range(memory.shape[2]):
             write_state(memory, b, j, current_substep(read_state(memory, b, j), read_inputs(memory, b, j), c))
