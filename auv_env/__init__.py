@@ -1,9 +1,22 @@
-"""An autonomous underwater vehicle: equations of motion, parameters, sensors, and its model for filters."""
+"""An autonomous underwater vehicle as Gymnasium environments; importing this package registers them."""
 
+from gymnasium.envs.registration import register, registry
+
+from auv_env.env import SegorogeniAUVEnv
 from auv_env.parameters import VehicleParameters
 from auv_env.presets import PRESETS
+from auv_env.tasks import SegorogeniAUVDepthEnv, SegorogeniAUVPathEnv
 from numerics.compiled import may_be_inlined
 
 may_be_inlined(__name__, "plants")
 
-__all__ = ["PRESETS", "VehicleParameters"]
+__all__ = ["PRESETS", "SegorogeniAUVDepthEnv", "SegorogeniAUVEnv", "SegorogeniAUVPathEnv", "VehicleParameters"]
+
+for _task, _steps in {"": 1200, "Path": 600, "Depth": 1200}.items():
+    if f"SegorogeniAUV{_task}-v0" not in registry:
+        register(
+            id=f"SegorogeniAUV{_task}-v0",
+            entry_point=f"auv_env.{'tasks' if _task else 'env'}:SegorogeniAUV{_task}Env",
+            vector_entry_point=f"auv_env.vector_env:SegorogeniAUV{_task}VectorEnv",
+            max_episode_steps=_steps,
+        )

@@ -9,14 +9,16 @@ from typing import NamedTuple
 import numpy as np
 
 from auv_env.channels import CHANNELS, MAX_CHANNELS, Instrument, default_instrument, suite
+from auv_env.effects.current import Current, make_current
+from auv_env.effects.sensors import VEHICLE_SENSOR_EFFECTS, NearSurface
 from auv_env.forces import Constants
 from auv_env.operating import required_substeps
 from auv_env.parameters import VehicleParameters, derive_constants
 from auv_env.presets import preset_parameters
 from auv_env.quantities import COMMANDS, INPUTS, STATES
 from numerics.checks import at_least, between, covariance, finite, one_of, positive, shown, vector
-from plants.disturbances.effects import Effect
-from plants.disturbances.sensors import SENSOR_EFFECTS
+from plants.disturbances.effects import Effect, dropping_channels
+from plants.disturbances.missing import SampleEvery
 from plants.quantities import Quantity
 
 DEFAULT_DT = 0.05  # [s]; one Runge-Kutta step follows the vehicle to 2e-5 of its range
@@ -49,6 +51,9 @@ class Plant(NamedTuple):
     initial_cov: np.ndarray  # (12, 12)
     sensors: dict[str, tuple[Effect, ...]]  # effects by channel; the m channels in their order
     instruments: dict[str, Instrument]  # by channel
+    current: Current = {}  # signals by direction
+    propeller_lag: float = 0.0  # time constant from the commanded thrust to the propeller's [s]
+    plane_lag: float = 0.0  # and of both planes [s]
 
     @property
     def constants(self) -> Constants:
@@ -61,6 +66,11 @@ class Plant(NamedTuple):
         return INPUTS if self.propeller_torque is None else COMMANDS
 
     @property
+    def max_torque(self) -> float:
+        """Torques are clipped to plus and minus this, where they are an input [N m]."""
+        return abs(DEFAULT_PROPELLER_TORQUE) * self.max_thrust
+
+    @property
     def channels(self) -> tuple[str, ...]:
         """Names of the measured quantities, in order."""
         return tuple(self.sensors)
@@ -68,8 +78,7 @@ class Plant(NamedTuple):
     @property
     def dropping_channels(self) -> tuple[int, ...]:
         """Numbers of the channels whose measurements may be missing."""
-        effects = self.sensors.values()
-        return tuple(i for i, chain in enumerate(effects) if any(effect.name == "dropout" for effect in chain))
+        return dropping_channels(self.sensors)
 
 
 def make_plant(
@@ -82,6 +91,9 @@ def make_plant(
     measurement_noise_cov=None,
     initial_state=None,
     sensors=None,
+    current=None,
+    propeller_lag: float = 0.0,
+    plane_lag: float = 0.0,
     substeps: int | None = None,
 ) -> Plant:
     """Make a plant from plain arguments, the same ones that the env takes.
@@ -97,7 +109,13 @@ def make_plant(
         initial_state: None for about a cruise at 1 m/s, a fixed state (12,), or a mapping: {"speed": U} for a
             fixed speed straight ahead from the origin, 0 for rest, or {"mean": [..], "cov": [..]}.
         sensors: None for the suite "default", the name of a suite of `channels.SUITES`, a list of channels of
-            `channels.CHANNELS`, or a mapping from channels to lists of effects.
+            `channels.CHANNELS`, or a mapping from channels to lists of effects. Suites and lists come at the rates
+            of their instruments, satellites near the surface; in a mapping, effects "sample-every" and
+            "near-surface" say so.
+        current: three velocities (north, east, down) [m/s], or signals by direction; see `effects.current`.
+        propeller_lag: time constant with which the thrust follows the command [s]; 0 for at once. (A small
+            propeller's is some 1 s.)
+        plane_lag: that of both planes [s]. (Servos have some 0.1 s.) Filters do not know of either.
         substeps: Runge-Kutta steps a sample time; None for the fewest that hold `operating.ONE_STEP_ACCURACY`.
 
     Raises:
@@ -110,7 +128,7 @@ def make_plant(
     if propeller_torque is not None:
         propeller_torque = finite("propeller_torque", propeller_torque)
     mean, cov = _initial_distribution(initial_state)
-    effects, instruments = _sensors(sensors)
+    effects, instruments = _sensors(sensors, dt)
     if measurement_noise_cov is None:
         measurement_noise_cov = [instrument.deviation**2 for instrument in instruments.values()]
     if substeps is None:
@@ -128,20 +146,24 @@ def make_plant(
         cov,
         effects,
         instruments,
+        make_current(current),
+        positive("propeller_lag", propeller_lag, zero_allowed=True),
+        positive("plane_lag", plane_lag, zero_allowed=True),
     )
 
 
-def _sensors(given) -> tuple[dict[str, tuple[Effect, ...]], dict[str, Instrument]]:
+def _sensors(given, dt: float) -> tuple[dict[str, tuple[Effect, ...]], dict[str, Instrument]]:
     """Effects and instrument of each channel."""
     if given is None or isinstance(given, str):
         instruments = suite("default" if given is None else given)
-        return dict.fromkeys(instruments, ()), instruments
+        return {channel: _timing(one, dt) for channel, one in instruments.items()}, instruments
     if not isinstance(given, Mapping):
         if not hasattr(given, "__iter__"):
             rule = "sensors must be a suite's name, a list of channels or a mapping from them"
             raise ValueError(f"{rule}, but got {shown(given)}")
         names = list(given)
-        given = {name: () for name in names if isinstance(name, str)}
+        known = [one_of("a channel of sensors", name, tuple(CHANNELS)) for name in names]
+        given = {name: _timing(default_instrument(name), dt) for name in known}
         if len(given) != len(names):
             raise ValueError(f"sensors must name each channel once, but got {shown(names)}")
     if not given:
@@ -149,10 +171,16 @@ def _sensors(given) -> tuple[dict[str, tuple[Effect, ...]], dict[str, Instrument
     if len(given) > MAX_CHANNELS:
         raise ValueError(f"sensors must name at most {MAX_CHANNELS} channels, but got {len(given)}")
     effects = {
-        one_of("a channel of sensors", channel, tuple(CHANNELS)): SENSOR_EFFECTS.make(effects)
+        one_of("a channel of sensors", channel, tuple(CHANNELS)): VEHICLE_SENSOR_EFFECTS.make(effects)
         for channel, effects in given.items()
     }
     return effects, {channel: default_instrument(channel) for channel in effects}
+
+
+def _timing(instrument: Instrument, dt: float) -> tuple[Effect, ...]:
+    """When an instrument has a measurement: every so many steps, the nearest to its rate, and where it works."""
+    steps = 1 if instrument.rate is None else max(1, round(1.0 / (instrument.rate * dt)))
+    return (SampleEvery(steps),) * (steps > 1) + (NearSurface(),) * instrument.at_surface
 
 
 def _initial_distribution(given) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
+from numerics.compiled import inlined
 from numerics.streams import normal_block
 from numerics.tuples import written_out
 from plants.memory import KEY_0, KEY_1, STEP
@@ -34,3 +35,23 @@ def noise_adder(size: int, first: int, root: int, stream: int) -> Callable:
         lines.append(f"    memory[b, {first + i}, j] += {terms}")
     names = {"normal_block": normal_block, "KEY_0": KEY_0, "KEY_1": KEY_1, "STEP": STEP}
     return written_out("add", "memory, b, numbers", *lines, "None", **names)
+
+
+@inlined
+def add_noise(memory, b, numbers, size, first, root, stream, scratch):
+    """Add w ~ N(0, L L') to rows of every copy, as `noise_adder` does, for a number of rows known at run time.
+
+    What is zero in L costs nothing. The draws go into rows from `scratch` on, `size` rounded up to a multiple of
+    BLOCK.
+    """
+    for block in range((size + BLOCK - 1) // BLOCK):
+        at = scratch + BLOCK * block
+        for j in range(memory.shape[2]):
+            w = normal_block(block, memory[b, STEP, j], stream, memory[b, KEY_0, j], memory[b, KEY_1, j])
+            memory[b, at, j], memory[b, at + 1, j], memory[b, at + 2, j], memory[b, at + 3, j] = w
+    for i in range(size):
+        for k in range(i + 1):
+            factor = numbers[root + i * size + k]
+            if factor != 0.0:
+                for j in range(memory.shape[2]):
+                    memory[b, first + i, j] += factor * memory[b, scratch + k, j]

@@ -8,20 +8,21 @@ from gymnasium.vector.utils import batch_space
 
 
 class ObserveState(gym.Wrapper, gym.utils.RecordConstructorArgs):
-    """Observe the true state in place of the measurement.
+    """Observe the true state of a plant in place of the measurement.
 
     What the env appends to its measurement (validity flags, a reference) stays at the end.
 
     Args:
-        env: an env of a plant, whose infos have the state.
+        env: an env of a plant.
     """
 
     def __init__(self, env: gym.Env):
         """Wrap the env; see the class."""
         gym.utils.RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
-        self._appended = env.unwrapped.appended_entries
-        self.observation_space = _space(env.unwrapped, self._appended)
+        base = env.unwrapped
+        self._appended = base.appended_entries
+        self.observation_space = _space(base.report_rows.states + self._appended)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Reset the env."""
@@ -38,14 +39,15 @@ class ObserveStateVector(gym.vector.VectorWrapper):
     """`ObserveState` for envs in number, in all three autoreset modes.
 
     Args:
-        env: a plant's vector env.
+        env: a vector env of a plant.
     """
 
     def __init__(self, env: gym.vector.VectorEnv):
         """Wrap the envs; see the class."""
         super().__init__(env)
-        self._appended = env.unwrapped.appended_entries
-        self.single_observation_space = _space(env.unwrapped, self._appended)
+        base = env.unwrapped
+        self._appended = base.appended_entries
+        self.single_observation_space = _space(base.report_rows.states + self._appended)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict | None = None):
@@ -63,9 +65,8 @@ class ObserveStateVector(gym.vector.VectorWrapper):
         return _observed(info["state"], observations, self._appended), *outcome, info
 
 
-def _space(env, appended: int) -> gym.spaces.Box:
-    rows = env.report_rows.info["state"]
-    return gym.spaces.Box(-np.inf, np.inf, shape=(rows.stop - rows.start + appended,), dtype=np.float32)
+def _space(entries: int) -> gym.spaces.Box:
+    return gym.spaces.Box(-np.inf, np.inf, shape=(entries,), dtype=np.float32)
 
 
 def _observed(state: np.ndarray, observation: np.ndarray, appended: int) -> np.ndarray:

@@ -24,6 +24,12 @@ class ReportRows(NamedTuple):
     info: Mapping[str, int | slice]  # what info has, in order: a row for a number, several for a vector
 
     @property
+    def states(self) -> int:
+        """Number of states, of a plant whose info has them."""
+        place = self.info["state"]
+        return place.stop - place.start
+
+    @property
     def flags(self) -> tuple[int, ...]:
         """Rows of the validity flags that observations have."""
         return tuple(self.valid.start + i for i in self.dropping)

@@ -55,6 +55,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
         env = self.single_env(**arguments)
         self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
         self.plant, self.task, self._rows = env.plant, env.task, env.report_rows
+        self.inputs = env.inputs
         self._observed = self._rows.observed
         self.appended_entries = env.appended_entries  # of an observation, after the measurement
         self.single_action_space, self.single_observation_space = env.action_space, env.observation_space
@@ -72,7 +73,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
 
     @property
     def report_rows(self) -> ReportRows:
-        """What a report holds, and which of it makes observations and infos."""
+        """What a report holds, and which of it makes observation and info."""
         return self._rows
 
     @property
@@ -104,7 +105,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
         if not self._keys.seeded:
             raise gym.error.ResetNeeded("call reset() before step()")
         ignored = self._done if self.autoreset_mode == AutoresetMode.NEXT_STEP else None
-        report = self._copies.step(of_copies(actions, self.num_envs, self.single_env.inputs, ignored))
+        report = self._copies.step(of_copies(actions, self.num_envs, self.inputs, ignored))
         if self.autoreset_mode == AutoresetMode.NEXT_STEP and self._done.any():
             self._restart(np.flatnonzero(self._done), report)
         terminated, truncated = report[TERMINATED] > 0.0, report[TIME] >= self._last_time

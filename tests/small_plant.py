@@ -20,7 +20,7 @@ from plants.arguments import arguments_of, takes_arguments_of
 from plants.channels import Channel, reader_of
 from plants.copies import PlantCopies, machine_code_of
 from plants.disturbances.chains import chain_of
-from plants.disturbances.effects import Context, encoded
+from plants.disturbances.effects import Context, dropping_channels, encoded
 from plants.disturbances.sensors import SENSOR_EFFECTS
 from plants.env import PlantEnv
 from plants.memory import FIRST_REPORTED, FRONT, REWARD, STEP, TERMINATED, TIME
@@ -183,8 +183,7 @@ class CartEnv(ModelledCart, PlantEnv):
     def __init__(self, *, render_mode=None, **arguments):
         self.plant = make_cart(**arguments_of(make_cart, arguments))
         readings, valid = slice(READINGS, READINGS + 2), slice(VALID, VALID + 2)
-        chains = enumerate(self.plant.sensors.values())
-        dropping = tuple(i for i, effects in chains if any(effect.name == "dropout" for effect in effects))
+        dropping = dropping_channels(self.plant.sensors)
         info = {"state": slice(X, X + 3), "measurement": readings, "time": TIME}
         space = gym.spaces.Box(np.float32([-5.0, -1.0]), np.float32([5.0, 1.0]))
         self._set_up(space, ReportRows(readings, valid, dropping, (X + 2,), info), render_mode)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from numerics.checks import at_least, between, covariance, finite, one_of, positive, shown, vector, within
-from plants.disturbances.effects import Effect
+from plants.disturbances.effects import Effect, dropping_channels
 from plants.disturbances.sensors import SENSOR_EFFECTS
 from thruster_env.channels import CHANNELS, MAX_CHANNELS
 from thruster_env.dynamics import Constants
@@ -64,8 +64,7 @@ class Plant(NamedTuple):
     @property
     def dropping_channels(self) -> tuple[int, ...]:
         """Numbers of the channels whose measurements may be missing."""
-        effects = self.sensors.values()
-        return tuple(i for i, chain in enumerate(effects) if any(effect.name == "dropout" for effect in chain))
+        return dropping_channels(self.sensors)
 
 
 def make_plant(

@@ -42,6 +42,7 @@ class Effect:
 
     act: ClassVar[Callable]  # the function above, a staticmethod
     name: ClassVar[str]
+    loses: ClassVar[bool] = False  # whether measurements may be missing: then their validity is observed
 
     def parameters(self, context: Context) -> list[float]:
         """Numbers that `act` finds from `numbers[at]` on: the fields in order, unless overridden."""
@@ -58,6 +59,11 @@ class Effect:
     def as_mapping(self) -> dict:
         """The effect as JSON can hold it: its name and its arguments."""
         return {"name": self.name, **dataclasses.asdict(self)}
+
+
+def dropping_channels(sensors: Mapping[str, tuple[Effect, ...]]) -> tuple[int, ...]:
+    """Numbers of the channels whose measurements may be missing, of effects by channel."""
+    return tuple(i for i, chain in enumerate(sensors.values()) if any(effect.loses for effect in chain))
 
 
 class Registry:

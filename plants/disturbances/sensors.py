@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from numerics.checks import at_least, finite, positive, within
+from numerics.checks import at_least, finite, positive
 from numerics.compiled import inlined
 from plants.disturbances.effects import Context, Effect, Registry, normals, set_field, uniforms
+from plants.disturbances.missing import Dropout, SampleEvery, probability
 from plants.memory import STEP
 
 SENSOR_EFFECTS = Registry("sensors")
@@ -66,26 +67,6 @@ def saturation(memory, b, target, rows, number, numbers, at, begin):
     """Clip to an interval."""
     for j in range(memory.shape[2]):
         memory[b, target, j] = min(max(memory[b, target, j], numbers[at]), numbers[at + 1])
-
-
-@inlined
-def dropout(memory, b, target, rows, number, numbers, at, begin):
-    """Lose measurements in runs: a chain of two states. A lost one repeats the last, and is not valid."""
-    begins, ends, valid = numbers[at], numbers[at + 1], target + int(numbers[at + 2])
-    held, lost = rows, rows + 1
-    for j in range(memory.shape[2]):
-        u, _, _, _ = uniforms(memory, b, j, number)
-        if begin:
-            memory[b, held, j] = 0.0
-            memory[b, lost, j] = 0.0
-        if memory[b, lost, j] > 0.0:
-            memory[b, lost, j] = 0.0 if u < ends else 1.0
-        else:
-            memory[b, lost, j] = 1.0 if u < begins else 0.0
-        if memory[b, lost, j] > 0.0:
-            memory[b, target, j] = memory[b, held, j]
-            memory[b, valid, j] = 0.0
-        memory[b, held, j] = memory[b, target, j]
 
 
 @inlined
@@ -203,43 +184,7 @@ class SensorSaturation(Effect):
         set_field(self, "high", high)
 
 
-@SENSOR_EFFECTS.register("dropout")
-@dataclass(frozen=True)
-class Dropout(Effect):
-    """Missing measurements, in runs of random length.
-
-    The observation then repeats the last valid value (0 at first), a validity flag of the channel is appended
-    to it, and `info["measurement_valid"]` tells the same.
-
-    Args:
-        probability: share of the measurements that are missing in the long run.
-        mean_length: mean number of missing measurements in a row; 1/(1 - probability) is independent dropout.
-    """
-
-    probability: float = 0.1
-    mean_length: float | None = None
-    act = staticmethod(dropout)
-
-    def __post_init__(self):
-        """Check the arguments."""
-        share = probability("probability", self.probability)
-        if share == 1.0:
-            raise ValueError("probability must be less than 1, but got 1.0")
-        shortest = max(1.0, share / (1.0 - share))  # else a run would have to begin with a probability above 1
-        length = 1.0 / (1.0 - share) if self.mean_length is None else finite("mean_length", self.mean_length)
-        if length < shortest:
-            raise ValueError(f"mean_length must be at least {shortest:g}, but got {self.mean_length!r}")
-        set_field(self, "probability", share)
-        set_field(self, "mean_length", length)
-
-    def parameters(self, context: Context) -> list[float]:
-        """Probabilities that a run of missing measurements begins, and that it ends; where validity stands."""
-        begins = self.probability / (1.0 - self.probability) / self.mean_length
-        return [begins, 1.0 / self.mean_length, context.valid_offset]
-
-    def rows(self, context: Context) -> int:
-        """The last valid measurement, and whether one is missing."""
-        return 2
+SENSOR_EFFECTS.register("dropout")(Dropout)
 
 
 @SENSOR_EFFECTS.register("delay")
@@ -266,8 +211,4 @@ class Delay(Effect):
         return 2 * self.steps
 
 
-def probability(name: str, value) -> float:
-    """Return value as a float; raise ValueError unless it lies within 0 and 1."""
-    if within(name, value, 1.0) < 0:
-        raise ValueError(f"{name} must be at least 0 and at most 1, but got {value!r}")
-    return float(value)
+SENSOR_EFFECTS.register("sample-every")(SampleEvery)

@@ -17,6 +17,13 @@ from plants.memory import STEP
 
 
 @inlined
+def constant(memory, b, target, rows, number, numbers, at, begin):
+    """Add a constant."""
+    for j in range(memory.shape[2]):
+        memory[b, target, j] += numbers[at]
+
+
+@inlined
 def sinusoid(memory, b, target, rows, number, numbers, at, begin):
     """Add amplitude sin(2 pi t/period + phase)."""
     amplitude, period, phase, dt = numbers[at], numbers[at + 1], numbers[at + 2], numbers[at + 3]
@@ -61,6 +68,22 @@ def recorded(memory, b, target, rows, number, numbers, at, begin):
     for j in range(memory.shape[2]):
         time = (memory[b, STEP, j] - 0.5) * numbers[at]
         memory[b, target, j] += recorded_value(time, numbers, at + 1)
+
+
+@dataclass(frozen=True)
+class ConstantSignal(Effect):
+    """A constant `value`."""
+
+    value: float
+    act = staticmethod(constant)
+
+    def __post_init__(self):
+        """Check the argument."""
+        set_field(self, "value", finite("value", self.value))
+
+    def largest(self) -> float:
+        """Its magnitude."""
+        return abs(self.value)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from numerics.checks import finite
+from plants.remembered import remembered
 from thruster_env.control.gains import lambda_gains, quadratic_gain
 from thruster_env.linear.operating import OperatingPoints, operating_points, slopes, thrust_of
 from thruster_env.plant import Plant
@@ -176,13 +177,3 @@ def read_state(observation: np.ndarray, reference: float | None) -> np.ndarray:
         rule = "an observation must begin with the state"
         raise ValueError(f"{rule}, but has {observation.shape[-1]} entries: see plants.observe.ObserveState")
     return observation[..., :2]
-
-
-def remembered(state, episode_start, at_start: np.ndarray) -> np.ndarray:
-    """The state (..., k) of the last call; where an episode starts, what it is at the start."""
-    if state is None:
-        return at_start
-    if episode_start is None:
-        return np.asarray(state)
-    starts = np.reshape(episode_start, at_start.shape[:-1]).astype(bool)
-    return np.where(starts[..., None], at_start, state)

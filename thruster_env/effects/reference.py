@@ -16,6 +16,7 @@ from numerics.compiled import inlined
 from numerics.streams import REFERENCE_SIGNAL, normal_block, uniform_block
 from plants.disturbances.effects import LONGEST, Effect, Registry, set_field
 from plants.disturbances.recorded import RecordedSeries, recorded_value
+from plants.disturbances.signals import constant
 from plants.memory import KEY_0, KEY_1, STEP
 from thruster_env.effects.context import ThrusterContext
 from thruster_env.engine.memory import SAMPLE_TIME
@@ -27,13 +28,6 @@ REFERENCE_SIGNALS = Registry("reference")
 def _uniform(memory, b, j, number, index):
     u, _, _, _ = uniform_block(number, index, REFERENCE_SIGNAL, memory[b, KEY_0, j], memory[b, KEY_1, j])
     return u
-
-
-@inlined
-def constant(memory, b, target, rows, number, numbers, at, begin):
-    """Add a constant."""
-    for j in range(memory.shape[2]):
-        memory[b, target, j] += numbers[at]
 
 
 @inlined

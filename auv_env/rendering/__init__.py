@@ -1,0 +1,1 @@
+"""Pictures of the vehicle on its way."""

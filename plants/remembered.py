@@ -1,0 +1,15 @@
+"""What a policy remembers from one step of its env to the next."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def remembered(state, episode_start, at_start: np.ndarray) -> np.ndarray:
+    """The state (..., k) of the last call; where an episode starts, what it is at the start."""
+    if state is None:
+        return at_start
+    if episode_start is None:
+        return np.asarray(state)
+    starts = np.reshape(episode_start, at_start.shape[:-1]).astype(bool)
+    return np.where(starts[..., None], at_start, state)
