@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from auv_env.plant import Plant
 from plants.modelled import ModelledEnv
 
 if TYPE_CHECKING:
+    from auv_env.rendering import Overlay
     from plants.state_space import StateSpaceModel
 
 
@@ -27,3 +30,15 @@ class ModelledVehicle(ModelledEnv):
         from auv_env.model import model_of_plant
 
         return model_of_plant
+
+    def overlay(self, label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
+        """What a rendered vehicle shows of a belief beside the truth: states that it has, by their symbols."""
+        from auv_env.rendering import Overlay
+
+        names = {state.symbol: i for i, state in enumerate(model.states)}
+        std = np.sqrt(np.maximum(np.diag(cov), 0.0)).tolist()
+        shown = {"x": "x", "y": "y", "depth": "z", "phi": "phi", "theta": "theta", "psi": "psi", "u": "u"}
+        known = {name: names[symbol] for name, symbol in shown.items() if symbol in names}
+        values = {name: float(mean[i]) for name, i in known.items()}
+        spreads = {f"{name}_std": std[i] for name, i in known.items() if f"{name}_std" in Overlay._fields}
+        return Overlay(label, **values, **spreads)

@@ -33,7 +33,8 @@ class DepthAndCourse:
 
     e_y, e_z are the distances to starboard of the path and below it, L the distance ahead at which it is aimed at
     (line-of-sight guidance, Fossen 2011, section 10.3). Actions are cut off at the action space. The integral is
-    what holds a depth against a trim, and a path against its slope; it stands still while the pitch is at its limit.
+    what holds a depth against a trim, and a path against its slope; it stands still while the pitch is at its
+    limit.
 
     The gains were found by hand on `segorogeni` at 1 m/s: at small angles one radian of the rudder turns it with
     3.7 rad/s, one of the stern plane pitches it by 3 rad. They are the same for all tasks.
@@ -43,13 +44,13 @@ class DepthAndCourse:
     task: Task
     seen: str  # what observations begin with, one of SEEN
     places: dict[str, int]  # of theta, q, r and u in an observation
-    look_ahead: float = 3.0  # L [m]
+    look_ahead: float = 1.2  # L [m]
     depth_gain: float = 1.0  # k_z
-    depth_integral: float = 0.1  # k_i [1/s]
+    depth_integral: float = 0.2  # k_i [1/s]
     largest_pitch: float = 0.6  # that is asked for [rad]
-    pitch_gain: float = 0.8  # K_theta
+    pitch_gain: float = 1.2  # K_theta
     pitch_rate_gain: float = 0.5  # K_q [s]
-    course_gain: float = 0.6  # K_psi
+    course_gain: float = 1.0  # K_psi
     yaw_rate_gain: float = 0.4  # K_r [s]
     speed_gain: float = 4.0  # K_u [N s/m]
 
@@ -79,7 +80,7 @@ class DepthAndCourse:
         return cls(plant, task, seen, {name: names.index(name) for name in ("u", "q", "r", "theta")}, **gains)
 
     def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
-        """Actions (..., p) for observations (..., d), and state (..., 2): the integral [m] and the path's piece."""
+        """Actions (..., p) for observations (..., d), and state (..., 2): integral [m] and piece of the path."""
         observation = np.asarray(observation, dtype=np.float64)
         integral, piece = np.moveaxis(
             remembered(state, episode_start, np.zeros((*observation.shape[:-1], 2))), -1, 0

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thruster_env.rendering.canvas import Canvas, number
+from plants.rendering.canvas import Canvas, number
 
 ROUND = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)  # ends of an axis, up to powers of ten
 LEAST = 0.02  # ends of an axis, of full scale, where nothing happens
@@ -21,10 +21,12 @@ class Axis(NamedTuple):
     high: float
     top: float  # [px]
     height: float  # [px]
+    downward: bool = False  # with the larger values below
 
     def y(self, value):
         """Where a value is [px]; a value off the axis is somewhat off it, however large."""
-        return self.top + self.height * (1 - np.clip((value - self.low) / (self.high - self.low), -1, 2))
+        part = np.clip((value - self.low) / (self.high - self.low), -1, 2)
+        return self.top + self.height * (part if self.downward else 1 - part)
 
     def label(self, canvas: Canvas, x: float) -> None:
         """Write zero and the ends, unless these are too near to it, left of x [px]."""

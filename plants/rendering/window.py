@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pygame
 
-from thruster_env.rendering.canvas import SIZE
+from plants.rendering.canvas import SIZE
 
 LEAST_RATE = 20.0  # frames a second that are shown even if the steps come late [1/s]
 
@@ -16,8 +16,9 @@ LEAST_RATE = 20.0  # frames a second that are shown even if the steps come late 
 class Window:
     """A window that keeps real time: it waits when it is early and leaves frames out when it is late."""
 
-    def __init__(self, frame_time: float):
-        """Keep calls of `show` frame_time [s] apart; the window opens with the first."""
+    def __init__(self, frame_time: float, caption: str):
+        """Keep calls of `show` frame_time [s] apart; the window opens with the first, under a caption."""
+        self._caption = caption
         self._frame_time = frame_time
         self._screen = None
         self._closed_by_hand = False
@@ -29,7 +30,7 @@ class Window:
         if self._screen is None or not pygame.display.get_init():  # perhaps another env called pygame.quit()
             pygame.display.init()
             self._screen = pygame.display.set_mode(SIZE)
-            pygame.display.set_caption("Bow thruster")
+            pygame.display.set_caption(self._caption)
             self._due, self._shown = time.perf_counter(), -math.inf
         if pygame.event.get((pygame.QUIT, pygame.WINDOWCLOSE)):  # all other events are left to the caller
             self.close()

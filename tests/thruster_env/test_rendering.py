@@ -13,8 +13,9 @@ from thruster_env.rendering import Moment, Overlay, Renderer
 
 pygame = pytest.importorskip("pygame")
 
-from thruster_env.rendering.axis import fitting_axis  # noqa: E402
-from thruster_env.rendering.canvas import BAND  # noqa: E402
+from plants.rendering.axis import fitting_axis  # noqa: E402
+from plants.rendering.canvas import BAND  # noqa: E402
+from plants.rendering.window import Window  # noqa: E402
 from thruster_env.rendering.propeller import BLADES, end_view  # noqa: E402
 from thruster_env.rendering.scene import (  # noqa: E402
     AXIS,
@@ -27,7 +28,6 @@ from thruster_env.rendering.scene import (  # noqa: E402
     PORTHOLE,
     PORTHOLE_RADIUS,
 )
-from thruster_env.rendering.window import Window  # noqa: E402
 
 GEAR_RATIO, DT = 2.0, 0.01
 ARGUMENTS = {
@@ -340,7 +340,7 @@ def test_a_window_leaves_out_frames_that_come_late():
         time.sleep(0.03)
         return picture
 
-    slow = Window(0.01)
+    slow = Window(0.01, "slow")
     for _ in range(30):
         slow.show(slow_picture)
     slow.close()

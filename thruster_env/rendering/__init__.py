@@ -4,10 +4,7 @@ Above, the hull cut through at the thruster, with the propeller turning and arro
 the ship; below, strip charts of the last 500 steps and gauges of thrust and voltage, with truth and measurement.
 One step is one frame, so `render_fps = 1/dt` shows true speed.
 
-**Overlay hook.** The plant knows no filter. The env holds `render_overlay`, None or a function without arguments
-that returns an `Overlay` or None; a filter wrapper sets it: `env.unwrapped.render_overlay = ...`. A wrapper knows
-its estimate only after the env's step has ended. So the env asks for it when it draws and at the start of the next
-step, and hands it to `Renderer.amend`: each estimate is then drawn at the time that it is of.
+What pictures of all plants have, and how a filter shows its estimate in them, is in `plants.rendering`.
 
 Needs pygame, which is imported when a `Renderer` is made: `pip install 'thruster-env[render]'`.
 """

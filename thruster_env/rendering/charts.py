@@ -1,155 +1,20 @@
-"""Strip charts of the last steps: thrust, motor speed and flow, with their legend."""
+"""The thruster's strip charts: thrust, motor speed and flow."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import NamedTuple
-
-import numpy as np
-
-from thruster_env.rendering.axis import Axis, fitting_axis
-from thruster_env.rendering.canvas import (
-    BAND,
-    ESTIMATE,
-    FAINT,
-    INK,
-    MEASURED,
-    PANEL,
-    REFERENCE,
-    SIGMAS,
-    SIZE,
-    WHITE,
-    Canvas,
-    number,
-    with_band,
-)
-from thruster_env.rendering.history import STEPS, newest
+from plants.rendering.canvas import Canvas
+from plants.rendering.charts import Charts, Strip
 
 TOP = 186  # of the lower half of the picture [px]
-LEFT, RIGHT = 44, 486  # of the strip charts [px]
-DASH = 6  # steps in a dash of the reference
 
 
-class Strip(NamedTuple):
-    """One strip chart."""
-
-    name: str  # of the truth in the history
-    title: str
-    digits: int  # shown after the point
-    top: float  # [px]
-    height: float  # [px]
-    scale: float  # full scale, in the unit of the quantity
-    measured: str | None = None
-    reference: str | None = None
-
-
-class Charts:
-    """Three strip charts and their legend."""
-
-    def __init__(
-        self,
-        canvas: Canvas,
-        *,
-        dt: float,
-        thrust_scale: float,
-        speed_scale: float,
-        flow_scale: float,
-    ):
-        """Draw what never moves; dt is the sample time [s], scales are in N, rad/s and m/s."""
-        self._canvas = canvas
-        self._span = dt * STEPS
-        self._strips = (
-            Strip("thrust", "thrust [N]", 1, 207, 66, thrust_scale, "measured_thrust", "reference"),
-            Strip("omega_m", "motor speed [rad/s]", 1, 292, 38, speed_scale),
-            Strip("U_a", "flow [m/s]", 2, 349, 34, flow_scale),
-        )
-        canvas.box(0, TOP, SIZE[0], SIZE[1] - TOP, PANEL)
-        canvas.box(0, TOP, SIZE[0], 1, (186, 200, 210))
-        for strip in self._strips:
-            canvas.box(LEFT, strip.top, RIGHT - LEFT, strip.height, WHITE)
-            for fifth in range(6):
-                canvas.box(LEFT + (RIGHT - LEFT) * fifth / 5 - 0.5, strip.top, 1, strip.height, FAINT)
-
-    def draw(self, columns: dict[str, np.ndarray], last: int, label: str) -> Axis:
-        """Draw columns whose last entry is step number `last`; the axis of the thrust chart.
-
-        A label names the filter in the legend; "" if there is none.
-        """
-        axes = [self._draw_strip(columns, strip, last) for strip in self._strips]
-        self._draw_legend(columns, label)
-        for fifth in range(6):
-            text = f"\u2212{self._span * (5 - fifth) / 5:.3g} s" if fifth < 5 else "now"
-            x = LEFT + (RIGHT - LEFT) * fifth / 5
-            self._canvas.text(text, (x, 391), 10, align=0.5)
-        return axes[0]
-
-    def _draw_strip(self, columns, strip: Strip, last: int) -> Axis:
-        canvas, count = self._canvas, len(columns[strip.name])
-        x = RIGHT - np.arange(count)[::-1] * (RIGHT - LEFT) / STEPS
-        estimate, std = columns[f"estimated_{strip.name}"], columns[f"estimated_{strip.name}_std"]
-        others = [columns[name] for name in (strip.measured, strip.reference) if name]
-        values = np.concatenate((columns[strip.name], estimate, *others))
-        axis = fitting_axis(values, strip.scale, strip.top + 2, strip.height - 4)
-
-        def line(values, colour, width):
-            for run in _runs(np.isfinite(values)):
-                canvas.lines(np.stack((x[run], axis.y(values[run])), axis=-1), colour, width)
-
-        canvas.clip(LEFT, strip.top, RIGHT - LEFT, strip.height)
-        low, high = axis.y(estimate - SIGMAS * std), axis.y(estimate + SIGMAS * std)
-        for run in _runs(np.isfinite(low)):
-            outline = np.concatenate((low[run], high[run][::-1]))
-            canvas.polygon(np.stack((np.concatenate((x[run], x[run][::-1])), outline), axis=-1), BAND)
-        canvas.box(LEFT, axis.y(0.0) - 0.5, RIGHT - LEFT, 1, (170, 182, 192))
-        if strip.measured:
-            dots = np.stack((x, axis.y(columns[strip.measured])), axis=-1)
-            canvas.dots(dots[np.isfinite(dots[:, 1])], 1.1, MEASURED)
-        if strip.reference:
-            dashes = np.arange(last - count + 1, last + 1) // DASH % 2 == 0
-            line(np.where(dashes, columns[strip.reference], np.nan), REFERENCE, 1.5)
-        line(estimate, ESTIMATE, 3)
-        line(columns[strip.name], INK, 1.25)  # thin on thick: both are seen where they agree
-        canvas.clip()
-        axis.label(canvas, LEFT - 5)
-        self._write(columns, strip)
-        return axis
-
-    def _write(self, columns, strip: Strip) -> None:
-        """The title and, but for thrust, which has a gauge, the newest numbers."""
-        write, x, y = self._canvas.text, RIGHT, strip.top - 9
-        write(strip.title, (LEFT, y), 11, INK)
-        if strip.measured:
-            return
-        estimate = newest(columns, f"estimated_{strip.name}")
-        if np.isfinite(estimate):
-            std = newest(columns, f"estimated_{strip.name}_std")
-            x -= write(with_band(estimate, std, strip.digits), (x, y), 11, ESTIMATE, 1.0) + 14
-        write(number(columns[strip.name][-1], strip.digits), (x, y), 11, INK, 1.0)
-
-    def _draw_legend(self, columns, label: str) -> None:
-        canvas, x, y = self._canvas, RIGHT, self._strips[0].top - 9
-        entries = [("truth", INK), ("measured", MEASURED)]
-        if np.isfinite(columns["reference"]).any():
-            entries.append(("reference", REFERENCE))
-        if label:
-            entries.append((f"{label} \u00b1 {SIGMAS}\u03c3", ESTIMATE))
-        for text, colour in reversed(entries):
-            x -= canvas.text(text, (x, y), 11, colour, 1.0) + 5
-            if colour == MEASURED:
-                canvas.disc((x - 4, y), 2.5, colour)
-                x += 8
-            elif colour == REFERENCE:
-                canvas.box(x - 16, y - 0.75, 6, 1.5, colour)
-                canvas.box(x - 7, y - 0.75, 6, 1.5, colour)
-            else:
-                if colour == ESTIMATE:
-                    canvas.box(x - 16, y - 4, 16, 8, BAND)
-                thickness = 1.25 if colour == INK else 3
-                canvas.box(x - 16, y - thickness / 2, 16, thickness, colour)
-            x -= 28
-
-
-def _runs(shown: np.ndarray) -> Iterator[slice]:
-    """Stretches of a boolean array that are true."""
-    edges = np.flatnonzero(np.diff(np.concatenate(((False,), shown, (False,)))))
-    return (slice(start, stop) for start, stop in zip(edges[::2], edges[1::2], strict=True))
+def thruster_charts(
+    canvas: Canvas, *, dt: float, thrust_scale: float, speed_scale: float, flow_scale: float
+) -> Charts:
+    """Three strip charts; dt is in s, scales are in N, rad/s and m/s. Thrust has a gauge besides."""
+    strips = (
+        Strip("thrust", "thrust [N]", 1, 207, 66, thrust_scale, "measured_thrust", "reference", False),
+        Strip("omega_m", "motor speed [rad/s]", 1, 292, 38, speed_scale),
+        Strip("U_a", "flow [m/s]", 2, 349, 34, flow_scale),
+    )
+    return Charts(canvas, strips, top=TOP, dt=dt)

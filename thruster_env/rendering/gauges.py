@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from thruster_env.rendering.axis import Axis
-from thruster_env.rendering.canvas import (
+from plants.rendering.axis import Axis
+from plants.rendering.canvas import (
     BAND,
     ESTIMATE,
     INK,
@@ -18,7 +18,7 @@ from thruster_env.rendering.canvas import (
     number,
     with_band,
 )
-from thruster_env.rendering.history import newest
+from plants.rendering.history import newest
 
 TOP, HEIGHT = 210, 122  # of the gauges [px]
 THRUST, VOLTAGE = 538, 612  # their middle [px]
