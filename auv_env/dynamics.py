@@ -23,7 +23,7 @@ from auv_env.kinematics import (
     in_earth_axes_tangent,
 )
 from numerics.compiled import inlined
-from numerics.integration import runge_kutta, runge_kutta_jacobian
+from numerics.integration import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
 
 
 @inlined
@@ -116,3 +116,12 @@ current_substep = runge_kutta(current_rates, 12)
 velocity_jacobian = runge_kutta_jacobian(velocity_rates, velocity_rates_tangent, 6)
 motion_jacobian = runge_kutta_jacobian(motion_rates, motion_rates_tangent, 8)
 navigation_jacobian = runge_kutta_jacobian(navigation_rates, navigation_rates_tangent, 12)
+
+velocity_euler = euler(velocity_rates, 6)
+"""`velocity_euler(x, u, c)`: `velocity_substep` by Euler's method, as the papers have it; ..."""
+
+motion_euler = euler(motion_rates, 8)
+navigation_euler = euler(navigation_rates, 12)
+velocity_euler_jacobian = euler_jacobian(velocity_rates_tangent, 6)
+motion_euler_jacobian = euler_jacobian(motion_rates_tangent, 8)
+navigation_euler_jacobian = euler_jacobian(navigation_rates_tangent, 12)

@@ -27,10 +27,10 @@ def top_speed(p: VehicleParameters, thrust: float) -> float:
 
 
 def operating_range(p: VehicleParameters, thrust: float) -> np.ndarray:
-    """Largest state (12,) of normal operation under thrusts up to so much [N]; the smallest is less that, and u = 0.
+    """Largest state (12,) of normal operation under thrusts up to so much [N]; the smallest is its opposite.
 
-    Manoeuvres with both planes within 5 deg stay inside, and a swing in roll of 3 deg. Velocities are parts of the top
-    speed, pitch and yaw rates parts of that over the radius of gyration.
+    Only u is never negative. Manoeuvres with both planes within 5 deg stay inside, and a swing in roll of 3 deg.
+    Velocities are parts of the top speed, pitch and yaw rates parts of that over the radius of gyration.
     """
     speed = top_speed(p, thrust)
     turning = 0.09 * speed / math.sqrt(max(p.Iy, 1e-9) / p.m)

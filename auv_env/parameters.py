@@ -132,11 +132,15 @@ def checked(parameters: VehicleParameters) -> VehicleParameters:
 
 def parameters_of(given: Mapping) -> VehicleParameters:
     """Parameters from a mapping of all fields but those of linear damping, which may be left out."""
-    try:
-        return checked(VehicleParameters(**given))
-    except TypeError as error:
-        names = ", ".join(VehicleParameters._fields)
-        raise ValueError(f"a preset mapping must have the fields {names}: {error}") from None
+    known, needed = (
+        VehicleParameters._fields,
+        set(VehicleParameters._fields) - set(VehicleParameters._field_defaults),
+    )
+    unknown, missing = sorted(map(str, set(given) - set(known))), sorted(needed - set(given))
+    if unknown or missing:
+        said = [f"lacks {', '.join(missing)}"] * bool(missing) + [f"got {', '.join(unknown)}"] * bool(unknown)
+        raise ValueError(f"a preset mapping must have the fields of VehicleParameters, but {' and '.join(said)}")
+    return checked(VehicleParameters(**given))
 
 
 def derive_constants(p: VehicleParameters, substep: float = 0.0, propeller_torque: float = 0.0) -> Constants:

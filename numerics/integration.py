@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
@@ -31,6 +31,17 @@ def runge_kutta(rates: Callable, count: int) -> Callable:
     return step
 
 
+def euler(rates: Callable, count: int) -> Callable:
+    """Return `step(x, u, c)`, one step of Euler's method, x + h rates(x, u, c), of length h = c.substep [s]."""
+    add = scaled_sum(count)
+
+    @inlined
+    def step(x, u, c):
+        return add(x, c.substep, rates(x, u, c))
+
+    return step
+
+
 @makes_functions
 def runge_kutta_jacobian(rates: Callable, rates_tangent: Callable, count: int) -> Callable:
     """Return `jacobian(x, u, c)`, the exact derivative by x of the step that `runge_kutta(rates, count)` makes.
@@ -43,27 +54,40 @@ def runge_kutta_jacobian(rates: Callable, rates_tangent: Callable, count: int) -
         rates_tangent: `rates_tangent(x, dx, u, c)`, its directional derivative at x along dx.
         count: number of components of x, which is a tuple.
     """
-    stages = (
-        ("d1", "x", "direction"),
-        ("d2", "x2", "add(direction, 0.5 * h, d1)"),
-        ("d3", "x3", "add(direction, 0.5 * h, d2)"),
-        ("d4", "x4", "add(direction, h, d3)"),
-    )
-    slopes = (f"h / 6.0 * (d1[{i}] + 2.0 * d2[{i}] + 2.0 * d3[{i}] + d4[{i}])" for i in range(count))
-    whole = matrix_of(count, count, lambda i, j: f"out[{i}, {j}]")
-    lines = (
-        "h = c.substep",
+    points = (
         "k1 = rates(x, u, c)",
         "x2 = add(x, 0.5 * h, k1)",
         "k2 = rates(x2, u, c)",
         "x3 = add(x, 0.5 * h, k2)",
         "x4 = add(x, h, rates(x3, u, c))",
+    )
+    stages = (
+        "d1 = tangent(x, dx, u, c)",
+        "d2 = tangent(x2, add(dx, 0.5 * h, d1), u, c)",
+        "d3 = tangent(x3, add(dx, 0.5 * h, d2), u, c)",
+        "d4 = tangent(x4, add(dx, h, d3), u, c)",
+    )
+    mean = "(d1[{0}] + 2.0 * d2[{0}] + 2.0 * d3[{0}] + d4[{0}]) / 6.0"
+    names = {"rates": inlined(rates), "tangent": inlined(rates_tangent)}
+    return _by_directions(points, stages, mean, count, **names)
+
+
+@makes_functions
+def euler_jacobian(rates_tangent: Callable, count: int) -> Callable:
+    """Return `jacobian(x, u, c)`, the derivative by x of `euler`'s step; see `runge_kutta_jacobian`."""
+    return _by_directions((), ("d = tangent(x, dx, u, c)",), "d[{0}]", count, tangent=inlined(rates_tangent))
+
+
+def _by_directions(points: Iterable[str], stages: Iterable[str], slope: str, count: int, **names) -> Callable:
+    """A Jacobian by columns: lines that come first, those for each direction dx, the mean slope of row {0}."""
+    lines = (
+        "h = c.substep",
+        *points,
         f"out = np.empty(({count}, {count}))",
         f"for j in range({count}):",
-        "    direction = " + tuple_of(f"1.0 if j == {i} else 0.0" for i in range(count)),
-        *(f"    {slope} = tangent({point}, {dx}, u, c)" for slope, point, dx in stages),
-        *(f"    out[{i}, j] = direction[{i}] + {slope}" for i, slope in enumerate(slopes)),
-        "out" if is_array(count, count) else whole,
+        "    dx = " + tuple_of(f"1.0 if j == {i} else 0.0" for i in range(count)),
+        *(f"    {stage}" for stage in stages),
+        *(f"    out[{i}, j] = dx[{i}] + h * ({slope.format(i)})" for i in range(count)),
+        "out" if is_array(count, count) else matrix_of(count, count, lambda i, j: f"out[{i}, {j}]"),
     )
-    names = {"rates": inlined(rates), "tangent": inlined(rates_tangent), "add": scaled_sum(count), "np": np}
-    return written_out("jacobian", "x, u, c", *lines, _loops=True, **names)
+    return written_out("jacobian", "x, u, c", *lines, _loops=True, add=scaled_sum(count), np=np, **names)

@@ -24,7 +24,12 @@ def array_valued(function: Callable, arguments: str, *shape: int) -> Callable:
 
     So a user's function may return tuples, or arrays, of any size.
     """
-    if not is_array(*shape) or made_here(function):
+    return function if made_here(function) else as_array(function, arguments, *shape)
+
+
+def as_array(function: Callable, arguments: str, *shape: int) -> Callable:
+    """Return the same of a function that returns a tuple of this shape, however it was made."""
+    if not is_array(*shape):
         return function
     lines = f"out = np.empty({shape})", f"fill(out, function({arguments}))"
     names = {"function": inlined(function), "fill": fill, "np": np}

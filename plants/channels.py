@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from numerics.compiled import inlined
+from numerics.results import as_array
 from numerics.tuples import tuple_of, written_out
 from plants.quantities import Quantity
 
@@ -58,7 +59,7 @@ def reader_of(channels: Sequence[Channel], of_copy: Callable[[Callable], Callabl
 
 
 def functions_of(
-    channels: Sequence[Channel], outputs: Callable, outputs_jacobian: Callable
+    channels: Sequence[Channel], outputs: Callable, outputs_jacobian: Callable, states: int
 ) -> tuple[Callable, Callable]:
     """`observe(x, c)` of a model that has these channels, and its Jacobian by rows.
 
@@ -66,12 +67,15 @@ def functions_of(
         channels: what is measured, in order; each with slopes.
         outputs: `outputs(x, c)`, the plant's outputs y.
         outputs_jacobian: `outputs_jacobian(x, c)`, their derivatives by rows.
+        states: number of components of x.
     """
     reads = {f"read_{i}": inlined(channel.read) for i, channel in enumerate(channels)}
     slopes = {f"slopes_{i}": inlined(channel.slopes) for i, channel in enumerate(channels)}
     readings = tuple_of(f"{name}(x, y, (), c)" for name in reads)
     rows = tuple_of(f"{name}(x, dy, c)" for name in slopes)
-    return (
-        written_out("observe", "x, c", "y = outputs(x, c)", readings, outputs=outputs, **reads),
-        written_out("observe_jacobian", "x, c", "dy = slopes(x, c)", rows, slopes=outputs_jacobian, **slopes),
+    observe = written_out("observe", "x, c", "y = outputs(x, c)", readings, outputs=outputs, **reads)
+    jacobian = written_out(
+        "observe_jacobian", "x, c", "dy = slopes(x, c)", rows, slopes=outputs_jacobian, **slopes
     )
+    count = len(channels)
+    return as_array(observe, "x, c", count), as_array(jacobian, "x, c", count, states)

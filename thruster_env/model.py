@@ -8,12 +8,13 @@ from functools import partial
 
 import numpy as np
 
-from numerics.checks import covariance, finite, positive, shown
+from numerics.checks import covariance, finite, positive
 from numerics.compiled import inlined
 from numerics.linear_systems import zero_order_hold
 from numerics.pickling import makes_functions
 from plants.affine import affine_model
 from plants.channels import functions_of
+from plants.factors import scaled
 from plants.state_space import StateSpaceModel
 from thruster_env.channels import CHANNELS
 from thruster_env.dynamics import (
@@ -62,7 +63,7 @@ def _channel_functions(names: tuple[str, ...]) -> tuple[Callable, Callable]:
     if names == ("thrust",):
         return observe, observe_jacobian
     _check_channels("that a model of the state can predict", names, lambda channel: channel.slopes is not None)
-    return functions_of([CHANNELS[name] for name in names], observe, observe_jacobian)
+    return functions_of([CHANNELS[name] for name in names], observe, observe_jacobian, len(STATES))
 
 
 def _check_channels(which: str, names: tuple[str, ...], fit: Callable) -> None:
@@ -112,7 +113,8 @@ def model_of_plant(
     if plant.linear is not None and parameter_factors:
         raise ValueError(f"parameter_factors must be none for a linear plant, but got {parameter_factors}")
     if parameter_factors is not None:
-        plant = plant._replace(parameters=_scaled(plant.parameters, parameter_factors))
+        names = [name for name in ThrusterParameters._fields if name != "angles"]
+        plant = plant._replace(parameters=checked(scaled(plant.parameters, parameter_factors, names)))
     if process_noise_cov is not None:
         plant = plant._replace(process_noise_cov=covariance("process_noise_cov", process_noise_cov, 2))
     if measurement_noise_cov is not None:
@@ -211,14 +213,3 @@ def _operating_range(plant: Plant) -> dict[str, np.ndarray]:
         "state_low": np.min(ends, axis=0) + np.minimum(flow, 0.0),
         "state_high": np.max(ends, axis=0) + np.maximum(flow, 0.0),
     }
-
-
-def _scaled(parameters: ThrusterParameters, factors: Mapping[str, float]) -> ThrusterParameters:
-    names = [name for name in ThrusterParameters._fields if name != "angles"]
-    if not isinstance(factors, Mapping):
-        raise ValueError(f"parameter_factors must map names to factors, but got {shown(factors)}")
-    unknown = [name for name in factors if name not in names]
-    if unknown:
-        raise ValueError(f"parameter_factors must name fields of {', '.join(names)}, but got {unknown}")
-    scaled = {name: getattr(parameters, name) * positive(name, factor) for name, factor in factors.items()}
-    return checked(parameters._replace(**scaled))

@@ -1,0 +1,234 @@
+"""The vehicle as a `StateSpaceModel`: what a filter assumes of it, with six, eight or twelve states."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from auv_env import dynamics
+from auv_env.channels import CHANNELS, MEASURED, channels_of, suite
+from auv_env.kinematics import angle_rates, attitude_of, in_earth_axes
+from auv_env.operating import cruise_thrust, operating_range
+from auv_env.parameters import VehicleParameters, checked
+from auv_env.plant import CRUISE_SPEED, Plant, make_plant
+from auv_env.quantities import ATTITUDE_INPUTS, STATES, SYMBOLS
+from numerics.checks import covariance, one_of, positive
+from numerics.compiled import inlined
+from numerics.pickling import makes_functions
+from numerics.sources import tuple_of, written_out
+from plants.channels import functions_of
+from plants.factors import scaled
+from plants.quantities import Quantity
+from plants.state_space import StateSpaceModel
+
+
+class Steps(NamedTuple):
+    """How many states move, by which functions of the equations of motion."""
+
+    count: int
+    methods: dict[str, tuple[Callable, Callable]]  # the step by each method of integration, and its Jacobian
+
+
+MODELS = {
+    "velocities": Steps(
+        6,
+        {
+            "runge-kutta": (dynamics.velocity_substep, dynamics.velocity_jacobian),
+            "euler": (dynamics.velocity_euler, dynamics.velocity_euler_jacobian),
+        },
+    ),
+    "motion": Steps(
+        8,
+        {
+            "runge-kutta": (dynamics.motion_substep, dynamics.motion_jacobian),
+            "euler": (dynamics.motion_euler, dynamics.motion_euler_jacobian),
+        },
+    ),
+    "navigation": Steps(
+        12,
+        {
+            "runge-kutta": (dynamics.navigation_substep, dynamics.navigation_jacobian),
+            "euler": (dynamics.navigation_euler, dynamics.navigation_euler_jacobian),
+        },
+    ),
+}
+"""Models by name: the papers' six velocities; these with roll and pitch; these with yaw and position."""
+
+METHODS = ("runge-kutta", "euler")
+ATTITUDES = ("input", "level")
+
+
+@makes_functions
+def transition_of(states: str, method: str, torque_is_input: bool, attitude: str) -> tuple[Callable, Callable]:
+    """One step of a model, and its Jacobian, as functions of the model's own inputs."""
+    step, jacobian = MODELS[states].methods[method]
+    if torque_is_input:
+        inputs = ["u[0]", "u[1]", "u[2]", "u[3]"]
+    else:
+        inputs = ["u[0]", "c.propeller_torque * u[0]", "u[1]", "u[2]"]
+    if states == "velocities":
+        first = 4 if torque_is_input else 3
+        inputs += [f"u[{first}]", f"u[{first + 1}]"] if attitude == "input" else ["0.0", "0.0"]
+    source = f"move(x, {tuple_of(inputs)}, c)"
+    return (
+        written_out("transition", "x, u, c", source, move=step),
+        written_out("transition_jacobian", "x, u, c", source, _loops=True, move=jacobian),
+    )
+
+
+@inlined
+def no_outputs(x, c):
+    """Nothing: what is measured of a vehicle are its states."""
+    return ()
+
+
+@makes_functions
+def observation_of(channels: tuple[str, ...], count: int) -> tuple[Callable, Callable]:
+    """`observe` and its Jacobian for some measured quantities of the first so many states."""
+    return functions_of(channels_of(channels, count), no_outputs, no_outputs, count)
+
+
+def speed_of(x, c):
+    """Speed [m/s] over ground at components x of the state, floats or arrays."""
+    return (x[0] * x[0] + x[1] * x[1] + x[2] * x[2]) ** 0.5
+
+
+def sinking_of(x, c):
+    """Rate of depth [m/s]."""
+    return in_earth_axes(attitude_of(x[6], x[7]), 0.0, x[0], x[1], x[2])[2]
+
+
+def turning_of(x, c):
+    """Rate of yaw [rad/s]."""
+    return angle_rates(attitude_of(x[6], x[7]), x[3], x[4], x[5])[2]
+
+
+OUTPUTS = {
+    "U": (Quantity("speed", "U", "m/s"), speed_of),
+    "z_dot": (Quantity("sinking speed", "z_dot", "m/s"), sinking_of),
+    "psi_dot": (Quantity("rate of yaw", "psi_dot", "rad/s"), turning_of),
+}
+"""What follows from a state; but the speed, from one with roll and pitch."""
+
+
+def auv_model(
+    *,
+    states: str | None = None,
+    sensors=None,
+    integration: str = "runge-kutta",
+    attitude: str = "input",
+    parameter_factors: Mapping[str, float] | None = None,
+    operating_speed: float = CRUISE_SPEED,
+    process_noise_cov=None,
+    measurement_noise_cov=None,
+    prior_cov_factor: float = 1.0,
+    **plant_arguments,
+) -> StateSpaceModel:
+    """What a filter assumes of a vehicle, from plain arguments that JSON can hold.
+
+    Args:
+        states: "velocities" for (u, v, w, p, q, r), "motion" for these with (phi, theta), "navigation" for those
+            with (psi, x, y, z); None for "motion", or "navigation" if a sensor asks for it.
+        sensors: as `auv_env.plant.make_plant` takes them; None for those of the suite "default" that the states
+            predict.
+        integration: "runge-kutta", or "euler" as the papers have it.
+        attitude: of "velocities" alone: "input" for phi and theta as two further inputs, "level" for zeros.
+        parameter_factors: factors on fields of `VehicleParameters`, by which the assumed vehicle differs.
+        operating_speed: where a Kalman filter approximates the model, straight ahead [m/s].
+        process_noise_cov: Q of the model's n states, (n, n) or n variances; the plant's if None.
+        measurement_noise_cov: R, (m, m) or m variances; the plant's if None.
+        prior_cov_factor: P_0, the covariance of the filter's prior, over that of the plant's initial state.
+        **plant_arguments: others of `auv_env.plant.make_plant`.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
+    if sensors is None:
+        states = "motion" if states is None else one_of("states", states, tuple(MODELS))
+        known = SYMBOLS[: MODELS[states].count]
+        sensors = [channel for channel in suite("default") if MEASURED[channel] in known]
+    return model_of_plant(
+        make_plant(sensors=sensors, **plant_arguments),
+        states=states,
+        integration=integration,
+        attitude=attitude,
+        parameter_factors=parameter_factors,
+        operating_speed=operating_speed,
+        process_noise_cov=process_noise_cov,
+        measurement_noise_cov=measurement_noise_cov,
+        prior_cov_factor=prior_cov_factor,
+    )
+
+
+def model_of_plant(
+    plant: Plant,
+    *,
+    states: str | None = None,
+    integration: str = "runge-kutta",
+    attitude: str = "input",
+    parameter_factors: Mapping[str, float] | None = None,
+    operating_speed: float = CRUISE_SPEED,
+    process_noise_cov=None,
+    measurement_noise_cov=None,
+    prior_cov_factor: float = 1.0,
+) -> StateSpaceModel:
+    """The model of a plant, exact unless told otherwise; see `auv_model` for the arguments."""
+    states = _smallest(plant.channels) if states is None else one_of("states", states, tuple(MODELS))
+    method = one_of("integration", integration, METHODS)
+    attitude = one_of("attitude", attitude, ATTITUDES)
+    n, torque_is_input = MODELS[states].count, plant.propeller_torque is None
+    observe, observe_jacobian = observation_of(plant.channels, n)
+    if parameter_factors is not None:
+        changed = scaled(plant.parameters, parameter_factors, VehicleParameters._fields)
+        plant = plant._replace(parameters=checked(changed))
+    move, move_jacobian = transition_of(states, method, torque_is_input, attitude)
+    told = ATTITUDE_INPUTS if states == "velocities" and attitude == "input" else ()
+    inputs = plant.inputs + told
+    speed = positive("operating_speed", operating_speed)
+    thrust = cruise_thrust(plant.parameters, speed)
+    torque = plant.propeller_torque or 0.0
+    at_cruise = {"X_prop": thrust, "K_prop": torque * thrust}
+    high = operating_range(plant.parameters, plant.max_thrust)[:n]
+    prior_factor = positive("prior_cov_factor", prior_cov_factor)
+    q, r = _block(plant.process_noise_cov, n), plant.measurement_noise_cov
+    if process_noise_cov is not None:
+        q = covariance("process_noise_cov", process_noise_cov, n)
+    if measurement_noise_cov is not None:
+        r = covariance("measurement_noise_cov", measurement_noise_cov, len(plant.channels))
+    return StateSpaceModel(
+        transition=move,
+        observe=observe,
+        transition_jacobian=move_jacobian,
+        observe_jacobian=observe_jacobian,
+        process_noise_cov=q,
+        measurement_noise_cov=r,
+        prior_mean=plant.initial_mean[:n],
+        prior_cov=prior_factor * _block(plant.initial_cov, n),
+        inputs=len(inputs),
+        constants=plant.constants,
+        substeps=plant.substeps,
+        operating_state=speed * np.eye(n)[0],
+        operating_input=[at_cruise.get(quantity.symbol, 0.0) for quantity in inputs],
+        state_low=np.where(np.arange(n) == 0, 0.0, -high),
+        state_high=high,
+        states=STATES[:n],
+        input_quantities=inputs,
+        measurements=[CHANNELS[name].quantity for name in plant.channels],
+        outputs={symbol: output for symbol, output in OUTPUTS.items() if n > 6 or symbol == "U"},
+    )
+
+
+MODEL_ARGUMENTS = tuple(inspect.signature(model_of_plant).parameters)[1:]
+
+
+def _smallest(channels: tuple[str, ...]) -> str:
+    """The smaller of the two closed models that predicts all channels."""
+    within = SYMBOLS[: MODELS["motion"].count]
+    return "motion" if all(MEASURED[channel] in within for channel in channels) else "navigation"
+
+
+def _block(cov: np.ndarray, n: int) -> np.ndarray:
+    return cov[:n, :n]
