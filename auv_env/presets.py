@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from auv_env.parameters import VehicleParameters, checked, parameters_of
-from auv_env.recipe import Sizes, recipe
+from auv_env.recipe import GRAVITY, Sizes, recipe
 from numerics.checks import one_of
 
 SEGOROGENI_SIZES = Sizes(
@@ -112,11 +112,89 @@ Public files disagree: Yvv and Zww are -131 or -1310, Mqq -9.4 or -188, Nrr -9.4
 -6.6, so the first of each pair is taken.
 """
 
+_LAUV_FINS = 2 * 0.5 * 1028.0 * 0.0064 * 3.0  # lift of a pair over u^2 times its angle: density, area, slope
+
+LAUV = VehicleParameters(
+    m=18.0,
+    W=18.0 * GRAVITY,
+    B=1028.0 * 0.017551374956865266 * GRAVITY,
+    xG=0.0,
+    yG=0.0,
+    zG=0.01,
+    Ix=0.5 * 18.0 * 0.075**2,
+    Iy=18.0 / 12 * (3 * 0.075**2 + 1.08**2),
+    Iz=18.0 / 12 * (3 * 0.075**2 + 1.08**2),
+    Xud=-1.0,
+    Yvd=-16.0,
+    Yrd=0.0,
+    Zwd=-16.0,
+    Zqd=0.0,
+    Kpd=-0.005,
+    Mwd=0.0,
+    Mqd=-1.3,
+    Nvd=0.0,
+    Nrd=-1.3,
+    Xuu=-2.4,
+    Xwq=-16.0,
+    Xqq=0.0,
+    Xvr=16.0,
+    Xrr=0.0,
+    Yvv=-80.0,
+    Yrr=0.3,
+    Yuv=-_LAUV_FINS,
+    Yur=-1.0 + 0.4 * _LAUV_FINS,
+    Ywp=16.0,
+    Ypq=0.0,
+    Yuudr=_LAUV_FINS,
+    Zww=-80.0,
+    Zqq=-0.3,
+    Zuw=-_LAUV_FINS,
+    Zuq=1.0 - 0.4 * _LAUV_FINS,
+    Zvp=-16.0,
+    Zrp=0.0,
+    Zuuds=-_LAUV_FINS,
+    Kpp=-0.0006,
+    Kup=-2 * _LAUV_FINS * 0.04**2,
+    Mww=1.5,
+    Mqq=-9.1,
+    Muw=15.0 - 0.4 * _LAUV_FINS,
+    Muq=-(0.4**2) * _LAUV_FINS,
+    Mvp=0.0,
+    Mrp=1.295,
+    Muuds=-0.4 * _LAUV_FINS,
+    Nvv=-1.5,
+    Nrr=-9.1,
+    Nuv=-15.0 + 0.4 * _LAUV_FINS,
+    Nur=-(0.4**2) * _LAUV_FINS,
+    Nwp=0.0,
+    Npq=-1.295,
+    Nuudr=-0.4 * _LAUV_FINS,
+    Xu=-2.4,
+    Yv=-23.0,
+    Yr=11.5,
+    Zw=-23.0,
+    Zq=-11.5,
+    Kp=-0.3,
+    Mw=3.1,
+    Mq=-9.7,
+    Nv=-3.1,
+    Nr=-9.7,
+)
+"""LAUV as the Gazebo simulation lauv_gazebo (Apache-2.0) has it, its linear damping included.
+
+Mass, inertia, volume, added mass and damping are that file's. The products of velocities that come with the added
+mass (Munk's moment among them) follow from it; the fins lift with a slope of 3 at x = -0.4 m, 0.04 m off the axis.
+The hull's lift is not apart there: it is in the linear damping. gym-auv has the same damping, and an added mass
+from Lamb's factors with e = 1 - (b/a)^2, of which the root is forgotten. Coefficients hold about the centre of
+gravity there, and about the centre of buoyancy 1 cm above it here.
+"""
+
 PRESETS: dict[str, VehicleParameters] = {
     "segorogeni": SEGOROGENI,
     "segorogeni_papers": SEGOROGENI_PAPERS,
     "remus100": REMUS100,
     "remus100_prestero": REMUS100_PRESTERO,
+    "lauv": LAUV,
 }
 
 
