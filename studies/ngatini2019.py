@@ -42,8 +42,8 @@ PAPER = Paper(
     name="ngatini2019",
     source="Ngatini, H. Nurhadi (2019), Jurnal Inovtek Polbeng Seri Informatika 4(1), 12-21",
     remarks=(
-        "Equation (24) moves the mean, and no member: every forecast member is f(mean) plus noise, whose covariance "
-        "is Q whatever the measurements said. The slides of ngatini2017 move the members.",
+        "Equation (24) moves the mean, and no member: every forecast member is f(mean) plus noise, whose "
+        "covariance is Q whatever the measurements said. The slides of ngatini2017 move the members.",
         "The text has an accuracy above 55 %, without a definition: it cannot be done again.",
         "The seconds are linear in the number of members, 0.056 to 0.061 s each, so members were looped over. At "
         "0.001 s a step a path of 18 m takes some 20 000 steps, which would leave 3 us of Octave for a member's "

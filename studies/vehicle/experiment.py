@@ -28,7 +28,7 @@ MEASURED_PLACES = tuple("uvwpqr".index(name) for name in MEASURED)
 
 
 class Bound(NamedTuple):
-    """Least standard deviations of any estimate along the noise-free path: roots of means over the scored steps."""
+    """Least RMSE of any estimate along the noise-free path: roots of mean variances over the scored steps."""
 
     velocities: np.ndarray  # (6,)
     attitude: np.ndarray  # (2,)

@@ -43,8 +43,8 @@ class MeanPropagatingEnKF(EnsembleKalmanFilter):
     see are those of the model alone. With Q = R a state that is measured directly is estimated with the variance
     2/3 R, where a right filter has 0.618 R. It is no filter to use, so it stands here and not in `filters`.
 
-    Source: Ngatini, Nurhadi (2019), Jurnal Inovtek Polbeng Seri Informatika 4(1), equation (24), which has no index
-    on the state that is moved; probably a misprint, for the authors' slides of 2017 have one.
+    Source: Ngatini, Nurhadi (2019), Jurnal Inovtek Polbeng Seri Informatika 4(1), equation (24), which has no
+    index on the state that is moved; probably a misprint, for the authors' slides of 2017 have one.
     """
 
     name: ClassVar[str] = "mean-propagating enkf"

@@ -60,8 +60,8 @@ class OwnAttitudeKalmanFilter(ExtendedKalmanFilter):
         predict: with roll and pitch as inputs, those that its estimates of p, q, r have led to
         update:  that of `ExtendedKalmanFilter`, then roll and pitch a step further by Heun's rule
 
-    It takes the attitude as known, so its covariance is too small. Whatever is given as roll and pitch, the last two
-    inputs of the model `auv_model(states="velocities")`, is overwritten. The vehicle starts level.
+    It takes the attitude as known, so its covariance is too small. Whatever is given as roll and pitch, the last
+    two inputs of the model `auv_model(states="velocities")`, is overwritten. The vehicle starts level.
     """
 
     name: ClassVar[str] = "own attitude"

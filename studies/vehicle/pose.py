@@ -17,7 +17,7 @@ from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, i
 
 @inlined
 def next_attitude(phi, theta, before, after, dt):
-    """Roll and pitch [rad] a step later, by Heun's rule, of a body whose p, q, r [rad/s] were before and are after."""
+    """Roll and pitch [rad] a step later, by Heun's rule; p, q, r [rad/s] were before and are after."""
     rolling, pitching, _ = angle_rates(attitude_of(phi, theta), before[0], before[1], before[2])
     there = attitude_of(phi + dt * rolling, theta + dt * pitching)
     rolling_there, pitching_there, _ = angle_rates(there, after[0], after[1], after[2])

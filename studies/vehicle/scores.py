@@ -13,8 +13,8 @@ from filters.consistency.intervals import Interval, interval, mean_interval, res
 class Scores(NamedTuple):
     """A filter's errors in B runs; NaN where it says nothing.
 
-    Velocities are u, v, w [m/s] and p, q, r [rad/s], attitude is roll and pitch [rad]; both are scored from 2 s on, as
-    the NEES is. A pose is x, y, z [m] and psi [rad], scored over the whole run as the papers do, it seems.
+    Velocities are u, v, w [m/s] and p, q, r [rad/s], attitude is roll and pitch [rad]; both are scored from 2 s
+    on, as the NEES is. A pose is x, y, z [m] and psi [rad], scored over the whole run as the papers do, it seems.
     """
 
     velocities: np.ndarray  # (B, 6), mean squares
