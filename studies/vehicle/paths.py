@@ -14,8 +14,9 @@ import numpy as np
 from numerics.checks import one_of
 from studies.vehicle.printed import DT
 
-THRUST = 2.845  # [N]; holds 1 m/s, the printed speed
-TORQUE = -0.017  # [N m], of the propeller: about -0.006 m times the thrust
+THRUST = 2.84531  # [N]; holds 1 m/s, the printed speed
+TORQUE_ARM = -0.006  # propeller's torque over its thrust [m]
+TORQUE = -0.017  # [N m]; that of the constant thrust
 
 
 class Manoeuvre(NamedTuple):
@@ -39,7 +40,7 @@ class Manoeuvre(NamedTuple):
         """X_prop [N], K_prop [N m], delta_s and delta_r [rad] of the first so many steps, all if None, (K, 4)."""
         time = DT * np.arange(self.steps if steps is None else min(steps, self.steps))
         swing = self.thrust_swing * switching(time, self.thrust_period)
-        torque = np.full(len(time), TORQUE) if self.thrust_swing == 0.0 else -0.006 * THRUST * (1.0 + swing)
+        torque = np.full(len(time), TORQUE) if self.thrust_swing == 0.0 else TORQUE_ARM * THRUST * (1.0 + swing)
         stern = math.radians(self.stern) * switching(time, self.stern_period)
         rudder = math.radians(self.rudder) * switching(time, self.rudder_period)
         return np.stack([THRUST * (1.0 + swing), torque, stern, rudder], axis=1)
