@@ -49,7 +49,7 @@ def kalman(world: str = "vehicle") -> list[Estimator]:
     ]
 
 
-def ensembles(states: int = 8, world: str = "vehicle", members: Sequence[int] = MEMBERS) -> list[Estimator]:
+def ensembles(states: int, world: str = "vehicle", members: Sequence[int] = MEMBERS) -> list[Estimator]:
     """The ensemble filter for each number of members, and that of equation (24) for the least."""
     model = papers_model("motion", world) if states == 8 else papers_model("velocities", world, attitude="level")
     right = [
@@ -61,12 +61,17 @@ def ensembles(states: int = 8, world: str = "vehicle", members: Sequence[int] = 
 
 
 def fuzzy(world: str = "vehicle") -> list[Estimator]:
-    """The fuzzy filter of 64 rules: with the printed bounds, without and with offsets, and with narrow ones."""
+    """The fuzzy filter of 64 rules in four readings.
+
+    The printed bounds without and with offsets; the same with rules that go on from an estimate of their own each,
+    blended for output only; a range about the manoeuvre.
+    """
     model = papers_model("velocities", world, attitude="level")
     bounds = {"low": np.array(FUZZY_LOW), "high": np.array(FUZZY_HIGH)}
     narrow = {"low": np.array(NARROW_LOW), "high": np.array(NARROW_HIGH)}
     return [
         Estimator("fuzzy 0..1", FuzzyKalmanFilter(model=model, offsets=False, **bounds)),
         Estimator("fuzzy 0..1 offsets", FuzzyKalmanFilter(model=model, **bounds)),
+        Estimator("fuzzy 0..1 own", FuzzyKalmanFilter(model=model, offsets=False, blending="output", **bounds)),
         Estimator("fuzzy narrow offsets", FuzzyKalmanFilter(model=model, **narrow)),
     ]

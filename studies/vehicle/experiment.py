@@ -154,12 +154,14 @@ def scores_of(one: Estimator, truth: Truth, keys: np.ndarray, inputs: np.ndarray
         velocities, errors = estimates.means[..., :6], all_errors[..., :6]
         attitude = np.square(all_errors[..., 6:]).mean(axis=1) if one.has_attitude else nothing[:, :2]
         full = full_pose(velocities, estimates.means[..., 6:] if one.has_attitude else None, DT) - true_pose
-    planar = planar_pose(velocities, DT) - true_pose
+    by_yaw = planar_pose(velocities, DT)
+    planar, both = by_yaw - true_pose, by_yaw - planar_pose(truth.states[..., :6], DT)
     return Scores(
         np.square(errors).mean(axis=1),
         attitude,
         nothing if full is None else np.square(full).mean(axis=1),
         np.square(planar).mean(axis=1),
+        np.square(both).mean(axis=1),
         nothing if full is None else np.abs(full[:, -1]),
         np.abs(planar[:, -1]),
         nees,

@@ -21,6 +21,7 @@ class Scores(NamedTuple):
     attitude: np.ndarray  # (B, 2), mean squares
     full: np.ndarray  # (B, 4), mean squares of the pose by the full transformation
     planar: np.ndarray  # (B, 4), the same by yaw alone
+    planar_both: np.ndarray  # (B, 4), by yaw alone, against the path that true velocities give by yaw alone
     full_end: np.ndarray  # (B, 4), absolute errors at the end
     planar_end: np.ndarray  # (B, 4)
     nees: np.ndarray  # (B,), mean
@@ -47,7 +48,7 @@ def joined(parts: Sequence[Scores]) -> Scores:
 
 
 def position_ratio(a: Scores, b: Scores, field: str) -> Interval:
-    """RMSE of position of a over that of b on the same runs, paired, by "full" or "planar" transformation."""
+    """RMSE of position of a over that of b on the same runs, paired, of a field of poses such as "full"."""
     above, below = (getattr(one, field)[:, :3].sum(axis=1) for one in (a, b))
     ratios = np.sqrt(resampled_means(above) / resampled_means(below))
     return interval(float(np.sqrt(above.mean() / below.mean())), ratios)
