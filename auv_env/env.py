@@ -116,9 +116,7 @@ class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
 
 def action_space(plant: Plant) -> gym.spaces.Box:
     """Thrust from zero, planes, and between them the torque where it is an action, each to its limit."""
-    torque = [] if plant.propeller_torque is not None else [plant.max_torque]
-    top = np.array([plant.max_thrust, *torque, plant.max_plane, plant.max_plane], dtype=np.float32)
-    return gym.spaces.Box(np.concatenate([[np.float32(0.0)], -top[1:]]), top, dtype=np.float32)
+    return gym.spaces.Box(*(limit.astype(np.float32) for limit in plant.input_limits), dtype=np.float32)
 
 
 def at_depth(plant: Plant, depth: float) -> Plant:

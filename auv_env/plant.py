@@ -71,6 +71,13 @@ class Plant(NamedTuple):
         return abs(DEFAULT_PROPELLER_TORQUE) * self.max_thrust
 
     @property
+    def input_limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest inputs (p,), in their order: what is beyond is cut off."""
+        torque = [] if self.propeller_torque is not None else [self.max_torque]
+        high = np.array([self.max_thrust, *torque, self.max_plane, self.max_plane])
+        return np.concatenate([[0.0], -high[1:]]), high
+
+    @property
     def channels(self) -> tuple[str, ...]:
         """Names of the measured quantities, in order."""
         return tuple(self.sensors)

@@ -19,7 +19,7 @@ from numerics.compiled import tell_when_compiling
 from numerics.files import write_whole
 from thruster_cli.characters import showable
 from thruster_env.parameters import PRESETS
-from tuning.thruster.scenarios import SCENARIOS
+from tuning.problems.rooms import built_in
 
 JsonOption = Annotated[
     str | None,
@@ -30,7 +30,7 @@ SeedOption = Annotated[
     int, typer.Option("--seed", min=0, help="Seed of all randomness; the same seed repeats all.")
 ]
 PROBLEMS = (
-    f"{', '.join(SCENARIOS)}, a .toml file, or module:object: a tuning.problems.problem.Problem, or a function "
+    f"{', '.join(built_in())}, a .toml file, or module:object: a tuning.problems.problem.Problem, or a function "
     "that gives one."
 )
 CodeOption = Annotated[

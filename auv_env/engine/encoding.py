@@ -74,11 +74,14 @@ def _program(plant: Plant, numbers: np.ndarray) -> tuple[list[float], int]:
     context = VehicleContext(plant.dt, at.VALID - at.READINGS, at.STATE + at.Z)
     chains = [(0, plant.current.get(name, ()), at.CURRENT + i) for i, name in enumerate(DIRECTIONS)]
     chains += [(1, effects, at.READINGS + i) for i, effects in enumerate(plant.sensors.values())]
+    instruments = list(plant.instruments.values())  # what one of them measures is lost together
+    first = [*range(len(DIRECTIONS)), *(len(DIRECTIONS) + instruments.index(one) for one in instruments)]
     known = known_effects()
     program: list[float] = []
     rows = 0
     for index, (section, effects, target) in enumerate(chains):
-        code, taken = encoded(effects, known[section], target, at.FIXED_ROWS + rows, index * _SPACING, context)
+        number, with_first = index * _SPACING, first[index] * _SPACING
+        code, taken = encoded(effects, known[section], target, at.FIXED_ROWS + rows, number, context, with_first)
         numbers[at.SECTIONS + section] += len(effects)
         program += code
         rows += taken

@@ -131,13 +131,23 @@ def uniforms(memory, b, j, number):
 
 
 def encoded(
-    effects, kinds: tuple[type[Effect], ...], target: int, first_row: int, first_number: int, context: Context
+    effects,
+    kinds: tuple[type[Effect], ...],
+    target: int,
+    first_row: int,
+    first_number: int,
+    context: Context,
+    lost_with: int | None = None,
 ):
-    """Numbers of some effects on one target row, and the number of rows that they take."""
+    """Numbers of some effects on one target row, and the number of rows that they take.
+
+    With `lost_with`, the first number of another channel's effects, measurements are lost when that channel's are.
+    """
     numbers: list[float] = []
     rows = 0
-    for number, effect in enumerate(effects, first_number):
+    for place, effect in enumerate(effects):
         parameters = _representable(effect, effect.parameters(context))
+        number = place + (lost_with if effect.loses and lost_with is not None else first_number)
         header = [5 + len(parameters), kinds.index(type(effect)), target, first_row + rows, number]
         numbers += [*header, *parameters]
         rows += effect.rows(context)

@@ -17,7 +17,7 @@ from plants.disturbances.effects import LONGEST, Effect, Registry, set_field
 from plants.disturbances.sensors import probability
 
 EXCITATIONS = Registry("excitation")
-Levels = float | tuple[float, ...]  # one for all inputs, or one each, in their units
+Level = float | tuple[float, ...]  # one for all inputs, or one each, in their units
 
 
 class Excitation(Effect):
@@ -25,7 +25,7 @@ class Excitation(Effect):
 
     def inputs(self, keys: np.ndarray, steps: int, dt: float, count: int) -> np.ndarray:
         """Inputs (B, steps, count) for keys (B, 2) and a sample time [s]."""
-        for name in ("amplitude", "offset"):
+        for name in ("amplitude", "offset", "low", "high"):
             given = getattr(self, name, 0.0)
             if isinstance(given, tuple) and len(given) != count:
                 raise ValueError(f"{name} must be one number, or one for each of {count} inputs, but got {given}")
@@ -42,7 +42,7 @@ class Excitation(Effect):
 class Steps(Excitation):
     """Levels uniform within plus and minus `amplitude`, each held for `hold` steps."""
 
-    amplitude: Levels = 12.0
+    amplitude: Level = 12.0
     hold: int = 25
 
     def __post_init__(self):
@@ -65,13 +65,42 @@ class BinarySequence(Steps):
         return level_of(self.amplitude, number) * np.sign(held_levels(keys, 1.0, self.hold, steps, number))
 
 
+@EXCITATIONS.register("levels")
+@dataclass(frozen=True)
+class Levels(Excitation):
+    """Levels uniform between `low` and `high`, each held for `shortest` to `longest` steps."""
+
+    low: Level = -12.0
+    high: Level = 12.0
+    shortest: int = 10
+    longest: int = 50
+
+    def __post_init__(self):
+        """Check the arguments."""
+        set_field(self, "low", levels("low", self.low, signed=True))
+        set_field(self, "high", levels("high", self.high, signed=True))
+        if np.any(np.asarray(self.low) > np.asarray(self.high)):
+            raise ValueError(f"low must be at most high, {self.high}, but got {self.low}")
+        set_field(self, "shortest", at_least("shortest", self.shortest, 1, LONGEST))
+        set_field(self, "longest", at_least("longest", self.longest, self.shortest, LONGEST))
+
+    def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
+        """One of the inputs, (B, steps)."""
+        share, length, *_ = uniforms(keys, np.arange(steps // self.shortest + 1), number)
+        lengths = self.shortest + np.floor((self.longest - self.shortest + 1) * length).astype(np.int64)
+        ends = np.cumsum(lengths, axis=1)
+        piece = np.stack([np.searchsorted(one, np.arange(steps), side="right") for one in ends])
+        low, high = level_of(self.low, number), level_of(self.high, number)
+        return low + (high - low) * np.take_along_axis(share, piece, axis=1)
+
+
 @EXCITATIONS.register("multi-sine")
 @dataclass(frozen=True)
 class MultiSine(Excitation):
     """Sines of equal `amplitude`, given `periods` [s] and drawn phases, added to `offset`."""
 
-    amplitude: Levels = 4.0
-    offset: Levels = 0.0
+    amplitude: Level = 4.0
+    offset: Level = 0.0
     periods: tuple[float, ...] = (2.3, 0.9, 0.4)
 
     def __post_init__(self):
@@ -98,7 +127,7 @@ class Dwells(Excitation):
     zero with probability `zeros`, else uniform within plus and minus `amplitude`.
     """
 
-    amplitude: Levels = 1.0
+    amplitude: Level = 1.0
     ramp: int = 50
     dwell: int = 25
     zeros: float = 0.5
@@ -132,12 +161,12 @@ def uniforms(keys: np.ndarray, draws: np.ndarray, number: int = 0) -> tuple[np.n
     return uniform_block(number, draws[None, :], EXCITATION, keys[:, :1], keys[:, 1:])
 
 
-def levels(name: str, given, *, signed: bool = False) -> Levels:
+def levels(name: str, given, *, signed: bool = False) -> Level:
     """One level for all inputs, or one each; ValueError unless finite and, if not signed, not negative."""
     check = finite if signed else (lambda name, value: positive(name, value, zero_allowed=True))
     return tuple(check(name, one) for one in given) if isinstance(given, list | tuple) else check(name, given)
 
 
-def level_of(given: Levels, number: int) -> float:
+def level_of(given: Level, number: int) -> float:
     """The level of one input."""
     return given[number] if isinstance(given, tuple) else given

@@ -7,7 +7,7 @@ from types import ModuleType
 
 # Each has the class Scenario, NAMES of scenarios, the NOMINAL one, find_scenario(name) and
 # computed_scale(scenario, sequences).
-ROOMS = {"thruster": "tuning.thruster.find"}
+ROOMS = {"thruster": "tuning.thruster.find", "auv": "tuning.auv.find"}
 
 
 def room_of(plant: str) -> ModuleType:

@@ -1,0 +1,1 @@
+"""The underwater vehicle's scenarios."""

@@ -1,0 +1,152 @@
+"""`Scenario`: a named, seeded, immutable recipe for an underwater vehicle, made once for all filters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+
+import numpy as np
+
+from auv_env.channels import MAX_CHANNELS
+from auv_env.model import MODELS, model_of_plant
+from auv_env.operating import operating_range
+from auv_env.plant import DEFAULT_DT, DEFAULT_PROCESS_NOISE, DEFAULT_PROPELLER_TORQUE, Plant, make_plant
+from auv_env.quantities import STATES
+from auv_env.simulation import simulate
+from filters.bounds import path_bound
+from numerics.checks import one_of, positive, shown, vector
+from numerics.streams import episode_keys, filter_keys
+from plants.state_space import StateSpaceModel
+from tuning.auv.excitation import commands_of
+from tuning.problems.data import Data
+from tuning.problems.plain import plain
+from tuning.problems.scenario import BaseScenario
+
+UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as part of each state's range
+RUNS_AT_ONCE = 16  # whose covariances of every step the bound holds together
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario(BaseScenario):
+    """A vehicle, an excitation and what a filter assumes of the vehicle.
+
+    A filter's model has the first states of the twelve; it is the vehicle's, but for `parameter_factors`, and
+    knows the distribution of the initial state. Of sensor effects and the current it knows nothing.
+
+    Attributes, beside those of `BaseScenario`:
+        process_noise_cov: the vehicle's Q, twelve variances a step.
+        measurement_noise_cov: the vehicle's R, a variance a channel.
+        scale: of each of the model's states, the root of the Riccati covariance along the noise-free path, fixed
+            numbers made by `scale.computed_scale`.
+        states: those of the model, "velocities" (6), "motion" (8) or "navigation" (12). With "velocities" roll and
+            pitch are inputs, true ones.
+        preset: the vehicle, as for `auv_env.plant.make_plant`; so are all that follow.
+        dt: sample time [s].
+        propeller_torque: over thrust [m]; None makes it an input.
+        initial_state: None, twelve numbers, or a mapping.
+        sensors: a suite's name, channels, or a mapping from them to lists of effects.
+        current: three velocities [m/s], or signals by direction.
+        propeller_lag: [s], of which filters do not know.
+        plane_lag: the same of both planes [s].
+    """
+
+    plant_kind = "auv"
+    process_noise_cov: Sequence[float] = DEFAULT_PROCESS_NOISE
+    measurement_noise_cov: Sequence[float] | None = None
+    states: str = "motion"
+    preset: str | Mapping = "segorogeni"
+    dt: float = DEFAULT_DT
+    propeller_torque: float | None = DEFAULT_PROPELLER_TORQUE
+    initial_state: Sequence | Mapping | None = None
+    sensors: str | Sequence | Mapping = "motion"
+    current: Sequence | Mapping = field(default_factory=dict)
+    propeller_lag: float = 0.0
+    plane_lag: float = 0.0
+
+    __hash__ = BaseScenario.__hash__
+
+    def own_checks(self) -> dict:
+        """Noise, and the scale of the model's states."""
+        one_of("states", self.states, tuple(MODELS))
+        own = {
+            "scale": self.checked_scale(self.count),
+            "process_noise_cov": vector("process_noise_cov", self.process_noise_cov, len(STATES)).tolist(),
+        }
+        given = self.measurement_noise_cov
+        if given is None:  # of the instruments, so that the scenario says what they are
+            own["measurement_noise_cov"] = np.diag(make_plant(sensors=self.sensors).measurement_noise_cov).tolist()
+            return own
+        if not isinstance(given, list | tuple) or not 1 <= len(given) <= MAX_CHANNELS:
+            rule = f"measurement_noise_cov must be 1 to {MAX_CHANNELS} variances, one a channel"
+            raise ValueError(f"{rule}, but got {shown(given)}")
+        return own | {"measurement_noise_cov": [positive("measurement_noise_cov", one) for one in given]}
+
+    @property
+    def count(self) -> int:
+        """Number n of the model's states."""
+        return MODELS[self.states].count
+
+    @property
+    def plant_arguments(self) -> dict:
+        """Arguments of the env of the same vehicle, `SegorogeniAUV-v0`."""
+        own = {"name", "about", "scale", "parameter_factors", "excitation", "steps", "first_scored_step", "states"}
+        names = [entry.name for entry in fields(self) if entry.name not in own]
+        return {name: plain(getattr(self, name)) for name in names}
+
+    @cached_property
+    def plant(self) -> Plant:
+        """The true vehicle."""
+        return make_plant(**self.plant_arguments)
+
+    def model(self, **changes) -> StateSpaceModel:
+        """What the filter assumes; changes are arguments of `auv_env.model.model_of_plant`."""
+        held = {"states": self.states, "parameter_factors": dict(self.parameter_factors) or None}
+        return model_of_plant(self.plant, **{**held, **changes})
+
+    @property
+    def held(self) -> dict:
+        """What the filter's model has of its own: its states, and wrong parameters."""
+        return {"states": self.states, **super().held}
+
+    @property
+    def untuned(self) -> dict:
+        """Model arguments of the untuned filter: R from the sheets, Q from 1 % of each state's range."""
+        top = operating_range(self.plant.parameters, self.plant.max_thrust)[: self.count]
+        deviation = UNTUNED_RANGE_FRACTION * np.where(np.arange(self.count) == 0, 1.0, 2.0) * top
+        return {
+            "process_noise_cov": tuple(float(v) for v in deviation**2),
+            "measurement_noise_cov": self.measurement_noise_cov,
+        }
+
+    @property
+    def true(self) -> dict:
+        """Model arguments of the filter that knows the vehicle's Q and R."""
+        return {**super().true, "process_noise_cov": self.process_noise_cov[: self.count]}
+
+    def bound(self, data: Data) -> np.ndarray:
+        """Riccati's standard deviation of each state (n,) along noise-free paths, over scored steps.
+
+        It is that of the nominal vehicle with the same Q, R and inputs, and with the measurements that the data
+        have. `posterior_bound` would be useless here: angles and positions have hardly any noise of their own.
+        """
+        exact, missing, total = model_of_plant(self.plant, states=self.states), np.isnan(data.measurements), 0.0
+        for first in range(0, len(data.seeds), RUNS_AT_ONCE):
+            some = slice(first, first + RUNS_AT_ONCE)
+            covs = path_bound(exact, data.inputs[some], missing[some])
+            total = total + np.einsum("bkii->i", covs[:, data.scored])
+        return np.sqrt(total / (len(data.seeds) * (data.steps + 1 - data.first_scored)))
+
+    def make(self, seeds: tuple[int, ...]) -> Data:
+        """Truth and measurements under the excitation's thrusts and planes."""
+        keys, plant = episode_keys(seeds), self.plant
+        commands = commands_of(self.excitation, plant, keys, self.steps)
+        found = simulate(plant, keys, commands).checked(f"the plant of scenario {self.name}")
+        inputs = commands
+        if self.states == "velocities":
+            inputs = np.concatenate([commands, found.states[:, :-1, 6:8]], axis=2)
+        states = np.ascontiguousarray(found.states[..., : self.count])
+        model = self.model()
+        outputs = {symbol: model.output(symbol, states) for symbol in model.outputs}
+        measurements = np.where(found.valid, found.measurements, np.nan)  # as filters take missing ones
+        return Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, states, outputs)
