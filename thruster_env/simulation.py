@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from plants.record import record
 from thruster_env.engine.copies import Copies
-from thruster_env.engine.memory import FLOW, OMEGA, READINGS, REPORTED, THRUST, VALID
+from thruster_env.engine.memory import FLOW, OMEGA, READINGS, THRUST, VALID
 from thruster_env.plant import Plant
 from thruster_env.task import Task
 
@@ -40,19 +41,8 @@ def simulate(plant: Plant, keys: np.ndarray, voltages: np.ndarray) -> Simulation
     Raises:
         ValueError: if shapes do not fit or a number is not finite.
     """
-    keys, voltages = (np.ascontiguousarray(a, dtype=np.float64) for a in (keys, voltages))
-    if keys.ndim != 2 or keys.shape[1] != 2 or not np.isfinite(keys).all():
-        raise ValueError(f"keys must be finite and of shape (B, 2), but got shape {keys.shape}")
-    if voltages.ndim != 2 or len(voltages) != len(keys) or np.isnan(voltages).any():
-        rule = f"without NaN and of shape ({len(keys)}, K), one row a key"
-        raise ValueError(f"voltages must be {rule}, but got shape {voltages.shape}")
-    copies = Copies(plant, Task(), len(keys))
-    record = np.empty((voltages.shape[1] + 1, REPORTED, len(keys)))
-    record[0] = copies.begin(keys)
-    for k, voltage in enumerate(voltages.T):
-        record[k + 1] = copies.step(voltage)
+    reports = record(lambda count: Copies(plant, Task(), count), keys, voltages, "voltages", 1)
     m = len(plant.channels)
-    record = np.ascontiguousarray(record.transpose(2, 0, 1))
-    readings = record[..., READINGS : READINGS + m]
-    valid = record[..., VALID : VALID + m] > 0 if plant.dropping_channels else np.ones(readings.shape, dtype=bool)
-    return Simulation(record[..., OMEGA : FLOW + 1], record[..., THRUST], readings, valid)
+    readings = reports[..., READINGS : READINGS + m]
+    valid = reports[..., VALID : VALID + m] > 0 if plant.dropping_channels else np.ones(readings.shape, dtype=bool)
+    return Simulation(reports[..., OMEGA : FLOW + 1], reports[..., THRUST], readings, valid)

@@ -1,0 +1,35 @@
+"""Whole trajectories of a plant, without an env around it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from auv_env.engine.copies import Copies
+from auv_env.engine.memory import READINGS, STATE, VALID, N
+from auv_env.plant import Plant
+from auv_env.task import make_task
+from plants.record import record
+
+
+class Simulation(NamedTuple):
+    """Trajectories of a batch of B vehicles over K steps."""
+
+    states: np.ndarray  # (B, K + 1, 12)
+    measurements: np.ndarray  # (B, K + 1, m)
+    valid: np.ndarray  # (B, K + 1, m), false where a measurement is missing and the last one repeated
+
+
+def simulate(plant: Plant, keys: np.ndarray, inputs: np.ndarray) -> Simulation:
+    """Run a plant from its initial state for every key (B, 2) under inputs (B, K, p).
+
+    The same key and inputs give the same numbers as an env that is stepped through Gymnasium.
+
+    Raises:
+        ValueError: if shapes do not fit or a number is not finite.
+    """
+    m = len(plant.channels)
+    reports = record(lambda count: Copies(plant, make_task(), count), keys, inputs, "inputs", len(plant.inputs))
+    valid = reports[..., VALID : VALID + m] > 0.0
+    return Simulation(reports[..., STATE : STATE + N], reports[..., READINGS : READINGS + m], valid)
