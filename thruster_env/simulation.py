@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plants.trajectories import check_finite, recorded
+from plants.record import check_finite, record
 from thruster_env.engine.copies import Copies
 from thruster_env.engine.memory import FLOW, OMEGA, READINGS, THRUST, VALID
 from thruster_env.plant import Plant
@@ -35,11 +35,8 @@ def simulate(plant: Plant, keys: np.ndarray, voltages: np.ndarray) -> Simulation
     Raises:
         ValueError: if shapes do not fit or a number is not finite.
     """
-    voltages = np.asarray(voltages, dtype=np.float64)
-    if voltages.ndim != 2:
-        raise ValueError(f"voltages must be of shape (B, K), one row a key, but got shape {voltages.shape}")
-    record = recorded(Copies(plant, Task(), len(keys)), keys, voltages[..., None])
+    reports = record(lambda count: Copies(plant, Task(), count), keys, voltages, "voltages", 1)
     m = len(plant.channels)
-    readings = record[..., READINGS : READINGS + m]
-    valid = record[..., VALID : VALID + m] > 0 if plant.dropping_channels else np.ones(readings.shape, dtype=bool)
-    return Simulation(record[..., OMEGA : FLOW + 1], record[..., THRUST], readings, valid)
+    readings = reports[..., READINGS : READINGS + m]
+    valid = reports[..., VALID : VALID + m] > 0 if plant.dropping_channels else np.ones(readings.shape, dtype=bool)
+    return Simulation(reports[..., OMEGA : FLOW + 1], reports[..., THRUST], readings, valid)

@@ -108,7 +108,7 @@ def make_setup(
     kind.check_scenario(scenario)
     if arm.filter is None and (filter_arguments or tuned):
         raise ValueError(f"filter arguments must come with an arm that has a filter, but got {observe!r}")
-    assumed = {"parameter_factors": plain(scenario.parameter_factors)} if scenario.parameter_factors else {}
+    assumed = {name: value for name, value in plain(scenario.held).items() if value}
     given = {**arm.numbers, **assumed} if arm.filter is not None else {}
     if tuned is not None:
         content = read_tuned_file(tuned)

@@ -60,10 +60,8 @@ class Renderer(PlantRenderer):
 
         given = self._made_with
         strips = (
-            Strip(
-                "depth", "depth [m]", 2, 254, 54, 1.0, "measured_depth", "reference_depth", False, downward=True
-            ),
-            Strip("u", "speed ahead [m/s]", 2, 330, 52, 1.0, "measured_u", "reference_u"),
+            Strip("depth", "depth [m]", 2, 254, 54, 100.0, *_named("depth"), says_numbers=False, downward=True),
+            Strip("u", "speed ahead [m/s]", 2, 330, 52, 1.0, *_named("u")),
         )
         self._view = View(self._canvas, given["path"])
         self._dials = Dials(self._canvas, PANEL)
@@ -78,3 +76,8 @@ class Renderer(PlantRenderer):
         self._dials.draw(columns, moment)
         self._charts.draw(columns, count - 1, label)
         self._gauges.draw(moment)
+
+
+def _named(name: str) -> tuple[str, str]:
+    """Columns of what is measured of a quantity, and of its reference."""
+    return f"measured_{name}", f"reference_{name}"

@@ -37,7 +37,10 @@ ALLOWED = {
     "studies": {"numerics", "plants", "thruster_env", "filters", "tuning"},
     "thruster_cli": set(ROOMS),
 }
-TUNING_OF_PLANTS = {"tuning/thruster": {"thruster_env"}, "tuning/auv": {"auv_env"}}  # the rooms of tuning that know a plant
+TUNING_OF_PLANTS = {
+    "tuning/thruster": {"thruster_env"},
+    "tuning/auv": {"auv_env"},
+}  # the rooms of tuning that know a plant
 LEARNING = {"stable_baselines3", "sb3_contrib", "rl_zoo3", "torch"}
 
 

@@ -32,7 +32,11 @@ def test_a_policy_learns_on_every_arm_and_is_scored(observe, tmp_path):
     seeds = held_out_seeds(0, 3)
     policy = load(find_saved(run.folder), make_environments(setup, seeds))
     scores = score(policy, setup, seeds)
-    assert scores.returns.shape == (3,) and (scores.returns < 0).all() and scores.parts["all"].steps.sum() == 3 * LIMIT
+    assert (
+        scores.returns.shape == (3,)
+        and (scores.returns < 0).all()
+        and scores.parts["all"].steps.sum() == 3 * LIMIT
+    )
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from numerics.checks import one_of
+from training.plants.auv import AUV
 from training.plants.plant import TrainingPlant
 from training.plants.thruster import THRUSTER
 
-PLANTS: dict[str, TrainingPlant] = {"thruster": THRUSTER}
+PLANTS: dict[str, TrainingPlant] = {"thruster": THRUSTER, "vehicle": AUV}
 TASKS = {name: task for plant in PLANTS.values() for name, task in plant.tasks.items()}
 
 
