@@ -17,7 +17,7 @@ from filters import StateSpaceModel, make_filter, run
 from filters.consistency.intervals import Interval, mean_interval
 from numerics.checks import at_least, one_of
 from studies import BENCHMARKS
-from tuning.evaluation.evaluate import state_errors
+from tuning.evaluation.runs import state_errors
 from tuning.problems.model_problem import ModelProblem
 
 RUNS = 16  # of 1000 analyses each; what is published rests on one such run, as far as is told

@@ -8,7 +8,6 @@ import numpy as np
 
 from filters.baselines.baselines import OpenLoop
 from filters.bounds import posterior_bound
-from filters.engine.batch import run
 from numerics.checks import shown
 from numerics.streams import episode_keys, filter_keys
 from plants.simulate import simulate
@@ -18,6 +17,7 @@ from tuning.problems.check import check_quantities
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.digest import digest_of
 from tuning.problems.excitation import EXCITATIONS, Excitation
+from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.parameter import Parameter
 
 SCALE_SEEDS = range(200)  # whose inputs the scale is the bound of, where none is given
@@ -132,9 +132,9 @@ class ModelProblem(AssumedProblem):
         scale = self._bound(data, 100)
         if np.isnan(scale).any():
             with np.errstate(all="ignore"):
-                estimates = run(OpenLoop(model=self.truth), data.filter_keys, data.inputs, data.measurements)
-                errors = (estimates.means[..., self._shared] - data.states)[:, data.scored]
-                scale = np.sqrt((errors**2).mean(axis=(0, 1)))
+                parts = estimates_in_parts(OpenLoop(model=self.truth), data)
+                errors = [(found.means[..., self._shared] - one.states)[:, one.scored] for one, found in parts]
+                scale = np.sqrt((np.concatenate(errors) ** 2).mean(axis=(0, 1)))
         if not (np.isfinite(scale).all() and (scale > 0).all()):
             raise ValueError(
                 f"the scale of problem {self.name} must be given where neither a bound nor the error of the open "
