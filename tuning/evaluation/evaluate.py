@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.consistency.intervals import Interval, interval, mean_interval, resampled_means, rmse_intervals
-from filters.consistency.report import ConsistencyReport, consistency_report
-from filters.engine.batch import run
+from filters.consistency.report import ConsistencyReport, findings, joined, report_of
 from filters.ensembles.recording import record_members
 from filters.filter import Filter
 from plants.quantities import Quantity
 from tuning.evaluation.runs import RunMetrics, metrics_of_all
 from tuning.problems.data import Data
+from tuning.problems.in_parts import estimates_in_parts
 
 MEMBER_RUNS, MEMBER_STEPS = 40, 5  # rank histograms are made of so many runs, and of every fifth step
 NOTHING = Interval(np.nan, np.nan, np.nan)
@@ -130,19 +130,23 @@ def _checked(scale, n: int) -> np.ndarray:
 
 def check_consistency(filter_: Filter, data: Data) -> ConsistencyReport:
     """Whether a filter's covariance is consistent on some data, and for an ensemble whether its members are."""
-    estimates, members, model = run(filter_, data.filter_keys, data.inputs, data.measurements), None, filter_.model
+    model, members, first = filter_.model, None, data.scored.start
     n = model.n if data.states is None else data.states.shape[-1]
     if filter_.size and data.states is not None:
         some = (part[:MEMBER_RUNS] for part in (data.filter_keys, data.inputs, data.measurements))
-        members = record_members(filter_, *some, first=data.scored.start, every=MEMBER_STEPS)
-    return consistency_report(
-        estimates._replace(means=estimates.means[..., :n], covs=estimates.covs[..., :n, :n]),
+        members = record_members(filter_, *some, first=first, every=MEMBER_STEPS)
+    angles = model.shape.state_angles[:n]
+    parts = []
+    for one, estimates in estimates_in_parts(filter_, data):
+        own = estimates._replace(means=estimates.means[..., :n], covs=estimates.covs[..., :n, :n])
+        parts.append(findings(own, one.states, one.measurements, first, angles))
+    return report_of(
+        joined(parts),
         data.states,
-        data.measurements,
         members=members,
-        first_step=data.scored.start,
+        first_step=first,
         names=[state.short_label for state in model.states[:n]],
-        angles=model.shape.state_angles[:n],
+        angles=angles,
         channels=[channel.label for channel in model.measurements],
     )
 
