@@ -7,6 +7,7 @@ Nothing has a unit: time is in that of the equations.
 
     thruster reproduce lorenz63
     thruster tune --problem studies.lorenz63:problem --filter etkf --hold-r --trials 30
+    thruster tune --problem studies.lorenz63:problem --filter pf --hold-r --trials 30
     thruster tune --problem studies.lorenz63:faded --filter ekf --trials 30
     thruster tune --problem studies.lorenz63:jittered --filter pf --trials 30
 
