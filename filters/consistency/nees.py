@@ -9,6 +9,7 @@ from scipy.special import chdtr, chdtri
 
 from filters.consistency.intervals import Interval, mean_interval
 from filters.consistency.uniformity import Uniformity, uniformity
+from numerics.threads import spread
 
 SINGULAR = 1e-12  # a pivot of P below this part of its variance counts as zero
 LARGEST_BY_ENTRIES = 12  # beyond, operations on single entries take longer than copies of columns
@@ -23,8 +24,20 @@ def whitened(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
         if errors.shape[-1] <= LARGEST_BY_ENTRIES:
             return _by_entries(errors, covs)
         if errors.ndim > 2:
-            return np.stack([whitened(*pair) for pair in zip(errors, covs, strict=True)])
+            return _by_runs(errors, covs)
         return _by_columns(errors, covs)
+
+
+def _by_runs(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
+    """`whitened` of one run after the other, shared out to the cores: NumPy lets other threads run meanwhile."""
+    out = np.empty(errors.shape)
+
+    def part(first: int, last: int) -> None:
+        for run in range(first, last):
+            out[run] = whitened(errors[run], covs[run])
+
+    spread(part, len(errors))
+    return out
 
 
 def _by_entries(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
