@@ -62,7 +62,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
 
 
 def study_seconds(seed: int, count: int, seeds: int) -> tuple[float, list[int]]:
-    """Seconds of a study of so many trials on so many seeds, without pruning, and the N of each trial."""
+    """Seconds of a study of so many trials on so many seeds, without pruning, and the N of all that it runs."""
     quiet_optuna()
     few = mock.patch.multiple(plans, TRAINING_SEEDS=seeds, SIZE_SEEDS=seeds)
     sizes = mock.patch.object(space, "KALMAN_SIZES", space.Sizes(30, 5, LARGEST))
@@ -72,7 +72,10 @@ def study_seconds(seed: int, count: int, seeds: int) -> tuple[float, list[int]]:
         plan.training_data()  # drawing the truth is no part of the study, nor of the peer's runs
         begin = perf_counter()
         result = run_study(study, plan, count)
-        return perf_counter() - begin, [trial.params["N"] for trial in result.trials]
+        seconds = perf_counter() - begin
+    # Each size that the study looks at in the end is run on as many training and as many fresh seeds.
+    sizes = [trial.params["N"] for trial in result.trials] + 2 * [row.size for row in result.sizes]
+    return seconds, [*sizes, result.choice.numbers["ensemble_size"]]
 
 
 def peer_line(steps: int) -> np.ndarray:

@@ -31,9 +31,8 @@ RUNS, TRIALS = 16, 20
 def published(name: str) -> str:
     """A standard problem: theirs, ours, why different."""
     benchmark = find_benchmark(name)
-    header = ["filter", benchmark.theirs, f"ours, {benchmark.score}", "ratio", "pooled", "why different"]
     remarks = "\n".join(f"- {remark}" for remark in benchmark.remarks)
-    return f"{table(header, [row.cells() for row in benchmark.reproduce(RUNS)])}\n\n{remarks}"
+    return f"{table(benchmark.header, [row.cells() for row in benchmark.reproduce(RUNS)])}\n\n{remarks}"
 
 
 def inflation() -> str:

@@ -81,6 +81,13 @@ def at_least(name: str, value, least: int, most: int | None = None) -> int:
     return int(number)
 
 
+def switch(name: str, value) -> int:
+    """Return value as an int; raise ValueError unless it is 0 or 1."""
+    if at_least(name, value, 0) > 1:
+        raise ValueError(f"{name} must be 0 or 1, but got {shown(value)}")
+    return int(value)
+
+
 def seed(value) -> int | None:
     """Return a reset's seed as an int or None; raise ValueError unless it is a whole number or None."""
     if value is None:

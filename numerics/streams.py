@@ -15,7 +15,7 @@ from numerics.trigonometry import cosine_and_sine_of_turns
 
 # Streams: what a draw is for. Two streams of one key are independent.
 PROCESS, MEASUREMENT, INITIAL, EXCITATION, FILTER_PROCESS, FILTER_MEASUREMENT, FILTER_PRIOR = range(1, 8)
-DISTURBANCE, CHANCE, REFERENCE_SIGNAL, PARAMETERS, FILTER_ROTATION = range(8, 13)
+DISTURBANCE, CHANCE, REFERENCE_SIGNAL, PARAMETERS, FILTER_ROTATION, FILTER_KERNEL = range(8, 14)
 
 GROUP = 32  # normals that one pass of vector code makes: four from each of eight blocks
 

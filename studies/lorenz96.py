@@ -116,8 +116,8 @@ problem = noise_free_problem(
 )
 
 PUBLISHED = (
-    Published("enkf", {"ensemble_size": 40, "inflation": 1.06}, 0.22),
-    Published("enkf", {"ensemble_size": 28, "inflation": 1.08}, 0.24),
+    Published("enkf", {"ensemble_size": 40, "inflation": 1.06, "centred_perturbations": 1}, 0.22),
+    Published("enkf", {"ensemble_size": 28, "inflation": 1.08, "centred_perturbations": 1}, 0.24),
     Published("denkf", {"ensemble_size": 40, "inflation": 1.01}, 0.18),
     Published("etkf", {"ensemble_size": 24, "inflation": 1.013, "rotations": 1}, 0.18),
     Published("etkf", {"ensemble_size": 20, "inflation": 1.04, "rotations": 1}, 0.20),
@@ -135,6 +135,9 @@ BENCHMARK = Benchmark(
         "differ by one forecast.",
         "The EKF's inflation is a factor on its covariance in one unit of time, here within the Jacobian. With "
         "exp(0.05 dx'/dx) at the forecast for the step's own Jacobian, as DAPPER has it, ours gives 0.235.",
+        "The published EnKF has centred perturbations of the measurements. Its N = 28 is few for forty states: "
+        "two of 64 of our runs lose the truth, one with independent perturbations; the median of all is 0.237 and "
+        "0.241. None of 16 runs of DAPPER's own is lost: 0.242 +- 0.002.",
     ),
     rows=against_published(problem, model, PUBLISHED),
 )

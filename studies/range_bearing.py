@@ -91,8 +91,13 @@ def rows(seeds: Sequence[int], on_row: OnRow) -> list[Row]:
             )
             squares, theirs = (_squares(means, data) for means in (estimates.means, other))
             (ours,) = rmse_intervals(squares[:, None])
-            row = ours, ours.value, int(estimates.divergences.sum()), float(np.sqrt(squares).std(ddof=1)), ""
-            found.append(Row(f"{name}, {word}, sigma_a {sigma:.3g}", float(np.sqrt(theirs.mean())), *row))
+            label, runs, lost = (
+                f"{name}, {word}, sigma_a {sigma:.3g}",
+                np.sqrt(squares),
+                estimates.divergences.sum(),
+            )
+            spread = float(np.median(runs)), float(runs.std(ddof=1))
+            found.append(Row(label, float(np.sqrt(theirs.mean())), ours, ours.value, int(lost), *spread, ""))
             on_row(found[-1])
     return found
 

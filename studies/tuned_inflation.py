@@ -7,7 +7,7 @@ from typing import NamedTuple
 from filters.consistency.intervals import Interval, mean_interval
 from filters.engine.batch import run
 from studies.benchmark import mean_of_roots
-from tuning.evaluation.evaluate import state_errors
+from tuning.evaluation.runs import state_errors
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan

@@ -7,10 +7,8 @@ from collections.abc import Sequence
 from rich.table import Table
 from rich.text import Text
 
-from studies.benchmark import Benchmark, Row, find_benchmark
+from studies.benchmark import WHY, Benchmark, Row, find_benchmark
 from thruster_cli.output import announce_compilation, progress_console, table
-
-WHY = "why different"
 
 
 def reproduce_benchmark(name: str, runs: int, seed: int) -> tuple[list, dict]:
@@ -33,11 +31,13 @@ def reproduce_benchmark(name: str, runs: int, seed: int) -> tuple[list, dict]:
 
 
 def _table(benchmark: Benchmark, rows: list[Row], runs: int) -> Table:
-    columns = ["filter", benchmark.theirs, f"ours ({runs} runs)", "ratio", "pooled", WHY]
+    columns = benchmark.header
+    columns[2] = f"ours ({runs} runs)"
     cells = [row.cells() for row in rows]
     for row in cells:
         row[2] = row[2].replace(" [", "\n[")
-    caption = f"Compared is {benchmark.score}, ours with its 95 % interval. Pooled: the RMSE of our tables."
+    compared = f"Compared is {benchmark.score}, ours with its 95 % interval."
+    caption = f"{compared} Median run: of the scores of single runs. Pooled: the RMSE of our tables."
     out = fitted(table(benchmark.about, columns, cells, caption=caption), cells, flexible=WHY)
     out.columns[0].width = None
     return out

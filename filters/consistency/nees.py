@@ -9,6 +9,7 @@ from scipy.special import chdtr, chdtri
 
 from filters.consistency.intervals import Interval, mean_interval
 from filters.consistency.uniformity import Uniformity, uniformity
+from numerics.threads import spread
 
 SINGULAR = 1e-12  # a pivot of P below this part of its variance counts as zero
 LARGEST_BY_ENTRIES = 12  # beyond, operations on single entries take longer than copies of columns
@@ -23,8 +24,20 @@ def whitened(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
         if errors.shape[-1] <= LARGEST_BY_ENTRIES:
             return _by_entries(errors, covs)
         if errors.ndim > 2:
-            return np.stack([whitened(*pair) for pair in zip(errors, covs, strict=True)])
+            return _by_runs(errors, covs)
         return _by_columns(errors, covs)
+
+
+def _by_runs(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
+    """`whitened` of one run after the other, shared out to the cores: NumPy lets other threads run meanwhile."""
+    out = np.empty(errors.shape)
+
+    def part(first: int, last: int) -> None:
+        for run in range(first, last):
+            out[run] = whitened(errors[run], covs[run])
+
+    spread(part, len(errors))
+    return out
 
 
 def _by_entries(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
@@ -63,8 +76,13 @@ def normalized_squares(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     consistent filter each is chi-squared with d degrees of freedom. Source: Bar-Shalom, Li, Kirubarajan (2001),
     Estimation with Applications to Tracking and Navigation, section 5.4.
     """
+    return sums_of_squares(whitened(errors, covs))
+
+
+def sums_of_squares(values: np.ndarray) -> np.ndarray:
+    """Sums of squares over the last axis, infinite where they are too large."""
     with np.errstate(over="ignore"):
-        return (whitened(errors, covs) ** 2).sum(axis=-1)
+        return (values**2).sum(axis=-1)
 
 
 class SquaresCheck(NamedTuple):
@@ -83,6 +101,11 @@ class SquaresCheck(NamedTuple):
 def check_squares(
     name: str, errors: np.ndarray, covs: np.ndarray, present: np.ndarray | None = None
 ) -> SquaresCheck:
+    """`check_whitened` of errors with their covariances (B, T, d, d); singular ones are left out."""
+    return check_whitened(name, whitened(errors, covs), present)
+
+
+def check_whitened(name: str, errors: np.ndarray, present: np.ndarray | None = None) -> SquaresCheck:
     """Hold normalised squares against chi-square, as numbers of B independent runs.
 
     The sum over runs of one step is chi-squared with as many degrees of freedom as there are components, so its
@@ -91,11 +114,10 @@ def check_squares(
 
     Args:
         name: "NEES" or "NIS", for reports.
-        errors: estimation errors or innovations, (B, T, d).
-        covs: their covariances, (B, T, d, d); singular ones are left out.
+        errors: estimation errors or innovations, `whitened`, (B, T, d).
         present: which components are there, (B, T, d); all if None.
     """
-    squares = normalized_squares(errors, covs)
+    squares = sums_of_squares(errors)
     freedom = np.full(squares.shape, float(errors.shape[-1])) if present is None else present.sum(axis=-1) * 1.0
     freedom = np.where(np.isnan(squares), 0.0, freedom)
     counted = freedom > 0

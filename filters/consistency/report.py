@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.consistency.intervals import Interval, mean_interval
-from filters.consistency.nees import SquaresCheck, check_squares
+from filters.consistency.nees import SquaresCheck, check_whitened, whitened
 from filters.consistency.scores import (
     LEVELS,
     covered,
@@ -18,7 +18,7 @@ from filters.consistency.scores import (
     gaussian_crps,
 )
 from filters.consistency.uniformity import Uniformity, uniformity
-from filters.consistency.whiteness import LAGS, Whiteness, whiteness
+from filters.consistency.whiteness import LAGS, Whiteness, whiteness_of
 from filters.engine.batch import Estimates
 from filters.ensembles.recording import Members
 from numerics.angles import difference, is_angle, wrapped
@@ -55,10 +55,86 @@ class ConsistencyReport(NamedTuple):
     has_truth: bool  # without it only the innovations are looked at
 
 
+class Residuals(NamedTuple):
+    """Errors or innovations of B runs over T steps that count, beside what the filter expected of them."""
+
+    values: np.ndarray  # (B, T, d)
+    whitened: np.ndarray  # (B, T, d), as `filters.consistency.nees.whitened`
+    deviations: np.ndarray  # (B, T, d), expected standard deviations
+
+
+class Findings(NamedTuple):
+    """All that a `ConsistencyReport` is made of: without the covariances of every step."""
+
+    errors: Residuals
+    innovations: Residuals
+    present: np.ndarray | None  # (B, T, m), which measurements were there; None for all
+    divergences: np.ndarray  # (B,), restarts from the prior
+
+
+def findings(
+    estimates: Estimates,
+    states: np.ndarray | None,
+    measurements: np.ndarray | None,
+    first_step: int = 0,
+    angles: Sequence[bool] = (),
+) -> Findings:
+    """What a filter's estimates of some runs are to be judged by; arguments are those of `consistency_report`."""
+    late = slice(first_step, None)
+    truth = np.full(estimates.means.shape, np.nan) if states is None else states
+    errors = difference(estimates.means, truth, angles)[:, late]
+    return Findings(
+        _residuals(errors, estimates.covs[:, late]),
+        _residuals(estimates.innovations[:, late], estimates.innovation_covs[:, late]),
+        None if measurements is None else ~np.isnan(measurements[:, late]),
+        estimates.divergences,
+    )
+
+
+def joined(parts: Sequence[Findings]) -> Findings:
+    """Findings of all runs from those of some after the others."""
+    errors, innovations, present, divergences = zip(*parts, strict=True)
+    both = [Residuals(*map(np.concatenate, zip(*some, strict=True))) for some in (errors, innovations)]
+    return Findings(*both, None if present[0] is None else np.concatenate(present), np.concatenate(divergences))
+
+
+def _residuals(values: np.ndarray, covs: np.ndarray) -> Residuals:
+    return Residuals(values, whitened(values, covs), _deviations(covs))
+
+
 def consistency_report(
     estimates: Estimates,
     states: np.ndarray | None,
     measurements: np.ndarray | None = None,
+    *,
+    first_step: int = 0,
+    angles: Sequence[bool] = (),
+    **options,
+) -> ConsistencyReport:
+    """Hold a filter's estimates against the truth, and its innovations against what it expected of them.
+
+    Args:
+        estimates: of B runs, from `filters.run`.
+        states: the truth, (B, K + 1, n); None where it is not known.
+        measurements: (B, K + 1, m); needed only where some are missing (NaN).
+        first_step: steps before it are start-up and do not count.
+        angles: (n,), which states are angles, as the filter's `model.shape.state_angles`; none if empty.
+        **options: members, names, channels and lags, as `report_of` takes them.
+
+    Raises:
+        ValueError: if shapes do not fit or there is only one run.
+    """
+    if states is not None and np.shape(states) != estimates.means.shape:
+        raise ValueError(
+            f"states must have the shape of the estimates, {estimates.means.shape}, but got {np.shape(states)}"
+        )
+    found = findings(estimates, states, measurements, first_step, angles)
+    return report_of(found, states, first_step=first_step, angles=angles, **options)
+
+
+def report_of(
+    found: Findings,
+    states: np.ndarray | None,
     *,
     members: Members | None = None,
     first_step: int = 0,
@@ -67,35 +143,25 @@ def consistency_report(
     channels: Sequence[str] | None = None,
     lags: int = LAGS,
 ) -> ConsistencyReport:
-    """Hold a filter's estimates against the truth, and its innovations against what it expected of them.
+    """The report of findings; other arguments and errors are those of `consistency_report`.
 
     Args:
-        estimates: of B runs, from `filters.run`.
+        found: of all runs, at least two.
         states: the truth, (B, K + 1, n); None where it is not known.
-        measurements: (B, K + 1, m); needed only where some are missing (NaN).
         members: of the first of these runs, for ensembles, from `filters.ensembles.recording.record_members`.
-        first_step: steps before it are start-up and do not count.
+        first_step: the first that counts.
         names: of the states, with units.
-        angles: (n,), which states are angles, as the filter's `model.shape.state_angles`; none if empty.
+        angles: (n,), which states are angles.
         channels: names of the measurements, with units.
         lags: of the innovations' correlation.
-
-    Raises:
-        ValueError: if shapes do not fit or there is only one run.
     """
-    if (states is not None and np.shape(states) != estimates.means.shape) or len(estimates.means) < 2:
-        raise ValueError(
-            f"states must have the shape of the estimates, {estimates.means.shape}, with at least two runs, "
-            f"but got {np.shape(states if states is not None else estimates.means)}"
-        )
-    n, m, late = estimates.means.shape[-1], estimates.innovations.shape[-1], slice(first_step, None)
+    errors, whitened_errors, deviations = found.errors
+    innovations, whitened_innovations, expected_deviations = found.innovations
+    if len(errors) < 2:
+        raise ValueError(f"a consistency report must be of at least two runs, but got {len(errors)}")
+    n, m, present = errors.shape[-1], innovations.shape[-1], found.present
     names = _named("names", names, n, "state")
     channels = _named("channels", channels, m, "channel")
-    truth = np.full(estimates.means.shape, np.nan) if states is None else states
-    errors, covs = difference(estimates.means, truth, angles)[:, late], estimates.covs[:, late]
-    innovations, innovation_covs = estimates.innovations[:, late], estimates.innovation_covs[:, late]
-    present = None if measurements is None else ~np.isnan(measurements[:, late])
-    deviations, expected_deviations = _deviations(covs), _deviations(innovation_covs)
     seen = innovations if present is None else np.where(present, innovations, np.nan)
     crps = np.where(deviations > 0, gaussian_crps(errors, deviations), np.nan)
     expected = expected_gaussian_crps(deviations)
@@ -103,16 +169,16 @@ def consistency_report(
         runs=len(errors),
         first_step=first_step,
         states=names,
-        nees=check_squares("NEES", errors, covs),
-        nis=check_squares("NIS", innovations, innovation_covs, present),
-        whiteness=whiteness(innovations, innovation_covs, present, lags),
+        nees=check_whitened("NEES", whitened_errors),
+        nis=check_whitened("NIS", whitened_innovations, present),
+        whiteness=whiteness_of(whitened_innovations, present, lags),
         coverage=tuple(mean_interval(covered(errors[..., i], deviations[..., i])) for i in range(n)),
         coverage_by_level=np.array([_mean(covered(errors, deviations, level), (0, 1)) for level in LEVELS]),
         crps=tuple(mean_interval(crps[..., i]) for i in range(n)),
         crps_expected=_mean(expected, (0, 1)),
         crps_ratio=_mean(crps, 0) / _mean(expected, 0),
-        divergences=int(estimates.divergences.sum()),
-        diverged_runs=int((estimates.divergences > 0).sum()),
+        divergences=int(found.divergences.sum()),
+        diverged_runs=int((found.divergences > 0).sum()),
         ensemble=None if members is None or states is None else check_ensemble(members, states, angles),
         channels=channels,
         innovation_coverage=tuple(

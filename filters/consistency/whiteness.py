@@ -26,6 +26,11 @@ class Whiteness(NamedTuple):
 def whiteness(
     innovations: np.ndarray, covs: np.ndarray, present: np.ndarray | None = None, lags: int = LAGS
 ) -> Whiteness:
+    """`whiteness_of` innovations (B, T, m) with their covariances (B, T, m, m)."""
+    return whiteness_of(whitened(innovations, covs), present, lags)
+
+
+def whiteness_of(e: np.ndarray, present: np.ndarray | None = None, lags: int = LAGS) -> Whiteness:
     """Test whether the innovations of B runs are white, with e = L^-1 v and L L' = S.
 
         rho_ij(l) = sum e_i(k) e_j(k + l) / (c sqrt(mean e_i^2 mean e_j^2)) over all runs and the c pairs of steps
@@ -36,8 +41,7 @@ def whiteness(
     so none is subtracted. Many runs find correlations that are too small to matter: look at their size, too.
 
     Args:
-        innovations: v, (B, T, m).
-        covs: S, (B, T, m, m).
+        e: whitened innovations, (B, T, m), as `filters.consistency.nees.whitened` gives them.
         present: which channels were measured, (B, T, m); all if None.
         lags: number of lags, less than T.
 
@@ -47,11 +51,10 @@ def whiteness(
     Source: Ljung, Box (1978), "On a measure of lack of fit in time series models"; Hosking (1980), "The
     multivariate portmanteau statistic"; Bar-Shalom, Li, Kirubarajan (2001), section 5.4.
     """
-    count, steps, m = innovations.shape
+    _, steps, m = e.shape
     lags = at_least("lags", lags, 1)
     if steps <= lags:
         raise ValueError(f"there must be more steps than lags, but got {steps} steps and {lags} lags")
-    e = whitened(innovations, covs)
     there = ~np.isnan(e) if present is None else present & ~np.isnan(e)
     e, there = np.where(there, e, 0.0), there.astype(np.float64)
     values = np.maximum(there.sum(axis=(0, 1)), 1.0)

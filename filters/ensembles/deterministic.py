@@ -11,7 +11,7 @@ from filters.engine.belief import Kernels
 from filters.ensembles.ensemble import EnsembleFilter, measurement_moments
 from filters.ensembles.rotation import with_rotation
 from numerics import arrays, matrices
-from numerics.checks import at_least
+from numerics.checks import switch
 from numerics.compiled import inlined
 from numerics.sources import Source, entrywise, is_array
 from numerics.tuples import column_writer
@@ -98,8 +98,7 @@ class DeterministicUpdateFilter(EnsembleFilter):
     def __post_init__(self):
         """Check the numbers; raise ValueError that states the rule and the value."""
         super().__post_init__()
-        if at_least("rotations", self.rotations, 0) > 1:
-            raise ValueError(f"rotations must be 0 or 1, but got {self.rotations}")
+        switch("rotations", self.rotations)
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""

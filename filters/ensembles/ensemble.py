@@ -10,11 +10,11 @@ from typing import ClassVar
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, row_access
 from filters.ensembles.inflation import with_spread_control
-from filters.ensembles.members import add_noise, drawer, ensemble_motion, row_covariances, row_means
+from filters.ensembles.members import add_noise, centre, drawer, ensemble_motion, row_covariances, row_means
 from filters.filter import Filter
 from numerics import arrays, matrices
 from numerics.angles import at_angle, row_aligner
-from numerics.checks import at_least, positive, shown
+from numerics.checks import at_least, positive, shown, switch
 from numerics.compiled import inlined
 from numerics.sources import Source, entrywise
 from numerics.streams import FILTER_MEASUREMENT
@@ -172,7 +172,7 @@ class EnsembleFilter(Filter):
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
         model = self.kernel_model
-        plain = ensemble_kernels(type(self).analysis, model.functions, model.shape)
+        plain = ensemble_kernels(self.analysis, model.functions, model.shape)
         # Compiled in only where it does something: in the loop over steps even an idle branch takes a tenth.
         neutral = self.inflation == 1.0 and self.relaxation == 0.0
         return plain if neutral else with_spread_control(plain, model.shape)
@@ -209,7 +209,7 @@ def filler(angles: tuple[bool, ...]) -> Callable:
 
 
 @lru_cache(maxsize=64)
-def perturbed_analysis(observe: Callable, shape: Shape) -> Callable:
+def perturbed_analysis(observe: Callable, shape: Shape, centred: bool = False) -> Callable:
     """Return `analyse(memory, z, numbers, size)` of the stochastic ensemble Kalman filter."""
     n, m = shape.n, shape.m
     r_root_place = number_places(n, m).r_root
@@ -221,10 +221,18 @@ def perturbed_analysis(observe: Callable, shape: Shape) -> Callable:
         row, table, draws = memory
         expected, innovation, cross, _, _, root = compare(memory, z, numbers, size)
         draw(draws, m * table.shape[1], row, FILTER_MEASUREMENT)
+        if centred:
+            centre(draws, m, table.shape[1], size)
         add_noise(table, n, m, draws, numbers, r_root_place)
         nudge(table, solve(cross, root), filled(z, expected, innovation))
 
     return analyse
+
+
+@cache
+def centred_analysis(observe: Callable, shape: Shape) -> Callable:
+    """The same with perturbations whose sample mean is zero."""
+    return perturbed_analysis(observe, shape, True)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -236,10 +244,28 @@ class EnsembleKalmanFilter(EnsembleFilter):
                  x_j += K (z - v_j - y_j),  v_j ~ N(0, R);  sample covariances with divisor N - 1
 
     The perturbations of an update depend on the key and the step alone: of two updates within one step the second
-    repeats the first one's. Attributes are those of `EnsembleFilter`.
+    repeats the first one's.
 
-    Source: Evensen (1994); Burgers, van Leeuwen, Evensen (1998), "Analysis scheme in the EnKF".
+    Attributes:
+        centred_perturbations: 1 for perturbations of the measurements whose sample mean is zero, 0 for independent
+            ones. Centred, v_j is (N/(N - 1))^1/2 (v_j - mean(v)), whose covariance is R, and the mean moves as
+            the Kalman filter's; the mean of independent ones, of covariance R/N, enters the estimate. For small N.
+
+    Others are those of `EnsembleFilter`.
+
+    Source: Evensen (1994); Burgers, van Leeuwen, Evensen (1998), "Analysis scheme in the EnKF"; centred: Evensen
+    (2004), "Sampling strategies and square root analysis schemes for the EnKF".
     """
 
     name: ClassVar[str] = "enkf"
-    analysis = staticmethod(perturbed_analysis)
+    centred_perturbations: int = 0
+
+    def __post_init__(self):
+        """Check the numbers; raise ValueError that states the rule and the value."""
+        super().__post_init__()
+        switch("centred_perturbations", self.centred_perturbations)
+
+    @property
+    def analysis(self) -> Callable:
+        """The update, as `ensemble_kernels` takes it."""
+        return centred_analysis if self.centred_perturbations else perturbed_analysis

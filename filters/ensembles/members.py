@@ -42,6 +42,22 @@ def drawer(n: int, m: int) -> Callable:
     return draw
 
 
+@inlined
+def centre(draws, count, width, size):
+    """Give each of `count` rows of draws, of `width` each, the mean zero over the first N = `size` of its entries.
+
+    What is left is scaled by (N/(N - 1))^1/2, so that the variance stays 1.
+    """
+    factor = (size / (size - 1.0)) ** 0.5
+    for i in range(count):
+        mean = 0.0
+        for j in range(size):
+            mean += draws[i * width + j]
+        mean /= size
+        for j in range(size):
+            draws[i * width + j] = factor * (draws[i * width + j] - mean)
+
+
 @cache
 def row_means(rows: int) -> Callable:
     """Return `means(table, size)`: means of the first `size` entries of rows 0 ... rows - 1, in one loop."""

@@ -10,8 +10,16 @@ from typing import ClassVar
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
 from filters.ensembles.members import add_noise, ensemble_motion
+from filters.particles.regularisation import kernel_spreader
 from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
-from filters.particles.weights import normalise, read_weights, systematic_resampler, weighted_squares
+from filters.particles.weights import (
+    normalise,
+    read_weights,
+    systematic_resampler,
+    weighted_covariances,
+    weighted_means,
+    weighted_squares,
+)
 from numerics import matrices
 from numerics.angles import kept
 from numerics.compiled import inlined
@@ -22,8 +30,10 @@ from plants.shape import Functions, Shape
 
 
 @lru_cache(maxsize=64)
-def auxiliary_kernels(functions: Functions, shape: Shape) -> Kernels:
+def auxiliary_kernels(functions: Functions, shape: Shape, regularised: bool) -> Kernels:
     """Kernels of the auxiliary particle filter for a model's functions and shape.
+
+    If it is regularised, the parents that it draws are spread, by the first of its own numbers.
 
     The table's rows: n of particles, one of log weights, n of the noise in the particles, weights, scratch.
     """
@@ -45,6 +55,11 @@ def auxiliary_kernels(functions: Functions, shape: Shape) -> Kernels:
     foreseen, store_foreseen = column_reader(m, scratch + m), column_writer(m, scratch + m)
     add_scaled, add = kept(scaled_sum(m), "x, a, y", shape.measurement_angles), matrices.symmetric_sum(m)
     read_r, choose = matrix_reader(m, m, source.r), systematic_resampler(n + 1, weights, scratch)
+    means, covariances, spread = (
+        weighted_means(0, n, weights),
+        weighted_covariances(0, n, weights),
+        kernel_spreader(shape),
+    )
 
     @inlined
     def forget_noise(table):
@@ -91,7 +106,12 @@ def auxiliary_kernels(functions: Functions, shape: Shape) -> Kernels:
             for j in range(table.shape[1]):
                 table[logarithms, j] = table[far, j] + lost
             place, _, _, _ = uniform_block(0, row[step_place], FILTER_MEASUREMENT, row[key_0], row[key_1])
-            choose(table, size, place)
+            if regularised:
+                cov = covariances(table, size, means(table, size))
+                choose(table, size, place)
+                spread(memory, cov, numbers, size)
+            else:
+                choose(table, size, place)
             # The chosen ones with the noise of the place that they went to.
             for i in range(n):
                 for j in range(table.shape[1]):
@@ -105,7 +125,8 @@ def auxiliary_kernels(functions: Functions, shape: Shape) -> Kernels:
             summarise(memory, size)
 
     rows = scratch + max(2 * m + 1, n + 3)
-    return Kernels(n, m, rows, n, start, predict, update, summarise, extras=1, extra_kept_rows=1 + n)
+    root = n * n if regularised else 0
+    return Kernels(n, m, rows, n, start, predict, update, summarise, extras=1, extra_kept_rows=1 + n, scratch=root)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,6 +137,7 @@ class AuxiliaryParticleFilter(WeightedFilter):
         update:  V = sum of w_j (h(x_j) - h(mu_j))(h(x_j) - h(mu_j))'
                  lambda_j = w_j N(z; h(mu_j), R + V), parents i(j) drawn by lambda (systematic)
                  x_j = mu_i(j) + noise_j,  w_j = N(z; h(x_j), R)/N(z; h(mu_i(j)), R + V), normalised
+                 regularised: x_j += c h e_j before it is weighed,  e_j ~ N(0, covariance of mu by lambda)
                  L = (sum of lambda_j) (mean of w_j before normalisation)
         belief:  mean = sum of w_j x_j,  cov = sum of w_j (x_j - mean)(x_j - mean)'/(1 - sum of w_j^2)
 
@@ -130,8 +152,7 @@ class AuxiliaryParticleFilter(WeightedFilter):
     The log-likelihood is log L; innovation, S and restarts are the bootstrap filter's. `Belief.members` is
     (2 n + 1, N): particles, log weights, noise. `Belief.extras` holds the effective sample size.
 
-    Attributes:
-        ensemble_size: number N of particles, from 2 to a million.
+    Attributes are those of `WeightedFilter`, c its regularisation and h as in `ParticleFilter`.
 
     Source: Pitt, Shephard (1999), "Filtering via simulation: auxiliary particle filters", section 3, where the
     first stage's density is free; the likelihood: Pitt (2002), "Smooth particle filters for likelihood evaluation
@@ -142,4 +163,5 @@ class AuxiliaryParticleFilter(WeightedFilter):
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
-        return auxiliary_kernels(self.kernel_model.functions, self.kernel_model.shape)
+        model = self.kernel_model
+        return auxiliary_kernels(model.functions, model.shape, self.regularisation > 0.0)

@@ -9,6 +9,7 @@ from typing import ClassVar
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
 from filters.ensembles.members import ensemble_motion
+from filters.particles.regularisation import kernel_spreader
 from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
 from filters.particles.weights import read_weights, systematic_resampler
 from numerics.checks import finite
@@ -20,18 +21,22 @@ from plants.shape import Functions, Shape
 
 
 @lru_cache(maxsize=64)
-def particle_kernels(functions: Functions, shape: Shape) -> Kernels:
-    """Kernels of the bootstrap particle filter for a model's functions and shape."""
+def particle_kernels(functions: Functions, shape: Shape, regularised: bool) -> Kernels:
+    """Kernels of the bootstrap particle filter for a model's functions and shape.
+
+    If it is regularised, the particles that it draws anew are spread, by the first of its own numbers.
+    """
     n, m, observe = shape.n, shape.m, functions.observe
     places, weights = memory_places(n, m), n + 1
     scratch, logarithms = weights + 1, n
     size_place, step_place, key_0, key_1 = places.extras, places.step, places.key_0, places.key_1
-    likelihood_place, threshold_place = places.log_likelihood, own_place(shape)
+    likelihood_place, threshold_place = places.log_likelihood, own_place(shape) + 1
     motion, parts = ensemble_motion(functions.transition, shape), particle_parts(observe, shape, weights)
     draw_prior, move = motion.start, motion.predict
     set_equal, expect, normal, distance, level, weigh, summarise = parts
     resample = systematic_resampler(n, weights, scratch)
     read_r, predicted = matrix_reader(m, m, number_places(n, m).r), column_reader(m, scratch)
+    read_cov, spread = matrix_reader(n, n, places.cov), kernel_spreader(shape)
 
     @inlined
     def start(memory, numbers, size):
@@ -45,6 +50,8 @@ def particle_kernels(functions: Functions, shape: Shape) -> Kernels:
             read_weights(table, logarithms, weights, size)
             place, _, _, _ = uniform_block(0, row[step_place], FILTER_MEASUREMENT, row[key_0], row[key_1])
             resample(table, size, place)
+            if regularised:
+                spread(memory, read_cov(row), numbers, size)  # no particle moved since that was their covariance
             set_equal(memory, size)
         move(memory, u, numbers, size)
 
@@ -62,7 +69,8 @@ def particle_kernels(functions: Functions, shape: Shape) -> Kernels:
             summarise(memory, size)
 
     rows = scratch + max(m, n + 2)
-    return Kernels(n, m, rows, n, start, predict, update, summarise, extras=1, extra_kept_rows=1)
+    root = n * n if regularised else 0
+    return Kernels(n, m, rows, n, start, predict, update, summarise, extras=1, extra_kept_rows=1, scratch=root)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,6 +78,7 @@ class ParticleFilter(WeightedFilter):
     """Bootstrap particle filter: importance sampling from the prediction, with systematic resampling.
 
         predict: if ESS < threshold N, draw the particles anew by weight (systematic), and all w_j = 1/N;
+                 regularised: x_j += c h e_j,  e_j ~ N(0, cov),  h = (4/(n + 2))^(1/(n + 4)) N^(-1/(n + 4));
                  x_j = f(x_j, u) + noise_j,  noise_j ~ N(0, Q)
         update:  w_j = w_j p(z | x_j)/L,  L = sum of w_j p(z | x_j),  p(z | x) = N(z; h(x), R)
                  ESS = 1/(sum of w_j^2)
@@ -85,11 +94,13 @@ class ParticleFilter(WeightedFilter):
     `Belief.members` is (n + 1, N), its last row the log weights; `Belief.extras` holds the ESS.
 
     Attributes:
-        ensemble_size: number N of particles, from 2 to a million.
         resampling_threshold: the part of N below which the ESS calls for resampling, from 0 (never) to 1.
 
+    Others are those of `WeightedFilter`, c its regularisation.
+
     Source: Gordon, Salmond, Smith (1993), "Novel approach to nonlinear/non-Gaussian Bayesian state estimation";
-    Kitagawa (1996) for the resampling; Kong, Liu, Wong (1994) for the ESS.
+    Kitagawa (1996) for the resampling; Kong, Liu, Wong (1994) for the ESS; Musso, Oudjane, Le Gland (2001),
+    "Improving regularised particle filters", for the regularisation, without their rescaling.
     """
 
     name: ClassVar[str] = "pf"
@@ -105,9 +116,10 @@ class ParticleFilter(WeightedFilter):
 
     @property
     def own_numbers(self) -> tuple[float, ...]:
-        """The threshold."""
-        return (self.resampling_threshold,)
+        """The factor on the kernel's width, and the threshold."""
+        return *super().own_numbers, self.resampling_threshold
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
-        return particle_kernels(self.kernel_model.functions, self.kernel_model.shape)
+        model = self.kernel_model
+        return particle_kernels(model.functions, model.shape, self.regularisation > 0.0)

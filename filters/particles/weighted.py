@@ -15,7 +15,7 @@ from filters.filter import Filter
 from filters.particles.weights import normalise, read_weights, weighted_covariances, weighted_means
 from numerics import matrices
 from numerics.angles import row_aligner
-from numerics.checks import at_least
+from numerics.checks import at_least, positive
 from numerics.compiled import inlined
 from numerics.tuples import column_reader, column_writer, matrix_reader, vector_reader
 from plants.layout import constants_reader, number_places
@@ -141,17 +141,28 @@ class WeightedFilter(Filter):
 
     Attributes:
         ensemble_size: number N of particles, from 2 to a million.
+        regularisation: factor on the width of the Gaussian kernel by which particles are spread when they were
+            drawn anew; 0 for none, 1 for the width that is best for a Gaussian belief. Where there is little or
+            no process noise, copies of a particle part by nothing else.
     """
 
     gaussian_likelihood: ClassVar[bool] = False
     ensemble_size: int = 1000
+    regularisation: float = 0.0
 
     def __post_init__(self):
-        """Check the size; raise ValueError if it is not a whole number from 2 to a million."""
+        """Check the numbers; raise ValueError that states the rule and the value."""
         size = at_least("ensemble_size", self.ensemble_size, 2)
         if size > LARGEST_ENSEMBLE:
             raise ValueError(f"ensemble_size must be at most {LARGEST_ENSEMBLE}, but got {size}")
         object.__setattr__(self, "ensemble_size", size)
+        width = positive("regularisation", self.regularisation, zero_allowed=True)
+        object.__setattr__(self, "regularisation", width)
+
+    @property
+    def own_numbers(self) -> tuple[float, ...]:
+        """The factor on the kernel's width."""
+        return (self.regularisation,)
 
     @property
     def size(self) -> int:

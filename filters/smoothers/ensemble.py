@@ -38,7 +38,7 @@ def smooth_ensembles(
         raise ValueError(f"a smoothed filter must have rotations 0, but got {filter_.rotations}")
     paired = dataclasses.replace(filter_, model=_paired_model(filter_.kernel_model))
     kernels, pair_kernels, size = filter_.kernels(), paired.kernels(), filter_.size
-    analyse_pair = type(filter_).analysis(paired.model.functions.observe, paired.model.shape)
+    analyse_pair = filter_.analysis(paired.model.functions.observe, paired.model.shape)
     count, times, _ = measurements.shape
     n = kernels.n
     means, covs = np.empty((count, times, n)), np.empty((count, times, n, n))

@@ -13,10 +13,11 @@ from tests.models import KEY, held_voltages, line_model, plane_model, simulated
 from tests.oracles import assert_normal, convergence, normals, relative_errors
 
 
-def test_one_cycle_is_the_naive_one_with_the_same_normals():
+@pytest.mark.parametrize("centred", [0, 1])
+def test_one_cycle_is_the_naive_one_with_the_same_normals(centred):
     size, model = 11, plane_model()
     a, b, offset, c, shift = model.matrices()
-    filter_ = EnsembleKalmanFilter(model=model, ensemble_size=size)
+    filter_ = EnsembleKalmanFilter(model=model, ensemble_size=size, centred_perturbations=centred)
     root_p, root_q, root_r = (
         np.linalg.cholesky(cov) for cov in (model.prior_cov, model.process_noise_cov, model.measurement_noise_cov)
     )
@@ -37,12 +38,27 @@ def test_one_cycle_is_the_naive_one_with_the_same_normals():
             s = joint[2:, 2:] + model.measurement_noise_cov
             gain = joint[:2, 2:] @ np.linalg.inv(s)
             v = root_r @ normals(FILTER_MEASUREMENT, step, 2, size)
+            if centred:  # the sample of v has mean zero, and covariance R on average over draws
+                v = (v - v.mean(axis=1, keepdims=True)) * math.sqrt(size / (size - 1))
             x = x + gain @ (np.array(z)[:, None] - v - y)
             np.testing.assert_allclose(belief.members, x, rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(belief.mean, x.mean(axis=1), rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(belief.cov, np.cov(x), rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(innovation.value, z - y.mean(axis=1), rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(innovation.cov, s, rtol=1e-12, atol=1e-12)
+
+
+def test_centred_perturbations_move_the_mean_as_the_gain_says():
+    model, z = plane_model(), [2.0, -1.0]
+    filter_ = EnsembleKalmanFilter(model=model, ensemble_size=5, centred_perturbations=1)
+    with interpreted():
+        prior = filter_.init(KEY)
+        belief, innovation = filter_.update(prior, z)
+    _, _, _, c, _ = model.matrices()
+    gain = prior.cov @ c.T @ np.linalg.inv(innovation.cov)
+    np.testing.assert_allclose(belief.mean, prior.mean + gain @ innovation.value, rtol=1e-12)
+    with pytest.raises(ValueError, match="centred_perturbations must be 0 or 1, but got 2"):
+        EnsembleKalmanFilter(model=model, centred_perturbations=2)
 
 
 def test_members_are_stirred_by_the_prior_the_process_noise_and_the_measurement_noise():

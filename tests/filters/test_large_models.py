@@ -44,6 +44,9 @@ FORMS = {
     "kf, scheduled": ("kf", {"schedule": 5}),
     "fuzzy, by moments": ("fuzzy", {"blending": "moments"}),
     "enkf, inflated": ("enkf", {"inflation": 1.1, "relaxation": 0.3}),
+    "enkf, centred": ("enkf", {"centred_perturbations": 1}),
+    "pf, regularised": ("pf", {"regularisation": 1.0, "resampling_threshold": 1.0}),
+    "apf, regularised": ("apf", {"regularisation": 1.0}),
 }
 CASES = {**{name: (name, {}) for name in FILTERS}, **FORMS}
 

@@ -10,6 +10,7 @@ from filters import AuxiliaryParticleFilter, KalmanFilter, ParticleFilter, run, 
 from filters.engine.session import Session
 from numerics.compiled import interpreted
 from numerics.streams import (
+    FILTER_KERNEL,
     FILTER_MEASUREMENT,
     FILTER_PRIOR,
     FILTER_PROCESS,
@@ -65,19 +66,27 @@ def assert_innovation(innovation, model, z, y, w):
 CYCLES = [(0.5, [2.0, -1.0]), (-1.0, [0.3, 0.9]), (0.0, [4.0, 1.0])]
 
 
-@pytest.mark.parametrize("threshold", [0.0, 0.5, 1.0])
-def test_bootstrap_cycles_are_the_naive_ones_with_the_same_draws(threshold):
+def kernel(cov, width, step, size):
+    """What regularisation adds to the particles."""
+    best = (4.0 / (2 + 2)) ** (1 / 6) * size ** (-1 / 6)  # Silverman's, for two states
+    return width * best * root(cov) @ normals(FILTER_KERNEL, step, 2, size)
+
+
+@pytest.mark.parametrize(("threshold", "width"), [(0.0, 0.0), (0.5, 0.0), (1.0, 0.0), (1.0, 0.7)])
+def test_bootstrap_cycles_are_the_naive_ones_with_the_same_draws(threshold, width):
     model, size = plane_model(), 13
     a, b, offset, c, shift = model.matrices()
-    filter_ = ParticleFilter(model=model, ensemble_size=size, resampling_threshold=threshold)
+    numbers = {"resampling_threshold": threshold, "regularisation": width}
+    filter_ = ParticleFilter(model=model, ensemble_size=size, **numbers)
     with interpreted():
         belief = filter_.init(KEY)
         x = model.prior_mean[:, None] + root(model.prior_cov) @ normals(FILTER_PRIOR, 0, 2, size)
         w = np.full(size, 1.0 / size)
         assert_belief(filter_, belief, x, w)
         for step, (u, z) in enumerate(CYCLES):
-            if 1.0 / (w**2).sum() < threshold * size:
-                x, w = x[:, resampled(w, step)], np.full(size, 1.0 / size)
+            if 1.0 / (w**2).sum() < threshold * size * (1.0 - 1e-12):
+                spread = kernel(weighted_covariance(x, w), width, step, size)
+                x, w = x[:, resampled(w, step)] + spread, np.full(size, 1.0 / size)
             x = a @ x + b * u + offset[:, None]
             x = x + root(model.process_noise_cov) @ normals(FILTER_PROCESS, step + 1, 2, size)
             belief = filter_.predict(belief, [u])
@@ -93,11 +102,12 @@ def test_bootstrap_cycles_are_the_naive_ones_with_the_same_draws(threshold):
             assert_belief(filter_, belief, x, w)
 
 
-def test_auxiliary_cycles_are_the_naive_ones_with_the_same_draws():
+@pytest.mark.parametrize("width", [0.0, 0.7])
+def test_auxiliary_cycles_are_the_naive_ones_with_the_same_draws(width):
     model, size = plane_model(), 13
     a, b, offset, c, shift = model.matrices()
     r = model.measurement_noise_cov
-    filter_ = AuxiliaryParticleFilter(model=model, ensemble_size=size)
+    filter_ = AuxiliaryParticleFilter(model=model, ensemble_size=size, regularisation=width)
     with interpreted():
         belief = filter_.init(KEY)
         x = model.prior_mean[:, None] + root(model.prior_cov) @ normals(FILTER_PRIOR, 0, 2, size)
@@ -116,7 +126,8 @@ def test_auxiliary_cycles_are_the_naive_ones_with_the_same_draws():
             fit = densities(z, c @ foreseen + shift[:, None], r + (w * effect) @ effect.T)
             first = w * fit
             parents = resampled(first, step)
-            x = foreseen[:, parents] + noise
+            spread = kernel(weighted_covariance(foreseen, first / first.sum()), width, step, size)
+            x = foreseen[:, parents] + spread + noise
             w = densities(z, c @ x + shift[:, None], r) / fit[parents]
             log_likelihood = math.log(first.sum()) + math.log(w.mean())
             assert innovation.log_likelihood == pytest.approx(log_likelihood, rel=1e-10)

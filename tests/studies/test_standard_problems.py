@@ -78,6 +78,7 @@ QUICK = {
         Published("etkf", {"ensemble_size": 10, "inflation": 1.02, "rotations": 1}, 0.60),
         0.06,
     ),
+    "lorenz63, regularised particles": (lorenz63, Published("pf", lorenz63.particles(800, 0.9, 0.2), 0.28), 0.018),
     "lorenz96": (lorenz96, Published("enkf", {"ensemble_size": 40, "inflation": 1.06}, 0.22), 0.008),
 }
 
@@ -117,6 +118,8 @@ class TestReproduce:
         assert row._replace(theirs=1.04 * row.ours.value).why == "the same to 5 %"
         near = row._replace(theirs=row.ours.value + 1.9, run_std=1.0)
         assert near.why == "within the scatter of a single run"
+        alike = near._replace(run_median=1.01 * near.theirs)
+        assert alike.why.startswith("the median run is the same to 5 %")
 
     @pytest.mark.parametrize(
         ("arguments", "rule"),

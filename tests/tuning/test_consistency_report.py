@@ -112,7 +112,7 @@ def test_a_report_refuses_what_does_not_fit(scalar_truth):
     with pytest.raises(ValueError, match="states must have the shape of the estimates"):
         consistency_report(estimates, scalar_truth.states[:, 1:])
     one = Estimates(*(part[:1] for part in estimates))
-    with pytest.raises(ValueError, match="with at least two runs"):
+    with pytest.raises(ValueError, match="at least two runs"):
         consistency_report(one, scalar_truth.states[:1])
     with pytest.raises(ValueError, match="names must be 1, one a state"):
         consistency_report(estimates, scalar_truth.states, names=("a", "b"))

@@ -1,3 +1,5 @@
+import pickle
+
 import numpy as np
 import pytest
 
@@ -6,8 +8,9 @@ from filters.bounds import posterior_bound, riccati_covariances
 from filters.consistency.nees import normalized_squares
 from numerics.compiled import interpreted
 from plants import simulate
-from tuning.evaluation.evaluate import evaluate, score_ratio
+from tuning.evaluation.evaluate import check_consistency, evaluate, score_ratio
 from tuning.evaluation.tuned import summary
+from tuning.problems import in_parts
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.space import choice_of, parameters_of, true_choice, untuned_choice
 from tuning.thruster.find import find_scenario
@@ -41,6 +44,17 @@ def test_rmse_is_pooled_over_runs_and_steps_from_50_on(nominal, data, ekf):
     np.testing.assert_allclose([r.value for r in ekf.rmse], np.sqrt((errors**2).mean((0, 1))), rtol=1e-12)
     expected = np.mean([r.value / s for r, s in zip(ekf.rmse, nominal.scale, strict=True)])
     assert ekf.score.value == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["ekf", "enkf"])
+def test_runs_may_be_evaluated_some_at_a_time(nominal, data, name, monkeypatch):
+    filter_, some = true_choice(name, nominal).filter(nominal), data.slice(0, 21)
+    whole = evaluate(filter_, some, nominal.scale), check_consistency(filter_, some)
+    monkeypatch.setattr(in_parts, "MOST_BYTES", 1)
+    monkeypatch.setattr(in_parts, "cores", lambda: 4)
+    assert in_parts.parts_of(filter_, some)[-2:] == [(16, 20), (20, 21)]
+    parts = evaluate(filter_, some, nominal.scale), check_consistency(filter_, some)
+    assert pickle.dumps(parts) == pickle.dumps(whole)
 
 
 def test_the_true_ekf_sits_on_the_bound_and_is_consistent(nominal, data, ekf):

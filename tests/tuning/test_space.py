@@ -2,8 +2,16 @@ import optuna
 import pytest
 
 from filters.registry import FILTERS
+from studies import lorenz63
 from tuning.search.plan import Plan
-from tuning.search.space import choice_of, parameters_of, size_ladder, untuned_choice
+from tuning.search.space import (
+    choice_of,
+    distributions,
+    parameters_of,
+    size_ladder,
+    trial_parameters,
+    untuned_choice,
+)
 from tuning.search.study import open_study
 from tuning.thruster.find import find_scenario
 
@@ -22,6 +30,18 @@ def test_particle_filters_have_sizes_of_their_own(name, size):
     assert untuned_choice(name, NOMINAL).numbers["ensemble_size"] == size
     ladder = size_ladder(name)
     assert (ladder[0], ladder[-1]) == ((5, 200) if size == 30 else (200, 5000)) and size in ladder
+
+
+@pytest.mark.parametrize("name", ["pf", "apf"])
+def test_particles_are_regularised_by_a_study_where_there_is_no_process_noise(name):
+    untuned, known = untuned_choice(name, lorenz63.problem), untuned_choice(name, NOMINAL)
+    assert untuned.numbers["regularisation"] == 0.0 and "regularisation" not in known.numbers
+    assert "regularisation" not in distributions(name, NOMINAL)
+    space = distributions(name, lorenz63.problem, hold_r=True)
+    values = {"N": 300, "regularisation": 1.5} | ({"resampling_threshold": 0.3} if name == "pf" else {})
+    choice = choice_of(name, values, lorenz63.problem)
+    assert set(space) == set(values) and trial_parameters(choice, space) == values
+    assert choice.filter(lorenz63.problem).regularisation == 1.5
 
 
 def test_baselines_are_not_searched_over_q_and_r():

@@ -10,7 +10,7 @@ import numpy as np
 
 from filters.augmented import Unknown, augmented_model
 from filters.consistency.intervals import Interval, rmse_ratios
-from filters.engine.batch import Estimates, run
+from filters.engine.batch import run
 from filters.estimators.find import is_foreign, label_of
 from filters.filter import Filter
 from filters.particles.weighted import WeightedFilter
@@ -18,7 +18,9 @@ from filters.registry import filter_class, make_filter
 from numerics.checks import one_of, positive
 from tuning.evaluation.baselines import oracle, rule_of_thumb, scaled_default
 from tuning.evaluation.evaluate import Evaluation, compute_metrics, likelihood_gain, score_ratio
+from tuning.evaluation.runs import RunMetrics, joined, metrics_by_run
 from tuning.problems.data import Data
+from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.problem import Problem
 from tuning.search.interruption import stop_on_interrupt
 from tuning.search.space import Choice, ensemble_sizes_of, has_ensemble
@@ -203,8 +205,8 @@ def compare(
 
 
 def _row(label: str, filter_: Filter, data: Data, board: Leaderboard) -> Row:
-    estimates, seconds = timed_run(filter_, data)
-    evaluation = compute_metrics(filter_, estimates, data, board.scenario.scale)
+    runs, seconds = timed_runs(filter_, data)
+    evaluation = compute_metrics(filter_, runs, data, board.scenario.scale)
     first = board.rows[0].evaluation if board.rows else evaluation
     particles = isinstance(filter_, WeightedFilter)
     return Row(
@@ -221,13 +223,16 @@ def _row(label: str, filter_: Filter, data: Data, board: Leaderboard) -> Row:
     )
 
 
-def timed_run(filter_: Filter, data: Data) -> tuple[Estimates, float]:
-    """Estimates of a filter on some data, and the seconds that they took without compilation."""
+def timed_runs(filter_: Filter, data: Data) -> tuple[RunMetrics, float]:
+    """What a filter achieved on some data, and the seconds that its runs took without compilation."""
     few = data.filter_keys[:2], data.inputs[:2, :2], data.measurements[:2, :3]
     first = [np.ascontiguousarray(part) for part in few]
     for part in first:
         part.setflags(write=False)  # as the data's are: numba compiles writable arrays anew
     run(filter_, *first)
-    started = time.perf_counter()
-    estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
-    return estimates, time.perf_counter() - started
+    found, seconds, started = [], 0.0, time.perf_counter()
+    for some, estimates in estimates_in_parts(filter_, data):
+        seconds += time.perf_counter() - started
+        found.append(metrics_by_run(filter_, estimates, some))
+        started = time.perf_counter()
+    return joined(found), seconds

@@ -8,17 +8,15 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.consistency.intervals import Interval, interval, mean_interval, resampled_means, rmse_intervals
-from filters.consistency.nees import normalized_squares
-from filters.consistency.report import ConsistencyReport, consistency_report
-from filters.engine.batch import Estimates, run
+from filters.consistency.report import ConsistencyReport, findings, joined, report_of
 from filters.ensembles.recording import record_members
 from filters.filter import Filter
-from numerics.angles import difference
 from plants.quantities import Quantity
-from tuning.problems.data import FIRST_SCORED_STEP, Data
+from tuning.evaluation.runs import RunMetrics, metrics_of_all
+from tuning.problems.data import Data
+from tuning.problems.in_parts import estimates_in_parts
 
 MEMBER_RUNS, MEMBER_STEPS = 40, 5  # rank histograms are made of so many runs, and of every fifth step
-FARTHEST = 1e100  # an output beyond this is this: its square is a number
 NOTHING = Interval(np.nan, np.nan, np.nan)
 
 
@@ -57,7 +55,7 @@ class Evaluation(NamedTuple):
 
 
 def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
-    """Run a filter over all seeds of some data in one compiled, parallel call, and compute its metrics.
+    """Run a filter over all seeds of some data in compiled, parallel calls, and compute its metrics.
 
     Args:
         filter_: the filter; where it estimates more than the plant's n states, these come first.
@@ -68,30 +66,24 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
     Raises:
         ValueError: if the scale is not positive, or not one a state.
     """
-    return compute_metrics(filter_, run(filter_, data.filter_keys, data.inputs, data.measurements), data, scale)
+    return compute_metrics(filter_, metrics_of_all(filter_, data), data, scale)
 
 
-def compute_metrics(filter_: Filter, estimates: Estimates, data: Data, scale) -> Evaluation:
-    """What the estimates of a filter on some data are worth; arguments and errors are those of `evaluate`."""
-    late, measurements = data.scored, data.measurements
-    innovations, innovation_covs = estimates.innovations[:, late], estimates.innovation_covs[:, late]
-    present = (~np.isnan(measurements[:, late])).sum(axis=-1)
-    squares = normalized_squares(innovations, innovation_covs)
-    likelihoods = np.full(len(measurements), np.nan)
-    if filter_.has_covariance:
-        likelihoods = estimates.log_likelihoods[:, late].sum(axis=1)
+def compute_metrics(filter_: Filter, runs: RunMetrics, data: Data, scale) -> Evaluation:
+    """What a filter's runs on some data are worth together; other arguments and errors are those of `evaluate`."""
+    some = runs.present[runs.present > 0]
     return Evaluation(
-        **_errors(filter_, estimates, data, scale),
-        nis=mean_interval(np.where(present > 0, squares, np.nan)),
-        expected_nis=float(present[present > 0].mean()) if present.any() else np.nan,
-        channels=measurements.shape[-1],
-        log_likelihood=float(likelihoods.mean()),
-        log_likelihoods=likelihoods,
-        divergences=int(estimates.divergences.sum()),
+        **_errors(filter_, runs, data, scale),
+        nis=mean_interval(runs.nis),
+        expected_nis=float(some.mean()) if some.size else np.nan,
+        channels=data.measurements.shape[-1],
+        log_likelihood=float(runs.log_likelihoods.mean()),
+        log_likelihoods=runs.log_likelihoods,
+        divergences=int(runs.divergences.sum()),
     )
 
 
-def _errors(filter_: Filter, estimates: Estimates, data: Data, scale) -> dict:
+def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale) -> dict:
     """The fields of an `Evaluation` that need the truth; NaN without it."""
     if data.states is None:
         n = filter_.model.n if scale is None else len(scale)
@@ -107,21 +99,19 @@ def _errors(filter_: Filter, estimates: Estimates, data: Data, scale) -> dict:
             "mean_squares": np.full((len(data.measurements), n), np.nan),
             "scale": np.full(n, np.nan),
         }
-    n, late, scale = data.states.shape[-1], data.scored, _checked(scale, data.states.shape[-1])
-    errors = state_errors(filter_, estimates, data)
-    squares = normalized_squares(errors[:, late], estimates.covs[:, late, :n, :n])
-    mean_squares = (errors[:, late] ** 2).mean(axis=1)
+    n, scale = data.states.shape[-1], _checked(scale, data.states.shape[-1])
+    mean_squares, nees = runs.mean_squares, runs.nees
     resampled = np.sqrt(resampled_means(mean_squares))  # (resamples, n)
-    outputs = _output_rmse(filter_, estimates, data)
+    outputs = {symbol: rmse_intervals(squares)[0] for symbol, squares in runs.output_mean_squares.items()}
     return {
         "states": filter_.model.states[:n],
         "outputs": {symbol: filter_.model.outputs[symbol].quantity for symbol in outputs},
         "rmse": rmse_intervals(mean_squares),
-        "start_up_rmse": np.sqrt((errors[:, :FIRST_SCORED_STEP] ** 2).mean(axis=(0, 1))),
+        "start_up_rmse": np.sqrt(runs.start_up_squares.mean(axis=(0, 1))),
         "score": interval(score(mean_squares, scale), _scores(resampled, scale)),
         "output_rmse": outputs,
-        "nees": mean_interval(squares),
-        "median_nees": float(np.nanmedian(squares)) if np.isfinite(squares).any() else np.nan,
+        "nees": mean_interval(nees),
+        "median_nees": float(np.nanmedian(nees)) if np.isfinite(nees).any() else np.nan,
         "mean_squares": mean_squares,
         "scale": scale,
     }
@@ -138,41 +128,25 @@ def _checked(scale, n: int) -> np.ndarray:
     return scale
 
 
-def state_errors(filter_: Filter, estimates: Estimates, data: Data) -> np.ndarray:
-    """Errors (B, K + 1, n) of the plant's n states, those of angles the short way round."""
-    n = data.states.shape[-1]
-    return difference(estimates.means[..., :n], data.states, filter_.model.shape.state_angles[:n])
-
-
-def _output_rmse(filter_: Filter, estimates: Estimates, data: Data) -> dict[str, Interval]:
-    """RMSE of each derived output that both the truth and the filter's model have."""
-    late, found = data.scored, {}
-    for symbol, truth in (data.outputs or {}).items():
-        if symbol not in filter_.model.outputs:
-            continue
-        with np.errstate(all="ignore"):  # estimates far off, though finite, may have an output that is not
-            values = filter_.model.output(symbol, estimates.means[:, late])
-        values, angle = np.clip(values, -FARTHEST, FARTHEST), filter_.model.outputs[symbol].quantity.angle
-        errors = difference(values[..., None], truth[:, late, None], (angle,))[..., 0]
-        found[symbol] = rmse_intervals((errors**2).mean(axis=1, keepdims=True))[0]
-    return found
-
-
 def check_consistency(filter_: Filter, data: Data) -> ConsistencyReport:
     """Whether a filter's covariance is consistent on some data, and for an ensemble whether its members are."""
-    estimates, members, model = run(filter_, data.filter_keys, data.inputs, data.measurements), None, filter_.model
+    model, members, first = filter_.model, None, data.scored.start
     n = model.n if data.states is None else data.states.shape[-1]
     if filter_.size and data.states is not None:
         some = (part[:MEMBER_RUNS] for part in (data.filter_keys, data.inputs, data.measurements))
-        members = record_members(filter_, *some, first=data.scored.start, every=MEMBER_STEPS)
-    return consistency_report(
-        estimates._replace(means=estimates.means[..., :n], covs=estimates.covs[..., :n, :n]),
+        members = record_members(filter_, *some, first=first, every=MEMBER_STEPS)
+    angles = model.shape.state_angles[:n]
+    parts = []
+    for one, estimates in estimates_in_parts(filter_, data):
+        own = estimates._replace(means=estimates.means[..., :n], covs=estimates.covs[..., :n, :n])
+        parts.append(findings(own, one.states, one.measurements, first, angles))
+    return report_of(
+        joined(parts),
         data.states,
-        data.measurements,
         members=members,
-        first_step=data.scored.start,
+        first_step=first,
         names=[state.short_label for state in model.states[:n]],
-        angles=model.shape.state_angles[:n],
+        angles=angles,
         channels=[channel.label for channel in model.measurements],
     )
 
@@ -188,10 +162,9 @@ def _scores(rmse: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return (rmse[..., counted] / scale[counted]).mean(axis=-1)
 
 
-def run_scores(filter_: Filter, estimates: Estimates, data: Data, scale) -> np.ndarray:
+def run_scores(runs: RunMetrics, scale) -> np.ndarray:
     """The score of each run by itself, (B,): mean over states of its RMSE over scale."""
-    errors = state_errors(filter_, estimates, data)[:, data.scored]
-    return _scores(np.sqrt((errors**2).mean(axis=1)), np.asarray(scale))
+    return _scores(np.sqrt(runs.mean_squares), np.asarray(scale))
 
 
 def score_ratio(a: Evaluation, b: Evaluation) -> Interval:

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from optuna.distributions import BaseDistribution
 
-from filters.engine.batch import run
 from filters.registry import filter_class
 from tuning.problems.data import Data
+from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.problem import Problem
 from tuning.search.parameters import places_in
 from tuning.search.space import Choice, choice_of, parameters_of, untuned_choice
@@ -81,7 +81,8 @@ def identify(
         parts = []
         for scenario, one in zip(scenarios, data, strict=True):
             filter_ = choice_of(choice.name, moved, scenario).filter(scenario)
-            parts.append(run(filter_, one.filter_keys, one.inputs, one.measurements).log_likelihoods.sum(axis=1))
+            some = estimates_in_parts(filter_, one)
+            parts += [estimates.log_likelihoods.sum(axis=1) for _, estimates in some]
         found = np.concatenate(parts)
         return np.where(np.isfinite(found), found, LEAST)
 

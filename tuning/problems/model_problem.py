@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from inspect import Parameter as SignatureParameter
+from inspect import Signature
 
 import numpy as np
 
 from filters.baselines.baselines import OpenLoop
 from filters.bounds import posterior_bound
-from filters.engine.batch import run
+from filters.tuned_file import NOISE, PRIOR
 from numerics.checks import shown
 from numerics.streams import episode_keys, filter_keys
+from plants.model_env import ModelEnv
 from plants.simulate import simulate
 from plants.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_argument
@@ -18,6 +21,7 @@ from tuning.problems.check import check_quantities
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.digest import digest_of
 from tuning.problems.excitation import EXCITATIONS, Excitation
+from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.parameter import Parameter
 
 SCALE_SEEDS = range(200)  # whose inputs the scale is the bound of, where none is given
@@ -132,9 +136,9 @@ class ModelProblem(AssumedProblem):
         scale = self._bound(data, 100)
         if np.isnan(scale).any():
             with np.errstate(all="ignore"):
-                estimates = run(OpenLoop(model=self.truth), data.filter_keys, data.inputs, data.measurements)
-                errors = (estimates.means[..., self._shared] - data.states)[:, data.scored]
-                scale = np.sqrt((errors**2).mean(axis=(0, 1)))
+                parts = estimates_in_parts(OpenLoop(model=self.truth), data)
+                errors = [(found.means[..., self._shared] - one.states)[:, one.scored] for one, found in parts]
+                scale = np.sqrt((np.concatenate(errors) ** 2).mean(axis=(0, 1)))
         if not (np.isfinite(scale).all() and (scale > 0).all()):
             raise ValueError(
                 f"the scale of problem {self.name} must be given where neither a bound nor the error of the open "
@@ -148,6 +152,14 @@ class ModelProblem(AssumedProblem):
         variances = np.einsum("bkii->bki", posterior_bound(self.truth, data.inputs, truths=truths))
         return np.sqrt(variances[:, data.scored, self._shared].mean(axis=(0, 1)))
 
+    def env(self, **bounds) -> ModelEnv:
+        """The truth as a Gymnasium env, which offers filters the assumed model; the data of a seed is its episode.
+
+        Args:
+            **bounds: `low` and `high` of the inputs, as `ModelEnv` takes them.
+        """
+        return ModelEnv(self.truth, NamedArguments(self), dt=self._dt, **bounds)
+
     def _inputs_of(self, seeds: tuple[int, ...]) -> np.ndarray:
         shape = len(seeds), self.steps, self.truth.inputs
         if self.inputs is None:
@@ -160,6 +172,26 @@ class ModelProblem(AssumedProblem):
         if found.shape != shape:
             raise ValueError(f"inputs of problem {self.name} must have the shape {shape}, but got {found.shape}")
         return found
+
+
+class NamedArguments:
+    """A problem's `model`, whose signature names what it takes."""
+
+    def __init__(self, problem: ModelProblem):
+        """Take the problem."""
+        self._problem = problem
+
+    @property
+    def __signature__(self) -> Signature:
+        """Q, R, the factor on P_0 and the problem's parameters."""
+        names = *NOISE, PRIOR, *(one.name for one in self._problem.parameters or ())
+        return Signature(
+            [SignatureParameter(name, SignatureParameter.KEYWORD_ONLY, default=None) for name in names]
+        )
+
+    def __call__(self, **changes) -> StateSpaceModel:
+        """The model with some changes."""
+        return self._problem.model(**changes)
 
 
 def _checked_inputs(given: Inputs, count: int) -> np.ndarray | Excitation | Callable | None:

@@ -13,7 +13,7 @@ from filters.engine.batch import Estimates, run
 from filters.filter import Filter
 from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from plants.quantities import Quantity
-from tuning.evaluation.evaluate import state_errors
+from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data
 from tuning.report.panels import axis_label, shown_states
 

@@ -119,16 +119,26 @@ OWN_NUMBERS = {
 }
 
 
-def filter_parameters(name: str, sizes: tuple[int, int] | None) -> list[Parameter]:
+# Without process noise nothing but this parts the copies of a particle; with it a study has Q for that.
+WITHOUT_NOISE = {one.name: one for one in (_own("regularisation", 0.0, 3.0),)}
+
+
+def has_process_noise(problem: Problem) -> bool:
+    """Whether filters of a problem are untuned with some process noise, or its parameters say how much."""
+    return problem.parameters is not None or bool(np.any(problem.untuned.get(Q, True)))
+
+
+def filter_parameters(name: str, sizes: tuple[int, int] | None, process_noise: bool) -> list[Parameter]:
     """What a study may choose of a filter itself: N from `sizes`, if it has an ensemble, and its own numbers.
 
-    Of an estimator that is what it says it is tuned by.
+    Of an estimator that is what it says it is tuned by. Some numbers are chosen only without process noise.
     """
     if is_foreign(name):
         return [replace(one, place=FilterNumber(one.name)) for one in parameters_of(name)]
     size = [] if sizes is None else [Parameter("N", *sizes, integer=True, place=FilterNumber("ensemble_size"))]
     known = tunable_numbers(name)
-    return size + [one for number, one in OWN_NUMBERS.items() if number in known]
+    numbers = OWN_NUMBERS if process_noise else OWN_NUMBERS | WITHOUT_NOISE
+    return size + [one for number, one in numbers.items() if number in known]
 
 
 def model_parameters(

@@ -14,7 +14,13 @@ from filters.particles.weighted import WeightedFilter
 from filters.registry import FILTERS, filter_class, make_filter, tunable_numbers
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
-from tuning.search.parameters import FilterNumber, filter_parameters, model_parameters, places_in
+from tuning.search.parameters import (
+    FilterNumber,
+    filter_parameters,
+    has_process_noise,
+    model_parameters,
+    places_in,
+)
 
 AUTO = "auto"  # stands for a filter that a study is to choose
 # Among these: all that know how sure they are. The first one is the first trial.
@@ -53,12 +59,12 @@ class Choice(NamedTuple):
 
 def untuned_choice(name: str, problem: Problem) -> Choice:
     """The untuned filter: R from the sensor's sheet, Q from the ranges of the states, N = 30 (particles: 1000)."""
-    return Choice(name, dict(problem.untuned), _default_numbers(name))
+    return Choice(name, dict(problem.untuned), _default_numbers(name, problem))
 
 
 def true_choice(name: str, problem: Problem) -> Choice | None:
     """The filter that is told the plant's own Q and R, with the untuned ensemble size; None if unknown."""
-    return None if problem.true is None else Choice(name, dict(problem.true), _default_numbers(name))
+    return None if problem.true is None else Choice(name, dict(problem.true), _default_numbers(name, problem))
 
 
 def has_ensemble(name: str) -> bool:
@@ -77,17 +83,18 @@ def size_ladder(name: str) -> tuple[int, ...]:
     return tuple(size for size in SIZE_LADDER if low <= size <= high)
 
 
-def _default_numbers(name: str) -> dict:
+def _default_numbers(name: str, problem: Problem) -> dict:
+    own = _of_filter(name, has_process_noise(problem))
     if is_foreign(name):
-        return {one.name: one.start for one in _of_filter(name)}
+        return {one.name: one.start for one in own}
     numbers = {"ensemble_size": ensemble_sizes_of(name).untuned} if has_ensemble(name) else {}
-    others = [one.name for one in _of_filter(name) if one.name != "N"]
+    others = [one.name for one in own if one.name != "N"]
     return numbers | {number: getattr(filter_class(name), number) for number in others}
 
 
-def _of_filter(name: str) -> list[Parameter]:
+def _of_filter(name: str, process_noise: bool = False) -> list[Parameter]:
     sizes = ensemble_sizes_of(name)[1:] if has_ensemble(name) else None
-    return filter_parameters(name, sizes)
+    return filter_parameters(name, sizes, process_noise)
 
 
 def parameters(
@@ -108,7 +115,7 @@ def parameters(
     found = []
     if filter_class(name).has_covariance:
         found = model_parameters(problem, hold_r=hold_r, full_q=full_q, prior=prior)
-    return found + _of_filter(name)
+    return found + _of_filter(name, has_process_noise(problem))
 
 
 def distributions(name: str, problem: Problem, **options) -> dict[str, BaseDistribution]:

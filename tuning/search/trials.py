@@ -10,9 +10,8 @@ from statistics import geometric_mean
 import numpy as np
 import optuna
 
-from filters.engine.batch import Estimates, run
-from filters.filter import Filter
 from tuning.evaluation.evaluate import Evaluation, compute_metrics, run_scores
+from tuning.evaluation.runs import RunMetrics, joined, metrics_of_all
 from tuning.problems.data import Data
 from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
 from tuning.search.objectives import LARGEST, nis_ratio, nis_violation, penalised
@@ -82,29 +81,21 @@ def measure(
     filters = [choice.filter(scenario) for scenario in plan.scenarios]
     count = len(data[0].seeds)
     size = count if trial is None else BLOCK
-    parts: list[list[Estimates]] = [[] for _ in filters]
+    parts: list[list[RunMetrics]] = [[] for _ in filters]
     for first in range(0, count, size):
         block = [one.slice(first, first + size) for one in data]
-        for estimates, filter_, one in zip(parts, filters, block, strict=True):
-            estimates.append(run(filter_, one.filter_keys, one.inputs, one.measurements))
+        for runs, filter_, one in zip(parts, filters, block, strict=True):
+            runs.append(metrics_of_all(filter_, one))
         if trial is not None:
-            _report(trial, first, filters, [estimates[-1] for estimates in parts], block, plan)
+            _report(trial, first, [runs[-1] for runs in parts], plan)
             if first + size < count and trial.should_prune():
                 raise optuna.TrialPruned
-    whole = [Estimates(*map(np.concatenate, zip(*estimates, strict=True))) for estimates in parts]
-    rows = zip(filters, whole, data, plan.scenarios, strict=True)
-    return [compute_metrics(filter_, estimates, one, scenario.scale) for filter_, estimates, one, scenario in rows]
+    rows = zip(filters, map(joined, parts), data, plan.scenarios, strict=True)
+    return [compute_metrics(filter_, runs, one, scenario.scale) for filter_, runs, one, scenario in rows]
 
 
-def _report(
-    trial: optuna.Trial,
-    first: int,
-    filters: list[Filter],
-    estimates: list[Estimates],
-    block: list[Data],
-    plan: Plan,
-) -> None:
-    rows = zip(filters, estimates, block, plan.scenarios, strict=True)
-    scores = np.mean([run_scores(*row, scenario.scale) for *row, scenario in rows], axis=0)
+def _report(trial: optuna.Trial, first: int, parts: list[RunMetrics], plan: Plan) -> None:
+    pairs = zip(parts, plan.scenarios, strict=True)
+    scores = np.mean([run_scores(runs, scenario.scale) for runs, scenario in pairs], axis=0)
     for place, score in enumerate(scores):
         trial.report(float(score), first + place)

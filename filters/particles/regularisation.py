@@ -1,0 +1,43 @@
+"""Regularisation of particles that were drawn anew: copies of one are spread by a Gaussian kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+from filters.engine.layout import memory_places, own_place
+from filters.ensembles.members import add_noise, drawer
+from numerics import matrices
+from numerics.compiled import inlined
+from numerics.streams import FILTER_KERNEL
+from numerics.tuples import matrix_writer
+from plants.shape import Shape
+
+
+@cache
+def kernel_spreader(shape: Shape) -> Callable:
+    """Return `spread(memory, cov, numbers, size)`: x_j += c h e_j, e_j ~ N(0, cov), cov (n, n).
+
+    c is the first of the filter's own numbers, and h = (4/(n + 2))^(1/(n + 4)) N^(-1/(n + 4)) the width that makes
+    the mean integrated square error of the density least where that is Gaussian. The root of the kernel's
+    covariance is put into n^2 numbers of the row, behind the ESS.
+
+    Source: Silverman (1986), Density Estimation for Statistics and Data Analysis, section 4.3.2; Musso, Oudjane,
+    Le Gland (2001), "Improving regularised particle filters", in Sequential Monte Carlo Methods in Practice.
+    """
+    n, m = shape.n, shape.m
+    factor_place, root_place = own_place(shape), memory_places(n, m).extras + 1
+    factorise, store, draw = matrices.semidefinite_factor(n), matrix_writer(n, n, root_place), drawer(n, m)
+    power = 1.0 / (n + 4.0)
+    unit = (4.0 / (n + 2.0)) ** power
+
+    @inlined
+    def spread(memory, cov, numbers, size):
+        row, table, draws = memory
+        store(row, factorise(cov))
+        for i in range(n * n):
+            row[root_place + i] *= numbers[factor_place] * unit * size**-power
+        draw(draws, n * table.shape[1], row, FILTER_KERNEL)
+        add_noise(table, 0, n, draws, row, root_place)
+
+    return spread

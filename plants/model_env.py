@@ -1,0 +1,122 @@
+"""`ModelEnv`: a Gymnasium env whose plant is a state-space model itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+
+import gymnasium as gym
+import numpy as np
+
+from numerics.checks import positive, shown
+from numerics.checks import seed as checked_seed
+from numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from numerics.streams import GROUP, draw_key
+from plants.commands import some_numbers
+from plants.layout import padded
+from plants.simulate import truth_steps_of
+from plants.state_space import StateSpaceModel
+
+
+class ModelEnv(gym.Env):
+    """A state-space model as an env: the action is its input, the observation its measurement.
+
+    The first episode after `reset(seed=s)` is the trajectory that `plants.simulate.simulate` draws for the key of
+    s, under the same inputs; a problem of the same model has it as the data of seed s. `info` holds "state" (n,)
+    and "measurement" (m,) in float64. There is no reward and no end; `gymnasium.wrappers.TimeLimit` sets one.
+
+    Args:
+        truth: the model that moves and measures.
+        assumed: what `state_space_model` offers to filters: a model, or a function of changes by name that makes
+            it; the truth if None.
+        low: smallest input, one number or p.
+        high: largest input.
+        dt: sample time [s], with which tuned files are compared; None if it has none.
+
+    Raises:
+        ValueError: if the truth is no model, or bounds or dt are off.
+    """
+
+    metadata = {"render_modes": []}
+
+    def __init__(
+        self,
+        truth: StateSpaceModel,
+        assumed: StateSpaceModel | Callable[..., StateSpaceModel] | None = None,
+        *,
+        low=-np.inf,
+        high=np.inf,
+        dt: float | None = None,
+    ):
+        """Make spaces and memory; see the class for the arguments."""
+        if not isinstance(truth, StateSpaceModel):
+            raise ValueError(f"the truth of an env must be a StateSpaceModel, but it is {shown(truth)}")
+        self.truth, self.dt = truth, None if dt is None else positive("dt", dt)
+        assumed = truth if assumed is None else assumed
+        self.state_space_model = partial(with_noise, assumed) if isinstance(assumed, StateSpaceModel) else assumed
+        self.action_space = gym.spaces.Box(*_bounds(low, high, truth.inputs), dtype=np.float64)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (truth.m,), np.float64)
+        self._numbers, self._key, self._step = truth.numbers, np.zeros(2), 0
+        self._x, self._z, self._u = np.zeros(truth.n), np.zeros(truth.m), np.zeros(truth.inputs)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None):
+        """Draw a key from the env's generator, and by it an initial state and a first measurement."""
+        super().reset(seed=checked_seed(seed))
+        self._key, self._step = draw_key(self.np_random), 0
+        return self._moved()
+
+    def step(self, action):
+        """Apply an input (p,), clipped to its bounds, for one step; ValueError for one that is not p numbers."""
+        given = some_numbers(action, self.truth.input_quantities)
+        self._u[:] = np.clip(given, self.action_space.low, self.action_space.high)
+        self._step += 1
+        observation, info = self._moved()
+        return observation, 0.0, False, False, info
+
+    def _moved(self) -> tuple[np.ndarray, dict]:
+        move = _mover(*truth_steps_of(self.truth), max(self.truth.n, self.truth.m), is_interpreting())
+        move(self._x, self._z, self._u, self._step, self._key, self._numbers)
+        return self._z.copy(), {"state": self._x.copy(), "measurement": self._z.copy()}
+
+
+def with_noise(
+    model: StateSpaceModel,
+    *,
+    process_noise_cov=None,
+    measurement_noise_cov=None,
+    prior_cov_factor: float | None = None,
+) -> StateSpaceModel:
+    """A model with another Q or R, where given, and its P_0 times a factor."""
+    changes = {"process_noise_cov": process_noise_cov, "measurement_noise_cov": measurement_noise_cov}
+    if prior_cov_factor is not None:
+        changes["prior_cov"] = positive("prior_cov_factor", prior_cov_factor) * model.prior_cov
+    return model.replace(**{name: value for name, value in changes.items() if value is not None})
+
+
+def _bounds(low, high, count: int) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        low, high = (np.array(np.broadcast_to(np.asarray(one, dtype=np.float64), count)) for one in (low, high))
+    except (TypeError, ValueError):
+        low, high = np.full(1, np.nan), np.zeros(1)
+    if not (low <= high).all():
+        raise ValueError(f"low and high must be one number or {count}, low at most high, but they are not")
+    return low, high
+
+
+@cache
+def _mover(
+    begin: Callable, advance: Callable, measure: Callable, largest: int, interpreting: bool
+) -> CompiledOrPython:
+    fingerprint = function_fingerprint(begin, advance, measure, within=__name__)
+    room = padded(largest, GROUP)
+
+    def move(x, z, u, step, key, numbers):
+        fingerprint  # noqa: B018 - part of the cache's key
+        draws = np.zeros(room)
+        if step == 0:
+            begin(x, draws, key[0], key[1], numbers)
+        else:
+            advance(x, u, draws, step, key[0], key[1], numbers)
+        measure(z, x, draws, step, key[0], key[1], numbers)
+
+    return CompiledOrPython(move)
