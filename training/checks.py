@@ -31,8 +31,7 @@ def check_setup(setup: Setup) -> None:
         at_least(name, getattr(setup, name), least)
     if setup.controller is not None:
         one_of("controller", setup.controller, plant.correctable)
-        if not arm.shows_state:
-            raise ValueError(f"{setup.controller} must observe a state, but got observe={setup.observe!r}")
+        plant.check_observes(setup.controller, setup.observe)
     positive("share", setup.share)
     own = () if arm.filter is None else (*tunable_numbers(arm.filter), *plant.model_arguments)
     _check_known("env_arguments", setup.env_arguments, plant.env_arguments)

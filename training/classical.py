@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from numerics.checks import one_of
 from training.controllers import ClassicalPolicy
-from training.observations import find_arm
 from training.plants.find import plant_of
 from training.setup import Setup
 
@@ -20,6 +19,5 @@ def classical_policy(name: str, setup: Setup) -> ClassicalPolicy:
     """
     plant = plant_of(setup.task)
     one_of("controller", name, plant.controllers)
-    if name in plant.of_states and not find_arm(setup.observe).shows_state:
-        raise ValueError(f"{name} must observe a state, but got observe={setup.observe!r}")
+    plant.check_observes(name, setup.observe)
     return plant.classical(name, setup)

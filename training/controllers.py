@@ -25,12 +25,18 @@ class ClassicalPolicy:
     skipped: int  # entries in front of what the controller reads
     half: float | np.ndarray  # half of the range of each input, in its unit: the voltage's is max_voltage ...
     middle: float | np.ndarray = 0.0  # ... about this
+    keeps_input: bool = False  # whether what it remembers begins with its last input
 
     def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
         """Actions (n, p) in [-1, 1] for observations (n, d), and what the controller remembers."""
         seen = np.asarray(observation)[..., self.skipped :]
         inputs, state = self.controller.predict(seen, state, episode_start)
         return (inputs - self.middle) / self.half, state
+
+    def tell(self, state: np.ndarray, actions: np.ndarray) -> None:
+        """Put the actions (n, p) that were really applied in place of the last ones that a state remembers."""
+        if self.keeps_input:
+            state[:, 0] = self.middle + self.half * actions[:, 0]
 
 
 class CorrectController(VecEnvWrapper):
@@ -42,13 +48,13 @@ class CorrectController(VecEnvWrapper):
     Args:
         venv: envs that observe what the controller needs, with actions in [-1, 1].
         controller: what is corrected.
-        share: the largest correction [V_max].
+        share: the largest correction, as a part of half of each input's range.
     """
 
     def __init__(self, venv: VecEnv, controller: ClassicalPolicy, share: float):
         """Wrap the envs; see the class."""
         self._controller, self._share = controller, share
-        size = venv.observation_space.shape[0] + 1
+        size = venv.observation_space.shape[0] + venv.action_space.shape[0]
         super().__init__(venv, gym.spaces.Box(-np.inf, np.inf, (size,), np.float32))
 
     def reset(self) -> np.ndarray:
@@ -60,7 +66,7 @@ class CorrectController(VecEnvWrapper):
     def step_async(self, actions: np.ndarray) -> None:
         """Correct what the controller does."""
         applied = np.clip(self._actions + self._share * np.clip(actions, -1.0, 1.0), -1.0, 1.0)
-        self._state[:, 0] = applied[:, 0] * self._controller.half  # the last voltage, as it really was
+        self._controller.tell(self._state, applied)
         self.venv.step_async(applied.astype(np.float32))
 
     def step_wait(self):

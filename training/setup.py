@@ -128,7 +128,11 @@ def make_setup(
         steps=at_least("steps", algorithm.steps if steps is None else steps, 1, MOST_STEPS),
         seed=at_least("seed", seed, 0),
         num_envs=at_least("num_envs", algorithm.num_envs if num_envs is None else num_envs, 1, MOST_ENVS),
-        hyperparameters={**algorithm.hyperparameters, **(hyperparameters or {})},
+        hyperparameters={
+            **algorithm.hyperparameters,
+            **kind.hyperparameters.get(algo, {}),
+            **(hyperparameters or {}),
+        },
         controller=controller,
         share=share,
     )

@@ -10,8 +10,11 @@ import numpy as np
 from auv_env.control.depth_and_course import DepthAndCourse
 from auv_env.model import MODEL_ARGUMENTS, auv_model
 from auv_env.plant import CRUISE_SPEED, Plant, make_plant
+from auv_env.quantities import STATES
 from auv_env.tasks import SegorogeniAUVDepthEnv, SegorogeniAUVPathEnv
+from plants.observe import ObserveState
 from plants.state_space import StateSpaceModel
+from training.algorithms import LAYERS
 from training.observations import find_arm
 from training.plants.plant import Part, Task, TrainingPlant, part_of
 from tuning.auv.find import find_scenario
@@ -47,6 +50,14 @@ class Vehicle(TrainingPlant):
     model_arguments = MODEL_ARGUMENTS
     controllers = (PD,)
     of_states = ()
+    correctable = (PD,)
+    # A turn takes seconds, so the horizon is 5 s; and a vehicle that is shaken tumbles and learns nothing.
+    hyperparameters = {
+        "ppo": {"gamma": 0.99, "gae_lambda": 0.95, "policy_kwargs": {**LAYERS, "log_std_init": -2.0}},
+        "sac": {"gamma": 0.98},
+        "td3": {"gamma": 0.98},
+        "recurrent-ppo": {"gamma": 0.99, "gae_lambda": 0.95},
+    }
     parts = {"cross-track": "m", "vertical": "m", "speed": "m/s"}
     errors = "of the true place beside and above the path, and of the speed"
 
@@ -64,17 +75,25 @@ class Vehicle(TrainingPlant):
         """What a filter assumes: `auv_env.model.auv_model`."""
         return auv_model(**arguments)
 
+    def check_observes(self, name: str, observe: str) -> None:
+        """Raise ValueError for a history, or a belief with standard deviations."""
+        arm = find_arm(observe)
+        if arm.pairs or arm.form != "estimate":
+            raise ValueError(f"{name} must observe measurements or a state, but got observe={observe!r}")
+
     def classical(self, name: str, setup):
         """PD on depth and course, from measurements, from an estimate or from the true state."""
-        from training.controllers import ClassicalPolicy
         from training.environments import make_single
 
-        arm, env = find_arm(setup.observe), make_single(setup)
-        if arm.pairs or arm.form != "estimate":
-            raise ValueError(f"{PD} must observe measurements or a state, but got observe={setup.observe!r}")
-        seen = "measurement"
-        if arm.shows_state:
-            seen = "navigation" if arm.is_true or env.env.filter.model.n == 12 else "motion"
+        return self.corrected(name, make_single(setup).env)
+
+    def corrected(self, name: str, env):
+        """The same for an env with a filter, or `ObserveState`, as its outermost wrapper, if it has one."""
+        from training.controllers import ClassicalPolicy
+
+        seen = "navigation" if isinstance(env, ObserveState) else "measurement"
+        if (filter_ := getattr(env, "filter", None)) is not None:
+            seen = "navigation" if filter_.model.n == len(STATES) else "motion"
         low, high = env.unwrapped.plant.input_limits
         return ClassicalPolicy(DepthAndCourse.for_env(env, seen), 0, (high - low) / 2, (high + low) / 2)
 

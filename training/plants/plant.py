@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 
 from plants.state_space import StateSpaceModel
+from training.observations import find_arm
 from tuning.problems.scenario import BaseScenario
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ class TrainingPlant(ABC):
         controllers: names of the classical policies.
         of_states: those of them that must observe a state.
         correctable: those that a policy may correct.
+        hyperparameters: of algorithms by name, where they differ from those of `training.algorithms`.
         parts: what `parts_of` gives, with units.
         errors: what these are errors of, in words.
     """
@@ -72,6 +74,7 @@ class TrainingPlant(ABC):
     controllers: ClassVar[tuple[str, ...]]
     of_states: ClassVar[tuple[str, ...]]
     correctable: ClassVar[tuple[str, ...]] = ()
+    hyperparameters: ClassVar[Mapping[str, Mapping]] = {}
     parts: ClassVar[Mapping[str, str]]
     errors: ClassVar[str]
 
@@ -86,6 +89,11 @@ class TrainingPlant(ABC):
     @abstractmethod
     def model(self, **arguments) -> StateSpaceModel:
         """What a filter assumes, of arguments of the plant and of the model."""
+
+    def check_observes(self, name: str, observe: str) -> None:
+        """Raise ValueError unless a classical policy can act on what an arm observes."""
+        if name in self.of_states and not find_arm(observe).shows_state:
+            raise ValueError(f"{name} must observe a state, but got observe={observe!r}")
 
     @abstractmethod
     def classical(self, name: str, setup: Setup) -> ClassicalPolicy:

@@ -39,7 +39,7 @@ def predictive(name: str, env: gym.Env) -> ClassicalPolicy:
     believed = getattr(getattr(env, "filter", None), "model", None)
     constants = believed.constants if believed is not None and isinstance(believed.constants, Constants) else None
     controller = PredictiveController.for_env(env, horizon, constants)
-    return ClassicalPolicy(controller, 1, env.unwrapped.plant.max_voltage)
+    return ClassicalPolicy(controller, 1, env.unwrapped.plant.max_voltage, keeps_input=True)
 
 
 def lqr(setup: Setup) -> ClassicalPolicy:
