@@ -69,12 +69,12 @@ def test_every_suite_makes_an_env_and_the_vehicle_has_the_effects_of_all_plants(
 
 
 def test_a_vehicle_adrift_takes_on_the_velocity_of_the_current():
-    """Its drag goes with the square of what is left, so that halves in twice the time."""
+    """It turns, too, and its drag goes with the square of what is left: the last of that goes slowly."""
     current = np.array([0.3, -0.2, 0.1])
     states = run([0.0, 0.0, 0.0], 1600, current=current, **REST).states[0]
     left = np.linalg.norm(np.diff(states[:, 9:12], axis=0) / 0.05 - current, axis=1)
     assert left[0] == pytest.approx(np.linalg.norm(current), rel=0.01)
-    assert left[1599] < 0.15 * left[0] and left[1599] == pytest.approx(left[799] / 2, rel=0.25)
+    assert left[1599] < 0.1 * left[0] and left[1599] < left[799] < 0.2 * left[0]
 
 
 def test_adrift_from_the_start_nothing_changes():
