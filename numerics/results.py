@@ -65,11 +65,11 @@ def _copy_matrix(out, value):
 def _by_entries(count: int) -> Callable:
     """Entries of a tuple one by one, for they may differ in type."""
     return written_out(
-        "fill", "out, value", *(f"out[{i}] = value[{i}]" for i in range(count)), "None", _loops=True
+        "fill_entries", "out, value", *(f"out[{i}] = value[{i}]" for i in range(count)), "None", _loops=True
     )
 
 
 def _by_rows(count: int) -> Callable:
     """Rows of a tuple, each of which may be a tuple or an array."""
     lines = (f"fill(out[{i}], value[{i}])" for i in range(count))
-    return written_out("fill", "out, value", *lines, "None", _loops=True, fill=fill)
+    return written_out("fill_rows", "out, value", *lines, "None", _loops=True, fill=fill)
