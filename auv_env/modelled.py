@@ -31,6 +31,10 @@ class ModelledVehicle(ModelledEnv):
 
         return model_of_plant
 
+    def state_space_model(self, **changes) -> StateSpaceModel:
+        """See `plants.modelled`; for "velocities" the attitude is level, as nobody tells it to a filter here."""
+        return super().state_space_model(**{"attitude": "level"} | changes)
+
     def tuned_differences(self, tuned_for: Mapping, file: str) -> list[str]:
         """See `plant_data.check_same_plant`."""
         from auv_env.plant_data import check_same_plant

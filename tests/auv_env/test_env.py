@@ -247,6 +247,13 @@ def test_the_env_offers_the_smaller_model_that_predicts_all_channels(sensors, st
     assert observation.shape == (states + flags,) and info["estimate_cov"].shape == (states, states)
 
 
+def test_six_velocities_are_a_model_of_the_papers_sensors():
+    arguments = {"states": "velocities"}
+    env = EstimateState(gym.make("SegorogeniAUV-v0", sensors="papers"), filter="ekf", model_arguments=arguments)
+    env.reset(seed=0)
+    assert env.filter.model.n == 6 and np.isfinite(env.step(CRUISE)[-1]["estimate"]).all()
+
+
 def test_a_model_that_cannot_predict_a_channel_is_refused():
     env = gym.make("SegorogeniAUV-v0")
     with pytest.raises(ValueError, match="sensors of a model of 8 states must measure u, v, .*but got psi, z"):
