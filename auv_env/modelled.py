@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,6 +30,16 @@ class ModelledVehicle(ModelledEnv):
         from auv_env.model import model_of_plant
 
         return model_of_plant
+
+    def state_space_model(self, **changes) -> StateSpaceModel:
+        """See `plants.modelled`; for "velocities" the attitude is level, as nobody tells it to a filter here."""
+        return super().state_space_model(**{"attitude": "level"} | changes)
+
+    def tuned_differences(self, tuned_for: Mapping, file: str) -> list[str]:
+        """See `plant_data.check_same_plant`."""
+        from auv_env.plant_data import check_same_plant
+
+        return check_same_plant(tuned_for, self.plant, file)
 
     def overlay(self, label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
         """What a rendered vehicle shows of a belief beside the truth: states that it has, by their symbols."""

@@ -29,16 +29,12 @@ class EpisodeKeys:
         self._generators: list[np.random.Generator | None] = [None] * count
         self._ahead = np.zeros((count, KEYS_AHEAD, 2))
         self._used = np.full(count, KEYS_AHEAD)
+        self.seeded = False  # whether all copies have generators: asked at every step, so it is remembered
 
     @property
     def count(self) -> int:
         """Number of copies."""
         return len(self._generators)
-
-    @property
-    def seeded(self) -> bool:
-        """Whether the copies have generators."""
-        return all(generator is not None for generator in self._generators)
 
     def seed(self, seed: int | list[int | None] | None, mask: np.ndarray) -> None:
         """Give copy i of those in the mask a generator from seed + i, or seed[i]; None keeps the one it has."""
@@ -47,6 +43,7 @@ class EpisodeKeys:
             if seeds[i] is not None or self._generators[i] is None:
                 self._generators[i] = self._make_generator(seeds[i])
                 self._used[i] = KEYS_AHEAD
+        self.seeded = None not in self._generators
 
     def seeds(self, seed) -> list[int | None]:
         """The seed of each copy; ValueError unless a reset's seed is None, a number, or one of these a copy."""

@@ -28,16 +28,11 @@ def record(
     if keys.ndim != 2 or keys.shape[1] != 2 or not np.isfinite(keys).all():
         raise ValueError(f"keys must be finite and of shape (B, 2), but got shape {keys.shape}")
     rest = () if count == 1 else (count,)
-    if (
-        inputs.ndim != 2 + len(rest)
-        or len(inputs) != len(keys)
-        or inputs.shape[2:] != rest
-        or np.isnan(inputs).any()
-    ):
+    fits = inputs.ndim == 2 + len(rest) and len(inputs) == len(keys) and inputs.shape[2:] == rest
+    if not fits or np.isnan(inputs).any():
         shape = f"({len(keys)}, K{''.join(f', {size}' for size in rest)})"
-        raise ValueError(
-            f"{name} must be without NaN and of shape {shape}, one row a key, but got shape {inputs.shape}"
-        )
+        rule = f"{name} must be without NaN and of shape {shape}, one row a key"
+        raise ValueError(f"{rule}, but got shape {inputs.shape}")
     copies = copies_of(len(keys))
     reports = np.empty((inputs.shape[1] + 1, copies.reported, len(keys)))
     reports[0] = copies.begin(keys)

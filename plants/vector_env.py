@@ -125,6 +125,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
             report[:] = self._copies.begin(keys, numbers=numbers)
         else:
             report[:, which] = self._copies.begin(keys, which, numbers)
+        report[TERMINATED, which] = 0.0  # a reset ends nothing: what begins beyond limits ends with its first step
         self._done[which] = False
 
     def _endings(self, report: np.ndarray) -> dict[str, Any]:

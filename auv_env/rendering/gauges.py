@@ -106,9 +106,10 @@ class Gauges:
         values = {THRUST: moment.thrust, STERN: math.degrees(moment.stern), RUDDER: math.degrees(moment.rudder)}
         for (x, axis), title in zip(self._axes.items(), ("thrust", "stern", "rudder"), strict=True):
             canvas, value, zero = self._canvas, values[x], axis.y(0.0)
-            y = min(max(axis.y(value), TOP), TOP + HEIGHT)
-            canvas.box(x - 5, min(y, zero), 10, abs(y - zero), (158, 172, 185))
-            canvas.box(x - 9, y - 1.25, 18, 2.5, INK)
+            if math.isfinite(value):
+                y = min(max(axis.y(value), TOP), TOP + HEIGHT)
+                canvas.box(x - 5, min(y, zero), 10, abs(y - zero), (158, 172, 185))
+                canvas.box(x - 9, y - 1.25, 18, 2.5, INK)
             canvas.box(x - 7, zero - 0.4, 14, 0.8, SOFT_INK)
             canvas.text(title, (x, TOP - 13), 11, INK, 0.5)
             text = number(value, 2) + " N" if x == THRUST else number(value, 1) + "\u00b0"

@@ -47,10 +47,10 @@ class View:
     def draw(self, columns: dict[str, np.ndarray], moment: Moment, offset: float) -> None:
         """Draw the newest moment; the path to follow is `offset` [m] deeper than its points."""
         trail = _points(columns, "")
-        path = self._path + [0.0, 0.0, offset]
         seen = trail[np.isfinite(trail).all(axis=1)]
         place = seen[-1] if len(seen) else np.zeros(3)
-        shown = np.concatenate([seen, _near(path, place), [place]])
+        path = _shown_part(self._path, seen) + [0.0, 0.0, offset]
+        shown = np.concatenate([seen, path, [place]])
         low, high = shown.min(axis=0), shown.max(axis=0)
         floor = high[2] + 0.12 * max(LEAST_SIZE, float((high - low).max()))
         self._fit(np.concatenate([shown, shown * [1.0, 1.0, 0.0] + [0.0, 0.0, floor]]))
@@ -162,12 +162,14 @@ def _points(columns: dict[str, np.ndarray], prefix: str) -> np.ndarray:
     return np.stack([columns[f"{prefix}{name}"] for name in ("x", "y", "depth")], axis=-1)
 
 
-def _near(path: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """The points of a path, or of a straight one that begins far behind those near a place."""
+def _shown_part(path: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """A path's points; of a single straight line those from where the vehicle was to some way ahead of it."""
     if len(path) > 2:
         return path
-    along = (place - path[0]) @ (path[1] - path[0]) / ((path[1] - path[0]) @ (path[1] - path[0]))
-    return path[0] + (along + np.array([[-1.0], [2.0]])) * (path[1] - path[0])
+    piece = path[1] - path[0]
+    along = (seen - path[0]) @ piece / (piece @ piece) if len(seen) else np.zeros(1)
+    places = np.linspace(along.min(), along.max() + 2.0 / np.linalg.norm(piece), 100)
+    return path[0] + places[:, None] * piece
 
 
 def _runs(points: np.ndarray) -> list[np.ndarray]:

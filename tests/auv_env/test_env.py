@@ -4,6 +4,8 @@ import copy
 import json
 import math
 import pickle
+import tomllib
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -15,7 +17,6 @@ from auv_env.plant import make_plant
 from auv_env.simulation import simulate as simulate_plant
 from auv_env.vector_env import SegorogeniAUVVectorEnv
 from filters import EstimateState
-from filters.wrappers.ids import modelled_ids
 from numerics.streams import draw_key
 from plants.simulate import simulate
 
@@ -71,7 +72,8 @@ def test_spaces_are_those_that_the_class_says():
     assert gym.make("SegorogeniAUVPath-v0").observation_space.shape == (14 + 6,)
     assert gym.make("SegorogeniAUV-v0", propeller_torque=None).action_space.shape == (4,)
     assert {gym.spec(name).max_episode_steps for name in IDS} == {1200, 600}
-    assert set(IDS) <= set(modelled_ids())
+    content = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    assert content["project"]["entry-points"]["filters.plants"]["auv_env"] == "auv_env"
 
 
 def test_truth_and_measurements_are_those_of_the_model_with_the_same_key():
@@ -243,6 +245,13 @@ def test_the_env_offers_the_smaller_model_that_predicts_all_channels(sensors, st
     observation, info = env.reset(seed=0)
     flags = env.unwrapped.appended_entries
     assert observation.shape == (states + flags,) and info["estimate_cov"].shape == (states, states)
+
+
+def test_six_velocities_are_a_model_of_the_papers_sensors():
+    arguments = {"states": "velocities"}
+    env = EstimateState(gym.make("SegorogeniAUV-v0", sensors="papers"), filter="ekf", model_arguments=arguments)
+    env.reset(seed=0)
+    assert env.filter.model.n == 6 and np.isfinite(env.step(CRUISE)[-1]["estimate"]).all()
 
 
 def test_a_model_that_cannot_predict_a_channel_is_refused():

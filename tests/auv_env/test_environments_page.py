@@ -1,0 +1,35 @@
+"""The page on the environments: its examples run, and what it lists is all there is."""
+
+import re
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+import auv_env  # noqa: F401 - registers the envs
+from auv_env.channels import SUITES
+from auv_env.effects.current import CURRENT_SIGNALS
+from docs import auv_figures
+
+PAGE = (Path(__file__).parents[2] / "docs" / "auv_environments.md").read_text()
+EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("code", EXAMPLES, ids=range(len(EXAMPLES)))
+def test_an_example_runs(code, capsys):
+    exec(compile(code, "docs/auv_environments.md", "exec"), {})
+
+
+def test_ids_suites_and_signals_are_named():
+    ids = [name for name in gym.registry if re.fullmatch(r"SegorogeniAUV\w*-v0", name)]
+    assert len(ids) == 3 and all(f"| `{name}` |" in PAGE for name in ids)
+    assert all(f"`{name}`" in PAGE for name in (*SUITES, *CURRENT_SIGNALS.effects))
+
+
+def test_the_page_has_what_its_script_makes():
+    assert set(auv_figures.FIGURES) == set(re.findall(r"!\[.*?\]\((.*?)\)", PAGE))
+    assert set(auv_figures.TABLES) == set(re.findall(r"<!-- table (\w+) -->", PAGE))
+    folder = Path(__file__).parents[2] / "docs"
+    for target in re.findall(r"\]\((?!http)([^)#]+)", PAGE):
+        assert (folder / target).exists(), target
