@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from auv_env.channels import MAX_CHANNELS
 from auv_env.model import MODELS, model_of_plant
 from auv_env.operating import operating_range
 from auv_env.plant import DEFAULT_DT, DEFAULT_PROCESS_NOISE, DEFAULT_PROPELLER_TORQUE, Plant, make_plant
+from auv_env.plant_data import check_same_plant, plant_data
 from auv_env.quantities import STATES
 from auv_env.simulation import simulate
 from filters.bounds import path_bound
@@ -108,6 +110,16 @@ class Scenario(BaseScenario):
     def held(self) -> dict:
         """What the filter's model has of its own: its states, and wrong parameters."""
         return {"states": self.states, **super().held}
+
+    @property
+    def plant_data(self) -> dict:
+        """The vehicle as data, for comparison with an env's."""
+        return plant_data(self.plant)
+
+    def check_tuned_for(self, plant: Mapping | None, file: str | Path) -> None:
+        """Raise ValueError if a tuned file is for another vehicle, dt or sensors."""
+        if plant is not None:
+            check_same_plant(plant, self.plant, file)
 
     @property
     def untuned(self) -> dict:
