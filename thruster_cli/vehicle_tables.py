@@ -15,22 +15,13 @@ from studies.vehicle.findings import ENKF, FKF, Finding
 from studies.vehicle.paths import PATHS
 from studies.vehicle.printed import POSE, PrintedRow
 from studies.vehicle.scores import Scores, position_ratio
+from studies.vehicle.wording import digits, with_interval
 from thruster_cli.benchmark import fitted
 from thruster_cli.output import table
 
 WHY = "why they differ"
 POSES = "In each cell x, y, z [m] and psi [rad], one below the other."
 FIELDS = {"planar": "by yaw alone", "planar_both": "both by yaw", "full": "full"}
-
-
-def digits(value: float) -> str:
-    """Three digits; nothing for NaN."""
-    return "" if math.isnan(value) else f"{value:.3g}"
-
-
-def interval(one: Interval) -> str:
-    """A value with its interval; nothing for NaN."""
-    return "" if math.isnan(one.value) else f"{one.value:.3g} [{one.low:.3g}, {one.high:.3g}]"
 
 
 def particulars_table() -> Table:
@@ -68,7 +59,7 @@ def published_table(paper: str, result: PathResult, found: list[Finding]) -> Tab
     caption = (
         f"{POSES} By yaw alone: the papers' transformation, against the true path. Both by yaw: against the path "
         "that true velocities give by yaw alone. Full: with roll and pitch. s: seconds of a run, published above "
-        "ours, of one core."
+        "ours, of one core. Of a size: within a factor of 3."
     )
     title = f"{paper}, path {_name(result)}: published RMSE against ours"
     return fitted(table(title, columns, rows, caption=caption), rows, flexible=WHY)
@@ -100,11 +91,12 @@ def position_table(result: PathResult) -> Table:
                 cells += ["", ""]
                 continue
             own = Interval(*(math.sqrt(v) for v in _mean_square(one, field)))
-            cells += [interval(own), "" if one is base else interval(position_ratio(one, base, field))]
+            ratio = "" if one is base else with_interval(position_ratio(one, base, field))
+            cells += [text.replace(" [", "\n[") for text in (with_interval(own), ratio)]
         rows.append(cells)
     columns = ["filter", "by yaw alone [m]", "over EKF8", "full [m]", "over EKF8"]
     caption = "Root of the mean square distance over a run, 95 % intervals; ratios are paired by run."
-    return table(f"path {_name(result)}: position", columns, rows, caption=caption)
+    return fitted(table(f"path {_name(result)}: position", columns, rows, caption=caption), rows)
 
 
 def end_table(results: list[PathResult]) -> Table:
