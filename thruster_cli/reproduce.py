@@ -46,8 +46,8 @@ def command(
         int | None,
         typer.Option(
             help=f"Independent runs, at least 2; by default {RUNS} of 100 steps for a paper on the thruster, "
-            f"{VEHICLE_RUNS} of some 25000 for one on the vehicle, and {BENCHMARK_RUNS} for a standard problem; with "
-            "fewer the intervals are wide."
+            f"{VEHICLE_RUNS} of some 25000 for one on the vehicle, and {BENCHMARK_RUNS} for a standard problem; "
+            "with fewer the intervals are wide."
         ),
     ] = None,
     members: Annotated[

@@ -68,7 +68,10 @@ def paths_figure(path: str | Path, runs: Sequence[PathRun]) -> Path:
     columns = min(3, len(runs))
     rows = -(-len(runs) // columns)
     side = 4.2 if columns > 1 else 7.0
-    figure = new_figure((side * columns, 0.84 * side * rows + 0.4))
+    figure = new_figure((side * columns + 0.5, 0.84 * side * rows + 0.4))
+    figure.get_layout_engine().set(
+        rect=(0.0, 0.0, 1.0 - 0.5 / figure.get_figwidth(), 1.0)
+    )  # labels of depth stick out
     for place, one in enumerate(runs, start=1):
         axis = figure.add_subplot(rows, columns, place, projection="3d")
         for label, line in one.positions.items():

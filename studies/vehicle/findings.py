@@ -60,10 +60,10 @@ def why_different(printed: PrintedRow, scores: Scores, result: PathResult) -> st
             break
     if not said:
         likest = [f"{name} {words}" for name, words in _by_component(printed, scores).items()]
-        said = likest or ["of no size of ours"]
+        said = likest or ["unlike any of ours"]
     below = [name for name, value in printed.rmse.items() if value < result.bound.pose[POSE.index(name)] / FACTOR]
     if below:
-        said.append(f"{', '.join(below)} far below the bound of u, v, w, r: the reference follows no true path")
+        said.append(f"{', '.join(below)} less than measured u, v, w, r allow against a true path")
     return "; ".join(said)
 
 
@@ -80,5 +80,5 @@ def _by_component(printed: PrintedRow, scores: Scores) -> dict[str, str]:
                 found.setdefault(words, []).append(name)
                 break
         else:
-            found.setdefault("of no size of ours", []).append(name)
+            found.setdefault("unlike any of ours", []).append(name)
     return {", ".join(names): words for words, names in found.items()}
