@@ -57,7 +57,7 @@ def kalman(world: str = "vehicle") -> list[Estimator]:
 
 
 def ensembles(states: int, world: str = "vehicle", members: Sequence[int] = MEMBERS) -> list[Estimator]:
-    """The ensemble filter for each number of members, and that of equation (24) for the least, by Euler's method."""
+    """The ensemble filter for each number of members, and that of equation (24) for the least; Euler's method."""
     model = papers_model("motion", world, **EULER) if states == 8 else level_model(world)
     right = [
         Estimator(f"EnKF{states} N={count}", EnsembleKalmanFilter(model=model, ensemble_size=count))
@@ -70,8 +70,8 @@ def ensembles(states: int, world: str = "vehicle", members: Sequence[int] = MEMB
 def fuzzy(world: str = "vehicle") -> list[Estimator]:
     """The fuzzy filter of 64 rules in four readings.
 
-    All linearise Euler's method, I + A dt. The printed bounds without and with offsets; the same with rules that go on from an estimate of their own each,
-    blended for output only; a range about the manoeuvre.
+    All linearise Euler's method, I + A dt. The printed bounds without and with offsets; the same with rules that
+    go on from an estimate of their own each, blended for output only; a range about the manoeuvre.
     """
     model = level_model(world)
     bounds = {"low": np.array(FUZZY_LOW), "high": np.array(FUZZY_HIGH)}
