@@ -137,15 +137,15 @@ def test_own_attitude_is_what_its_own_rates_lead_to(as_python):
 def test_filters_on_the_same_runs(as_python):
     ekf8, _, level, own = kalman()
     tasks = [Task("dynamic", "vehicle", [measured(), ekf8, level, own])]
-    (result,) = run_tasks(tasks, runs=3, steps=80)
-    assert [len(one.nees) for one in result.scores.values()] == [3] * 4 and result.steps == 80
+    (result,) = run_tasks(tasks, runs=2, steps=80)
+    assert [len(one.nees) for one in result.scores.values()] == [2] * 4 and result.steps == 80
     for label in ("EKF8", "EKF6 level", "EKF6 own attitude"):
         one = result.scores[label]
         np.testing.assert_allclose(one.rmse("velocities")[[0, 1, 2, 5]], GOLDEN, rtol=0.25)
         np.testing.assert_allclose(one.rmse("planar"), result.scores["EKF8"].rmse("planar"), rtol=0.1)
         assert (one.rmse("full")[:3] < 1e-3).all() and not one.divergences.any()
     assert 4 < result.scores["EKF8"].nees.mean() < 14
-    again = run_tasks([Task("dynamic", "vehicle", [ekf8])], runs=3, steps=80)[0].scores["EKF8"]
+    again = run_tasks([Task("dynamic", "vehicle", [ekf8])], runs=2, steps=80)[0].scores["EKF8"]
     np.testing.assert_array_equal(again.velocities, result.scores["EKF8"].velocities)
 
 
@@ -210,13 +210,13 @@ def test_a_paper_is_reproduced_at_the_command_line(quick, monkeypatch, capsys, t
     shown = capsys.readouterr().out
     assert "…" not in shown and max(map(len, shown.splitlines())) <= 100
     words = " ".join(shown.split())
-    for said in ("0.4674", "EnKF8", "What the runs say", "useless here", "H P H' + R", "Picture:"):
+    for said in ("0.082", "EnKF8", "What the runs say", "useless here", "H P H' + R", "Picture:"):
         assert said in words, said
     found = json.loads(table.read_text())
     assert found["settings"] == {"runs": 2, "seed": 0, "steps": 2} and picture.stat().st_size > 10_000
     by_path = {(one["path"], one["world"]): one["filters"] for one in found["results"]}
     if paper == "ngatini2019":
-        assert [one["path"] for one in found["series"]] == ["IV"] and "0.0819" in words
+        assert [one["path"] for one in found["series"]] == ["IV"] and "0.4674" in words
         sizes = [by_path["IV", "vehicle"][f"EnKF8 N={count}"] for count in (50, 100, 200, 300)]
         assert [one["published"]["seconds"] for one in sizes] == [2.819, 5.692, 11.56, 18.15]
     else:
