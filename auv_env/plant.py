@@ -20,7 +20,7 @@ from plants.disturbances.sensors import SENSOR_EFFECTS
 from plants.quantities import Quantity
 
 DEFAULT_DT = 0.05  # [s]; one Runge-Kutta step follows the vehicle to 2e-5 of its range
-DEFAULT_MAX_THRUST = 4.0  # [N]; beyond 6 N full planes turn the vehicle over
+DEFAULT_MAX_THRUST = 4.0  # [N], for 1.19 m/s; with it 14 deg of stern plane, if held, pitch by 80 deg
 DEFAULT_MAX_PLANE = math.radians(15.0)  # [rad]
 DEFAULT_PROPELLER_TORQUE = -0.006  # K_prop over X_prop [m], assumed: K_Q/K_T D = 0.03/0.2 x 0.04 m
 CRUISE_SPEED = 1.0  # [m/s], as printed for Segorogeni

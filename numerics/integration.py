@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 
@@ -46,48 +46,44 @@ def euler(rates: Callable, count: int) -> Callable:
 def runge_kutta_jacobian(rates: Callable, rates_tangent: Callable, count: int) -> Callable:
     """Return `jacobian(x, u, c)`, the exact derivative by x of the step that `runge_kutta(rates, count)` makes.
 
-    It is the same step of the variational equation d(dx)/dt = (d rates/dx) dx, once for each unit vector dx. That
-    is a loop over directions, so there is one copy of the tangent a stage, whatever the count.
+    It is the same step of the variational equation d(dx)/dt = (d rates/dx) dx, once for each unit vector dx.
+    Stages and directions are loops, so there is one copy of the rates and one of the tangent, whatever the count.
 
     Args:
         rates: as `runge_kutta` takes it.
         rates_tangent: `rates_tangent(x, dx, u, c)`, its directional derivative at x along dx.
         count: number of components of x, which is a tuple.
     """
-    points = (
-        "k1 = rates(x, u, c)",
-        "x2 = add(x, 0.5 * h, k1)",
-        "k2 = rates(x2, u, c)",
-        "x3 = add(x, 0.5 * h, k2)",
-        "x4 = add(x, h, rates(x3, u, c))",
+    names = {"parts": (0.0, 0.5, 0.5, 1.0), "weights": (1 / 6, 1 / 3, 1 / 3, 1 / 6), "rates": inlined(rates)}
+    return _by_directions(
+        rates_tangent, count, "point = add(x, parts[stage + 1] * h, rates(point, u, c))", **names
     )
-    stages = (
-        "d1 = tangent(x, dx, u, c)",
-        "d2 = tangent(x2, add(dx, 0.5 * h, d1), u, c)",
-        "d3 = tangent(x3, add(dx, 0.5 * h, d2), u, c)",
-        "d4 = tangent(x4, add(dx, h, d3), u, c)",
-    )
-    mean = "(d1[{0}] + 2.0 * d2[{0}] + 2.0 * d3[{0}] + d4[{0}]) / 6.0"
-    names = {"rates": inlined(rates), "tangent": inlined(rates_tangent)}
-    return _by_directions(points, stages, mean, count, **names)
 
 
 @makes_functions
 def euler_jacobian(rates_tangent: Callable, count: int) -> Callable:
     """Return `jacobian(x, u, c)`, the derivative by x of `euler`'s step; see `runge_kutta_jacobian`."""
-    return _by_directions((), ("d = tangent(x, dx, u, c)",), "d[{0}]", count, tangent=inlined(rates_tangent))
+    return _by_directions(rates_tangent, count, "pass", parts=(0.0,), weights=(1.0,))
 
 
-def _by_directions(points: Iterable[str], stages: Iterable[str], slope: str, count: int, **names) -> Callable:
-    """A Jacobian by columns: lines that come first, those for each direction dx, the mean slope of row {0}."""
+def _by_directions(rates_tangent: Callable, count: int, next_point: str, **names) -> Callable:
+    """The derivative of a step whose stages each start from x by a part of the slopes of the one before."""
     lines = (
         "h = c.substep",
-        *points,
-        f"out = np.empty(({count}, {count}))",
+        f"slopes, out = np.zeros(({count}, {count})), np.zeros(({count}, {count}))",
+        "point = x",
+        f"for stage in range({len(names['parts'])}):",
+        "    part, weight = parts[stage] * h, weights[stage] * h",
+        f"    for j in range({count}):",
+        "        dx = " + tuple_of(f"(1.0 if j == {i} else 0.0) + part * slopes[{i}, j]" for i in range(count)),
+        "        d = tangent(point, dx, u, c)",
+        *(f"        slopes[{i}, j] = d[{i}]" for i in range(count)),
+        *(f"        out[{i}, j] += weight * d[{i}]" for i in range(count)),
+        f"    if stage < {len(names['parts']) - 1}:",
+        f"        {next_point}",
         f"for j in range({count}):",
-        "    dx = " + tuple_of(f"1.0 if j == {i} else 0.0" for i in range(count)),
-        *(f"    {stage}" for stage in stages),
-        *(f"    out[{i}, j] = dx[{i}] + h * ({slope.format(i)})" for i in range(count)),
+        "    out[j, j] += 1.0",
         "out" if is_array(count, count) else matrix_of(count, count, lambda i, j: f"out[{i}, {j}]"),
     )
-    return written_out("jacobian", "x, u, c", *lines, _loops=True, add=scaled_sum(count), np=np, **names)
+    names = {"tangent": inlined(rates_tangent), "add": scaled_sum(count), "np": np, **names}
+    return written_out("jacobian", "x, u, c", *lines, _loops=True, **names)
