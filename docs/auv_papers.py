@@ -2,8 +2,8 @@
 
     python -m docs.auv_papers [FOLDER]
 
-The results are those of `thruster reproduce ngatini2019` and `ngatini2017`; some minutes on two cores. Seconds of a
-run are those of the machine, all else repeats.
+The results are those of `thruster reproduce ngatini2019` and `ngatini2017`; some minutes on two cores. Seconds of
+a run are those of the machine, all else repeats.
 """
 
 from __future__ import annotations
