@@ -1,7 +1,7 @@
 """Published experiments and standard problems, with the published numbers beside ours.
 
-Papers on the bow thruster are in `authorYEAR.py` each. Standard problems are modules with a `BENCHMARK`, and a
-`problem` for `thruster tune --problem studies.NAME:problem`.
+Papers are in `authorYEAR.py` each; those on the underwater vehicle are done again in `vehicle`. Standard problems
+are modules with a `BENCHMARK`, and a `problem` for `thruster tune --problem studies.NAME:problem`.
 """
 
 from studies.kiki2020 import TABLE as KIKI_2020
@@ -13,5 +13,6 @@ BENCHMARKS = {
     "lorenz96": "studies.lorenz96",
     "range-bearing": "studies.range_bearing",
 }  # modules by name
+VEHICLE_STUDIES = ("ngatini2017", "ngatini2019")  # see `studies.vehicle`
 
-__all__ = ["BENCHMARKS", "KIKI_2020", "NURHADI_2022", "STUDIES"]
+__all__ = ["BENCHMARKS", "KIKI_2020", "NURHADI_2022", "STUDIES", "VEHICLE_STUDIES"]

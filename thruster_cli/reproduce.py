@@ -11,11 +11,13 @@ from rich.text import Text
 
 from numerics.checks import at_least, one_of
 from numerics.files import check_target
-from studies import BENCHMARKS, STUDIES
+from studies import BENCHMARKS, STUDIES, VEHICLE_STUDIES
 from studies.benchmark import RUNS as BENCHMARK_RUNS
 from studies.comparison import LARGEST_ENSEMBLE, MEMBERS, MOST_RUNS, RUNS, compare_all
 from studies.findings import findings, general_statements, study_statements
 from studies.series import all_series, series_figure
+from studies.vehicle.experiment import MOST_RUNS as MOST_VEHICLE_RUNS
+from studies.vehicle.printed import RUNS as VEHICLE_RUNS
 from thruster_cli.benchmark import fitted, list_of, reproduce_benchmark
 from thruster_cli.output import (
     JsonOption,
@@ -25,6 +27,7 @@ from thruster_cli.output import (
     progress_console,
     table,
 )
+from thruster_cli.vehicle import reproduce_vehicle
 
 ALL = "all"
 LINES = "In each cell first omega_m [rad/s], below it U_a [m/s]."
@@ -35,14 +38,16 @@ def command(
         str,
         typer.Argument(
             help=f"A paper on the bow thruster: {', '.join(STUDIES)}, or {ALL} of them; "
-            f"or a standard problem: {', '.join(BENCHMARKS)}."
+            f"or on the underwater vehicle: {', '.join(VEHICLE_STUDIES)}; or a standard problem: "
+            f"{', '.join(BENCHMARKS)}."
         ),
     ],
     runs: Annotated[
         int | None,
         typer.Option(
-            help=f"Independent runs, at least 2; {RUNS} of 100 steps for a paper by default, and {BENCHMARK_RUNS} "
-            "for a standard problem; with fewer the intervals are wide."
+            help=f"Independent runs, at least 2; by default {RUNS} of 100 steps for a paper on the thruster, "
+            f"{VEHICLE_RUNS} of some 25000 for one on the vehicle, and {BENCHMARK_RUNS} for a standard problem; "
+            "with fewer the intervals are wide."
         ),
     ] = None,
     members: Annotated[
@@ -52,8 +57,13 @@ def command(
         Path | None,
         typer.Option(
             metavar="FILE.png",
-            help="Also draw one run over time for each system and q, as the papers do; into --json, too.",
+            help="Also draw one run over time for each system and q, as the papers do, or the vehicle's paths; "
+            "into --json, too.",
         ),
+    ] = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(help="First steps of 1 ms of each of the vehicle's paths, for a quick look; all by default."),
     ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
@@ -71,25 +81,41 @@ def command(
     distances in standard deviations of a single run, and a word on why it
     differs.
 
+    The papers on the underwater vehicle compare ensemble and fuzzy Kalman
+    filters at 1 kHz by the RMSE of its path. Beside them stand other filters
+    and the bare measurements, on the same runs, by the papers' transformation
+    and by the right one.
+
     A standard problem shows our filters beside what is published of it, or
     beside another package on the same data.
 
     Example: thruster reproduce nurhadi2022 --series series.png --json table.json
 
+    Example: thruster reproduce ngatini2019 --series paths.png
+
     Example: thruster reproduce lorenz63
     """
-    if one_of("study", study, (*STUDIES, ALL, *BENCHMARKS)) in BENCHMARKS:
-        if members is not None or series is not None:
-            raise ValueError(f"--members and --series must come with a paper on the thruster, but got {study!r}")
+    one_of("study", study, (*STUDIES, ALL, *VEHICLE_STUDIES, *BENCHMARKS))
+    if members is not None and study not in (*STUDIES, ALL):
+        raise ValueError(f"--members must come with a paper on the thruster, but got {study!r}")
+    if steps is not None and study not in VEHICLE_STUDIES:
+        raise ValueError(f"--steps must come with a paper on the vehicle, but got {study!r}")
+    if study in BENCHMARKS:
+        if series is not None:
+            raise ValueError(f"--series must come with a paper, but got {study!r}")
         emit(*reproduce_benchmark(study, BENCHMARK_RUNS if runs is None else runs, seed), json)
         return
-    names = tuple(STUDIES) if study == ALL else (study,)
-    runs = at_least("runs", RUNS if runs is None else runs, 2, MOST_RUNS)
-    members = at_least("members", MEMBERS if members is None else members, 2, LARGEST_ENSEMBLE)
     if series is not None:
         if series.suffix != ".png":
             raise ValueError(f"--series must end in .png, but got {str(series)!r}")
         check_target(series)
+    if study in VEHICLE_STUDIES:
+        runs = at_least("runs", VEHICLE_RUNS if runs is None else runs, 2, MOST_VEHICLE_RUNS)
+        emit(*reproduce_vehicle(study, runs, seed, steps, series), json)
+        return
+    names = tuple(STUDIES) if study == ALL else (study,)
+    runs = at_least("runs", RUNS if runs is None else runs, 2, MOST_RUNS)
+    members = at_least("members", MEMBERS if members is None else members, 2, LARGEST_ENSEMBLE)
     shown, data = reproduce(names, runs, members, seed)
     if series is not None:
         drawn = all_series(members=members, seed=seed)

@@ -9,6 +9,7 @@ import numpy as np
 
 from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, FuzzyKalmanFilter, UnscentedKalmanFilter
 from filters.filter import Filter
+from plants.state_space import StateSpaceModel
 from studies.vehicle.mean_propagation import MeanPropagatingEnKF
 from studies.vehicle.models import papers_model
 from studies.vehicle.own_attitude import OwnAttitudeKalmanFilter
@@ -18,6 +19,7 @@ MEMBERS = (50, 100, 200, 300)
 NARROW_LOW = (0.5, -0.1, -0.1, -0.1, -0.3, -0.3)  # [m/s], [rad/s]: about what the paths come to once under way
 NARROW_HIGH = (1.1, 0.1, 0.1, 0.1, 0.3, 0.3)
 MEASUREMENTS = "measurements, no filter"
+EULER = {"integration": "euler"}  # what the papers print; the truth and our other filters have Runge and Kutta's
 
 
 class Estimator(NamedTuple):
@@ -30,6 +32,11 @@ class Estimator(NamedTuple):
     def has_attitude(self) -> bool:
         """Whether roll and pitch are among what is estimated."""
         return self.filter is not None and self.filter.model.n > 6
+
+
+def level_model(world: str = "vehicle") -> StateSpaceModel:
+    """The papers' model: six velocities, roll and pitch zero, Euler's method."""
+    return papers_model("velocities", world, attitude="level", **EULER)
 
 
 def measured() -> Estimator:
@@ -50,8 +57,8 @@ def kalman(world: str = "vehicle") -> list[Estimator]:
 
 
 def ensembles(states: int, world: str = "vehicle", members: Sequence[int] = MEMBERS) -> list[Estimator]:
-    """The ensemble filter for each number of members, and that of equation (24) for the least."""
-    model = papers_model("motion", world) if states == 8 else papers_model("velocities", world, attitude="level")
+    """The ensemble filter for each number of members, and that of equation (24) for the least; Euler's method."""
+    model = papers_model("motion", world, **EULER) if states == 8 else level_model(world)
     right = [
         Estimator(f"EnKF{states} N={count}", EnsembleKalmanFilter(model=model, ensemble_size=count))
         for count in members
@@ -63,10 +70,10 @@ def ensembles(states: int, world: str = "vehicle", members: Sequence[int] = MEMB
 def fuzzy(world: str = "vehicle") -> list[Estimator]:
     """The fuzzy filter of 64 rules in four readings.
 
-    The printed bounds without and with offsets; the same with rules that go on from an estimate of their own each,
-    blended for output only; a range about the manoeuvre.
+    All linearise Euler's method, I + A dt. The printed bounds without and with offsets; the same with rules that
+    go on from an estimate of their own each, blended for output only; a range about the manoeuvre.
     """
-    model = papers_model("velocities", world, attitude="level")
+    model = level_model(world)
     bounds = {"low": np.array(FUZZY_LOW), "high": np.array(FUZZY_HIGH)}
     narrow = {"low": np.array(NARROW_LOW), "high": np.array(NARROW_HIGH)}
     return [

@@ -68,15 +68,17 @@ def paths_figure(path: str | Path, runs: Sequence[PathRun]) -> Path:
     columns = min(3, len(runs))
     rows = -(-len(runs) // columns)
     side = 4.2 if columns > 1 else 7.0
-    figure = new_figure((side * columns, 0.92 * side * rows + 0.5))
+    figure = new_figure((side * columns + 0.5, 0.84 * side * rows + 0.4))
+    figure.get_layout_engine().set(
+        rect=(0.0, 0.0, 1.0 - 0.5 / figure.get_figwidth(), 1.0)
+    )  # labels of depth stick out
     for place, one in enumerate(runs, start=1):
         axis = figure.add_subplot(rows, columns, place, projection="3d")
         for label, line in one.positions.items():
             axis.plot(*line.T, label=label, **LOOKS[label])
         _arrange(axis, np.concatenate(list(one.positions.values())))
-        axis.set_title(
-            f"{one.path}: {PATHS[one.path].meaning}" if one.path in ("I", "II", "III", "IV") else one.path
-        )
+        meaning = PATHS[one.path].meaning
+        axis.set_title(one.path if one.path == meaning else f"{one.path}: {meaning}", fontsize=11, y=0.94)
     handles, labels = axis.get_legend_handles_labels()
     if rows * columns > len(runs):
         corner = figure.add_subplot(rows, columns, rows * columns)
@@ -100,4 +102,6 @@ def _arrange(axis, points: np.ndarray) -> None:
         each.set_pane_color((0.97, 0.97, 0.97))
         each._axinfo["grid"].update(color="#dddddd", linewidth=0.6)
     axis.tick_params(labelsize=8, pad=0)
+    axis.set_box_aspect((4, 4, 3), zoom=0.95)  # or the label of depth is cut off
+    axis.patch.set_visible(False)  # or it lies over that of the panel to the left
     axis.view_init(elev=24, azim=-58)

@@ -13,9 +13,9 @@ from studies.vehicle.scores import Scores
 
 FACTOR = 3.0  # up to which two errors count as of one size: path and duration are not printed
 FIELDS = {
-    "full": "as dead reckoning by the full transformation",
-    "planar_both": "as with path and estimate both by yaw alone",
-    "planar": "as by yaw alone, which no filter can mend",
+    "full": "of the size of ours by the full transformation",
+    "planar_both": "of the size of ours with path and estimate both by yaw alone",
+    "planar": "of the size of ours by yaw alone, which no filter can mend",
 }
 ENKF, FKF = "EnKF8 N=50", "fuzzy 0..1"  # those that stand beside the printed filters
 
@@ -60,10 +60,10 @@ def why_different(printed: PrintedRow, scores: Scores, result: PathResult) -> st
             break
     if not said:
         likest = [f"{name} {words}" for name, words in _by_component(printed, scores).items()]
-        said = likest or ["no error of ours is of this size: path, inputs and duration are not printed"]
+        said = likest or ["unlike any of ours"]
     below = [name for name, value in printed.rmse.items() if value < result.bound.pose[POSE.index(name)] / FACTOR]
     if below:
-        said.append(f"{', '.join(below)} far below the bound of u, v, w, r: the reference follows no true path")
+        said.append(f"{', '.join(below)} less than measured u, v, w, r allow against a true path")
     return "; ".join(said)
 
 
@@ -80,5 +80,5 @@ def _by_component(printed: PrintedRow, scores: Scores) -> dict[str, str]:
                 found.setdefault(words, []).append(name)
                 break
         else:
-            found.setdefault("of no size that we find", []).append(name)
+            found.setdefault("unlike any of ours", []).append(name)
     return {", ".join(names): words for words, names in found.items()}

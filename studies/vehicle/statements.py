@@ -11,12 +11,12 @@ from auv_env.presets import SEGOROGENI
 from auv_env.published import PRINTED_INVERSE
 from filters import FuzzyKalmanFilter
 from studies import ngatini2017, ngatini2019
-from studies.vehicle.estimators import MEASUREMENTS
-from studies.vehicle.experiment import PathResult
+from studies.vehicle.estimators import MEASUREMENTS, level_model
+from studies.vehicle.experiment import MEASURED_PLACES, PathResult
 from studies.vehicle.findings import ENKF, FKF
-from studies.vehicle.models import papers_model
 from studies.vehicle.printed import DT, FUZZY_HIGH, FUZZY_LOW, NOISE, POSE
 from studies.vehicle.scores import position_ratio
+from studies.vehicle.wording import digits, with_interval
 
 GOLDEN = math.sqrt(
     (math.sqrt(5.0) - 1.0) / 2.0 * NOISE
@@ -30,10 +30,10 @@ NO_POSTERIOR_BOUND = (
 
 
 def unstable_corners(low=FUZZY_LOW, high=FUZZY_HIGH, world: str = "vehicle") -> tuple[int, float]:
-    """How many of the 64 tangents of a fuzzy filter are unstable, and the fastest growth [1/s]."""
-    model = papers_model("velocities", world, attitude="level")
-    rules = FuzzyKalmanFilter(model=model, low=np.array(low), high=np.array(high)).rules
-    growth = np.array([np.log(np.abs(np.linalg.eigvals(rule.matrices()[0])).max()) / DT for rule in rules])
+    """How many of the 64 matrices A in I + A dt of a fuzzy filter are unstable, and the fastest growth [1/s]."""
+    rules = FuzzyKalmanFilter(model=level_model(world), low=np.array(low), high=np.array(high)).rules
+    rates = [(rule.matrices()[0] - np.eye(6)) / DT for rule in rules]
+    growth = np.array([np.linalg.eigvals(rate).real.max() for rate in rates])
     return int((growth > 1e-6).sum()), float(growth.max())
 
 
@@ -62,7 +62,7 @@ def _of_transformation(iv: PathResult) -> list[str]:
         "not the filter. So are ours by the papers' transformation, which turns by yaw alone: all filters, and "
         f"the bare measurements, agree to {ours:.1f} %. The vehicle dives by pitching, which that "
         f"transformation does not know: on true velocities without any noise its RMSE is {_pose(gap)}.",
-        f"By the full transformation the EKF of the same velocities has {_pose(full)}. Path or transformation "
+        f"By the full transformation the EKF of the same velocities has {_pose(full)}. Path and transformation "
         "decide; no filter does.",
     ]
 
@@ -70,19 +70,20 @@ def _of_transformation(iv: PathResult) -> list[str]:
 def _of_members(iv: PathResult) -> list[str]:
     scores, printed = iv.scores, ngatini2019.TABLE_III
     ours = [scores[f"EnKF8 N={count}"] for count in printed]
-    surge = 1e3 * np.array([scores[label].rmse("velocities")[0] for label in ("EKF8", "UKF8", "EKF6 level")])
-    nees = ", ".join(f"{one.nees_interval.value:.3g}" for one in ours)
+    kalman = ("EKF8", "UKF8", "EKF6 level", "EKF6 own attitude")
+    measured = 1e3 * np.array([scores[label].rmse("velocities")[list(MEASURED_PLACES)] for label in kalman])
+    nees = ", ".join(f"{digits(one.nees_interval.value)}" for one in ours)
     (mean_only,) = [one for label, one in scores.items() if "eq. (24)" in label]
     seconds = ", ".join(f"{one.seconds.mean():.2f}" for one in ours)
     theirs = ", ".join(f"{row.seconds:g}" for row in printed.values())
     return [
-        f"A measured velocity with Q = R is estimated to sqrt(0.618 R) = {1e3 * GOLDEN:.3f} mm/s, whatever the "
-        f"filter: u has {surge.min():.3f} to {surge.max():.3f} mm/s with EKF and UKF of eight states and with "
-        "the EKF of six. Measured velocities tell nothing of a filter. What is not measured does: p, q, roll, "
-        "pitch.",
+        f"A measured velocity with Q = R is estimated to sqrt(0.618 R) = {1e3 * GOLDEN:.3f} mm/s (or mrad/s), "
+        f"whatever the filter: extended and unscented ones of eight and of six states have {measured.min():.3f} "
+        f"to {measured.max():.3f} for u, v, w and r. Measured velocities tell nothing of a filter. What is not "
+        "measured does: p, q, roll, pitch.",
         f"Seconds for N = {', '.join(map(str, printed))}: {seconds} on one core for {iv.steps} steps, printed "
         f"{theirs} for an unknown number. The NEES of the EnKF is {nees} for 8 states, that of the EKF "
-        f"{scores['EKF8'].nees_interval.value:.2f}: at 1 kHz each update takes a little of the spread of roll "
+        f"{digits(scores['EKF8'].nees_interval.value)}: at 1 kHz each update takes a little of the spread of roll "
         "and pitch by chance correlations, and nothing gives it back.",
         "Equation (24) forgets the members, so its gain is 1/2 for what is measured: sqrt(2/3 R) = "
         f"{1e3 * MEAN_ONLY:.3f} mm/s in theory, {1e3 * mean_only.rmse('velocities')[0]:.3f} mm/s found with the "
@@ -97,9 +98,9 @@ def _of_attitude(iv: PathResult) -> list[str]:
     return [
         "The papers' six states are not closed: weight and buoyancy depend on roll and pitch. With zero roll "
         f"and pitch the EKF of six states has RMSE of p and q of {rates[2][0]:.0f} and {rates[2][1]:.0f} mrad/s "
-        f"and a NEES of {level.nees_interval.value:.0f}; with its own dead-reckoned attitude {rates[1][0]:.1f} "
-        f"and {rates[1][1]:.1f} and {own.nees_interval.value:.2f}; the EKF of eight states {rates[0][0]:.1f} "
-        f"and {rates[0][1]:.1f}.",
+        f"and a NEES of {digits(level.nees_interval.value)}; with its own dead-reckoned attitude "
+        f"{rates[1][0]:.1f} and {rates[1][1]:.1f} and {digits(own.nees_interval.value)}; the EKF of eight "
+        f"states {rates[0][0]:.1f} and {rates[0][1]:.1f}.",
         NO_POSTERIOR_BOUND,
     ]
 
@@ -118,7 +119,7 @@ def _of_paths(by_path: dict[str, PathResult]) -> list[str]:
     worse, printed_worse = [], []
     for name, result in by_path.items():
         ratio = position_ratio(result.scores[FKF], result.scores[ENKF], "full")
-        worse.append(f"{name} {ratio.value:.0f} [{ratio.low:.0f}, {ratio.high:.0f}]")
+        worse.append(f"{name} {with_interval(ratio)}")
         enkf, fkf = (row.rmse for row in ngatini2017.PATHS[name][:2])
         printed_worse.append(f"{name} {math.hypot(*_metres(fkf)) / math.hypot(*_metres(enkf)):.2g}")
     seconds = [
@@ -166,18 +167,16 @@ def _of_other_world(other: PathResult) -> list[str]:
     for label, what in words.items():
         p, q = scores[label].rmse("velocities")[3:5] / base.rmse("velocities")[3:5]
         ratio = position_ratio(scores[label], base, "full")
-        said.append(
-            f"{what}: p {p:.2g}, q {q:.2g}, position {ratio.value:.2g} [{ratio.low:.2g}, {ratio.high:.2g}]"
-        )
+        said.append(f"{what}: p {p:.2g}, q {q:.2g}, position {with_interval(ratio)}")
     ensembles = ", ".join(
-        f"{one.nees_interval.value:.3g}"
+        f"{digits(one.nees_interval.value)}"
         for label, one in scores.items()
         if label.startswith("EnKF6") and "(24)" not in label
     )
     return [
         "On equal terms, in a world without restoring moments where six states are exact, the fuzzy filter's "
         f"RMSE over that of the EKF of six states: {'; '.join(said)}. The NEES of that EKF is "
-        f"{base.nees_interval.value:.2f}, of the EnKF {ensembles} for N = 50, 100, 200, 300. Positions are "
+        f"{digits(base.nees_interval.value)}, of the EnKF {ensembles} for N = 50, 100, 200, 300. Positions are "
         "worse for all: without them roll and pitch drift unseen.",
     ]
 

@@ -34,7 +34,7 @@ ALLOWED = {
     "filters": {"numerics", "plants"},
     "tuning": {"numerics", "plants", "filters"},
     "training": {"numerics", "plants", "thruster_env", "filters", "tuning"},
-    "studies": {"numerics", "plants", "thruster_env", "filters", "tuning"},
+    "studies": {"numerics", "plants", "thruster_env", "auv_env", "filters", "tuning"},
     "thruster_cli": set(ROOMS),
 }
 TUNING_OF_PLANTS = {

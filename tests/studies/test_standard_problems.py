@@ -124,7 +124,7 @@ class TestReproduce:
     @pytest.mark.parametrize(
         ("arguments", "rule"),
         [
-            (("lorenz63", "--members", 5), "--members and --series must come with a paper on the thruster"),
+            (("lorenz63", "--members", 5), "--members must come with a paper on the thruster"),
             (("lorenz63", "--runs", 1), "runs must be a whole number of at least 2"),
             (("lorenz84",), "study must be one of"),
         ],
