@@ -1,5 +1,4 @@
 import math
-from itertools import product
 
 import numpy as np
 import pytest
@@ -14,10 +13,8 @@ from numerics.tuples import vector_reader, vector_writer
 from tests.auv_env import textbook
 from tests.auv_env.textbook import random_states
 
-SIZES = {"velocity": (6, 6), "motion": (8, 4), "navigation": (12, 4), "current": (12, 7)}
-WITH_JACOBIAN = {name: size for name, size in SIZES.items() if name != "current"}
+SIZES = {"velocity": 6, "motion": 8, "navigation": 12}
 every_preset = pytest.mark.parametrize("k", PRESETS.values(), ids=PRESETS)
-every_size = pytest.mark.parametrize("name", SIZES)
 
 
 def inputs_of(name, x, u):
@@ -78,37 +75,38 @@ def test_port_and_starboard_are_alike_to_the_last_digit(k):
         np.testing.assert_array_equal(dynamics.navigation_substep(*mirrored, c), here * MIRROR)
 
 
-def on_floats(name, x, u, c):
-    return [of(name, "substep")(tuple(a), tuple(b), c) for a, b in zip(x.tolist(), u.tolist(), strict=True)]
+def on_floats(x, u, c):
+    pairs = zip(x.tolist(), u.tolist(), strict=True)
+    return [dynamics.current_rates(tuple(a), tuple(b), c) for a, b in pairs]
 
 
-def on_tensors(name, x, u, c):
+def on_tensors(x, u, c):
     torch = pytest.importorskip("torch")
     x, u = (tuple(torch.tensor(a, dtype=torch.float64).T) for a in (x, u))
-    return torch.stack(of(name, "substep")(x, u, c), dim=1).numpy()
+    return torch.stack(dynamics.current_rates(x, u, c), dim=1).numpy()
 
 
-def in_machine_code(name, x, u, c):
-    n, p = SIZES[name]
-    step, fingerprint = of(name, "substep"), function_fingerprint(of(name, "substep"), within=__name__)
-    state, given, store = vector_reader(n), vector_reader(p), vector_writer(n)
+def in_machine_code(x, u, c):
+    fingerprint = function_fingerprint(dynamics.current_rates, within=__name__)
+    state, given, store = vector_reader(12), vector_reader(7), vector_writer(12)
 
     def evaluate(x, u, c, out):
         fingerprint  # noqa: B018 - part of the cache's key
         for j in range(x.shape[0]):
-            store(out[j], step(state(x[j]), given(u[j]), c))
+            store(out[j], dynamics.current_rates(state(x[j]), given(u[j]), c))
 
     out = np.empty(x.shape)
     compiled(evaluate)(x, u, c, out)
     return out
 
 
-@pytest.mark.parametrize("name, way", [*product(SIZES, [on_floats, on_tensors]), ("current", in_machine_code)])
-def test_one_source_gives_the_same_numbers_every_way(name, way):
+@pytest.mark.parametrize("way", [on_floats, on_tensors, in_machine_code])
+def test_one_source_gives_the_same_numbers_every_way(way):
+    """The rates in a current, which are made of all that there is."""
     c, (x, u) = derive_constants(SEGOROGENI, 0.05), random_states(30)
-    x, u = np.ascontiguousarray(x[:, : SIZES[name][0]]), inputs_of(name, x, u)
-    expected = np.transpose(of(name, "substep")(tuple(x.T), tuple(u.T), c))
-    result = np.asarray(way(name, x, u, c))
+    u = inputs_of("current", x, u)
+    expected = np.transpose(dynamics.current_rates(tuple(x.T), tuple(u.T), c))
+    result = np.asarray(way(x, u, c))
     assert result.dtype == np.float64
     np.testing.assert_allclose(result, expected, rtol=1e-12, atol=1e-12)
 
@@ -121,9 +119,9 @@ def differences(step, x, u, c, h=1e-5):
 
 
 @pytest.mark.parametrize("method", ["", "euler_"])
-@pytest.mark.parametrize("name", WITH_JACOBIAN)
+@pytest.mark.parametrize("name", SIZES)
 def test_jacobians_are_the_slopes_of_a_step(name, method):
-    count = SIZES[name][0]
+    count = SIZES[name]
     step, jacobian = of(name, "euler" if method else "substep"), of(name, f"{method}jacobian")
     for k in PRESETS.values():
         c, (x, u) = derive_constants(k._replace(xG=0.01, B=0.99 * k.B), 0.05), random_states(5, seed=3)
@@ -131,22 +129,6 @@ def test_jacobians_are_the_slopes_of_a_step(name, method):
             a, b = tuple(a[:count].tolist()), tuple(b.tolist())
             expected = differences(step, a, b, c)
             np.testing.assert_allclose(jacobian(a, b, c), expected, atol=1e-7 * np.abs(expected).max())
-
-
-def test_jacobians_compile_to_the_same_numbers():
-    c, (x, u) = derive_constants(SEGOROGENI, 0.05), random_states(1)
-    jacobian, fingerprint = (
-        dynamics.motion_jacobian,
-        function_fingerprint(dynamics.motion_jacobian, within=__name__),
-    )
-    state, given = vector_reader(8), vector_reader(4)
-
-    def evaluate(x, u, c):
-        fingerprint  # noqa: B018 - part of the cache's key
-        return jacobian(state(x), given(u), c)
-
-    expected = jacobian(tuple(x[0, :8].tolist()), tuple(u[0].tolist()), c)
-    np.testing.assert_allclose(compiled(evaluate)(x[0], u[0], c), expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("dt, limit", [(0.001, 1e-12), (0.02, 1e-6), (0.05, 3e-5), (0.1, 1e-3)])
