@@ -1,4 +1,4 @@
-"""Make the picture of docs/auv_environments.md and its computed table.
+"""Make the picture of docs/auv.md and its computed table.
 
     python -m docs.auv_figures [FOLDER]
 
@@ -78,7 +78,7 @@ EPISODES = 50
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
-    make_page("auv_environments", "docs.auv_figures", FIGURES, TABLES, __doc__.splitlines()[0], arguments)
+    make_page("auv", "docs.auv_figures", FIGURES, TABLES, __doc__.splitlines()[0], arguments)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The page on the environments: its examples run, and what it lists is all there is."""
+"""The environments in docs/auv.md: examples run, and what is listed is all there is."""
 
 import re
 from pathlib import Path
@@ -11,14 +11,14 @@ from auv_env.channels import SUITES
 from auv_env.effects.current import CURRENT_SIGNALS
 from docs import auv_figures
 
-PAGE = (Path(__file__).parents[2] / "docs" / "auv_environments.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "auv.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
 
 
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("code", EXAMPLES, ids=range(len(EXAMPLES)))
 def test_an_example_runs(code, capsys):
-    exec(compile(code, "docs/auv_environments.md", "exec"), {})
+    exec(compile(code, "docs/auv.md", "exec"), {})
 
 
 def test_ids_suites_and_signals_are_named():
