@@ -23,7 +23,7 @@ def test_the_default_plant_is_the_documented_one():
     np.testing.assert_array_equal(plant.initial_mean, np.eye(12)[0])
     assert [quantity.symbol for quantity in plant.inputs] == ["X_prop", "delta_s", "delta_r"]
     assert len(make_plant(propeller_torque=None).inputs) == 4
-    assert plant.dropping_channels == ()
+    assert plant.dropping_channels == (0, 1, 2, 9)  # those slower than the step
     assert make_plant(sensors={"u": [], "z": [{"name": "dropout", "probability": 0.1}]}).dropping_channels == (1,)
 
 
