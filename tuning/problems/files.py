@@ -6,6 +6,7 @@ import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
+from typing import TypeVar
 
 from numerics.checks import one_of, shown
 from tuning.problems.rooms import ROOMS, room_of
@@ -14,6 +15,7 @@ from tuning.problems.scenario import BaseScenario
 FILE_SEQUENCES = 200  # input sequences for the scale of a file that gives none
 PLANT = "plant"  # the key that says whose scenario it is
 BASE = "base"
+S = TypeVar("S", bound=BaseScenario)
 
 
 def read_scenario(path: str | Path) -> BaseScenario:
@@ -56,6 +58,29 @@ def read_scenario(path: str | Path) -> BaseScenario:
         return scenario.replace(scale=tuple(room.computed_scale(scenario, FILE_SEQUENCES)))
 
     return _made(make, content, path)
+
+
+def find_in(known: Mapping[str, S], kind: type[S], whose: str, name: str) -> S:
+    """A scenario of one plant, by its name or from a file.
+
+    Args:
+        known: the plant's scenarios by name.
+        kind: the plant's class of them.
+        whose: they are, for messages.
+        name: that of one of them, or of a file that ends in .toml.
+
+    Raises:
+        ValueError: for an unknown name, a file that `read_scenario` refuses, or one of another plant.
+    """
+    if isinstance(name, str) and name.endswith(".toml"):
+        found = read_scenario(name)
+        if not isinstance(found, kind):
+            raise ValueError(f"scenario must be {whose}, but {name} is of plant {found.plant_kind!r}")
+        return found
+    if not isinstance(name, str) or name not in known:
+        names = ", ".join(known)
+        raise ValueError(f"scenario must be one of {names}, or a file that ends in .toml, but got {shown(name)}")
+    return known[name]
 
 
 def scenario_of(content, name: str, file: str | Path) -> BaseScenario:

@@ -24,14 +24,3 @@ def plain(value):
     if isinstance(value, Mapping):
         return {key: plain(part) for key, part in value.items()}
     return [plain(part) for part in value] if isinstance(value, list | tuple) else value
-
-
-def as_data(value):
-    """As `plain`, with effects and parameters as mappings."""
-    if hasattr(value, "_asdict"):
-        return value._asdict()
-    if hasattr(value, "as_mapping"):
-        return value.as_mapping()
-    if isinstance(value, Mapping):
-        return {key: as_data(part) for key, part in value.items()}
-    return [as_data(part) for part in value] if isinstance(value, list | tuple) else value

@@ -10,9 +10,10 @@ from functools import lru_cache
 from typing import ClassVar, Self
 
 from numerics.checks import at_least, shown, vector
+from plants.env import as_json
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.excitation import EXCITATIONS, Excitation, Steps
-from tuning.problems.plain import as_data, frozen, plain
+from tuning.problems.plain import frozen, plain
 from tuning.problems.problem import Problem
 
 MOST_STEPS = 1_000_000
@@ -125,7 +126,7 @@ class BaseScenario(Problem):
     def as_mapping(self) -> dict:
         """All that it says but for its name, as JSON can hold it; `tuning.problems.files.scenario_of` reads it."""
         content = {
-            entry.name: as_data(getattr(self, entry.name)) for entry in fields(self) if entry.name != "name"
+            entry.name: as_json(getattr(self, entry.name)) for entry in fields(self) if entry.name != "name"
         }
         return {"plant": self.plant_kind, **content, "excitation": self.excitation.as_mapping()}
 
