@@ -6,6 +6,7 @@ import numpy as np
 
 from auv_env.model import auv_model
 from filters.consistency.nees import normalized_squares
+from numerics.angles import difference
 from numerics.streams import episode_keys
 from plants.simulate import simulate
 
@@ -36,9 +37,11 @@ def sailing(model, runs, steps, seed=0):
     return keys, inputs, simulate(model, keys, inputs)
 
 
-def scores(truth, estimates):
-    """RMSE of each state (n,), and the mean NEES of each run (B,), over settled steps."""
-    errors, covs = (estimates.means - truth.states)[:, SETTLED:], estimates.covs[:, SETTLED:]
+def scores(model, truth, estimates):
+    """RMSE of each state (n,), and the mean NEES of each run (B,), over settled steps; errors of yaw wrapped."""
+    angles = [state.angle for state in model.states]
+    errors = difference(estimates.means, truth.states, angles)[:, SETTLED:]
+    covs = estimates.covs[:, SETTLED:]
     return np.sqrt(np.mean(errors**2, axis=(0, 1))), normalized_squares(errors, covs).mean(axis=1)
 
 

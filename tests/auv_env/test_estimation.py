@@ -30,7 +30,7 @@ def test_the_extended_filter_of_eight_states_is_consistent_and_meets_the_referen
     with interpreted():
         again = run(extended, keys[:1], inputs[:1, :10], truth.measurements[:1, :11])
     np.testing.assert_allclose(estimates.means[:1, :11], again.means, rtol=1e-9, atol=1e-12)
-    rmse, nees = scores(truth, estimates)
+    rmse, nees = scores(model, truth, estimates)
     assert nees.mean() == pytest.approx(8.0, abs=0.7)
     assert 0.1 < nees.std(ddof=1) < 0.9
     ratio = rmse / riccati_reference(model, inputs[:3, :400])
