@@ -45,9 +45,9 @@ PAPER = Paper(
         "Equation (24) moves the mean, and no member: every forecast member is f(mean) plus noise, whose "
         "covariance is Q whatever the measurements said. The slides of ngatini2017 move the members.",
         "The text has an accuracy above 55 %, without a definition: it cannot be done again.",
-        "The seconds are linear in the number of members, 0.056 to 0.061 s each, so members were looped over. At "
-        "0.001 s a step a path of 18 m takes some 20 000 steps, which would leave 3 us of Octave for a member's "
-        "step, where a line of it takes about that long: the run was probably shorter than the path.",
+        "The seconds are linear in the number of members, 0.056 to 0.061 s each, so members were looped over. "
+        "At 0.001 s a step a path of 18 m takes some 20 000 steps, which would leave 3 us of Octave for the "
+        "dozen statements of a member's step: the run was probably shorter than the path.",
         "The printed A^-1 is no vehicle's: its inverse has eigenvalues of both signs.",
         "Table and text have 11.56 and 11.57 s for 200 members.",
         "Abstract and conclusion give the error of an angle in metres, and initial angles come in rad/s.",

@@ -1,7 +1,7 @@
 """Position and yaw that follow from velocities over time, by the full transformation or by yaw alone.
 
-All integrals are trapezoids: of steps of 1 ms and of 50 ms alike they follow the vehicle as closely as is needed.
-Yaw counts turns. Source of the transformation by yaw alone: Ngatini, Nurhadi (2019), equations 1 to 4.
+All integrals are trapezoids. Yaw counts turns, and its errors do: an estimate that has turned once too often has
+gone a way of its own. Source of the transformation by yaw alone: Ngatini, Nurhadi (2019), equations 1 to 4.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from studies.vehicle.estimators import MEASUREMENTS, level_model
 from studies.vehicle.experiment import MEASURED_PLACES, PathResult
 from studies.vehicle.findings import ENKF, FKF
 from studies.vehicle.printed import DT, FUZZY_HIGH, FUZZY_LOW, NOISE, POSE
-from studies.vehicle.scores import position_ratio
+from studies.vehicle.scores import Scores, position_ratio
 from studies.vehicle.wording import digits, with_interval
 
 GOLDEN = math.sqrt(
@@ -87,8 +87,8 @@ def _of_members(iv: PathResult) -> list[str]:
         "and pitch by chance correlations, and nothing gives it back.",
         "Equation (24) forgets the members, so its gain is 1/2 for what is measured: sqrt(2/3 R) = "
         f"{1e3 * MEAN_ONLY:.3f} mm/s in theory, {1e3 * mean_only.rmse('velocities')[0]:.3f} mm/s found with the "
-        "sampling noise of its members. p, q and the attitude are the model's alone, and no worse than the "
-        "right EnKF's, whose chance correlations disturb them.",
+        f"sampling noise of its members. p and q are the model's alone, {_rates(mean_only)}; the right EnKF of "
+        f"as many members, which chance correlations disturb, has {_rates(ours[0])}.",
     ]
 
 
@@ -129,16 +129,18 @@ def _of_paths(by_path: dict[str, PathResult]) -> list[str]:
         position_ratio(result.scores[FKF], result.scores[MEASUREMENTS], "planar").value
         for result in by_path.values()
     ]
-    dynamic = by_path["dynamic"].scores["EKF8"].rmse("full")
+    dynamic = by_path["dynamic"].scores[ENKF]
     return [
         "Position RMSE of the fuzzy filter over that of the EnKF with 50 members, printed: "
         f"{', '.join(printed_worse)}. Ours, by the full transformation and paired by run: {', '.join(worse)}. "
         "That the fuzzy filter wins on four paths does not come out: against a path that the vehicle's own "
         f"model does not follow, errors say nothing of filters. By yaw alone it has {min(planar):.2f} to "
         f"{max(planar):.2f} times the error of the bare measurements.",
-        "On the dynamic path the printed 1.5 mm, 1.4 mm and 1.1 mrad are of the size that dead reckoning from "
-        f"such measurements gives: the EKF has {_pose(dynamic)}. z, which is not printed, is worse, for pitch "
-        "is not measured.",
+        "On the dynamic path 1.5 mm, 1.4 mm and 1.1 mrad are printed for the EnKF. Ours has "
+        f"{_level_pose(dynamic.rmse('planar_both'))} with path and estimate both by yaw alone, and "
+        f"{_level_pose(dynamic.rmse('full'))} by the full transformation: millimetres are what such "
+        "measurements give. z, which is not printed, is worse, for pitch is not measured: "
+        f"{digits(dynamic.rmse('full')[2])} m.",
         "That 50 members are quicker than 64 rules comes out: a run of the fuzzy filter takes "
         f"{min(seconds):.0f} to {max(seconds):.0f} times as long. Printed are {_seconds_ratio()} times.",
     ]
@@ -193,3 +195,12 @@ def _seconds_ratio() -> str:
 def _pose(values: np.ndarray) -> str:
     metres = ", ".join(f"{name} {value:.3g} m" for name, value in zip(POSE[:3], values[:3], strict=True))
     return f"{metres}, psi {values[3]:.2g} rad"
+
+
+def _level_pose(values: np.ndarray) -> str:
+    return f"x {digits(values[0])} m, y {digits(values[1])} m, psi {digits(values[3])} rad"
+
+
+def _rates(scores: Scores) -> str:
+    p, q = 1e3 * scores.rmse("velocities")[3:5]
+    return f"{digits(p)} and {digits(q)} mrad/s"
