@@ -45,7 +45,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     timing = side_by_side(filtered, bare, 3 if quick else 20)
     yield Row(f"EKF of {N} states on {COPIES} vehicles", "vehicles alone", timing, time_goal=6e-6)
 
-    timing = alone(papers_ensemble(seed), 1 if quick else 5, warm_up=not quick)
+    timing = alone(papers_ensemble(seed), 1 if quick else 5, warm_up=False)
     yield Row(f"EnKF, {N} states, N = {PAPER_SIZE}, 25 s at 1 kHz", None, timing, time_goal=2.5)
 
 
@@ -69,12 +69,14 @@ def papers_ensemble(seed: int) -> Measure:
     scenario = find_scenario("auv:papers").replace(steps=round(PAPER_SECONDS / 0.001))
     data = scenario.data(training_seeds(seed, 2))
     first = (data.filter_keys[:1], data.inputs[:1], data.measurements[:1])
+    begin = (first[0], first[1][:, :10], first[2][:, :11])
     filter_ = make_filter("enkf", scenario.model(**scenario.true), ensemble_size=PAPER_SIZE)
+    run(filter_, *begin)  # compiles
 
     def measure() -> float:
-        begin = perf_counter()
+        started = perf_counter()
         run(filter_, *first)
-        return perf_counter() - begin
+        return perf_counter() - started
 
     return measure
 

@@ -142,7 +142,7 @@ def cells(row: Row) -> list[str]:
     found = row.evaluation
     return [
         row.label,
-        digits(found.score.value),
+        plain(found.score.value),
         about(row.score_ratio, 3),
         f"{about(found.nees)} of {len(found.states)}",
         f"{about(found.nis)} of {digits(found.expected_nis)}",
@@ -155,6 +155,11 @@ def about(value: Interval, decimals: int = 2) -> str:
     if abs(value.value) >= 100:
         return f"{digits(value.value)} ± {digits(half, 2)}"
     return f"{value.value:.{decimals}f} ± {half:.{decimals}f}"
+
+
+def plain(value: float) -> str:
+    """A score to two decimals; large ones to three figures."""
+    return digits(value) if value >= 100 else f"{value:.2f}"
 
 
 TABLES: Mapping[str, Callable[[], str]] = {
