@@ -51,6 +51,7 @@ def command(
         trajectories,
         vector_filters,
         vectors,
+        vehicles,
     )
 
     announce_compilation()
@@ -61,6 +62,7 @@ def command(
             vectors,
             vector_filters,
             batches,
+            vehicles,
             trajectories,
             studies,
             assimilation,

@@ -152,10 +152,11 @@ def main(
     tables: Mapping[str, Callable[[], str]] = TABLES,
     module: str = "docs.ranking_tables",
     about: str = __doc__,
+    page: Path = Path(__file__).parent / "ranking.md",
 ) -> None:
-    """Run the command line of a script that makes tables of the page."""
+    """Run the command line of a script that makes tables of a page."""
     parser = argparse.ArgumentParser(prog=f"python -m {module}", description=about.splitlines()[0])
-    parser.add_argument("page", nargs="?", type=Path, default=Path(__file__).parent / "ranking.md", metavar="PAGE")
+    parser.add_argument("page", nargs="?", type=Path, default=page, metavar="PAGE")
     parser.add_argument("--table", action="append", choices=list(tables), help="only this one; may be repeated")
     given = parser.parse_args(arguments)
     for name in given.table or tables:  # written one by one, so that what is done stays

@@ -1,0 +1,109 @@
+"""Underwater vehicles: the member's Runge-Kutta step, a filter on each of a thousand, the papers' ensemble."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from functools import cache
+from time import perf_counter
+
+import numpy as np
+
+from auv_env.dynamics import motion_substep
+from auv_env.engine.motion import read_constants
+from auv_env.plant import make_plant
+from benchmarks.batches import shared
+from benchmarks.rows import Row
+from benchmarks.timing import Measure, alone, side_by_side
+from benchmarks.vectors import vector_steps
+from filters import make_filter, run
+from numerics.compiled import compiled, function_fingerprint
+from numerics.tuples import tuple_of, written_out
+from tuning.auv.find import find_scenario
+from tuning.problems.seeds import training_seeds
+
+MEMBERS, STEPS = 256, 200
+COPIES, VECTOR_STEPS = 1024, 50
+PAPER_SIZE, PAPER_SECONDS = 300, 25.0
+N = 8  # states of the model "motion"
+PAIRS = 8  # of a sine and a cosine in a Runge-Kutta step: four rates of roll and pitch
+
+_column = written_out("column", "table, j", tuple_of(f"table[{i}, j]" for i in range(N)))
+_store = written_out("store", "table, j, x", *(f"table[{i}, j] = x[{i}]" for i in range(N)), "None")
+
+
+def rows(seed: int, quick: bool) -> Iterator[Row]:
+    """Measure, one row after the other."""
+    rounds = 5 if quick else 40
+    step, sines = member_steps(), library_sines()
+    timing = side_by_side(step, sines, rounds)
+    yield Row(f"vehicle, {N} states: member's step", "its library sines alone, one core", timing, time_goal=60e-9)
+
+    sensors = {"sensors": "motion"}
+    filtered = vector_steps("filters:SegorogeniAUV-EKF-v0", seed, COPIES, VECTOR_STEPS, **sensors)
+    bare = vector_steps("SegorogeniAUV-v0", seed, COPIES, VECTOR_STEPS, **sensors)
+    timing = side_by_side(filtered, bare, 3 if quick else 20)
+    yield Row(f"EKF of {N} states on {COPIES} vehicles", "vehicles alone", timing, time_goal=6e-6)
+
+    timing = alone(papers_ensemble(seed), 1 if quick else 5, warm_up=False)
+    yield Row(f"EnKF, {N} states, N = {PAPER_SIZE}, 25 s at 1 kHz", None, timing, time_goal=2.5)
+
+
+def member_steps() -> Measure:
+    """A measure of one member's Runge-Kutta step of 0.05 s at a cruise, on one core."""
+    plant = make_plant()
+    table = np.zeros((N, MEMBERS))
+    table[0], numbers = 1.0, np.array(plant.constants)
+    propagate = _propagate()
+    return shared(lambda: propagate(table, STEPS, numbers), STEPS * MEMBERS)
+
+
+def library_sines() -> Measure:
+    """A measure of the sines and cosines of one member's step as the mathematical library gives them."""
+    angles, evaluate = np.linspace(-0.1, 0.1, MEMBERS), _sines()
+    return shared(lambda: evaluate(angles, STEPS), STEPS * MEMBERS)
+
+
+def papers_ensemble(seed: int) -> Measure:
+    """A measure of one run of an ensemble over 25 s of path IV at 1 kHz; the truth is made before."""
+    scenario = find_scenario("auv:papers").replace(steps=round(PAPER_SECONDS / 0.001))
+    data = scenario.data(training_seeds(seed, 2))
+    first = (data.filter_keys[:1], data.inputs[:1], data.measurements[:1])
+    begin = (first[0], first[1][:, :10], first[2][:, :11])
+    filter_ = make_filter("enkf", scenario.model(**scenario.true), ensemble_size=PAPER_SIZE)
+    run(filter_, *begin)  # compiles
+
+    def measure() -> float:
+        started = perf_counter()
+        run(filter_, *first)
+        return perf_counter() - started
+
+    return measure
+
+
+@cache
+def _propagate() -> Callable:
+    fingerprint = function_fingerprint(within=__name__)
+
+    def propagate(table, steps, numbers):
+        fingerprint  # noqa: B018 - part of the cache's key
+        c = read_constants(numbers)
+        for _ in range(steps):
+            for j in range(table.shape[1]):
+                _store(table, j, motion_substep(_column(table, j), (2.845, -0.01707, 0.0, 0.0), c))
+
+    return compiled(propagate)
+
+
+@cache
+def _sines() -> Callable:
+    def evaluate(angles, repeats):
+        for _ in range(repeats):
+            for j in range(angles.shape[0]):
+                total = 0.0
+                for k in range(PAIRS):
+                    x = angles[j] + 0.01 * k
+                    total += math.sin(x) * math.cos(x)
+                angles[j] = 0.1 * total / PAIRS  # so that each round depends on the last
+
+    return compiled(evaluate)
