@@ -9,7 +9,7 @@ import pytest
 import auv_env  # noqa: F401 - registers the envs
 from auv_env.channels import SUITES
 from auv_env.effects.current import CURRENT_SIGNALS
-from docs import auv_figures
+from docs import auv_figures, auv_filters, auv_papers
 
 PAGE = (Path(__file__).parents[2] / "docs" / "auv.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
@@ -27,9 +27,11 @@ def test_ids_suites_and_signals_are_named():
     assert all(f"`{name}`" in PAGE for name in (*SUITES, *CURRENT_SIGNALS.effects))
 
 
-def test_the_page_has_what_its_script_makes():
-    assert set(auv_figures.FIGURES) == set(re.findall(r"!\[.*?\]\((.*?)\)", PAGE))
-    assert set(auv_figures.TABLES) == set(re.findall(r"<!-- table (\w+) -->", PAGE))
+def test_the_page_has_what_its_scripts_make():
+    figures = {*auv_figures.FIGURES, *auv_papers.FIGURES}
+    tables = {*auv_figures.TABLES, *auv_papers.TABLES, *auv_filters.TABLES}
+    assert figures == set(re.findall(r"!\[.*?\]\((.*?)\)", PAGE))
+    assert tables == set(re.findall(r"<!-- table (\w+) -->", PAGE))
     folder = Path(__file__).parents[2] / "docs"
     for target in re.findall(r"\]\((?!http)([^)#]+)", PAGE):
         assert (folder / target).exists(), target

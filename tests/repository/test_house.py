@@ -33,7 +33,7 @@ ALLOWED = {
     "auv_env": {"numerics", "plants"},
     "filters": {"numerics", "plants"},
     "tuning": {"numerics", "plants", "filters"},
-    "training": {"numerics", "plants", "thruster_env", "filters", "tuning"},
+    "training": {"numerics", "plants", "thruster_env", "auv_env", "filters", "tuning"},
     "studies": {"numerics", "plants", "thruster_env", "auv_env", "filters", "tuning"},
     "thruster_cli": set(ROOMS),
 }
