@@ -25,7 +25,8 @@ READ_VERSIONS = (2, 3, 4)
 NOISE = ("process_noise_cov", "measurement_noise_cov")
 PRIOR = "prior_cov_factor"  # on P_0
 FACTORS = "parameter_factors"  # a mapping of names to factors
-MODEL_KEYS = (*NOISE, PRIOR, FACTORS)  # what every plant with data of its own knows
+STATES = "states"  # which of its states a model has, by a name that the plant knows
+MODEL_KEYS = (*NOISE, PRIOR, FACTORS, STATES)  # what every plant with data of its own knows
 
 
 def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -120,6 +121,8 @@ def _check_filter(entry, known: tuple[str, ...] | None) -> None:
         if model.get(key) is None:
             raise ValueError(f"the model of a tuned file must have a {key}, but got {shown(model)}")
     for key, value in model.items():
+        if key == STATES and isinstance(value, str):
+            continue
         if key != FACTORS:
             _check_finite(key, value)
     if PRIOR in model:
