@@ -67,7 +67,7 @@ CURES = [
     small("etkf", rotations=1),
     small("etkf", relaxation=0.3),
     small("etkf", relaxation=0.45),
-    small("etkf", relaxation=0.4, rotations=1),
+    small("etkf", relaxation=0.45, rotations=1),
     small("etkf", inflation=1.02, relaxation=0.3),
     restless(small("etkf", relaxation=0.3), 1e-7),
 ]
