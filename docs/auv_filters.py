@@ -95,8 +95,8 @@ def filters_motion() -> str:
 
 
 def filters_navigation() -> str:
-    """Filters of twelve states."""
-    return by_scenario(NAVIGATION, (EKF, ROBUST, UKF))
+    """The EKF of twelve states."""
+    return by_scenario(NAVIGATION, [EKF])
 
 
 def filters_members() -> str:
