@@ -95,8 +95,8 @@ def filters_motion() -> str:
 
 
 def filters_navigation() -> str:
-    """The EKF of twelve states."""
-    return by_scenario(NAVIGATION, [EKF])
+    """Filters of twelve states."""
+    return by_scenario(NAVIGATION, (EKF, ROBUST, UKF))
 
 
 def filters_members() -> str:
