@@ -50,9 +50,9 @@ def test_there_members_cost_consistency_until_300_and_more():
 
 def test_there_a_transform_with_relaxation_is_consistent_enough_with_50_members():
     found = by_label("filters_cures")
-    for label in ("etkf 50 relaxation 0.45", "etkf 50 relaxation 0.4 rotations 1"):
+    for label in ("etkf 50 relaxation 0.45", "etkf 50 inflation 1.02 relaxation 0.3"):
         (nees, half), nis, ratio = found[label]
-        assert nees + half < 10 and BAND[0] < nis < BAND[1] and ratio < found["enkf 50"][2]
+        assert nees + half < 10 and BAND[0] < nis < BAND[1] and ratio < 1.15
 
 
 def test_there_nothing_cures_50_members_at_1_khz():
@@ -83,7 +83,7 @@ def test_restless_angles_are_the_model_s_and_no_other_number_changes():
 
 
 def test_numbers_are_printed_with_half_their_interval():
-    assert about(Interval(21.374, 20.46, 22.27)) == "21.37 ± 0.91"
+    assert about(Interval(21.374, 20.47, 22.27)) == "21.37 ± 0.90"
     assert about(Interval(161160.6, 112706.8, 217080.6)) == "161000 ± 52000"
 
 

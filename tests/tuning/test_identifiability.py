@@ -146,3 +146,16 @@ def test_thruster_tune_says_what_the_innovations_determine(tmp_path):
     tuning = tune(plan, 3, str(tmp_path / "j"), out=tmp_path / "tuned.json")
     assert sentences(tuning.known)[0] in report(tuning)
     assert set(as_data(tuning.known)) == set(as_json(tuning)["innovations_alone"]) == {"Q11", "Q22", "R"}
+
+
+def test_a_number_that_is_hardly_known_goes_along_no_further_than_ten_times_its_range():
+    asked, bounds = [], np.log([(1e-3, 1e3), (1e-3, 1e3)])
+    cov = np.array([[1e-4, 1e-2 * 2.0 * 0.9], [1e-2 * 2.0 * 0.9, 4.0]])  # the second would move by e^414
+
+    def log_likelihoods(at):
+        asked.append(at)
+        return np.array([-at @ np.linalg.solve(cov, at)])
+
+    known = is_identified(log_likelihoods, np.zeros(2), cov, bounds)
+    assert known.tolist() == [True, False]
+    assert np.abs(asked).max() <= np.log(1e4) + 1e-12

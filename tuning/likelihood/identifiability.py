@@ -180,7 +180,12 @@ def is_identified(
     narrow = TWO_SIDED * np.sqrt(variances) < KNOWN_WITHIN
     inside = (at > bounds[:, 0] + CLOSE) & (at < bounds[:, 1] - CLOSE)
     moves = KNOWN_WITHIN * cov / variances[:, None]
-    falls = [[highest - log_likelihoods(at + sign * move).sum() for sign in (1, -1)] for move in moves]
+    # Where one number is known far better than another, the other would go along by a hundred orders of magnitude.
+    low, high = bounds[:, 0] - KNOWN_WITHIN, bounds[:, 1] + KNOWN_WITHIN
+    falls = [
+        [highest - log_likelihoods(np.clip(at + sign * move, low, high)).sum() for sign in (1, -1)]
+        for move in moves
+    ]
     return narrow & inside & (np.array(falls) > SIGNIFICANT).all(axis=1)
 
 
