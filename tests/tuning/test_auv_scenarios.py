@@ -5,13 +5,16 @@ import numpy as np
 import pytest
 
 import auv_env  # noqa: F401 - registers the envs
+import thruster_env  # noqa: F401 - as well
 from auv_env.manoeuvres import MANOEUVRES
-from filters import make_filter
+from filters import EstimateState, make_filter
 from numerics.streams import episode_keys
+from tests.tuned_files import write_untuned
 from tuning.auv.find import find_scenario
 from tuning.auv.scale import computed_scale
 from tuning.auv.scenarios import SAILING, SCENARIOS
 from tuning.evaluation.evaluate import evaluate
+from tuning.evaluation.tuned import read_tuned
 from tuning.problems.check import checked_problem
 from tuning.problems.excitation import EXCITATIONS, Levels
 from tuning.problems.files import scenario_of
@@ -129,3 +132,19 @@ def test_what_is_wrong_is_one_clear_line(change, line):
         scenario = find_scenario("auv:navigation").replace(**change)
         scenario.model()
     assert "\n" not in str(error.value)
+
+
+def test_a_tuned_file_keeps_which_states_its_model_has_and_goes_on_an_env(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    scenario = short("auv:motion").replace(name="mine.toml")
+    write_untuned("tuned.json", scenario)
+    choice, found, _ = read_tuned("tuned.json")
+    assert found == scenario and choice.filter(found).model.n == 8
+    env = EstimateState(gym.make("SegorogeniAUV-v0", sensors="motion"), tuned="tuned.json")
+    assert env.reset(seed=1)[1]["estimate"].shape == (8,)
+    others = {"sensors": {"sensors": "default"}, "dt": {"dt": 0.1}, "preset": {"preset": "remus100"}}
+    for rule, other in others.items():
+        with pytest.raises(ValueError, match=f"must be for the plant it is put on, but .* was tuned for {rule}"):
+            EstimateState(gym.make("SegorogeniAUV-v0", **{"sensors": "motion", **other}), tuned="tuned.json")
+    with pytest.raises(ValueError, match="a plant's data must have"):
+        EstimateState(gym.make("BowThruster-v0"), tuned="tuned.json")
