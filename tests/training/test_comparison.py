@@ -165,7 +165,7 @@ def test_pi_has_gains_that_do_better_than_the_usual_ones_on_held_out_episodes():
     found = classical_policy("pi", chosen)
     usual = found.controller.for_env(make_environments(chosen, [0], native=False).envs[0])
     held_out = held_out_seeds(0, 40)
-    of_usual = score(type(found)(usual, 0, found.max_voltage), chosen, held_out).returns
+    of_usual = score(type(found)(usual, 0, found.half), chosen, held_out).returns
     assert (score(found, chosen, held_out).returns - of_usual).mean() > 0.5
 
 
