@@ -10,6 +10,7 @@ import auv_env  # noqa: F401 - registers the envs
 from auv_env.channels import SUITES
 from auv_env.effects.current import CURRENT_SIGNALS
 from docs import auv_figures, auv_filters, auv_papers
+from tuning.auv.scenarios import SCENARIOS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "auv.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
@@ -25,6 +26,10 @@ def test_ids_suites_and_signals_are_named():
     ids = [name for name in gym.registry if re.fullmatch(r"SegorogeniAUV\w*-v0", name)]
     assert len(ids) == 3 and all(f"| `{name}` |" in PAGE for name in ids)
     assert all(f"`{name}`" in PAGE for name in (*SUITES, *CURRENT_SIGNALS.effects))
+
+
+def test_scenarios_are_listed_with_their_states_and_what_they_are():
+    assert all(f"| `{one.name}` | {one.count} | {one.about} |" in PAGE for one in SCENARIOS.values())
 
 
 def test_the_page_has_what_its_scripts_make():
