@@ -19,7 +19,6 @@ from filters import (
     thruster_model,
 )
 from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
-from thruster_env.model import thrusts_of
 
 FLOW = "flow velocity $U_a$ [m/s]"
 FLOW_RMSE = "RMSE of $U_a$ [m/s]"
@@ -34,7 +33,7 @@ def outliers(share: float) -> dict:
 
 def noisy(runs: Runs, stds: np.ndarray) -> Runs:
     """Runs measured anew, with noise of given standard deviations (K + 1,) [N]."""
-    thrust = thrusts_of(thruster_model(), runs.states)
+    thrust = thruster_model().output("T", runs.states)
     draws = np.random.default_rng(SEED).normal(size=thrust.shape)
     return runs._replace(measurements=(thrust + stds * draws)[..., None])
 

@@ -155,13 +155,6 @@ def thrust_of(x, c):
 MODEL_ARGUMENTS = tuple(inspect.signature(model_of_plant).parameters)[1:]
 
 
-def thrusts_of(model: StateSpaceModel, states: np.ndarray) -> np.ndarray:
-    """Thrust [N] that a model of the thruster has at states (..., 2); NaN for a linear plant's model."""
-    if not isinstance(model.constants, Constants):
-        return np.full(states.shape[:-1], np.nan)
-    return thrust_and_torque((states[..., 0], states[..., 1]), model.constants)[0]
-
-
 def overlay_of(label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
     """What a rendered thruster shows of a belief: the state and its thrust, each with a standard deviation."""
     # A model may have more states, such as parameters, behind these two.

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters import ExtendedKalmanFilter, run
+from filters import run
+from filters.bounds import path_bound
 from filters.consistency.nees import normalized_squares
 from numerics.checks import at_least
 from plants.simulate import Truth, simulate
@@ -187,18 +188,15 @@ def noise_free(world: str, inputs: np.ndarray) -> np.ndarray:
 def along_path(world: str, inputs: np.ndarray) -> tuple:
     """End, gap of the transformation by yaw alone, share outside the bounds, and the bound, all without noise.
 
-    The bound is the Riccati recursion along the noise-free path: the covariance of an extended filter whose
-    estimate is the path itself. The posterior bound (`filters.bounds`) is useless here: with a noise of 1e-6 rad a
-    step on the angles its averages take the smallest differences of Jacobians between truths for information.
+    The bound is `filters.bounds.path_bound`: the posterior one is useless with a noise of 1e-6 rad a step on the
+    angles.
     """
     states, steps = noise_free(world, inputs), settled(len(inputs))
     pose = states[:, [9, 10, 11, 8]]
     gap = planar_pose(states[None, :, :6], DT)[0] - pose
     beyond = (states[:, :6] < 0.0) | (states[:, :6] > 1.0)
     outside = np.append(beyond.mean(axis=0), beyond.any(axis=1).mean())
-    model = papers_model("navigation", world)
-    seen = np.ascontiguousarray(states[None][..., list(MEASURED_PLACES)])
-    covs = run(ExtendedKalmanFilter(model=model), np.zeros((1, 2)), inputs[None], seen).covs[0]
+    covs = path_bound(papers_model("navigation", world), inputs[None])[0]
     variances = np.diagonal(covs, axis1=1, axis2=2)
     bound = Bound(
         np.sqrt(variances[steps, :6].mean(axis=0)),

@@ -12,7 +12,6 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormalize, VecVideoRecorder
 
 import thruster_env  # noqa: F401 - registers the envs
-from thruster_env.model import thrusts_of
 from thruster_env.vector_env import BowThrusterTrackingVectorEnv
 from training.environments import make_environments, make_single
 from training.observations import ARMS, STACKED
@@ -229,7 +228,7 @@ def test_the_entries_of_an_observation_are_those_of_the_table(observe):
             states = arrays["state"] if arm.is_true else arrays["estimate"]
             model = env.unwrapped.state_space_model() if arm.is_true else env.filter.model
             np.testing.assert_allclose(seen[:, 1:3], states, rtol=1e-6)
-            np.testing.assert_allclose(seen[:, 0], thrusts_of(model, states), rtol=1e-4, atol=1e-3)
+            np.testing.assert_allclose(seen[:, 0], model.output("T", states), rtol=1e-4, atol=1e-3)
             if observe == "belief":
                 deviations = np.sqrt(np.diagonal(arrays["estimate_cov"], axis1=1, axis2=2))
                 np.testing.assert_allclose(seen[:, 3:5], deviations, rtol=1e-6)
