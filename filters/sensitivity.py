@@ -36,6 +36,7 @@ class Sensitivity(NamedTuple):
     values: np.ndarray  # (B,)
     gradients: np.ndarray  # (B, p)
     information: np.ndarray  # (B, p, p), Fisher's, as if the innovations had the covariances S
+    block_gradients: np.ndarray  # (B, blocks, p), of the parts of each trajectory
 
 
 def sensitivity(
@@ -45,6 +46,7 @@ def sensitivity(
     slopes: ModelSlopes,
     *,
     degrees: float = math.inf,
+    blocks: int = 1,
 ) -> Sensitivity:
     """`likelihood`, and Fisher's information, for parameters that move all numbers of a model.
 
@@ -59,6 +61,7 @@ def sensitivity(
         slopes: how the model changes along each parameter.
         degrees: degrees of freedom of a Student-t density with the covariance S in place of the normal one, which
             outliers move less; above 2. The filter stays as it is.
+        blocks: equal parts of each trajectory, whose gradients are told apart.
 
     Raises:
         ValueError: if shapes do not fit, or degrees are not above 2.
@@ -74,13 +77,14 @@ def sensitivity(
     given = {"inputs": inputs, "measurements": measurements, **slopes._asdict()}
     check_shapes(given, model, (p, len(model.constants)), (p, n, n), (p, m, m), (p, n), (p, n, n))
     prior = np.concatenate([slopes.prior_mean, slopes.prior_cov.reshape(p, n * n)], axis=1)
-    out, information = np.zeros((count, 1 + p)), np.zeros((count, p, p))
+    out, information = np.zeros((count, blocks, 1 + p)), np.zeros((count, p, p))
     noise = slopes.process_noise_cov.reshape(p, n * n), slopes.measurement_noise_cov.reshape(p, m * m)
     moves = *noise, slopes.constants, _relative(slopes.constants, model), prior
     accumulate = _build(model.functions, model.shape, is_interpreting())
     arguments = inputs, measurements, model.numbers, *moves, float(degrees), out, information
     spread(lambda first, last: accumulate(*arguments, first, last), count)
-    return Sensitivity(out[:, 0], out[:, 1:], information)
+    total = out.sum(axis=1)
+    return Sensitivity(total[:, 0], total[:, 1:], information, out[:, :, 1:])
 
 
 def _relative(slopes: np.ndarray, model: StateSpaceModel) -> np.ndarray:
@@ -168,13 +172,13 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
                     p = grown(p, q(numbers))
                     for j in range(rows.shape[0]):
                         store_cov_slope(rows[j], grown(cov_slope(rows[j]), q_slope(q_slopes[j])))
-                z = reading(measurements[b, k])
+                part, z = k * out.shape[1] // measurements.shape[1], reading(measurements[b, k])
                 h = present_rows(observation_matrix(x, s, c), z)
                 v, spread_of_v = difference(z, observe(x, c)), seen(h, p, present(r(numbers), z))
                 root = root_of(spread_of_v)
                 gain = divide(correlation(p, h), root)
                 w = weigh(v, root)
-                out[b, 0] += log_likelihood(v, root, z, w, degrees)
+                out[b, part, 0] += log_likelihood(v, root, z, w, degrees)
                 for j in range(rows.shape[0]):
                     dx, dp = mean_slope(rows[j]), cov_slope(rows[j])
                     dc, size = constants_slope(constants_slopes[j]), sizes[j]
@@ -182,7 +186,7 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
                     dy = observation(h, dx, x, c, dc, size, z)  # less the slope of the innovation
                     ds = seen_slope(h, dh, p, dp, present(r_slope(r_slopes[j]), z))
                     dgain = divide(uneven_gain(h, dh, p, dp, gain, ds), root)
-                    out[b, 1 + j] += likelihood_slope(v, dy, root, ds, z, w, degrees)
+                    out[b, part, 1 + j] += likelihood_slope(v, dy, root, ds, z, w, degrees)
                     note(notes[j], dy, ds, root, z)
                     store_mean_slope(rows[j], corrected_slope(dx, gain, dgain, v, dy))
                     store_cov_slope(rows[j], reduced_slope(dp, gain, dgain, spread_of_v, ds))
