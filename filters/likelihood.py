@@ -7,16 +7,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from filters.innovation_slopes import log_likelihood_slope
+from filters.recursion import recursion_of
+from filters.sensitivity_parts import slope_along
 from numerics.angles import kept
-from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from numerics.derivatives import RELATIVE_STEP
+from numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
 from numerics.formulas import formula
-from numerics.matrices import cholesky_factor, innovation_likelihood, masked, row_solver, vector_solver
-from numerics.sources import Source, entrywise, matrix_of, tuple_of, written_out
+from numerics.matrices import innovation_likelihood
 from numerics.threads import spread
-from numerics.tuples import matrix_reader, matrix_writer, scaled_sum, vector_reader, vector_writer
-from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape, innovation_of, observation_slopes, transition_slopes
+from plants.layout import number_places
+from plants.shape import Functions, Shape, observation_slopes, transition_slopes
 from plants.state_space import StateSpaceModel
 
 
@@ -55,13 +55,8 @@ def likelihood(
         np.ascontiguousarray(value, dtype=np.float64) for value in (inputs, measurements, q_slopes, r_slopes)
     )
     n, m, count, parameters = model.n, model.m, len(measurements), len(q_slopes)
-    shapes = inputs.shape, measurements.shape, q_slopes.shape, r_slopes.shape
-    steps = inputs.shape[1] if inputs.ndim == 3 else 0
-    wanted = (count, steps, model.inputs), (count, steps + 1, m), (parameters, n, n), (parameters, m, m)
-    if shapes != wanted:
-        raise ValueError(
-            f"inputs, measurements, q_slopes and r_slopes must have the shapes {wanted}, but got {shapes}"
-        )
+    given = {"inputs": inputs, "measurements": measurements, "q_slopes": q_slopes, "r_slopes": r_slopes}
+    check_shapes(given, model, (parameters, n, n), (parameters, m, m))
     out = np.zeros((count, 1 + parameters))
     accumulate = _build(model.functions, model.shape, is_interpreting())
     slopes = q_slopes.reshape(parameters, -1), r_slopes.reshape(parameters, -1)
@@ -70,52 +65,60 @@ def likelihood(
     return Likelihood(out[:, 0], out[:, 1:])
 
 
+def check_shapes(given: dict[str, np.ndarray], model: StateSpaceModel, *of_slopes: tuple[int, ...]) -> None:
+    """Raise ValueError unless inputs, measurements and slopes have the shapes that fit the model."""
+    shapes = tuple(array.shape for array in given.values())
+    count, steps = len(given["measurements"]), given["inputs"].shape[1] if given["inputs"].ndim == 3 else 0
+    wanted = (count, steps, model.inputs), (count, steps + 1, model.m), *of_slopes
+    if shapes != wanted:
+        *names, last = given
+        raise ValueError(f"{', '.join(names)} and {last} must have the shapes {wanted}, but got {shapes}")
+
+
 @cache
 def _build(functions: Functions, shape: Shape, interpreting: bool):
     n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
-    transition_matrix, observation_matrix = (
-        transition_slopes(functions, shape),
-        observation_slopes(functions, shape),
-    )
+    transition_matrix = transition_slopes(functions, shape)
+    observation_matrix = observation_slopes(functions, shape)
     transition = kept(transition, "x, u, c", shape.state_angles)
-    places = number_places(n, m)
-    constants, scales, control = (
-        constants_reader(shape),
-        vector_reader(n, places.scales),
-        vector_reader(shape.inputs),
-    )
-    prior_mean = kept(vector_reader(n, places.prior_mean), "numbers", shape.state_angles)
-    prior_cov = matrix_reader(n, n, places.prior_cov)
-    q, r = matrix_reader(n, n, places.q), matrix_reader(m, m, places.r)
-    control, reading = vector_reader(shape.inputs), vector_reader(m)
-    q_slope, r_slope = matrix_reader(n, n), matrix_reader(m, m)
-    mean_slope, cov_slope = vector_reader(n), matrix_reader(n, n, n)  # a parameter's row: dx, then dP
-    store_mean_slope, store_cov_slope = vector_writer(n), matrix_writer(n, n, n)
-    difference, root_of, log_likelihood = (
-        innovation_of(shape),
-        cholesky_factor(m),
-        innovation_likelihood(m),
-    )
-    motion_slope = _slope_along(n, n, transition_matrix, "u, c")
-    observation_slope = _slope_along(m, n, observation_matrix, "c")
-    present_rows, present = _present_rows(m, n), masked(m)
-    likelihood_slope = _log_likelihood_slope(m)
-    divide = row_solver(n, m)  # by S
-
-    nn, mn, mm, nm = (n, n), (m, n), (m, m), (n, m)
-    moved = formula("F P F'", F=nn, P=nn)
-    moved_slope = formula("dF P F' + F dP F' + F P dF'", F=nn, dF=nn, P=nn, dP=nn)
-    grown = formula("P + Q", P=nn, Q=nn)
-    seen = formula("H P H' + R", H=mn, P=nn, R=mm)
-    seen_slope = formula("dH P H' + H dP H' + H P dH' + dR", H=mn, dH=mn, P=nn, dP=nn, dR=mm)
-    correlation = formula("P H'", P=nn, H=mn)
-    uneven_gain = formula("dP H' + P dH' - K dS", H=mn, dH=mn, P=nn, dP=nn, K=nm, dS=mm)
-    moved_mean_slope = formula("F dx", F=nn, dx=(n,))
-    seen_mean_slope = formula("H dx", H=mn, dx=(n,))  # less the slope of the innovation
-    corrected = kept(formula("x + K v", x=(n,), K=nm, v=(m,)), "x, K, v", shape.state_angles)
-    corrected_slope = formula("dx + dK v - K dy", dx=(n,), K=nm, dK=nm, v=(m,), dy=(m,))
-    reduced = formula("P - K S K'", P=nn, K=nm, S=mm)
-    reduced_slope = formula("dP - dK S K' - K dS K' - K S dK'", dP=nn, K=nm, dK=nm, S=mm, dS=mm)
+    substeps = number_places(n, m).substeps
+    (
+        constants,
+        scales,
+        control,
+        reading,
+        prior_mean,
+        prior_cov,
+        q,
+        r,
+        q_slope,
+        r_slope,
+        mean_slope,
+        cov_slope,
+        store_mean_slope,
+        store_cov_slope,
+        difference,
+        root_of,
+        divide,
+        present_rows,
+        present,
+        moved,
+        moved_slope,
+        grown,
+        seen,
+        seen_slope,
+        correlation,
+        uneven_gain,
+        corrected,
+        corrected_slope,
+        reduced,
+        reduced_slope,
+    ) = recursion_of(shape)
+    motion_slope = slope_along(n, n, transition_matrix, "u, c")
+    observation_slope = slope_along(m, n, observation_matrix, "c")
+    log_likelihood, likelihood_slope = innovation_likelihood(m), log_likelihood_slope(m)
+    moved_mean_slope = formula("F dx", F=(n, n), dx=(n,))
+    seen_mean_slope = formula("H dx", H=(m, n), dx=(n,))  # less the slope of the innovation
     fingerprint = function_fingerprint(transition, transition_matrix, observe, observation_matrix, within=__name__)
 
     def accumulate(all_inputs, measurements, numbers, q_slopes, r_slopes, out, first, last):
@@ -128,7 +131,7 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
             for k in range(measurements.shape[1]):
                 if k > 0:
                     u = control(all_inputs[b, k - 1])
-                    for _ in range(int(numbers[places.substeps])):
+                    for _ in range(int(numbers[substeps])):
                         f = transition_matrix(x, s, u, c)
                         for j in range(rows.shape[0]):
                             dx, dp = mean_slope(rows[j]), cov_slope(rows[j])
@@ -157,58 +160,3 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
                 x, p = corrected(x, gain, v), reduced(p, gain, spread_of_v)
 
     return CompiledOrPython(accumulate)
-
-
-@cache
-def _slope_along(rows: int, columns: int, matrix, arguments: str):
-    """`slope(x, scales, d, <arguments>)`: the derivative of a Jacobian along d, by central differences."""
-    arrays = {"result": (rows, columns), "x": (columns,), "scales": (columns,), "d": (columns,)}
-    source = Source("slope", f"x, scales, d, {arguments}", **arrays)
-    if source.loops:
-        source.line("h = 1e-300")
-        for i in source.range(columns):
-            source.line(f"h = max(h, abs(d[{i}]) / (abs(x[{i}]) + scales[{i}]))")
-        source.line(f"h = {RELATIVE_STEP} / h")
-        source.line(f"above = matrix(move(x, h, d), scales, {arguments})")
-        source.line(f"below = matrix(move(x, -h, d), scales, {arguments})")
-        entry = source.matrix(rows, columns, lambda i, j: f"(above[{i}, {j}] - below[{i}, {j}]) / (2.0 * h)")
-        return source.function(entry, matrix=matrix, move=scaled_sum(columns))
-    sizes = ", ".join(f"abs(d[{i}]) / (abs(x[{i}]) + scales[{i}])" for i in range(columns))
-    lines = [f"h = {RELATIVE_STEP} / max(1e-300, {sizes})"]
-    for name, sign in (("above", "+"), ("below", "-")):
-        point = tuple_of(f"x[{i}] {sign} h * d[{i}]" for i in range(columns))
-        lines.append(f"{name} = matrix({point}, scales, {arguments})")
-    entry = matrix_of(rows, columns, lambda i, j: f"(above[{i}][{j}] - below[{i}][{j}]) / (2.0 * h)")
-    return written_out("slope", f"x, scales, d, {arguments}", *lines, entry, matrix=matrix)
-
-
-@cache
-def _present_rows(rows: int, columns: int):
-    """`keep(h, z)`: h with zeros in the rows of channels that are NaN in z."""
-    shape = rows, columns
-    return entrywise(
-        "keep", "h, z", shape, lambda i, j: f"h[{i}][{j}] if z[{i}] == z[{i}] else 0.0", h=shape, z=(rows,)
-    )
-
-
-@cache
-def _log_likelihood_slope(size: int):
-    """`slope(v, dy, l, ds, z)`: of log N(v; 0, S) with S = l l', where v changes by -dy and S by ds.
-
-    It is -1/2 tr(S^-1 dS) + w' dy + 1/2 w' dS w with w = S^-1 v, over the channels that are not NaN in z.
-    """
-    matrix, vector = (size, size), (size,)
-    shapes = {"w": vector, "e": matrix, "dy": vector, "ds": matrix, "z": vector}
-    source = Source("combine", "w, e, dy, ds, z", work=size * size, **shapes)
-    products = (f"w[{i}] * ds[{i}][{j}] * w[{j}]" for i in source.range(size) for j in source.range(size))
-    square = source.sum(products)
-    trace = source.sum(f"(e[{i}][{i}] if z[{i}] == z[{i}] else 0.0)" for i in source.range(size))
-    shift = source.sum(f"w[{i}] * dy[{i}]" for i in source.range(size))
-    combine = source.function(f"0.5 * ({square} - ({trace})) + {shift}")
-    divide_one, divide = vector_solver(size), row_solver(size, size)
-
-    @inlined
-    def slope(v, dy, root, ds, z):
-        return combine(divide_one(v, root), divide(ds, root), dy, ds, z)
-
-    return slope

@@ -23,7 +23,6 @@ from tuning.evaluation.compare import Contender, compare, contender, sized
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
-from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice, has_ensemble
 
@@ -83,7 +82,12 @@ def command(
     for file, problem in product(files or [], chosen):
         read_choice(file, problem)  # a clear error for a file that is for another plant
     contenders = _contenders(files or [], filters or [], knows, augment or [], ensemble_size or [], seed)
-    held_out = held_out_seeds(seed, seeds)
+
+    def held_out(problem: Problem) -> range:
+        return problem.held_out_seeds(seed, seeds)
+
+    for problem in chosen:
+        held_out(problem)  # a clear error before any filter runs
     announce_compilation()
     with _bar(len(contenders) * len(chosen)) as on_row:
         boards, interrupted = compare(contenders, chosen, held_out, on_row)

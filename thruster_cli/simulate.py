@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Annotated
 
@@ -10,8 +9,8 @@ import numpy as np
 import typer
 
 from numerics.checks import at_least, positive, within
-from numerics.files import write_whole
 from numerics.streams import episode_keys
+from plants.logs.write import check_suffix, write_columns
 from thruster_cli.output import JsonOption, PresetOption, SeedOption, announce_compilation, emit
 from thruster_env.plant import (
     DEFAULT_DT,
@@ -27,7 +26,7 @@ COLUMNS = ("time_s", "voltage_V", "omega_m_rad_per_s", "U_a_m_per_s", "thrust_N"
 
 
 def command(
-    out: Annotated[Path, typer.Option(help="File to write: .csv with units in the header, or .npz.")],
+    out: Annotated[Path, typer.Option(help="File to write: .csv with units in the header, .parquet or .npz.")],
     preset: PresetOption = "tunnel",
     steps: Annotated[int, typer.Option(help="Number of steps.")] = 500,
     dt: Annotated[float, typer.Option(help="Sample time [s].")] = DEFAULT_DT,
@@ -43,14 +42,13 @@ def command(
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Simulate a thruster and write time, voltage, true state, true thrust and measured thrust to a file.
+    """Simulate a thruster and write time, voltage, true state, true thrust and measured thrust to a log.
 
     Row k holds the state at time k dt and the voltage that acts from then on; the last row has none. The
     numbers are those of BowThruster-v0 after reset(seed=SEED) under the same voltages. A simulation that does not
     stay finite is refused, and nothing is written.
     """
-    if out.suffix not in (".csv", ".npz"):
-        raise ValueError(f"--out must end in .csv or .npz, but got {str(out)!r}")
+    check_suffix(out)
     steps = at_least("steps", steps, 1, MOST_STEPS)
     plant = make_plant(preset, dt, process_noise_cov=process_noise, measurement_noise_cov=measurement_noise)
     keys = episode_keys([seed])
@@ -63,21 +61,13 @@ def command(
         )
     announce_compilation()
     run = simulate(plant, keys, voltages).checked()
-    values = np.column_stack(
-        [
-            plant.dt * np.arange(steps + 1),
-            np.append(voltages[0], np.nan),
-            run.states[0],
-            run.thrusts[0],
-            run.measurements[0],
-        ]
-    )
-    if out.suffix == ".csv":
-        text = io.StringIO()
-        np.savetxt(text, values, delimiter=",", header=",".join(COLUMNS), comments="", fmt="%.10g")
-        write_whole(out, text.getvalue())
-    else:
-        columns = dict(zip(COLUMNS, values.T, strict=True))
-        write_whole(out, lambda stream: np.savez(stream, **columns))
+    values = [
+        plant.dt * np.arange(steps + 1),
+        np.append(voltages[0], np.nan),
+        *run.states[0].T,
+        run.thrusts[0],
+        *run.measurements[0].T,
+    ]
+    write_columns(out, dict(zip(COLUMNS, values, strict=True)))
     data = {"file": str(out), "rows": steps + 1, "columns": list(COLUMNS), "seed": seed, "preset": preset}
     emit([f"{steps + 1} rows of {', '.join(COLUMNS)} in {out}"], data, json)

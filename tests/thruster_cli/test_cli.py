@@ -221,7 +221,7 @@ BAD = [
     (("inspect", "--out", "picture.pdf"), "--out must end in .png, but got 'picture.pdf'"),
     (("inspect", "--out", "text.txt/x.png"), "must be where it can be written"),
     (("inspect", "--voltage", "0", "--out", "x.png"), "the thrust must move with the voltage"),
-    (("simulate", "--out", "run.txt"), "--out must end in .csv or .npz, but got 'run.txt'"),
+    (("simulate", "--out", "run.txt"), "--out must end in .csv, .parquet or .npz, but got 'run.txt'"),
     (("simulate", "--out", "run.csv", "--measurement-noise", "-1"), "no negative variance"),
     (("simulate", "--out", "run.csv", "--voltage", "nan"), "voltage must be a finite number, but got nan"),
     (("reproduce", "none"), "none"),

@@ -11,7 +11,6 @@ from scipy.optimize import brentq
 
 from tuning.evaluation.evaluate import evaluate
 from tuning.problems.problem import Problem
-from tuning.problems.seeds import training_seeds
 from tuning.search.objectives import LARGEST, nis_ratio
 from tuning.search.plan import TRAINING_SEEDS
 from tuning.search.space import Choice, true_choice, untuned_choice
@@ -62,7 +61,7 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
     """
     if not rule_of_thumb(name, scenario).filter(scenario).has_covariance:
         return Scaled(None, None, None, f"{name} has no NIS by which its Q could be scaled")
-    data = scenario.data(training_seeds(seed, TRAINING_SEEDS))
+    data = scenario.data(scenario.training_seeds(seed, TRAINING_SEEDS))
     start = _with_q(rule_of_thumb(name, scenario), scenario)
 
     def nis_at(factor: float) -> float:

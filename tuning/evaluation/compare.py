@@ -158,7 +158,7 @@ def default_belief(name: str, value: float) -> Unknown:
 def compare(
     contenders: Sequence[Contender],
     scenarios: Iterable[Problem],
-    seeds: Sequence[int],
+    seeds: Sequence[int] | Callable[[Problem], Sequence[int]],
     on_row: Callable[[Problem, str], None] = lambda scenario, label: None,
 ) -> tuple[list[Leaderboard], bool]:
     """Run filters over scenarios, all on the same seeds.
@@ -168,7 +168,8 @@ def compare(
     Args:
         contenders: the filters; the first one is what the others are compared with.
         scenarios: on what.
-        seeds: at least 2; held-out ones, for a comparison of tuned filters.
+        seeds: at least 2; held-out ones, for a comparison of tuned filters. Or a function that gives those of a
+            problem.
         on_row: called before each filter's run with the scenario and the filter's label.
 
     Returns:
@@ -188,8 +189,9 @@ def compare(
     try:
         with stop_on_interrupt() as stopped:
             for scenario, filters in teams:
-                data = scenario.data(seeds)
-                board = Leaderboard(scenario, seeds, scenario.bound(data), [])
+                chosen = seeds(scenario) if callable(seeds) else seeds
+                data = scenario.data(chosen)
+                board = Leaderboard(scenario, chosen, scenario.bound(data), [])
                 boards.append(board)
                 for label, filter_ in zip(labels, filters, strict=True):
                     on_row(scenario, label)

@@ -10,7 +10,6 @@ from filters.consistency.intervals import Interval
 from tuning.evaluation.baselines import ORACLE, RULE, SCALED, TUNED, Scaled, oracle, rule_of_thumb, scaled_default
 from tuning.evaluation.evaluate import Evaluation, evaluate, likelihood_gain, score_ratio
 from tuning.problems.problem import Problem
-from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
 
@@ -54,9 +53,9 @@ def prove(choice: Choice, scenario: Problem, seed: int, count: int = HELD_OUT_SE
         choice: of a study.
         scenario: on what.
         seed: of the study; its training seeds scale the scaled default.
-        count: number of held-out seeds.
+        count: number of held-out seeds, where the problem can make as many as are asked for.
     """
-    seeds = held_out_seeds(seed, count)
+    seeds = scenario.held_out_seeds(seed, count)
     data = scenario.data(seeds)
     default = scaled_default(choice.name, scenario, seed)
     choices = (rule_of_thumb(choice.name, scenario), choice, oracle(choice.name, scenario), default.choice)

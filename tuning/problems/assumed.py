@@ -107,7 +107,7 @@ class AssumedProblem(Problem):
         """What errors of each state are measured in, as it is given or else found; None without truth."""
         if self._scale is not None:
             return self._scale
-        return None if self.data(RANGE_SEEDS).states is None else tuple(self.found_scale().tolist())
+        return None if self.data(self.range_seeds).states is None else tuple(self.found_scale().tolist())
 
     @property
     def parameters(self) -> tuple[Parameter, ...] | None:
@@ -125,6 +125,11 @@ class AssumedProblem(Problem):
     def true(self) -> dict | None:
         """Arguments of the model that knows the plant's own Q and R; None if they are unknown."""
         return self._true
+
+    @property
+    def range_seeds(self) -> range:
+        """Seeds whose runs tell each state's range."""
+        return RANGE_SEEDS
 
     @property
     def counts_start_up(self) -> bool:
@@ -149,7 +154,7 @@ class AssumedProblem(Problem):
         deviations = np.sqrt(np.diag(model.process_noise_cov))
         if model.state_low is not None and model.state_high is not None:
             deviations = RANGE_FRACTION * (model.state_high - model.state_low)
-        elif (states := self.data(RANGE_SEEDS).states) is not None:
+        elif (states := self.data(self.range_seeds).states) is not None:
             deviations[: states.shape[-1]] = RANGE_FRACTION * np.ptp(rows_of(states, model), axis=0)
         variances = tuple(float(v) for v in deviations**2)
         return {"process_noise_cov": variances, "measurement_noise_cov": as_argument(model.measurement_noise_cov)}

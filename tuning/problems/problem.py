@@ -10,6 +10,7 @@ import numpy as np
 
 from plants.quantities import Quantities
 from plants.state_space import StateSpaceModel
+from tuning.problems import seeds
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 
@@ -47,6 +48,18 @@ class Problem(ABC):
     @abstractmethod
     def data(self, seeds: Sequence[int]) -> Data:
         """Inputs, measurements and, where it is known, truth for seeds: the same for the same seeds."""
+
+    def training_seeds(self, seed: int, count: int) -> range:
+        """Seeds that a study with a given seed learns from: so many, or all that there are for it."""
+        return seeds.training_seeds(seed, count)
+
+    def size_seeds(self, seed: int, count: int) -> range:
+        """Seeds that choose the ensemble size of a study with a given seed, and nothing else."""
+        return seeds.size_seeds(seed, count)
+
+    def held_out_seeds(self, seed: int, count: int) -> range:
+        """Seeds that a study with a given seed never sees."""
+        return seeds.held_out_seeds(seed, count)
 
     @property
     @abstractmethod

@@ -18,7 +18,6 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.tuned import versions
 from tuning.evaluation.worth import scaling_sentence, without_truth, worth
-from tuning.problems.seeds import size_seeds, training_seeds
 from tuning.report.consistency_figures import consistency_figure
 from tuning.report.figures import SCORE, comparison_figure, history_figure
 from tuning.report.page import Picture, Section, Table, Words
@@ -144,8 +143,9 @@ def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
 
 def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) -> Section:
     """Errors against ensemble size."""
-    fresh = size_seeds(subject.plan.seed, SIZE_SEEDS)
-    where = f"seeds {fresh.start} to {fresh.stop - 1} of {subject.plan.scenarios[0].name}"
+    first = subject.plan.scenarios[0]
+    fresh = first.size_seeds(subject.plan.seed, SIZE_SEEDS)
+    where = f"seeds {fresh.start} to {fresh.stop - 1} of {first.name}"
     caption = f"RMSE with 95 % intervals on {where}, which chose neither Q nor R; dashed is N."
     kept = subject.choice.numbers["ensemble_size"]
     ratios = [[f"{row.size}", f"{row.ratio.value:.4f}", f"{row.ratio.high:.4f}"] for row in sizes]
@@ -180,7 +180,8 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
 
 def facts_section(subject: Subject, nis: Sequence[float]) -> Section:
     """What was tuned, on what and with what; `nis` is the choice's on training seeds, over the channels."""
-    plan, training = subject.plan, training_seeds(subject.plan.seed, TRAINING_SEEDS)
+    plan = subject.plan
+    training = plan.scenarios[0].training_seeds(plan.seed, TRAINING_SEEDS)
     about = [f"{one.name}: {one.about}" if one.about else one.name for one in plan.scenarios]
     rows = [
         ["filter", plan.filter if plan.filter == subject.choice.name else f"{plan.filter}: {subject.choice.name}"],

@@ -12,7 +12,6 @@ from numerics.checks import positive, shown
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
-from tuning.problems.seeds import held_out_seeds, size_seeds, training_seeds
 from tuning.search.objectives import Objective, check_objectives, find_objective
 from tuning.search.space import AUTO, AUTO_KINDS, has_search_space, joint_distributions, joint_parameters
 
@@ -142,12 +141,8 @@ class Plan(NamedTuple):
 
     def training_data(self) -> list[Data]:
         """Data that every trial shares, one for each scenario."""
-        return [scenario.data(training_seeds(self.seed, TRAINING_SEEDS)) for scenario in self.scenarios]
+        return [scenario.data(scenario.training_seeds(self.seed, TRAINING_SEEDS)) for scenario in self.scenarios]
 
     def size_data(self) -> list[Data]:
         """Data that choose the ensemble size once Q and R are chosen, one for each scenario."""
-        return [scenario.data(size_seeds(self.seed, SIZE_SEEDS)) for scenario in self.scenarios]
-
-    def held_out_seeds(self, count: int = HELD_OUT_SEEDS) -> range:
-        """Seeds that no trial sees."""
-        return held_out_seeds(self.seed, count)
+        return [scenario.data(scenario.size_seeds(self.seed, SIZE_SEEDS)) for scenario in self.scenarios]

@@ -1,0 +1,137 @@
+"""Which column of a file is which quantity of a model: by its header, or as it is told."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from numerics.checks import shown
+from plants.logs.units import parted
+from plants.quantities import Quantity
+from plants.state_space import StateSpaceModel
+
+INPUT, MEASUREMENT, STATE, OUTPUT = "input", "measurement", "state", "output"
+TIME = "time"
+TIME_NAMES = ("t", "time", "Time", "TIME", "timestamp", "stamp")
+
+
+class Wanted(NamedTuple):
+    """A quantity that a column may hold."""
+
+    kind: str  # one of the four above
+    quantity: Quantity
+
+    @property
+    def key(self) -> str:
+        """What tells it from all others: "input:V_s"."""
+        return f"{self.kind}:{self.quantity.symbol}"
+
+
+class Column(NamedTuple):
+    """A column of a file, and its unit; None where it tells none."""
+
+    header: str
+    unit: str | None
+
+
+def quantities_of(model: StateSpaceModel) -> list[Wanted]:
+    """All quantities of a model that a log may hold: inputs and measurements, then the references."""
+    states = [*model.states]
+    outputs = [one.quantity._replace(symbol=symbol) for symbol, one in model.outputs.items()]
+    kinds = (INPUT, model.input_quantities), (MEASUREMENT, model.measurements), (STATE, states), (OUTPUT, outputs)
+    return [Wanted(kind, quantity) for kind, some in kinds for quantity in some]
+
+
+def plain(name: str) -> str:
+    """A name as headers have it: "measured_speed" of "measured speed"."""
+    return name.replace(" ", "_").replace("-", "_")
+
+
+def find_wanted(name: str, wanted: Sequence[Wanted]) -> Wanted | None:
+    """The quantity of a symbol or name, inputs before measurements before references; or "kind:symbol"."""
+    for one in wanted:
+        symbol = one.quantity.symbol
+        if name in (symbol, one.key) or plain(name).lower() == plain(one.quantity.name).lower():
+            return one
+    return next((one for one in wanted if plain(name) == plain(one.quantity.symbol)), None)
+
+
+def column_of(text: str, headers: Sequence[str], units: Mapping[str, str], what: str, file: str) -> Column:
+    """The column that a text names, "HEADER" or "HEADER[UNIT]"; ValueError if the file has no such."""
+    bare, unit = text, None
+    if text not in headers and text.endswith("]"):
+        bare, _, unit = text[:-1].rpartition("[")
+        bare, unit = bare.strip(), unit.strip()
+    if bare not in headers:
+        raise ValueError(f"the column for {what} must be one of {', '.join(headers)}, but got {bare!r} ({file})")
+    return Column(bare, unit or units.get(bare) or parted(bare)[1])
+
+
+def find_columns(
+    wanted: Sequence[Wanted],
+    headers: Sequence[str],
+    given: Mapping[str, str],
+    units: Mapping[str, str],
+    file: str,
+) -> dict[str, Column]:
+    """The column of each quantity that the file has, and of "time", by key.
+
+    What is not told goes by headers: without its unit, that of a column is the quantity's name or its symbol.
+    Names come first, and of quantities inputs, measurements, states and outputs in this order; a column is used
+    once.
+
+    Args:
+        wanted: from `quantities_of`.
+        headers: of the file's columns.
+        given: columns by quantity: "thrust" or "output:T", and "time", to "loadcell_N" or "loadcell[N]".
+        units: by header, where the header tells none or another.
+        file: for messages.
+
+    Raises:
+        ValueError: for a quantity that the model has not, a column that the file has not, or one told twice.
+    """
+    found: dict[str, Column] = {}
+    for name, text in given.items():
+        one = None if name == TIME else find_wanted(name, wanted)
+        if one is None and name != TIME:
+            known = ", ".join([*(known.quantity.symbol for known in wanted), TIME])
+            raise ValueError(f"columns must be told for some of {known}, but got {shown(name)}={text} ({file})")
+        key = TIME if one is None else one.key
+        if key in found:
+            raise ValueError(
+                f"a column must be told once for {name}, but got {found[key].header} and {text} ({file})"
+            )
+        found[key] = column_of(text, headers, units, name, file)
+    for header in units:
+        if header not in headers:
+            raise ValueError(f"units must be of columns {', '.join(headers)}, but got {header!r} ({file})")
+    _by_headers(found, wanted, headers, units)
+    for kind in (INPUT, MEASUREMENT):
+        for one in wanted:
+            if one.kind == kind and one.key not in found:
+                name = plain(one.quantity.name)
+                raise ValueError(
+                    f"a log must have a column for the {kind} {one.quantity.label} (say --column "
+                    f"{one.quantity.symbol}=HEADER, or call it {name}), but {file} has {', '.join(headers)}"
+                )
+    return found
+
+
+def _by_headers(found: dict, wanted: Sequence[Wanted], headers: Sequence[str], units: Mapping[str, str]) -> None:
+    """Add the columns whose headers tell what they are."""
+    used = {column.header for column in found.values()}
+    bare = {header: parted(header) for header in headers if header not in used}
+
+    def take(key: str, fits) -> None:
+        header = None if key in found else next((one for one in bare if fits(bare[one][0])), None)
+        if header is not None:
+            found[key] = Column(header, units.get(header) or bare.pop(header)[1])
+            bare.pop(header, None)
+
+    take(TIME, lambda name: name in TIME_NAMES)
+    for one in wanted:
+        name = plain(one.quantity.name).lower()
+        take(one.key, lambda base, name=name: plain(base).lower() == name)
+    for one in wanted:
+        symbol = plain(one.quantity.symbol)
+        take(one.key, lambda base, symbol=symbol: plain(base) == symbol)

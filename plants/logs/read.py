@@ -1,0 +1,190 @@
+"""Logs from files: CSV, Parquet or npz, and what a small TOML file beside one says of its columns."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from numerics.checks import finite, positive, shown
+from plants.logs.columns import INPUT, MEASUREMENT, TIME, Column, Wanted, find_columns, find_wanted, quantities_of
+from plants.logs.grid import Grid, Series, grid_of, held, sampled
+from plants.logs.log import FEWEST_STEPS, Log
+from plants.logs.table import Table, read_table
+from plants.logs.units import converted
+from plants.state_space import StateSpaceModel
+
+SECOND = "s"
+
+
+class Description(NamedTuple):
+    """What is said of the columns of a file, beside what its header says."""
+
+    columns: Mapping[str, str] = {}  # headers by quantity: {"thrust": "loadcell[kgf]"}
+    units: Mapping[str, str] = {}  # by header
+    clock_offset: Mapping[str, float] = {}  # by quantity [s]: how far its clock is ahead
+    dt: float | None = None  # sample time [s]: of rows without a time, or of the grid to put irregular ones on
+
+    def updated(self, other: Description) -> Description:
+        """This one, but for what the other says."""
+        pairs = zip(self[:3], other[:3], strict=True)
+        return Description(
+            *({**mine, **theirs} for mine, theirs in pairs), self.dt if other.dt is None else other.dt
+        )
+
+
+def read_log(
+    path: str | Path,
+    model: StateSpaceModel,
+    columns: Mapping[str, str] | None = None,
+    *,
+    clock_offset: Mapping[str, float] | None = None,
+    dt: float | None = None,
+) -> Log:
+    """A log of a model's inputs and measurements from a file; columns of its states and outputs are references.
+
+    Columns are found by their headers (`plants.logs.columns.find_columns`), converted to the model's units
+    (`plants.logs.units`) and put on a grid (`plants.logs.grid`). A file beside, run.toml for run.csv, may say
+
+        dt = 0.01
+        [columns]
+        thrust = "loadcell[kgf]"
+        [units]
+        "motor" = "rpm"
+        [clock_offset]
+        thrust = -0.06
+
+    and the arguments say what they name in its place.
+
+    Args:
+        path: a file that ends in .csv, .parquet or .npz.
+        model: whose inputs and measurements it has to have.
+        columns: headers by the symbol or name of a quantity, or "kind:symbol"; "HEADER[UNIT]" with another unit.
+        clock_offset: how far a channel's clock is ahead [s].
+        dt: sample time [s], of rows without a time column, or of the grid where stamps are on none.
+
+    Raises:
+        ValueError: states the rule and the value, with file, line and column.
+    """
+    file, table = str(path), read_table(path)
+    said = _described(Path(path)).updated(Description(columns or {}, {}, clock_offset or {}, dt))
+    wanted = quantities_of(model)
+    found = find_columns(wanted, table.names, said.columns, said.units, file)
+    grid, start = _grid(table, found.get(TIME), said.dt, file)
+    offsets = _offsets(said.clock_offset, wanted, found, file)
+    source, parts, last = {}, {}, grid.rows - 1
+    for one in wanted:
+        if one.key not in found:
+            continue
+        series = _series(table, found[one.key], one, grid)
+        if len(series.values) < len(grid.times) or grid.irregular or one.key in offsets:
+            source[one.key] = series  # elsewhere the rows tell the same
+        offset = offsets.get(one.key, 0.0)
+        if one.kind == INPUT:
+            parts[one.key] = held(series, grid.dt, last, offset)
+        else:
+            parts[one.key] = sampled(series, grid.dt, grid.rows, offset)
+
+    def those(kind: str, rows: int) -> np.ndarray:
+        some = [parts[one.key] for one in wanted if one.kind == kind]
+        return np.column_stack(some) if some else np.empty((rows, 0))
+
+    referred = {
+        one.key: one.quantity for one in wanted if one.kind not in (INPUT, MEASUREMENT) and one.key in parts
+    }
+    if grid.rows <= FEWEST_STEPS:
+        raise ValueError(f"a log must have at least {FEWEST_STEPS + 1} rows, but {file} has {grid.rows}")
+    return Log(
+        name=file,
+        dt=grid.dt,
+        inputs=those(INPUT, last),
+        measurements=those(MEASUREMENT, grid.rows),
+        input_quantities=model.input_quantities,
+        measured=model.measurements,
+        references={key: parts[key] for key in referred},
+        referred=referred,
+        start=start,
+        source=source,
+        offsets=offsets,
+        irregular=grid.irregular,
+    )
+
+
+def _described(path: Path) -> Description:
+    """What the TOML file beside a log says, nothing if there is none."""
+    beside = path.with_suffix(".toml")
+    if not beside.is_file():
+        return Description()
+    try:
+        content = tomllib.loads(beside.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"what is said of a log must be TOML, but {beside} is not: {error}") from None
+    unknown = sorted(set(content) - set(Description._fields))
+    if unknown:
+        raise ValueError(
+            f"keys beside a log must be among {', '.join(Description._fields)}, but {beside} has {unknown}"
+        )
+    for key, kind in (("columns", str), ("units", str), ("clock_offset", float | int)):
+        part = content.get(key, {})
+        if not isinstance(part, dict) or not all(isinstance(value, kind) for value in part.values()):
+            what = "texts" if kind is str else "seconds"
+            raise ValueError(f"{key} beside a log must map names to {what}, but {beside} has {shown(part)}")
+    return Description(**content)
+
+
+def _grid(table: Table, column: Column | None, dt: float | None, file: str) -> tuple[Grid, float]:
+    """The grid of a file's rows, and the stamp of its first one [s]."""
+    count = len(table.lines)
+    if dt is not None:
+        dt = positive("dt", dt)
+    if column is None:
+        if dt is None:
+            raise ValueError(
+                f"a log must have a column of times (say --column time=HEADER) or a sample time (--dt), but "
+                f"{file} has {', '.join(table.names)}"
+            )
+        return Grid(dt, count, dt * np.arange(count), False), 0.0
+    stamps = converted(table.numbers(column.header), column.unit, SECOND, f"column {column.header!r} of {file}")
+    if np.isnan(stamps).any():
+        row = int(np.argmax(np.isnan(stamps)))
+        raise ValueError(f"every row must have a time, but there is none in {table.place(row, column.header)}")
+    if count <= FEWEST_STEPS:
+        raise ValueError(f"a log must have at least {FEWEST_STEPS + 1} rows, but {file} has {count}")
+    back = np.flatnonzero(np.diff(stamps) <= 0)
+    if len(back):
+        row = int(back[0]) + 1
+        raise ValueError(
+            f"times must increase from row to row, but {stamps[row]:.10g} s follows {stamps[row - 1]:.10g} s in "
+            f"{table.place(row, column.header)}"
+        )
+    return grid_of(stamps, dt), float(stamps[0])
+
+
+def _offsets(given: Mapping[str, float], wanted: list[Wanted], found: Mapping, file: str) -> dict[str, float]:
+    offsets = {}
+    for name, seconds in given.items():
+        one = find_wanted(name, wanted)
+        if one is None or one.key not in found:
+            known = ", ".join(one.quantity.symbol for one in wanted if one.key in found)
+            raise ValueError(f"clock offsets must be of channels {known}, but got {shown(name)} ({file})")
+        offsets[one.key] = finite(f"the clock offset of {name}", seconds)
+    return offsets
+
+
+def _series(table: Table, column: Column, one: Wanted, grid: Grid) -> Series:
+    """The samples of a column in the model's unit; ValueError for a late input, or a stuck sensor."""
+    where = f"column {column.header!r} of {table.file}"
+    values = converted(table.numbers(column.header), column.unit, one.quantity.unit, where)
+    there = ~np.isnan(values)
+    if not there.any() and one.kind in (INPUT, MEASUREMENT):
+        raise ValueError(f"a column must hold numbers, but {where} has none")
+    if one.kind == INPUT and not there[0]:
+        raise ValueError(
+            f"an input must be known from the first row on, but it is missing in {table.place(0, column.header)}"
+        )
+    if one.kind == MEASUREMENT and there.sum() > 1 and np.ptp(values[there]) == 0.0:
+        raise ValueError(f"a measurement must vary, but {where} is {values[there][0]:.10g} in all rows")
+    return Series(grid.times[there], values[there])

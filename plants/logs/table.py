@@ -1,0 +1,175 @@
+"""Tables of numbers in files: CSV, Parquet and npz, with errors that name file, line and column."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from numerics.checks import shown
+
+MISSING = {"", "nan", "na", "n/a", "null", "none"}  # what stands for a missing number, in any case of letters
+DELIMITERS = ",;\t"
+SUFFIXES = (".csv", ".parquet", ".npz")
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """The columns of a file; what is no number is found when a column is asked for.
+
+    Attributes:
+        file: its path, for messages.
+        cells: of each column by name: texts, or an array.
+        lines: of the file in which the rows are, counted from 1.
+        line_word: what a line is called.
+    """
+
+    file: str
+    cells: Mapping[str, Sequence[str] | np.ndarray]
+    lines: Sequence[int]
+    line_word: str = "line"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns, in order."""
+        return tuple(self.cells)
+
+    def place(self, row: int, column: str) -> str:
+        """Where a number stands, as messages have it."""
+        return f"{self.line_word} {self.lines[row]}, column {column!r} of {self.file}"
+
+    def numbers(self, column: str) -> np.ndarray:
+        """A column as float64 (rows,), NaN where a number is missing; ValueError for text and infinite numbers."""
+        cells = self.cells[column]
+        if isinstance(cells, np.ndarray):
+            if cells.dtype.kind not in "biuf" or cells.ndim != 1:
+                raise ValueError(
+                    f"columns must hold numbers, but column {column!r} of {self.file} holds {cells.dtype}"
+                )
+            found = cells.astype(np.float64)
+        else:
+            texts = ["nan" if cell.lower() in MISSING else cell for cell in cells]
+            try:
+                found = np.array(texts, dtype=np.float64)
+            except ValueError:
+                row = next(row for row, text in enumerate(texts) if not _is_number(text))
+                raise ValueError(
+                    f"columns must hold numbers, but got {shown(cells[row])} in {self.place(row, column)}"
+                ) from None
+        if np.isinf(found).any():
+            row = int(np.argmax(np.isinf(found)))
+            raise ValueError(f"numbers must be finite, but got {found[row]} in {self.place(row, column)}")
+        return found
+
+
+def read_table(path: str | Path) -> Table:
+    """The table in a file that ends in .csv, .parquet or .npz.
+
+    A CSV file is UTF-8 and begins with a line of names; commas, semicolons or tabs part the cells. An empty cell,
+    "nan", "NA" or "null" is a missing number. Parquet needs the package pyarrow.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        ValueError: states the rule and the value, with file, line and column.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(f"a log must be a file that ends in {', '.join(SUFFIXES)}, but got {shown(str(path))}")
+    try:
+        return {".csv": _read_csv, ".parquet": _read_parquet, ".npz": _read_npz}[suffix](Path(path))
+    except OSError as error:
+        raise ValueError(f"a log must be a file that can be read, but {path} is not: {error.strerror}") from None
+
+
+def _read_csv(path: Path) -> Table:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"a CSV file must be text in UTF-8, but {path} is not: {error.reason}") from None
+    if not text.strip():
+        raise ValueError(f"a log must have a header and rows, but {path} is empty")
+    first = text.lstrip().splitlines()[0]
+    delimiter = max(DELIMITERS, key=first.count)
+    reader = csv.reader(text.splitlines(), delimiter=delimiter, skipinitialspace=True)
+    try:
+        numbered = [
+            (reader.line_num, [cell.strip() for cell in row]) for row in reader if any(map(str.strip, row))
+        ]
+    except csv.Error as error:
+        raise ValueError(f"a CSV file must be one, but {path} is not: {error}") from None
+    (line, header), *rows = numbered
+    header[0] = header[0].removeprefix("#").strip()  # headers are comments to some programs
+    _check_header(header, line, path)
+    for line, row in rows:
+        if len(row) != len(header):
+            raise ValueError(
+                f"rows must have as many cells as the header, {len(header)}, but got {len(row)} in line {line} of "
+                f"{path}"
+            )
+    if not rows:
+        raise ValueError(f"a log must have a header and rows, but {path} has only a header")
+    columns = zip(*(row for _, row in rows), strict=True)
+    return Table(str(path), dict(zip(header, columns, strict=True)), [line for line, _ in rows])
+
+
+def _check_header(header: Sequence[str], line: int, path: Path) -> None:
+    if all(map(_is_number, header)):
+        raise ValueError(
+            f"the first line must name the columns, but line {line} of {path} has numbers: {shown(header)}"
+        )
+    for place, name in enumerate(header):
+        if not name:
+            raise ValueError(f"columns must have names, but number {place + 1} in line {line} of {path} has none")
+        if name in header[:place]:
+            raise ValueError(
+                f"names of columns must differ from one another, but line {line} of {path} has {name!r} twice"
+            )
+
+
+def _read_parquet(path: Path) -> Table:
+    try:
+        from pyarrow import ArrowException, parquet
+    except ImportError:
+        raise ValueError(
+            f"a Parquet file must be read by pyarrow, which is not installed (pip install "
+            f"'thruster-env[parquet]'), but got {path}"
+        ) from None
+    try:
+        table = parquet.read_table(path)
+    except ArrowException as error:
+        raise ValueError(
+            f"a Parquet file must be one, but {path} is not: {' '.join(str(error).split())}"
+        ) from None
+    _check_header(table.column_names, 1, path)
+    cells = {name: table.column(name).to_numpy(zero_copy_only=False) for name in table.column_names}
+    return _of_arrays(path, cells)
+
+
+def _read_npz(path: Path) -> Table:
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            cells = {name: content[name] for name in content.files}
+    except (ValueError, EOFError, KeyError) as error:
+        raise ValueError(f"an npz file must hold arrays of numbers, but {path} does not: {error}") from None
+    return _of_arrays(path, cells)
+
+
+def _of_arrays(path: Path, cells: dict[str, np.ndarray]) -> Table:
+    rows = {len(one) for one in cells.values() if one.ndim == 1}
+    if len(rows) != 1 or 0 in rows or any(one.ndim != 1 for one in cells.values()):
+        raise ValueError(f"a log must have columns of equal length with some rows, but {path} has not")
+    count = rows.pop()
+    return Table(str(path), cells, range(1, count + 1), "row")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

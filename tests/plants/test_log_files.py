@@ -1,0 +1,152 @@
+"""Logs in files: columns by name, units, what is said beside a file, and one line for what is wrong."""
+
+import numpy as np
+import pytest
+
+from plants.logs.read import read_log
+from plants.logs.units import parted
+from plants.logs.write import write_columns, write_log
+from tests.plants.test_logs import MODEL, log_of
+from thruster_env.model import thruster_model
+
+GOOD = "time_s,voltage_V,tach\n0,1,2\n0.1,2,3\n0.2,3,4\n"
+
+
+def test_what_simulate_writes_is_read_with_its_truth(tmp_path):
+    header = "time_s,voltage_V,omega_m_rad_per_s,U_a_m_per_s,thrust_N,measured_thrust_N"
+    rows = "0,6,0,0,0,0.5\n0.01,7,1,0.1,2,1.5\n0.02,nan,2,0.2,3,2.5\n"
+    (tmp_path / "sim.csv").write_text(f"{header}\n{rows}")
+    model = thruster_model()
+    log = read_log(tmp_path / "sim.csv", model)
+    np.testing.assert_array_equal(log.measurements[:, 0], [0.5, 1.5, 2.5])
+    np.testing.assert_array_equal(log.inputs[:, 0], [6, 7])
+    np.testing.assert_array_equal(log.true_states(model), [[0, 0], [1, 0.1], [2, 0.2]])
+    np.testing.assert_array_equal(log.references["output:T"], [0, 2, 3])
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet"])
+def test_a_log_comes_back_to_the_bit(tmp_path, suffix):
+    if suffix == ".parquet":
+        pytest.importorskip("pyarrow")
+    noise = np.random.default_rng(1).normal(size=(20, 3))
+    columns = {"t": 0.1 * np.arange(20), "voltage": noise[:, 0], "tach": noise[:, 1], "n": noise[:, 2]}
+    columns["tach"][7] = np.nan
+    write_columns(tmp_path / "first.csv", columns)
+    log = read_log(tmp_path / "first.csv", MODEL)
+    write_log(tmp_path / f"again{suffix}", log)
+    again = read_log(tmp_path / f"again{suffix}", MODEL)
+    assert again.digest == log.digest and again.dt == log.dt
+    np.testing.assert_array_equal(again.references["state:n"], log.references["state:n"])
+
+
+@pytest.mark.parametrize(
+    ("header", "base", "unit"),
+    [
+        ("omega_m_rad_per_s", "omega_m", "rad/s"),
+        ("y_tach_abs_rad_s", "y_tach_abs", "rad/s"),
+        ("U_a_m_per_s", "U_a", "m/s"),
+        ("a_m_per_s2", "a", "m/s^2"),
+        ("time_s", "time", "s"),
+        ("load cell [kgf]", "load cell", "kgf"),
+        ("loadcell_N", "loadcell", "N"),
+        ("x_1", "x_1", None),
+        ("force_x", "force_x", None),
+        ("m_s", "m", "s"),
+    ],
+)
+def test_a_header_tells_its_unit(header, base, unit):
+    assert parted(header) == (base, unit)
+
+
+def test_units_are_converted(tmp_path):
+    pytest.importorskip("pint")
+    text = "t_ms,supply [mV],motor_rpm\n0,1000,60\n100,2000,120\n200,0,180\n"
+    columns = {"V_s": "supply [mV]", "tach": "motor_rpm"}
+    log = log_of(tmp_path / "run.csv", text, columns=columns)
+    assert log.dt == pytest.approx(0.1)
+    np.testing.assert_allclose(log.inputs[:, 0], [1.0, 2.0])
+    np.testing.assert_allclose(log.measurements[:, 0], 2 * np.pi * np.array([1, 2, 3]))
+    again = log_of(tmp_path / "b.csv", text.replace("_rpm", ""), columns=columns | {"tach": "motor[rpm]"})
+    np.testing.assert_array_equal(again.measurements, log.measurements)
+    for unit, said in (("kgf", "must be one of rad/s, but got 'kgf'"), ("furl", "must be one that pint knows")):
+        with pytest.raises(ValueError, match=f"the unit of column 'motor' of .*b.csv {said}"):
+            read_log(tmp_path / "b.csv", MODEL, columns | {"tach": f"motor[{unit}]"})
+
+
+def test_a_file_beside_tells_columns_units_and_clocks(tmp_path):
+    pytest.importorskip("pint")
+    (tmp_path / "run.toml").write_text(
+        'dt = 0.1\n[columns]\nV_s = "u"\ntach = "motor"\n[units]\nmotor = "rpm"\n[clock_offset]\ntach = 0.1\n'
+    )
+    log = log_of(tmp_path / "run.csv", "u,motor\n1,60\n2,120\n3,180\n")
+    np.testing.assert_allclose(log.measurements[:, 0], 2 * np.pi * np.array([2, 3, np.nan]))
+    assert log.offsets == {"measurement:tach": 0.1}
+    told = read_log(tmp_path / "run.csv", MODEL, {"tach": "u"}, clock_offset={"tach": 0.0})
+    np.testing.assert_array_equal(told.measurements[:, 0], [1, 2, 3])
+    (tmp_path / "run.toml").write_text("speed = 1\n")
+    with pytest.raises(ValueError, match=r"keys beside a log must be among columns.*run.toml has \['speed'\]"):
+        read_log(tmp_path / "run.csv", MODEL)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "a log must have a header and rows, but .*run.csv is empty"),
+        ("time_s,voltage_V,tach\n", "has only a header"),
+        ("0,1,2\n0.1,2,3\n", r"the first line must name the columns, but line 1 of .*run.csv has numbers"),
+        ("t,tach,tach\n0,1,2\n", "names of columns must differ from one another, but line 1 .* has 'tach' twice"),
+        ("t,,tach\n0,1,2\n", "columns must have names, but number 2 in line 1"),
+        (GOOD + "0.3,4\n", "rows must have as many cells as the header, 3, but got 2 in line 5"),
+        (GOOD + "0.3,4,off\n", "columns must hold numbers, but got 'off' in line 5, column 'tach' of .*run.csv"),
+        (GOOD + "0.3,4,inf\n", "numbers must be finite, but got inf in line 5, column 'tach'"),
+        (GOOD + "0.15,4,5\n", "times must increase .* 0.15 s follows 0.2 s in line 5, column 'time_s'"),
+        (GOOD + ",4,5\n", "every row must have a time, but there is none in line 5, column 'time_s'"),
+        ("t,voltage,tach\n0,1,2\n1,1,3\n", "a log must have at least 3 rows, but .*run.csv has 2"),
+        (
+            "t,voltage,tach\n0,1,2\n1,2,2\n2,3,2\n",
+            "a measurement must vary, but column 'tach' .* is 2 in all rows",
+        ),
+        (
+            "t,voltage,tach\n0,,2\n1,2,3\n2,3,2\n",
+            "an input must be known from the first row on.*line 2, column 'volt",
+        ),
+        (
+            "t,voltage,tach\n0,1,\n1,2,\n2,3,\n",
+            "a column must hold numbers, but column 'tach' of .*run.csv has none",
+        ),
+        (
+            "voltage,tach\n0,1\n1,2\n2,3\n",
+            "a log must have a column of times .* or a sample time .*has voltage, tach",
+        ),
+        (
+            "t,voltage,speed\n0,1,2\n",
+            r"a log must have a column for the measurement tachometer \[rad/s\] \(say --column",
+        ),
+    ],
+)
+def test_what_is_wrong_is_one_line_with_its_place(tmp_path, text, said):
+    with pytest.raises(ValueError, match=said) as error:
+        log_of(tmp_path / "run.csv", text)
+    assert "\n" not in str(error.value)
+
+
+def test_columns_that_are_told_have_to_be_there(tmp_path):
+    refused = {
+        "the column for tach must be one of time_s, voltage_V, tach, but got 'rpm'": {"tach": "rpm"},
+        "columns must be told for some of V_s, tach, n, time, but got 'flow'=tach": {"flow": "tach"},
+        "a column must be told once for voltage, but got tach and voltage_V": {
+            "V_s": "tach",
+            "voltage": "voltage_V",
+        },
+    }
+    for said, columns in refused.items():
+        with pytest.raises(ValueError, match=said):
+            log_of(tmp_path / "run.csv", GOOD, columns=columns)
+    with pytest.raises(ValueError, match="clock offsets must be of channels V_s, tach, but got 'n'"):
+        log_of(tmp_path / "run.csv", GOOD, clock_offset={"n": 1.0})
+    with pytest.raises(ValueError, match="a log must be a file that can be read, but nowhere.csv is not: No such"):
+        read_log("nowhere.csv", MODEL)
+    with pytest.raises(
+        ValueError, match="a log must be a file that ends in .csv, .parquet, .npz, but got 'run.txt'"
+    ):
+        read_log("run.txt", MODEL)

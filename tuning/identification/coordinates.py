@@ -1,0 +1,66 @@
+"""Scaled coordinates of free parameters: logarithms where they are positive, else parts of the range."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from numerics.checks import finite, shown
+from tuning.problems.parameter import Parameter
+
+PART = 0.1  # of the range of a parameter that has no logarithm: its unit
+
+
+class Coordinates:
+    """Between values of p parameters and coordinates (p,), a unit of which is a sensible amount of each.
+
+    That is a factor of e for parameters on a logarithmic scale, a tenth of the range for others.
+    """
+
+    def __init__(self, free: Sequence[Parameter]):
+        """Raise ValueError unless there are parameters, each with a name of its own."""
+        self.free = tuple(free)
+        self.names = tuple(one.name for one in self.free)
+        if not self.free or len(set(self.names)) < len(self.names):
+            raise ValueError(f"free parameters must be some, each named once, but got {shown(list(self.names))}")
+        if any(one.integer for one in self.free):
+            whole = ", ".join(one.name for one in self.free if one.integer)
+            raise ValueError(f"free parameters must be no whole numbers, but got {whole}")
+        self.log = np.array([one.log for one in self.free])
+        self.units = np.array([1.0 if one.log else PART * (one.high - one.low) for one in self.free])
+        self.low, self.high = self.of([one.low for one in self.free]), self.of([one.high for one in self.free])
+
+    def of(self, values: Sequence[float]) -> np.ndarray:
+        """Coordinates of values (p,)."""
+        values = np.asarray(values, dtype=np.float64)
+        return np.where(self.log, np.log(np.where(self.log, values, 1.0)), values) / self.units
+
+    def values(self, at: np.ndarray) -> np.ndarray:
+        """Values (p,) at coordinates."""
+        at = np.asarray(at) * self.units
+        return np.where(self.log, np.exp(np.where(self.log, at, 0.0)), at)
+
+    def named(self, at: np.ndarray) -> dict[str, float]:
+        """Values by name."""
+        return dict(zip(self.names, self.values(at).tolist(), strict=True))
+
+    def slopes(self, at: np.ndarray) -> np.ndarray:
+        """Derivative of each value by its coordinate, (p,)."""
+        return np.where(self.log, self.values(at), 1.0) * self.units
+
+    def start(self, given: dict[str, float] | None = None) -> np.ndarray:
+        """Coordinates of given values, of the defaults of parameters without; ValueError outside the range."""
+        given = given or {}
+        unknown = sorted(set(given) - set(self.names))
+        if unknown:
+            raise ValueError(f"a start must name free parameters, {', '.join(self.names)}, but got {unknown}")
+        values = []
+        for one in self.free:
+            value = finite(f"the start of {one.name}", given.get(one.name, one.start))
+            if not one.low <= value <= one.high:
+                raise ValueError(
+                    f"the start of {one.name} must be within {one.low:g} and {one.high:g}, but got {value:g}"
+                )
+            values.append(value)
+        return self.of(values)

@@ -1,0 +1,123 @@
+"""A plant's numbers by maximum likelihood over a filter's innovations, from several starts."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+
+from numerics.checks import at_least, shown
+from plants.state_space import StateSpaceModel
+from tuning.identification.ascent import Ascent, climb
+from tuning.identification.coordinates import Coordinates
+from tuning.identification.objective import Objective
+from tuning.identification.result import Identification, Optimum, identification_of
+from tuning.problems.data import Data
+from tuning.problems.parameter import Parameter
+from tuning.search.interruption import stop_on_interrupt
+
+STARTS = 4  # the one given, and others drawn about it
+REACH = 0.25  # of a range, to either side of the start, within which others are drawn
+
+Progress = Callable[[int, float, dict[str, float]], None]
+
+
+def identify(
+    data: Data | Sequence[Data] | Callable,
+    model: Callable[..., StateSpaceModel],
+    free: Sequence[Parameter],
+    *,
+    filter: str = "ekf",
+    start: Mapping[str, float] | None = None,
+    starts: int | Sequence[Mapping[str, float]] = STARTS,
+    seed: int = 0,
+    degrees: float = math.inf,
+    simulation_first: bool = True,
+    progress: Progress | None = None,
+) -> Identification:
+    """Find the values of free parameters under which a filter's innovations are most likely.
+
+    The search is Fisher scoring (`ascent.climb`) in logarithms of positive parameters and parts of the range of
+    others, with slopes by the filter's sensitivities for all that a parameter moves of a model: constants, Q, R
+    and prior, in any mixture. Parameters that move the data, or need other functions, are taken by differences of
+    the likelihood.
+
+    The first start is `start`; the others are drawn uniformly (in coordinates) within a quarter of each range to
+    either side of it. With `simulation_first` each start is first brought to where the model, simulated without
+    process noise, is nearest to the measurements, if that is likelier: innovations forgive a model that is far
+    off as long as its filter follows the measurements.
+
+    Args:
+        data: runs of one length (`Data`), a sequence of such, or a function of some of the parameters, named as
+            its arguments, that gives these.
+        model: `model(**values)` of the other parameters.
+        free: what is to be found, with ranges; `default` is where the search starts.
+        filter: "ekf", or "kf" for affine models and such as have an operating point.
+        start: values at which to start, where they are not the defaults.
+        starts: how many, or the other starts themselves.
+        seed: of the draws.
+        degrees: of freedom of Student-t innovations, for logs with outliers; infinite for normal ones.
+        simulation_first: see above.
+        progress: called with the number of the start, the log-likelihood and the values, after every rise.
+
+    Returns:
+        `Identification`. After Ctrl-C, the best so far, with `interrupted`.
+
+    Raises:
+        ValueError: for parameters, starts or data that do not fit, or if no start has a likelihood.
+
+    Source: Astrom (1980), "Maximum likelihood and prediction error methods", Automatica 16(5).
+    """
+    begin = time.perf_counter()
+    coordinates = Coordinates(free)
+    objective = Objective(data, model, coordinates, filter=filter, degrees=degrees)
+    first = coordinates.start(dict(start or {}))
+    points = [first, *_others(coordinates, first, starts, seed)]
+    with stop_on_interrupt() as asked:
+        ascents = []
+        for number, point in enumerate(points):
+
+            def tell(at, found, number=number):
+                if progress is not None:
+                    progress(number, found.value, coordinates.named(at))
+
+            ascents.append(_climb_from(objective, point, simulation_first, asked, tell))
+            if asked():
+                break
+        if not any(math.isfinite(one.found.value) for one in ascents):
+            raise ValueError(
+                "a start must be one at which the filter stays finite on all runs, but it does so at none of "
+                f"{shown([coordinates.named(point) for point in points[: len(ascents)]])}"
+            )
+        optima = tuple(
+            Optimum(
+                coordinates.named(point), coordinates.named(one.at), one.found.value, one.iterations, one.converged
+            )
+            for point, one in zip(points, ascents, strict=False)
+        )
+        best = max(ascents, key=lambda one: one.found.value if math.isfinite(one.found.value) else -math.inf)
+        return identification_of(
+            objective, first, best, optima, interrupted=asked(), seconds=time.perf_counter() - begin
+        )
+
+
+def _climb_from(objective: Objective, point, simulation_first: bool, stop, tell) -> Ascent:
+    bounds = objective.coordinates.low, objective.coordinates.high
+    if simulation_first:
+        simulation = objective.with_changes(simulation=True)
+        nearest = climb(simulation, point, *bounds, stop=stop, iterations=15)
+        objective.evaluations += simulation.evaluations
+        if objective.value(nearest.at) > objective.value(point):
+            point = nearest.at
+    return climb(objective, point, *bounds, stop=stop, progress=tell)
+
+
+def _others(coordinates: Coordinates, first: np.ndarray, starts, seed: int) -> list[np.ndarray]:
+    """The starts after the first: given, or drawn."""
+    if not isinstance(starts, (int, np.integer)):
+        return [coordinates.start(dict(one)) for one in starts]
+    rng, width = np.random.default_rng(seed), REACH * (coordinates.high - coordinates.low)
+    drawn = [first + width * rng.uniform(-1, 1, len(first)) for _ in range(at_least("starts", starts, 1) - 1)]
+    return [np.clip(point, coordinates.low, coordinates.high) for point in drawn]

@@ -1,0 +1,182 @@
+"""The log-likelihood of logs as a function of a model's free parameters, with its slopes."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.registry import make_filter
+from filters.sensitivity import ModelSlopes, sensitivity
+from numerics.checks import one_of, shown
+from plants.state_space import StateSpaceModel
+from tuning.identification.coordinates import Coordinates
+from tuning.likelihood.gradient import DIFFERENTIABLE
+from tuning.problems.data import Data
+
+STEP = 1e-4  # of differences of the model's numbers, in coordinates
+LARGE_STEP = 1e-2  # of differences of the likelihood itself
+BLOCKS = 20  # parts of all runs together, at least, whose scores tell the scatter
+
+
+class Evaluation(NamedTuple):
+    """Log-likelihood and slopes in coordinates at one point."""
+
+    value: float  # of all runs
+    gradient: np.ndarray  # (p,)
+    information: np.ndarray  # (p, p), Fisher's; differences of the gradient for parameters without sensitivities
+    scores: np.ndarray  # (runs or blocks of them, p), gradients of parts that are nearly independent
+    run_values: np.ndarray  # (runs,)
+
+
+class Objective:
+    """Log-likelihood of a filter's innovations over logs, as a function of coordinates (p,) of free parameters.
+
+    Args:
+        data: runs of one length (`Data`), a sequence of such, or a function of some free parameters, named as its
+            arguments, that gives these: a clock offset moves the data.
+        model: `model(**values)`, the model for values of the parameters; others than those of `data`.
+        coordinates: of the parameters.
+        filter: "ekf" or "kf".
+        degrees: of freedom of Student-t innovations; infinite for normal ones.
+        simulation: whether Q is put to zero: the filter then simulates, and -log L is a sum of squares.
+
+    Raises:
+        ValueError: where models or data do not fit.
+    """
+
+    def __init__(
+        self,
+        data: Data | Sequence[Data] | Callable,
+        model: Callable[..., StateSpaceModel],
+        coordinates: Coordinates,
+        *,
+        filter: str = "ekf",
+        degrees: float = math.inf,
+        simulation: bool = False,
+    ):
+        """Find out which parameters move the model's numbers alone."""
+        self.filter = one_of("filter", filter, DIFFERENTIABLE)
+        self.coordinates, self._model, self.degrees, self.simulation = coordinates, model, degrees, simulation
+        self._data, self.evaluations = data, 0
+        self._of_data = _arguments_among(data, coordinates.names) if callable(data) else ()
+        self.rough: tuple[int, ...] = ()  # places of parameters that have no sensitivities
+        at = coordinates.start()
+        pairs = [self._pair(at, j) for j in range(len(at))]
+        same = [_same_functions(*pair) for pair in pairs]
+        self.rough = tuple(j for j, name in enumerate(coordinates.names) if name in self._of_data or not same[j])
+        self._smooth = [j for j in range(len(at)) if j not in self.rough]
+        runs = self.data_at(at)
+        for run in runs:
+            _check_run(run, self.model_at(at))
+        count = sum(len(run.measurements) for run in runs)
+        self.blocks = 1 if count >= BLOCKS else -(-BLOCKS // count)
+
+    def with_changes(self, **changes) -> Objective:
+        """The same with other data, filter, degrees or simulation."""
+        kept = {"filter": self.filter, "degrees": self.degrees, "simulation": self.simulation}
+        data = changes.pop("data", self._data)
+        return Objective(data, self._model, self.coordinates, **{**kept, **changes})
+
+    def model_at(self, at: np.ndarray) -> StateSpaceModel:
+        """The model at coordinates, as the filter runs on it."""
+        values = {n: v for n, v in self.coordinates.named(at).items() if n not in self._of_data}
+        model = make_filter(self.filter, self._model(**values)).kernel_model
+        if self.simulation:
+            model = model.replace(process_noise_cov=np.zeros((model.n, model.n)))
+        return model
+
+    def data_at(self, at: np.ndarray) -> list[Data]:
+        """The runs at coordinates, those of one length together."""
+        data = self._data
+        if callable(data):
+            named = self.coordinates.named(at)
+            data = data(**{name: named[name] for name in self._of_data})
+        return [data] if isinstance(data, Data) else list(data)
+
+    def value(self, at: np.ndarray) -> float:
+        """Log-likelihood of all runs; minus infinity where it has none."""
+        value = float(self._smooth_part(at, ()).value)
+        return value if math.isfinite(value) else -math.inf
+
+    def __call__(self, at: np.ndarray) -> Evaluation:
+        """Value and slopes at coordinates."""
+        here = self._smooth_part(at, self._smooth)
+        if not self.rough:
+            return here
+        p, smooth = len(at), self._smooth
+        gradient, information = np.zeros(p), np.zeros((p, p))
+        scores = np.zeros((len(here.scores), p))
+        gradient[smooth], scores[:, smooth] = here.gradient, here.scores
+        information[np.ix_(smooth, smooth)] = here.information
+        for j in self.rough:
+            sides = [self._smooth_part(at + s * LARGE_STEP * np.eye(p)[j], smooth) for s in (1.0, -1.0)]
+            above, below = sides
+            gradient[j] = (above.value - below.value) / (2 * LARGE_STEP)
+            of_runs = (above.run_values - below.run_values) / (2 * LARGE_STEP)
+            scores[:, j] = np.repeat(of_runs / self.blocks, self.blocks)
+            row = (below.gradient - above.gradient) / (2 * LARGE_STEP)
+            information[j, smooth] = information[smooth, j] = row
+            curvature = (2 * here.value - above.value - below.value) / LARGE_STEP**2
+            information[j, j] = max(curvature, 1e-3 * abs(curvature), 1e-6)
+        return here._replace(gradient=gradient, information=information, scores=scores)
+
+    def _smooth_part(self, at: np.ndarray, places: Sequence[int]) -> Evaluation:
+        self.evaluations += 1
+        model, slopes = self.model_at(at), self._slopes(at, places)
+        found = [
+            sensitivity(model, run.inputs, run.measurements, slopes, degrees=self.degrees, blocks=self.blocks)
+            for run in self.data_at(at)
+        ]
+        values = np.concatenate([one.values for one in found])
+        scores = np.concatenate([np.concatenate(one.block_gradients) for one in found])
+        information = np.sum([one.information.sum(axis=0) for one in found], axis=0)
+        return Evaluation(float(values.sum()), scores.sum(axis=0), information, scores, values)
+
+    def _slopes(self, at: np.ndarray, places: Sequence[int]) -> ModelSlopes:
+        pairs = [self._pair(at, j) for j in places]
+        if not pairs:
+            model = self.model_at(at)
+            return ModelSlopes(*(np.zeros((0, *np.shape(getattr(model, name)))) for name in ModelSlopes._fields))
+        return ModelSlopes(
+            *(
+                np.array([np.subtract(getattr(a, name), getattr(b, name)) / (2 * STEP) for a, b in pairs])
+                for name in ModelSlopes._fields
+            )
+        )
+
+    def _pair(self, at: np.ndarray, place: int) -> list[StateSpaceModel]:
+        """Models a step above and below; at an end of the range a step within."""
+        middle, step = np.array(at, dtype=np.float64), STEP * np.eye(len(at))[place]
+        low, high = self.coordinates.low[place] + STEP, self.coordinates.high[place] - STEP
+        middle[place] = np.clip(middle[place], low, high)
+        return [self.model_at(middle + step), self.model_at(middle - step)]
+
+
+def _arguments_among(function: Callable, names: Sequence[str]) -> tuple[str, ...]:
+    """The arguments of a function that are free parameters."""
+    arguments = set(inspect.signature(function).parameters)
+    if isinstance(function, partial):
+        arguments -= set(function.keywords)
+    return tuple(name for name in names if name in arguments)
+
+
+def _same_functions(one: StateSpaceModel, other: StateSpaceModel) -> bool:
+    return (one.functions, one.shape, one.substeps) == (other.functions, other.shape, other.substeps)
+
+
+def _check_run(run: Data, model: StateSpaceModel) -> None:
+    """Raise ValueError unless a run has the model's inputs and measurements, and some that is no gap."""
+    sizes = run.inputs.shape[-1], run.measurements.shape[-1]
+    if sizes != (model.inputs, model.m):
+        raise ValueError(
+            f"data must have the model's {model.inputs} inputs and {model.m} measurements, but got {shown(sizes)}"
+        )
+    empty = np.isnan(run.measurements).all(axis=(0, 1))
+    if empty.any():
+        missing = ", ".join(one.symbol for one, none in zip(model.measurements, empty, strict=True) if none)
+        raise ValueError(f"data must have measurements of each channel, but have none of {missing}")

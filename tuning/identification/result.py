@@ -1,0 +1,176 @@
+"""What was identified: values, how sure they are, and what the data do not determine."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tuning.identification.ascent import Ascent
+from tuning.identification.objective import Objective
+from tuning.likelihood.identifiability import COMPANION, TWO_SIDED
+
+WIDEST = 0.5  # of its range, that a 95 % interval of a determined parameter may take
+TRADED = 0.95  # correlation from which on two parameters are said to trade off
+EQUAL = 0.1  # optima whose parameters are within so many standard errors, or so little of the likelihood, are one
+EQUAL_VALUES = 0.01
+FLAT = 1e-10  # of a range^-2: curvature below which there is none
+
+
+class Optimum(NamedTuple):
+    """Where one start led."""
+
+    start: dict[str, float]
+    values: dict[str, float]
+    log_likelihood: float
+    iterations: int
+    converged: bool
+
+
+class Identification(NamedTuple):
+    """The most likely values of p free parameters; covariances are in `objective.coordinates`."""
+
+    names: tuple[str, ...]
+    values: dict[str, float]
+    start: dict[str, float]
+    standard_errors: dict[str, float]  # of the values
+    cov: np.ndarray  # (p, p)
+    at: np.ndarray  # (p,), coordinates
+    at_end: dict[str, bool]  # whether a value is at an end of its range
+    determined: dict[str, bool]  # 95 % interval below half the range, and not at its end
+    log_likelihood: float
+    start_log_likelihood: float
+    optima: tuple[Optimum, ...]  # one a start
+    objective: Objective
+    interrupted: bool
+    seconds: float
+
+    @property
+    def correlations(self) -> np.ndarray:
+        """Of the estimates, (p, p)."""
+        scale = np.sqrt(np.diag(self.cov))
+        return self.cov / np.outer(scale, scale)
+
+    @property
+    def agreement(self) -> int:
+        """How many starts led to the best maximum: within 0.01 in log L, or 0.1 standard errors everywhere."""
+        coordinates = self.objective.coordinates
+        scale, near = np.sqrt(np.diag(self.cov)), 0
+        for one in self.optima:
+            apart = np.abs(coordinates.of(list(one.values.values())) - self.at)
+            close = self.log_likelihood - one.log_likelihood < EQUAL_VALUES
+            near += bool(close or (apart < EQUAL * scale).all())
+        return near
+
+    @property
+    def evaluations(self) -> int:
+        """Of likelihood and slopes, all starts together."""
+        return self.objective.evaluations
+
+    @property
+    def traded(self) -> list[tuple[str, str, float]]:
+        """Pairs of parameters that trade off, and their correlation."""
+        found = self.correlations
+        pairs = [(i, j) for i in range(len(found)) for j in range(i) if abs(found[i, j]) >= TRADED]
+        return [(self.names[j], self.names[i], float(found[i, j])) for i, j in pairs]
+
+    @property
+    def loosest(self) -> dict[str, float]:
+        """The direction that is known least: standard errors of its parameters, in ranges, with signs.
+
+        Parameters with less than a fifth of the largest part are left out.
+        """
+        width = self.objective.coordinates.high - self.objective.coordinates.low
+        variances, axes = np.linalg.eigh(self.cov / np.outer(width, width))
+        axis = axes[:, -1] * np.sign(axes[np.argmax(np.abs(axes[:, -1])), -1]) * np.sqrt(variances[-1])
+        order = [i for i in np.argsort(-np.abs(axis)) if abs(axis[i]) >= COMPANION * np.abs(axis).max()]
+        return {self.names[i]: float(axis[i]) for i in order}
+
+    def sentences(self) -> list[str]:
+        """What the data determine, and what they do not."""
+        said = []
+        ends = [name for name in self.names if self.at_end[name]]
+        wide = [name for name in self.names if not self.determined[name] and not self.at_end[name]]
+        if not ends and not wide:
+            said.append("The data determine every free parameter: no 95 % interval takes half its range.")
+        if wide:
+            said.append(f"The data do not determine {', '.join(wide)}: a 95 % interval takes half its range.")
+        if ends:
+            said.append(f"At an end of the range: {', '.join(ends)}. A wider one may fit better.")
+        for one, other, correlation in self.traded:
+            said.append(f"{one} and {other} trade off (correlation {correlation:.3f}).")
+        if len(self.loosest) > 1 and wide:
+            parts = ", ".join(f"{name} {part:+.2g}" for name, part in self.loosest.items())
+            said.append(f"Known least is the direction of (in ranges) {parts}.")
+        if len(self.optima) > 1:
+            said.append(f"{self.agreement} of {len(self.optima)} starts led to this maximum.")
+        if self.interrupted:
+            said.append("Interrupted: the best so far.")
+        return said
+
+
+def identification_of(
+    objective: Objective,
+    first: np.ndarray,
+    best: Ascent,
+    optima: tuple[Optimum, ...],
+    *,
+    interrupted: bool,
+    seconds: float,
+) -> Identification:
+    """Errors and judgements at the best maximum."""
+    coordinates, at = objective.coordinates, best.at
+    width = coordinates.high - coordinates.low
+    cov = covariance(best.found.information, best.found.scores, width)
+    errors = np.sqrt(np.diag(cov))
+    ends = (at <= coordinates.low + 1e-6 * width) | (at >= coordinates.high - 1e-6 * width)
+    narrow = 2 * TWO_SIDED * errors < WIDEST * width
+    names = coordinates.names
+
+    def by_name(values) -> dict:
+        return dict(zip(names, np.asarray(values).tolist(), strict=True))
+
+    return Identification(
+        names=names,
+        values=coordinates.named(at),
+        start=coordinates.named(first),
+        standard_errors=by_name(errors * np.abs(coordinates.slopes(at))),
+        cov=cov,
+        at=at,
+        at_end=by_name(ends),
+        determined=by_name(narrow & ~ends),
+        log_likelihood=best.found.value,
+        start_log_likelihood=objective.value(first),
+        optima=optima,
+        objective=objective,
+        interrupted=interrupted,
+        seconds=seconds,
+    )
+
+
+def covariance(information: np.ndarray, scores: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Covariance of estimates (p, p): J^-1 (sum_b g_b g_b') J^-1, or J^-1 in directions where that is larger.
+
+    J is Fisher's information, g_b the scores of B nearly independent runs, or of blocks where there are few. The
+    first holds for a wrong model, too; the second where scatter says too little. A direction of which the data say
+    nothing has a variance of a range and more.
+
+    Args:
+        information: J, (p, p).
+        scores: (B, p).
+        width: of the parameters' ranges, (p,), in the same coordinates.
+
+    Source: Huber (1967), "The behavior of maximum likelihood estimates under nonstandard conditions".
+    """
+    scale = np.outer(width, width)
+    values, axes = np.linalg.eigh(information * scale)
+    values = np.maximum(values, 1.0 / 12.0)  # what is known before: the variance of a uniform density is a twelfth
+    along = scores * width @ axes / values
+    along -= along.mean(axis=0)
+    count = len(along)
+    scatter = along.T @ along * (count / max(count - 1, 1))
+    roots = 1.0 / np.sqrt(values)
+    # In units of J's own errors: the larger of the two in each principal direction of the scatter.
+    ratios, turns = np.linalg.eigh(scatter / np.outer(roots, roots))
+    wide = turns * np.maximum(ratios, 1.0) @ turns.T * np.outer(roots, roots)
+    return axes @ wide @ axes.T * scale
