@@ -43,6 +43,7 @@ class Objective:
         coordinates: of the parameters.
         filter: "ekf" or "kf".
         degrees: of freedom of Student-t innovations; infinite for normal ones.
+        predicted: symbols of channels that the filter predicts, but does not see.
         simulation: whether Q is put to zero: the filter then simulates, and -log L is a sum of squares.
 
     Raises:
@@ -57,12 +58,13 @@ class Objective:
         *,
         filter: str = "ekf",
         degrees: float = math.inf,
+        predicted: Sequence[str] = (),
         simulation: bool = False,
     ):
         """Find out which parameters move the model's numbers alone."""
         self.filter = one_of("filter", filter, DIFFERENTIABLE)
         self.coordinates, self._model, self.degrees, self.simulation = coordinates, model, degrees, simulation
-        self._data, self.evaluations = data, 0
+        self._data, self.evaluations, self.predicted = data, 0, tuple(predicted)
         self._of_data = _arguments_among(data, coordinates.names) if callable(data) else ()
         self.rough: tuple[int, ...] = ()  # places of parameters that have no sensitivities
         at = coordinates.start()
@@ -73,12 +75,19 @@ class Objective:
         runs = self.data_at(at)
         for run in runs:
             _check_run(run, self.model_at(at))
+        symbols = [channel.symbol for channel in self.model_at(at).measurements]
+        for symbol in self.predicted:
+            one_of("a predicted channel", symbol, symbols)
+        self._unseen = [symbol in self.predicted for symbol in symbols]
+        if all(self._unseen):
+            raise ValueError(f"a filter must see some channel, but {', '.join(symbols)} are only predicted")
         count = sum(len(run.measurements) for run in runs)
         self.blocks = 1 if count >= BLOCKS else -(-BLOCKS // count)
 
     def with_changes(self, **changes) -> Objective:
         """The same with other data, filter, degrees or simulation."""
-        kept = {"filter": self.filter, "degrees": self.degrees, "simulation": self.simulation}
+        names = "filter", "degrees", "predicted", "simulation"
+        kept = {name: getattr(self, name) for name in names}
         data = changes.pop("data", self._data)
         return Objective(data, self._model, self.coordinates, **{**kept, **changes})
 
@@ -129,7 +138,15 @@ class Objective:
         self.evaluations += 1
         model, slopes = self.model_at(at), self._slopes(at, places)
         found = [
-            sensitivity(model, run.inputs, run.measurements, slopes, degrees=self.degrees, blocks=self.blocks)
+            sensitivity(
+                model,
+                run.inputs,
+                run.measurements,
+                slopes,
+                degrees=self.degrees,
+                blocks=self.blocks,
+                predicted=self._unseen,
+            )
             for run in self.data_at(at)
         ]
         values = np.concatenate([one.values for one in found])
