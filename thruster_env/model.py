@@ -58,7 +58,7 @@ def observe_jacobian(x, c):
 
 
 @makes_functions
-def _channel_functions(names: tuple[str, ...]) -> tuple[Callable, Callable]:
+def channel_functions(names: tuple[str, ...]) -> tuple[Callable, Callable]:
     """`observe` and its Jacobian for some measured quantities."""
     if names == ("thrust",):
         return observe, observe_jacobian
@@ -126,7 +126,7 @@ def model_of_plant(
     operating_voltage = finite("operating_voltage", operating_voltage)
     if plant.linear is not None:
         return _linear_model(plant)
-    of_channels, of_channels_jacobian = _channel_functions(plant.channels)
+    of_channels, of_channels_jacobian = channel_functions(plant.channels)
     return StateSpaceModel(
         transition=transition,
         observe=of_channels,

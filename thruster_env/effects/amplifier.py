@@ -14,12 +14,17 @@ AMPLIFIER_EFFECTS = Registry("amplifier")
 
 
 @inlined
+def outside(voltage, low, high):
+    """A voltage less what of it is within low ... high, a dead band: zero there."""
+    return voltage - min(max(voltage, low), high)
+
+
+@inlined
 def dead_band(memory, b, target, rows, number, numbers, at, begin):
     """Take the half width off the voltage's magnitude, down to zero."""
     width = numbers[at]
     for j in range(memory.shape[2]):
-        voltage = memory[b, target, j]
-        memory[b, target, j] = voltage - min(max(voltage, -width), width)
+        memory[b, target, j] = outside(memory[b, target, j], -width, width)
 
 
 @inlined

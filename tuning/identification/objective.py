@@ -157,7 +157,9 @@ class Objective:
 
 
 def _arguments_among(function: Callable, names: Sequence[str]) -> tuple[str, ...]:
-    """The arguments of a function that are free parameters."""
+    """The arguments of a function that are free parameters; it may list them as its `parameters`."""
+    if hasattr(function, "parameters"):
+        return tuple(name for name in names if name in function.parameters)
     arguments = set(inspect.signature(function).parameters)
     if isinstance(function, partial):
         arguments -= set(function.keywords)
