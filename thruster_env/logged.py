@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numerics.checks import finite, positive, shown
+from numerics.checks import covariance, finite, positive, shown
 from numerics.compiled import inlined
 from numerics.pickling import makes_functions
 from numerics.tuples import matrix_of, tuple_of, written_out
@@ -26,6 +26,7 @@ from thruster_env.effects.amplifier import outside
 from thruster_env.linear.steady_state import steady_state
 from thruster_env.model import channel_functions, model_of_plant, thrust_of
 from thruster_env.plant import Plant, make_plant
+from thruster_env.preset_file import BY_CHANNEL, checked_band, is_file, read_preset
 from thruster_env.quantities import THRUST
 
 _FURTHER = (
@@ -38,6 +39,9 @@ LoggedConstants = NamedTuple("LoggedConstants", [(name, float) for name in (*Con
 """`dynamics.Constants`, and what logs show beside."""
 
 
+NO_BAND = 0.0, 0.0
+
+
 class Shown(NamedTuple):
     """What logs show beside the equations of motion."""
 
@@ -47,20 +51,21 @@ class Shown(NamedTuple):
     lag: tuple[tuple[str, float], ...] = ()  # time constants [s] by channel
 
 
-def shown_of(plant: Plant, dead_band=(0.0, 0.0), bias: Mapping | None = None, lag: Mapping | None = None) -> Shown:
+def shown_of(plant: Plant, dead_band=None, bias: Mapping | None = None, lag: Mapping | None = None) -> Shown:
     """Check what logs show of a plant; ValueError states the rule and the value.
 
     Args:
         plant: whose channels these are.
-        dead_band: (low, high) [V], or its half width.
+        dead_band: (low, high) [V], or its half width; the plant's own if None.
         bias: by channel, in its unit.
         lag: time constants by channel [s]; zero for none.
     """
+    if dead_band is None:
+        dead_band = plant.dead_band
     if not isinstance(dead_band, (tuple, list)):
-        dead_band = -positive("dead_band", dead_band, zero_allowed=True), dead_band
-    low, high = (finite("dead_band", end) for end in dead_band)
-    if not low <= 0.0 <= high:
-        raise ValueError(f"dead_band must be from low <= 0 to high >= 0, but got {shown(tuple(dead_band))}")
+        half = positive("dead_band", dead_band, zero_allowed=True)
+        dead_band = -half, half
+    low, high = checked_band(dead_band)
     unknown = [name for name in (*(bias or {}), *(lag or {})) if name not in plant.channels]
     if unknown:
         known = ", ".join(plant.channels)
@@ -72,7 +77,7 @@ def shown_of(plant: Plant, dead_band=(0.0, 0.0), bias: Mapping | None = None, la
 
 def logged_model(
     *,
-    dead_band=(0.0, 0.0),
+    dead_band=None,
     bias: Mapping[str, float] | None = None,
     lag: Mapping[str, float] | None = None,
     operating_voltage: float | None = None,
@@ -81,7 +86,8 @@ def logged_model(
 ) -> StateSpaceModel:
     """`thruster_model` with a dead band, biases and lags.
 
-    A sensor that lags has a state behind the two of the thruster: what it would show without bias and noise.
+    A sensor that lags has a state behind the two of the thruster: what it would show without bias and noise. Of a
+    preset file the recorder is taken, too: bias, lag, ambient flow, Q and R, as far as no arguments say otherwise.
 
     Args:
         dead_band: voltages (low, high) within which the motor has none [V], or half of a symmetric band.
@@ -94,9 +100,31 @@ def logged_model(
     Raises:
         ValueError: states the rule and the value.
     """
-    plant = make_plant(**plant_arguments)
-    base = model_of_plant(plant, operating_voltage=operating_voltage, prior_cov_factor=prior_cov_factor)
-    return with_shown(base, plant, shown_of(plant, dead_band, bias, lag))
+    plant, seen = logged_plant(dead_band=dead_band, bias=bias, lag=lag, **plant_arguments)
+    base = model_of_plant(
+        plant._replace(dead_band=NO_BAND), operating_voltage=operating_voltage, prior_cov_factor=prior_cov_factor
+    )
+    return with_shown(base, plant, seen)
+
+
+def logged_plant(*, dead_band=None, bias=None, lag=None, **plant_arguments) -> tuple[Plant, Shown]:
+    """A plant, and what logs show beside, as `logged_model` takes both."""
+    preset = plant_arguments.get("preset")
+    recorder = read_preset(preset).recorder if is_file(preset) else {}
+    own = {name: value for name, value in recorder.items() if name not in BY_CHANNEL}
+    if plant_arguments.get("dt", own.get("dt")) != own.get("dt"):  # of which Q is
+        own.pop("process_noise_cov", None)
+    plant = make_plant(**{**own, **plant_arguments})
+    variances = [recorder.get("measurement_noise_cov", {}).get(channel) for channel in plant.channels]
+    if None not in variances and plant_arguments.get("measurement_noise_cov") is None:
+        cov = covariance("measurement_noise_cov", variances, len(variances), positive_definite=True)
+        plant = plant._replace(measurement_noise_cov=cov)
+    known = [
+        {channel: value for channel, value in recorder.get(name, {}).items() if channel in plant.channels}
+        for name in ("bias", "lag")
+    ]
+    bias, lag = (of_file if given is None else given for of_file, given in zip(known, (bias, lag), strict=True))
+    return plant, shown_of(plant, dead_band, bias, lag)
 
 
 def with_shown(base: StateSpaceModel, plant: Plant, seen: Shown, *, always: bool = False) -> StateSpaceModel:

@@ -127,7 +127,7 @@ def model_of_plant(
     if plant.linear is not None:
         return _linear_model(plant)
     of_channels, of_channels_jacobian = channel_functions(plant.channels)
-    return StateSpaceModel(
+    model = StateSpaceModel(
         transition=transition,
         observe=of_channels,
         transition_jacobian=transition_jacobian,
@@ -145,6 +145,11 @@ def model_of_plant(
         **_quantities(plant),
         **_operating_range(plant),
     )
+    if plant.dead_band == (0.0, 0.0):
+        return model
+    from thruster_env.logged import Shown, with_shown
+
+    return with_shown(model, plant, Shown(*plant.dead_band))
 
 
 def thrust_of(x, c):

@@ -10,7 +10,7 @@ import numpy as np
 from numerics.checks import shown
 from plants.logs.log import Log, at_offset
 from plants.state_space import StateSpaceModel
-from thruster_env.logged import Shown, with_shown
+from thruster_env.logged import NO_BAND, Shown, with_shown
 from thruster_env.model import model_of_plant
 from thruster_env.parameters import ThrusterParameters, checked
 from thruster_env.plant import Plant
@@ -76,7 +76,8 @@ class ThrusterFamily:
             raise ValueError("dead_band must not be free beside dead_band_low or dead_band_high")
         self.free = tuple(known[name] for name in dict.fromkeys(names))
         self._lagging = tuple(channel for channel in plant.channels if f"lag_{channel}" in names)
-        self._base = with_shown(model_of_plant(plant), plant, self._shown({}), always=True)
+        base = model_of_plant(plant._replace(dead_band=NO_BAND))
+        self._base = with_shown(base, plant, self._shown({}), always=True)
 
     @property
     def noise_names(self) -> tuple[str, ...]:
