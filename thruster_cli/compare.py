@@ -18,7 +18,8 @@ from filters.registry import FILTERS, filter_class
 from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least
 from thruster_cli.leaderboard import as_json, report
-from thruster_cli.output import PROBLEMS, JsonOption, SeedOption, announce_compilation, emit, progress_console
+from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
+from thruster_cli.problems import PROBLEMS
 from tuning.evaluation.compare import Contender, compare, contender, sized
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.find import find_problem

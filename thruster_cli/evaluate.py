@@ -9,15 +9,16 @@ import typer
 
 from thruster_cli.consistency import check_covariance, check_request
 from thruster_cli.error_tables import comparison_table
+from thruster_cli.log_problems import LogModelOption, problems_in
 from thruster_cli.output import (
     FILTER_HELP,
-    PROBLEMS,
     JsonOption,
     SeedOption,
     announce_compilation,
     emit,
     progress_console,
 )
+from thruster_cli.problems import PROBLEMS
 from thruster_cli.tables import choice_table
 from thruster_cli.tuning_report import gains
 from tuning.evaluation.baselines import RULE, TUNED, baselines, rule_of_thumb
@@ -45,6 +46,7 @@ def command(
             help="Also say whether the filter's covariance is consistent, and draw that: a .png file.",
         ),
     ] = None,
+    model: LogModelOption = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
@@ -62,7 +64,7 @@ def command(
         raise ValueError("give either --tuned FILE or --filter NAME")
     if tuned is not None:
         if scenario is None:
-            choice, chosen, _ = read_tuned(tuned)
+            choice, chosen, _ = read_tuned(tuned, problems_in(tuned, model))
         else:
             chosen = find_problem(scenario)
             choice = read_choice(tuned, chosen)
@@ -84,7 +86,7 @@ def command(
         "scenario": chosen.name,
         **said,
     }
-    where = f"held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
+    where = f"held-out {chosen.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
     shown = [choice_table(choices, chosen), comparison_table(evaluations, proof.bound, where)]
     if tuned is None and not proof.tuned.has_truth:
         shown.append(without_truth(chosen.name))

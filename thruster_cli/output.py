@@ -19,7 +19,6 @@ from numerics.compiled import tell_when_compiling
 from numerics.files import write_whole
 from thruster_cli.characters import showable
 from thruster_env.parameters import PRESETS
-from tuning.problems.rooms import built_in
 
 JsonOption = Annotated[
     str | None,
@@ -29,10 +28,6 @@ PresetOption = Annotated[str, typer.Option("--preset", help=f"{', '.join(PRESETS
 SeedOption = Annotated[
     int, typer.Option("--seed", min=0, help="Seed of all randomness; the same seed repeats all.")
 ]
-PROBLEMS = (
-    f"{', '.join(built_in())}, a .toml file, or module:object: a tuning.problems.problem.Problem, or a function "
-    "that gives one."
-)
 CodeOption = Annotated[
     list[str] | None,
     typer.Option(

@@ -7,10 +7,12 @@ from typing import Annotated
 
 import typer
 
+from thruster_cli.log_problems import LogModelOption, problems_in
 from thruster_cli.output import CodeOption, JsonOption, announce_compilation, emit, progress_console
 from thruster_cli.tune import DEFAULT_STORAGE
 from tuning.problems.find import find_problem
 from tuning.report.report import write_report
+from tuning.report.subject import is_file
 from tuning.search.study import quiet_optuna
 
 
@@ -23,6 +25,7 @@ def command(
         Path | None, typer.Option(metavar="FOLDER", help="Where to write; by default beside the tuned file.")
     ] = None,
     problem: CodeOption = None,
+    model: LogModelOption = None,
     json: JsonOption = None,
 ) -> None:
     """Write a page on a tuned filter that any browser shows without a network, and its tables as Markdown.
@@ -34,7 +37,8 @@ def command(
     """
     quiet_optuna()
     announce_compilation()
+    given = [*map(find_problem, problem or []), *(problems_in(Path(source), model) if is_file(source) else [])]
     with progress_console.status(f"reporting on {source} ..."):
-        report = write_report(source, storage, out, [find_problem(name) for name in problem or []])
+        report = write_report(source, storage, out, given)
     data = {"advice": report.advice, "page": str(report.page), "tables": str(report.tables)}
     emit([report.advice, f"Page: {report.page}", f"Tables: {report.tables}"], data, json)

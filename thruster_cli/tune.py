@@ -14,21 +14,29 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from numerics.checks import at_least, one_of
 from numerics.files import check_target
+from thruster_cli.log_problems import BlocksOption, HeldOutOption, LogOption, problems_of
+from thruster_cli.logs import (
+    ClockOption,
+    ColumnOption,
+    DtOption,
+    LogPresetOption,
+    ModelOption,
+    SensorOption,
+)
 from thruster_cli.output import (
     FILTER_HELP,
-    PROBLEMS,
     JsonOption,
     SeedOption,
     announce_compilation,
     emit,
     progress_console,
 )
+from thruster_cli.problems import PROBLEMS
 from thruster_cli.tuning_report import Tuning, as_json, report
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import check_keepable, write_tuned
 from tuning.likelihood.gradient import DIFFERENTIABLE, maximise_likelihood
 from tuning.likelihood.identifiability import identify
-from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
 from tuning.search.filter_types import kinds_running
 from tuning.search.objectives import OBJECTIVES
@@ -82,6 +90,15 @@ def command(
     storage: Annotated[
         str, typer.Option(help="Journal file for one host; for several, a database as docs/workers.md tells.")
     ] = DEFAULT_STORAGE,
+    log: LogOption = None,
+    held_out: HeldOutOption = None,
+    blocks: BlocksOption = None,
+    preset: LogPresetOption = None,
+    model: ModelOption = None,
+    sensor: SensorOption = None,
+    column: ColumnOption = None,
+    clock_offset: ClockOption = None,
+    dt: DtOption = None,
     study: Annotated[str | None, typer.Option(help="Name of the study; by default from the above.")] = None,
     out: Annotated[Path | None, typer.Option(help="Tuned file; out/STUDY.json by default.")] = None,
     seed: SeedOption = 0,
@@ -99,14 +116,21 @@ def command(
     unless --no-consistency is given, and the report says what that costs. Where no trial is in the band, the one
     with the least error is written, the report and the file say so, and the exit code is 3.
 
+    With --log it learns from recorded runs instead, cut into blocks of which every third proves the choice. What
+    is made small is the negative log-likelihood of the innovations, unless the logs hold the true states.
+
     Example: thruster tune --filter ekf --scenario mismatch --scenario outliers --trials 100
+
+    Example: thruster tune --filter ekf --log run1.csv --log run2.csv --trials 100
 
     Example: thruster tune --filter auto --budget 2 --scenario published_noise --trials 100
     """
     one_of("method", method, METHODS)
     check_keepable(filter_name)
-    scenarios = tuple(find_problem(name) for name in scenario or ["mismatch"])
-    objectives = tuple(objective or ["score"])
+    of_logs = {"preset": preset, "model": model, "sensors": sensor, "columns": column}
+    of_logs |= {"clock_offset": clock_offset, "dt": dt, "held_out": held_out, "blocks": blocks}
+    scenarios = problems_of(scenario, log, of_logs, "mismatch")
+    objectives = tuple(objective or ["score" if scenarios[0].scale is not None else "likelihood"])
     plan = Plan(
         filter_name,
         scenarios,

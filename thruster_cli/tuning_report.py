@@ -60,7 +60,8 @@ def report(tuning: Tuning) -> list:
         found = {TUNED: result.choice, **baselines(result.choice.name, scenario, plan.seed)}
         evaluations = proof.evaluations
         choices = {name: found[name] for name in evaluations}
-        where = f"held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {scenario.name}"
+        span_of_seeds = f"{scenario.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}"
+        where = f"held-out {span_of_seeds}, scenario {scenario.name}"
         shown += [choice_table(choices, scenario), comparison_table(evaluations, proof.bound, where)]
         shown += gains(proof)
         shown.append(_consistency_sentence(proof.tuned))

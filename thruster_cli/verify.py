@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from thruster_cli.log_problems import LogModelOption, problems_in
 from thruster_cli.output import CodeOption, JsonOption, announce_compilation, emit, progress_console, table
 from tuning.evaluation.verify import TOLERANCE, Verification, verify
 from tuning.problems.find import find_problem
@@ -18,6 +19,7 @@ LISTED = 10  # differences in the table; --json has all
 def command(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Tuned file, as `thruster tune` writes it.")],
     problem: CodeOption = None,
+    model: LogModelOption = None,
     json: JsonOption = None,
 ) -> None:
     """Compute the held-out metrics of a tuned file once more, on its seeds, and say whether they hold.
@@ -29,7 +31,7 @@ def command(
     """
     announce_compilation()
     with progress_console.status(f"computing the metrics of {file} once more ..."):
-        found = verify(file, [find_problem(name) for name in problem or []])
+        found = verify(file, [*map(find_problem, problem or []), *problems_in(file, model)])
     emit(_shown(file, found), _as_json(file, found), json)
     if not found.holds:
         sys.exit(1)

@@ -58,7 +58,7 @@ def observe_jacobian(x, c):
 
 
 @makes_functions
-def _channel_functions(names: tuple[str, ...]) -> tuple[Callable, Callable]:
+def channel_functions(names: tuple[str, ...]) -> tuple[Callable, Callable]:
     """`observe` and its Jacobian for some measured quantities."""
     if names == ("thrust",):
         return observe, observe_jacobian
@@ -126,8 +126,8 @@ def model_of_plant(
     operating_voltage = finite("operating_voltage", operating_voltage)
     if plant.linear is not None:
         return _linear_model(plant)
-    of_channels, of_channels_jacobian = _channel_functions(plant.channels)
-    return StateSpaceModel(
+    of_channels, of_channels_jacobian = channel_functions(plant.channels)
+    model = StateSpaceModel(
         transition=transition,
         observe=of_channels,
         transition_jacobian=transition_jacobian,
@@ -145,6 +145,11 @@ def model_of_plant(
         **_quantities(plant),
         **_operating_range(plant),
     )
+    if plant.dead_band == (0.0, 0.0):
+        return model
+    from thruster_env.logged import Shown, with_shown
+
+    return with_shown(model, plant, Shown(*plant.dead_band))
 
 
 def thrust_of(x, c):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numerics.checks import between, one_of, positive, within
+from numerics.checks import between, one_of, positive, shown, within
 from thruster_env.dynamics import Constants
 
 LARGEST = 1e12  # of a parameter, and one over it the smallest positive one: floating point overflows far beyond
@@ -178,7 +178,26 @@ PRESETS: dict[str, ThrusterParameters] = {
 
 
 def preset_parameters(preset: str | Mapping | ThrusterParameters) -> ThrusterParameters:
-    """Parameters from a preset's name, a mapping of all fields, or parameters; ValueError otherwise."""
+    """Parameters from a preset's name, a preset FILE.toml, a mapping of all fields, or parameters.
+
+    Raises ValueError for others. See `preset_and_dead_band` for what else a file may say.
+    """
+    return preset_and_dead_band(preset)[0]
+
+
+def preset_and_dead_band(preset) -> tuple[ThrusterParameters, tuple[float, float]]:
+    """Parameters as `preset_parameters`, and the dead band (low, high) [V] that a file or a mapping may have."""
+    from thruster_env.preset_file import checked_band, is_file, read_preset
+
+    if is_file(preset):
+        return read_preset(preset)[:2]
+    if isinstance(preset, Mapping) and "dead_band" in preset:
+        rest = {name: value for name, value in preset.items() if name != "dead_band"}
+        return _parameters(rest), checked_band(preset["dead_band"])
+    return _parameters(preset), (0.0, 0.0)
+
+
+def _parameters(preset: str | Mapping | ThrusterParameters) -> ThrusterParameters:
     if isinstance(preset, ThrusterParameters):
         return checked(preset)
     if isinstance(preset, Mapping):
@@ -187,7 +206,10 @@ def preset_parameters(preset: str | Mapping | ThrusterParameters) -> ThrusterPar
         except TypeError as error:
             names = ", ".join(ThrusterParameters._fields)
             raise ValueError(f"a preset mapping must have the fields {names}: {error}") from None
-    return PRESETS[one_of("preset", preset, tuple(PRESETS))]
+    if not isinstance(preset, str) or preset not in PRESETS:
+        names = ", ".join(PRESETS)
+        raise ValueError(f"preset must be one of {names}, or a file that ends in .toml, but got {shown(preset)}")
+    return PRESETS[preset]
 
 
 def derive_constants(p: ThrusterParameters, ambient_velocity: float = 0.0, substep: float = 0.0) -> Constants:

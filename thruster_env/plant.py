@@ -12,12 +12,12 @@ from plants.disturbances.effects import Effect, dropping_channels
 from plants.disturbances.sensors import SENSOR_EFFECTS
 from thruster_env.channels import CHANNELS, MAX_CHANNELS
 from thruster_env.dynamics import Constants
-from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
+from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS, dead_band_of
 from thruster_env.effects.flow import FLOW_SIGNALS
 from thruster_env.effects.uncertainty import LogNormal, Uniform, extreme_parameters, make_uncertainty
 from thruster_env.linear.analysis import LinearModel
 from thruster_env.linear.steady_state import required_substeps, steady_state
-from thruster_env.parameters import ThrusterParameters, derive_constants, preset_parameters
+from thruster_env.parameters import ThrusterParameters, derive_constants, preset_and_dead_band
 
 DEFAULT_DT = 0.01  # [s], the sample time of the published experiments
 DEFAULT_MAX_VOLTAGE = 24.0  # [V]
@@ -50,6 +50,7 @@ class Plant(NamedTuple):
     amplifier: tuple[Effect, ...] = ()
     uncertainty: dict[str, Uniform | LogNormal] = {}
     linear: LinearModel | None = None  # moves the plant in place of the equations of motion
+    dead_band: tuple[float, float] = (0.0, 0.0)  # of a preset file [V], the first of `amplifier`; models have it
 
     @property
     def constants(self) -> Constants:
@@ -84,7 +85,8 @@ def make_plant(
     """Make a plant from plain arguments, the same ones that the env takes.
 
     Args:
-        preset: a preset's name, a mapping of all fields of `ThrusterParameters`, or one of these.
+        preset: a preset's name, a preset FILE.toml, a mapping of all fields of `ThrusterParameters`, or one of
+            these; a file or a mapping may have a dead band, too.
         dt: sample time [s].
         max_voltage: voltages are clipped to plus and minus this [V].
         ambient_velocity: flow U_0 along the thruster's axis [m/s].
@@ -103,7 +105,7 @@ def make_plant(
     Raises:
         ValueError: states the rule and the value.
     """
-    parameters = preset_parameters(preset)
+    parameters, dead_band = preset_and_dead_band(preset)
     dt = between("dt", positive("dt", dt), *SAMPLE_TIMES, "s")
     max_voltage = between("max_voltage", positive("max_voltage", max_voltage), *VOLTAGES, "V")
     ambient_velocity = within("ambient_velocity", ambient_velocity, FASTEST_FLOW)
@@ -134,8 +136,9 @@ def make_plant(
         cov,
         sensors,
         flow,
-        AMPLIFIER_EFFECTS.make(amplifier),
+        (*dead_band_of(*dead_band), *AMPLIFIER_EFFECTS.make(amplifier)),
         uncertainty,
+        dead_band=dead_band,
     )
 
 

@@ -39,7 +39,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     Info gains `estimate` (n,), `estimate_cov` (n, n), `innovation` (m,), `innovation_cov` (m, m) and
     `estimate_divergences`, the restarts from the prior after an estimate that was not finite. The measurement
     is `info["measurement"]` where the env reports it (NaN where `measurement_valid` is false), else the
-    observation. The action is clipped to the action space before the filter sees it. The filter's
+    observation. The action is clipped to the action space before the filter sees it; where an env replays a log
+    and reports `info["recorded_input"]`, that is what the filter sees. The filter's
     randomness comes from the reset seed by a stream of its own; the env's generator is never touched. Where a
     measurement is missing, the observation repeats the last one that was there (0 at first).
 
@@ -118,6 +119,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         """
         u = self._clipped(action)
         observation, reward, terminated, truncated, info = self.env.step(action)
+        if "recorded_input" in info:
+            u = info["recorded_input"].tolist()
         z = info.get("measurement")
         if z is None or "measurement_valid" in info:
             z = _measurement(observation, info)

@@ -92,9 +92,13 @@ class EstimateStates(gym.vector.VectorWrapper):
         ignored = self._done if self.autoreset_mode == AutoresetMode.NEXT_STEP else False
         u = np.clip(checked_actions(actions, self.num_envs, len(self._low), ignored), self._low, self._high)
         observations, rewards, terminated, truncated, info = self.env.step(actions)
+        if "recorded_input" in info:
+            u = np.where(info["_recorded_input"][:, None], info["recorded_input"], u)
         z = self._measurements(observations, info)
         done = terminated | truncated
         if self.autoreset_mode == AutoresetMode.SAME_STEP and done.any():
+            last = info.get("final_info", {})
+            u = np.where(done[:, None], last["recorded_input"], u) if "recorded_input" in last else u
             self._end(u, z, done, info)
             self._start(done, z)
         elif self.autoreset_mode == AutoresetMode.NEXT_STEP and self._done.any():

@@ -14,12 +14,17 @@ AMPLIFIER_EFFECTS = Registry("amplifier")
 
 
 @inlined
+def outside(voltage, low, high):
+    """A voltage less what of it is within low ... high, a dead band: zero there."""
+    return voltage - min(max(voltage, low), high)
+
+
+@inlined
 def dead_band(memory, b, target, rows, number, numbers, at, begin):
-    """Take the half width off the voltage's magnitude, down to zero."""
-    width = numbers[at]
+    """Take off the voltage what of it is within the band."""
+    low, high = numbers[at], numbers[at + 1]
     for j in range(memory.shape[2]):
-        voltage = memory[b, target, j]
-        memory[b, target, j] = voltage - min(max(voltage, -width), width)
+        memory[b, target, j] = outside(memory[b, target, j], low, high)
 
 
 @inlined
@@ -53,14 +58,34 @@ def sag(memory, b, target, rows, number, numbers, at, begin):
 @AMPLIFIER_EFFECTS.register("dead-band")
 @dataclass(frozen=True)
 class DeadBand(Effect):
-    """No voltage within plus and minus `width` [V]; beyond, the voltage less the width."""
+    """No voltage within plus and minus `width` [V]; beyond, the voltage less the width.
+
+    Where the band is another one astern, that is `astern` [V], and `width` is that ahead.
+    """
 
     width: float
+    astern: float | None = None
     act = staticmethod(dead_band)
 
     def __post_init__(self):
-        """Check the argument."""
+        """Check the arguments."""
         set_field(self, "width", positive("width", self.width, zero_allowed=True))
+        if self.astern is not None:
+            set_field(self, "astern", positive("astern", self.astern, zero_allowed=True))
+
+    def parameters(self, context: Context) -> list[float]:
+        """The band's ends [V]."""
+        return [-self.width if self.astern is None else -self.astern, self.width]
+
+    def as_mapping(self) -> dict:
+        """As plain data; without `astern` where the band is symmetric."""
+        found = super().as_mapping()
+        return {name: value for name, value in found.items() if value is not None}
+
+
+def dead_band_of(low: float, high: float) -> tuple[DeadBand, ...]:
+    """The dead band of ends low <= 0 <= high [V] as an effect; none where both are zero."""
+    return () if low == high else (DeadBand(high, -low),)
 
 
 @AMPLIFIER_EFFECTS.register("slew-limit")

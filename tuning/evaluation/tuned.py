@@ -130,6 +130,11 @@ def problem_in(content: Mapping, name, path: str | Path, given: Sequence[Problem
                 f"but here it has the digest {one.digest} ({path})"
             )
     mapping = kept.get("content") if isinstance(kept, Mapping) else kept
+    if isinstance(mapping, Mapping) and "logs" in mapping:
+        raise ValueError(
+            f"a problem of logs must be given, but {path} only names the logs of {name}: the commands evaluate, "
+            "verify and report read them again"
+        )
     if mapping is None:
         return find_given(name, (), path)
     return scenario_of(mapping, name, path)

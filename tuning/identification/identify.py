@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from numerics.checks import at_least, shown
+from plants.logs.log import Log
 from plants.state_space import StateSpaceModel
 from tuning.identification.ascent import Ascent, climb
 from tuning.identification.coordinates import Coordinates
@@ -25,7 +26,7 @@ Progress = Callable[[int, float, dict[str, float]], None]
 
 
 def identify(
-    data: Data | Sequence[Data] | Callable,
+    data: Data | Log | Sequence[Data | Log] | Callable,
     model: Callable[..., StateSpaceModel],
     free: Sequence[Parameter],
     *,
@@ -51,7 +52,7 @@ def identify(
     off as long as its filter follows the measurements.
 
     Args:
-        data: runs of one length (`Data`), a sequence of such, or a function of some of the parameters, named as
+        data: `Data`, a `Log`, a sequence of such, or a function of some of the parameters, named as
             its arguments, that gives these.
         model: `model(**values)` of the other parameters.
         free: what is to be found, with ranges; `default` is where the search starts.

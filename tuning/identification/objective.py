@@ -13,8 +13,10 @@ import numpy as np
 from filters.registry import make_filter
 from filters.sensitivity import ModelSlopes, sensitivity
 from numerics.checks import one_of, shown
+from plants.logs.log import Log
 from plants.state_space import StateSpaceModel
 from tuning.identification.coordinates import Coordinates
+from tuning.identification.runs import runs_of
 from tuning.likelihood.gradient import DIFFERENTIABLE
 from tuning.problems.data import Data
 
@@ -37,7 +39,7 @@ class Objective:
     """Log-likelihood of a filter's innovations over logs, as a function of coordinates (p,) of free parameters.
 
     Args:
-        data: runs of one length (`Data`), a sequence of such, or a function of some free parameters, named as its
+        data: `Data`, a `Log`, a sequence of such, or a function of some free parameters, named as its
             arguments, that gives these: a clock offset moves the data.
         model: `model(**values)`, the model for values of the parameters; others than those of `data`.
         coordinates: of the parameters.
@@ -52,7 +54,7 @@ class Objective:
 
     def __init__(
         self,
-        data: Data | Sequence[Data] | Callable,
+        data: Data | Log | Sequence[Data | Log] | Callable,
         model: Callable[..., StateSpaceModel],
         coordinates: Coordinates,
         *,
@@ -64,7 +66,8 @@ class Objective:
         """Find out which parameters move the model's numbers alone."""
         self.filter = one_of("filter", filter, DIFFERENTIABLE)
         self.coordinates, self._model, self.degrees, self.simulation = coordinates, model, degrees, simulation
-        self._data, self.evaluations, self.predicted = data, 0, tuple(predicted)
+        self._data, self.evaluations = data if callable(data) else runs_of(data), 0
+        self.predicted = tuple(predicted)
         self._of_data = _arguments_among(data, coordinates.names) if callable(data) else ()
         self.rough: tuple[int, ...] = ()  # places of parameters that have no sensitivities
         at = coordinates.start()
@@ -73,15 +76,9 @@ class Objective:
         self.rough = tuple(j for j, name in enumerate(coordinates.names) if name in self._of_data or not same[j])
         self._smooth = [j for j in range(len(at)) if j not in self.rough]
         runs = self.data_at(at)
-        for run in runs:
-            _check_run(run, self.model_at(at))
-        symbols = [channel.symbol for channel in self.model_at(at).measurements]
-        for symbol in self.predicted:
-            one_of("a predicted channel", symbol, symbols)
-        self._unseen = [symbol in self.predicted for symbol in symbols]
-        if all(self._unseen):
-            raise ValueError(f"a filter must see some channel, but {', '.join(symbols)} are only predicted")
-        count = sum(len(run.measurements) for run in runs)
+        _check_runs(runs, self.model_at(at))
+        self._unseen = _checked_channels(self.predicted, self.model_at(at))
+        count = len(runs.measurements)
         self.blocks = 1 if count >= BLOCKS else -(-BLOCKS // count)
 
     def with_changes(self, **changes) -> Objective:
@@ -99,13 +96,12 @@ class Objective:
             model = model.replace(process_noise_cov=np.zeros((model.n, model.n)))
         return model
 
-    def data_at(self, at: np.ndarray) -> list[Data]:
-        """The runs at coordinates, those of one length together."""
-        data = self._data
-        if callable(data):
-            named = self.coordinates.named(at)
-            data = data(**{name: named[name] for name in self._of_data})
-        return [data] if isinstance(data, Data) else list(data)
+    def data_at(self, at: np.ndarray) -> Data:
+        """The runs at coordinates."""
+        if not callable(self._data):
+            return self._data
+        named = self.coordinates.named(at)
+        return runs_of(self._data(**{name: named[name] for name in self._of_data}))
 
     def value(self, at: np.ndarray) -> float:
         """Log-likelihood of all runs; minus infinity where it has none."""
@@ -137,22 +133,19 @@ class Objective:
     def _smooth_part(self, at: np.ndarray, places: Sequence[int]) -> Evaluation:
         self.evaluations += 1
         model, slopes = self.model_at(at), self._slopes(at, places)
-        found = [
-            sensitivity(
-                model,
-                run.inputs,
-                run.measurements,
-                slopes,
-                degrees=self.degrees,
-                blocks=self.blocks,
-                predicted=self._unseen,
-            )
-            for run in self.data_at(at)
-        ]
-        values = np.concatenate([one.values for one in found])
-        scores = np.concatenate([np.concatenate(one.block_gradients) for one in found])
-        information = np.sum([one.information.sum(axis=0) for one in found], axis=0)
-        return Evaluation(float(values.sum()), scores.sum(axis=0), information, scores, values)
+        runs = self.data_at(at)
+        found = sensitivity(
+            model,
+            runs.inputs,
+            runs.measurements,
+            slopes,
+            degrees=self.degrees,
+            blocks=self.blocks,
+            predicted=self._unseen,
+        )
+        scores = np.concatenate(found.block_gradients)
+        information = found.information.sum(axis=0)
+        return Evaluation(float(found.values.sum()), scores.sum(axis=0), information, scores, found.values)
 
     def _slopes(self, at: np.ndarray, places: Sequence[int]) -> ModelSlopes:
         pairs = [self._pair(at, j) for j in places]
@@ -175,7 +168,9 @@ class Objective:
 
 
 def _arguments_among(function: Callable, names: Sequence[str]) -> tuple[str, ...]:
-    """The arguments of a function that are free parameters."""
+    """The arguments of a function that are free parameters; it may list them as its `parameters`."""
+    if hasattr(function, "parameters"):
+        return tuple(name for name in names if name in function.parameters)
     arguments = set(inspect.signature(function).parameters)
     if isinstance(function, partial):
         arguments -= set(function.keywords)
@@ -186,8 +181,8 @@ def _same_functions(one: StateSpaceModel, other: StateSpaceModel) -> bool:
     return (one.functions, one.shape, one.substeps) == (other.functions, other.shape, other.substeps)
 
 
-def _check_run(run: Data, model: StateSpaceModel) -> None:
-    """Raise ValueError unless a run has the model's inputs and measurements, and some that is no gap."""
+def _check_runs(run: Data, model: StateSpaceModel) -> None:
+    """Raise ValueError unless runs have the model's inputs and measurements, and some that is no gap."""
     sizes = run.inputs.shape[-1], run.measurements.shape[-1]
     if sizes != (model.inputs, model.m):
         raise ValueError(
@@ -197,3 +192,14 @@ def _check_run(run: Data, model: StateSpaceModel) -> None:
     if empty.any():
         missing = ", ".join(one.symbol for one, none in zip(model.measurements, empty, strict=True) if none)
         raise ValueError(f"data must have measurements of each channel, but have none of {missing}")
+
+
+def _checked_channels(predicted: Sequence[str], model: StateSpaceModel) -> list[bool]:
+    """Which channels are only predicted; ValueError for one that there is not, or if all are."""
+    symbols = [channel.symbol for channel in model.measurements]
+    for symbol in predicted:
+        one_of("a predicted channel", symbol, symbols)
+    unseen = [symbol in predicted for symbol in symbols]
+    if all(unseen):
+        raise ValueError(f"a filter must see some channel, but {', '.join(symbols)} are only predicted")
+    return unseen

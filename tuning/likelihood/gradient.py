@@ -78,10 +78,16 @@ def maximise_likelihood(
     untuned = untuned_choice(filter_name, problem)
     reference = np.array([one.get(untuned) for one in parameters], dtype=np.float64)
     noise_at = noise_family(untuned, problem, parameters)
+    beginning = data.beginning if problem.leads_in and data.first_scored else None
 
     def slopes(logarithms: np.ndarray) -> Likelihood:
         """Log-likelihood of each run (B,), and its gradients (B, p) in the logarithms."""
-        return likelihood(*noise_at(np.exp(logarithms), data))
+        values = np.exp(logarithms)
+        found = likelihood(*noise_at(values, data))
+        if beginning is None:
+            return found
+        before = likelihood(*noise_at(values, beginning))
+        return Likelihood(found.values - before.values, found.gradients - before.gradients)
 
     def negative(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
         found = slopes(logarithms)

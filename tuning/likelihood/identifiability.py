@@ -82,7 +82,8 @@ def identify(
         for scenario, one in zip(scenarios, data, strict=True):
             filter_ = choice_of(choice.name, moved, scenario).filter(scenario)
             some = estimates_in_parts(filter_, one)
-            parts += [estimates.log_likelihoods.sum(axis=1) for _, estimates in some]
+            first = one.first_scored if scenario.leads_in else 0
+            parts += [estimates.log_likelihoods[:, first:].sum(axis=1) for _, estimates in some]
         found = np.concatenate(parts)
         return np.where(np.isfinite(found), found, LEAST)
 

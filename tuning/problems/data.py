@@ -31,6 +31,13 @@ class Data(NamedTuple):
         """Number K of steps."""
         return self.inputs.shape[1]
 
+    @property
+    def beginning(self) -> Data:
+        """The steps that do not count, without truth."""
+        first = self.first_scored
+        inputs, measurements = self.inputs[:, : max(first - 1, 0)], self.measurements[:, :first]
+        return self._replace(inputs=inputs, measurements=measurements, states=None, outputs=None)
+
     def slice(self, first: int, last: int) -> Data:
         """The runs from `first` up to, but without, `last`."""
         part = slice(first, last)

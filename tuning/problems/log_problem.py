@@ -47,6 +47,8 @@ class LogProblem(AssumedProblem):
         ValueError: states the rule and the value.
     """
 
+    seed_word = "blocks"
+
     def __init__(
         self,
         logs: Log | Sequence[Log],
@@ -118,6 +120,11 @@ class LogProblem(AssumedProblem):
     def counts_start_up(self) -> bool:
         """Whether the first steps count: not where most blocks begin in the middle of a run."""
         return False
+
+    @property
+    def leads_in(self) -> bool:
+        """Whether the first steps are a lead-in: the prior is that of the beginning of a run, not of a block."""
+        return True
 
     def make(self, seeds: tuple[int, ...]) -> Data:
         """Blocks of these numbers."""

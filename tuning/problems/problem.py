@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -31,6 +32,7 @@ class Problem(ABC):
     name: str
     about: str
     scale: Sequence[float] | None
+    seed_word: ClassVar[str] = "seeds"  # what its seeds are called
 
     @property
     @abstractmethod
@@ -88,6 +90,11 @@ class Problem(ABC):
     @property
     def counts_start_up(self) -> bool:
         """Whether the first steps count, in which P_0 is felt: a study then tunes its scale, too."""
+        return False
+
+    @property
+    def leads_in(self) -> bool:
+        """Whether the steps before the first scored one are a lead-in, which counts in no likelihood, either."""
         return False
 
     @property

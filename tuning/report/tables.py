@@ -26,7 +26,8 @@ def errors_table(scenario: Problem, proof: Comparison) -> Table:
     A row is a filter; of more states than fit side by side, and of derived outputs then, a row is a state and a
     column a filter. Without truth the metrics are those of the innovations.
     """
-    where = f"{scenario.name}, held-out seeds {proof.seeds.start} to {proof.seeds.stop - 1}, with 95 % intervals"
+    seeds = f"{scenario.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}"
+    where = f"{scenario.name}, held-out {seeds}, with 95 % intervals"
     if not proof.tuned.has_truth:
         return _innovations_table(proof, where)
     return _errors_across(proof, where) if len(proof.bound) <= MOST_ACROSS else _errors_below(proof, where)

@@ -7,8 +7,10 @@ by its parent, or because its parent is gone.
 
 from __future__ import annotations
 
+import base64
 import json
 import os
+import pickle
 import select
 import subprocess
 import sys
@@ -23,6 +25,7 @@ import optuna
 from numerics.threads import cores
 from tuning.problems.data import Data
 from tuning.problems.find import find_same
+from tuning.problems.log_problem import LogProblem
 from tuning.search.interruption import stop_on_interrupt, without_interrupts
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage, retry_orphans, this_process
@@ -59,6 +62,7 @@ def run_in_workers(
     orders = {"study": study.study_name, "storage": storage, "trials": trials, "workers": workers}
     orders["plan"] = plan._replace(scenarios=names)._asdict()
     orders["digests"] = [scenario.digest for scenario in plan.scenarios]
+    orders["logs"] = {one.name: _packed(one) for one in plan.scenarios if isinstance(one, LogProblem)}
     # Places that no other host has, whichever starts first, so that no two workers propose the same.
     first = zlib.crc32(this_process().encode())
     processes: dict[int, subprocess.Popen] = {}
@@ -77,6 +81,20 @@ def run_in_workers(
             with suppress(BrokenPipeError):
                 process.stdin.close()
         retry_orphans(study)
+
+
+def _packed(problem: LogProblem) -> str:
+    """A problem of logs as text: no name tells how these are read. Only the parent of a worker sends such."""
+    try:
+        return base64.b64encode(pickle.dumps(problem)).decode()
+    except Exception as error:  # functions within functions, say
+        raise ValueError(
+            f"several workers need logs whose model can be pickled, but that of {problem.name} cannot: {error}"
+        ) from None
+
+
+def _unpacked(text: str) -> LogProblem:
+    return pickle.loads(base64.b64decode(text))
 
 
 def _start(orders: dict) -> subprocess.Popen:
@@ -134,7 +152,9 @@ def main() -> None:
     quiet_optuna()
     plan = Plan(**orders["plan"])
     try:
-        scenarios = tuple(map(find_same, plan.scenarios, orders["digests"]))
+        logs = {name: _unpacked(text) for name, text in orders["logs"].items()}
+        pairs = zip(plan.scenarios, orders["digests"], strict=True)
+        scenarios = tuple(logs.get(name) or find_same(name, digest) for name, digest in pairs)
         objectives = tuple(plan.objectives)
         plan = plan._replace(scenarios=scenarios, objectives=objectives)
         study = open_study(orders["study"], plan, open_storage(orders["storage"]), worker=orders["place"])

@@ -1,0 +1,41 @@
+"""An estimate of a log as columns of a file."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from filters.logs.estimate import LogEstimate
+from filters.logs.findings import compared
+from plants.logs.columns import plain
+from plants.logs.units import suffix
+from plants.quantities import Quantity
+
+
+def columns_of(found: LogEstimate) -> dict[str, np.ndarray]:
+    """Columns (K + 1,) by header: time, inputs and measurements, then what the filter says, all by symbol.
+
+    Of a state or output "omega_m" it is "omega_m_rad_per_s" and "omega_m_std_rad_per_s"; of a channel "thrust"
+    "measured_thrust_N", "innovation_thrust_N" and "innovation_std_thrust_N"; of a reference "reference_T_N".
+    """
+    log, model = found.log, found.model
+    columns = {"time_s": log.start + log.times}
+    for one, values in zip(log.input_quantities, log.inputs.T, strict=True):
+        columns[_header("input", one)] = np.append(values, np.nan)
+    for one, values in zip(log.measured, log.measurements.T, strict=True):
+        columns[_header("measured", one)] = values
+    for key in compared(found):
+        columns[_header("reference", log.referred[key])] = log.references[key]
+    for one, mean, std in zip(model.states, found.means.T, found.stds.T, strict=True):
+        columns[_header("", one)], columns[_header("std", one)] = mean, std
+    for symbol, output in model.outputs.items():
+        quantity = output.quantity._replace(symbol=symbol)
+        columns[_header("", quantity)], columns[_header("std", quantity)] = found.output(symbol)
+    deviations = np.sqrt(np.maximum(np.einsum("kii->ki", found.innovation_covs), 0.0))
+    for one, values, std in zip(log.measured, found.innovations.T, deviations.T, strict=True):
+        columns[_header("innovation", one)], columns[_header("innovation_std", one)] = values, std
+    return columns
+
+
+def _header(what: str, quantity: Quantity) -> str:
+    parts = (what, plain(quantity.symbol), suffix(quantity.unit))
+    return "_".join(part for part in parts if part)

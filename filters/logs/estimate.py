@@ -1,0 +1,138 @@
+"""A filter, or a smoother, over a log: estimates, bands and innovations of every row."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.engine.batch import Estimates, run
+from filters.estimators.estimator import Estimator
+from filters.estimators.foreign import ForeignFilter
+from filters.filter import Filter
+from filters.smoothers.smooth import smooth
+from filters.wrappers.arguments import filter_for
+from numerics.checks import at_least
+from numerics.streams import filter_keys
+from plants.logs.log import Log
+from plants.replay import ReplayEnv
+from plants.state_space import StateSpaceModel
+
+SKIPPED = 50  # first rows that do not count, in which a filter settles
+STEP = 1e-4  # of the slopes of outputs, in standard deviations
+
+
+class LogEstimate(NamedTuple):
+    """What a filter makes of a log of K steps; of a smoother, means and covariances are the smoother's."""
+
+    log: Log
+    filter: Filter
+    means: np.ndarray  # (K + 1, n)
+    covs: np.ndarray  # (K + 1, n, n)
+    innovations: np.ndarray  # (K + 1, m), NaN where nothing was measured
+    innovation_covs: np.ndarray  # (K + 1, m, m)
+    log_likelihoods: np.ndarray  # (K + 1,), NaN for filters without a covariance
+    divergences: int  # restarts from the prior
+    smoothed: bool
+
+    @property
+    def model(self) -> StateSpaceModel:
+        """What the filter assumes."""
+        return self.filter.model
+
+    @property
+    def stds(self) -> np.ndarray:
+        """Standard deviations of the states, (K + 1, n); zero for filters without a covariance."""
+        return np.sqrt(np.maximum(np.einsum("kii->ki", self.covs), 0.0))
+
+    def output(self, symbol: str) -> tuple[np.ndarray, np.ndarray]:
+        """An output of the model at the estimates, (K + 1,), and its standard deviation, linearised."""
+        stds, here = self.stds, self.model.output(symbol, self.means)
+        slopes = np.zeros_like(self.means)
+        for i in range(self.means.shape[1]):
+            step = np.zeros_like(self.means)
+            step[:, i] = np.where(stds[:, i] > 0, STEP * stds[:, i], 1.0)
+            ends = [self.model.output(symbol, self.means + sign * step) for sign in (1, -1)]
+            slopes[:, i] = (ends[0] - ends[1]) / (2 * step[:, i])
+        return here, np.sqrt(np.maximum(np.einsum("ki,kij,kj->k", slopes, self.covs, slopes), 0.0))
+
+
+def estimate(
+    log: Log | str | Path,
+    filter: str | Estimator | Callable | None = None,
+    model=None,
+    *,
+    tuned: str | Path | None = None,
+    smoother: bool = False,
+    lag: int | None = None,
+    columns: Mapping[str, str] | None = None,
+    clock_offset: Mapping[str, float] | None = None,
+    dt: float | None = None,
+    model_arguments: Mapping | None = None,
+    seed: int = 0,
+    **numbers,
+) -> LogEstimate:
+    """Run a filter over a log, and a smoother after it if that is asked for.
+
+    The numbers are those of `EstimateState(gym.make("Replay-v0", log=log, model=model), ...)` after
+    `reset(seed=seed)`.
+
+    Args:
+        log: recorded run, or the path of a file.
+        filter: as `EstimateState` takes it; "ekf" if None and no tuned file.
+        model: of the log, as `plants.replay.ReplayEnv` takes it: a model, what makes or offers one, or
+            "module:object".
+        tuned: path of a tuned file; it gives filter, numbers and model arguments.
+        smoother: whether estimates are corrected by later measurements.
+        lag: how many later ones; all if None.
+        columns: headers by quantity, as `plants.logs.read.read_log` takes them.
+        clock_offset: seconds by quantity, likewise.
+        dt: sample time [s], likewise.
+        model_arguments: what the model's maker takes, such as `process_noise_cov`.
+        seed: of the filter's random numbers.
+        **numbers: the filter's own numbers, such as `ensemble_size`.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
+    env = ReplayEnv(log, model, columns=columns, clock_offset=clock_offset, dt=dt)
+    filter_ = filter_for(env, filter, None, None if tuned is None else str(tuned), model_arguments, numbers)
+    return estimate_with(filter_, env.log, smoother=smoother, lag=lag, seed=seed)
+
+
+def estimate_with(
+    filter_: Filter, log: Log, *, smoother: bool = False, lag: int | None = None, seed: int = 0
+) -> LogEstimate:
+    """What a filter that is made already makes of a log; other arguments are those of `estimate`."""
+    if lag is not None and not smoother:
+        raise ValueError(f"a lag must be that of a smoother, but got lag {lag} without one")
+    data = filter_keys([at_least("seed", seed, 0)]), log.inputs[None], log.measurements[None]
+    found = run(filter_, *data) if isinstance(filter_, ForeignFilter) else _stepped(filter_, *data)
+    means, covs = smooth(filter_, *data, lag) if smoother else (found.means, found.covs)
+    likelihoods = found.log_likelihoods[0]
+    return LogEstimate(
+        log,
+        filter_,
+        means[0],
+        covs[0],
+        np.where(np.isnan(log.measurements), np.nan, found.innovations[0]),
+        found.innovation_covs[0],
+        likelihoods if filter_.has_covariance else np.full_like(likelihoods, np.nan),
+        int(found.divergences[0]),
+        smoother,
+    )
+
+
+def _stepped(filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray) -> Estimates:
+    """What `run` gives of one trajectory, by the steps of a wrapper: the same to the last bit."""
+    session, z = filter_.session(), measurements[0]
+    session.start(keys[0], z[0])
+    rows = []
+    for k in range(len(z)):
+        if k:
+            session.step(inputs[0, k - 1].tolist(), z[k])
+        innovation = session.innovation_copy()
+        rows.append((session.mean.copy(), session.cov.copy(), *innovation))
+    return Estimates(*(np.array(part)[None] for part in zip(*rows, strict=True)), np.array([session.divergences]))

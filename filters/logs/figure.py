@@ -1,0 +1,61 @@
+"""A picture of an estimate of a log: states, outputs and innovations over time, each with its 95 % band."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from filters.logs.estimate import LogEstimate
+from filters.logs.findings import compared, estimated
+from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from plants.logs.columns import OUTPUT, STATE
+
+TWO_SIDED = 1.96
+MOST_PANELS = 6  # of states and outputs
+TALL, LOW, WIDTH = 1.5, 1.1, 9.0  # [inch]
+ROOM = 0.6  # for title and legend [inch]
+
+
+def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
+    """Draw estimates beside the reference channels, and the innovations below; return the path.
+
+    References come first; of many states and outputs the first six are drawn.
+    """
+    model, references = found.model, compared(found)
+    values = [f"{STATE}:{one.symbol}" for one in model.states] + [f"{OUTPUT}:{symbol}" for symbol in model.outputs]
+    shown = sorted(values, key=lambda key: key not in references)[:MOST_PANELS]
+    shown = [key for key in values if key in shown]
+    heights = [TALL] * len(shown) + [LOW] * len(found.log.measured)
+    figure = new_figure((WIDTH, sum(heights) + ROOM))
+    axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
+    tidy(axes)
+    times = found.log.start + found.log.times
+    labels = {f"{STATE}:{one.symbol}": one for one in model.states}
+    labels |= {f"{OUTPUT}:{symbol}": one.quantity for symbol, one in model.outputs.items()}
+    for axis, key in zip(axes, shown, strict=False):
+        mean, std = estimated(found, key)
+        _band(axis, times, mean, std)
+        if key in references:
+            axis.plot(times, found.log.references[key], color=DARK, linewidth=1.2, label="reference, not seen")
+        axis.plot(times, mean, color=BLUE, linewidth=1.0, label="smoother" if found.smoothed else "estimate")
+        axis.set_ylabel(labels[key].plot_label.replace(" $", "\n$"))
+    for j, (axis, one) in enumerate(zip(axes[len(shown) :], found.log.measured, strict=True)):
+        std = np.sqrt(np.maximum(found.innovation_covs[:, j, j], 0.0))
+        _band(axis, times, np.zeros_like(std), std)
+        axis.plot(times, found.innovations[:, j], color=RUST, linewidth=0.8, label="innovation")
+        axis.set_ylabel(f"innovation of\n{one.symbol}" + (f" [{one.unit}]" if one.unit else ""))
+    axes[0].set_title(title, fontsize=11)
+    axes[-1].set_xlabel("time [s]")
+    figure.align_ylabels(axes)
+    named = {}
+    for axis in axes:
+        handles, texts = axis.get_legend_handles_labels()
+        named |= dict(zip(texts, handles, strict=True))
+    figure.legend(named.values(), named, loc="outside lower center", ncols=len(named), frameon=False)
+    return save_figure(figure, path)
+
+
+def _band(axis, times: np.ndarray, middle: np.ndarray, std: np.ndarray) -> None:
+    low, high = middle - TWO_SIDED * std, middle + TWO_SIDED * std
+    axis.fill_between(times, low, high, color=BLUE, alpha=0.25, linewidth=0, label="95 % band")

@@ -1,0 +1,154 @@
+"""`thruster estimate`: a filter or a smoother over a recorded log."""
+
+from __future__ import annotations
+
+from math import isnan
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from filters.logs.columns import columns_of
+from filters.logs.estimate import LogEstimate, estimate
+from filters.logs.findings import LogFindings, Residual, findings
+from numerics.files import check_target
+from plants.logs.write import check_suffix, write_columns
+from thruster_cli.logs import (
+    ClockOption,
+    ColumnOption,
+    DtOption,
+    LogPresetOption,
+    ModelOption,
+    SensorOption,
+    read_named,
+)
+from thruster_cli.output import FILTER_HELP, JsonOption, SeedOption, announce_compilation, emit, table
+
+ALPHA = 0.05  # below which a p-value speaks against white innovations
+
+
+def command(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A .csv, .parquet or .npz file with a header.")],
+    filter_name: Annotated[
+        str | None, typer.Option("--filter", help=f"Without a tuned file; ekf by default. {FILTER_HELP}")
+    ] = None,
+    tuned: Annotated[Path | None, typer.Option(help="Tuned file: filter, Q, R and the like.")] = None,
+    preset: LogPresetOption = None,
+    model: ModelOption = None,
+    sensor: SensorOption = None,
+    column: ColumnOption = None,
+    clock_offset: ClockOption = None,
+    dt: DtOption = None,
+    ensemble_size: Annotated[int | None, typer.Option(help="Of a filter with an ensemble.")] = None,
+    smoother: Annotated[bool, typer.Option("--smoother", help="Correct estimates by later measurements.")] = False,
+    lag: Annotated[int | None, typer.Option(help="How many later ones; all by default.")] = None,
+    skip: Annotated[
+        int | None, typer.Option(help="First rows that do not count; 50, a quarter of a short log, by default.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Estimates, bands and innovations as .csv, .parquet or .npz.")
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Picture of all over time.")] = None,
+    seed: SeedOption = 0,
+    json: JsonOption = None,
+) -> None:
+    """Estimate the state of a recorded run, and say what the innovations tell of filter and model.
+
+    The log has the model's inputs and measurements, found by the headers of its columns or told by --column. What
+    it has of the model's states and outputs beside these, such as the thrust of a load cell where the filter sees
+    the tachometer, is held against the estimate. docs/logs.md tells the rules.
+
+    Example: thruster estimate run.csv --tuned out/ekf-run-seed0.json --out est.csv --plot est.png
+
+    Example: thruster estimate run.csv --sensor speed --column speed=motor_rpm --column thrust=loadcell[kgf]
+    """
+    if tuned is not None and filter_name is not None:
+        raise ValueError("give either --tuned FILE or --filter NAME")
+    if plot is not None and plot.suffix != ".png":
+        raise ValueError(f"--plot must end in .png, but got {str(plot)!r}")
+    if out is not None:
+        check_suffix(out)
+    recorded, offer = read_named(log, preset, model, sensor, column, clock_offset, dt)
+    for target in (out, plot):
+        if target is not None:
+            check_target(target)
+    announce_compilation()
+    numbers = {} if ensemble_size is None else {"ensemble_size": ensemble_size}
+    options = {"tuned": tuned, "smoother": smoother, "lag": lag, "seed": seed, **numbers}
+    found = estimate(recorded, filter_name, offer, **options)
+    told = findings(found, skip)
+    if out is not None:
+        write_columns(out, columns_of(found))
+    if plot is not None:
+        from filters.logs.figure import log_figure
+
+        log_figure(plot, found, f"{_title(found)} on {log.name}")
+    emit(_shown(found, told, out, plot), _as_json(found, told, out, plot), json)
+
+
+def _title(found: LogEstimate) -> str:
+    return f"{found.filter.name}, smoothed," if found.smoothed else found.filter.name
+
+
+def _shown(found: LogEstimate, told: LogFindings, out: Path | None, plot: Path | None) -> list:
+    log = found.log
+    about = f"{log.steps + 1} rows, dt {log.dt:g} s" + (", put on a grid" if log.irregular else "")
+    title = f"{_title(found)} on {log.name} ({about}); rows {told.first} to {log.steps} count"
+    rows = [
+        ["mean NIS over channels", f"{told.mean_nis:.3g}", f"{told.nis_band[0]:.3g} to {told.nis_band[1]:.3g}"],
+        ["log-likelihood", f"{told.log_likelihood:.6g}", ""],
+        ["restarts", str(found.divergences), "0"],
+    ]
+    if isnan(told.mean_nis):
+        rows = rows[2:]
+    elif told.whiteness is not None:
+        white = told.whiteness
+        rows.insert(1, ["whiteness, p-value", f"{white.p_value:.3g}", f"above {ALPHA:g}"])
+    shown = [table(title, ["innovations", "", "if consistent"], rows)]
+    columns = ["", "RMSE", "bias", "rows"]
+    shown.append(table("One step ahead, prediction less measurement", columns, list(map(_row, told.predictions))))
+    if told.references:
+        what = "Smoother" if found.smoothed else "Estimate"
+        shown.append(table(f"{what} less reference, not seen", columns, list(map(_row, told.references))))
+    shown += _sentences(told)
+    return shown + [f"wrote {path}" for path in (out, plot) if path is not None]
+
+
+def _sentences(told: LogFindings) -> list[str]:
+    if isnan(told.mean_nis):
+        return ["This filter gives no covariance, so there is no NIS and no likelihood."]
+    low, high = told.nis_band
+    said = "The mean NIS is in its 95 % band."
+    if told.mean_nis > high:
+        said = "The innovations are larger than the filter expects: its Q or R is too small, or the model is off."
+    elif told.mean_nis < low:
+        said = "The innovations are smaller than the filter expects: its Q or R is too large."
+    if told.whiteness is not None and told.whiteness.p_value < ALPHA:
+        said += " They are not white: the filter could have known some of them."
+    return [said]
+
+
+def _row(one: Residual) -> list[str]:
+    return [one.quantity.short_label, f"{one.rmse:.4g}", f"{one.bias:+.4g}", str(one.rows)]
+
+
+def _as_json(found: LogEstimate, told: LogFindings, out: Path | None, plot: Path | None) -> dict:
+    log, white = found.log, told.whiteness
+    return {
+        "log": log.name,
+        "digest": log.digest,
+        "dt": log.dt,
+        "rows": log.steps + 1,
+        "irregular": log.irregular,
+        "filter": found.filter.name,
+        "smoothed": found.smoothed,
+        "first_row": told.first,
+        "mean_nis": told.mean_nis,
+        "nis_band": told.nis_band,
+        "whiteness_p_value": None if white is None else white.p_value,
+        "log_likelihood": told.log_likelihood,
+        "divergences": found.divergences,
+        "one_step_ahead": {one.quantity.symbol: one._asdict() for one in told.predictions},
+        "references": {one.quantity.symbol: one._asdict() for one in told.references},
+        "files": [str(path) for path in (out, plot) if path is not None],
+    }

@@ -1,0 +1,112 @@
+"""What commands on logs share: whose log it is, which column is what, and the clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from numerics.checks import shown
+from numerics.modules import object_named
+from plants.logs.log import Log
+from plants.replay import ANY_DT, read_for
+from plants.state_space import StateSpaceModel
+from thruster_env.modelled import ModelledThruster
+from thruster_env.parameters import PRESETS
+from thruster_env.plant import make_plant
+
+DEFAULT_PRESET = "tunnel"
+
+LogPresetOption = Annotated[
+    str | None, typer.Option("--preset", help=f"The thruster that the log is of: {', '.join(PRESETS)}; tunnel.")
+]
+ModelOption = Annotated[
+    str | None,
+    typer.Option(
+        "--model",
+        metavar="MODULE:OBJECT",
+        help="In place of a thruster: a StateSpaceModel, or a function that makes one (of dt, if it takes it).",
+    ),
+]
+SensorOption = Annotated[
+    list[str] | None, typer.Option("--sensor", help="What the filter sees of a thruster: thrust, speed, ...")
+]
+ColumnOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--column",
+        metavar="NAME=HEADER[UNIT]",
+        help="Which column is which input, measurement, state or output; may be repeated.",
+    ),
+]
+ClockOption = Annotated[
+    list[str] | None,
+    typer.Option("--clock-offset", metavar="NAME=SECONDS", help="How far the clock of a channel is ahead."),
+]
+DtOption = Annotated[
+    float | None, typer.Option("--dt", help="Sample time [s]: of a log without times, or to put it on.")
+]
+
+
+class Preset(ModelledThruster):
+    """A thruster of a preset, of which logs are: it offers the model, and checks tuned files."""
+
+    def __init__(self, preset: str, sensors: Sequence[str] | None, dt: float):
+        """Make the plant."""
+        self.plant = make_plant(preset, dt, **({"sensors": tuple(sensors)} if sensors else {}))
+
+
+def read_named(
+    path: str | Path,
+    preset: str | None = None,
+    model: str | None = None,
+    sensors: Sequence[str] | None = None,
+    columns: Sequence[str] | None = None,
+    clock_offset: Sequence[str] | None = None,
+    dt: float | None = None,
+) -> tuple[Log, Any]:
+    """A log, and what offers its model at its sample time, from the options of a command.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
+    if model is not None and (preset is not None or sensors):
+        raise ValueError("a log must be of --model or of a thruster (--preset, --sensor), but got both")
+    options = {
+        "columns": pairs("--column", columns),
+        "clock_offset": {
+            name: _seconds(name, value) for name, value in pairs("--clock-offset", clock_offset).items()
+        },
+        "dt": dt,
+    }
+    if model is not None:
+        offer = object_named(model, "model")
+        return read_for(path, offer, **options)[0], offer
+    log, _ = read_for(path, _states_of(preset or DEFAULT_PRESET, sensors), **options)
+    return log, Preset(preset or DEFAULT_PRESET, sensors, log.dt)
+
+
+def pairs(option: str, given: Sequence[str] | None) -> Mapping[str, str]:
+    """A mapping from options NAME=VALUE; ValueError for another form, or a name that comes twice."""
+    found: dict[str, str] = {}
+    for text in given or []:
+        name, equals, value = text.partition("=")
+        if not (name and equals and value) or name in found:
+            rule = "be given once for each name" if name in found else "have the form NAME=VALUE"
+            raise ValueError(f"{option} must {rule}, but got {shown(text)}")
+        found[name.strip()] = value.strip()
+    return found
+
+
+def _states_of(preset: str, sensors: Sequence[str] | None) -> StateSpaceModel:
+    """A model of a thruster whose quantities are those of any sample time."""
+    return Preset(preset, sensors, ANY_DT).state_space_model()
+
+
+def _seconds(name: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"--clock-offset {name} must be seconds, but got {shown(text)}") from None

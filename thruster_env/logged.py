@@ -1,0 +1,242 @@
+"""The thruster as logs show it: with a dead band, and sensors that have a bias and lag behind.
+
+    V = V_s less what of it is within the dead band,  low <= 0 <= high
+    z_i = h_i(x) + bias_i + v_i,  or with y' = (h_i(x) - y)/tau, of a sensor that lags,  z_i = y + bias_i + v_i
+
+Thrust that differs ahead and astern is `thrust_asymmetry` of the parameters. Without any of it the model is
+that of `thruster_env.model`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from numerics.checks import covariance, finite, positive, shown
+from numerics.compiled import inlined
+from numerics.pickling import makes_functions
+from numerics.tuples import matrix_of, tuple_of, written_out
+from plants.quantities import Quantity
+from plants.state_space import StateSpaceModel
+from thruster_env.channels import MAX_CHANNELS
+from thruster_env.dynamics import Constants, substep, substep_jacobian
+from thruster_env.effects.amplifier import outside
+from thruster_env.linear.steady_state import steady_state
+from thruster_env.model import channel_functions, model_of_plant, thrust_of
+from thruster_env.plant import Plant, make_plant
+from thruster_env.preset_file import BY_CHANNEL, checked_band, is_file, read_preset
+from thruster_env.quantities import THRUST
+
+_FURTHER = (
+    "dead_band_low",  # [V], not positive
+    "dead_band_high",  # [V], not negative
+    *(f"bias_{place}" for place in range(MAX_CHANNELS)),  # by the channel's place, in its unit
+    *(f"kept_{place}" for place in range(MAX_CHANNELS)),  # exp(-substep/tau), what a lagging sensor keeps
+)
+LoggedConstants = NamedTuple("LoggedConstants", [(name, float) for name in (*Constants._fields, *_FURTHER)])
+"""`dynamics.Constants`, and what logs show beside."""
+
+
+NO_BAND = 0.0, 0.0
+
+
+class Shown(NamedTuple):
+    """What logs show beside the equations of motion."""
+
+    dead_band_low: float = 0.0  # [V]
+    dead_band_high: float = 0.0  # [V]
+    bias: tuple[tuple[str, float], ...] = ()  # by channel, in its unit
+    lag: tuple[tuple[str, float], ...] = ()  # time constants [s] by channel
+
+
+def shown_of(plant: Plant, dead_band=None, bias: Mapping | None = None, lag: Mapping | None = None) -> Shown:
+    """Check what logs show of a plant; ValueError states the rule and the value.
+
+    Args:
+        plant: whose channels these are.
+        dead_band: (low, high) [V], or its half width; the plant's own if None.
+        bias: by channel, in its unit.
+        lag: time constants by channel [s]; zero for none.
+    """
+    if dead_band is None:
+        dead_band = plant.dead_band
+    if not isinstance(dead_band, (tuple, list)):
+        half = positive("dead_band", dead_band, zero_allowed=True)
+        dead_band = -half, half
+    low, high = checked_band(dead_band)
+    unknown = [name for name in (*(bias or {}), *(lag or {})) if name not in plant.channels]
+    if unknown:
+        known = ", ".join(plant.channels)
+        raise ValueError(f"bias and lag must be of measured channels, {known}, but got {shown(unknown[0])}")
+    biases = tuple((name, finite(f"bias of {name}", value)) for name, value in (bias or {}).items() if value)
+    lags = ((n, positive(f"lag of {n}", value, zero_allowed=True)) for n, value in (lag or {}).items())
+    return Shown(low, high, biases, tuple((name, value) for name, value in lags if value > 0))
+
+
+def logged_model(
+    *,
+    dead_band=None,
+    bias: Mapping[str, float] | None = None,
+    lag: Mapping[str, float] | None = None,
+    operating_voltage: float | None = None,
+    prior_cov_factor: float = 1.0,
+    **plant_arguments,
+) -> StateSpaceModel:
+    """`thruster_model` with a dead band, biases and lags.
+
+    A sensor that lags has a state behind the two of the thruster: what it would show without bias and noise. Of a
+    preset file the recorder is taken, too: bias, lag, ambient flow, Q and R, as far as no arguments say otherwise.
+
+    Args:
+        dead_band: voltages (low, high) within which the motor has none [V], or half of a symmetric band.
+        bias: of channels, in their units.
+        lag: time constants of channels [s].
+        operating_voltage: as for `thruster_model`.
+        prior_cov_factor: likewise.
+        **plant_arguments: those of `thruster_env.plant.make_plant`.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
+    plant, seen = logged_plant(dead_band=dead_band, bias=bias, lag=lag, **plant_arguments)
+    base = model_of_plant(
+        plant._replace(dead_band=NO_BAND), operating_voltage=operating_voltage, prior_cov_factor=prior_cov_factor
+    )
+    return with_shown(base, plant, seen)
+
+
+def logged_plant(*, dead_band=None, bias=None, lag=None, **plant_arguments) -> tuple[Plant, Shown]:
+    """A plant, and what logs show beside, as `logged_model` takes both."""
+    preset = plant_arguments.get("preset")
+    recorder = read_preset(preset).recorder if is_file(preset) else {}
+    own = {name: value for name, value in recorder.items() if name not in BY_CHANNEL}
+    if plant_arguments.get("dt", own.get("dt")) != own.get("dt"):  # of which Q is
+        own.pop("process_noise_cov", None)
+    plant = make_plant(**{**own, **plant_arguments})
+    variances = [recorder.get("measurement_noise_cov", {}).get(channel) for channel in plant.channels]
+    if None not in variances and plant_arguments.get("measurement_noise_cov") is None:
+        cov = covariance("measurement_noise_cov", variances, len(variances), positive_definite=True)
+        plant = plant._replace(measurement_noise_cov=cov)
+    known = [
+        {channel: value for channel, value in recorder.get(name, {}).items() if channel in plant.channels}
+        for name in ("bias", "lag")
+    ]
+    bias, lag = (of_file if given is None else given for of_file, given in zip(known, (bias, lag), strict=True))
+    return plant, shown_of(plant, dead_band, bias, lag)
+
+
+def with_shown(base: StateSpaceModel, plant: Plant, seen: Shown, *, always: bool = False) -> StateSpaceModel:
+    """A plant's model with what logs show; the model itself where that is nothing, unless `always`."""
+    if seen == Shown() and not always:
+        return base
+    channels, lags, biases = plant.channels, dict(seen.lag), dict(seen.bias)
+    lagging = tuple(channel in lags for channel in channels)
+    step = base.constants.substep
+    constants = LoggedConstants(
+        *base.constants,
+        seen.dead_band_low,
+        seen.dead_band_high,
+        *_by_place(biases.get(channel, 0.0) for channel in channels),
+        *_by_place(float(np.exp(-step / lags[channel])) if channel in lags else 0.0 for channel in channels),
+    )
+    f, f_slopes, h, h_slopes = _functions(channels, lagging)
+    read = channel_functions(channels)[0]
+
+    def extended(state) -> np.ndarray:
+        """A state with what the sensors show of it."""
+        shows = read(tuple(state), base.constants)
+        return np.array([*state, *(shows[i] for i, lags_behind in enumerate(lagging) if lags_behind)])
+
+    voltage = float(base.operating_input[0])
+    driving = float(outside(voltage, seen.dead_band_low, seen.dead_band_high))
+    operating = steady_state(plant.parameters, driving, plant.ambient_velocity)[:2]
+    added = [one for one, lags_behind in zip(base.measurements, lagging, strict=True) if lags_behind]
+    slopes = np.vstack([np.eye(2), _slopes_at(base, plant.channels, lagging)])
+    q = np.zeros((2 + len(added),) * 2)
+    q[:2, :2] = base.process_noise_cov
+    ends = [extended(end) for end in (base.state_low, base.state_high)]
+    lagging_states = (Quantity(f"lagging {one.symbol}", f"{one.symbol}_lag", one.unit) for one in added)
+    return base.replace(
+        transition=f,
+        observe=h,
+        transition_jacobian=f_slopes,
+        observe_jacobian=h_slopes,
+        constants=constants,
+        process_noise_cov=q,
+        prior_mean=extended(base.prior_mean),
+        prior_cov=slopes @ base.prior_cov @ slopes.T,
+        operating_state=extended(operating),
+        operating_points=None if seen != Shown() else base.operating_points,
+        state_low=np.minimum(*ends),
+        state_high=np.maximum(*ends),
+        states=(*base.states, *lagging_states),
+        outputs={"T": (THRUST, _thrust)},
+    )
+
+
+def _thrust(x, c):
+    return thrust_of(x[:2], c)
+
+
+def _by_place(values) -> tuple[float, ...]:
+    given = [float(value) for value in values]
+    return (*given, *(0.0,) * (MAX_CHANNELS - len(given)))
+
+
+def _slopes_at(base: StateSpaceModel, channels, lagging) -> np.ndarray:
+    """Slopes of what lagging sensors show at the prior mean, (lags, 2)."""
+    rows = channel_functions(channels)[1](tuple(base.prior_mean), base.constants)
+    some = [row for row, lags_behind in zip(rows, lagging, strict=True) if lags_behind]
+    return np.array(some, dtype=np.float64).reshape(len(some), 2)
+
+
+@makes_functions
+def _functions(channels: tuple[str, ...], lagging: tuple[bool, ...]) -> tuple[Callable, ...]:
+    """Transition, its Jacobian, observation and its Jacobian, for some channels of which some lag."""
+    read, read_slopes = channel_functions(channels)
+    places = [i for i, lags_behind in enumerate(lagging) if lags_behind]
+    n = 2 + len(places)
+    state_of = {channel: 2 + number for number, channel in enumerate(places)}
+    names = {
+        "substep": substep,
+        "substep_jacobian": substep_jacobian,
+        "outside": outside,
+        "read": inlined(read),
+        "read_slopes": inlined(read_slopes),
+    }
+    drive = "v = outside(u[0], c.dead_band_low, c.dead_band_high), c.ambient_velocity"
+    move = drive, "s = substep((x[0], x[1]), v, c)"
+    look = ("y = read(s, c)",) if places else ()
+    lags = [f"c.kept_{i} * x[{state_of[i]}] + (1.0 - c.kept_{i}) * y[{i}]" for i in places]
+    transition = written_out("transition", "x, u, c", *move, *look, tuple_of(["s[0]", "s[1]", *lags]), **names)
+    lines = [*move, "a = substep_jacobian((x[0], x[1]), v, c)"]
+    lines += ["b = read_slopes(s, c)"] if places else []
+
+    def slope(i, j):
+        if i < 2:
+            return f"a[{i}][{j}]" if j < 2 else "0.0"
+        channel = places[i - 2]
+        if j < 2:
+            return f"(1.0 - c.kept_{channel}) * (b[{channel}][0] * a[0][{j}] + b[{channel}][1] * a[1][{j}])"
+        return f"c.kept_{channel}" if i == j else "0.0"
+
+    transition_jacobian = written_out("transition_jacobian", "x, u, c", *lines, matrix_of(n, n, slope), **names)
+    shows = [f"x[{state_of[i]}]" if i in state_of else f"y[{i}]" for i in range(len(channels))]
+    direct = len(places) < len(channels)
+    look = ("y = read((x[0], x[1]), c)",) if direct else ()
+    reading = tuple_of(f"{one} + c.bias_{i}" for i, one in enumerate(shows))
+    look_along = ("b = read_slopes((x[0], x[1]), c)",) if direct else ()
+
+    def row(i, j):
+        if i in state_of:
+            return "1.0" if j == state_of[i] else "0.0"
+        return f"b[{i}][{j}]" if j < 2 else "0.0"
+
+    return (
+        transition,
+        transition_jacobian,
+        written_out("observe", "x, c", *look, reading, **names),
+        written_out("observe_jacobian", "x, c", *look_along, matrix_of(len(channels), n, row), **names),
+    )

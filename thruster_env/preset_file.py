@@ -1,0 +1,144 @@
+"""Preset files: an identified thruster as data, in TOML, which every command and env takes as its preset.
+
+    [thruster]                      the fields of `ThrusterParameters`, all of them
+    [dead_band]                     low and high [V]
+    [recorder]                      what belongs to the recorded runs and their sensors, not to the thruster:
+                                    dt, sensors, ambient_velocity, process_noise_cov (a step of dt), and by channel
+                                    measurement_noise_cov, bias, lag, clock_offset
+    [identified]                    how it was found, for people
+
+An env and its model have the thruster with its dead band; `thruster_env.logged.logged_model` takes the recorder,
+too. Nothing in a file is run.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from numerics.checks import finite, shown
+from numerics.files import write_whole
+from thruster_env.parameters import ThrusterParameters, checked
+
+SECTIONS = ("thruster", "dead_band", "recorder", "identified")
+BY_CHANNEL = ("measurement_noise_cov", "bias", "lag", "clock_offset")
+RECORDER = ("dt", "sensors", "ambient_velocity", "process_noise_cov", *BY_CHANNEL)
+
+
+class PresetFile(NamedTuple):
+    """What a preset file holds."""
+
+    parameters: ThrusterParameters
+    dead_band: tuple[float, float] = (0.0, 0.0)  # [V]
+    recorder: Mapping[str, Any] = {}
+    identified: Mapping[str, Any] = {}
+
+
+def is_file(preset) -> bool:
+    """Whether a preset is the path of a file."""
+    return isinstance(preset, (str, Path)) and str(preset).endswith(".toml")
+
+
+def read_preset(path: str | Path) -> PresetFile:
+    """A thruster from a preset file.
+
+    Raises:
+        ValueError: states the rule and the value, with the path.
+    """
+    try:
+        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"a preset file must be readable, but {path} is not: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:  # not TOML, nested too deeply, or not even text
+        raise ValueError(f"a preset file must be TOML, but {path} is not: {error}") from None
+    try:
+        return _checked(content)
+    except ValueError as error:
+        raise ValueError(f"{error} (in {path})") from None
+
+
+def _checked(content: dict) -> PresetFile:
+    unknown = sorted(set(content) - set(SECTIONS))
+    if unknown or not all(isinstance(part, dict) for part in content.values()):
+        raise ValueError(f"a preset file must have the tables {', '.join(SECTIONS)}, but got {shown(unknown)}")
+    thruster, band = content.get("thruster", {}), content.get("dead_band", {})
+    missing = [name for name in ThrusterParameters._fields if name not in thruster]
+    unknown = [name for name in thruster if name not in ThrusterParameters._fields]
+    optional = ThrusterParameters._field_defaults
+    if unknown or not set(missing) <= set(optional):
+        names = ", ".join(ThrusterParameters._fields)
+        off = f"{unknown[0]} is none" if unknown else f"{missing[0]} is missing"
+        raise ValueError(f"thruster of a preset file must have the fields {names}, but {off}")
+    if sorted(band) not in ([], ["high", "low"]):
+        raise ValueError(f"dead_band of a preset file must have low and high, but got {shown(sorted(band))}")
+    recorder = content.get("recorder", {})
+    unknown = sorted(set(recorder) - set(RECORDER))
+    if unknown:
+        raise ValueError(f"recorder of a preset file must have {', '.join(RECORDER)}, but got {shown(unknown)}")
+    for name in BY_CHANNEL:
+        table = recorder.get(name, {})
+        if not isinstance(table, dict):
+            raise ValueError(f"{name} of a preset file must be a table by channel, but got {shown(table)}")
+        for channel, value in table.items():
+            finite(f"{name} of {channel}", value)
+    ends = checked_band((band.get("low", 0.0), band.get("high", 0.0)))
+    return PresetFile(checked(ThrusterParameters(**thruster)), ends, recorder, content.get("identified", {}))
+
+
+def checked_band(ends) -> tuple[float, float]:
+    """A dead band (low, high) [V]; ValueError unless low <= 0 <= high."""
+    pair = tuple(ends) if isinstance(ends, (tuple, list)) else ()
+    if len(pair) != 2:
+        raise ValueError(f"dead_band must be two voltages, low and high, but got {shown(ends)}")
+    low, high = (finite("dead_band", end) for end in pair)
+    if not low <= 0.0 <= high:
+        raise ValueError(f"dead_band must be from low <= 0 to high >= 0, but got {shown(pair)}")
+    return low, high
+
+
+def write_preset(path: str | Path, preset: PresetFile, about: str = "") -> None:
+    """Write a preset file.
+
+    Args:
+        path: ends in .toml.
+        preset: what it holds.
+        about: a line of comment.
+
+    Raises:
+        ValueError: if the path does not end in .toml, or cannot be written.
+    """
+    if not is_file(path):
+        raise ValueError(f"a preset file must end in .toml, but got {str(path)!r}")
+    low, high = preset.dead_band
+    tables = {
+        "thruster": preset.parameters._asdict(),
+        "dead_band": {"low": low, "high": high} if (low, high) != (0.0, 0.0) else {},
+        "recorder": preset.recorder,
+        "identified": preset.identified,
+    }
+    lines = [f"# {about}"] if about else []
+    for name, table in tables.items():
+        if table:
+            lines += [""] if lines else []
+            lines += [f"[{name}]", *(f"{_key(one)} = {_text(value)}" for one, value in table.items())]
+    write_whole(path, "\n".join(lines) + "\n")
+
+
+def _key(name: str) -> str:
+    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _text(name)
+
+
+def _text(value) -> str:
+    """A value as TOML has it."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{_key(name)} = {_text(part)}" for name, part in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(_text, value)) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        characters = (f"\\u{ord(c):04X}" if ord(c) < 32 or c in '"\\\x7f' else c for c in value)
+        return '"' + "".join(characters) + '"'
+    return repr(float(value)) if isinstance(value, float) else repr(value)

@@ -1,0 +1,115 @@
+"""Profile likelihoods: how far the log-likelihood falls where one parameter is held elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from numerics.checks import one_of
+from numerics.plots import BLUE, DARK, RUST, panels
+from tuning.identification.ascent import climb
+from tuning.identification.result import Identification
+from tuning.likelihood.identifiability import SIGNIFICANT
+from tuning.search.interruption import stop_on_interrupt
+
+REACH = (0.75, 1.5, 2.5)  # standard errors at which a parameter is held
+LEGS = 6  # steps that the others may take at each
+
+
+class Profile(NamedTuple):
+    """log L maximised over all other parameters, where one is held at some values."""
+
+    name: str
+    values: np.ndarray  # (count,), rising
+    log_likelihoods: np.ndarray  # (count,)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Where log L is within 1.92 of its maximum, a 95 % interval; infinite where it is not known to end."""
+        falls = self.log_likelihoods.max() - self.log_likelihoods
+        best = int(np.argmin(falls))
+        ends = []
+        for side in (slice(None, best + 1), slice(best, None)):
+            fall, value = falls[side], self.values[side]
+            order = np.argsort(fall)
+            if fall.max() < SIGNIFICANT:
+                ends.append(np.inf if side.stop is None else -np.inf)
+            else:
+                ends.append(float(np.interp(np.sqrt(SIGNIFICANT), np.sqrt(fall[order]), value[order])))
+        return ends[0], ends[1]
+
+
+def profiles(
+    found: Identification,
+    names: Sequence[str] | None = None,
+    *,
+    reach: Sequence[float] = REACH,
+    progress: Callable[[str], None] = lambda name: None,
+) -> list[Profile]:
+    """Profile likelihoods of parameters; after Ctrl-C those that are done.
+
+    Args:
+        found: from `identify`.
+        names: of the parameters; all if None.
+        reach: how many standard errors to either side a parameter is held, within its range.
+        progress: told the name of each.
+
+    Raises:
+        ValueError: for an unknown name.
+
+    Source: Raue et al. (2009), "Structural and practical identifiability analysis of partially observed dynamical
+    models by exploiting the profile likelihood", Bioinformatics 25(15).
+    """
+    made = []
+    with stop_on_interrupt() as asked:
+        for name in found.names if names is None else names:
+            place = found.names.index(one_of("a parameter", name, found.names))
+            progress(name)
+            points = [(found.at[place], found.log_likelihood)]
+            for sign in (1.0, -1.0):
+                points += _side(found, place, [sign * part for part in reach], asked)
+            if asked():
+                break
+            at, values = np.array(sorted(points)).T
+            whole = np.tile(found.at, (len(at), 1))
+            whole[:, place] = at
+            natural = np.array([found.objective.coordinates.values(row)[place] for row in whole])
+            made.append(Profile(name, natural, values))
+    return made
+
+
+def _side(found: Identification, place: int, reach: Sequence[float], asked) -> list[tuple[float, float]]:
+    """Points outwards; the others start along the direction in which they go with this parameter."""
+    coordinates, error = found.objective.coordinates, np.sqrt(found.cov[place, place])
+    slope, points = found.cov[:, place] / found.cov[place, place], []
+    held = np.arange(len(found.at)) == place
+    for part in reach:
+        move = part * error
+        at = np.clip(found.at + slope * move, coordinates.low, coordinates.high)
+        if asked() or at[place] in [point for point, _ in points] or at[place] == found.at[place]:
+            break
+        there = climb(
+            found.objective, at, coordinates.low, coordinates.high, held=held, iterations=LEGS, stop=asked
+        )
+        points.append((float(at[place]), there.found.value))
+    return points
+
+
+def profile_figure(found: Identification, made: Sequence[Profile]):
+    """A panel for each profile: how far log L falls, the 95 % line, and the parabola of the standard error."""
+    figure, axes = panels(len(made), 3, (3.0, 2.2), 0.2)
+    for axis, one in zip(axes, made, strict=True):
+        falls = one.log_likelihoods - found.log_likelihood
+        parameter = found.objective.coordinates.free[found.names.index(one.name)]
+        best, error = found.values[one.name], found.standard_errors[one.name]
+        grid = np.linspace(one.values[0], one.values[-1], 100)
+        axis.plot(grid, -0.5 * ((grid - best) / error) ** 2, color=RUST, linewidth=1, label="standard error")
+        axis.plot(one.values, falls, "o-", color=BLUE, linewidth=1.2, markersize=3, label="profile")
+        axis.axhline(-SIGNIFICANT, color=DARK, linewidth=0.8, linestyle=":")
+        axis.set_ylim(min(-4.0, falls.min() * 1.05), 0.3)
+        axis.set_xlabel(one.name + (f" [{parameter.unit}]" if parameter.unit else ""))
+        axis.set_ylabel("fall in log L")
+    axes[0].legend(fontsize=7, frameon=False)
+    return figure

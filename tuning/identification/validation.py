@@ -1,0 +1,76 @@
+"""What a model is worth on runs that it was not identified on: prediction, simulation and likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.engine.batch import run
+from filters.gaussian.extended import ExtendedKalmanFilter
+from plants.logs.log import Log
+from plants.state_space import StateSpaceModel
+from tuning.identification.result import Identification
+from tuning.problems.data import Data
+
+
+class Validation(NamedTuple):
+    """How a model does on some runs; by the measurements' symbols, in their units."""
+
+    log_likelihood: float  # of the innovations
+    one_step: dict[str, float]  # RMSE of the one-step prediction
+    simulation: dict[str, float]  # RMSE of the simulation, which sees no measurement
+    fit: dict[str, float]  # 100 (1 - RMSE of the simulation / standard deviation of the measurement) [%]
+    nis: float  # mean NIS over the number of channels; 1 for a consistent filter
+
+
+def validation_of(model: StateSpaceModel, runs: Data) -> Validation:
+    """How a model does on runs.
+
+    A filter without any noise of the plant, whose gain is zero, simulates.
+
+    Args:
+        model: as the filter runs on it.
+        runs: with inputs and measurements.
+    """
+    symbols = [one.symbol for one in model.measurements]
+    there = ~np.isnan(runs.measurements)
+    estimates = _estimates(model, runs)
+    nothing = np.zeros((model.n, model.n))
+    simulated = _estimates(model.replace(process_noise_cov=nothing, prior_cov=nothing), runs)
+
+    def rmse(errors: np.ndarray) -> np.ndarray:
+        return np.sqrt((errors**2).sum(axis=(0, 1)) / there.sum(axis=(0, 1)))
+
+    one_step, simulation = rmse(estimates.innovations), rmse(simulated.innovations)
+    spread = np.array([runs.measurements[..., i][there[..., i]].std() for i in range(model.m)])
+    fit = 100 * (1 - simulation / np.where(spread > 0, spread, np.nan))
+    weighted = np.linalg.solve(estimates.innovation_covs, estimates.innovations[..., None])[..., 0]
+    nis = (weighted * estimates.innovations).sum() / there.sum()
+    columns = (dict(zip(symbols, map(float, one), strict=True)) for one in (one_step, simulation, fit))
+    return Validation(float(estimates.log_likelihoods.sum()), *columns, float(nis))
+
+
+def validate(
+    found: Identification, data: Data | Log | Sequence[Data | Log] | None = None
+) -> dict[str, Validation]:
+    """The model at the start and at the identified values, "start" and "identified".
+
+    Args:
+        found: from `identify`.
+        data: runs that it did not see; None for those it saw. A parameter that moves the data moves those that
+            were given as a function only, so that held-out runs are one, too, where there is one.
+    """
+    objective = found.objective
+    if data is not None:
+        objective = objective.with_changes(data=data)
+    points = {
+        "start": objective.coordinates.of([found.start[name] for name in found.names]),
+        "identified": found.at,
+    }
+    return {name: validation_of(objective.model_at(at), objective.data_at(at)) for name, at in points.items()}
+
+
+def _estimates(model: StateSpaceModel, runs: Data):
+    return run(ExtendedKalmanFilter(model=model), runs.filter_keys, runs.inputs, runs.measurements)

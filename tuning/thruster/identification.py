@@ -1,0 +1,216 @@
+"""What of a thruster may be free in `thruster identify`, and the model for its values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+
+from numerics.checks import shown
+from plants.logs.log import Log, at_offset
+from plants.state_space import StateSpaceModel
+from thruster_env.logged import NO_BAND, Shown, with_shown
+from thruster_env.model import model_of_plant
+from thruster_env.parameters import ThrusterParameters, checked
+from thruster_env.plant import Plant
+from tuning.problems.parameter import Parameter, squared
+from tuning.search.parameters import r_name
+
+UNITS = {
+    "lift_coefficient": "",
+    "drag_coefficient": "",
+    "motor_damping": "1/s",
+    "voltage_gain": "rad/(s^2 V)",
+    "load_gain": "1/(kg m^2)",
+    "added_mass": "kg",
+    "momentum_drag": "kg/m",
+    "area": "m^2",
+    "diameter": "m",
+    "gear_ratio": "",
+    "density": "kg/m^3",
+    "blade_angle": "rad",
+    "thrust_asymmetry": "",
+}  # of the thruster's own parameters
+FACTOR = 10.0  # of the start, to either side, that a positive parameter may be
+NOISE_FACTOR = 1e4  # the same of variances
+LINEAR = {"blade_angle": (0.05, 1.5), "thrust_asymmetry": (-0.5, 0.5)}
+FASTEST_FLOW = 2.0  # [m/s], ambient
+DEAD_PART = 0.25  # of the largest voltage, that a dead band may reach to
+DEAD_START = 0.02
+BIAS_PART = 0.25  # of the channel's largest magnitude
+LAGS = 0.1, 100.0  # time constants in sample times
+LAG_START = 3.0
+OFFSETS = 10.0  # sample times that a clock may be off, and at least
+LEAST_OFFSET = 0.1  # [s]
+
+
+class ThrusterFamily:
+    """A thruster's models and logs as functions of its free parameters.
+
+    Known are the fields of `ThrusterParameters` but angles; ambient_velocity; dead_band, or dead_band_low and
+    dead_band_high; bias_CHANNEL, lag_CHANNEL and clock_offset_CHANNEL; Q11, Q22 and R, or R11, R22, ...
+
+    Args:
+        logs: of the plant's inputs and channels.
+        plant: where everything starts, and what is held.
+        seen: what logs show beside, where it starts.
+        free: names of free parameters.
+        noise: whether Q and R are free, too.
+
+    Raises:
+        ValueError: for an unknown name, with those that are known.
+    """
+
+    def __init__(self, logs: Sequence[Log], plant: Plant, seen: Shown, free: Sequence[str], *, noise: bool = True):
+        """Find the parameters by name."""
+        self.logs, self.plant, self.seen = tuple(logs), plant, seen
+        if plant.linear is not None:
+            raise ValueError("a thruster must move by its equations to be identified, but this one is linear")
+        known = self.known
+        names = list(free) + [name for name in self.noise_names if noise and name not in free]
+        wrong = [name for name in names if name not in known]
+        if wrong:
+            raise ValueError(f"free parameters must be of {', '.join(known)}, but got {shown(wrong[0])}")
+        if "dead_band" in names and {"dead_band_low", "dead_band_high"} & set(names):
+            raise ValueError("dead_band must not be free beside dead_band_low or dead_band_high")
+        self.free = tuple(known[name] for name in dict.fromkeys(names))
+        self._lagging = tuple(channel for channel in plant.channels if f"lag_{channel}" in names)
+        base = model_of_plant(plant._replace(dead_band=NO_BAND))
+        self._base = with_shown(base, plant, self._shown({}), always=True)
+
+    @property
+    def noise_names(self) -> tuple[str, ...]:
+        """Names of the variances in Q and R."""
+        count = len(self.plant.channels)
+        return ("Q11", "Q22", *(r_name(i, count) for i in range(count)))
+
+    @cached_property
+    def known(self) -> dict[str, Parameter]:
+        """Every parameter that may be free, with its range about where it starts."""
+        plant, seen, found = self.plant, self.seen, {}
+        for name, unit in UNITS.items():
+            found[name] = _about(name, getattr(plant.parameters, name), unit)
+        flow = plant.ambient_velocity
+        ends = min(-FASTEST_FLOW, 2 * flow), max(FASTEST_FLOW, 2 * flow)
+        found["ambient_velocity"] = Parameter("ambient_velocity", *ends, "m/s", log=False, default=flow)
+        reach, first = DEAD_PART * plant.max_voltage, DEAD_START * plant.max_voltage
+        low, high = (max(-reach, seen.dead_band_low) or -first), (min(reach, seen.dead_band_high) or first)
+        found["dead_band"] = Parameter("dead_band", 0.0, reach, "V", log=False, default=high)
+        found["dead_band_low"] = Parameter("dead_band_low", -reach, 0.0, "V", log=False, default=low)
+        found["dead_band_high"] = Parameter("dead_band_high", 0.0, reach, "V", log=False, default=high)
+        dt = plant.dt
+        offset = max(OFFSETS * dt, LEAST_OFFSET)
+        model = model_of_plant(plant)
+        for place, (channel, quantity) in enumerate(zip(plant.channels, model.measurements, strict=True)):
+            largest = max(np.nanmax(np.abs(log.measurements[:, place]), initial=0.0) for log in self.logs)
+            bias, at = BIAS_PART * (largest or 1.0), dict(seen.bias).get(channel, 0.0)
+            name = f"bias_{channel}"
+            found[name] = Parameter(
+                name, min(-bias, 2 * at), max(bias, 2 * at), quantity.unit, log=False, default=at
+            )
+            name, lag = f"lag_{channel}", dict(seen.lag).get(channel, LAG_START * dt)
+            found[name] = Parameter(name, min(LAGS[0] * dt, lag), max(LAGS[1] * dt, lag), "s", default=lag)
+            name = f"clock_offset_{channel}"
+            found[name] = Parameter(name, -offset, offset, "s", log=False, default=0.0)
+        q, r = np.diag(plant.process_noise_cov), np.diag(plant.measurement_noise_cov)
+        units = [one.unit for one in (*model.states, *model.measurements)]
+        for name, variance, unit in zip(self.noise_names, (*q, *r), units, strict=True):
+            ends = variance / NOISE_FACTOR, variance * NOISE_FACTOR
+            if variance > 0:
+                found[name] = Parameter(name, *ends, squared(unit), default=float(variance))
+        return found
+
+    @property
+    def data(self):
+        """The logs, or a function of the clock offsets that are free."""
+        offsets = tuple(one.name for one in self.free if one.name.startswith("clock_offset_"))
+        return ShiftedLogs(self.logs, offsets) if offsets else self.logs
+
+    def parameters(self, values: Mapping[str, float]) -> ThrusterParameters:
+        """The thruster's own parameters."""
+        return checked(self.plant.parameters._replace(**{k: v for k, v in values.items() if k in UNITS}))
+
+    def plant_at(self, values: Mapping[str, float]) -> Plant:
+        """The plant for values; others are held."""
+        q, r = self._noise(values)
+        return self.plant._replace(
+            parameters=self.parameters(values),
+            ambient_velocity=values.get("ambient_velocity", self.plant.ambient_velocity),
+            process_noise_cov=q,
+            measurement_noise_cov=r,
+        )
+
+    def shown_at(self, values: Mapping[str, float]) -> Shown:
+        """What logs show beside, for values."""
+        return self._shown(values)
+
+    def model(self, **values: float) -> StateSpaceModel:
+        """The model for values of the free parameters, but for clock offsets; quickly: its ranges stay."""
+        plant, seen = self.plant_at(values), self._shown(values)
+        constants = plant.constants
+        step, biases, lags = constants.substep, dict(seen.bias), dict(seen.lag)
+        further = {"dead_band_low": seen.dead_band_low, "dead_band_high": seen.dead_band_high}
+        for place, channel in enumerate(plant.channels):
+            further[f"bias_{place}"] = biases.get(channel, 0.0)
+            further[f"kept_{place}"] = float(np.exp(-step / lags[channel])) if channel in lags else 0.0
+        q = self._base.process_noise_cov.copy()
+        q[:2, :2] = plant.process_noise_cov
+        return self._base.replace(
+            constants=self._base.constants._replace(**constants._asdict(), **further),
+            process_noise_cov=q,
+            measurement_noise_cov=plant.measurement_noise_cov,
+        )
+
+    def _noise(self, values: Mapping[str, float]) -> tuple[np.ndarray, np.ndarray]:
+        found = []
+        for cov, names in (
+            (self.plant.process_noise_cov, self.noise_names[:2]),
+            (self.plant.measurement_noise_cov, self.noise_names[2:]),
+        ):
+            before = np.diag(cov)
+            after = [values.get(name, variance) for name, variance in zip(names, before, strict=True)]
+            factors = np.sqrt(np.divide(after, before, out=np.ones(len(before)), where=before > 0))
+            found.append(cov * np.outer(factors, factors))
+        return found[0], found[1]
+
+    def _shown(self, values: Mapping[str, float]) -> Shown:
+        known, seen = self.known, self.seen
+        half = values.get("dead_band")
+        low, high = seen.dead_band_low, seen.dead_band_high
+        low = values.get("dead_band_low", low) if half is None else -half
+        high = values.get("dead_band_high", high) if half is None else half
+        bias, lag = dict(seen.bias), dict(seen.lag)
+        for channel in self.plant.channels:
+            if f"bias_{channel}" in values:
+                bias[channel] = values[f"bias_{channel}"]
+            if channel in self._lagging:
+                lag[channel] = values.get(f"lag_{channel}", known[f"lag_{channel}"].start)
+        return Shown(low, high, tuple(bias.items()), tuple(lag.items()))
+
+
+class ShiftedLogs:
+    """Logs as a function of clock offsets of their channels [s]."""
+
+    def __init__(self, logs: Sequence[Log], names: Sequence[str]):
+        """Take logs, and the names clock_offset_CHANNEL."""
+        self.logs, self.parameters = tuple(logs), tuple(names)
+
+    def __call__(self, **offsets: float) -> list[Log]:
+        """The logs with the channels' clocks set."""
+        return [self._shifted(log, offsets) for log in self.logs]
+
+    def _shifted(self, log: Log, offsets: Mapping[str, float]) -> Log:
+        for name, seconds in offsets.items():
+            log = at_offset(log, f"measurement:{name.removeprefix('clock_offset_')}", seconds)
+        return log
+
+
+def _about(name: str, value: float, unit: str) -> Parameter:
+    """A parameter of the thruster, within a range about its value."""
+    if name in LINEAR:
+        low, high = LINEAR[name]
+        return Parameter(name, min(low, value), max(high, value), unit, log=False, default=value)
+    if value == 0:  # as a preset without drag
+        return Parameter(name, 0.0, 1.0, unit, log=False, default=0.0)
+    return Parameter(name, value / FACTOR, value * FACTOR, unit, default=value)
