@@ -187,7 +187,7 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
                         store_cov_slope(rows[j], grown(cov_slope(rows[j]), q_slope(q_slopes[j])))
                 part, sample = k * out.shape[1] // measurements.shape[1], reading(measurements[b, k])
                 for turn in range(turns):
-                    z = chosen(sample, fed, 1.0 - turn)
+                    z, freedom = chosen(sample, fed, 1.0 - turn), degrees if turn == turns - 1 else math.inf
                     h = present_rows(observation_matrix(x, s, c), z)
                     v, spread_of_v = difference(z, observe(x, c)), present(r(numbers), z)
                     if turn == 0:
@@ -195,7 +195,7 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
                     root = root_of(spread_of_v)
                     gain = divide(correlation(p, h), root)
                     w = weigh(v, root)
-                    out[b, part, 0] += log_likelihood(v, root, z, w, degrees)
+                    out[b, part, 0] += log_likelihood(v, root, z, w, freedom)
                     for j in range(rows.shape[0]):
                         dx, dp = mean_slope(rows[j]), cov_slope(rows[j])
                         dc, size = constants_slope(constants_slopes[j]), sizes[j]
@@ -204,7 +204,7 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
                         ds = present(r_slope(r_slopes[j]), z)
                         if turn == 0:
                             ds = seen_slope(h, dh, p, dp, ds)
-                        out[b, part, 1 + j] += likelihood_slope(v, dy, root, ds, z, w, degrees)
+                        out[b, part, 1 + j] += likelihood_slope(v, dy, root, ds, z, w, freedom)
                         note(notes[j], dy, ds, root, z)
                         if turn == 0:
                             dgain = divide(uneven_gain(h, dh, p, dp, gain, ds), root)

@@ -1,1 +1,1 @@
-"""A recorded ROV thruster on a load cell: identified from its logs, estimated without the load cell, and compared."""
+"""A recorded ROV thruster on a load cell: identified from its logs, then estimated without the load cell."""

@@ -1,91 +1,90 @@
 """What is assumed of the recorded ROV thruster: a motor, the water that it moves, its tachometer and its mount.
 
-    dn/dt = k_n (g d(u) - n)                                motor speed n [rad/s] under the command u [V]
-    dy/dt = (n - y) / tau                                   what the tachometer shows, without its sign
-    T = e(n) (c_n n|n| - c_v (v - v_a)|n|) + a dn/dt        thrust on the water [N]
-    dv/dt = -k_v v - k_vv v|v| + k_t (T - a dn/dt)          axial flow v [m/s]
-    d2q/dt2 = w^2 (T - q) - 2 zeta w dq/dt                  what the mount passes on [N]
+    dn/dt = k_n (g d(u) - n)                             motor speed n [rad/s] under the command u [V]
+    dy/dt = (n - y)/tau                                  what the tachometer shows, but for the sign
+    B = e(n) (c_n n|n| - c_v (v - v_a)|n|)               thrust of the blades [N]
+    T = B + a dn/dt                                      thrust on the water [N]
+    dv/dt = -k_v v - k_vv v|v| + k_t B                   axial flow v [m/s]
+    d2q/dt2 = w^2 (T - q) - 2 zeta w dq/dt               what the mount passes on [N]
 
-with d(u) = u - high above the dead band, b (u - low) below it, 0 within; e(n) = 1 ahead and e astern; the load cell
-reads T + m (q - T). Effects whose constant is neutral (a, m or c_v of 0, e or b of 1) are not there.
+with d(u) = u - high above the dead band, b (u - low) below it and 0 within; e(n) = 1 ahead and e astern. The load
+cell shows T + m (q - T). An effect whose constant is neutral is not there: a, m, c_v of 0; b, e of 1.
 
-The structure without mount and inertial force is J. A. Boehm's (2019); the numbers are found from the recordings.
+v has no scale of its own where only thrust is measured: c_v, k_vv and k_t change with it. k_t is therefore held.
+
+Source of motor, dead band, blades and flow: J. A. Boehm (2019), MSc thesis, University of Maryland. The numbers of
+`identified.toml` are ours, found from the recordings (docs/real_data.md).
 """
 
 from __future__ import annotations
 
 import math
+import tomllib
+from pathlib import Path
 from typing import NamedTuple
 
 from numerics.integration import runge_kutta
 from plants.quantities import Output, Quantity
 from plants.state_space import StateSpaceModel
 
-DT = 0.04  # s, of the recordings
-SUBSTEPS = 8  # of 5 ms: the mount swings at 14 Hz
+DT = 0.04  # of the recordings [s]
+SUBSTEPS = 4
+IDENTIFIED = Path(__file__).with_name("identified.toml")
 
 
 class Constants(NamedTuple):
-    """Numbers of the model, before anything is identified: those of the recorder's table, round."""
+    """Numbers of the model; those given here are round ones to start from."""
 
-    motor_rate: float = 60.0  # k_n, 1/s
-    motor_gain: float = 51.0  # g, rad/s per V
-    gain_ratio: float = 1.0  # b, astern over ahead
-    dead_band_low: float = -0.8  # V
-    dead_band_high: float = 0.8
-    tachometer_lag: float = 0.04  # tau, s
-    thrust_factor: float = 1.5e-3  # c_n, N s^2
-    thrust_ratio: float = 1.05  # e, astern over ahead
-    flow_factor: float = 0.4  # c_v, N s^2/m
-    flow_linear: float = 1.0  # k_v, 1/s
-    flow_quadratic: float = 20.0  # k_vv, 1/m
-    flow_gain: float = 0.03  # k_t, 1/kg
-    ambient_factor: float = 0.0  # on the measured ambient flow
-    inertia: float = 0.0  # a, N s^2
+    motor_rate: float = 60.0  # k_n [1/s]
+    motor_gain: float = 51.0  # g [rad/(s V)]
+    gain_ratio: float = 1.0  # b
+    dead_band_low: float = -0.8  # [V]
+    dead_band_high: float = 0.8  # [V]
+    tachometer_lag: float = 0.04  # tau [s]
+    thrust_factor: float = 1.5e-3  # c_n [N s^2]
+    thrust_ratio: float = 1.05  # e
+    flow_factor: float = 0.4  # c_v [N s^2/m]
+    flow_linear: float = 1.0  # k_v [1/s]
+    flow_quadratic: float = 20.0  # k_vv [1/m]
+    flow_gain: float = 0.03  # k_t [1/kg]
+    ambient_factor: float = 0.0  # v_a over the measured ambient flow
+    inertia: float = 0.0  # a [N s^2]
     mount_share: float = 0.0  # m
-    mount_frequency: float = 14.0  # Hz
+    mount_frequency: float = 14.0  # w/2 pi [Hz]
     mount_damping: float = 0.1  # zeta
-    thrust_offset: float = 0.0  # of the load cell, N
-    substep: float = DT / SUBSTEPS
-
-
-class Noise(NamedTuple):
-    """Standard deviations of the noise, a step, and of the sensors."""
-
-    motor: float = 5.0  # rad/s
-    tachometer: float = 1.0  # rad/s
-    flow: float = 0.003  # m/s
-    mount: float = 30.0  # N/s
-    tachometer_sensor: float = 1.8  # rad/s
-    load_cell: float = 1.0  # N
+    substep: float = DT / SUBSTEPS  # [s]
 
 
 STATES = (
     Quantity("motor speed", "n", "rad/s"),
-    Quantity("tachometer's speed", "y", "rad/s"),
+    Quantity("speed that the tachometer shows", "y", "rad/s"),
     Quantity("axial flow", "v", "m/s"),
     Quantity("effective command", "d", "V"),
-    Quantity("mount force", "q", "N"),
-    Quantity("rate of the mount force", "r", "N/s"),
+    Quantity("force in the mount", "q", "N"),
+    Quantity("rate of the force in the mount", "r", "N/s"),
 )
-INPUTS = (Quantity("command", "u", "V"), Quantity("measured ambient flow", "flow", "m/s"))
-TACHOMETER = Quantity("motor speed without sign", "tach", "rad/s")
-LOAD_CELL = Quantity("load cell", "load", "N")
 INITIAL = (30.0, 30.0, 0.03, 0.0, 5.0, 200.0)  # standard deviations
+PROCESS = (5.0, 1.0, 3e-3, 0.0, 0.0, 0.0)  # standard deviations of the noise of a step
+COMMAND = Quantity("command", "u", "V")
+AMBIENT = Quantity("measured ambient flow", "flow", "m/s")
+TACHOMETER = Quantity("motor speed without its sign", "tach", "rad/s")
+LOAD_CELL = Quantity("load cell", "load", "N")
+SENSORS = (1.8, 1.0)  # standard deviations of tachometer [rad/s] and load cell [N]
 
 
-def effective(u, c):
-    """The command beyond the dead band [V]; astern of another weight."""
-    if u > c.dead_band_high:
-        return u - c.dead_band_high
-    if u < c.dead_band_low:
-        return c.gain_ratio * (u - c.dead_band_low)
+def effective(command, c):
+    """The command beyond the dead band [V]."""
+    if command > c.dead_band_high:
+        return command - c.dead_band_high
+    if command < c.dead_band_low:
+        return c.gain_ratio * (command - c.dead_band_low)
     return 0.0
 
 
-def lift(n, v, c):
-    """Thrust of the blades at a speed and a flow [N]."""
-    return (1.0 + (c.thrust_ratio - 1.0) * (n < 0.0)) * (c.thrust_factor * n * abs(n) - c.flow_factor * v * abs(n))
+def blades(n, v, c):
+    """Thrust of the blades at a speed and a flow through them [N]."""
+    side = 1.0 + (c.thrust_ratio - 1.0) * (n < 0.0)
+    return side * (c.thrust_factor * n * abs(n) - c.flow_factor * v * abs(n))
 
 
 def acceleration(x, c):
@@ -95,26 +94,25 @@ def acceleration(x, c):
 
 def thrust(x, c):
     """Thrust on the water [N]."""
-    return lift(x[0], x[2], c) + c.inertia * acceleration(x, c)
+    return blades(x[0], x[2], c) + c.inertia * acceleration(x, c)
 
 
 def load(x, c):
     """What the load cell shows [N]."""
-    return thrust(x, c) * (1.0 - c.mount_share) + c.mount_share * x[4] + c.thrust_offset
+    return thrust(x, c) * (1.0 - c.mount_share) + c.mount_share * x[4]
 
 
 def rates(x, u, c):
-    """How fast the state changes."""
-    n, y, v, q, r = x[0], x[1], x[2], x[4], x[5]
+    """How fast the state changes under u = (effective command, ambient flow)."""
     w = 2.0 * math.pi * c.mount_frequency
-    blades = lift(n, v - c.ambient_factor * u[1], c)
+    lift = blades(x[0], x[2] - c.ambient_factor * u[1], c)
     return (
         acceleration(x, c),
-        (n - y) / c.tachometer_lag,
-        -c.flow_linear * v - c.flow_quadratic * v * abs(v) + c.flow_gain * blades,
+        (x[0] - x[1]) / c.tachometer_lag,
+        c.flow_gain * lift - (c.flow_linear + c.flow_quadratic * abs(x[2])) * x[2],
         0.0,
-        r,
-        w * w * (blades + c.inertia * acceleration(x, c) - q) - 2.0 * c.mount_damping * w * r,
+        x[5],
+        w * w * (lift + c.inertia * acceleration(x, c) - x[4]) - 2.0 * c.mount_damping * w * x[5],
     )
 
 
@@ -122,34 +120,73 @@ _step = runge_kutta(rates, len(STATES))
 
 
 def transition(x, u, c):
-    """One of the equal parts of a sample."""
-    return _step((x[0], x[1], x[2], effective(u[0], c), x[4], x[5]), u, c)
+    """One of the equal parts of a step under the command."""
+    return _step((x[0], x[1], x[2], effective(u[0], c), x[4], x[5]), (u[0], 0.0), c)
 
 
-def observe(x, c):
+def transition_in_flow(x, u, c):
+    """One of the equal parts of a step under command and measured ambient flow."""
+    return _step((x[0], x[1], x[2], effective(u[0], c), x[4], x[5]), (u[0], u[1]), c)
+
+
+def shown(x, c):
+    """What the tachometer shows."""
+    return (abs(x[1]),)
+
+
+def shown_with_load(x, c):
     """What tachometer and load cell show."""
     return (abs(x[1]), load(x, c))
 
 
-def model(**values: float) -> StateSpaceModel:
-    """The thruster with some of its constants and standard deviations of its noise, by their names.
+def to_identify(ambient: bool = False) -> StateSpaceModel:
+    """The model with the load cell among its channels and round numbers, from which identification starts.
 
     Args:
-        **values: fields of `Constants` and of `Noise`; an unknown name is a TypeError.
+        ambient: whether the measured ambient flow is an input.
     """
-    noise = Noise(**{name: values.pop(name) for name in Noise._fields if name in values})
     return StateSpaceModel(
-        transition=transition,
-        observe=observe,
-        process_noise_cov=[noise.motor**2, noise.tachometer**2, noise.flow**2, 0.0, 0.0, noise.mount**2],
-        measurement_noise_cov=[noise.tachometer_sensor**2, noise.load_cell**2],
+        transition=transition_in_flow if ambient else transition,
+        observe=shown_with_load,
+        process_noise_cov=[deviation**2 for deviation in PROCESS],
+        measurement_noise_cov=[deviation**2 for deviation in SENSORS],
         prior_mean=[0.0] * len(STATES),
         prior_cov=[deviation**2 for deviation in INITIAL],
-        inputs=len(INPUTS),
-        constants=Constants(**values),
+        inputs=1 + ambient,
+        constants=Constants(),
         substeps=SUBSTEPS,
         states=STATES,
-        input_quantities=INPUTS,
+        input_quantities=(COMMAND, AMBIENT)[: 1 + ambient],
         measurements=(TACHOMETER, LOAD_CELL),
-        outputs={"T": Output(Quantity("thrust", "T", "N"), thrust)},
+        outputs={
+            "T": Output(Quantity("thrust", "T", "N"), thrust),
+            "load": Output(Quantity("load cell", "load", "N"), load),
+        },
     )
+
+
+def on_line(identified: StateSpaceModel) -> StateSpaceModel:
+    """An identified model as a filter has it that sees the tachometer alone."""
+    r = identified.measurement_noise_cov[:1, :1]
+    return identified.replace(observe=shown, measurements=(TACHOMETER,), measurement_noise_cov=r)
+
+
+def model() -> StateSpaceModel:
+    """The thruster with the numbers of `identified.toml`, for a filter that sees command and tachometer.
+
+    Its output T is the thrust; a load cell's column may be its reference (`--column T=HEADER`).
+    """
+    values = tomllib.loads(IDENTIFIED.read_text(encoding="utf-8"))["values"]
+    return on_line(with_values(to_identify(), values))
+
+
+def with_values(base: StateSpaceModel, values: dict[str, float]) -> StateSpaceModel:
+    """A model with other constants, and variances Q11, Q22, ..., R11, R22, by name."""
+    constants = {name: value for name, value in values.items() if name in Constants._fields}
+    q, r = base.process_noise_cov.copy(), base.measurement_noise_cov.copy()
+    for name, value in values.items():
+        if name not in constants:
+            place = int(name[1]) - 1
+            (q if name[0] == "Q" else r)[place, place] = value
+    changed = base.constants._replace(**constants)
+    return base.replace(constants=changed, process_noise_cov=q, measurement_noise_cov=r)

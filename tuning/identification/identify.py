@@ -60,7 +60,8 @@ def identify(
         start: values at which to start, where they are not the defaults.
         starts: how many, or the other starts themselves.
         seed: of the draws.
-        degrees: of freedom of Student-t innovations, for logs with outliers; infinite for normal ones.
+        degrees: of freedom of Student-t innovations, for logs with outliers; infinite for normal ones. Where there
+            are predicted channels, of their errors alone.
         predicted: symbols of channels that the filter is to predict, but never sees, such as a load cell that will
             not be there later. What it sees alone would be identified as it predicts best one step ahead; with a
             channel of these, as it predicts that channel best.
