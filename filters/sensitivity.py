@@ -88,7 +88,8 @@ def sensitivity(
     noise = slopes.process_noise_cov.reshape(p, n * n), slopes.measurement_noise_cov.reshape(p, m * m)
     moves = *noise, slopes.constants, _relative(slopes.constants, model), prior
     fed = 1.0 - np.array(np.zeros(m) if predicted is None else predicted, dtype=np.float64)
-    check_shapes({**given, "predicted": fed}, model, *(slope.shape for slope in slopes), (m,))
+    if fed.shape != (m,):
+        raise ValueError(f"predicted must say of each of {m} channels whether it is, but got {predicted!r}")
     accumulate = _build(model.functions, model.shape, is_interpreting())
     arguments = inputs, measurements, model.numbers, *moves, float(degrees), fed, out, information
     spread(lambda first, last: accumulate(*arguments, first, last), count)

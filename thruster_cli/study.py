@@ -15,6 +15,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from thruster_cli import recordings
 from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
 
 RESULTS = Path("out") / "comparison"
@@ -25,6 +26,9 @@ app = typer.Typer(help="Comparisons that take their time.", no_args_is_help=True
 @app.callback()
 def _callback() -> None:
     pass
+
+
+app.command("recordings")(recordings.command)
 
 
 @app.command("policies")

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_t
+from scipy.stats import multivariate_t, norm
 
 from filters import ExtendedKalmanFilter, StateSpaceModel, affine_model, run
 from filters.likelihood import likelihood
@@ -177,6 +177,35 @@ def test_values_and_information_are_those_of_a_textbook_recursion(name):
     )
 
 
+@pytest.mark.parametrize("degrees", [math.inf, 5.0])
+def test_a_predicted_channel_counts_but_corrects_nothing(degrees):
+    make, values, sizes, inputs, measurements = case("pendulum")
+    model, unseen = make(**values), measurements.copy()
+    unseen[..., 1] = np.nan
+    estimates = run(ExtendedKalmanFilter(model=model), episode_keys([0, 1]), inputs, unseen)
+    errors = measurements[..., 1] - np.array(
+        [[model.observe(x, model.constants)[1] for x in one] for one in estimates.means]
+    )
+    r = model.measurement_noise_cov[1, 1]
+    density = multivariate_t(shape=r * 3 / 5, df=5) if degrees == 5.0 else norm(0.0, math.sqrt(r))
+    expected = estimates.log_likelihoods.sum(axis=1)
+    expected += [density.logpdf(one[~np.isnan(one)]).sum() for one in errors]
+    options = {"degrees": degrees, "predicted": [False, True]}
+    found = sensitivity(model, inputs, measurements, slopes_of(make, values, sizes), **options)
+    np.testing.assert_allclose(found.values, expected, rtol=1e-10)
+    nothing = ModelSlopes(*(a[:0] for a in slopes_of(make, values, sizes)))
+    for j, (one, size) in enumerate(sizes.items()):
+        steps = [2e-4 * size * factor for factor in (1, -1, 2, -2)]
+        a, b, c, d = (
+            sensitivity(
+                make(**{**values, one: values[one] + step}), inputs, measurements, nothing, **options
+            ).values
+            for step in steps
+        )
+        slope = (8 * (a - b) - (c - d)) / (12 * 2e-4)
+        np.testing.assert_allclose(found.gradients[:, j], slope, rtol=1e-6, atol=1e-6 * abs(slope).max())
+
+
 def test_parameters_that_move_no_constants_have_the_gradient_of_the_noise_alone():
     make, values, sizes, inputs, measurements = case("thruster")
     slopes = slopes_of(make, values, {"r": 0.2})
@@ -215,3 +244,5 @@ def test_shapes_and_degrees_that_do_not_fit_are_refused():
         sensitivity(make(**values), inputs, measurements, slopes._replace(constants=slopes.constants[:, 1:]))
     with pytest.raises(ValueError, match="degrees of freedom must be above 2, but got 1.0"):
         sensitivity(make(**values), inputs, measurements, slopes, degrees=1.0)
+    with pytest.raises(ValueError, match="predicted must say of each of 2 channels whether it is"):
+        sensitivity(make(**values), inputs, measurements, slopes, predicted=[True])

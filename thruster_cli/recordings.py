@@ -1,0 +1,97 @@
+"""`thruster study recordings`: thrust of the recorded ROV thruster, estimated without its load cell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from numerics.files import check_target
+from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
+
+RESULTS = Path("out") / "recordings.json"
+
+
+def command(
+    data: Annotated[
+        Path, typer.Option(help="Folder with the recorded runs as .csv files, or with a folder closed_loop_25Hz.")
+    ],
+    identify: Annotated[
+        bool,
+        typer.Option(
+            "--identify",
+            help="Find all numbers anew, of nine structures, with all runs and without each: an hour.",
+        ),
+    ] = False,
+    out: Annotated[
+        Path, typer.Option(help="With --identify: file of results; what is there is not done again.")
+    ] = RESULTS,
+    json: JsonOption = None,
+) -> None:
+    """Compare estimates of a recorded thruster's thrust with its load cell, and with the recorder's own estimate.
+
+    The filter sees command and tachometer. Without --identify its numbers are those that the project has from six
+    runs; with it, each run is estimated with numbers that were found without that run. The recordings are those of
+    J. A. Boehm (University of Maryland, 2019), which are no part of this project: docs/real_data.md tells more.
+
+    Example: thruster study recordings --data rov_thruster
+    """
+    from studies.recordings.comparison import estimates_of
+    from studies.recordings.results import identify_all
+    from studies.recordings.runs import read_recordings
+    from studies.recordings.tables import (
+        CLOCK_HEADER,
+        LADDER_HEADER,
+        NUMBER_HEADER,
+        RATIO_HEADER,
+        baseline_header,
+        baseline_rows,
+        clock_rows,
+        ladder_rows,
+        number_rows,
+        ratio_rows,
+        sentences,
+    )
+
+    runs = read_recordings(data)
+    if identify:
+        check_target(out)
+    announce_compilation()
+    tasks = None
+    if identify:
+        columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+        try:
+            with Progress(*columns, console=progress_console) as progress:
+                bar = progress.add_task("identifying", total=None)
+                tasks = identify_all(
+                    runs,
+                    out,
+                    progress=lambda name, done, count: progress.update(
+                        bar, description=name, completed=done, total=count
+                    ),
+                )
+        except KeyboardInterrupt:
+            progress_console.print(f"Interrupted: what is done is in {out}, and the same command goes on.")
+            raise
+    estimates = estimates_of(runs, tasks)
+    which = "numbers found without the run" if identify else "the project's numbers"
+    made = {
+        "ratios": (f"RMSE of thrust over 0.2 s; {which}", RATIO_HEADER, ratio_rows(runs, estimates)),
+        "estimators": (
+            "RMSE over 0.2 s, N: all rows / settled",
+            baseline_header(estimates),
+            baseline_rows(runs, estimates),
+        ),
+        "clocks": ("how far the load cell's clock is ahead", CLOCK_HEADER, clock_rows(runs)),
+    }
+    if tasks is not None:
+        made["structures"] = ("what each effect is worth", LADDER_HEADER, ladder_rows(runs, tasks))
+        made["numbers"] = ("numbers found", NUMBER_HEADER, number_rows(runs, tasks))
+    shown = [table(title, header, rows) for title, header, rows in made.values()]
+    named = {
+        name: [dict(zip(header, row, strict=True)) for row in rows] for name, (_, header, rows) in made.items()
+    }
+    said = sentences(estimates, runs)
+    emit([*shown, *said], {**named, "answers": said}, json)
