@@ -11,15 +11,21 @@ from filters.gaussian.extended import ExtendedKalmanFilter
 from numerics.checks import at_least
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from numerics.matrices import multiplier, quadratic_form
+from numerics.progress import told
 from numerics.sources import Source
 from numerics.streams import GROUP
-from numerics.threads import spread
+from numerics.threads import cores, spread
 from numerics.tuples import matrix_reader, vector_reader
 from plants.affine import AffineModel
 from plants.layout import constants_reader, number_places, padded
 from plants.shape import Functions, Shape, observation_slopes, transition_slopes
 from plants.simulate import simulate, truth_steps
 from plants.state_space import StateSpaceModel
+
+ALL_UP_TO = 12  # states, for which the bound is that of every sequence
+MOST_WORK = 2e10  # truths x steps x n^3, of all sequences of a larger model together
+WORK_AT_ONCE = 2e9  # of the same, some seconds: Ctrl-C is heard in between
+MOST_BYTES, MATRICES = 2**28, 8  # of so many matrices (n, n) a sequence and step at once
 
 
 def riccati_covariances(model: AffineModel) -> tuple[np.ndarray, np.ndarray]:
@@ -64,33 +70,79 @@ def posterior_bound(model: StateSpaceModel, inputs: np.ndarray, *, truths: int =
     Source: Tichavsky, Muravchik, Nehorai (1998), "Posterior Cramer-Rao bounds for discrete-time nonlinear
     filtering", IEEE Trans. Signal Processing 46(5), eqs. 21 and 34-36.
     """
-    truths = at_least("truths", truths, 2)
     inputs = np.ascontiguousarray(inputs, dtype=np.float64)
+    return _posterior_bound(model, inputs, _truth_keys(len(inputs), truths, seed))
+
+
+def posterior_variances(
+    model: StateSpaceModel, inputs: np.ndarray, *, truths: int = 100, seed: int = 0
+) -> np.ndarray:
+    """Diagonals of `posterior_bound` without its matrices of every step, and of a large model for fewer sequences.
+
+    Up to twelve states they are those of all sequences. Beyond, a sequence is truths x steps x n^3 of work, and as
+    many sequences are taken, spread evenly over those given, as 2e10 of it allow: at least one, and one alone where
+    all are the same, for its bound is that of all. Truths are never fewer.
+
+    Args:
+        model: the model that draws the truth; Q must be positive definite.
+        inputs: (B, K, p), one sequence a row.
+        truths: truths drawn for each sequence.
+        seed: of the truths.
+
+    Returns:
+        Variances for every sequence that is taken and every step, (B or fewer, K + 1, n).
+
+    Raises:
+        ValueError: if Q is singular.
+    """
+    keys = _truth_keys(len(inputs), truths, seed)
+    some = _taken(np.asarray(inputs, dtype=np.float64), truths, model.n)
+    inputs, keys = np.ascontiguousarray(inputs[some], dtype=np.float64), np.ascontiguousarray(keys[some])
+    count, steps = inputs.shape[:2]
+    most = max(MOST_BYTES // (8 * MATRICES * (steps + 1) * model.n**2), cores())
+    variances = np.empty((count, steps + 1, model.n))
+    parts = [slice(first, min(first + most, count)) for first in range(0, count, most)]
+    for part in told("posterior bound", parts, [len(inputs[part]) for part in parts]):
+        variances[part] = np.einsum("bkii->bki", _posterior_bound(model, inputs[part], keys[part]))
+    return variances
+
+
+def _taken(inputs: np.ndarray, truths: int, n: int) -> np.ndarray:
+    """Places of the sequences of which `posterior_variances` are made."""
+    count, steps, _ = inputs.shape
+    if n <= ALL_UP_TO or not count:
+        return np.arange(count)
+    if (inputs == inputs[:1]).all():
+        return np.arange(1)
+    most = min(max(int(MOST_WORK / (truths * steps * n**3)), 1), count)
+    return np.arange(most) * count // most
+
+
+def _truth_keys(count: int, truths: int, seed: int) -> np.ndarray:
+    """Keys of the truths of each sequence, (count, truths, 2)."""
+    size = count, at_least("truths", truths, 2), 2
+    return np.random.default_rng(seed).integers(0, 2**32, size=size).astype(np.float64)
+
+
+def _posterior_bound(model: StateSpaceModel, inputs: np.ndarray, keys: np.ndarray) -> np.ndarray:
+    """The bound of `posterior_bound` from the truths of these keys."""
     if np.linalg.eigvalsh(model.process_noise_cov)[0] <= 0:
         raise ValueError(f"the bound needs a positive definite Q, but got {model.process_noise_cov.tolist()}")
-    count, steps, _ = inputs.shape
+    (count, steps, _), (_, truths, _) = inputs.shape, keys.shape
     n = model.n
     q_inverse = np.linalg.inv(model.process_noise_cov)  # enters the recursion itself, as a weight
     r_inverse = np.linalg.inv(model.measurement_noise_cov)
-    keys = np.random.default_rng(seed).integers(0, 2**32, size=(count, truths, 2)).astype(np.float64)
     f_mean, d11, information = (np.zeros((count, steps + 1, n, n)) for _ in range(3))
     gather = _gatherer(model.functions, model.shape, is_interpreting())
-    spread(
-        lambda first, last: gather(
-            keys,
-            inputs,
-            model.numbers,
-            q_inverse.ravel(),
-            r_inverse.ravel(),
-            f_mean,
-            d11,
-            information,
-            first,
-            last,
-        ),
-        count,
-    )
-    f_mean, d11, information = f_mean / truths, d11 / truths, information / truths
+    fixed = inputs, model.numbers, q_inverse.ravel(), r_inverse.ravel()
+    sums = f_mean, d11, information
+    # Some truths at a time, in the same order: Ctrl-C is heard in between.
+    size = max(int(WORK_AT_ONCE / (max(count, 1) * (steps + 1) * n**3)), 1)
+    parts = [np.ascontiguousarray(keys[:, first : first + size]) for first in range(0, truths, size)]
+    for some in told("truths", parts, [part.shape[1] for part in parts]):
+        spread(lambda first, last, some=some: gather(some, *fixed, *sums, first, last), count)
+    for part in sums:
+        part /= truths
 
     bound = np.empty((count, steps + 1, n, n))
     prior = np.broadcast_to(model.prior_cov, (count, n, n))

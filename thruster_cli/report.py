@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from thruster_cli.output import CodeOption, JsonOption, announce_compilation, emit, progress_console
+from thruster_cli.output import CodeOption, JsonOption, announce_compilation, emit, working
 from thruster_cli.tune import DEFAULT_STORAGE
 from tuning.problems.find import find_problem
 from tuning.report.report import write_report
@@ -34,7 +34,7 @@ def command(
     """
     quiet_optuna()
     announce_compilation()
-    with progress_console.status(f"reporting on {source} ..."):
+    with working(f"reporting on {source}"):
         report = write_report(source, storage, out, [find_problem(name) for name in problem or []])
     data = {"advice": report.advice, "page": str(report.page), "tables": str(report.tables)}
     emit([report.advice, f"Page: {report.page}", f"Tables: {report.tables}"], data, json)

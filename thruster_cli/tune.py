@@ -22,6 +22,7 @@ from thruster_cli.output import (
     announce_compilation,
     emit,
     progress_console,
+    working,
 )
 from thruster_cli.tuning_report import Tuning, as_json, report
 from tuning.evaluation.held_out import prove
@@ -166,11 +167,11 @@ def tune(
         result = run_study(study, plan, trials, advance, run)
     gradient = rival = None
     if by_gradient:
-        with progress_console.status("maximising the likelihood ..."):
+        with working("maximising the likelihood"):
             gradient = maximise_likelihood(plan.filter, plan.scenarios[0], plan.training_data()[0])
         rival = prove(result.choice, plan.scenarios[0], plan.seed)
         result = result._replace(choice=gradient.choice, consistent=None, nis=())
-    with progress_console.status("proving the choice on held-out seeds ..."):
+    with working("proving the choice on held-out seeds"):
         proofs = tuple(prove(result.choice, scenario, plan.seed) for scenario in plan.scenarios)
     write_tuned(file, plan, result, proofs, name, METHODS[by_gradient])
     known = None if by_gradient else identify(result.choice, plan.scenarios, plan.training_data(), plan.space())

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from filters.bounds import posterior_bound
+from filters.bounds import posterior_variances
 from numerics.checks import positive, shown, vector
 from numerics.streams import episode_keys, filter_keys
 from plants.state_space import StateSpaceModel
@@ -133,7 +133,7 @@ class Scenario(BaseScenario):
         if not self.has_bound:
             return np.full(2, np.nan)
         exact = model_of_plant(self.plant)
-        variances = np.einsum("bkii->bki", posterior_bound(exact, data.inputs, truths=truths))
+        variances = posterior_variances(exact, data.inputs, truths=truths)
         return np.sqrt(variances[:, self.first_scored_step :].mean(axis=(0, 1)))
 
     def make(self, seeds: tuple[int, ...]) -> Data:
