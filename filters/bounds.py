@@ -79,9 +79,9 @@ def posterior_variances(
 ) -> np.ndarray:
     """Diagonals of `posterior_bound` without its matrices of every step, and of a large model for fewer sequences.
 
-    Up to twelve states they are those of all sequences. Beyond, a sequence is truths x steps x n^3 of work, and as
-    many sequences are taken, spread evenly over those given, as 2e10 of it allow: at least one, and one alone where
-    all are the same, for its bound is that of all. Truths are never fewer.
+    Up to twelve states they are those of all sequences. Beyond, a sequence is truths x steps x n^3 of work, and
+    as many sequences are taken, spread evenly over those given, as 2e10 of it allow: at least one, and one alone
+    where all are the same, for its bound is that of all. Truths are never fewer.
 
     Args:
         model: the model that draws the truth; Q must be positive definite.

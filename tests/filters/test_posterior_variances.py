@@ -1,4 +1,4 @@
-"""The posterior bound's variances: in parts the same to the bit, and of how many sequences a large model has them."""
+"""The posterior bound's variances: the same in parts, and of how many sequences of a large model."""
 
 import numpy as np
 import pytest

@@ -73,6 +73,9 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
         return math.log(nis_at(10.0**exponent))
 
     first, exponent = excess(0.0), 0
+    if not np.any(start.model["process_noise_cov"]):
+        said = f"no factor on a Q of zero brings the mean NIS of {name} to 1: it is {math.exp(first):.3g}"
+        return Scaled(None, None, None, said)
     step = 1 if first > 0 else -1  # a larger Q lowers the NIS
     last = first
     while last * first > 0 and abs(exponent) < DECADES:
