@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from numerics.checks import at_least, one_of
 from numerics.files import check_target
+from numerics.progress import listening
 from thruster_cli.output import (
     FILTER_HELP,
     PROBLEMS,
@@ -171,8 +172,12 @@ def tune(
             gradient = maximise_likelihood(plan.filter, plan.scenarios[0], plan.training_data()[0])
         rival = prove(result.choice, plan.scenarios[0], plan.seed)
         result = result._replace(choice=gradient.choice, consistent=None, nis=())
-    with working("proving the choice on held-out seeds"):
-        proofs = tuple(prove(result.choice, scenario, plan.seed) for scenario in plan.scenarios)
+    try:
+        with working("proving the choice on held-out seeds"):
+            proofs = tuple(prove(result.choice, scenario, plan.seed) for scenario in plan.scenarios)
+    except KeyboardInterrupt:
+        progress_console.print(f"study {name!r} keeps its trials: the same command goes on with the proof")
+        raise
     write_tuned(file, plan, result, proofs, name, METHODS[by_gradient])
     known = None if by_gradient else identify(result.choice, plan.scenarios, plan.training_data(), plan.space())
     return Tuning(name, plan, result, proofs, file, gradient, rival, known)
@@ -224,4 +229,9 @@ def _bar(plan: Plan, total: int, done: int) -> Iterator[tuple[OnTrial, Callable[
             if running := kinds_running(trials):
                 show_kinds(running)
 
-        yield advance, show_kinds
+        def show_rest(far: str) -> None:
+            if progress.tasks[task].finished:  # what comes after the last trial
+                progress.update(task, description=f"ensemble sizes, {far}" if far.startswith("N: ") else far)
+
+        with listening(show_rest):
+            yield advance, show_kinds

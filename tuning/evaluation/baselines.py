@@ -93,6 +93,11 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
     return Scaled(scaled(start, factor), factor, nis)
 
 
+def scaled_rule(rule: Choice, scenario: Problem, factor: float) -> Choice:
+    """A rule of thumb with a factor on its Q, even where that follows from other numbers."""
+    return scaled(_with_q(rule, scenario), factor)
+
+
 def scaled(choice: Choice, factor: float) -> Choice:
     """The same choice with variances of the process noise that are a factor times as large."""
     q = choice.model["process_noise_cov"]
@@ -111,9 +116,12 @@ def _with_q(choice: Choice, scenario: Problem) -> Choice:
     return choice._replace(model={**choice.model, "process_noise_cov": tuple(map(tuple, q.tolist()))})
 
 
-def baselines(name: str, scenario: Problem, seed: int = 0) -> dict[str, Choice]:
-    """All baselines of a kind of filter that there are, by what they are called, the one that counts first."""
-    default = scaled_default(name, scenario, seed).choice
+def baselines(name: str, scenario: Problem, seed: int = 0, default: Scaled | None = None) -> dict[str, Choice]:
+    """All baselines of a kind of filter that there are, by what they are called, the one that counts first.
+
+    The scaled default is found for the study's seed, unless it is given.
+    """
+    default = (scaled_default(name, scenario, seed) if default is None else default).choice
     found = {SCALED: default} if default is not None else {}
     known = oracle(name, scenario)
     return found | {RULE: rule_of_thumb(name, scenario)} | ({} if known is None else {ORACLE: known})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,8 @@ class Comparison(NamedTuple):
     seeds: range
     scaled: Evaluation | None = None  # of the scaled default; None where there is none
     default: Scaled | None = None  # its factor, or why there is none; None where it was not asked for
+    kept_ratios: Mapping[str, Interval] | None = None  # where evaluations are summaries, without their runs
+    kept_gains: Mapping[str, Interval] | None = None
 
     @property
     def evaluations(self) -> dict[str, Evaluation]:
@@ -36,6 +39,8 @@ class Comparison(NamedTuple):
     @property
     def ratios(self) -> dict[str, Interval]:
         """Score of the tuned filter over that of each baseline, paired, the one that counts first."""
+        if self.kept_ratios is not None:
+            return dict(self.kept_ratios)
         found = self.evaluations
         names = [name for name in (SCALED, RULE, ORACLE) if name in found]
         return {name: score_ratio(self.tuned, found[name]) for name in names}
@@ -43,6 +48,8 @@ class Comparison(NamedTuple):
     @property
     def likelihood_gains(self) -> dict[str, Interval]:
         """Log-likelihood of a run of the tuned filter less that of each baseline; it needs no truth."""
+        if self.kept_gains is not None:
+            return dict(self.kept_gains)
         found = self.evaluations
         names = [name for name in (SCALED, RULE, ORACLE) if name in found]
         return {name: likelihood_gain(self.tuned, found[name]) for name in names}

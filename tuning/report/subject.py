@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -19,6 +19,7 @@ from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.space import Choice, choice_of
 from tuning.search.storage import open_storage
 from tuning.search.storage_url import shown_storage
+from tuning.search.study import SIZES
 
 
 class Subject(NamedTuple):
@@ -31,6 +32,8 @@ class Subject(NamedTuple):
     seeds: int  # number of held-out seeds
     chosen: bool  # whether the ensemble size is that of a tuned file, or still to be chosen
     consistent: bool = False  # whether its mean NIS is in its band, where it has to be
+    content: Mapping = {}  # of the tuned file
+    sizes: object = None  # the table of ensemble sizes as it is kept
 
 
 def find_subject(source: str | Path, storage: str, problems: Sequence[Problem] = ()) -> Subject:
@@ -67,7 +70,8 @@ def _of_file(path: str, storage: str, problems: Sequence[Problem]) -> Subject:
     except (KeyError, TypeError):
         raise ValueError(f"a tuned file must tell its held-out seeds, but {path} does not") from None
     consistent = plan.is_constrained and bool(content["study"].get("any_trial_consistent"))
-    return Subject(name, plan, choice, study, count, chosen=True, consistent=consistent)
+    kept = content if content.get("digest") == plan.scenarios[0].digest else {}
+    return Subject(name, plan, choice, study, count, True, consistent, kept, content.get("ensemble_sizes"))
 
 
 def _of_study(name: str, storage: str, problems: Sequence[Problem]) -> Subject:
@@ -82,7 +86,8 @@ def _of_study(name: str, storage: str, problems: Sequence[Problem]) -> Subject:
         raise ValueError(f"a study must have a complete trial for a report, but {name!r} has none")
     choice = choice_of(plan.filter, best.params, plan.scenarios[0])
     consistent = plan.is_constrained and is_consistent(best)
-    return Subject(name, plan, choice, study, HELD_OUT_SEEDS, len(plan.objectives) > 1, consistent)
+    chosen, sizes = len(plan.objectives) > 1, study.user_attrs.get(SIZES)
+    return Subject(name, plan, choice, study, HELD_OUT_SEEDS, chosen, consistent, sizes=sizes)
 
 
 def _load(name: str, storage: str) -> optuna.Study | None:

@@ -7,7 +7,7 @@ from math import isnan
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import rounded
 from plants.quantities import Quantity
-from tuning.evaluation.baselines import RULE, TUNED, baselines
+from tuning.evaluation.baselines import RULE, TUNED, Scaled, baselines
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.held_out import Comparison
 from tuning.likelihood.identifiability import Identifiability
@@ -86,9 +86,9 @@ def _output_label(output: Quantity) -> str:
     return f"RMSE {output.label}"
 
 
-def numbers_table(choice: Choice, scenario: Problem, seed: int) -> Table:
-    """The numbers of a tuned filter and of its baselines."""
-    found = baselines(choice.name, scenario, seed)
+def numbers_table(choice: Choice, scenario: Problem, seed: int, default: Scaled | None = None) -> Table:
+    """The numbers of a tuned filter and of its baselines; the scaled default is found unless it is given."""
+    found = baselines(choice.name, scenario, seed, default)
     choices, default = {TUNED: choice, **found}, found[RULE].numbers
     columns = [parameters_of(one._replace(numbers={**default, **one.numbers})) for one in choices.values()]
     names = labels(dict.fromkeys(name for column in columns for name in column), choice.name, scenario, "²")
