@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.bounds import ALL_UP_TO
 from filters.consistency.intervals import Interval
+from filters.posterior import ALL_UP_TO
 from numerics.progress import told
 from tuning.evaluation.evaluate import Evaluation, evaluate, resampled_ratios, score_ratio
 from tuning.problems.data import Data

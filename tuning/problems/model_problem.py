@@ -9,7 +9,7 @@ from inspect import Signature
 import numpy as np
 
 from filters.baselines.baselines import OpenLoop
-from filters.bounds import posterior_variances
+from filters.posterior import has_bound, posterior_variances
 from filters.tuned_file import NOISE, PRIOR
 from numerics.checks import shown
 from numerics.streams import episode_keys, filter_keys
@@ -150,7 +150,7 @@ class ModelProblem(AssumedProblem):
         return scale
 
     def _bound(self, data: Data, truths: int) -> np.ndarray:
-        if not np.linalg.eigvalsh(self.truth.process_noise_cov)[0] > 0:
+        if not has_bound(self.truth.process_noise_cov):
             return np.full(len(self._shared), np.nan)
         variances = posterior_variances(self.truth, data.inputs, truths=truths)
         return np.sqrt(variances[:, data.scored, self._shared].mean(axis=(0, 1)))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from filters.bounds import posterior_variances
+from filters.posterior import has_bound, posterior_variances
 from numerics.checks import positive, shown, vector
 from numerics.streams import episode_keys, filter_keys
 from plants.state_space import StateSpaceModel
@@ -122,7 +122,7 @@ class Scenario(BaseScenario):
     @property
     def has_bound(self) -> bool:
         """Whether there is a posterior Cramér-Rao bound: its recursion needs the inverse of Q."""
-        return bool(np.linalg.eigvalsh(self.plant.process_noise_cov)[0] > 0)
+        return has_bound(self.plant.process_noise_cov)
 
     def bound(self, data: Data, truths: int = 100) -> np.ndarray:
         """Bound on the standard error of each state (2,), averaged over the data's inputs and scored steps.
