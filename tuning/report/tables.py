@@ -13,8 +13,8 @@ from tuning.evaluation.held_out import Comparison
 from tuning.likelihood.identifiability import Identifiability
 from tuning.problems.problem import Problem
 from tuning.report.page import Table
-from tuning.report.units import labels
-from tuning.search.space import Choice, neutral, parameters_of
+from tuning.report.units import number_rows
+from tuning.search.space import Choice
 
 MOST_ACROSS = 3  # states side by side; more stand one below the other
 EXPECTED = "bound; expected value"  # what stands beside the metrics
@@ -90,11 +90,8 @@ def numbers_table(choice: Choice, scenario: Problem, seed: int, default: Scaled 
     """The numbers of a tuned filter and of its baselines; the scaled default is found unless it is given."""
     found = baselines(choice.name, scenario, seed, default)
     choices, default = {TUNED: choice, **found}, found[RULE].numbers
-    columns = [parameters_of(one._replace(numbers={**default, **one.numbers})) for one in choices.values()]
-    names = labels(dict.fromkeys(name for column in columns for name in column), choice.name, scenario, "²")
-    rows = [
-        [label, *(_number(column.get(name, neutral(name))) for column in columns)] for name, label in names.items()
-    ]
+    whole = [one._replace(numbers={**default, **one.numbers}) for one in choices.values()]
+    rows = number_rows(whole, choice.name, scenario, _number, "²")
     return Table(f"Numbers of the {choice.name} filter", ["", *choices], rows)
 
 
