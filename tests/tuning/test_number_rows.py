@@ -1,4 +1,4 @@
-"""Rows of the numbers of filters: what is the same of many states shares a row, and nobody invents correlations."""
+"""Rows of the numbers of filters: equal variances of many states share one; nobody invents correlations."""
 
 import numpy as np
 
