@@ -87,6 +87,10 @@ def few_seeds_first(
         return [evaluate(choice.with_size(n).filter(one), some, one.scale) for one, some in pairs]
 
     early = [on(few, n) for n in told("N", sizes)]
+
+    def on_all(i: int) -> list[Evaluation]:
+        return early[i] if len(fresh[0].seeds) <= FEW else on(fresh, sizes[i])
+
     outside = [max(map(nis_violation, found)) if plan.is_constrained else 0.0 for found in early]
     trained: set[int] = set()
 
@@ -103,12 +107,12 @@ def few_seeds_first(
         for i in set(best_ones()):
             train(i)
     best = best_ones()
-    whole = {i: on(fresh, sizes[i]) for i in told("best N on all seeds", sorted(set(best)))}
+    whole = {i: on_all(i) for i in told("best N on all seeds", sorted(set(best)))}
     hopeful = [i for i in range(len(sizes)) if not _surely_worse(early[i], [early[b] for b in best])]
     for i in told("smallest N on all seeds", hopeful):
         if i not in whole:
             train(i)
-            whole[i] = on(fresh, sizes[i])
+            whole[i] = on_all(i)
         ends = [ratio[i].high for ratio in _ratios_of(whole, _counting_of(whole, outside, consistent))]
         if i in _counting_of(whole, outside, consistent) and max(ends) < 1.0 + SIZE_TOLERANCE:
             break

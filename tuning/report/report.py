@@ -79,7 +79,7 @@ def write_report(
     said = advice(choice, plan, proofs)
     known = identify(choice, plan.scenarios, data, plan.space())
     identified = sentences(known) if known else too_many(choice, plan.space())
-    nis = [nis_ratio(found) for found in measure(choice, plan, data)]
+    nis = subject.nis or [nis_ratio(found) for found in measure(choice, plan, data)]
     numbers = [
         numbers_table(choice, plan.scenarios[0], plan.seed, proofs[0].default),
         *([known_table(known)] if known else []),

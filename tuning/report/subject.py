@@ -12,6 +12,7 @@ import optuna
 from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least, shown
 from tuning.evaluation.tuned import problem_in, read_tuned
+from tuning.evaluation.versions import versions
 from tuning.problems.find import find_given
 from tuning.problems.problem import Problem
 from tuning.search.outcome import best_trial, is_consistent
@@ -34,6 +35,7 @@ class Subject(NamedTuple):
     consistent: bool = False  # whether its mean NIS is in its band, where it has to be
     content: Mapping = {}  # of the tuned file
     sizes: object = None  # the table of ensemble sizes as it is kept
+    nis: tuple[float, ...] = ()  # mean NIS over the channels on each scenario's training seeds, where it is kept
 
 
 def find_subject(source: str | Path, storage: str, problems: Sequence[Problem] = ()) -> Subject:
@@ -71,7 +73,16 @@ def _of_file(path: str, storage: str, problems: Sequence[Problem]) -> Subject:
         raise ValueError(f"a tuned file must tell its held-out seeds, but {path} does not") from None
     consistent = plan.is_constrained and bool(content["study"].get("any_trial_consistent"))
     kept = content if content.get("digest") == plan.scenarios[0].digest else {}
-    return Subject(name, plan, choice, study, count, True, consistent, kept, content.get("ensemble_sizes"))
+    sizes, nis = content.get("ensemble_sizes"), _kept_nis(kept, plan)
+    return Subject(name, plan, choice, study, count, True, consistent, kept, sizes, nis)
+
+
+def _kept_nis(content: Mapping, plan: Plan) -> tuple[float, ...]:
+    """The mean NIS on the training seeds that a tuned file tells; nothing if other packages made it."""
+    found = content.get("study", {}).get("mean_nis") if content.get("made_with") == versions() else None
+    if not isinstance(found, list) or len(found) != len(plan.scenarios):
+        return ()
+    return tuple(found) if all(isinstance(one, float) for one in found) else ()
 
 
 def _of_study(name: str, storage: str, problems: Sequence[Problem]) -> Subject:
