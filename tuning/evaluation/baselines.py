@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from tuning.evaluation.evaluate import evaluate
+from tuning.problems.assumed import rows_argument
 from tuning.problems.problem import Problem
 from tuning.problems.seeds import training_seeds
 from tuning.search.objectives import LARGEST, nis_ratio
@@ -112,8 +113,8 @@ def _with_q(choice: Choice, scenario: Problem) -> Choice:
     """The same choice, which says what Q is even where it follows from other numbers."""
     if "process_noise_cov" in choice.model:
         return choice
-    q = scenario.model(**choice.model).process_noise_cov
-    return choice._replace(model={**choice.model, "process_noise_cov": tuple(map(tuple, q.tolist()))})
+    q = rows_argument(scenario.model(**choice.model).process_noise_cov)
+    return choice._replace(model={**choice.model, "process_noise_cov": q})
 
 
 def baselines(name: str, scenario: Problem, seed: int = 0, default: Scaled | None = None) -> dict[str, Choice]:

@@ -58,7 +58,7 @@ def _said(column: Mapping[str, float], name: str) -> float | None:
 
 def _letters(label: str) -> str | None:
     """What the label of a variance or a correlation begins with and ends with; the whole of all others."""
-    found = re.fullmatch(r"(Q|R|correlation )\d+( \[.*\])?", label)
+    found = re.fullmatch(r"(Q|R|correlation )\d+(?: \d+)?( \[.*\])?", label)
     return f"{found[1]}{found[2]}" if found else label
 
 
