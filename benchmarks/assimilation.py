@@ -17,7 +17,9 @@ import numpy as np
 
 from benchmarks.rows import Row
 from benchmarks.timing import Timing
+from filters.engine.batch import run
 from studies.lorenz96 import STEPS, problem
+from tuning.problems import in_parts
 from tuning.search import plan as plans
 from tuning.search import space
 from tuning.search.plan import Plan
@@ -55,27 +57,30 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     ours, sizes = study_seconds(seed, count, seeds)
     what = f"a study on Lorenz-96: {count} trials, EnKF, N up to {LARGEST}, {seeds} seeds, {STEPS} steps"
     if os.environ.get(INTERPRETER):
-        peer = seeds * float(np.polyval(peer_line(100 if quick else STEPS), sizes).sum())
+        peer = float(np.polyval(peer_line(100 if quick else STEPS), sizes).sum())
         yield Row(what, "DAPPER, extrapolated", Timing(ours, peer, ours / peer), ratio_goal=GOAL)
     else:
         yield Row(what, f"no DAPPER: {INTERPRETER} is not set", Timing(ours, None, None))
 
 
 def study_seconds(seed: int, count: int, seeds: int) -> tuple[float, list[int]]:
-    """Seconds of a study of so many trials on so many seeds, without pruning, and the N of all that it runs."""
+    """Seconds of a study of so many trials on so many seeds, without pruning, and the N of each of its runs."""
     quiet_optuna()
     few = mock.patch.multiple(plans, TRAINING_SEEDS=seeds, SIZE_SEEDS=seeds)
-    sizes = mock.patch.object(space, "KALMAN_SIZES", space.Sizes(30, 5, LARGEST))
-    with few, sizes:
+    limits = mock.patch.object(space, "KALMAN_SIZES", space.Sizes(30, 5, LARGEST))
+    sizes: list[int] = []
+
+    def counting(filter_, keys, *data, **noise):
+        sizes.extend([filter_.size] * len(keys))
+        return run(filter_, keys, *data, **noise)
+
+    with few, limits, mock.patch.object(in_parts, "run", counting):
         plan = Plan("enkf", (problem,), seed, hold_r=True, prune=False)
         study = open_study("lorenz96", plan, None)
         plan.training_data()  # drawing the truth is no part of the study, nor of the peer's runs
         begin = perf_counter()
-        result = run_study(study, plan, count)
-        seconds = perf_counter() - begin
-    # Each size that the study looks at in the end is run on as many training and as many fresh seeds.
-    sizes = [trial.params["N"] for trial in result.trials] + 2 * [row.size for row in result.sizes]
-    return seconds, [*sizes, result.choice.numbers["ensemble_size"]]
+        run_study(study, plan, count)
+        return perf_counter() - begin, sizes
 
 
 def peer_line(steps: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from filters import (
     smooth,
     thruster_model,
 )
-from filters.bounds import posterior_bound
+from filters.posterior import posterior_bound
 from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from thruster_env.plant import make_plant
 from tuning.problems.data import FIRST_SCORED_STEP

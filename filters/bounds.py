@@ -1,24 +1,13 @@
-"""How good an estimate can be: Riccati covariances and the posterior Cramer-Rao bound."""
+"""How good an estimate can be: Riccati covariances, steady and along a path; `filters.posterior` has the bound."""
 
 from __future__ import annotations
-
-from functools import cache
 
 import numpy as np
 
 from filters.engine.batch import run
 from filters.gaussian.extended import ExtendedKalmanFilter
-from numerics.checks import at_least
-from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from numerics.matrices import multiplier, quadratic_form
-from numerics.sources import Source
-from numerics.streams import GROUP
-from numerics.threads import spread
-from numerics.tuples import matrix_reader, vector_reader
 from plants.affine import AffineModel
-from plants.layout import constants_reader, number_places, padded
-from plants.shape import Functions, Shape, observation_slopes, transition_slopes
-from plants.simulate import simulate, truth_steps
+from plants.simulate import simulate
 from plants.state_space import StateSpaceModel
 
 
@@ -36,71 +25,6 @@ def riccati_covariances(model: AffineModel) -> tuple[np.ndarray, np.ndarray]:
     gain = np.linalg.solve(innovation_cov, c @ predicted).T
     posterior = predicted - gain @ innovation_cov @ gain.T
     return (predicted + predicted.T) / 2, (posterior + posterior.T) / 2
-
-
-def posterior_bound(model: StateSpaceModel, inputs: np.ndarray, *, truths: int = 100, seed: int = 0) -> np.ndarray:
-    """Posterior Cramer-Rao bound on the covariance of any estimate, conditional on each input sequence.
-
-    With F = df/dx and H = dh/dx at truths drawn under the very input sequence, and P = J^-1,
-
-        J_0 = P_0^-1 + E[H' R^-1 H],  D11 = E[F' Q^-1 F],  D12 = -E[F'] Q^-1,
-        J_{k+1} = Q^-1 + E[H' R^-1 H] - D12' (J_k + D11)^-1 D12
-
-    written with P in place of J, so that P_0 may be singular. Expectations are over truths of one sequence;
-    Jacobians pooled over different inputs would give a bound that nothing attains and nothing obeys.
-
-    Args:
-        model: the model that draws the truth; Q must be positive definite.
-        inputs: (B, K, p), one sequence a row.
-        truths: truths drawn for each sequence.
-        seed: of the truths.
-
-    Returns:
-        Bound P_k for every sequence and step, (B, K + 1, n, n); index 0 is after the first measurement.
-
-    Raises:
-        ValueError: if Q is singular: then the recursion's Q^-1 does not exist.
-
-    Source: Tichavsky, Muravchik, Nehorai (1998), "Posterior Cramer-Rao bounds for discrete-time nonlinear
-    filtering", IEEE Trans. Signal Processing 46(5), eqs. 21 and 34-36.
-    """
-    truths = at_least("truths", truths, 2)
-    inputs = np.ascontiguousarray(inputs, dtype=np.float64)
-    if np.linalg.eigvalsh(model.process_noise_cov)[0] <= 0:
-        raise ValueError(f"the bound needs a positive definite Q, but got {model.process_noise_cov.tolist()}")
-    count, steps, _ = inputs.shape
-    n = model.n
-    q_inverse = np.linalg.inv(model.process_noise_cov)  # enters the recursion itself, as a weight
-    r_inverse = np.linalg.inv(model.measurement_noise_cov)
-    keys = np.random.default_rng(seed).integers(0, 2**32, size=(count, truths, 2)).astype(np.float64)
-    f_mean, d11, information = (np.zeros((count, steps + 1, n, n)) for _ in range(3))
-    gather = _gatherer(model.functions, model.shape, is_interpreting())
-    spread(
-        lambda first, last: gather(
-            keys,
-            inputs,
-            model.numbers,
-            q_inverse.ravel(),
-            r_inverse.ravel(),
-            f_mean,
-            d11,
-            information,
-            first,
-            last,
-        ),
-        count,
-    )
-    f_mean, d11, information = f_mean / truths, d11 / truths, information / truths
-
-    bound = np.empty((count, steps + 1, n, n))
-    prior = np.broadcast_to(model.prior_cov, (count, n, n))
-    bound[:, 0] = _less_information(prior, information[:, 0])
-    for k in range(steps):
-        d12 = -np.swapaxes(f_mean[:, k], -1, -2) @ q_inverse
-        kept = _less_information(bound[:, k], d11[:, k])  # (J_k + D11)^-1
-        j = q_inverse + information[:, k + 1] - np.swapaxes(d12, -1, -2) @ kept @ d12
-        bound[:, k + 1] = np.linalg.inv((j + np.swapaxes(j, -1, -2)) / 2)
-    return bound
 
 
 def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray | None = None) -> np.ndarray:
@@ -132,63 +56,3 @@ def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray |
         measured = np.where(missing, np.nan, measured)
     # Measurements that are right leave the estimate on the path.
     return run(ExtendedKalmanFilter(model=model), keys, inputs, measured).covs
-
-
-def _less_information(p: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """(P^-1 + information)^-1 for a P that may be singular: (I + P information)^-1 P."""
-    result = np.linalg.solve(np.eye(p.shape[-1]) + p @ information, p)
-    return (result + np.swapaxes(result, -1, -2)) / 2
-
-
-@cache
-def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
-    n, m, transition = shape.n, shape.m, functions.transition
-    transition_matrix, observation_matrix = (
-        transition_slopes(functions, shape),
-        observation_slopes(functions, shape),
-    )
-    begin, advance, _ = truth_steps(functions, shape)
-    state, control, constants = vector_reader(n), vector_reader(shape.inputs), constants_reader(shape)
-    scales = vector_reader(n, number_places(n, m).scales)
-    substeps, room = number_places(n, m).substeps, padded(max(n, m), GROUP)
-    times, identity = multiplier(n, n, n), matrix_reader(n, n)
-    read_weight_n, read_weight_m = matrix_reader(n, n), matrix_reader(m, m)
-    quadratic_n, quadratic_m = quadratic_form(n, n), quadratic_form(m, n)
-    adder = Source("accumulate", "out, b, k, a", a=(n, n))
-    for i in adder.range(n):
-        for j in adder.range(n):
-            adder.line(f"out[b, k, {i}, {j}] += a[{i}][{j}]")
-    accumulate = adder.function()
-    fingerprint = function_fingerprint(transition, transition_matrix, observation_matrix, within=__name__)
-
-    @inlined
-    def whole_step_matrix(x, u, numbers, c, eye):
-        f = identity(eye)
-        for _ in range(int(numbers[substeps])):
-            f = times(transition_matrix(x, scales(numbers), u, c), f)
-            x = transition(x, u, c)
-        return f
-
-    def gather(keys, inputs, numbers, q_inverse, r_inverse, f_mean, d11, information, first, last):
-        fingerprint  # noqa: B018 - part of the cache's key
-        x, u, draws, eye = np.zeros(n), np.zeros(inputs.shape[2]), np.zeros(room), np.eye(n).ravel()
-        c = constants(numbers)
-        weight_q, weight_r = read_weight_n(q_inverse), read_weight_m(r_inverse)
-        for b in range(first, last):
-            for truth in range(keys.shape[1]):
-                key_0, key_1 = keys[b, truth, 0], keys[b, truth, 1]
-                begin(x, draws, key_0, key_1, numbers)
-                for k in range(f_mean.shape[1]):
-                    accumulate(
-                        information, b, k, quadratic_m(observation_matrix(state(x), scales(numbers), c), weight_r)
-                    )
-                    if k == inputs.shape[1]:
-                        break
-                    for i in range(u.shape[0]):
-                        u[i] = inputs[b, k, i]
-                    f = whole_step_matrix(state(x), control(u), numbers, c, eye)
-                    accumulate(d11, b, k, quadratic_n(f, weight_q))
-                    accumulate(f_mean, b, k, f)
-                    advance(x, u, draws, k + 1, key_0, key_1, numbers)
-
-    return CompiledOrPython(gather)

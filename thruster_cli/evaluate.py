@@ -16,7 +16,7 @@ from thruster_cli.output import (
     SeedOption,
     announce_compilation,
     emit,
-    progress_console,
+    working,
 )
 from thruster_cli.problems import PROBLEMS
 from thruster_cli.tables import choice_table
@@ -74,7 +74,7 @@ def command(
     if consistency is not None:
         check_request(consistency, choice.filter(chosen))
     announce_compilation()
-    with progress_console.status(f"{choice.name} on {seeds} seeds of {chosen.name} ..."):
+    with working(f"{choice.name} on {seeds} seeds of {chosen.name}"):
         proof = prove(choice, chosen, seed, seeds)
     evaluations, said = proof.evaluations, metrics(proof)
     choices = {TUNED: choice, **baselines(choice.name, chosen, seed)}
@@ -93,7 +93,7 @@ def command(
     shown += [scaling_sentence(proof)] if tuned is None else gains(proof)
     if consistency is not None:
         name = RULE if tuned is None else TUNED
-        with progress_console.status("checking the covariance ..."):
+        with working("checking the covariance"):
             words, data["consistency"] = check_covariance(choice, name, chosen, proof, consistency)
         shown += words
     emit(shown, data, json)

@@ -14,7 +14,9 @@ from rich.text import Text
 
 from filters.filter import Filter
 from filters.registry import FILTERS, filter_class, tunable_numbers
-from thruster_cli.output import JsonOption, console, emit, table
+from thruster_cli.fitting import fit_table, fits_of
+from thruster_cli.output import PROBLEMS, JsonOption, console, emit, table
+from tuning.problems.find import find_problem
 from tuning.search.space import has_ensemble
 
 ATTRIBUTES, ERRORS = "Attributes:", "Raises:"  # what these sections of a docstring begin with
@@ -42,6 +44,10 @@ class Entry(NamedTuple):
 
 def command(
     name: Annotated[str | None, typer.Argument(help="A filter, to be shown in full.")] = None,
+    problem: Annotated[
+        str | None,
+        typer.Option("--problem", "--scenario", help=f"Tell which filters fit its model. {PROBLEMS}"),
+    ] = None,
     json: JsonOption = None,
 ) -> None:
     """List the filters, their numbers and what these mean; or show one filter with its equations and sources.
@@ -49,9 +55,16 @@ def command(
     Every name can be given to --filter of other commands, to EstimateState and to make_filter.
 
     Example: thruster filters ukf
+
+    Example: thruster filters --problem my_module:problem
     """
     if name is not None:
         filter_class(name)
+    if problem is not None:
+        found = find_problem(problem)
+        fits = fits_of(found, tuple(FILTERS) if name is None else (name,))
+        emit(fit_table(found, fits), {"problem": found.name, "filters": [one._asdict() for one in fits]}, json)
+        return
     entries = [entry(known) for known in FILTERS if name in (None, known)]
     shown = overview(entries) if name is None else in_full(entries[0], console.width)
     emit(shown, {"filters": [_plain(one) for one in entries]}, json)

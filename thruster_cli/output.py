@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import math
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Annotated, Any
 
@@ -17,6 +19,7 @@ from rich.text import Text
 
 from numerics.compiled import tell_when_compiling
 from numerics.files import write_whole
+from numerics.progress import listening
 from thruster_cli.characters import showable
 from thruster_env.parameters import PRESETS
 
@@ -77,6 +80,13 @@ def announce_compilation() -> None:
     tell_when_compiling(
         lambda: progress_console.print("compiling numerical code: the first run only, some seconds a filter ...")
     )
+
+
+@contextmanager
+def working(text: str) -> Iterator[None]:
+    """Say on standard error what goes on, with how far it is where that is told."""
+    with progress_console.status(f"{text} ...") as status, listening(lambda far: status.update(f"{text}: {far}")):
+        yield
 
 
 def as_text(data) -> str:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from thruster_cli.log_problems import LogModelOption, problems_in
-from thruster_cli.output import CodeOption, JsonOption, announce_compilation, emit, progress_console
+from thruster_cli.output import CodeOption, JsonOption, announce_compilation, emit, working
 from thruster_cli.tune import DEFAULT_STORAGE
 from tuning.problems.find import find_problem
 from tuning.report.report import write_report
@@ -38,7 +38,7 @@ def command(
     quiet_optuna()
     announce_compilation()
     given = [*map(find_problem, problem or []), *(problems_in(Path(source), model) if is_file(source) else [])]
-    with progress_console.status(f"reporting on {source} ..."):
+    with working(f"reporting on {source}"):
         report = write_report(source, storage, out, given)
     data = {"advice": report.advice, "page": str(report.page), "tables": str(report.tables)}
     emit([report.advice, f"Page: {report.page}", f"Tables: {report.tables}"], data, json)

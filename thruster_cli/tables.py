@@ -10,21 +10,17 @@ from rich.table import Table
 from thruster_cli.output import table
 from tuning.likelihood.gradient import GradientResult
 from tuning.problems.problem import Problem
-from tuning.report.units import labels
+from tuning.report.units import number_rows
 from tuning.search.filter_types import Kind
 from tuning.search.plan import Plan
-from tuning.search.space import Choice, neutral, parameters_of
+from tuning.search.space import Choice
 
 
 def choice_table(choices: Mapping[str, Choice], scenario: Problem) -> Table:
     """The numbers of filters of one kind, a column each."""
     kind, caption = next(iter(choices.values())).name, None
     model = scenario.model()
-    columns = [parameters_of(choice) for choice in choices.values()]
-    names = labels(dict.fromkeys(name for column in columns for name in column), kind, scenario)
-    rows = [
-        [label, *(_number(column.get(name, neutral(name))) for column in columns)] for name, label in names.items()
-    ]
+    rows = number_rows(list(choices.values()), kind, scenario, _number)
     if kind == "kf" and model.operating_input is not None:
         pairs = zip(model.operating_input, model.input_quantities, strict=True)
         about = ", ".join(f"{value:g} {quantity.unit}".rstrip() for value, quantity in pairs)

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from numerics.checks import at_least, one_of
 from numerics.files import check_target
+from numerics.progress import listening
 from thruster_cli.log_problems import BlocksOption, HeldOutOption, LogOption, problems_of
 from thruster_cli.logs import (
     ClockOption,
@@ -30,6 +31,7 @@ from thruster_cli.output import (
     announce_compilation,
     emit,
     progress_console,
+    working,
 )
 from thruster_cli.problems import PROBLEMS
 from thruster_cli.tuning_report import Tuning, as_json, report
@@ -190,12 +192,16 @@ def tune(
         result = run_study(study, plan, trials, advance, run)
     gradient = rival = None
     if by_gradient:
-        with progress_console.status("maximising the likelihood ..."):
+        with working("maximising the likelihood"):
             gradient = maximise_likelihood(plan.filter, plan.scenarios[0], plan.training_data()[0])
         rival = prove(result.choice, plan.scenarios[0], plan.seed)
         result = result._replace(choice=gradient.choice, consistent=None, nis=())
-    with progress_console.status("proving the choice on held-out seeds ..."):
-        proofs = tuple(prove(result.choice, scenario, plan.seed) for scenario in plan.scenarios)
+    try:
+        with working("proving the choice on held-out seeds"):
+            proofs = tuple(prove(result.choice, scenario, plan.seed) for scenario in plan.scenarios)
+    except KeyboardInterrupt:
+        progress_console.print(f"study {name!r} keeps its trials: the same command goes on with the proof")
+        raise
     write_tuned(file, plan, result, proofs, name, METHODS[by_gradient])
     known = None if by_gradient else identify(result.choice, plan.scenarios, plan.training_data(), plan.space())
     return Tuning(name, plan, result, proofs, file, gradient, rival, known)
@@ -247,4 +253,9 @@ def _bar(plan: Plan, total: int, done: int) -> Iterator[tuple[OnTrial, Callable[
             if running := kinds_running(trials):
                 show_kinds(running)
 
-        yield advance, show_kinds
+        def show_rest(far: str) -> None:
+            if progress.tasks[task].finished:  # what comes after the last trial
+                progress.update(task, description=f"ensemble sizes, {far}" if far.startswith("N: ") else far)
+
+        with listening(show_rest):
+            yield advance, show_kinds

@@ -19,7 +19,7 @@ from tuning.evaluation.sizes import SIZE_TOLERANCE
 from tuning.evaluation.tuned import consistency, metrics
 from tuning.evaluation.worth import scaling_sentence, without_truth
 from tuning.likelihood.gradient import GradientResult
-from tuning.likelihood.identifiability import Identifiability, as_data, sentences
+from tuning.likelihood.identifiability import Identifiability, as_data, sentences, too_many
 from tuning.problems.problem import Problem
 from tuning.search.filter_types import kinds_tried
 from tuning.search.objectives import NIS_BAND
@@ -70,7 +70,7 @@ def report(tuning: Tuning) -> list:
                 f"{scenario.name} has no bound: there is none for a singular Q, or if the plant is no model. Its "
                 "score is RMSE over its scale."
             )
-    shown += sentences(tuning.known) if tuning.known else []
+    shown += sentences(tuning.known) if tuning.known else too_many(result.choice, plan.space())
     shown += _search_sentences(tuning)
     trained = f"{result.finished} trials, {result.pruned} of them pruned, {result.seconds:.1f} s in this run"
     over = sum(map(is_over_budget, result.trials))
@@ -101,7 +101,7 @@ def _search_sentences(tuning: Tuning) -> list:
         )
         shown.append(
             "Score over the best by ensemble size, on seeds that chose neither Q nor R, with the upper end of its "
-            f"95 % interval: {ratios}. {_size_sentence(kept, result)}"
+            f"95 % interval: {ratios}. {_size_sentence(kept, result)}{_seeds_sentence(result)}"
         )
     if result.consistent is False:
         shown.append(_none_consistent(result, plan))
@@ -173,7 +173,13 @@ def as_json(tuning: Tuning) -> dict:
         **consistency(result),
         "interrupted": result.interrupted,
         "sizes": [
-            {"N": r.size, "ratio": r.ratio.value, "upper_end": r.ratio.high, "score": r.evaluation.score.value}
+            {
+                "N": r.size,
+                "ratio": r.ratio.value,
+                "upper_end": r.ratio.high,
+                "score": r.evaluation.score.value,
+                "seeds": r.seeds,
+            }
             for r in result.sizes
         ],
         "front": [{"values": trial.values, "parameters": trial.params} for trial in result.front],
@@ -237,6 +243,15 @@ def _size_sentence(kept: int, result: StudyResult) -> str:
     if ends[kept] < 1 + SIZE_TOLERANCE:
         return f"N = {kept} is the smallest whose upper end is below {1 + SIZE_TOLERANCE:g}."
     return f"No N has its upper end below {1 + SIZE_TOLERANCE:g} on all scenarios; N = {kept} is a compromise."
+
+
+def _seeds_sentence(result: StudyResult) -> str:
+    """Which sizes few seeds left out; empty where all were run on all of them."""
+    counts = {row.seeds for row in result.sizes}
+    if len(counts) < 2:
+        return ""
+    whole = ", ".join(str(row.size) for row in result.sizes if row.seeds == max(counts))
+    return f" The first {min(counts)} seeds left out the others before N = {whole} were run on {max(counts)}."
 
 
 def _consistency_sentence(evaluation: Evaluation) -> str:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from thruster_cli.log_problems import LogModelOption, problems_in
-from thruster_cli.output import CodeOption, JsonOption, announce_compilation, emit, progress_console, table
+from thruster_cli.output import CodeOption, JsonOption, announce_compilation, emit, table, working
 from tuning.evaluation.verify import TOLERANCE, Verification, verify
 from tuning.problems.find import find_problem
 
@@ -30,7 +30,7 @@ def command(
     Example: thruster verify out/enkf-mismatch-seed0.json
     """
     announce_compilation()
-    with progress_console.status(f"computing the metrics of {file} once more ..."):
+    with working(f"computing the metrics of {file} once more"):
         found = verify(file, [*map(find_problem, problem or []), *problems_in(file, model)])
     emit(_shown(file, found), _as_json(file, found), json)
     if not found.holds:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from filters import StateSpaceModel, bounds, likelihood, make_filter, run
+from filters import StateSpaceModel, bounds, likelihood, make_filter, posterior, run
 from filters.augmented import augmented_model
 from filters.registry import FILTERS, tunable_numbers
 from filters.smoothers.smooth import smooth
@@ -94,7 +94,7 @@ def everything(model_name):
             continue
     slopes = [np.stack([np.eye(size), np.ones((size, size))]) for size in (model.n, model.m)]
     found["likelihood"] = likelihood.likelihood(model, inputs, z, *slopes)
-    found["bound"] = (bounds.posterior_bound(model, inputs, truths=2),)
+    found["bound"] = (posterior.posterior_bound(model, inputs, truths=2),)
     if len(model.constants):
         names = getattr(model.constants, "_fields", range(len(model.constants)))
         known = {names[min(1, len(names) - 1)]: (0.1, 0.01)}
@@ -165,8 +165,8 @@ def test_a_filter_of_forty_states_is_the_kalman_filter_on_an_affine_model(name):
     u, z = np.array([0.5, -1.0]), np.linspace(-1.0, 1.0, 40)
     if name == "kf-steady":
         a, _, _, c, _ = model.matrices()
-        predicted, posterior = bounds.riccati_covariances(model)
-        model = model.replace(prior_cov=posterior)  # A P A' + Q is the solution of Riccati's equation
+        predicted, updated = bounds.riccati_covariances(model)
+        model = model.replace(prior_cov=updated)  # A P A' + Q is the solution of Riccati's equation
     with interpreted():
         made = make_filter(name, model)
         belief, _ = made.update(made.predict(made.init(), u), z)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from filters.bounds import path_bound, posterior_bound, riccati_covariances
+from filters.bounds import path_bound, riccati_covariances
+from filters.posterior import posterior_bound
 from tuning.thruster.find import find_scenario
 
 pytestmark = pytest.mark.usefixtures("as_python")

@@ -93,3 +93,16 @@ def test_equations_break_where_they_part_and_sentences_fill_the_width():
     text = "One two three\nfour.\n\n    update:  a = b,  c = d,  e\n             g = h\n\nAttributes:\n    x: y"
     lines = "One two three four.", "", "    update:  a = b,", "             c = d,  e", "             g = h"
     assert fitted(text, 23) == "\n".join(lines)
+
+
+def test_it_tells_which_filters_fit_a_problem_and_what_a_belief_takes(thruster):
+    code, out, _ = thruster("filters", "--problem", "studies.lorenz96:problem", "--json", "-")
+    found = {one["name"]: one for one in json.loads(out)["filters"]}
+    assert code == 0 and list(found) == list(FILTERS)
+    assert "affine model" in found["kf"]["reason"] and found["kf"]["kilobytes"] is None
+    assert found["etkf"]["reason"] == "" and found["etkf"]["ensemble_size"] == 30
+    assert found["ekf"]["kilobytes"] > 8e-3 * 3 * 40**2 and found["pf"]["kilobytes"] > 8e-3 * 1000 * 40
+    code, out, _ = thruster("filters", "ukf", "--problem", "nominal")
+    assert code == 0 and "nominal: 2 states, 1 measurement, 1 input" in " ".join(out.split()) and "ekf" not in out
+    code, _, err = thruster("filters", "--problem", "nowhere:problem")
+    assert code == 2 and "must be 'module:object' that can be imported" in err

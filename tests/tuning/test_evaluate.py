@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from filters import affine_model, make_filter, thruster_model
-from filters.bounds import posterior_bound, riccati_covariances
+from filters.bounds import riccati_covariances
 from filters.consistency.nees import normalized_squares
+from filters.posterior import posterior_bound
 from numerics.compiled import interpreted
 from plants import simulate
 from tuning.evaluation.evaluate import check_consistency, evaluate, score_ratio

@@ -8,6 +8,7 @@ from numerics.streams import episode_keys
 from plants import simulate
 from thruster_cli.tune import tune
 from thruster_cli.tuning_report import as_json, report
+from tuning.likelihood import identifiability
 from tuning.likelihood.gradient import maximise_likelihood
 from tuning.likelihood.identifiability import (
     Identifiability,
@@ -17,6 +18,7 @@ from tuning.likelihood.identifiability import (
     is_identified,
     maximum,
     sentences,
+    too_many,
 )
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters_of, true_choice, untuned_choice
@@ -159,3 +161,15 @@ def test_a_number_that_is_hardly_known_goes_along_no_further_than_ten_times_its_
     known = is_identified(log_likelihoods, np.zeros(2), cov, bounds)
     assert known.tolist() == [True, False]
     assert np.abs(asked).max() <= np.log(1e4) + 1e-12
+
+
+def test_of_more_numbers_than_can_be_paired_off_it_says_so():
+    nominal = find_scenario("nominal")
+    choice, plan = true_choice("ekf", nominal), Plan("ekf", (nominal,))
+    assert too_many(choice, plan.space()) == [] and identifiability.MOST_NUMBERS > len(plan.space())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(identifiability, "MOST_NUMBERS", 2)
+        assert identify(choice, plan.scenarios, [], plan.space()) is None
+        (said,) = too_many(choice, plan.space())
+        assert "at most 2 numbers" in said and "here are 3" in said
+        assert too_many(true_choice("open-loop", nominal), plan.space()) == []

@@ -6,8 +6,8 @@ import pickle
 import numpy as np
 import pytest
 
-from filters.bounds import posterior_bound
 from filters.likelihood import likelihood
+from filters.posterior import posterior_bound
 from filters.tuned_file import NOISE
 from tests import pendulum_problem
 from tests.models import wide_model

@@ -184,3 +184,11 @@ def test_r_may_be_held_at_the_sensor_s_sheet():
     assert result.choice.model["measurement_noise_cov"] == MISMATCH.measurement_noise_cov
     assert not any(TWIN in trial.user_attrs for trial in result.trials)
     assert result.best_value < result.trials[0].values[0]
+
+
+def test_trials_have_a_nees_where_an_objective_is_made_of_it_alone():
+    for objectives, known in ((("score",), False), (("score", "consistency"), True)):
+        plan = PLAN._replace(objectives=objectives)
+        (found,) = measure(untuned_choice("ekf", MISMATCH), plan, [PLAN.training_data()[0].slice(0, 2)])
+        assert np.isfinite(found.nees.value) == np.isfinite(found.median_nees) == known
+        assert np.isfinite(found.score.value) and np.isfinite(found.nis.value)

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from tuning.evaluation.evaluate import evaluate
+from tuning.problems.assumed import rows_argument
 from tuning.problems.problem import Problem
 from tuning.search.objectives import LARGEST, nis_ratio
 from tuning.search.plan import TRAINING_SEEDS
@@ -72,6 +73,9 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
         return math.log(nis_at(10.0**exponent))
 
     first, exponent = excess(0.0), 0
+    if not np.any(start.model["process_noise_cov"]):
+        said = f"no factor on a Q of zero brings the mean NIS of {name} to 1: it is {math.exp(first):.3g}"
+        return Scaled(None, None, None, said)
     step = 1 if first > 0 else -1  # a larger Q lowers the NIS
     last = first
     while last * first > 0 and abs(exponent) < DECADES:
@@ -89,6 +93,11 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
     return Scaled(scaled(start, factor), factor, nis)
 
 
+def scaled_rule(rule: Choice, scenario: Problem, factor: float) -> Choice:
+    """A rule of thumb with a factor on its Q, even where that follows from other numbers."""
+    return scaled(_with_q(rule, scenario), factor)
+
+
 def scaled(choice: Choice, factor: float) -> Choice:
     """The same choice with variances of the process noise that are a factor times as large."""
     q = choice.model["process_noise_cov"]
@@ -103,13 +112,16 @@ def _with_q(choice: Choice, scenario: Problem) -> Choice:
     """The same choice, which says what Q is even where it follows from other numbers."""
     if "process_noise_cov" in choice.model:
         return choice
-    q = scenario.model(**choice.model).process_noise_cov
-    return choice._replace(model={**choice.model, "process_noise_cov": tuple(map(tuple, q.tolist()))})
+    q = rows_argument(scenario.model(**choice.model).process_noise_cov)
+    return choice._replace(model={**choice.model, "process_noise_cov": q})
 
 
-def baselines(name: str, scenario: Problem, seed: int = 0) -> dict[str, Choice]:
-    """All baselines of a kind of filter that there are, by what they are called, the one that counts first."""
-    default = scaled_default(name, scenario, seed).choice
+def baselines(name: str, scenario: Problem, seed: int = 0, default: Scaled | None = None) -> dict[str, Choice]:
+    """All baselines of a kind of filter that there are, by what they are called, the one that counts first.
+
+    The scaled default is found for the study's seed, unless it is given.
+    """
+    default = (scaled_default(name, scenario, seed) if default is None else default).choice
     found = {SCALED: default} if default is not None else {}
     known = oracle(name, scenario)
     return found | {RULE: rule_of_thumb(name, scenario)} | ({} if known is None else {ORACLE: known})

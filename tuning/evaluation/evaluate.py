@@ -176,8 +176,14 @@ def score_ratio(a: Evaluation, b: Evaluation) -> Interval:
     _check_paired(a, b)
     if not (a.has_truth and b.has_truth):
         return NOTHING
+    value = score(a.mean_squares, a.scale) / score(b.mean_squares, b.scale)
+    return interval(value, resampled_ratios(a, b))
+
+
+def resampled_ratios(a: Evaluation, b: Evaluation) -> np.ndarray:
+    """Score of a over that of b for every bootstrap resample of the runs, which are the same for both."""
     scores = [_scores(np.sqrt(resampled_means(e.mean_squares)), e.scale) for e in (a, b)]
-    return interval(score(a.mean_squares, a.scale) / score(b.mean_squares, b.scale), scores[0] / scores[1])
+    return scores[0] / scores[1]
 
 
 def likelihood_gain(a: Evaluation, b: Evaluation) -> Interval:

@@ -30,8 +30,11 @@ class RunMetrics(NamedTuple):
     output_mean_squares: Mapping[str, np.ndarray]  # (B, 1) each, by symbol
 
 
-def metrics_by_run(filter_: Filter, estimates: Estimates, data: Data) -> RunMetrics:
-    """What the estimates of a filter on some data are worth, run by run, of the states that the plant has."""
+def metrics_by_run(filter_: Filter, estimates: Estimates, data: Data, nees: bool = True) -> RunMetrics:
+    """What the estimates of a filter on some data are worth, run by run, of the states that the plant has.
+
+    The NEES is NaN where it is not wanted: of forty states it takes a tenth of what the filter takes.
+    """
     late, measurements = data.scored, data.measurements
     present = (~np.isnan(measurements[:, late])).sum(axis=-1)
     squares = normalized_squares(estimates.innovations[:, late], estimates.innovation_covs[:, late])
@@ -39,12 +42,15 @@ def metrics_by_run(filter_: Filter, estimates: Estimates, data: Data) -> RunMetr
     if filter_.has_covariance:
         likelihoods = estimates.log_likelihoods[:, late].sum(axis=1)
     nis = np.where(present > 0, squares, np.nan)
-    return RunMetrics(nis, present, likelihoods, estimates.divergences, *_against_truth(filter_, estimates, data))
+    return RunMetrics(
+        nis, present, likelihoods, estimates.divergences, *_against_truth(filter_, estimates, data, nees)
+    )
 
 
-def metrics_of_all(filter_: Filter, data: Data) -> RunMetrics:
+def metrics_of_all(filter_: Filter, data: Data, nees: bool = True) -> RunMetrics:
     """`metrics_by_run` of a filter on all runs of some data, some at a time: the same as of all at once."""
-    return joined([metrics_by_run(filter_, found, some) for some, found in estimates_in_parts(filter_, data)])
+    parts = estimates_in_parts(filter_, data)
+    return joined([metrics_by_run(filter_, found, some, nees) for some, found in parts])
 
 
 def joined(parts: Sequence[RunMetrics]) -> RunMetrics:
@@ -62,13 +68,16 @@ def state_errors(filter_: Filter, estimates: Estimates, data: Data) -> np.ndarra
     return difference(estimates.means[..., :n], data.states, filter_.model.shape.state_angles[:n])
 
 
-def _against_truth(filter_: Filter, estimates: Estimates, data: Data) -> tuple:
+def _against_truth(filter_: Filter, estimates: Estimates, data: Data, wanted: bool) -> tuple:
     """The last fields of `RunMetrics`."""
     if data.states is None:
         return None, None, None, {}
     n, late = data.states.shape[-1], data.scored
     errors = state_errors(filter_, estimates, data)
-    nees = normalized_squares(errors[:, late], estimates.covs[:, late, :n, :n])
+    late_errors = errors[:, late]
+    nees = np.full(late_errors.shape[:2], np.nan)
+    if wanted:
+        nees = normalized_squares(late_errors, estimates.covs[:, late, :n, :n])
     mean_squares, start_up = (errors[:, late] ** 2).mean(axis=1), errors[:, :FIRST_SCORED_STEP] ** 2
     return mean_squares, start_up, nees, _output_mean_squares(filter_, estimates, data)
 

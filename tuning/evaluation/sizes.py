@@ -2,27 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from filters.consistency.intervals import Interval
-from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
+from filters.posterior import ALL_UP_TO
+from numerics.progress import told
+from tuning.evaluation.evaluate import Evaluation, evaluate, resampled_ratios, score_ratio
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 from tuning.search.objectives import nis_violation
-from tuning.search.plan import Plan
+from tuning.search.plan import SIZE_SEEDS, Plan
 from tuning.search.space import Choice, size_ladder
 
+FEW = 8  # of the fresh seeds, on which all sizes of a large model meet
+SURE = 0.0005  # of the resamples may say otherwise, where a size is left out after these
 SIZE_TOLERANCE = 0.01  # the score of the smallest sufficient ensemble is surely this close to the best
 
 
 class SizeRow(NamedTuple):
-    """How an ensemble of one size does against the best one."""
+    """How an ensemble of one size does against the best one, on the seeds on which it was run."""
 
     size: int
     evaluation: Evaluation  # on the first scenario
     ratio: Interval  # score over the best score on the same seeds, paired; of several scenarios the largest
     outside: float = 0.0  # how far the mean NIS is outside its band, as in `nis_violation`; of several the most
+    seeds: int = SIZE_SEEDS  # on which it was run
 
 
 def ensemble_sizes(
@@ -31,7 +38,8 @@ def ensemble_sizes(
     """The score of a choice against ensemble size, paired on the same fresh seeds, smallest size first.
 
     The seeds chose neither Q, R nor N (`seeds.size_seeds`). Where the plan has a budget, no size is above that
-    of the choice, which is known to be within it. Without truth there is no score, and no row.
+    of the choice, which is known to be within it. Without truth there is no score, and no row. Sizes of models of
+    more than twelve states meet on a few of the seeds first: see `few_seeds_first`.
 
     Args:
         choice: of a study.
@@ -43,14 +51,106 @@ def ensemble_sizes(
         return []
     size = choice.numbers["ensemble_size"]
     sizes = [n for n in sorted({*size_ladder(choice.name), size}) if plan.budget is None or n <= size]
+    if max(problem.model().n for problem in plan.scenarios) > ALL_UP_TO:
+        return few_seeds_first(choice, plan, training, sizes, consistent)
     outside = [_outside(choice.with_size(n), plan, training) if plan.is_constrained else 0.0 for n in sizes]
     tables = [_on(one, fresh, choice, sizes) for one, fresh in zip(plan.scenarios, plan.size_data(), strict=True)]
     among = _counting(outside, consistent)
     columns = [_over_the_best(found, among) for found in tables]
+    count = len(plan.size_data()[0].seeds)
     return [
-        SizeRow(n, tables[0][i], max((column[i] for column in columns), key=lambda ratio: ratio.high), outside[i])
+        SizeRow(n, tables[0][i], _worst(column[i] for column in columns), outside[i], count)
         for i, n in enumerate(sizes)
     ]
+
+
+def few_seeds_first(
+    choice: Choice, plan: Plan, training: Sequence[Data], sizes: Sequence[int], consistent: bool
+) -> list[SizeRow]:
+    """The same where a step is expensive: no size is run on all seeds of which a few tell that it will not do.
+
+    All sizes meet on the first eight seeds. The one with the least score there, of each scenario, is the best
+    one, and run on all seeds; so are the others, smallest first, until one is sufficient. Those are left out whose
+    score is more than 1 % above that of the best on the first seeds already, by the lower end of a 99.9 %
+    interval: an early look has to be so sure that the interval in the end is worth its 95 % (Peto's rule). No size
+    is ever found sufficient early, for runs in which a small ensemble fails may be rare. The mean NIS is that of
+    the first fresh seeds, and of sizes on all seeds that of the training data.
+
+    Source: Peto et al. (1976), "Design and analysis of randomized clinical trials requiring prolonged observation
+    of each patient", British J. Cancer 34, 585-612.
+    """
+    fresh = plan.size_data()
+    few = [one.slice(0, FEW) for one in fresh]
+
+    def on(data: Sequence[Data], n: int) -> list[Evaluation]:
+        pairs = zip(plan.scenarios, data, strict=True)
+        return [evaluate(choice.with_size(n).filter(one), some, one.scale) for one, some in pairs]
+
+    early = [on(few, n) for n in told("N", sizes)]
+
+    def on_all(i: int) -> list[Evaluation]:
+        return early[i] if len(fresh[0].seeds) <= FEW else on(fresh, sizes[i])
+
+    outside = [max(map(nis_violation, found)) if plan.is_constrained else 0.0 for found in early]
+    trained: set[int] = set()
+
+    def best_ones() -> list[int]:
+        among = _counting(outside, consistent)
+        return [min(among, key=lambda i: early[i][k].score.value) for k in range(len(fresh))]
+
+    def train(i: int) -> None:
+        if i not in trained and plan.is_constrained:
+            outside[i] = _outside(choice.with_size(sizes[i]), plan, training)
+        trained.add(i)
+
+    while not trained.issuperset(best_ones()):
+        for i in set(best_ones()):
+            train(i)
+    best = best_ones()
+    whole = {i: on_all(i) for i in told("best N on all seeds", sorted(set(best)))}
+    hopeful = [i for i in range(len(sizes)) if not _surely_worse(early[i], [early[b] for b in best])]
+    for i in told("smallest N on all seeds", hopeful):
+        if i not in whole:
+            train(i)
+            whole[i] = on_all(i)
+        ends = [ratio[i].high for ratio in _ratios_of(whole, _counting_of(whole, outside, consistent))]
+        if i in _counting_of(whole, outside, consistent) and max(ends) < 1.0 + SIZE_TOLERANCE:
+            break
+    over = _ratios_of(whole, _counting_of(whole, outside, consistent))
+    rows = []
+    for i, n in enumerate(sizes):
+        if i in whole:
+            ratio = _worst(ratios[i] for ratios in over)
+            rows.append(SizeRow(n, whole[i][0], ratio, outside[i], len(fresh[0].seeds)))
+            continue
+        ratios = (score_ratio(found, early[b][k]) for k, (found, b) in enumerate(zip(early[i], best, strict=True)))
+        rows.append(SizeRow(n, early[i][0], _worst(ratios), outside[i], len(few[0].seeds)))
+    return rows
+
+
+def _ratios_of(whole: Mapping[int, Sequence[Evaluation]], among: Sequence[int]) -> list[dict[int, Interval]]:
+    """Of each scenario, scores of the sizes that were run on all seeds over the best of those that count."""
+    places = list(whole)
+    columns = zip(*whole.values(), strict=True)
+    found = [_over_the_best(column, [places.index(i) for i in among]) for column in columns]
+    return [dict(zip(places, ratios, strict=True)) for ratios in found]
+
+
+def _counting_of(whole: Mapping[int, object], outside: Sequence[float], consistent: bool) -> list[int]:
+    """The sizes of `whole` that count."""
+    places = list(whole)
+    return [places[i] for i in _counting([outside[i] for i in places], consistent)]
+
+
+def _surely_worse(found: Sequence[Evaluation], best: Sequence[Sequence[Evaluation]]) -> bool:
+    """Whether the score is more than 1 % above the best on some scenario, so surely that few seeds suffice."""
+    pairs = [(one, best[k][k]) for k, one in enumerate(found)]
+    return any(np.quantile(resampled_ratios(*pair), SURE) > 1.0 + SIZE_TOLERANCE for pair in pairs)
+
+
+def _worst(ratios: Iterable[Interval]) -> Interval:
+    """The interval with the highest end."""
+    return max(ratios, key=lambda ratio: ratio.high)
 
 
 def sufficient_size(sizes: Sequence[SizeRow], consistent: bool = False) -> int:
@@ -73,7 +173,7 @@ def _counting(outside: Sequence[float], consistent: bool) -> list[int]:
 
 
 def _on(scenario: Problem, data: Data, choice: Choice, sizes: Sequence[int]) -> list[Evaluation]:
-    return [evaluate(choice.with_size(n).filter(scenario), data, scenario.scale) for n in sizes]
+    return [evaluate(choice.with_size(n).filter(scenario), data, scenario.scale) for n in told("N", sizes)]
 
 
 def _outside(choice: Choice, plan: Plan, training: Sequence[Data]) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
 import math
 import warnings
@@ -11,16 +10,17 @@ from pathlib import Path
 
 import numpy as np
 
-from filters.consistency.intervals import Interval
 from filters.estimators.find import is_foreign, label_of
 from filters.tuned_file import FACTORS, FILE_FORMAT, FILE_VERSION, NOISE, PRIOR, read_tuned_file, sealed
 from filters.tuned_model import check_same_quantities, model_data
 from numerics.checks import at_least, covariance, positive, shown
 from numerics.files import write_whole
-from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.kept import comparison_as_data, sizes_as_data
+from tuning.evaluation.summary import summary
+from tuning.evaluation.versions import versions
 from tuning.problems.files import scenario_of
 from tuning.problems.find import find_given, find_problem
 from tuning.problems.problem import Problem
@@ -29,8 +29,6 @@ from tuning.search.objectives import NIS_BAND
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 from tuning.search.study import StudyResult
-
-PACKAGES = ("thruster-env", "optuna", "numpy", "numba", "gymnasium")
 
 
 def write_tuned(
@@ -81,6 +79,10 @@ def write_tuned(
             **consistency(result),
         },
         "held_out": {one.name: metrics(proof) for one, proof in zip(plan.scenarios, proofs, strict=True)},
+        "comparisons": {
+            one.name: comparison_as_data(proof) for one, proof in zip(plan.scenarios, proofs, strict=True)
+        },
+        "ensemble_sizes": sizes_as_data(result.sizes, choice, plan) if result.sizes else None,
     }
     write_whole(Path(path), json.dumps(sealed(content), indent=2) + "\n")
 
@@ -252,38 +254,3 @@ def consistency(result: StudyResult) -> dict:
     """Whether any trial of a study was consistent, and the mean NIS of its choice, as plain numbers for JSON."""
     nis = [ratio if math.isfinite(ratio) else None for ratio in result.nis]
     return {"any_trial_consistent": result.consistent, "mean_nis": nis, "nis_band": list(NIS_BAND)}
-
-
-def versions() -> dict[str, str]:
-    """Versions of the packages that a tuned file depends on, as they are installed."""
-    return {name: _version(name) for name in PACKAGES}
-
-
-def summary(evaluation: Evaluation) -> dict:
-    """The figures of an evaluation as plain numbers for JSON, None where there is nothing to tell."""
-    return {
-        "rmse": [_numbers(value) for value in evaluation.rmse],
-        "start_up_rmse": [None if math.isnan(part) else part for part in evaluation.start_up_rmse.tolist()],
-        **{_key(evaluation.outputs[symbol]): _numbers(one) for symbol, one in evaluation.output_rmse.items()},
-        "score": _numbers(evaluation.score),
-        "nees": _numbers(evaluation.nees),
-        "nis": _numbers(evaluation.nis),
-        "log_likelihood": None if math.isnan(evaluation.log_likelihood) else evaluation.log_likelihood,
-        "divergences": evaluation.divergences,
-    }
-
-
-def _key(output: Quantity) -> str:
-    """What the RMSE of a derived output is called in a file: "thrust_rmse" of the thrust."""
-    return f"{output.name.replace(' ', '_')}_rmse"
-
-
-def _numbers(value: Interval) -> list[float] | None:
-    return None if math.isnan(value.value) else list(value)
-
-
-def _version(name: str) -> str:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 from filters.tuned_file import read_tuned_file
 from numerics.checks import shown
 from tuning.evaluation.held_out import prove
-from tuning.evaluation.tuned import metrics, problem_in, read_tuned, versions
+from tuning.evaluation.tuned import metrics, problem_in, read_tuned
+from tuning.evaluation.versions import versions
 from tuning.problems.problem import Problem
 
 TOLERANCE = 1e-9  # relative: what the order of a sum may change

@@ -22,6 +22,7 @@ STEP = np.log(2.0)  # of differences, in logarithms: ensembles need large ones
 CLOSE = 0.02  # in logarithms, to which the maximum is found
 EVALUATIONS = 100  # at most, on the way there
 LEAST = -1e6  # stands in for the log-likelihood of a run that has none
+MOST_NUMBERS = 24  # a curvature takes a run of all data for each pair of numbers
 COMPANION = 0.2  # part in a direction, of the largest one, from which on a number is named
 
 
@@ -60,7 +61,7 @@ def identify(
 ) -> Identifiability | None:
     """How well the innovations determine a choice's numbers of the model; None without a covariance.
 
-    By default these are Q's variances, R and the scale of P_0.
+    By default these are Q's variances, R and the scale of P_0. Of more than 24 numbers it is None, too.
 
     It works for every filter with a covariance: only its innovations' log-likelihood is needed.
 
@@ -71,9 +72,8 @@ def identify(
         space: numbers that were searched with their ranges, `Plan.space`.
     """
     own = parameters_of(choice)
-    places = places_in(choice)  # of the model's numbers, among which correlations have no logarithm
-    names = tuple(name for name, range_ in space.items() if name in places and getattr(range_, "log", False))
-    if not names or not filter_class(choice.name).has_covariance:
+    names = _names(choice, space)
+    if not 0 < len(names) <= MOST_NUMBERS:
         return None
 
     def log_likelihoods(logarithms: np.ndarray) -> np.ndarray:
@@ -95,6 +95,21 @@ def identify(
     cov = covariance(log_likelihoods, likeliest)
     identified = is_identified(log_likelihoods, likeliest, cov, bounds)
     return Identifiability(names, tuned, np.exp(likeliest), cov, identified)
+
+
+def too_many(choice: Choice, space: Mapping[str, BaseDistribution]) -> list[str]:
+    """Why it is not worked out what the innovations determine, where that is for the number of numbers."""
+    count = len(_names(choice, space))
+    if count <= MOST_NUMBERS:
+        return []
+    rule = f"It is worked out for at most {MOST_NUMBERS} numbers which of them the innovations determine"
+    return [f"{rule}; here are {count}, and parameters of the problem's own would make them few."]
+
+
+def _names(choice: Choice, space: Mapping[str, BaseDistribution]) -> tuple[str, ...]:
+    """The model's numbers that were searched; none without a covariance. Correlations have no logarithm."""
+    places = places_in(choice) if filter_class(choice.name).has_covariance else ()
+    return tuple(name for name, range_ in space.items() if name in places and getattr(range_, "log", False))
 
 
 def maximum(

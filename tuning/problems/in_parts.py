@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from filters.engine.batch import Estimates, run
 from filters.filter import Filter
+from numerics.progress import told
 from numerics.threads import cores
 from plants.layout import LANES
 from tuning.problems.data import Data
@@ -19,7 +20,8 @@ def estimates_in_parts(filter_: Filter, data: Data) -> Iterator[tuple[Data, Esti
     Estimates at a time take some 256 MB, or those of as many runs as there are cores, so that what is made of them
     need not hold the covariances of all.
     """
-    for first, last in parts_of(filter_, data):
+    parts = parts_of(filter_, data)
+    for first, last in told("runs", parts, [last - first for first, last in parts]):
         some = data.slice(first, last)
         yield some, run(filter_, some.filter_keys, some.inputs, some.measurements)
 

@@ -9,7 +9,7 @@ from inspect import Signature
 import numpy as np
 
 from filters.baselines.baselines import OpenLoop
-from filters.bounds import posterior_bound
+from filters.posterior import has_bound, posterior_variances
 from filters.tuned_file import NOISE, PRIOR
 from numerics.checks import shown
 from numerics.streams import episode_keys, filter_keys
@@ -127,7 +127,10 @@ class ModelProblem(AssumedProblem):
         return Data(seeds, inputs, truth.measurements, filter_keys(seeds), self.first_scored_step, states, outputs)
 
     def bound(self, data: Data) -> np.ndarray:
-        """The posterior Cramér-Rao bound of the truth on these inputs, (n,); NaN where its Q is singular."""
+        """The posterior Cramér-Rao bound of the truth on these inputs, (n,); NaN where its Q is singular.
+
+        It is averaged over all inputs, and beyond twelve states over as many as `posterior_variances` takes.
+        """
         return self._bound(data, 100)
 
     def found_scale(self) -> np.ndarray:
@@ -147,9 +150,9 @@ class ModelProblem(AssumedProblem):
         return scale
 
     def _bound(self, data: Data, truths: int) -> np.ndarray:
-        if not np.linalg.eigvalsh(self.truth.process_noise_cov)[0] > 0:
+        if not has_bound(self.truth.process_noise_cov):
             return np.full(len(self._shared), np.nan)
-        variances = np.einsum("bkii->bki", posterior_bound(self.truth, data.inputs, truths=truths))
+        variances = posterior_variances(self.truth, data.inputs, truths=truths)
         return np.sqrt(variances[:, data.scored, self._shared].mean(axis=(0, 1)))
 
     def env(self, **bounds) -> ModelEnv:

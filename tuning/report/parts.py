@@ -16,7 +16,7 @@ from tuning.evaluation.baselines import TUNED, baselines
 from tuning.evaluation.evaluate import Evaluation, check_consistency
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
-from tuning.evaluation.tuned import versions
+from tuning.evaluation.versions import versions
 from tuning.evaluation.worth import scaling_sentence, without_truth, worth
 from tuning.report.consistency_figures import consistency_figure
 from tuning.report.figures import SCORE, comparison_figure, history_figure
@@ -142,18 +142,20 @@ def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
 
 
 def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) -> Section:
-    """Errors against ensemble size."""
+    """Errors against ensemble size; how many seeds tell it of each is said where that differs."""
     first = subject.plan.scenarios[0]
     fresh = first.size_seeds(subject.plan.seed, SIZE_SEEDS)
     where = f"seeds {fresh.start} to {fresh.stop - 1} of {first.name}"
     caption = f"RMSE with 95 % intervals on {where}, which chose neither Q nor R; dashed is N."
     kept = subject.choice.numbers["ensemble_size"]
-    ratios = [[f"{row.size}", f"{row.ratio.value:.4f}", f"{row.ratio.high:.4f}"] for row in sizes]
+    ratios = [[f"{row.size}", f"{row.ratio.value:.4f}", f"{row.ratio.high:.4f}", f"{row.seeds}"] for row in sizes]
     said = (
         "Score over the best, paired on the same seeds; of several scenarios the largest. The smallest N whose "
         "upper end is below 1.01 is sufficient"
     )
-    columns = ["N", "score over the best", "upper end of its 95 % interval"]
+    columns = ["N", "score over the best", "upper end of its 95 % interval", "seeds"]
+    if len({row.seeds for row in sizes}) == 1:
+        columns, ratios = columns[:-1], [row[:-1] for row in ratios]
     picture = book.picture(caption, sizes_figure, sizes, kept)
     return Section("Error against ensemble size", [picture, Table(said, columns, ratios)])
 
@@ -162,7 +164,7 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
     """One held-out run over time, and whether the covariance is consistent, both on the first scenario."""
     choice, scenario = subject.choice, subject.plan.scenarios[0]
     data, tuned = scenario.data(proof.seeds), choice.filter(scenario)
-    name, before = next(iter(baselines(choice.name, scenario, subject.plan.seed).items()))
+    name, before = next(iter(baselines(choice.name, scenario, subject.plan.seed, proof.default).items()))
     pair = {name: before.filter(scenario), TUNED: tuned}
     what = "Estimate and innovation, each with its" if data.states is None else "Truth, estimate and"
     caption = f"{what} 95 % band on {scenario.name}, held-out seed {proof.seeds.start}, before and after."

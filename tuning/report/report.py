@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 from numerics.files import check_target, write_whole
 from tuning.evaluation.held_out import prove
+from tuning.evaluation.kept import kept_comparison, kept_sizes
 from tuning.evaluation.sizes import ensemble_sizes, sufficient_size
-from tuning.likelihood.identifiability import identify, sentences
+from tuning.likelihood.identifiability import identify, sentences, too_many
 from tuning.problems.problem import Problem
 from tuning.report.page import Section, Words, html_page, markdown_page
 from tuning.report.parts import (
@@ -40,7 +41,10 @@ class Report(NamedTuple):
 def write_report(
     source: str | Path, storage: str, out: str | Path | None = None, problems: Sequence[Problem] = ()
 ) -> Report:
-    """Write a page, NAME.html, and its tables, NAME.md, on a tuned file or a study; all metrics are computed anew.
+    """Write a page, NAME.html, and its tables, NAME.md, on a tuned file or a study.
+
+    Held-out metrics and the table of ensemble sizes are those that the file or the study keeps, where they were
+    made of the same problems by the same versions of packages; else they are computed anew. `verify` always does.
 
     Args:
         source: a tuned file, or the name of a study.
@@ -59,21 +63,32 @@ def write_report(
     for target in (page, tables):
         check_target(target)
     data = plan.training_data()
-    sizes = ensemble_sizes(choice, plan, data, subject.consistent) if has_ensemble(choice.name) else []
+    sizes = []
+    if has_ensemble(choice.name):
+        sizes = kept_sizes(subject.sizes, choice, plan)
+        sizes = ensemble_sizes(choice, plan, data, subject.consistent) if sizes is None else sizes
     if sizes and not subject.chosen:
         choice = choice.with_size(sufficient_size(sizes, subject.consistent))
         subject = subject._replace(choice=choice)
-    proofs = [prove(choice, scenario, plan.seed, subject.seeds) for scenario in plan.scenarios]
+    kept = [kept_comparison(subject.content, choice, scenario) for scenario in plan.scenarios]
+    proofs = [
+        prove(choice, scenario, plan.seed, subject.seeds) if proof is None else proof
+        for proof, scenario in zip(kept, plan.scenarios, strict=True)
+    ]
     title = f"{choice.name} tuned on {', '.join(_short(scenario.name) for scenario in plan.scenarios)}"
     said = advice(choice, plan, proofs)
     known = identify(choice, plan.scenarios, data, plan.space())
-    nis = [nis_ratio(found) for found in measure(choice, plan, data)]
-    numbers = [numbers_table(choice, plan.scenarios[0], plan.seed), *([known_table(known)] if known else [])]
+    identified = sentences(known) if known else too_many(choice, plan.space())
+    nis = subject.nis or [nis_ratio(found) for found in measure(choice, plan, data)]
+    numbers = [
+        numbers_table(choice, plan.scenarios[0], plan.seed, proofs[0].default),
+        *([known_table(known)] if known else []),
+    ]
     with tempfile.TemporaryDirectory() as scratch:
         book = Sketchbook(Path(scratch))
         sections = [
             held_out_section(book, subject, proofs),
-            Section("The numbers", [*numbers, *([Words(sentences(known))] if known else [])]),
+            Section("The numbers", [*numbers, *([Words(identified)] if identified else [])]),
             search_section(book, subject),
             *([sizes_section(book, subject, sizes)] if sizes else []),
             *run_sections(book, subject, proofs[0]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -12,6 +12,7 @@ import optuna
 from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least, shown
 from tuning.evaluation.tuned import problem_in, read_tuned
+from tuning.evaluation.versions import versions
 from tuning.problems.find import find_given
 from tuning.problems.problem import Problem
 from tuning.search.outcome import best_trial, is_consistent
@@ -19,6 +20,7 @@ from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.space import Choice, choice_of
 from tuning.search.storage import open_storage
 from tuning.search.storage_url import shown_storage
+from tuning.search.study import SIZES
 
 
 class Subject(NamedTuple):
@@ -31,6 +33,9 @@ class Subject(NamedTuple):
     seeds: int  # number of held-out seeds
     chosen: bool  # whether the ensemble size is that of a tuned file, or still to be chosen
     consistent: bool = False  # whether its mean NIS is in its band, where it has to be
+    content: Mapping = {}  # of the tuned file
+    sizes: object = None  # the table of ensemble sizes as it is kept
+    nis: tuple[float, ...] = ()  # mean NIS over the channels on each scenario's training seeds, where it is kept
 
 
 def find_subject(source: str | Path, storage: str, problems: Sequence[Problem] = ()) -> Subject:
@@ -67,7 +72,17 @@ def _of_file(path: str, storage: str, problems: Sequence[Problem]) -> Subject:
     except (KeyError, TypeError):
         raise ValueError(f"a tuned file must tell its held-out seeds, but {path} does not") from None
     consistent = plan.is_constrained and bool(content["study"].get("any_trial_consistent"))
-    return Subject(name, plan, choice, study, count, chosen=True, consistent=consistent)
+    kept = content if content.get("digest") == plan.scenarios[0].digest else {}
+    sizes, nis = content.get("ensemble_sizes"), _kept_nis(kept, plan)
+    return Subject(name, plan, choice, study, count, True, consistent, kept, sizes, nis)
+
+
+def _kept_nis(content: Mapping, plan: Plan) -> tuple[float, ...]:
+    """The mean NIS on the training seeds that a tuned file tells; nothing if other packages made it."""
+    found = content.get("study", {}).get("mean_nis") if content.get("made_with") == versions() else None
+    if not isinstance(found, list) or len(found) != len(plan.scenarios):
+        return ()
+    return tuple(found) if all(isinstance(one, float) for one in found) else ()
 
 
 def _of_study(name: str, storage: str, problems: Sequence[Problem]) -> Subject:
@@ -82,7 +97,8 @@ def _of_study(name: str, storage: str, problems: Sequence[Problem]) -> Subject:
         raise ValueError(f"a study must have a complete trial for a report, but {name!r} has none")
     choice = choice_of(plan.filter, best.params, plan.scenarios[0])
     consistent = plan.is_constrained and is_consistent(best)
-    return Subject(name, plan, choice, study, HELD_OUT_SEEDS, len(plan.objectives) > 1, consistent)
+    chosen, sizes = len(plan.objectives) > 1, study.user_attrs.get(SIZES)
+    return Subject(name, plan, choice, study, HELD_OUT_SEEDS, chosen, consistent, sizes=sizes)
 
 
 def _load(name: str, storage: str) -> optuna.Study | None:

@@ -7,14 +7,14 @@ from math import isnan
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import rounded
 from plants.quantities import Quantity
-from tuning.evaluation.baselines import RULE, TUNED, baselines
+from tuning.evaluation.baselines import RULE, TUNED, Scaled, baselines
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.held_out import Comparison
 from tuning.likelihood.identifiability import Identifiability
 from tuning.problems.problem import Problem
 from tuning.report.page import Table
-from tuning.report.units import labels
-from tuning.search.space import Choice, neutral, parameters_of
+from tuning.report.units import number_rows
+from tuning.search.space import Choice
 
 MOST_ACROSS = 3  # states side by side; more stand one below the other
 EXPECTED = "bound; expected value"  # what stands beside the metrics
@@ -87,15 +87,12 @@ def _output_label(output: Quantity) -> str:
     return f"RMSE {output.label}"
 
 
-def numbers_table(choice: Choice, scenario: Problem, seed: int) -> Table:
-    """The numbers of a tuned filter and of its baselines."""
-    found = baselines(choice.name, scenario, seed)
+def numbers_table(choice: Choice, scenario: Problem, seed: int, default: Scaled | None = None) -> Table:
+    """The numbers of a tuned filter and of its baselines; the scaled default is found unless it is given."""
+    found = baselines(choice.name, scenario, seed, default)
     choices, default = {TUNED: choice, **found}, found[RULE].numbers
-    columns = [parameters_of(one._replace(numbers={**default, **one.numbers})) for one in choices.values()]
-    names = labels(dict.fromkeys(name for column in columns for name in column), choice.name, scenario, "²")
-    rows = [
-        [label, *(_number(column.get(name, neutral(name))) for column in columns)] for name, label in names.items()
-    ]
+    whole = [one._replace(numbers={**default, **one.numbers}) for one in choices.values()]
+    rows = number_rows(whole, choice.name, scenario, _number, "²")
     return Table(f"Numbers of the {choice.name} filter", ["", *choices], rows)
 
 

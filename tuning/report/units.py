@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from tuning.problems.problem import Problem
-from tuning.search.space import parameters
+from tuning.search.space import Choice, neutral, parameters, parameters_of
+
+ALIKE = 4  # so many numbers of one kind and more, which are the same in every column, share a row
 
 
 def labels(names: Iterable[str], kind: str, problem: Problem, square: str = "^2") -> dict[str, str]:
@@ -21,3 +24,45 @@ def labels(names: Iterable[str], kind: str, problem: Problem, square: str = "^2"
     units = {one.name: one.unit.replace("^2", square) for one in parameters(kind, problem, **everything)}
     said = {name: name.replace("_", " ") for name in names}
     return {name: f"{words} [{units[name]}]" if units.get(name) else words for name, words in said.items()}
+
+
+def number_rows(
+    choices: Sequence[Choice], kind: str, problem: Problem, word: Callable, square: str = "^2"
+) -> list[list[str]]:
+    """Rows of a table of choices' numbers, a column each: a label, and what `word` makes of each number or None.
+
+    Q11, Q22, ... and such that are the same in every column share a row.
+
+    Args:
+        choices: of one kind of filter.
+        kind: its name.
+        problem: whose parameters have the units.
+        word: of a number, or of None where a choice does not say it.
+        square: what stands for "squared".
+    """
+    columns = [parameters_of(choice) for choice in choices]
+    names = labels(dict.fromkeys(name for column in columns for name in column), kind, problem, square)
+    rows = [[label, *(word(_said(column, name)) for column in columns)] for name, label in names.items()]
+    groups: list[list[list[str]]] = []
+    for row in rows:
+        alike = groups and row[1:] == groups[-1][0][1:] and _letters(row[0]) == _letters(groups[-1][0][0])
+        groups[-1].append(row) if alike else groups.append([row])
+    return [row for group in groups for row in ([_shared(group)] if len(group) >= ALIKE else group)]
+
+
+def _said(column: Mapping[str, float], name: str) -> float | None:
+    """A number of a choice; where it has none of Q, neither has it correlations."""
+    tells_q = any(re.fullmatch(r"Q\d+", known) for known in column)
+    return column.get(name, neutral(name) if tells_q or not name.startswith("correlation") else None)
+
+
+def _letters(label: str) -> str | None:
+    """What the label of a variance or a correlation begins with and ends with; the whole of all others."""
+    found = re.fullmatch(r"(Q|R|correlation )\d+(?: \d+)?( \[.*\])?", label)
+    return f"{found[1]}{found[2]}" if found else label
+
+
+def _shared(group: Sequence[Sequence[str]]) -> list[str]:
+    """One row for several: "Q11 to Q44 [m^2]"."""
+    (first, *cells), last = group[0], group[-1][0]
+    return [f"{first.partition(' [')[0]} to {last}", *cells]

@@ -24,6 +24,7 @@ class Objective(NamedTuple):
     needs_covariance: bool = False
     needs_truth: bool = False
     output: str = ""  # symbol of the derived output that it needs
+    needs_nees: bool = False
 
 
 def nis_ratio(evaluation: Evaluation) -> float:
@@ -64,7 +65,11 @@ OBJECTIVES = {
     ),
     "nis": Objective("|log(mean NIS / m)|", _nis_inconsistency, needs_covariance=True),
     "consistency": Objective(
-        "|log(mean NEES / n)| + |log(mean NIS / m)|", _inconsistency, needs_covariance=True, needs_truth=True
+        "|log(mean NEES / n)| + |log(mean NIS / m)|",
+        _inconsistency,
+        needs_covariance=True,
+        needs_truth=True,
+        needs_nees=True,
     ),
     "cost": Objective("microseconds a step of one run, of one core", lambda _, microseconds: microseconds),
 }

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
+from tuning.evaluation.kept import kept_sizes, sizes_as_data
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
 from tuning.problems.data import Data
 from tuning.search.cost import COST
@@ -25,6 +26,7 @@ from tuning.search.trials import cost_of, make_pruner, measure, run_trial
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 BEST = "best trial under the constraints"  # attribute of a study, for programs that know no constraints
+SIZES = "ensemble sizes"  # attribute of a study: their table, and what it is of
 OnTrial = Callable[[optuna.Study, int], None]
 
 
@@ -168,7 +170,10 @@ def run_study(
     choice = choice_of(plan.filter, best.params, plan.scenarios[0])
     sizes, consistent = [], plan.is_constrained and is_consistent(best)
     if has_ensemble(choice.name) and len(plan.objectives) == 1:
-        sizes = ensemble_sizes(choice, plan, data, consistent)
+        sizes = kept_sizes(study.user_attrs.get(SIZES), choice, plan)
+        if sizes is None:
+            sizes = ensemble_sizes(choice, plan, data, consistent)
+            study.set_user_attr(SIZES, sizes_as_data(sizes, choice, plan))
         choice = choice.with_size(sufficient_size(sizes, consistent)) if sizes else choice
     complete = [trial.values[0] for trial in present if trial.state == TrialState.COMPLETE]
     return StudyResult(

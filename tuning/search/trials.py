@@ -77,7 +77,11 @@ def cost_of(choice: Choice, plan: Plan, data: Sequence[Data]) -> float:
 def measure(
     choice: Choice, plan: Plan, data: Sequence[Data], trial: optuna.Trial | None = None
 ) -> list[Evaluation]:
-    """Run a choice on all data; with a trial, tell it each seed's score and end where it should be pruned."""
+    """Run a choice on all data; with a trial, tell it each seed's score and end where it should be pruned.
+
+    The NEES is worked out where an objective is made of it.
+    """
+    nees = any(objective.needs_nees for objective in plan.found_objectives())
     filters = [choice.filter(scenario) for scenario in plan.scenarios]
     count = len(data[0].seeds)
     size = count if trial is None else BLOCK
@@ -85,7 +89,7 @@ def measure(
     for first in range(0, count, size):
         block = [one.slice(first, first + size) for one in data]
         for runs, filter_, one in zip(parts, filters, block, strict=True):
-            runs.append(metrics_of_all(filter_, one))
+            runs.append(metrics_of_all(filter_, one, nees))
         if trial is not None:
             _report(trial, first, [runs[-1] for runs in parts], plan)
             if first + size < count and trial.should_prune():

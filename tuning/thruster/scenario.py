@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from filters.bounds import posterior_bound
+from filters.posterior import has_bound, posterior_variances
 from numerics.checks import positive, shown, vector
 from numerics.streams import episode_keys, filter_keys
 from plants.state_space import StateSpaceModel
@@ -122,7 +122,7 @@ class Scenario(BaseScenario):
     @property
     def has_bound(self) -> bool:
         """Whether there is a posterior Cramér-Rao bound: its recursion needs the inverse of Q."""
-        return bool(np.linalg.eigvalsh(self.plant.process_noise_cov)[0] > 0)
+        return has_bound(self.plant.process_noise_cov)
 
     def bound(self, data: Data, truths: int = 100) -> np.ndarray:
         """Bound on the standard error of each state (2,), averaged over the data's inputs and scored steps.
@@ -133,7 +133,7 @@ class Scenario(BaseScenario):
         if not self.has_bound:
             return np.full(2, np.nan)
         exact = model_of_plant(self.plant)
-        variances = np.einsum("bkii->bki", posterior_bound(exact, data.inputs, truths=truths))
+        variances = posterior_variances(exact, data.inputs, truths=truths)
         return np.sqrt(variances[:, self.first_scored_step :].mean(axis=(0, 1)))
 
     def make(self, seeds: tuple[int, ...]) -> Data:

@@ -1,0 +1,134 @@
+"""What a study and a tuned file keep of long work, so that a report need not do it once more.
+
+It is kept with what it follows from, and used only where that is the same: the choice, the problems and the
+versions of all packages. A hash tells that, not who wrote it: `tuning.evaluation.verify` computes held-out metrics
+anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from tuning.evaluation.baselines import Scaled, rule_of_thumb, scaled_rule
+from tuning.evaluation.evaluate import Evaluation
+from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.sizes import SizeRow
+from tuning.evaluation.summary import as_interval, numbers, summarised, summary
+from tuning.evaluation.versions import versions
+from tuning.problems.problem import Problem
+from tuning.search.plan import SIZE_SEEDS, TRAINING_SEEDS, Plan
+from tuning.search.space import Choice, size_ladder
+
+ROLES = ("untuned", "tuned", "true", "scaled")  # evaluations of a `Comparison`
+
+
+def sizes_as_data(rows: Sequence[SizeRow], choice: Choice, plan: Plan) -> dict:
+    """The table of ensemble sizes of a choice as plain data, with a digest of what it follows from."""
+    found = [
+        {
+            "N": row.size,
+            "seeds": row.seeds,
+            "ratio": numbers(row.ratio),
+            "nis_violation": row.outside,
+            "metrics": summary(row.evaluation),
+        }
+        for row in rows
+    ]
+    return {"digest": _digest_of_sizes(choice, plan), "rows": found}
+
+
+def kept_sizes(data, choice: Choice, plan: Plan) -> list[SizeRow] | None:
+    """The table of ensemble sizes that was kept of this choice; None if it is of something else, or none.
+
+    Args:
+        data: what `sizes_as_data` gave, or anything.
+        choice: whose size stands in the table.
+        plan: what the study is for.
+    """
+    if not isinstance(data, Mapping) or data.get("digest") != _digest_of_sizes(choice, plan):
+        return None
+    try:
+        rows = [
+            SizeRow(
+                int(row["N"]),
+                summarised(row["metrics"], plan.scenarios[0]),
+                as_interval(row["ratio"]),
+                float(row["nis_violation"]),
+                int(row["seeds"]),
+            )
+            for row in data["rows"]
+        ]
+    except (KeyError, TypeError, ValueError):
+        return None
+    return rows if choice.numbers["ensemble_size"] in [row.size for row in rows] else None
+
+
+def _digest_of_sizes(choice: Choice, plan: Plan) -> str:
+    of_filter = {key: value for key, value in choice.numbers.items() if key != "ensemble_size"}
+    own = {one.name: choice.model.get(one.name) for one in plan.scenarios[0].parameters or ()}
+    model = plan.scenarios[0].model(**choice.model)  # a file may say more of it than a trial
+    noise = [model.process_noise_cov.tolist(), model.measurement_noise_cov.tolist(), model.prior_cov.tolist()]
+    of_problems = [one.digest for one in plan.scenarios], plan.consistent, plan.budget, plan.seed
+    seeds = SIZE_SEEDS, TRAINING_SEEDS, size_ladder(choice.name)
+    text = json.dumps([choice.name, own, noise, of_filter, of_problems, seeds, versions()], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def comparison_as_data(proof: Comparison) -> dict:
+    """What a report shows of a comparison beside the metrics that a tuned file holds."""
+    found = {role: getattr(proof, role) for role in ROLES}
+    return {
+        "expected_nis": _plain(proof.tuned.expected_nis),
+        "median_nees": {role: one and _plain(one.median_nees) for role, one in found.items()},
+        "score_ratios": {name: numbers(ratio) for name, ratio in proof.ratios.items()},
+        "likelihood_gains": {name: numbers(gain) for name, gain in proof.likelihood_gains.items()},
+        "no_scaled_default": "" if proof.default is None else proof.default.reason,
+    }
+
+
+def kept_comparison(content: Mapping, choice: Choice, problem: Problem) -> Comparison | None:
+    """The comparison on held-out seeds that a tuned file keeps of a problem; None if it has to be made anew.
+
+    That is where the file does not hold it, or was made with other versions of packages.
+
+    Args:
+        content: of the tuned file.
+        choice: which it holds.
+        problem: one of those that it was tuned on, whose digest is known to be that of the file.
+    """
+    if content.get("made_with") != versions():
+        return None
+    try:
+        held_out, more = content["held_out"][problem.name], content["comparisons"][problem.name]
+        found = {role: _summarised(role, held_out, more, problem) for role in ROLES}
+        scaling, reason = held_out["scaled_default"], str(more["no_scaled_default"])
+        default = Scaled(None, None, None, reason)
+        if scaling["factor"] is not None:
+            factor, nis = float(scaling["factor"]), float(scaling["mean_nis"])
+            default = Scaled(scaled_rule(rule_of_thumb(choice.name, problem), problem, factor), factor, nis)
+        first, beyond = map(int, held_out["seeds"])
+        return Comparison(
+            **found,
+            bound=np.array([math.nan if part is None else float(part) for part in held_out["bound"]]),
+            seeds=range(first, beyond),
+            default=default,
+            kept_ratios={str(name): as_interval(ratio) for name, ratio in more["score_ratios"].items()},
+            kept_gains={str(name): as_interval(gain) for name, gain in more["likelihood_gains"].items()},
+        )
+    except (AttributeError, KeyError, TypeError, ValueError):
+        return None
+
+
+def _summarised(role: str, held_out: Mapping, more: Mapping, problem: Problem) -> Evaluation | None:
+    if held_out[role] is None:
+        return None
+    return summarised(held_out[role], problem, more["expected_nis"], more["median_nees"][role])
+
+
+def _plain(value: float) -> float | None:
+    return None if math.isnan(value) else value

@@ -1,0 +1,82 @@
+"""Evaluations as plain numbers, as files and studies hold them, and back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from filters.consistency.intervals import Interval
+from plants.quantities import Quantity
+from tuning.evaluation.evaluate import NOTHING, Evaluation
+from tuning.problems.problem import Problem
+
+
+def summary(evaluation: Evaluation) -> dict:
+    """The figures of an evaluation as plain numbers for JSON, None where there is nothing to tell."""
+    return {
+        "rmse": [numbers(value) for value in evaluation.rmse],
+        "start_up_rmse": [None if math.isnan(part) else part for part in evaluation.start_up_rmse.tolist()],
+        **{_key(evaluation.outputs[symbol]): numbers(one) for symbol, one in evaluation.output_rmse.items()},
+        "score": numbers(evaluation.score),
+        "nees": numbers(evaluation.nees),
+        "nis": numbers(evaluation.nis),
+        "log_likelihood": None if math.isnan(evaluation.log_likelihood) else evaluation.log_likelihood,
+        "divergences": evaluation.divergences,
+    }
+
+
+def summarised(
+    data: Mapping, problem: Problem, expected_nis: float | None = None, median_nees: float | None = None
+) -> Evaluation:
+    """An evaluation that has the figures of a `summary`, and nothing of single runs: all are as one run.
+
+    So no interval can be made of it anew, and it cannot be compared in pairs.
+
+    Raises:
+        KeyError, TypeError, ValueError: if the data are none.
+    """
+    model = problem.model()
+    rmse = tuple(map(as_interval, data["rmse"]))
+    outputs = {
+        symbol: output.quantity for symbol, output in model.outputs.items() if _key(output.quantity) in data
+    }
+    likelihood = _number(data["log_likelihood"])
+    return Evaluation(
+        states=model.states[: len(rmse)],
+        outputs=outputs,
+        rmse=rmse,
+        start_up_rmse=np.array([_number(part) for part in data["start_up_rmse"]]),
+        score=as_interval(data["score"]),
+        output_rmse={symbol: as_interval(data[_key(quantity)]) for symbol, quantity in outputs.items()},
+        nees=as_interval(data["nees"]),
+        median_nees=_number(median_nees),
+        nis=as_interval(data["nis"]),
+        expected_nis=_number(expected_nis),
+        channels=model.m,
+        log_likelihood=likelihood,
+        log_likelihoods=np.array([likelihood]),
+        divergences=int(data["divergences"]),
+        mean_squares=np.array([[value.value**2 for value in rmse]]),
+        scale=np.array([math.nan] * len(rmse) if problem.scale is None else problem.scale, dtype=np.float64),
+    )
+
+
+def numbers(value: Interval) -> list[float] | None:
+    """An interval as plain numbers, None where there is none."""
+    return None if math.isnan(value.value) else list(value)
+
+
+def as_interval(data) -> Interval:
+    """An interval from plain numbers."""
+    return NOTHING if data is None else Interval(*map(float, data))
+
+
+def _number(value) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _key(output: Quantity) -> str:
+    """What the RMSE of a derived output is called in a file: "thrust_rmse" of the thrust."""
+    return f"{output.name.replace(' ', '_')}_rmse"

@@ -1,0 +1,19 @@
+"""Versions of the packages on which numbers depend."""
+
+from __future__ import annotations
+
+import importlib.metadata
+
+PACKAGES = ("thruster-env", "optuna", "numpy", "numba", "gymnasium")
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that a tuned file depends on, as they are installed."""
+    return {name: _version(name) for name in PACKAGES}
+
+
+def _version(name: str) -> str:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
