@@ -48,7 +48,7 @@ def identify_all(
     digest = digest_of(
         tuple(run.log(True).digest for run in runs), [(*one,) for one in STRUCTURES.values()], starts
     )
-    kept = json.loads(file.read_text()) if file.is_file() else {}
+    kept = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     found = kept["tasks"] if kept.get("digest") == digest else {}
     tasks = tasks_of(runs)
     for number, task in enumerate(tasks):
