@@ -120,6 +120,7 @@ def problems_of(
             raise ValueError(f"a study must be of --log or of --problem, but got both, {logs[0]} and {names[0]}")
         return (log_problem(logs, **given),)
     if given:
-        option = next(iter(given)).removesuffix("s").replace("_", "-")
+        first = next(iter(given))
+        option = {"sensors": "sensor", "columns": "column"}.get(first, first).replace("_", "-")
         raise ValueError(f"--{option} must come with --log, but there is none")
     return tuple(map(find_problem, names or [default]))
