@@ -114,8 +114,7 @@ def _enqueue_likeliest(study: optuna.Study, plan: Plan) -> None:
 
     They are those of the first scenario's model in an extended Kalman filter, or in the Kalman filter where that
     is tuned. Near the best Q and R the score is so flat that a sampler finds the place late; where the model is
-    wrong the trial is one among many. On recorded runs they are also tried with the filter's other numbers untuned,
-    and with the largest ensemble.
+    wrong the trial is one among many. On recorded runs they are also tried with all else untuned.
     """
     best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
     if best is None:
@@ -131,9 +130,7 @@ def _enqueue_likeliest(study: optuna.Study, plan: Plan) -> None:
     if any(problem.leads_in for problem in plan.scenarios):  # recorded runs, whose likelihood is all there is
         kind = best.params.get(KIND, plan.filter)
         plain = trial_parameters(untuned_choice(kind, plan.scenarios[0]), space)
-        largest = {"N": space["N"].high} if "N" in space else {}
-        for numbers in (plain, {**plain, **largest}):
-            study.enqueue_trial({**numbers, **likeliest}, user_attrs={LIKELIEST: True}, skip_if_exists=True)
+        study.enqueue_trial({**plain, **likeliest}, user_attrs={LIKELIEST: True}, skip_if_exists=True)
 
 
 def _ends_a_round(trials: int, kinds: int) -> bool:
