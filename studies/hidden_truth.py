@@ -18,7 +18,7 @@ from tuning.search.space import Choice
 from tuning.search.study import open_study, quiet_optuna, run_study
 
 TRIALS = 60
-RUNS = 96  # logs; 64 of them are learnt from, or outliers tell too little of Q
+RUNS, MANY_RUNS = 96, 300  # logs, of which two thirds are learnt from
 FILTERS = ("kf", "ekf", "enkf")
 CASES = (*product(("nominal", "outliers"), FILTERS), ("published_tunnel", "kf"))
 

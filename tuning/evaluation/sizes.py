@@ -75,8 +75,8 @@ def close_size(choice: Choice, plan: Plan, training: Sequence[Data]) -> int:
         mean of (m_N - m_L)^2 / P_L over runs, scored steps and states < 1.01^2 - 1
 
     Where nothing is known of the truth this is what can be told: sampling adds this much to the mean square error,
-    in units of the variance that the largest ensemble believes in. The likelihood hardly feels it where R is large.
-    Where the plan has a budget, no size is above that of the choice.
+    in units of the variance that the largest ensemble believes in. The likelihood hardly feels it where R is
+    large. Where the plan has a budget, no size is above that of the choice.
 
     Args:
         choice: of a study.
