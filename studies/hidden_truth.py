@@ -6,7 +6,6 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-import optuna
 
 from filters.consistency.intervals import Interval
 from plants.logs.log import Log
@@ -75,7 +74,7 @@ def hide_truth(
     plans = Plan(filter_name, (problem,), seed), Plan(filter_name, (blind_problem,), seed, ("likelihood",))
     choices = []
     for plan in plans:
-        study = open_study(f"hidden-{filter_name}", plan, optuna.storages.InMemoryStorage())
+        study = open_study(f"hidden-{filter_name}", plan)
         choices.append(run_study(study, plan, trials).or_interrupted().choice)
     data = problem.data(problem.held_out_seeds(seed, held_out))
     found = [evaluate(choice.filter(problem), data, problem.scale) for choice in choices]

@@ -1,11 +1,14 @@
 """Recorded runs as a problem: blocks, what is held out, what counts, and truth where logs have it."""
 
 import pickle
+from pathlib import Path
 
 import numpy as np
 import optuna
 import pytest
 
+from docs import log_tables
+from filters import run
 from filters.likelihood import likelihood
 from plants.affine import affine_model
 from plants.logs.log import Log
@@ -13,6 +16,7 @@ from plants.simulate import simulate
 from studies.hidden_truth import hide_truth
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import prove
+from tuning.evaluation.sizes import close_size
 from tuning.likelihood.gradient import maximise_likelihood
 from tuning.likelihood.identifiability import identify
 from tuning.problems.check import checked_problem
@@ -20,8 +24,9 @@ from tuning.problems.find import find_problem
 from tuning.problems.log_parts import LEAD, parts_of
 from tuning.problems.log_problem import LogProblem
 from tuning.search.plan import Plan
-from tuning.search.space import untuned_choice
+from tuning.search.space import size_ladder, untuned_choice
 from tuning.search.study import open_study, run_study
+from tuning.search.workers import _packed, _unpacked
 
 Q, R = 0.04, 0.25
 MODEL = affine_model(
@@ -43,13 +48,13 @@ def quiet():
 
 def logs_of(*steps, truth=False, offset=0.0):
     logs = []
-    for run, count in enumerate(steps):
+    for number, count in enumerate(steps):
         inputs = offset + np.sign(np.sin(0.1 * np.arange(count)))[None, :, None]
-        found = simulate(MODEL, np.array([[run, 5]]), inputs)
+        found = simulate(MODEL, np.array([[number, 5]]), inputs)
         states = {"state:x_1": found.states[0, :, 0]} if truth else {}
         referred = {"state:x_1": MODEL.states[0]} if truth else {}
         quantities = MODEL.input_quantities, MODEL.measurements
-        logs.append(Log(f"run{run}", 0.1, inputs[0], found.measurements[0], *quantities, states, referred))
+        logs.append(Log(f"run{number}", 0.1, inputs[0], found.measurements[0], *quantities, states, referred))
     return logs
 
 
@@ -109,6 +114,7 @@ def test_a_problem_of_logs_is_one_whose_digest_is_of_its_content():
     one, same = (checked_problem(LogProblem(logs_of(300), GUESS)) for _ in range(2))
     assert one.scale is None and one.true is None and one.digest == same.digest
     assert pickle.loads(pickle.dumps(one)).digest == one.digest
+    assert _unpacked(_packed(one)).digest == one.digest  # as workers get it
     others = LogProblem(logs_of(300, offset=0.1), GUESS), LogProblem(logs_of(300), GUESS, blocks=8)
     assert len({one.digest, *(other.digest for other in others)}) == 3
 
@@ -157,6 +163,39 @@ def test_true_states_in_the_logs_give_a_scale_and_runs_of_their_own_for_the_ense
     assert data.states[1, 0, 0] == first
     hidden = LogProblem(logs, MODEL, truth=False)
     assert hidden.scale is None and hidden.data([0]).states is None
+
+
+def test_an_ensemble_without_a_truth_is_the_smallest_whose_estimates_are_close_to_the_largest_one_s():
+    problem = LogProblem(logs_of(300), MODEL, blocks=8)
+    plan, data = Plan("enkf", (problem,), objectives=("likelihood",)), problem.data(problem.parts.training)
+    choice = untuned_choice("enkf", problem)._replace(
+        model={"process_noise_cov": (Q,), "measurement_noise_cov": R}
+    )
+
+    def means_of(size):
+        filter_ = choice.with_size(size).filter(problem)
+        found = run(filter_, data.filter_keys, data.inputs, data.measurements)
+        return found.means[:, data.scored, 0], found.covs[:, data.scored, 0, 0]
+
+    size = close_size(choice, plan, [data])
+    ladder = [n for n in size_ladder("enkf") if n < 200]
+    largest, variances = means_of(200)
+    excess = {n: ((means_of(n)[0] - largest) ** 2 / variances).mean() for n in ladder}
+    assert size == min(n for n in ladder if excess[n] < 0.0201) and 20 < size < 200
+    assert close_size(choice.with_size(10), plan._replace(budget=1.0), [data]) <= 10
+
+
+def test_the_page_has_the_table_of_its_script_and_says_what_the_truth_is_worth():
+    page = (Path(__file__).parents[2] / "docs" / "logs.md").read_text()
+    lines = page.partition("<!-- table hidden_truth -->")[2].partition("<!-- end -->")[0].strip().splitlines()
+    rows = {(row[1].strip(" `"), row[2].strip(" `")): row for row in (line.split("|") for line in lines[2:])}
+    assert set(rows) == set(log_tables.CASES)
+    ratios = {case: float(row[4].split()[0]) for case, row in rows.items()}  # with the most logs
+    fitting = [ratios[case] for case in ratios if case[1] != "kf" or case[0] == "published_tunnel"]
+    assert len(fitting) == 5 and max(fitting) <= 1.02
+    assert min(ratios["nominal", "kf"], ratios["outliers", "kf"]) > 1.5  # as the text says
+    made = log_tables.hidden_truth(trials=2, cases=[("nominal", "ekf")], runs=(6,))
+    assert made.startswith("| scenario | filter | 6 logs |") and "| `nominal` | `ekf` | " in made
 
 
 def test_a_study_that_never_saw_the_truth_comes_close_to_one_that_did():
