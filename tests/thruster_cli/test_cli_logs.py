@@ -1,6 +1,8 @@
 """Logs at the command line: estimate, tune --log, and what follows; one line for what is wrong."""
 
 import json
+import subprocess
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -57,6 +59,13 @@ def test_a_simulated_log_goes_through_estimate(simulated, as_json, thruster, tmp
     assert as_json("estimate", "again.npz")["log_likelihood"] == pytest.approx(data["log_likelihood"], rel=1e-6)
 
 
+def test_estimating_imports_no_optimiser_and_draws_nothing_that_is_not_asked_for():
+    heavy = ["optuna", "matplotlib", "pint", "pyarrow"]
+    code = f"import sys, thruster_cli.app, thruster_cli.estimate; print([n for n in {heavy} if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 def test_a_load_cell_is_held_against_what_the_tachometer_tells(simulated, as_json):  # noqa: F811
     simulated("run.csv")
     columns = "--column", "speed=omega_m_rad_per_s", "--column", "thrust=thrust_N"
@@ -72,7 +81,7 @@ def test_a_filter_tuned_on_logs_is_verified_reported_and_used(simulated, as_json
             "\n".join(",".join(row[i] for i in (0, 1, 5)) for row in rows) + "\n"
         )
     logs = "--log", "a.csv", "--log", "b.csv"
-    options = "--filter", "ekf", *logs, "--held-out", "c.csv", "--trials", 4, "--out", "tuned.json"
+    options = "--filter", "ekf", *logs, "--held-out", "c.csv", "--lead", 40, "--trials", 4, "--out", "tuned.json"
     data = as_json("tune", *options)
     assert data["file"] == "tuned.json" and objectives_of(tmp_path / "tuned.json") == ["likelihood"]
     assert as_json("verify", "tuned.json")["holds"]
