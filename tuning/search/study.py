@@ -11,7 +11,7 @@ import optuna
 from optuna.trial import FrozenTrial, TrialState
 
 from tuning.evaluation.kept import kept_sizes, sizes_as_data
-from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
+from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
 from tuning.problems.data import Data
 from tuning.search.cost import COST
 from tuning.search.enqueued import enqueue_followers, enqueue_what_is_left
@@ -174,7 +174,10 @@ def run_study(
         if sizes is None:
             sizes = ensemble_sizes(choice, plan, data, consistent)
             study.set_user_attr(SIZES, sizes_as_data(sizes, choice, plan))
-        choice = choice.with_size(sufficient_size(sizes, consistent)) if sizes else choice
+        if sizes:
+            choice = choice.with_size(sufficient_size(sizes, consistent))
+        elif all(scenario.leads_in for scenario in plan.scenarios):
+            choice = choice.with_size(close_size(choice, plan, data))
     complete = [trial.values[0] for trial in present if trial.state == TrialState.COMPLETE]
     return StudyResult(
         choice,
