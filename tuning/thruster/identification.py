@@ -124,8 +124,12 @@ class ThrusterFamily:
     @property
     def data(self):
         """The logs, or a function of the clock offsets that are free."""
+        return self.shifted(self.logs)
+
+    def shifted(self, logs: Sequence[Log]):
+        """Some logs as this family takes them: as they are, or a function of the clock offsets that are free."""
         offsets = tuple(one.name for one in self.free if one.name.startswith("clock_offset_"))
-        return ShiftedLogs(self.logs, offsets) if offsets else self.logs
+        return ShiftedLogs(logs, offsets) if offsets else tuple(logs)
 
     def parameters(self, values: Mapping[str, float]) -> ThrusterParameters:
         """The thruster's own parameters."""
