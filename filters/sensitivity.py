@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from filters.recursion import recursion_of
 from filters.sensitivity_parts import parts_of
 from numerics.angles import kept
 from numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from numerics.sources import Source
 from numerics.threads import spread
 from plants.layout import number_places
 from plants.shape import Functions, Shape, observation_slopes, transition_slopes
@@ -47,6 +49,7 @@ def sensitivity(
     *,
     degrees: float = math.inf,
     blocks: int = 1,
+    predicted: Sequence[bool] | None = None,
 ) -> Sensitivity:
     """`likelihood`, and Fisher's information, for parameters that move all numbers of a model.
 
@@ -62,6 +65,10 @@ def sensitivity(
         degrees: degrees of freedom of a Student-t density with the covariance S in place of the normal one, which
             outliers move less; above 2. The filter stays as it is.
         blocks: equal parts of each trajectory, whose gradients are told apart.
+        predicted: (m,) which channels the filter predicts after it has seen the others, but never sees: those of
+            a load cell that is there for the identification alone. Their prediction errors enter as innovations
+            do; as nothing corrects them, errors of steps one after the other are alike, and the information is
+            more than there is.
 
     Raises:
         ValueError: if shapes do not fit, or degrees are not above 2.
@@ -80,8 +87,10 @@ def sensitivity(
     out, information = np.zeros((count, blocks, 1 + p)), np.zeros((count, p, p))
     noise = slopes.process_noise_cov.reshape(p, n * n), slopes.measurement_noise_cov.reshape(p, m * m)
     moves = *noise, slopes.constants, _relative(slopes.constants, model), prior
+    fed = 1.0 - np.array(np.zeros(m) if predicted is None else predicted, dtype=np.float64)
+    check_shapes({**given, "predicted": fed}, model, *(slope.shape for slope in slopes), (m,))
     accumulate = _build(model.functions, model.shape, is_interpreting())
-    arguments = inputs, measurements, model.numbers, *moves, float(degrees), out, information
+    arguments = inputs, measurements, model.numbers, *moves, float(degrees), fed, out, information
     spread(lambda first, last: accumulate(*arguments, first, last), count)
     total = out.sum(axis=1)
     return Sensitivity(total[:, 0], total[:, 1:], information, out[:, :, 1:])
@@ -134,6 +143,8 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
     ) = recursion_of(shape)
     constants_slope, motion, motion_slope, observation, observation_slope = parts_of(functions, shape)
     weigh, log_likelihood, likelihood_slope, note, sum_up = statistics_of(m)
+    source = Source("chosen", "z, fed, turn", result=(m,), z=(m,), fed=(m,))
+    chosen = source.function(source.vector(m, lambda i: f"z[{i}] if fed[{i}] == turn else nan"), nan=math.nan)
     fingerprint = function_fingerprint(transition, transition_matrix, observe, observation_matrix, within=__name__)
 
     def accumulate(
@@ -146,6 +157,7 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
         sizes,
         prior_slopes,
         degrees,
+        fed,
         out,
         information,
         first,
@@ -154,6 +166,7 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
         fingerprint  # noqa: B018 - part of the cache's key
         c, s = constants(numbers), scales(numbers)
         rows, notes = np.zeros((q_slopes.shape[0], n + n * n)), np.zeros((q_slopes.shape[0], width))
+        turns = 1 if fed.min() > 0.0 else 2  # of a sample: what the filter sees, then what it only predicts
         for b in range(first, last):
             x, p = prior_mean(numbers), prior_cov(numbers)
             rows[:] = prior_slopes
@@ -172,25 +185,33 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
                     p = grown(p, q(numbers))
                     for j in range(rows.shape[0]):
                         store_cov_slope(rows[j], grown(cov_slope(rows[j]), q_slope(q_slopes[j])))
-                part, z = k * out.shape[1] // measurements.shape[1], reading(measurements[b, k])
-                h = present_rows(observation_matrix(x, s, c), z)
-                v, spread_of_v = difference(z, observe(x, c)), seen(h, p, present(r(numbers), z))
-                root = root_of(spread_of_v)
-                gain = divide(correlation(p, h), root)
-                w = weigh(v, root)
-                out[b, part, 0] += log_likelihood(v, root, z, w, degrees)
-                for j in range(rows.shape[0]):
-                    dx, dp = mean_slope(rows[j]), cov_slope(rows[j])
-                    dc, size = constants_slope(constants_slopes[j]), sizes[j]
-                    dh = present_rows(observation_slope(x, s, c, dx, dc, size), z)
-                    dy = observation(h, dx, x, c, dc, size, z)  # less the slope of the innovation
-                    ds = seen_slope(h, dh, p, dp, present(r_slope(r_slopes[j]), z))
-                    dgain = divide(uneven_gain(h, dh, p, dp, gain, ds), root)
-                    out[b, part, 1 + j] += likelihood_slope(v, dy, root, ds, z, w, degrees)
-                    note(notes[j], dy, ds, root, z)
-                    store_mean_slope(rows[j], corrected_slope(dx, gain, dgain, v, dy))
-                    store_cov_slope(rows[j], reduced_slope(dp, gain, dgain, spread_of_v, ds))
-                sum_up(notes, information[b])
-                x, p = corrected(x, gain, v), reduced(p, gain, spread_of_v)
+                part, sample = k * out.shape[1] // measurements.shape[1], reading(measurements[b, k])
+                for turn in range(turns):
+                    z = chosen(sample, fed, 1.0 - turn)
+                    h = present_rows(observation_matrix(x, s, c), z)
+                    v, spread_of_v = difference(z, observe(x, c)), present(r(numbers), z)
+                    if turn == 0:
+                        spread_of_v = seen(h, p, spread_of_v)
+                    root = root_of(spread_of_v)
+                    gain = divide(correlation(p, h), root)
+                    w = weigh(v, root)
+                    out[b, part, 0] += log_likelihood(v, root, z, w, degrees)
+                    for j in range(rows.shape[0]):
+                        dx, dp = mean_slope(rows[j]), cov_slope(rows[j])
+                        dc, size = constants_slope(constants_slopes[j]), sizes[j]
+                        dh = present_rows(observation_slope(x, s, c, dx, dc, size), z)
+                        dy = observation(h, dx, x, c, dc, size, z)  # less the slope of the innovation
+                        ds = present(r_slope(r_slopes[j]), z)
+                        if turn == 0:
+                            ds = seen_slope(h, dh, p, dp, ds)
+                        out[b, part, 1 + j] += likelihood_slope(v, dy, root, ds, z, w, degrees)
+                        note(notes[j], dy, ds, root, z)
+                        if turn == 0:
+                            dgain = divide(uneven_gain(h, dh, p, dp, gain, ds), root)
+                            store_mean_slope(rows[j], corrected_slope(dx, gain, dgain, v, dy))
+                            store_cov_slope(rows[j], reduced_slope(dp, gain, dgain, spread_of_v, ds))
+                    sum_up(notes, information[b])
+                    if turn == 0:
+                        x, p = corrected(x, gain, v), reduced(p, gain, spread_of_v)
 
     return CompiledOrPython(accumulate)

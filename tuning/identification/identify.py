@@ -35,6 +35,7 @@ def identify(
     starts: int | Sequence[Mapping[str, float]] = STARTS,
     seed: int = 0,
     degrees: float = math.inf,
+    predicted: Sequence[str] = (),
     simulation_first: bool = True,
     progress: Progress | None = None,
 ) -> Identification:
@@ -60,6 +61,9 @@ def identify(
         starts: how many, or the other starts themselves.
         seed: of the draws.
         degrees: of freedom of Student-t innovations, for logs with outliers; infinite for normal ones.
+        predicted: symbols of channels that the filter is to predict, but never sees, such as a load cell that will
+            not be there later. What it sees alone would be identified as it predicts best one step ahead; with a
+            channel of these, as it predicts that channel best.
         simulation_first: see above.
         progress: called with the number of the start, the log-likelihood and the values, after every rise.
 
@@ -73,7 +77,7 @@ def identify(
     """
     begin = time.perf_counter()
     coordinates = Coordinates(free)
-    objective = Objective(data, model, coordinates, filter=filter, degrees=degrees)
+    objective = Objective(data, model, coordinates, filter=filter, degrees=degrees, predicted=predicted)
     first = coordinates.start(dict(start or {}))
     points = [first, *_others(coordinates, first, starts, seed)]
     with stop_on_interrupt() as asked:

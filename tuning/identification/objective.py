@@ -45,6 +45,7 @@ class Objective:
         coordinates: of the parameters.
         filter: "ekf" or "kf".
         degrees: of freedom of Student-t innovations; infinite for normal ones.
+        predicted: symbols of channels that the filter predicts, but does not see.
         simulation: whether Q is put to zero: the filter then simulates, and -log L is a sum of squares.
 
     Raises:
@@ -59,12 +60,14 @@ class Objective:
         *,
         filter: str = "ekf",
         degrees: float = math.inf,
+        predicted: Sequence[str] = (),
         simulation: bool = False,
     ):
         """Find out which parameters move the model's numbers alone."""
         self.filter = one_of("filter", filter, DIFFERENTIABLE)
         self.coordinates, self._model, self.degrees, self.simulation = coordinates, model, degrees, simulation
         self._data, self.evaluations = data if callable(data) else runs_of(data), 0
+        self.predicted = tuple(predicted)
         self._of_data = _arguments_among(data, coordinates.names) if callable(data) else ()
         self.rough: tuple[int, ...] = ()  # places of parameters that have no sensitivities
         at = coordinates.start()
@@ -74,12 +77,14 @@ class Objective:
         self._smooth = [j for j in range(len(at)) if j not in self.rough]
         runs = self.data_at(at)
         _check_runs(runs, self.model_at(at))
+        self._unseen = _checked_channels(self.predicted, self.model_at(at))
         count = len(runs.measurements)
         self.blocks = 1 if count >= BLOCKS else -(-BLOCKS // count)
 
     def with_changes(self, **changes) -> Objective:
         """The same with other data, filter, degrees or simulation."""
-        kept = {"filter": self.filter, "degrees": self.degrees, "simulation": self.simulation}
+        names = "filter", "degrees", "predicted", "simulation"
+        kept = {name: getattr(self, name) for name in names}
         data = changes.pop("data", self._data)
         return Objective(data, self._model, self.coordinates, **{**kept, **changes})
 
@@ -130,7 +135,13 @@ class Objective:
         model, slopes = self.model_at(at), self._slopes(at, places)
         runs = self.data_at(at)
         found = sensitivity(
-            model, runs.inputs, runs.measurements, slopes, degrees=self.degrees, blocks=self.blocks
+            model,
+            runs.inputs,
+            runs.measurements,
+            slopes,
+            degrees=self.degrees,
+            blocks=self.blocks,
+            predicted=self._unseen,
         )
         scores = np.concatenate(found.block_gradients)
         information = found.information.sum(axis=0)
@@ -181,3 +192,14 @@ def _check_runs(run: Data, model: StateSpaceModel) -> None:
     if empty.any():
         missing = ", ".join(one.symbol for one, none in zip(model.measurements, empty, strict=True) if none)
         raise ValueError(f"data must have measurements of each channel, but have none of {missing}")
+
+
+def _checked_channels(predicted: Sequence[str], model: StateSpaceModel) -> list[bool]:
+    """Which channels are only predicted; ValueError for one that there is not, or if all are."""
+    symbols = [channel.symbol for channel in model.measurements]
+    for symbol in predicted:
+        one_of("a predicted channel", symbol, symbols)
+    unseen = [symbol in predicted for symbol in symbols]
+    if all(unseen):
+        raise ValueError(f"a filter must see some channel, but {', '.join(symbols)} are only predicted")
+    return unseen

@@ -1,0 +1,1 @@
+"""A recorded ROV thruster on a load cell: identified from its logs, estimated without the load cell, and compared."""
