@@ -105,17 +105,17 @@ def test_a_single_run_has_standard_errors_from_its_blocks():
         assert abs(found.values[name] - truth) < 3.5 * found.standard_errors[name], name
 
 
-def test_student_innovations_are_moved_less_by_outliers(data, found):
+def test_outliers_beyond_a_gate_are_left_out(data, found):
     rng, spoilt = np.random.default_rng(0), data.measurements.copy()
-    spoilt[rng.random(spoilt.shape) < 0.02] += 3.0
+    outliers = rng.random(spoilt.shape) < 0.02
+    spoilt[outliers] += 3.0
     spoilt = data._replace(measurements=spoilt)
-    normal, student = (identify(spoilt, pendulum, FREE, starts=1, degrees=d) for d in (math.inf, 4.0))
-
-    def distance(one, name):
-        return abs(one.values[name] - TRUTH[name])
-
-    assert distance(student, "offset") < 0.5 * distance(normal, "offset")
-    assert distance(student, "r") < 0.5 * distance(normal, "r")
+    normal, gated = (identify(spoilt, pendulum, FREE, starts=1, gate=gate) for gate in (math.inf, 4.5))
+    left_out = gated.objective.data.outliers
+    assert (left_out & outliers).sum() > 0.97 * outliers.sum() and (left_out & ~outliers).sum() < 5
+    for name in ("offset", "r"):
+        assert abs(normal.values[name] - found.values[name]) > 3 * found.standard_errors[name]
+        assert abs(gated.values[name] - found.values[name]) < 0.5 * found.standard_errors[name]
 
 
 def test_ctrl_c_keeps_the_best_so_far(data):
