@@ -57,8 +57,6 @@ def write_files(
     """Write the preset file of a thruster, and the profiles; return the paths."""
     files = []
     if out is not None:
-        if not isinstance(family, ThrusterFamily):
-            raise ValueError("--out must be left out for a --model: its values are told by --json FILE")
         write_preset(out, preset_of(found, family, logs), "A thruster as `thruster identify` found it.")
         files.append(str(out))
     if plot is not None and made:
@@ -122,6 +120,7 @@ def as_json(
         "optima": [one._asdict() for one in found.optima],
         "starts_that_agree": found.agreement,
         "evaluations": found.evaluations,
+        "samples_left_out": found.left_out,
         "interrupted": found.interrupted,
         "validation": {name: one._asdict() for name, one in checked.items()},
         "profiles": [{**one._asdict(), "interval": one.interval} for one in made],

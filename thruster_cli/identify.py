@@ -21,6 +21,7 @@ from thruster_cli.logs import (
 )
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
 from thruster_cli.to_identify import family_of, numbers_of, ranges_of, split_runs
+from thruster_env.preset_file import is_file
 from tuning.identification.coordinates import Coordinates
 from tuning.identification.excitation import check_excitation
 from tuning.identification.family import with_ranges
@@ -62,8 +63,8 @@ def command(
     ] = None,
     use_all: Annotated[bool, typer.Option("--use-all", help="Hold no run out.")] = False,
     filter_name: Annotated[str, typer.Option("--filter", help="ekf, or kf for affine models.")] = "ekf",
-    degrees: Annotated[
-        float, typer.Option(help="Degrees of freedom of Student-t innovations, above 2, for logs with outliers.")
+    gate: Annotated[
+        float, typer.Option(help="Leave out samples beyond so many standard deviations, such as 5, as outliers.")
     ] = math.inf,
     starts: Annotated[int, typer.Option(help="Searches from so many starts.")] = STARTS,
     bollard: Annotated[
@@ -108,12 +109,15 @@ def command(
     family = family_of(family, runs, free, noise=not hold_noise)
     numbers, ranges = numbers_of("--start", pairs("--start", start)), ranges_of(pairs("--range", range_))
     parameters = with_ranges(family.free, ranges, numbers)
+    if out is not None and (model is not None or not is_file(out)):
+        rule = "be left out for a --model, whose values --json tells" if model else "end in .toml, a preset file"
+        raise ValueError(f"--out must {rule}, but got {str(out)!r}")
     for target in (out, plot):
         if target is not None:
             check_target(target)
     announce_compilation()
     coordinates = Coordinates(parameters)
-    objective = Objective(family.data, family.model, coordinates, filter=filter_name, degrees=degrees)
+    objective = Objective(family.data, family.model, coordinates, filter=filter_name)
     check_excitation(objective, runs, coordinates.start())
     with progress_console.status("identifying ...") as status:
 
@@ -127,7 +131,7 @@ def command(
             filter=filter_name,
             starts=starts,
             seed=seed,
-            degrees=degrees,
+            gate=gate,
             progress=tell,
         )
         made = []

@@ -55,13 +55,19 @@ class Identification(NamedTuple):
     @property
     def agreement(self) -> int:
         """How many starts led to the best maximum: within 0.01 in log L, or 0.1 standard errors everywhere."""
-        coordinates = self.objective.coordinates
-        scale, near = np.sqrt(np.diag(self.cov)), 0
+        coordinates, scale, near = self.objective.coordinates, np.sqrt(np.diag(self.cov)), 0
+        best = max(self.optima, key=lambda one: one.log_likelihood)
+        top = coordinates.of(list(best.values.values()))
         for one in self.optima:
-            apart = np.abs(coordinates.of(list(one.values.values())) - self.at)
-            close = self.log_likelihood - one.log_likelihood < EQUAL_VALUES
+            apart = np.abs(coordinates.of(list(one.values.values())) - top)
+            close = best.log_likelihood - one.log_likelihood < EQUAL_VALUES
             near += bool(close or (apart < EQUAL * scale).all())
         return near
+
+    @property
+    def left_out(self) -> int:
+        """How many samples were outliers."""
+        return int(np.sum(getattr(self.objective.data, "outliers", 0)))
 
     @property
     def evaluations(self) -> int:
@@ -105,6 +111,8 @@ class Identification(NamedTuple):
             said.append(f"Known least is the direction of (in ranges) {parts}.")
         if len(self.optima) > 1:
             said.append(f"{self.agreement} of {len(self.optima)} starts led to this maximum.")
+        if self.left_out:
+            said.append(f"{self.left_out} samples beyond the gate were left out.")
         if self.interrupted:
             said.append("Interrupted: the best so far.")
         return said
