@@ -91,9 +91,7 @@ def from_step(
     """
     log, _ = read_named(path, preset, sensors=["speed"])
     if not np.ptp(log.inputs):
-        raise ValueError(
-            f"a step response must have a step of the voltage, but {path} has {shown(log.inputs[0, 0])} V"
-        )
+        raise ValueError(f"a step response must have a step of the voltage, but {path} has none")
     largest = float(np.abs(log.inputs).max())
     plant = make_plant(parameters, log.dt, max_voltage=max(largest, 1.0), sensors=["speed"])
     family = ThrusterFamily([log], plant, Shown(), (*MOTOR, "added_mass"))
