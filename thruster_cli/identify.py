@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -30,6 +31,7 @@ from tuning.identification.objective import Objective
 from tuning.identification.profiles import profiles
 from tuning.identification.validation import validate
 
+INTERRUPTED = 130
 DEFAULT_OUT = Path("out/identified.toml")
 
 
@@ -141,3 +143,5 @@ def command(
     files = write_files(found, family, made, out, plot, [log.name for log in runs])
     data = as_json(found, checked, made, runs, proving, files)
     emit(report(found, checked, runs, proving, files), data, json)
+    if found.interrupted:
+        sys.exit(INTERRUPTED)
