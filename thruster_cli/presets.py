@@ -20,8 +20,13 @@ OfPresetOption = Annotated[
 ]
 
 
-def of_preset(problem: Problem, preset: str | None) -> Problem:
+def of_preset(problem: Problem, preset: str | None, sequences: int = FILE_SEQUENCES) -> Problem:
     """A scenario of another thruster, whose scale is computed anew; the problem itself where no preset is given.
+
+    Args:
+        problem: a scenario.
+        preset: a preset's name or file.
+        sequences: of inputs, that the scale is made of.
 
     Raises:
         ValueError: for a problem that is no scenario of a thruster that moves by its equations.
@@ -32,4 +37,4 @@ def of_preset(problem: Problem, preset: str | None) -> Problem:
         raise ValueError(f"--preset must come with scenarios of the thruster's equations, but got {problem.name}")
     name = f"{problem.name} ({preset})"
     made = problem.replace(preset=preset, name=name, scale=problem.scale)
-    return made.replace(scale=tuple(float(one) for one in computed_scale(made, FILE_SEQUENCES)))
+    return made.replace(scale=tuple(float(one) for one in computed_scale(made, sequences)))

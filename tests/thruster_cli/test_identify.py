@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -16,10 +15,13 @@ from plants.simulate import simulate
 from studies.identification import TRUTH, record
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.thruster_env.test_t200 import OTHER, recorded_rows, write_table
+from thruster_cli.presets import of_preset
 from thruster_env.logged import logged_model
 from thruster_env.model import thruster_model
 from thruster_env.parameters import TUNNEL_PHYSICAL
 from thruster_env.preset_file import PresetFile, read_preset, write_preset
+from tuning.problems.files import scenario_of
+from tuning.problems.find import find_problem
 
 FREE = ",".join(name for name in TRUTH if not name.startswith(("Q", "R")))
 OF_LOGS = ("--preset", "tunnel_physical", "--sensor", "thrust", "--sensor", "speed")
@@ -91,7 +93,7 @@ def test_logs_without_excitation_say_what_they_do_not_determine(thruster, tmp_pa
     done = thruster("identify", "flat.csv", *OF_LOGS, "--free", f"{FREE},Q11")
     assert done.returncode == 2
     said = done.stderr.splitlines()[-1]  # before it there may be a line on compilation
-    assert "constant inputs do not determine" in said and "dead_band_low" in said and "bias_thrust" in said
+    assert "constant inputs do not determine" in said and "voltage_gain, dead_band_low" in said
     assert not list(tmp_path.rglob("*.toml"))
 
 
@@ -122,13 +124,17 @@ def test_a_bollard_table_and_a_step_response_make_a_preset(thruster, as_json, tm
     assert done.returncode == 2 and "a step response must have a step of the voltage" in done.stderr
 
 
-def test_scenarios_are_of_another_thruster_by_its_preset_file(thruster, as_json):  # noqa: F811
-    write_preset("mine.toml", PresetFile(TUNNEL_PHYSICAL._replace(voltage_gain=1300.0), (-0.5, 0.7)))
-    found = as_json("compare", "--filter", "ekf", "--preset", "mine.toml", "--seeds", 8)
-    assert "nominal (mine.toml)" in str(found)
-    done = thruster("tune", "--filter", "ekf", "--preset", "mine.toml", "--trials", 2, "--out", "t.json")
-    assert done.returncode == 0, done.stderr
-    (Path("mine.toml")).unlink()  # the tuned file holds what it said
-    assert thruster("evaluate", "--tuned", "t.json", "--seeds", 8).returncode == 0
-    done = thruster("compare", "--filter", "ekf", "--scenario", "linear_tunnel", "--preset", "t200")
+def test_scenarios_are_of_another_thruster_by_its_preset_file(thruster, tmp_path):  # noqa: F811
+    path = tmp_path / "mine.toml"
+    write_preset(path, PresetFile(TUNNEL_PHYSICAL._replace(voltage_gain=1300.0), (-0.5, 0.7)))
+    made = of_preset(find_problem("nominal"), str(path), sequences=4)
+    path.unlink()  # the scenario holds what it said
+    assert made.plant.parameters.voltage_gain == 1300.0 and made.model().constants.dead_band_high == 0.7
+    assert np.isfinite(made.scale).all() and made.scale != find_problem("nominal").scale
+    again = scenario_of(made.as_mapping(), made.name, "t.json")
+    assert again.digest == made.digest != find_problem("nominal").digest
+    assert of_preset(made, None) is made
+    done = thruster("compare", "--filter", "ekf", "--scenario", "published_tunnel", "--preset", "t200")
     assert done.returncode == 2 and "--preset must come with scenarios of the thruster's equations" in done.stderr
+    done = thruster("evaluate", "--tuned", "t.json", "--preset", "t200")
+    assert done.returncode == 2 and "--preset must come with --scenario" in done.stderr
