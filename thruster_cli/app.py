@@ -9,7 +9,19 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 COMMANDS = (
-    *("demo", "inspect", "simulate", "estimate", "tune", "evaluate", "report", "verify", "compare", "filters"),
+    *(
+        "demo",
+        "inspect",
+        "simulate",
+        "estimate",
+        "identify",
+        "tune",
+        "evaluate",
+        "report",
+        "verify",
+        "compare",
+        "filters",
+    ),
     *("reproduce", "train", "play", "score", "study"),
 )
 MARKUP = "markdown"

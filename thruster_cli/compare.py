@@ -19,6 +19,7 @@ from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least
 from thruster_cli.leaderboard import as_json, report
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
+from thruster_cli.presets import OfPresetOption, of_preset
 from thruster_cli.problems import PROBLEMS
 from tuning.evaluation.compare import Contender, compare, contender, sized
 from tuning.evaluation.tuned import read_choice, read_tuned
@@ -46,6 +47,7 @@ def command(
         list[str] | None,
         typer.Option("--problem", "--scenario", help=f"{PROBLEMS} May be repeated."),
     ] = None,
+    preset: OfPresetOption = None,
     seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,
     knows: Annotated[
         str,
@@ -80,6 +82,7 @@ def command(
     Example: thruster compare --filter ekf --augment ambient_velocity --scenario ambient
     """
     chosen = [find_problem(name) for name in scenarios or []] or [_default(files or [])]
+    chosen = [of_preset(one, preset) for one in chosen]
     for file, problem in product(files or [], chosen):
         read_choice(file, problem)  # a clear error for a file that is for another plant
     contenders = _contenders(files or [], filters or [], knows, augment or [], ensemble_size or [], seed)

@@ -18,6 +18,7 @@ from thruster_cli.output import (
     emit,
     working,
 )
+from thruster_cli.presets import OfPresetOption, of_preset
 from thruster_cli.problems import PROBLEMS
 from thruster_cli.tables import choice_table
 from thruster_cli.tuning_report import gains
@@ -38,6 +39,7 @@ def command(
         str | None,
         typer.Option("--problem", "--scenario", help=f"By default the tuned file's, or nominal. {PROBLEMS}"),
     ] = None,
+    preset: OfPresetOption = None,
     seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,
     consistency: Annotated[
         Path | None,
@@ -63,13 +65,17 @@ def command(
     if (tuned is None) == (filter_name is None):
         raise ValueError("give either --tuned FILE or --filter NAME")
     if tuned is not None:
+        if scenario is None and preset is not None:
+            raise ValueError(
+                "--preset must come with --scenario, for a tuned file names its own, but got it alone"
+            )
         if scenario is None:
             choice, chosen, _ = read_tuned(tuned, problems_in(tuned, model))
         else:
-            chosen = find_problem(scenario)
+            chosen = of_preset(find_problem(scenario), preset)
             choice = read_choice(tuned, chosen)
     else:
-        chosen = find_problem(scenario or "nominal")
+        chosen = of_preset(find_problem(scenario or "nominal"), preset)
         choice = rule_of_thumb(filter_name, chosen)
     if consistency is not None:
         check_request(consistency, choice.filter(chosen))

@@ -12,6 +12,7 @@ from filters.tuned_file import read_tuned_file
 from numerics.checks import shown
 from plants.replay import read_for
 from thruster_cli.logs import read_named
+from thruster_cli.presets import of_preset
 from tuning.problems.find import find_problem
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Problem
@@ -125,8 +126,9 @@ def problems_of(
         if names:
             raise ValueError(f"a study must be of --log or of --problem, but got both, {logs[0]} and {names[0]}")
         return (log_problem(logs, **given),)
+    preset = given.pop("preset", None)
     if given:
         first = next(iter(given))
         option = {"sensors": "sensor", "columns": "column"}.get(first, first).replace("_", "-")
         raise ValueError(f"--{option} must come with --log, but there is none")
-    return tuple(map(find_problem, names or [default]))
+    return tuple(of_preset(find_problem(name), preset) for name in names or [default])

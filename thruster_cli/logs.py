@@ -13,14 +13,18 @@ from numerics.modules import object_named
 from plants.logs.log import Log
 from plants.replay import ANY_DT, read_for
 from plants.state_space import StateSpaceModel
+from thruster_env.logged import NO_BAND, logged_plant, with_shown
+from thruster_env.model import model_of_plant
 from thruster_env.modelled import ModelledThruster
 from thruster_env.parameters import PRESETS
-from thruster_env.plant import make_plant
 
 DEFAULT_PRESET = "tunnel"
 
 LogPresetOption = Annotated[
-    str | None, typer.Option("--preset", help=f"The thruster that the log is of: {', '.join(PRESETS)}; tunnel.")
+    str | None,
+    typer.Option(
+        "--preset", help=f"The thruster that it is of: {', '.join(PRESETS)}, or a FILE.toml of `identify`."
+    ),
 ]
 ModelOption = Annotated[
     str | None,
@@ -51,11 +55,21 @@ DtOption = Annotated[
 
 
 class Preset(ModelledThruster):
-    """A thruster of a preset, of which logs are: it offers the model, and checks tuned files."""
+    """A thruster of a preset, of which logs are: it offers the model, and checks tuned files.
+
+    Of a preset file the model has the recorder, too: biases, lags, ambient flow, Q and R.
+    """
 
     def __init__(self, preset: str, sensors: Sequence[str] | None, dt: float):
         """Make the plant."""
-        self.plant = make_plant(preset, dt, **({"sensors": tuple(sensors)} if sensors else {}))
+        self.plant, self._seen = logged_plant(
+            preset=preset, dt=dt, **({"sensors": tuple(sensors)} if sensors else {})
+        )
+
+    def state_space_model(self, **changes) -> StateSpaceModel:
+        """The model, with what logs show beside the equations."""
+        bare = self.plant._replace(dead_band=NO_BAND)
+        return with_shown(model_of_plant(bare, **changes), bare, self._seen)
 
 
 def read_named(

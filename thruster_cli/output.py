@@ -27,7 +27,9 @@ JsonOption = Annotated[
     str | None,
     typer.Option("--json", metavar="FILE", help="Also write the result as JSON; - for standard output."),
 ]
-PresetOption = Annotated[str, typer.Option("--preset", help=f"{', '.join(PRESETS)}.")]
+PresetOption = Annotated[
+    str, typer.Option("--preset", help=f"{', '.join(PRESETS)}, or a FILE.toml of `thruster identify`.")
+]
 SeedOption = Annotated[
     int, typer.Option("--seed", min=0, help="Seed of all randomness; the same seed repeats all.")
 ]

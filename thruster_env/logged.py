@@ -9,6 +9,7 @@ that of `thruster_env.model`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
@@ -33,7 +34,8 @@ _FURTHER = (
     "dead_band_low",  # [V], not positive
     "dead_band_high",  # [V], not negative
     *(f"bias_{place}" for place in range(MAX_CHANNELS)),  # by the channel's place, in its unit
-    *(f"kept_{place}" for place in range(MAX_CHANNELS)),  # exp(-substep/tau), what a lagging sensor keeps
+    *(f"kept_{place}" for place in range(MAX_CHANNELS)),  # what a lagging sensor keeps over a substep,
+    *(f"after_{place}" for place in range(MAX_CHANNELS)),  # and what it takes of the value behind it
 )
 LoggedConstants = NamedTuple("LoggedConstants", [(name, float) for name in (*Constants._fields, *_FURTHER)])
 """`dynamics.Constants`, and what logs show beside."""
@@ -139,7 +141,8 @@ def with_shown(base: StateSpaceModel, plant: Plant, seen: Shown, *, always: bool
         seen.dead_band_low,
         seen.dead_band_high,
         *_by_place(biases.get(channel, 0.0) for channel in channels),
-        *_by_place(float(np.exp(-step / lags[channel])) if channel in lags else 0.0 for channel in channels),
+        *_by_place(lag_weights(lags.get(channel, 0.0), step)[0] for channel in channels),
+        *_by_place(lag_weights(lags.get(channel, 0.0), step)[1] for channel in channels),
     )
     f, f_slopes, h, h_slopes = _functions(channels, lagging)
     read = channel_functions(channels)[0]
@@ -180,6 +183,22 @@ def _thrust(x, c):
     return thrust_of(x[:2], c)
 
 
+def lag_weights(lag: float, step: float) -> tuple[float, float]:
+    """What a first-order lag keeps over a step, and its weight of the value behind it.
+
+    With tau y' = h - y and h linear over the step, y_1 = a y_0 + (r - a) h_0 + (1 - r) h_1, a = exp(-step/tau),
+    r = tau/step (1 - a).
+
+    Args:
+        lag: time constant tau [s]; zero for none.
+        step: [s].
+    """
+    if lag == 0:
+        return 0.0, 1.0
+    kept = math.exp(-step / lag)
+    return kept, 1.0 + lag / step * math.expm1(-step / lag)
+
+
 def _by_place(values) -> tuple[float, ...]:
     given = [float(value) for value in values]
     return (*given, *(0.0,) * (MAX_CHANNELS - len(given)))
@@ -208,18 +227,22 @@ def _functions(channels: tuple[str, ...], lagging: tuple[bool, ...]) -> tuple[Ca
     }
     drive = "v = outside(u[0], c.dead_band_low, c.dead_band_high), c.ambient_velocity"
     move = drive, "s = substep((x[0], x[1]), v, c)"
-    look = ("y = read(s, c)",) if places else ()
-    lags = [f"c.kept_{i} * x[{state_of[i]}] + (1.0 - c.kept_{i}) * y[{i}]" for i in places]
+    look = ("y = read((x[0], x[1]), c)", "z = read(s, c)") if places else ()
+    lags = [
+        f"c.kept_{i} * x[{state_of[i]}] + (1.0 - c.kept_{i} - c.after_{i}) * y[{i}] + c.after_{i} * z[{i}]"
+        for i in places
+    ]
     transition = written_out("transition", "x, u, c", *move, *look, tuple_of(["s[0]", "s[1]", *lags]), **names)
     lines = [*move, "a = substep_jacobian((x[0], x[1]), v, c)"]
-    lines += ["b = read_slopes(s, c)"] if places else []
+    lines += ["b = read_slopes((x[0], x[1]), c)", "d = read_slopes(s, c)"] if places else []
 
     def slope(i, j):
         if i < 2:
             return f"a[{i}][{j}]" if j < 2 else "0.0"
         channel = places[i - 2]
         if j < 2:
-            return f"(1.0 - c.kept_{channel}) * (b[{channel}][0] * a[0][{j}] + b[{channel}][1] * a[1][{j}])"
+            before = f"(1.0 - c.kept_{channel} - c.after_{channel}) * b[{channel}][{j}]"
+            return f"{before} + c.after_{channel} * (d[{channel}][0] * a[0][{j}] + d[{channel}][1] * a[1][{j}])"
         return f"c.kept_{channel}" if i == j else "0.0"
 
     transition_jacobian = written_out("transition_jacobian", "x, u, c", *lines, matrix_of(n, n, slope), **names)

@@ -171,7 +171,7 @@ WRONG = [
     ("sag", "amplifier must be a list of mappings with a name, but got 'sag'"),
     ([{"name": "hum"}], "each entry of amplifier must be a mapping whose name is one of dead-band, slew-limit"),
     ([{"name": "bias"}], "each entry of amplifier must be a mapping whose name"),
-    ([{"name": "dead-band"}], "'dead-band' must be given width, but got {}"),
+    ([{"name": "dead-band"}], "'dead-band' must be given width, astern, but got {}"),
     ([{"name": "dead-band", "width": -1}], "width must be zero or positive, but got -1"),
     ([{"name": "slew-limit", "rate": 0}], "rate must be positive, but got 0"),
     ([{"name": "saturation", "limit": math.inf}], "limit must be a finite number, but got inf"),

@@ -14,6 +14,7 @@ from plants.state_space import StateSpaceModel
 from tuning.identification.ascent import Ascent, climb
 from tuning.identification.coordinates import Coordinates
 from tuning.identification.objective import Objective
+from tuning.identification.outliers import ROUNDS, outliers_of, without_outliers
 from tuning.identification.result import Identification, Optimum, identification_of
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
@@ -36,6 +37,7 @@ def identify(
     seed: int = 0,
     degrees: float = math.inf,
     predicted: Sequence[str] = (),
+    gate: float = math.inf,
     simulation_first: bool = True,
     progress: Progress | None = None,
 ) -> Identification:
@@ -65,6 +67,9 @@ def identify(
         predicted: symbols of channels that the filter is to predict, but never sees, such as a load cell that will
             not be there later. What it sees alone would be identified as it predicts best one step ahead; with a
             channel of these, as it predicts that channel best.
+        gate: leave out samples whose innovations are beyond so many standard deviations of a robust filter's, and
+            identify anew, until they are the same; infinite to keep all. (Student-t innovations tell a scale in
+            spite of outliers, but the filter still follows these, and constants get a bias.)
         simulation_first: see above.
         progress: called with the number of the start, the log-likelihood and the values, after every rise.
 
@@ -104,9 +109,25 @@ def identify(
             for point, one in zip(points, ascents, strict=False)
         )
         best = max(ascents, key=lambda one: one.found.value if math.isfinite(one.found.value) else -math.inf)
+        if gate < math.inf:
+            objective, best = _gated(objective, best, gate, asked, tell)
         return identification_of(
             objective, first, best, optima, interrupted=asked(), seconds=time.perf_counter() - begin
         )
+
+
+def _gated(objective: Objective, best: Ascent, gate: float, stop, tell) -> tuple[Objective, Ascent]:
+    """The objective without outliers, and its maximum: left out and identified anew until nothing changes."""
+    coordinates, whole, left_out, spent = objective.coordinates, objective, None, objective.evaluations
+    for _ in range(ROUNDS):
+        found = outliers_of(whole.model_at(best.at), whole.data_at(best.at), gate)
+        if stop() or (left_out is not None and np.array_equal(found, left_out)):
+            break
+        left_out, objective = found, without_outliers(whole, found)
+        best = climb(objective, best.at, coordinates.low, coordinates.high, stop=stop, progress=tell)
+        spent += objective.evaluations
+    objective.evaluations = spent
+    return objective, best
 
 
 def _climb_from(objective: Objective, point, simulation_first: bool, stop, tell) -> Ascent:

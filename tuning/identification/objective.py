@@ -66,7 +66,7 @@ class Objective:
         """Find out which parameters move the model's numbers alone."""
         self.filter = one_of("filter", filter, DIFFERENTIABLE)
         self.coordinates, self._model, self.degrees, self.simulation = coordinates, model, degrees, simulation
-        self._data, self.evaluations = data if callable(data) else runs_of(data), 0
+        self.data, self.evaluations = data if callable(data) else runs_of(data), 0
         self.predicted = tuple(predicted)
         self._of_data = _arguments_among(data, coordinates.names) if callable(data) else ()
         self.rough: tuple[int, ...] = ()  # places of parameters that have no sensitivities
@@ -85,7 +85,7 @@ class Objective:
         """The same with other data, filter, degrees or simulation."""
         names = "filter", "degrees", "predicted", "simulation"
         kept = {name: getattr(self, name) for name in names}
-        data = changes.pop("data", self._data)
+        data = changes.pop("data", self.data)
         return Objective(data, self._model, self.coordinates, **{**kept, **changes})
 
     def model_at(self, at: np.ndarray) -> StateSpaceModel:
@@ -98,10 +98,10 @@ class Objective:
 
     def data_at(self, at: np.ndarray) -> Data:
         """The runs at coordinates."""
-        if not callable(self._data):
-            return self._data
+        if not callable(self.data):
+            return self.data
         named = self.coordinates.named(at)
-        return runs_of(self._data(**{name: named[name] for name in self._of_data}))
+        return runs_of(self.data(**{name: named[name] for name in self._of_data}))
 
     def value(self, at: np.ndarray) -> float:
         """Log-likelihood of all runs; minus infinity where it has none."""

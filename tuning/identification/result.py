@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tuning.identification.ascent import Ascent
+from tuning.identification.coordinates import Coordinates
 from tuning.identification.objective import Objective
 from tuning.likelihood.identifiability import COMPANION, TWO_SIDED
 
@@ -54,13 +55,19 @@ class Identification(NamedTuple):
     @property
     def agreement(self) -> int:
         """How many starts led to the best maximum: within 0.01 in log L, or 0.1 standard errors everywhere."""
-        coordinates = self.objective.coordinates
-        scale, near = np.sqrt(np.diag(self.cov)), 0
+        coordinates, scale, near = self.objective.coordinates, np.sqrt(np.diag(self.cov)), 0
+        best = max(self.optima, key=lambda one: one.log_likelihood)
+        top = coordinates.of(list(best.values.values()))
         for one in self.optima:
-            apart = np.abs(coordinates.of(list(one.values.values())) - self.at)
-            close = self.log_likelihood - one.log_likelihood < EQUAL_VALUES
+            apart = np.abs(coordinates.of(list(one.values.values())) - top)
+            close = best.log_likelihood - one.log_likelihood < EQUAL_VALUES
             near += bool(close or (apart < EQUAL * scale).all())
         return near
+
+    @property
+    def left_out(self) -> int:
+        """How many samples were outliers."""
+        return int(np.sum(getattr(self.objective.data, "outliers", 0)))
 
     @property
     def evaluations(self) -> int:
@@ -104,6 +111,8 @@ class Identification(NamedTuple):
             said.append(f"Known least is the direction of (in ranges) {parts}.")
         if len(self.optima) > 1:
             said.append(f"{self.agreement} of {len(self.optima)} starts led to this maximum.")
+        if self.left_out:
+            said.append(f"{self.left_out} samples beyond the gate were left out.")
         if self.interrupted:
             said.append("Interrupted: the best so far.")
         return said
@@ -124,7 +133,7 @@ def identification_of(
     cov = covariance(best.found.information, best.found.scores, width)
     errors = np.sqrt(np.diag(cov))
     ends = (at <= coordinates.low + 1e-6 * width) | (at >= coordinates.high - 1e-6 * width)
-    narrow = 2 * TWO_SIDED * errors < WIDEST * width
+    narrow = is_narrow(cov, coordinates)
     names = coordinates.names
 
     def by_name(values) -> dict:
@@ -148,6 +157,11 @@ def identification_of(
     )
 
 
+def is_narrow(cov: np.ndarray, coordinates: Coordinates) -> np.ndarray:
+    """Whether the 95 % interval of each parameter takes less than half its range, (p,) bool."""
+    return 2 * TWO_SIDED * np.sqrt(np.diag(cov)) < WIDEST * (coordinates.high - coordinates.low)
+
+
 def covariance(information: np.ndarray, scores: np.ndarray, width: np.ndarray) -> np.ndarray:
     """Covariance of estimates (p, p): J^-1 (sum_b g_b g_b') J^-1, or J^-1 in directions where that is larger.
 
@@ -157,7 +171,7 @@ def covariance(information: np.ndarray, scores: np.ndarray, width: np.ndarray) -
 
     Args:
         information: J, (p, p).
-        scores: (B, p).
+        scores: (B, p); of fewer than two there is no scatter.
         width: of the parameters' ranges, (p,), in the same coordinates.
 
     Source: Huber (1967), "The behavior of maximum likelihood estimates under nonstandard conditions".
@@ -165,10 +179,12 @@ def covariance(information: np.ndarray, scores: np.ndarray, width: np.ndarray) -
     scale = np.outer(width, width)
     values, axes = np.linalg.eigh(information * scale)
     values = np.maximum(values, 1.0 / 12.0)  # what is known before: the variance of a uniform density is a twelfth
+    if len(scores) < 2:
+        return axes / values @ axes.T * scale
     along = scores * width @ axes / values
     along -= along.mean(axis=0)
     count = len(along)
-    scatter = along.T @ along * (count / max(count - 1, 1))
+    scatter = along.T @ along * (count / (count - 1))
     roots = 1.0 / np.sqrt(values)
     # In units of J's own errors: the larger of the two in each principal direction of the scatter.
     ratios, turns = np.linalg.eigh(scatter / np.outer(roots, roots))

@@ -10,7 +10,7 @@ import numpy as np
 from numerics.checks import shown
 from plants.logs.log import Log, at_offset
 from plants.state_space import StateSpaceModel
-from thruster_env.logged import NO_BAND, Shown, with_shown
+from thruster_env.logged import NO_BAND, Shown, lag_weights, with_shown
 from thruster_env.model import model_of_plant
 from thruster_env.parameters import ThrusterParameters, checked
 from thruster_env.plant import Plant
@@ -124,8 +124,12 @@ class ThrusterFamily:
     @property
     def data(self):
         """The logs, or a function of the clock offsets that are free."""
+        return self.shifted(self.logs)
+
+    def shifted(self, logs: Sequence[Log]):
+        """Some logs as this family takes them: as they are, or a function of the clock offsets that are free."""
         offsets = tuple(one.name for one in self.free if one.name.startswith("clock_offset_"))
-        return ShiftedLogs(self.logs, offsets) if offsets else self.logs
+        return ShiftedLogs(logs, offsets) if offsets else tuple(logs)
 
     def parameters(self, values: Mapping[str, float]) -> ThrusterParameters:
         """The thruster's own parameters."""
@@ -153,7 +157,7 @@ class ThrusterFamily:
         further = {"dead_band_low": seen.dead_band_low, "dead_band_high": seen.dead_band_high}
         for place, channel in enumerate(plant.channels):
             further[f"bias_{place}"] = biases.get(channel, 0.0)
-            further[f"kept_{place}"] = float(np.exp(-step / lags[channel])) if channel in lags else 0.0
+            further[f"kept_{place}"], further[f"after_{place}"] = lag_weights(lags.get(channel, 0.0), step)
         q = self._base.process_noise_cov.copy()
         q[:2, :2] = plant.process_noise_cov
         return self._base.replace(

@@ -20,6 +20,7 @@ from thruster_env.linear.steady_state import state_range
 from thruster_env.model import model_of_plant
 from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_PROCESS_NOISE, Plant, make_plant
 from thruster_env.plant_data import check_same_plant, plant_data
+from thruster_env.preset_file import is_file, preset_mapping
 from thruster_env.simulation import simulate
 from tuning.problems.data import Data
 from tuning.problems.plain import plain
@@ -43,7 +44,8 @@ class Scenario(BaseScenario):
         scale: bound on the standard error of each state, (omega_m [rad/s], U_a [m/s]), of the scenario's Gaussian
             core: fixed numbers that errors are measured in, made by `scale.computed_scale`.
         system: a published linear system that is the plant, "tunnel" or "open_bladed"; None for the equations.
-        preset: the thruster, as for `thruster_env.plant.make_plant`; so are all that follow.
+        preset: the thruster, as for `thruster_env.plant.make_plant`; so are all that follow. What a file says of
+            it is kept in place of the path.
         dt: sample time [s].
         max_voltage: voltages are clipped to plus and minus this [V].
         ambient_velocity: constant flow U_0 [m/s].
@@ -78,6 +80,7 @@ class Scenario(BaseScenario):
                 f"sensors of a scenario must be one channel or several, but got {shown(self.sensors)}"
             )
         return {
+            "preset": preset_mapping(self.preset) if is_file(self.preset) else self.preset,
             "scale": self.checked_scale(2),
             "process_noise_cov": vector("process_noise_cov", self.process_noise_cov, 2).tolist(),
             "measurement_noise_cov": _variances(self.measurement_noise_cov, len(self.sensors)),

@@ -1,0 +1,140 @@
+"""`thruster identify`: tables, files that every preset takes, and one clear line for a mistake."""
+
+import re
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import thruster_env  # noqa: F401 - registers the env
+from numerics.streams import episode_keys
+from plants.logs.log import Log
+from plants.logs.write import write_log
+from plants.simulate import simulate
+from studies.identification import TRUTH, record
+from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from tests.thruster_env.test_t200 import OTHER, recorded_rows, write_table
+from thruster_cli.presets import of_preset
+from thruster_env.logged import logged_model
+from thruster_env.model import thruster_model
+from thruster_env.parameters import TUNNEL_PHYSICAL
+from thruster_env.preset_file import PresetFile, read_preset, write_preset
+from tuning.problems.files import scenario_of
+from tuning.problems.find import find_problem
+
+FREE = ",".join(name for name in TRUTH if not name.startswith(("Q", "R")))
+OF_LOGS = ("--preset", "tunnel_physical", "--sensor", "thrust", "--sensor", "speed")
+
+
+@pytest.fixture
+def logs(tmp_path):
+    recorded = record(0, 4, 300)
+    for place, log in enumerate(recorded):
+        write_log(tmp_path / f"run{place}.csv", log)
+    return [f"run{place}.csv" for place in range(len(recorded))]
+
+
+def test_identified_numbers_go_into_a_preset_that_everything_takes(thruster, as_json, logs, tmp_path):  # noqa: F811
+    found = as_json("identify", *logs, *OF_LOGS, "--free", FREE, "--starts", 1, "--out", "mine.toml")
+    assert found["held_out"] == ["run2.csv"] and found["files"] == ["mine.toml"]
+    for name, value in found["values"].items():
+        assert abs(value - TRUTH[name]) < 4 * found["standard_errors"][name], name
+    checked = found["validation"]
+    assert checked["identified"]["log_likelihood"] > checked["start"]["log_likelihood"] + 1000
+    kept = read_preset("mine.toml")
+    assert kept.parameters.voltage_gain == found["values"]["voltage_gain"]
+    assert kept.parameters.added_mass == TUNNEL_PHYSICAL.added_mass
+    assert kept.dead_band == (found["values"]["dead_band_low"], found["values"]["dead_band_high"])
+    model = logged_model(preset="mine.toml")
+    assert model.n == 3 and model.constants.bias_0 == found["values"]["bias_thrust"]
+    r = [found["values"][name] for name in ("R11", "R22")]
+    assert np.diag(model.measurement_noise_cov).tolist() == pytest.approx(r, rel=1e-12)
+    inside = as_json("inspect", "--preset", "mine.toml", "--out", "x.png")
+    assert inside["preset"] == "mine.toml"
+    assert thruster("simulate", "--preset", "mine.toml", "--steps", 20, "--out", "sim.csv").returncode == 0
+    env = gym.make("BowThruster-v0", preset="mine.toml").unwrapped
+    assert env.plant.parameters == kept.parameters
+    assert env.state_space_model().constants.dead_band_high == kept.dead_band[1]
+
+
+WITHOUT_LOG = [
+    ((), "identify must have at least one log"),
+    (("--step", "x.csv"), "--step must come with --bollard"),
+    (("--bollard", "none.csv"), "none.csv cannot be read"),
+]
+WITH_LOG = [
+    (("--free", "mass"), "free parameters must be of lift_coefficient, .*, but got 'mass'"),
+    (("--start", "voltage_gain=1e9"), "the start of voltage_gain must be within"),
+    (("--range", "voltage_gain=5"), "--range must have the form NAME=LOW:HIGH, but got 'voltage_gain=5'"),
+    (("--filter", "kf"), "a thruster must be identified with the ekf, but got --filter kf"),
+    (("--held-out", "run0.csv"), "at least one log must be left to learn from"),
+    (("--out", "x.json"), "--out must end in .toml"),
+]
+MISTAKES = [
+    *((("identify", *arguments), message) for arguments, message in WITHOUT_LOG),
+    *((("identify", "run0.csv", *OF_LOGS, *arguments), message) for arguments, message in WITH_LOG),
+    (("identify", "run0.csv", "--preset", "none.toml"), "a preset file must be readable, but none.toml is not"),
+    (("identify", "run0.csv", "--bollard", "table.csv"), "give either logs or --bollard TABLE.csv"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), MISTAKES)
+def test_a_mistake_is_one_line_and_nothing_is_written(thruster, logs, tmp_path, arguments, message):  # noqa: F811
+    done = thruster(*arguments)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+    assert re.search(message, done.stderr), done.stderr
+    assert not list(tmp_path.glob("*.toml"))
+
+
+def test_logs_without_excitation_say_what_they_do_not_determine(thruster, tmp_path):  # noqa: F811
+    (log,) = record(0, 1, 100)
+    write_log("flat.csv", replace(log, inputs=np.full_like(log.inputs, 6.0)))
+    done = thruster("identify", "flat.csv", *OF_LOGS, "--free", f"{FREE},Q11")
+    assert done.returncode == 2
+    said = done.stderr.splitlines()[-1]  # before it there may be a line on compilation
+    assert "constant inputs do not determine" in said and "voltage_gain, dead_band_low" in said
+    assert not list(tmp_path.rglob("*.toml"))
+
+
+def test_a_bollard_table_and_a_step_response_make_a_preset(thruster, as_json, tmp_path):  # noqa: F811
+    truth = OTHER.thruster._replace(
+        **{name: 1.5 * getattr(OTHER.thruster, name) for name in ("motor_damping", "voltage_gain", "load_gain")},
+        added_mass=0.6,
+    )
+    write_table(tmp_path / "table.csv", recorded_rows(OTHER))
+    model = thruster_model(preset=truth, max_voltage=12.0, sensors=["speed"], measurement_noise_cov=[0.25])
+    inputs = np.repeat([[[2.0], [10.0], [-8.0]]], 60, axis=1)
+    drawn = simulate(model, episode_keys([0]), inputs).measurements[0]
+    write_log("step.csv", Log("step", 0.01, inputs[0], drawn, model.input_quantities, model.measurements))
+    found = as_json("identify", "--bollard", "table.csv", "--step", "step.csv", "--out", "mine.toml")
+    assert found["held_out_supplies"] == [14.0, 18.0]
+    assert found["thruster"]["lift_coefficient"] == pytest.approx(truth.lift_coefficient, rel=1e-4)
+    values, errors = found["step"]["values"], found["step"]["standard_errors"]
+    assert abs(values["motor_rate"] - 1.5) < 3 * errors["motor_rate"] < 0.3
+    assert abs(values["added_mass"] - 0.6) < 3 * errors["added_mass"] < 0.3
+    kept = read_preset("mine.toml").parameters
+    assert kept.voltage_gain / kept.motor_damping == pytest.approx(
+        truth.voltage_gain / truth.motor_damping, rel=1e-4
+    )
+    assert kept.added_mass == values["added_mass"]
+    inputs = np.full((60, 1), 2.0)
+    write_log("flat.csv", Log("step", 0.01, inputs, drawn[:61], model.input_quantities, model.measurements))
+    done = thruster("identify", "--bollard", "table.csv", "--step", "flat.csv")
+    assert done.returncode == 2 and "a step response must have a step of the voltage" in done.stderr
+
+
+def test_scenarios_are_of_another_thruster_by_its_preset_file(thruster, tmp_path):  # noqa: F811
+    path = tmp_path / "mine.toml"
+    write_preset(path, PresetFile(TUNNEL_PHYSICAL._replace(voltage_gain=1300.0), (-0.5, 0.7)))
+    made = of_preset(find_problem("nominal"), str(path), sequences=4)
+    path.unlink()  # the scenario holds what it said
+    assert made.plant.parameters.voltage_gain == 1300.0 and made.model().constants.dead_band_high == 0.7
+    assert np.isfinite(made.scale).all() and made.scale != find_problem("nominal").scale
+    again = scenario_of(made.as_mapping(), made.name, "t.json")
+    assert again.digest == made.digest != find_problem("nominal").digest
+    assert of_preset(made, None) is made
+    done = thruster("compare", "--filter", "ekf", "--scenario", "published_tunnel", "--preset", "t200")
+    assert done.returncode == 2 and "--preset must come with scenarios of the thruster's equations" in done.stderr
+    done = thruster("evaluate", "--tuned", "t.json", "--preset", "t200")
+    assert done.returncode == 2 and "--preset must come with --scenario" in done.stderr

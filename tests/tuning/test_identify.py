@@ -1,0 +1,219 @@
+"""Parameters by maximum likelihood over innovations: values, standard errors, and what data do not determine."""
+
+import math
+import signal
+
+import numpy as np
+import pytest
+
+from numerics.streams import episode_keys, filter_keys
+from plants import simulate
+from plants.logs.log import Log
+from tests.filters.test_sensitivity import pendulum
+from tuning.identification import identify, profile_figure, profiles, validate
+from tuning.identification.family import ModelFamily, with_ranges
+from tuning.identification.result import covariance
+from tuning.identification.runs import runs_of
+from tuning.problems.data import Data
+from tuning.problems.parameter import Parameter
+
+TRUTH = {"stiffness": 11.0, "damping": 0.5, "offset": -0.3, "q": 0.02, "r": 0.03}
+FREE = (
+    Parameter("stiffness", 1.0, 50.0, default=7.0),
+    Parameter("damping", 0.0, 2.0, log=False, default=0.1),
+    Parameter("offset", -1.0, 1.0, log=False, default=0.0),
+    Parameter("q", 1e-4, 1.0, default=0.1),
+    Parameter("r", 1e-4, 1.0, default=0.1),
+)
+
+
+def recorded(count=8, steps=150, first=0, **changes):
+    rng = np.random.default_rng(first)
+    model = pendulum(**{**TRUTH, **changes})
+    inputs = np.repeat(rng.uniform(-3, 3, size=(count, -(-steps // 10), 1)), 10, axis=1)[:, :steps]
+    seeds = tuple(range(first, first + count))
+    drawn = simulate.simulate(model, episode_keys(seeds), inputs).measurements
+    return Data(seeds, inputs, drawn, filter_keys(seeds), 0)
+
+
+@pytest.fixture(scope="module")
+def data():
+    return recorded()
+
+
+@pytest.fixture(scope="module")
+def found(data):
+    return identify(data, pendulum, FREE, starts=3)
+
+
+def test_constants_and_noise_are_found_together_within_their_standard_errors(found):
+    for name, truth in TRUTH.items():
+        assert abs(found.values[name] - truth) < 3 * found.standard_errors[name], name
+        assert found.determined[name] and not found.at_end[name]
+    assert found.standard_errors["stiffness"] < 0.3 and found.standard_errors["offset"] < 0.05
+    assert found.agreement == 3 and all(one.converged for one in found.optima)
+    assert len({one.start["stiffness"] for one in found.optima}) == 3
+    assert found.log_likelihood > found.start_log_likelihood + 100
+    assert "determine every free parameter" in found.sentences()[0]
+
+
+def test_standard_errors_are_the_scatter_of_estimates(found, data):
+    some = [identify(recorded(8, first=100 * i), pendulum, FREE, starts=1) for i in range(1, 9)]
+    for name in TRUTH:
+        scatter = np.std([one.values[name] for one in some], ddof=1)
+        assert 0.45 < scatter / found.standard_errors[name] < 2.0, name  # chi with 7 degrees of freedom
+
+
+def test_the_same_numbers_come_out_of_one_seed(data, found):
+    again = identify(data, pendulum, FREE, starts=3)
+    assert again.values == found.values and again.standard_errors == found.standard_errors
+
+
+def test_what_stands_in_a_product_alone_trades_off_and_is_not_determined(data):
+    def model(first, second, **values):
+        return pendulum(**{**TRUTH, **values, "drive": first * second})
+
+    pair = (Parameter("first", 0.1, 10.0, default=1.0), Parameter("second", 0.1, 10.0, default=1.5))
+    found = identify(data, model, (*pair, FREE[1]), starts=1)
+    product = found.values["first"] * found.values["second"]
+    assert product == pytest.approx(2.0, rel=0.1)
+    assert found.determined == {"first": False, "second": False, "damping": True}
+    assert found.traded[0][:2] == ("first", "second") and found.traded[0][2] < -0.95
+    assert found.loosest.keys() == {"first", "second"}
+    assert np.prod(np.sign(list(found.loosest.values()))) == -1
+    said = " ".join(found.sentences())
+    assert "do not determine first, second" in said and "trade off" in said
+
+
+def test_a_parameter_that_moves_the_data_is_found_as_one_of_the_model(data, found):
+    def moved(offset):
+        return data._replace(measurements=data.measurements - np.array([0.0, offset]))
+
+    def model(**values):
+        return pendulum(offset=0.0, **values)
+
+    again = identify(moved, model, FREE, start=found.values, starts=1)
+    for name in TRUTH:
+        assert again.values[name] == pytest.approx(found.values[name], abs=0.05 * found.standard_errors[name])
+        assert again.standard_errors[name] == pytest.approx(found.standard_errors[name], rel=0.2)
+
+
+def test_a_single_run_has_standard_errors_from_its_blocks():
+    found = identify(recorded(1, 800), pendulum, FREE, starts=1)
+    for name, truth in TRUTH.items():
+        assert 0 < found.standard_errors[name] < math.inf
+        assert abs(found.values[name] - truth) < 3.5 * found.standard_errors[name], name
+
+
+def test_outliers_beyond_a_gate_are_left_out(data, found):
+    rng, spoilt = np.random.default_rng(0), data.measurements.copy()
+    outliers = rng.random(spoilt.shape) < 0.02
+    spoilt[outliers] += 3.0
+    spoilt = data._replace(measurements=spoilt)
+    normal, gated = (identify(spoilt, pendulum, FREE, starts=1, gate=gate) for gate in (math.inf, 4.5))
+    left_out = gated.objective.data.outliers
+    assert (left_out & outliers).sum() > 0.97 * outliers.sum() and (left_out & ~outliers).sum() < 5
+    for name in ("offset", "r"):
+        assert abs(normal.values[name] - found.values[name]) > 3 * found.standard_errors[name]
+        assert abs(gated.values[name] - found.values[name]) < 0.5 * found.standard_errors[name]
+
+
+def test_ctrl_c_keeps_the_best_so_far(data):
+    rises = []
+
+    def tell(number, value, values):
+        rises.append((value, values))
+        if len(rises) == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    found = identify(data, pendulum, FREE, starts=3, simulation_first=False, progress=tell)
+    assert found.interrupted and len(found.optima) == 1
+    assert found.log_likelihood >= rises[2][0] and "Interrupted" in found.sentences()[-1]
+
+
+def test_a_profile_falls_as_the_standard_error_says(found, tmp_path):
+    (one,) = profiles(found, ["stiffness"])
+    low, high = one.interval
+    width = 1.96 * found.standard_errors["stiffness"]
+    assert low < found.values["stiffness"] < high
+    assert (high - low) / (2 * width) == pytest.approx(1.0, abs=0.25)
+    assert one.log_likelihoods.max() == pytest.approx(found.log_likelihood, abs=1e-2)
+    assert len(profile_figure(found, [one]).axes) == 1
+
+
+def test_held_out_runs_prove_the_model(found):
+    checked = validate(found, recorded(4, first=50))
+    assert checked["identified"].log_likelihood > checked["start"].log_likelihood + 50
+    assert checked["identified"].nis == pytest.approx(1.0, abs=0.1)
+    assert checked["identified"].one_step["w"] < checked["start"].one_step["w"]
+    assert set(checked["identified"].fit) == {"a", "w"}
+
+
+def test_logs_of_different_lengths_are_one_batch(data, found):
+    model = pendulum()
+    logs = [
+        Log(str(b), 0.1, u[:end], z[: end + 1], model.input_quantities, model.measurements)
+        for b, (u, z, end) in enumerate(zip(data.inputs, data.measurements, [150] * 7 + [90], strict=True))
+    ]
+    runs = runs_of(logs)
+    assert runs.inputs.shape == (8, 150, 1) and np.isnan(runs.measurements[7, 91:]).all()
+    again = identify(logs, pendulum, FREE, starts=1)
+    assert again.values["stiffness"] == pytest.approx(found.values["stiffness"], rel=0.03)
+    with pytest.raises(ValueError, match="one sample time, but got 0.1 s, 0.2 s"):
+        runs_of([logs[0], Log("b", 0.2, *map(np.array, (u_of(logs), z_of(logs))), *quantities(model))])
+    with pytest.raises(ValueError, match="data must be some of Log or Data"):
+        runs_of([1.0])
+
+
+def u_of(logs):
+    return logs[0].inputs
+
+
+def z_of(logs):
+    return logs[0].measurements
+
+
+def quantities(model):
+    return model.input_quantities, model.measurements
+
+
+def test_a_family_knows_arguments_constants_and_noise():
+    family = ModelFamily(pendulum, ["stiffness", "q"])
+    assert [one.name for one in family.free] == ["stiffness", "q", "Q11", "Q22", "R11", "R22"]
+    changed = family.model(stiffness=4.0, Q11=5.0, R22=7.0)
+    assert changed.constants.stiffness == 4.0
+    assert np.diag(changed.process_noise_cov).tolist() == [5.0, 0.01]
+    assert np.diag(changed.measurement_noise_cov).tolist() == pytest.approx([0.05, 7.0])
+    of_model = ModelFamily(pendulum(), ["damping"], noise=False)
+    assert of_model.model(damping=0.9).constants == pendulum(damping=0.9).constants
+    with pytest.raises(ValueError, match="must be of stiffness, damping, .*, but got 'mass'"):
+        ModelFamily(pendulum, ["mass"])
+    (changed,) = with_ranges(of_model.free, {"damping": (-1.0, 3.0)}, {"damping": 0.5})
+    assert (changed.low, changed.high, changed.log, changed.start) == (-1.0, 3.0, False, 0.5)
+    with pytest.raises(ValueError, match="the start of damping must be within 0.03 and 3, but got 4"):
+        with_ranges(of_model.free, {}, {"damping": 4.0})
+
+
+def test_wrong_arguments_are_refused(data):
+    with pytest.raises(ValueError, match="the start of stiffness must be within 1 and 50, but got 60"):
+        identify(data, pendulum, FREE, start={"stiffness": 60.0})
+    with pytest.raises(ValueError, match="a start must name free parameters, .*, but got .'mass'"):
+        identify(data, pendulum, FREE, start={"mass": 1.0})
+    with pytest.raises(ValueError, match="each named once"):
+        identify(data, pendulum, [FREE[0], FREE[0]])
+    with pytest.raises(ValueError, match="1 inputs and 2 measurements, but got"):
+        identify(data._replace(measurements=data.measurements[..., :1]), pendulum, FREE)
+
+
+def test_the_covariance_is_the_sandwich_or_the_information_where_scatter_says_less():
+    rng = np.random.default_rng(0)
+    information, width = np.array([[40.0, 10.0], [10.0, 20.0]]), np.array([1e3, 1e3])
+    scores = rng.multivariate_normal([0, 0], 4 * information / 500, size=500)
+    scores -= scores.mean(axis=0)
+    inverse = np.linalg.inv(information)
+    sandwich = inverse @ (scores.T @ scores * 500 / 499) @ inverse
+    np.testing.assert_allclose(covariance(information, scores, width), sandwich, rtol=1e-4)
+    np.testing.assert_allclose(covariance(information, 0.01 * scores, width), inverse, rtol=1e-4)
+    np.testing.assert_allclose(covariance(information, scores[:0], width), inverse, rtol=1e-4)
+    unknown = covariance(np.diag([40.0, 0.0]), scores[:0], np.array([1.0, 2.0]))
+    np.testing.assert_allclose(np.diag(unknown), [1 / 40, 12 * 4.0], rtol=1e-6)

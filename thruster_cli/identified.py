@@ -1,0 +1,129 @@
+"""What `thruster identify` says and writes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from numerics.plots import save_figure
+from plants.logs.log import Log
+from thruster_cli.output import table
+from thruster_env.preset_file import PresetFile, write_preset
+from tuning.identification.profiles import Profile, profile_figure
+from tuning.identification.result import Identification
+from tuning.identification.validation import Validation
+from tuning.thruster.identification import ThrusterFamily
+
+
+def report(
+    found: Identification,
+    checked: Mapping[str, Validation],
+    runs: Sequence[Log],
+    proving: Sequence[Log],
+    files: Sequence[str],
+) -> list:
+    """Tables and sentences for the terminal."""
+    units = {one.name: one.unit for one in found.objective.coordinates.free}
+    rows = []
+    for name in found.names:
+        known = "yes" if found.determined[name] else "at the end" if found.at_end[name] else "no"
+        numbers = found.start[name], found.values[name], found.standard_errors[name]
+        rows.append([f"{name} [{units[name]}]" if units[name] else name, *(f"{v:.5g}" for v in numbers), known])
+    count, steps = len(runs), sum(log.steps for log in runs)
+    title = f"Identified on {count} run{'' if count == 1 else 's'}, {steps} steps"
+    shown = [table(title, ["", "start", "value", "standard\nerror", "determined"], rows)]
+    where = f"Validation on {', '.join(log.name for log in proving)}" if proving else "On the runs it has seen"
+    rows = []
+    for symbol in checked["start"].one_step:
+        for what, part in (("one step", "one_step"), ("simulation", "simulation")):
+            rows.append(
+                [f"RMSE, {what}, {symbol}", *(f"{getattr(v, part)[symbol]:.4g}" for v in checked.values())]
+            )
+        rows.append([f"fit of the simulation, {symbol} [%]", *(f"{v.fit[symbol]:.1f}" for v in checked.values())])
+    rows.append(["mean NIS over channels", *(f"{v.nis:.3g}" for v in checked.values())])
+    rows.append(["log-likelihood", *(f"{v.log_likelihood:.6g}" for v in checked.values())])
+    shown.append(table(where, ["", *checked], rows))
+    return [*shown, *found.sentences(), *(f"wrote {path}" for path in files)]
+
+
+def write_files(
+    found: Identification,
+    family,
+    made: Sequence[Profile],
+    out: Path | None,
+    plot: Path | None,
+    logs: Sequence[str],
+) -> list[str]:
+    """Write the preset file of a thruster, and the profiles; return the paths."""
+    files = []
+    if out is not None:
+        write_preset(out, preset_of(found, family, logs), "A thruster as `thruster identify` found it.")
+        files.append(str(out))
+    if plot is not None and made:
+        save_figure(profile_figure(found, made), plot)
+        files.append(str(plot))
+    return files
+
+
+def preset_of(found: Identification, family: ThrusterFamily, logs: Sequence[str]) -> PresetFile:
+    """The identified thruster as a preset file holds it."""
+    plant, seen = family.plant_at(found.values), family.shown_at(found.values)
+    offsets = {
+        name.removeprefix("clock_offset_"): value
+        for name, value in found.values.items()
+        if name.startswith("clock_offset_")
+    }
+    recorder = {
+        "dt": plant.dt,
+        "sensors": list(plant.channels),
+        "ambient_velocity": plant.ambient_velocity,
+        "process_noise_cov": plant.process_noise_cov.diagonal().tolist(),
+        "measurement_noise_cov": dict(
+            zip(plant.channels, plant.measurement_noise_cov.diagonal().tolist(), strict=True)
+        ),
+        "bias": dict(seen.bias),
+        "lag": dict(seen.lag),
+        "clock_offset": offsets,
+    }
+    identified = {
+        "logs": [Path(log).name for log in logs],
+        "log_likelihood": found.log_likelihood,
+        "standard_errors": found.standard_errors,
+        "determined": found.determined,
+    }
+    kept = {name: value for name, value in recorder.items() if value not in ({}, 0.0)}
+    return PresetFile(plant.parameters, (seen.dead_band_low, seen.dead_band_high), kept, identified)
+
+
+def as_json(
+    found: Identification,
+    checked: Mapping[str, Validation],
+    made: Sequence[Profile],
+    runs: Sequence[Log],
+    proving: Sequence[Log],
+    files: Sequence[str],
+) -> dict:
+    """The result as plain data."""
+    return {
+        "logs": [log.name for log in runs],
+        "held_out": [log.name for log in proving],
+        "values": found.values,
+        "start": found.start,
+        "standard_errors": found.standard_errors,
+        "determined": found.determined,
+        "at_end": found.at_end,
+        "correlations": {"names": found.names, "matrix": found.correlations},
+        "trade_off": found.traded,
+        "least_known_direction": found.loosest,
+        "log_likelihood": found.log_likelihood,
+        "log_likelihood_at_start": found.start_log_likelihood,
+        "optima": [one._asdict() for one in found.optima],
+        "starts_that_agree": found.agreement,
+        "evaluations": found.evaluations,
+        "samples_left_out": found.left_out,
+        "interrupted": found.interrupted,
+        "validation": {name: one._asdict() for name, one in checked.items()},
+        "profiles": [{**one._asdict(), "interval": one.interval} for one in made],
+        "sentences": found.sentences(),
+        "files": list(files),
+    }

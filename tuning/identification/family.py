@@ -1,0 +1,136 @@
+"""Any model as a function of its named numbers: arguments of what makes it, constants, Q and R."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from numerics.checks import finite, shown
+from plants.state_space import StateSpaceModel
+from tuning.problems.parameter import Parameter, squared
+from tuning.search.parameters import r_name
+
+FACTOR = 10.0  # of its start, to either side, that a positive parameter may be
+NOISE_FACTOR = 1e4  # the same of variances
+
+
+class ModelFamily:
+    """The models that a function makes of its arguments, or that a model is for other constants.
+
+    Known are the function's arguments that have a number for a default; the fields of the constants, where these
+    are a NamedTuple and no argument has the name; and Q11, Q22, ... and R, or R11, R22, ...
+
+    Args:
+        make: a function, or a model.
+        free: names of free parameters.
+        noise: whether the variances of Q (as far as there are any) and R are free, too.
+        dt: given to the function where it takes it.
+
+    Raises:
+        ValueError: for an unknown name, with those that are known.
+    """
+
+    def __init__(
+        self, make: Callable | StateSpaceModel, free: Sequence[str], *, noise: bool = True, dt: float | None = None
+    ):
+        """Find the parameters by name."""
+        self._make = (lambda: make) if isinstance(make, StateSpaceModel) else make
+        self._arguments = _numbers_of(self._make)
+        if dt is not None and "dt" in inspect.signature(self._make).parameters:
+            self._arguments.pop("dt", None)
+            self._make = partial(self._make, dt=dt)
+        self.base = self._make()
+        if not isinstance(self.base, StateSpaceModel):
+            raise ValueError(f"a model must be a StateSpaceModel, but {shown(make)} makes {shown(self.base)}")
+        constants = self.base.constants
+        self._fields = [one for one in getattr(constants, "_fields", ()) if one not in self._arguments]
+        self._noise = self._variances()
+        names = list(dict.fromkeys([*free, *(self._noise if noise else ())]))
+        known = self.known
+        wrong = [name for name in names if name not in known]
+        if wrong:
+            raise ValueError(f"free parameters must be of {', '.join(known)}, but got {shown(wrong[0])}")
+        self.free = tuple(known[name] for name in names)
+
+    @property
+    def known(self) -> dict[str, Parameter]:
+        """Every parameter that may be free, with its range about where it starts."""
+        starts = dict(self._arguments) | {one: getattr(self.base.constants, one) for one in self._fields}
+        found = {name: about(name, float(value)) for name, value in starts.items()}
+        units = [one.unit for one in (*self.base.states, *self.base.measurements)]
+        for name, (_, place, variance) in self._noise.items():
+            unit = squared(units[place + (0 if name.startswith("Q") else self.base.n)])
+            ends = variance / NOISE_FACTOR, variance * NOISE_FACTOR
+            found.setdefault(name, Parameter(name, *ends, unit, default=variance))
+        return found
+
+    def model(self, **values: float) -> StateSpaceModel:
+        """The model for values of some parameters; others are as they are."""
+        given = {name: value for name, value in values.items() if name in self._arguments}
+        model = self._make(**given) if given else self.base
+        fields = {name: value for name, value in values.items() if name in self._fields}
+        changes: dict = {"constants": model.constants._replace(**fields)} if fields else {}
+        for name in ("process_noise_cov", "measurement_noise_cov"):
+            cov = getattr(model, name).copy()
+            for one, value in values.items():
+                kind, place, _ = self._noise.get(one, (None, 0, 0.0))
+                if kind == name and one not in self._arguments:
+                    factor = np.sqrt(value / cov[place, place])
+                    cov[place] *= factor
+                    cov[:, place] *= factor
+                    changes[name] = cov
+        return model.replace(**changes) if changes else model
+
+    def _variances(self) -> dict[str, tuple[str, int, float]]:
+        """Which covariance each variance is of, and its place."""
+        found = {}
+        for i, variance in enumerate(np.diag(self.base.process_noise_cov).tolist()):
+            if variance > 0:
+                found[f"Q{i + 1}{i + 1}"] = ("process_noise_cov", i, variance)
+        for i, variance in enumerate(np.diag(self.base.measurement_noise_cov).tolist()):
+            found[r_name(i, self.base.m)] = ("measurement_noise_cov", i, variance)
+        return found
+
+
+def about(name: str, value: float, unit: str = "") -> Parameter:
+    """A parameter within a range about its start: a factor of ten for a positive one."""
+    if value > 0:
+        return Parameter(name, value / FACTOR, value * FACTOR, unit, default=value)
+    reach = FACTOR * abs(value) or 1.0
+    return Parameter(name, -reach, reach, unit, log=False, default=value)
+
+
+def with_ranges(
+    free: Sequence[Parameter], ranges: Mapping[str, tuple[float, float]], start: Mapping[str, float]
+) -> tuple[Parameter, ...]:
+    """Free parameters with other ranges and starts; a range that reaches to zero or below has no logarithm.
+
+    Raises:
+        ValueError: for a name that is not free, or a range or start that is none.
+    """
+    names = [one.name for one in free]
+    for name in (*ranges, *start):
+        if name not in names:
+            raise ValueError(f"ranges and starts must be of free parameters, {', '.join(names)}, but got {name}")
+    found = []
+    for one in free:
+        low, high = ranges.get(one.name, (one.low, one.high))
+        at = finite(f"the start of {one.name}", start.get(one.name, one.start))
+        if not low <= at <= high:
+            raise ValueError(f"the start of {one.name} must be within {low:g} and {high:g}, but got {at:g}")
+        found.append(replace(one, low=low, high=high, log=low > 0 and (one.log or one.name in ranges), default=at))
+    return tuple(found)
+
+
+def _numbers_of(function: Callable) -> dict[str, float]:
+    """The arguments of a function that have a number for a default."""
+    arguments = inspect.signature(function).parameters.values()
+    return {
+        one.name: float(one.default)
+        for one in arguments
+        if isinstance(one.default, (int, float)) and not isinstance(one.default, bool)
+    }
