@@ -65,6 +65,16 @@ def command(
     ] = None,
     use_all: Annotated[bool, typer.Option("--use-all", help="Hold no run out.")] = False,
     filter_name: Annotated[str, typer.Option("--filter", help="ekf, or kf for affine models.")] = "ekf",
+    predicted: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="CHANNEL", help="The filter predicts it but never sees it, such as a load cell's thrust."
+        ),
+    ] = None,
+    degrees: Annotated[
+        float,
+        typer.Option(help="Of freedom of Student-t errors, such as 20, of predicted channels, if there are any."),
+    ] = math.inf,
     gate: Annotated[
         float, typer.Option(help="Leave out samples beyond so many standard deviations, such as 5, as outliers.")
     ] = math.inf,
@@ -88,6 +98,9 @@ def command(
     Of a thruster may be free: its parameters (motor_damping, voltage_gain, ...), dead_band or dead_band_low and
     dead_band_high, thrust_asymmetry, ambient_velocity, bias_CHANNEL, lag_CHANNEL, clock_offset_CHANNEL, and the
     variances of Q and R. Of a --model, the arguments that have numbers for defaults, and its named constants.
+
+    With --predicted what is found is what predicts that channel best for a filter that does not have it: --sensor
+    speed --sensor thrust --predicted thrust identifies on a stand what will estimate thrust on the ship.
 
     Every --preset and gym.make(preset=...) take the preset file that comes out. Ctrl-C keeps the best so far.
 
@@ -119,7 +132,7 @@ def command(
             check_target(target)
     announce_compilation()
     coordinates = Coordinates(parameters)
-    objective = Objective(family.data, family.model, coordinates, filter=filter_name)
+    objective = Objective(family.data, family.model, coordinates, filter=filter_name, predicted=predicted or ())
     check_excitation(objective, runs, coordinates.start())
     with progress_console.status("identifying ...") as status:
 
@@ -134,6 +147,8 @@ def command(
             starts=starts,
             seed=seed,
             gate=gate,
+            degrees=degrees,
+            predicted=predicted or (),
             progress=tell,
         )
         made = []

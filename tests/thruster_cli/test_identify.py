@@ -58,6 +58,13 @@ def test_identified_numbers_go_into_a_preset_that_everything_takes(thruster, as_
     assert env.state_space_model().constants.dead_band_high == kept.dead_band[1]
 
 
+def test_a_load_cell_that_will_not_be_there_is_predicted(as_json, logs):  # noqa: F811
+    free = "--free", "motor_damping,voltage_gain,lift_coefficient", "--hold-noise", "--starts", 1
+    found = as_json("identify", *logs, *OF_LOGS, *free, "--predicted", "thrust", "--degrees", 20)
+    checked = {name: found["validation"][name]["one_step"]["thrust"] for name in ("start", "identified")}
+    assert checked["identified"] < 0.9 * checked["start"]
+
+
 WITHOUT_LOG = [
     ((), "identify must have at least one log"),
     (("--step", "x.csv"), "--step must come with --bollard"),
@@ -66,6 +73,7 @@ WITHOUT_LOG = [
 WITH_LOG = [
     (("--free", "mass"), "free parameters must be of lift_coefficient, .*, but got 'mass'"),
     (("--start", "voltage_gain=1e9"), "the start of voltage_gain must be within"),
+    (("--predicted", "lift"), "a predicted channel must be one of thrust, speed, but got 'lift'"),
     (("--range", "voltage_gain=5"), "--range must have the form NAME=LOW:HIGH, but got 'voltage_gain=5'"),
     (("--filter", "kf"), "a thruster must be identified with the ekf, but got --filter kf"),
     (("--held-out", "run0.csv"), "at least one log must be left to learn from"),

@@ -6,6 +6,7 @@ import signal
 import numpy as np
 import pytest
 
+from filters import ExtendedKalmanFilter, run
 from numerics.streams import episode_keys, filter_keys
 from plants import simulate
 from plants.logs.log import Log
@@ -217,3 +218,22 @@ def test_the_covariance_is_the_sandwich_or_the_information_where_scatter_says_le
     np.testing.assert_allclose(covariance(information, scores[:0], width), inverse, rtol=1e-4)
     unknown = covariance(np.diag([40.0, 0.0]), scores[:0], np.array([1.0, 2.0]))
     np.testing.assert_allclose(np.diag(unknown), [1 / 40, 12 * 4.0], rtol=1e-6)
+
+
+def test_a_predicted_channel_is_learnt_from_but_never_seen(data):
+    free = [one for one in FREE if one.name in ("stiffness", "offset", "r")]
+    found = identify(data, pendulum, free, start={"r": 0.05}, starts=1, predicted=["w"])
+    for name in ("stiffness", "offset"):
+        assert abs(found.values[name] - TRUTH[name]) < 4 * found.standard_errors[name], name
+    blind = data._replace(measurements=data.measurements.copy())
+    blind.measurements[..., 1] = np.nan
+    model = found.objective.model_at(found.at)
+    estimates = run(ExtendedKalmanFilter(model=model), blind.filter_keys, blind.inputs, blind.measurements)
+    errors = data.measurements[..., 1] - estimates.means[..., 1] - model.constants.offset
+    checked = validate(found)
+    assert checked["identified"].one_step["w"] == pytest.approx(np.sqrt((errors**2).mean()), rel=1e-12)
+    assert checked["identified"].one_step["w"] < 0.9 * checked["start"].one_step["w"]
+    with pytest.raises(ValueError, match="a filter must see some channel, but a, w are only predicted"):
+        identify(data, pendulum, free, predicted=["a", "w"])
+    with pytest.raises(ValueError, match="a predicted channel must be one of a, w, but got 'x'"):
+        identify(data, pendulum, free, predicted=["x"])

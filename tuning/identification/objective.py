@@ -77,7 +77,7 @@ class Objective:
         self._smooth = [j for j in range(len(at)) if j not in self.rough]
         runs = self.data_at(at)
         _check_runs(runs, self.model_at(at))
-        self._unseen = _checked_channels(self.predicted, self.model_at(at))
+        self.unseen = _checked_channels(self.predicted, self.model_at(at))
         count = len(runs.measurements)
         self.blocks = 1 if count >= BLOCKS else -(-BLOCKS // count)
 
@@ -141,7 +141,7 @@ class Objective:
             slopes,
             degrees=self.degrees,
             blocks=self.blocks,
-            predicted=self._unseen,
+            predicted=self.unseen,
         )
         scores = np.concatenate(found.block_gradients)
         information = found.information.sum(axis=0)

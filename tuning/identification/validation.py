@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.engine.batch import run
+from filters.engine.batch import Estimates, run
 from filters.gaussian.extended import ExtendedKalmanFilter
+from numerics.angles import difference
 from plants.logs.log import Log
 from plants.state_space import StateSpaceModel
 from tuning.identification.result import Identification
@@ -25,7 +26,7 @@ class Validation(NamedTuple):
     nis: float  # mean NIS over the number of channels; 1 for a consistent filter
 
 
-def validation_of(model: StateSpaceModel, runs: Data) -> Validation:
+def validation_of(model: StateSpaceModel, runs: Data, unseen: Sequence[bool] | None = None) -> Validation:
     """How a model does on runs.
 
     A filter without any noise of the plant, whose gain is zero, simulates.
@@ -33,21 +34,24 @@ def validation_of(model: StateSpaceModel, runs: Data) -> Validation:
     Args:
         model: as the filter runs on it.
         runs: with inputs and measurements.
+        unseen: (m,) which channels the filter predicts and never sees: their errors are those of the estimate.
     """
     symbols = [one.symbol for one in model.measurements]
+    unseen = np.zeros(model.m, dtype=bool) if unseen is None else np.asarray(unseen)
     there = ~np.isnan(runs.measurements)
-    estimates = _estimates(model, runs)
-    nothing = np.zeros((model.n, model.n))
-    simulated = _estimates(model.replace(process_noise_cov=nothing, prior_cov=nothing), runs)
+    shown = runs._replace(measurements=np.where(unseen, np.nan, runs.measurements))
+    estimates, nothing = _estimates(model, shown), np.zeros((model.n, model.n))
+    simulated = _estimates(model.replace(process_noise_cov=nothing, prior_cov=nothing), shown)
 
-    def rmse(errors: np.ndarray) -> np.ndarray:
-        return np.sqrt((errors**2).sum(axis=(0, 1)) / there.sum(axis=(0, 1)))
+    def rmse(found: Estimates) -> np.ndarray:
+        errors = np.where(unseen, _less_predicted(model, runs, found, unseen), found.innovations)
+        return np.sqrt((np.where(there, errors, 0.0) ** 2).sum(axis=(0, 1)) / there.sum(axis=(0, 1)))
 
-    one_step, simulation = rmse(estimates.innovations), rmse(simulated.innovations)
+    one_step, simulation = rmse(estimates), rmse(simulated)
     spread = np.array([runs.measurements[..., i][there[..., i]].std() for i in range(model.m)])
     fit = 100 * (1 - simulation / np.where(spread > 0, spread, np.nan))
     weighted = np.linalg.solve(estimates.innovation_covs, estimates.innovations[..., None])[..., 0]
-    nis = (weighted * estimates.innovations).sum() / there.sum()
+    nis = (weighted * estimates.innovations).sum() / there[..., ~unseen].sum()
     columns = (dict(zip(symbols, map(float, one), strict=True)) for one in (one_step, simulation, fit))
     return Validation(float(estimates.log_likelihoods.sum()), *columns, float(nis))
 
@@ -69,8 +73,20 @@ def validate(
         "start": objective.coordinates.of([found.start[name] for name in found.names]),
         "identified": found.at,
     }
-    return {name: validation_of(objective.model_at(at), objective.data_at(at)) for name, at in points.items()}
+    unseen = objective.unseen
+    return {
+        name: validation_of(objective.model_at(at), objective.data_at(at), unseen) for name, at in points.items()
+    }
 
 
 def _estimates(model: StateSpaceModel, runs: Data):
     return run(ExtendedKalmanFilter(model=model), runs.filter_keys, runs.inputs, runs.measurements)
+
+
+def _less_predicted(model: StateSpaceModel, runs: Data, estimates: Estimates, unseen: np.ndarray) -> np.ndarray:
+    """Measurements less what the estimates predict of them, if some channels are unseen; else nothing."""
+    if not unseen.any():
+        return np.zeros_like(runs.measurements)
+    c = model.given_constants
+    predicted = [[model.observe(tuple(x), c) for x in means] for means in estimates.means.tolist()]
+    return difference(runs.measurements, np.array(predicted), model.shape.measurement_angles)
