@@ -28,6 +28,9 @@ HeldOutOption = Annotated[
 BlocksOption = Annotated[
     int | None, typer.Option("--blocks", help="How many blocks a run is cut into; about 24 in all by default.")
 ]
+LeadOption = Annotated[
+    int | None, typer.Option("--lead", help="Rows at the beginning of a block that do not count; 50 by default.")
+]
 LogModelOption = Annotated[
     str | None,
     typer.Option(
@@ -35,13 +38,14 @@ LogModelOption = Annotated[
     ),
 ]
 OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt")  # of `read_named`
-CUTS = ("held_out", "blocks")
+CUTS = ("held_out", "blocks", "lead")
 
 
 def log_problem(
     logs: Sequence[str | Path],
     held_out: Sequence[str | Path] | None = None,
     blocks: int | None = None,
+    lead: int | None = None,
     **options,
 ) -> LogProblem:
     """The problem of some logs.
@@ -50,6 +54,7 @@ def log_problem(
         logs: paths of recorded runs.
         held_out: paths of runs that a study never sees; those that are not among the logs are added to them.
         blocks: of each run.
+        lead: rows of a block's lead-in.
         **options: of `read_named`.
 
     Raises:
@@ -63,8 +68,9 @@ def log_problem(
     pairs = [read_named(name, **options) for name in names]
     recorded = [log for log, _ in pairs]
     model = read_for(recorded[0], pairs[0][1])[1]()
-    cuts = {"held_out": proving or None, "blocks": blocks}
-    content = {key: value for key, value in {**options, **cuts}.items() if value is not None}
+    cuts = {"held_out": proving, "blocks": blocks, "lead": lead}
+    cuts = {key: value for key, value in cuts.items() if value is not None and value != []}
+    content = {key: value for key, value in options.items() if value is not None} | cuts
     return LogProblem(recorded, model, **cuts, content={"options": content})
 
 
@@ -93,7 +99,7 @@ def problems_in(file: Path, model: str | None = None) -> list[Problem]:
                 f"logs in a tuned file must have paths and options, but {file} has {shown(content)}"
             ) from None
         _check_model(options.get("model"), model, file)
-        found.append(log_problem(paths, options.pop("held_out", None), options.pop("blocks", None), **options))
+        found.append(log_problem(paths, **options))
         if found[-1].name != name:
             said = f"logs in a tuned file must be those of {shown(name)}"
             raise ValueError(f"{said}, but {file} has {found[-1].name}")
@@ -122,6 +128,7 @@ def problems_of(
         return (log_problem(logs, **given),)
     preset = given.pop("preset", None)
     if given:
-        option = next(iter(given)).removesuffix("s").replace("_", "-")
+        first = next(iter(given))
+        option = {"sensors": "sensor", "columns": "column"}.get(first, first).replace("_", "-")
         raise ValueError(f"--{option} must come with --log, but there is none")
     return tuple(of_preset(find_problem(name), preset) for name in names or [default])

@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from numerics.checks import at_least, one_of
 from numerics.files import check_target
-from thruster_cli.log_problems import BlocksOption, HeldOutOption, LogOption, problems_of
+from thruster_cli.log_problems import BlocksOption, HeldOutOption, LeadOption, LogOption, problems_of
 from thruster_cli.logs import (
     ClockOption,
     ColumnOption,
@@ -93,6 +93,7 @@ def command(
     log: LogOption = None,
     held_out: HeldOutOption = None,
     blocks: BlocksOption = None,
+    lead: LeadOption = None,
     preset: LogPresetOption = None,
     model: ModelOption = None,
     sensor: SensorOption = None,
@@ -128,7 +129,7 @@ def command(
     one_of("method", method, METHODS)
     check_keepable(filter_name)
     of_logs = {"preset": preset, "model": model, "sensors": sensor, "columns": column}
-    of_logs |= {"clock_offset": clock_offset, "dt": dt, "held_out": held_out, "blocks": blocks}
+    of_logs |= {"clock_offset": clock_offset, "dt": dt, "held_out": held_out, "blocks": blocks, "lead": lead}
     scenarios = problems_of(scenario, log, of_logs, "mismatch")
     objectives = tuple(objective or ["score" if scenarios[0].scale is not None else "likelihood"])
     plan = Plan(

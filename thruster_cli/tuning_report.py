@@ -13,7 +13,7 @@ from filters.consistency.verdicts import mean_sentence
 from thruster_cli.error_tables import comparison_table, span
 from thruster_cli.tables import choice_table, front_table, gradient_table, kinds_table
 from tuning.evaluation.baselines import ORACLE, RULE, SCALED, TUNED, baselines
-from tuning.evaluation.evaluate import Evaluation, score_ratio
+from tuning.evaluation.evaluate import Evaluation, likelihood_gain, score_ratio
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SIZE_TOLERANCE
 from tuning.evaluation.tuned import consistency, metrics
@@ -145,10 +145,12 @@ def _gradient_sentences(tuning: Tuning) -> list[str]:
         if gradient.agree
         else "Starts lead to different maxima: the best is kept."
     )
-    ratio = score_ratio(ours, theirs)
+    over = f"Score over Optuna's on the held-out seeds: {span(score_ratio(ours, theirs), 3)}."
+    if not ours.has_truth:
+        over = f"Log-likelihood of a held-out run above Optuna's: {span(likelihood_gain(ours, theirs), 2)}."
     words.append(
         f"{agree} It took {gradient.seconds:.1f} s; {tuning.result.finished} trials of Optuna took "
-        f"{tuning.result.seconds:.1f} s in this run. Score over Optuna's on the held-out seeds: {span(ratio, 3)}."
+        f"{tuning.result.seconds:.1f} s in this run. {over}"
     )
     return words
 

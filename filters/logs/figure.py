@@ -44,7 +44,7 @@ def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
         std = np.sqrt(np.maximum(found.innovation_covs[:, j, j], 0.0))
         _band(axis, times, np.zeros_like(std), std)
         axis.plot(times, found.innovations[:, j], color=RUST, linewidth=0.8, label="innovation")
-        axis.set_ylabel(f"innovation of\n{one.symbol}" + (f" [{one.unit}]" if one.unit else ""))
+        axis.set_ylabel(f"innovation of\n{one.symbol}" + (f"\n[{one.unit}]" if one.unit else ""))
     axes[0].set_title(title, fontsize=11)
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)

@@ -18,6 +18,7 @@ from plants.logs.units import converted
 from plants.state_space import StateSpaceModel
 
 SECOND = "s"
+MOST_STEPS = 10_000_000
 
 
 class Description(NamedTuple):
@@ -159,6 +160,11 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str) -> t
         raise ValueError(
             f"times must increase from row to row, but {stamps[row]:.10g} s follows {stamps[row - 1]:.10g} s in "
             f"{table.place(row, column.header)}"
+        )
+    steps = (stamps[-1] - stamps[0]) / (float(np.median(np.diff(stamps))) if dt is None else dt)
+    if steps > MOST_STEPS:
+        raise ValueError(
+            f"a log must be at most {MOST_STEPS} steps long, but {file} has {steps:.3g} from first to last time"
         )
     return grid_of(stamps, dt), float(stamps[0])
 

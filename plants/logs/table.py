@@ -6,6 +6,7 @@ import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -69,7 +70,8 @@ def read_table(path: str | Path) -> Table:
     """The table in a file that ends in .csv, .parquet or .npz.
 
     A CSV file is UTF-8 and begins with a line of names; commas, semicolons or tabs part the cells. An empty cell,
-    "nan", "NA" or "null" is a missing number. Parquet needs the package pyarrow.
+    "nan", "NA" or "null" is a missing number. A column without a name, such as an index that pandas writes,
+    is left out. Parquet needs the package pyarrow.
 
     Args:
         path: of the file.
@@ -114,7 +116,8 @@ def _read_csv(path: Path) -> Table:
     if not rows:
         raise ValueError(f"a log must have a header and rows, but {path} has only a header")
     columns = zip(*(row for _, row in rows), strict=True)
-    return Table(str(path), dict(zip(header, columns, strict=True)), [line for line, _ in rows])
+    named = {name: cells for name, cells in zip(header, columns, strict=True) if name}
+    return Table(str(path), named, [line for line, _ in rows])
 
 
 def _check_header(header: Sequence[str], line: int, path: Path) -> None:
@@ -123,9 +126,7 @@ def _check_header(header: Sequence[str], line: int, path: Path) -> None:
             f"the first line must name the columns, but line {line} of {path} has numbers: {shown(header)}"
         )
     for place, name in enumerate(header):
-        if not name:
-            raise ValueError(f"columns must have names, but number {place + 1} in line {line} of {path} has none")
-        if name in header[:place]:
+        if name and name in header[:place]:
             raise ValueError(
                 f"names of columns must differ from one another, but line {line} of {path} has {name!r} twice"
             )
@@ -154,8 +155,8 @@ def _read_npz(path: Path) -> Table:
     try:
         with np.load(path, allow_pickle=False) as content:
             cells = {name: content[name] for name in content.files}
-    except (ValueError, EOFError, KeyError) as error:
-        raise ValueError(f"an npz file must hold arrays of numbers, but {path} does not: {error}") from None
+    except (ValueError, EOFError, KeyError, AttributeError, BadZipFile):
+        raise ValueError(f"an npz file must hold arrays of numbers by name, but {path} does not") from None
     return _of_arrays(path, cells)
 
 

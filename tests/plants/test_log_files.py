@@ -95,7 +95,10 @@ def test_a_file_beside_tells_columns_units_and_clocks(tmp_path):
         ("time_s,voltage_V,tach\n", "has only a header"),
         ("0,1,2\n0.1,2,3\n", r"the first line must name the columns, but line 1 of .*run.csv has numbers"),
         ("t,tach,tach\n0,1,2\n", "names of columns must differ from one another, but line 1 .* has 'tach' twice"),
-        ("t,,tach\n0,1,2\n", "columns must have names, but number 2 in line 1"),
+        (
+            GOOD + "1e9,4,5\n",
+            "a log must be at most 10000000 steps long, but .*run.csv has 1e.10 from first to last time",
+        ),
         (GOOD + "0.3,4\n", "rows must have as many cells as the header, 3, but got 2 in line 5"),
         (GOOD + "0.3,4,off\n", "columns must hold numbers, but got 'off' in line 5, column 'tach' of .*run.csv"),
         (GOOD + "0.3,4,inf\n", "numbers must be finite, but got inf in line 5, column 'tach'"),
@@ -128,6 +131,20 @@ def test_what_is_wrong_is_one_line_with_its_place(tmp_path, text, said):
     with pytest.raises(ValueError, match=said) as error:
         log_of(tmp_path / "run.csv", text)
     assert "\n" not in str(error.value)
+
+
+def test_an_unnamed_index_is_left_out(tmp_path):
+    lines = GOOD.splitlines()
+    indexed = [f",{lines[0]}", *(f"{i},{line}" for i, line in enumerate(lines[1:]))]
+    log = log_of(tmp_path / "run.csv", "\n".join(indexed))
+    np.testing.assert_array_equal(log.measurements[:, 0], [2, 3, 4])
+
+
+def test_a_file_of_another_kind_is_refused_in_one_line(tmp_path):
+    for name, said in (("a.npz", "an npz file must hold arrays of numbers by name"), ("b.csv", "text in UTF-8")):
+        (tmp_path / name).write_bytes(b"\xff\xfe\x00PK")
+        with pytest.raises(ValueError, match=f"must .*{said}|{said}"):
+            read_log(tmp_path / name, MODEL)
 
 
 def test_columns_that_are_told_have_to_be_there(tmp_path):

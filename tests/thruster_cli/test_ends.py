@@ -57,10 +57,16 @@ def process(before, name, arguments="filters", **options):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "module", ["typer", "numpy.linalg", "numba", "optuna.samplers", "thruster_cli.verify"], ids=lambda name: name
+    ("module", "arguments"),
+    [
+        *((name, "simulate --steps 3 --out run.csv") for name in ("typer", "numpy.linalg", "numba")),
+        ("optuna.samplers", "tune --trials 1"),
+        ("thruster_cli.verify", "verify none.json"),
+    ],
+    ids=lambda name: name,
 )
-def test_ctrl_c_while_a_package_loads_is_one_line(module, tmp_path):
-    done = process(AT_IMPORT, module, "simulate --steps 3 --out run.csv", cwd=tmp_path, stdout=subprocess.PIPE)
+def test_ctrl_c_while_a_package_loads_is_one_line(module, arguments, tmp_path):
+    done = process(AT_IMPORT, module, arguments, cwd=tmp_path, stdout=subprocess.PIPE)
     assert (done.returncode, done.stderr, done.stdout) == (130, INTERRUPTED, "")
     assert not list(tmp_path.iterdir())
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from filters.consistency.intervals import Interval
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.problems.data import Data
+from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.problem import Problem
 from tuning.search.objectives import nis_violation
 from tuning.search.plan import Plan
@@ -64,6 +67,40 @@ def sufficient_size(sizes: Sequence[SizeRow], consistent: bool = False) -> int:
     least, limit = min(row.ratio.high for row in rows), 1.0 + SIZE_TOLERANCE
     limit = limit if least < limit else limit * least
     return next(row.size for row in rows if row.ratio.high < limit)
+
+
+def close_size(choice: Choice, plan: Plan, training: Sequence[Data]) -> int:
+    """The smallest ensemble whose estimates are so close to the largest one's that the error hardly grows.
+
+        mean of (m_N - m_L)^2 / P_L over runs, scored steps and states < 1.01^2 - 1
+
+    Where nothing is known of the truth this is what can be told: sampling adds this much to the mean square error,
+    in units of the variance that the largest ensemble believes in. The likelihood hardly feels it where R is
+    large. Where the plan has a budget, no size is above that of the choice.
+
+    Args:
+        choice: of a study.
+        plan: what the study was for.
+        training: the plan's training data.
+    """
+    size = choice.numbers["ensemble_size"]
+    sizes = [n for n in sorted({*size_ladder(choice.name), size}) if plan.budget is None or n <= size]
+    rest, limit = sizes[:-1], (1.0 + SIZE_TOLERANCE) ** 2 - 1.0
+    for scenario, data in zip(plan.scenarios, training, strict=True):
+        means, variances = _scored(choice.with_size(sizes[-1]), scenario, data)
+        likely = np.maximum(variances, np.finfo(float).tiny)
+        excess = [((_scored(choice.with_size(n), scenario, data)[0] - means) ** 2 / likely).mean() for n in rest]
+        rest = [n for n, one in zip(rest, excess, strict=True) if one < limit]
+    return min(rest, default=sizes[-1])
+
+
+def _scored(choice: Choice, scenario: Problem, data: Data) -> tuple[np.ndarray, np.ndarray]:
+    """Means and variances of the scored steps, (B, T, n) each."""
+    parts = [found for _, found in estimates_in_parts(choice.filter(scenario), data)]
+    means, covs = (
+        np.concatenate([getattr(one, name)[:, data.scored] for one in parts]) for name in ("means", "covs")
+    )
+    return means, np.einsum("bkii->bki", covs)
 
 
 def _counting(outside: Sequence[float], consistent: bool) -> list[int]:

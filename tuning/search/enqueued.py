@@ -114,7 +114,7 @@ def _enqueue_likeliest(study: optuna.Study, plan: Plan) -> None:
 
     They are those of the first scenario's model in an extended Kalman filter, or in the Kalman filter where that
     is tuned. Near the best Q and R the score is so flat that a sampler finds the place late; where the model is
-    wrong the trial is one among many.
+    wrong the trial is one among many. On recorded runs they are also tried with all else untuned.
     """
     best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
     if best is None:
@@ -127,6 +127,10 @@ def _enqueue_likeliest(study: optuna.Study, plan: Plan) -> None:
         for name, value in zip(found.names, found.best.variances, strict=True)
     }
     study.enqueue_trial({**best.params, **likeliest}, user_attrs={LIKELIEST: True})
+    if any(problem.leads_in for problem in plan.scenarios):  # recorded runs, whose likelihood is all there is
+        kind = best.params.get(KIND, plan.filter)
+        plain = trial_parameters(untuned_choice(kind, plan.scenarios[0]), space)
+        study.enqueue_trial({**plain, **likeliest}, user_attrs={LIKELIEST: True}, skip_if_exists=True)
 
 
 def _ends_a_round(trials: int, kinds: int) -> bool:

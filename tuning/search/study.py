@@ -10,7 +10,7 @@ from typing import NamedTuple
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
+from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
 from tuning.problems.data import Data
 from tuning.search.cost import COST
 from tuning.search.enqueued import enqueue_followers, enqueue_what_is_left
@@ -169,7 +169,10 @@ def run_study(
     sizes, consistent = [], plan.is_constrained and is_consistent(best)
     if has_ensemble(choice.name) and len(plan.objectives) == 1:
         sizes = ensemble_sizes(choice, plan, data, consistent)
-        choice = choice.with_size(sufficient_size(sizes, consistent)) if sizes else choice
+        if sizes:
+            choice = choice.with_size(sufficient_size(sizes, consistent))
+        elif all(scenario.leads_in for scenario in plan.scenarios):
+            choice = choice.with_size(close_size(choice, plan, data))
     complete = [trial.values[0] for trial in present if trial.state == TrialState.COMPLETE]
     return StudyResult(
         choice,

@@ -1,0 +1,156 @@
+"""Logs at the command line: estimate, tune --log, and what follows; one line for what is wrong."""
+
+import json
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import thruster_env  # noqa: F401 - registers the env
+from filters import EstimateState
+from filters.logs.estimate import estimate
+from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+
+TWO_STATES = """
+from plants.affine import affine_model
+
+def model(dt):
+    return affine_model(
+        a=[[1.0, dt], [-dt, 1.0 - dt]],
+        b=[[0.0], [dt]],
+        c=[[1.0, 0.0]],
+        process_noise_cov=[1e-5, 1e-3],
+        measurement_noise_cov=[1e-2],
+        prior_mean=[0.0, 0.0],
+        prior_cov=[1.0, 1.0],
+        states=[("angle", "phi", "rad"), ("rate", "omega", "rad/s")],
+        input_quantities=[("torque", "tau", "N*m")],
+        measurements=[("encoder", "enc", "rad")],
+    )
+"""
+
+
+def objectives_of(path):
+    return json.loads(path.read_text())["study"]["objectives"]
+
+
+@pytest.fixture
+def simulated(thruster):  # noqa: F811
+    def make(*names):
+        for seed, name in enumerate(names):
+            assert thruster("simulate", "--out", name, "--steps", 300, "--seed", seed).returncode == 0
+
+    return make
+
+
+def test_a_simulated_log_goes_through_estimate(simulated, as_json, thruster, tmp_path):  # noqa: F811
+    simulated("run.csv")
+    data = as_json("estimate", "run.csv", "--filter", "ekf", "--out", "est.csv", "--plot", "est.png")
+    assert data["rows"] == 301 and data["first_row"] == 50 and data["files"] == ["est.csv", "est.png"]
+    assert set(data["references"]) == {"omega_m", "U_a", "T"}
+    found = estimate("run.csv", "ekf", "thruster_env.model:thruster_model")
+    table = np.genfromtxt(tmp_path / "est.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(table["omega_m_rad_per_s"], found.means[:, 0], rtol=1e-9)
+    done = thruster("estimate", "run.csv")
+    assert "mean NIS over channels" in done.stdout and "Estimate less reference, not seen" in done.stdout
+    simulated("again.npz")
+    assert as_json("estimate", "again.npz")["log_likelihood"] == pytest.approx(data["log_likelihood"], rel=1e-6)
+
+
+def test_estimating_imports_no_optimiser_and_draws_nothing_that_is_not_asked_for():
+    heavy = ["optuna", "matplotlib", "pint", "pyarrow"]
+    code = f"import sys, thruster_cli.app, thruster_cli.estimate; print([n for n in {heavy} if n in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_load_cell_is_held_against_what_the_tachometer_tells(simulated, as_json):  # noqa: F811
+    simulated("run.csv")
+    columns = "--column", "speed=omega_m_rad_per_s", "--column", "thrust=thrust_N"
+    data = as_json("estimate", "run.csv", "--sensor", "speed", *columns)
+    assert list(data["one_step_ahead"]) == ["speed"] and "T" in data["references"]
+
+
+def test_a_filter_tuned_on_logs_is_verified_reported_and_used(simulated, as_json, thruster, tmp_path):  # noqa: F811
+    simulated("a.csv", "b.csv", "c.csv")
+    for name in "abc":
+        rows = [line.split(",") for line in (tmp_path / f"{name}.csv").read_text().splitlines()]
+        (tmp_path / f"{name}.csv").write_text(
+            "\n".join(",".join(row[i] for i in (0, 1, 5)) for row in rows) + "\n"
+        )
+    logs = "--log", "a.csv", "--log", "b.csv"
+    options = "--filter", "ekf", *logs, "--held-out", "c.csv", "--lead", 40, "--trials", 4, "--out", "tuned.json"
+    data = as_json("tune", *options)
+    assert data["file"] == "tuned.json" and objectives_of(tmp_path / "tuned.json") == ["likelihood"]
+    assert as_json("verify", "tuned.json")["holds"]
+    assert "held-out blocks" in thruster("evaluate", "--tuned", "tuned.json").stdout
+    assert "log-likelihood" in as_json("report", "tuned.json")["advice"]
+    told = as_json("estimate", "c.csv", "--tuned", "tuned.json")
+    assert told["filter"] == "ekf"
+    wrapped = EstimateState(gym.make("BowThruster-v0"), tuned=str(tmp_path / "tuned.json"))
+    assert wrapped.filter.name == "ekf"
+    (tmp_path / "c.csv").write_text((tmp_path / "a.csv").read_text())
+    changed = thruster("verify", "tuned.json")
+    assert changed.returncode == 2 and "must be what it was tuned on, a.csv+2 of digest" in changed.stderr
+    done = thruster("estimate", "b.csv", "--tuned", "tuned.json", "--dt", "0.02", "--out", "est.csv")
+    assert done.returncode == 2 and "was tuned for dt 0.01 (here 0.02)" in done.stderr
+    assert not (tmp_path / "est.csv").exists()
+
+
+def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "pendulum_of_a_user.py").write_text(TWO_STATES)
+    draws = np.random.default_rng(0)
+    phi, omega, rows = 0.0, 0.0, ["t_s,torque,encoder_deg"]
+    for k in range(400):
+        tau = np.sign(np.sin(0.05 * k))
+        rows.append(f"{0.05 * k:.4f},{tau},{np.degrees(phi + 0.1 * draws.normal()):.6f}")
+        phi, omega = phi + 0.05 * omega, omega + 0.05 * (tau - phi - omega) + 0.03 * draws.normal()
+    (tmp_path / "run.csv").write_text("\n".join(rows) + "\n")
+    pytest.importorskip("pint")
+    model = "--model", "pendulum_of_a_user:model"
+    data = as_json("tune", "--log", "run.csv", *model, "--filter", "kf", "--trials", 3, "--out", "tuned.json")
+    assert data["file"] == "tuned.json" and objectives_of(tmp_path / "tuned.json") == ["likelihood"]
+    told = as_json("estimate", "run.csv", *model, "--tuned", "tuned.json", "--smoother")
+    assert told["smoothed"] and told["dt"] == 0.05
+    done = thruster("verify", "tuned.json")
+    assert done.returncode == 2 and "say --model pendulum_of_a_user:model, if you trust it" in done.stderr
+    assert as_json("verify", "tuned.json", *model)["holds"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (("estimate", "no.csv"), "a log must be a file that can be read, but no.csv is not: No such file"),
+        (
+            ("estimate", "run.csv", "--column", "thrust"),
+            "--column must have the form NAME=VALUE, but got 'thrust'",
+        ),
+        (("estimate", "run.csv", "--column", "flow=x"), "columns must be told for some of V_s, thrust, omega_m"),
+        (
+            ("estimate", "run.csv", "--column", "thrust=x"),
+            "the column for thrust must be one of time_s, voltage_V",
+        ),
+        (("estimate", "run.csv", "--model", "m:x", "--preset", "tunnel"), "must be of --model or of a thruster"),
+        (
+            ("estimate", "run.csv", "--filter", "ekf", "--tuned", "x.json"),
+            "give either --tuned FILE or --filter NAME",
+        ),
+        (("estimate", "run.csv", "--out", "est.txt"), "--out must end in .csv, .parquet or .npz"),
+        (("estimate", "run.csv", "--plot", "est.pdf"), "--plot must end in .png, but got 'est.pdf'"),
+        (("estimate", "run.csv", "--skip", "9999"), "skip must be at most 60, but got 9999"),
+        (("estimate", "run.csv", "--clock-offset", "thrust=late"), "--clock-offset thrust must be seconds"),
+        (("tune", "--log", "run.csv"), "a log must have at least 75 rows"),
+        (("tune", "--log", "run.csv", "--problem", "nominal"), "must be of --log or of --problem, but got both"),
+        (("tune", "--blocks", "3"), "--blocks must come with --log, but there is none"),
+    ],
+)
+def test_a_mistake_with_a_log_is_one_line_and_nothing_is_written(arguments, line, thruster, tmp_path):  # noqa: F811
+    times = 0.01 * np.arange(61)
+    rows = [f"{t:.2f},{6 * np.sin(t):.4f},{np.cos(9 * t):.4f}" for t in times]
+    (tmp_path / "run.csv").write_text("time_s,voltage_V,measured_thrust_N\n" + "\n".join(rows) + "\n")
+    done = thruster(*arguments)
+    assert done.returncode == 2 and line in done.stderr and done.stderr.count("thruster:") == 1
+    assert {path.name for path in tmp_path.iterdir()} <= {"run.csv", "out"}

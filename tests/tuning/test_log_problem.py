@@ -1,0 +1,203 @@
+"""Recorded runs as a problem: blocks, what is held out, what counts, and truth where logs have it."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import optuna
+import pytest
+
+from docs import log_tables
+from filters import run
+from filters.likelihood import likelihood
+from plants.affine import affine_model
+from plants.logs.log import Log
+from plants.simulate import simulate
+from studies.hidden_truth import hide_truth
+from tuning.evaluation.evaluate import evaluate
+from tuning.evaluation.held_out import prove
+from tuning.evaluation.sizes import close_size
+from tuning.likelihood.gradient import maximise_likelihood
+from tuning.likelihood.identifiability import identify
+from tuning.problems.check import checked_problem
+from tuning.problems.find import find_problem
+from tuning.problems.log_parts import LEAD, parts_of
+from tuning.problems.log_problem import LogProblem
+from tuning.search.plan import Plan
+from tuning.search.space import size_ladder, untuned_choice
+from tuning.search.study import open_study, run_study
+from tuning.search.workers import _packed, _unpacked
+
+Q, R = 0.04, 0.25
+MODEL = affine_model(
+    a=[[0.9]],
+    b=[[0.5]],
+    c=[[1.0]],
+    process_noise_cov=[Q],
+    measurement_noise_cov=[R],
+    prior_mean=[0.0],
+    prior_cov=[0.0],
+)
+GUESS = MODEL.replace(process_noise_cov=[1.0])
+
+
+@pytest.fixture(autouse=True)
+def quiet():
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+
+
+def logs_of(*steps, truth=False, offset=0.0):
+    logs = []
+    for number, count in enumerate(steps):
+        inputs = offset + np.sign(np.sin(0.1 * np.arange(count)))[None, :, None]
+        found = simulate(MODEL, np.array([[number, 5]]), inputs)
+        states = {"state:x_1": found.states[0, :, 0]} if truth else {}
+        referred = {"state:x_1": MODEL.states[0]} if truth else {}
+        quantities = MODEL.input_quantities, MODEL.measurements
+        logs.append(Log(f"run{number}", 0.1, inputs[0], found.measurements[0], *quantities, states, referred))
+    return logs
+
+
+def test_blocks_of_a_run_follow_one_another_and_each_has_a_lead_in():
+    (log,) = logs_of(400)
+    parts = parts_of([log], lead=20, blocks=6)
+    scored = sorted((block.first + 20, block.first + block.rows) for block in parts.blocks)
+    assert scored[0][0] == 20 and scored[-1][1] == 401
+    assert all(before[1] == after[0] for before, after in zip(scored, scored[1:], strict=False))
+    assert [len(some) for some in (parts.training, parts.sizes, parts.held_out)] == [4, 0, 2]
+    problem = LogProblem(log, GUESS, lead=20, blocks=6)
+    data = problem.data(range(6))
+    for place, block in enumerate(problem.parts.blocks):
+        rows = slice(block.first, block.first + block.rows)
+        np.testing.assert_array_equal(data.measurements[place, : block.rows], log.measurements[rows])
+        assert np.isnan(data.measurements[place, block.rows :]).all()
+        np.testing.assert_array_equal(data.inputs[place, : block.rows - 1], log.inputs[rows][: block.rows - 1])
+
+
+def test_every_third_run_is_held_out_or_those_that_are_named():
+    logs = logs_of(200, 200, 300, 200)
+    parts = parts_of(logs, blocks=2)
+    assert {parts.blocks[i].run for i in parts.held_out} == {2}
+    assert {parts.blocks[i].run for i in parts.training} == {0, 1, 3}
+    named = LogProblem(logs, GUESS, blocks=2, held_out=["run0", "run3"])
+    assert {named.parts.blocks[i].run for i in named.held_out_seeds(7, 200)} == {0, 3}
+    assert named.training_seeds(7, 32) == named.parts.training == named.range_seeds
+    seeds = {*named.parts.training, *named.parts.held_out}
+    assert len(seeds) == len(named.parts.blocks)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: LogProblem(logs_of(60), GUESS), "a log must have at least 75 rows.*but run0 has 61"),
+        (lambda: LogProblem(logs_of(100), GUESS), "at least 2 blocks held out, but run0 give 0"),
+        (lambda: LogProblem(logs_of(200), GUESS, held_out=["x"]), "held out must be among run0, but got 'x'"),
+        (lambda: LogProblem([], GUESS), "logs must be some plants.logs.log.Log"),
+        (lambda: LogProblem(logs_of(200) * 2, GUESS), "must have different names, but got run0, run0"),
+        (lambda: LogProblem(logs_of(200), GUESS, scale=[1.0]), "a scale must come with logs of all true states"),
+        (
+            lambda: LogProblem([logs_of(200)[0], Log("b", 0.2, *_rows())], GUESS),
+            "must have the same sample time, but run0 has 0.1 s and b 0.2 s",
+        ),
+    ],
+)
+def test_logs_that_cannot_be_a_problem_are_refused(make, said):
+    with pytest.raises(ValueError, match=said):
+        make()
+
+
+def _rows():
+    return np.zeros((200, 1)), np.arange(201.0)[:, None], MODEL.input_quantities, MODEL.measurements
+
+
+def test_a_problem_of_logs_is_one_whose_digest_is_of_its_content():
+    one, same = (checked_problem(LogProblem(logs_of(300), GUESS)) for _ in range(2))
+    assert one.scale is None and one.true is None and one.digest == same.digest
+    assert pickle.loads(pickle.dumps(one)).digest == one.digest
+    assert _unpacked(_packed(one)).digest == one.digest  # as workers get it
+    others = LogProblem(logs_of(300, offset=0.1), GUESS), LogProblem(logs_of(300), GUESS, blocks=8)
+    assert len({one.digest, *(other.digest for other in others)}) == 3
+
+
+def test_the_lead_in_counts_in_no_likelihood():
+    problem = LogProblem(logs_of(600), MODEL, blocks=6)
+    data = problem.data(problem.parts.training)
+    choice = untuned_choice("kf", problem)
+    evaluation = evaluate(choice.filter(problem), data, None)
+    found = maximise_likelihood("kf", problem, data, [1.0])
+    best = evaluate(found.choice.filter(problem), data, None)
+    assert best.log_likelihoods.sum() == pytest.approx(found.best.log_likelihood, rel=1e-9)
+    assert best.log_likelihood >= evaluation.log_likelihood
+    whole = likelihood(MODEL, data.inputs, data.measurements, np.zeros((1, 1, 1)), np.zeros((1, 1, 1)))
+    assert whole.values.sum() < evaluate(_with(problem, MODEL), data, None).log_likelihoods.sum() - 10
+
+
+def _with(problem, model):
+    choice = untuned_choice("kf", problem)
+    return choice._replace(model={"process_noise_cov": (Q,), "measurement_noise_cov": R}).filter(problem)
+
+
+def test_the_noise_of_a_simulation_is_found_again_without_its_truth():
+    problem = LogProblem(logs_of(1500, 1500), GUESS)
+    plan = Plan("kf", (problem,), objectives=("likelihood",))
+    result = run_study(open_study("logs", plan), plan, 22)
+    found = result.choice.model
+    assert found["process_noise_cov"][0] == pytest.approx(Q, rel=0.3)
+    assert found["measurement_noise_cov"] == pytest.approx(R, rel=0.15)
+    proof = prove(result.choice, problem, 0)
+    assert proof.seeds == problem.parts.held_out and not proof.tuned.has_truth
+    assert proof.likelihood_gains["rule of thumb"].low > 0
+    known = identify(result.choice, (problem,), plan.training_data(), plan.space())
+    assert known.identified.all() and (known.factors < 3).all()  # the errors of blocks of two runs are finite
+
+
+def test_true_states_in_the_logs_give_a_scale_and_runs_of_their_own_for_the_ensemble_size():
+    logs = logs_of(600, 500, truth=True)
+    problem = checked_problem(LogProblem(logs, MODEL, lead=LEAD))
+    data = problem.data(problem.training_seeds(0, 32))
+    assert problem.scale[0] == pytest.approx(data.states[:, LEAD:].std(), rel=1e-12)
+    assert problem.parts.sizes and not {*problem.parts.sizes} & {*problem.parts.training, *problem.parts.held_out}
+    assert not np.isnan(data.measurements).any()
+    block = problem.parts.blocks[1]
+    first = logs[block.run].references["state:x_1"][block.first]
+    assert data.states[1, 0, 0] == first
+    hidden = LogProblem(logs, MODEL, truth=False)
+    assert hidden.scale is None and hidden.data([0]).states is None
+
+
+def test_an_ensemble_without_a_truth_is_the_smallest_whose_estimates_are_close_to_the_largest_one_s():
+    problem = LogProblem(logs_of(300), MODEL, blocks=8)
+    plan, data = Plan("enkf", (problem,), objectives=("likelihood",)), problem.data(problem.parts.training)
+    choice = untuned_choice("enkf", problem)._replace(
+        model={"process_noise_cov": (Q,), "measurement_noise_cov": R}
+    )
+
+    def means_of(size):
+        filter_ = choice.with_size(size).filter(problem)
+        found = run(filter_, data.filter_keys, data.inputs, data.measurements)
+        return found.means[:, data.scored, 0], found.covs[:, data.scored, 0, 0]
+
+    size = close_size(choice, plan, [data])
+    ladder = [n for n in size_ladder("enkf") if n < 200]
+    largest, variances = means_of(200)
+    excess = {n: ((means_of(n)[0] - largest) ** 2 / variances).mean() for n in ladder}
+    assert size == min(n for n in ladder if excess[n] < 0.0201) and 20 < size < 200
+    assert close_size(choice.with_size(10), plan._replace(budget=1.0), [data]) <= 10
+
+
+def test_the_page_has_the_table_of_its_script_and_says_what_the_truth_is_worth():
+    page = (Path(__file__).parents[2] / "docs" / "logs.md").read_text()
+    lines = page.partition("<!-- table hidden_truth -->")[2].partition("<!-- end -->")[0].strip().splitlines()
+    rows = {(row[1].strip(" `"), row[2].strip(" `")): row for row in (line.split("|") for line in lines[2:])}
+    assert set(rows) == set(log_tables.CASES)
+    ratios = {case: float(row[4].split()[0]) for case, row in rows.items()}  # with the most logs
+    fitting = [ratios[case] for case in ratios if case[1] != "kf" or case[0] == "published_tunnel"]
+    assert len(fitting) == 5 and max(fitting) <= 1.02
+    assert min(ratios["nominal", "kf"], ratios["outliers", "kf"]) > 1.5  # as the text says
+    made = log_tables.hidden_truth(trials=2, cases=[("nominal", "ekf")], runs=(6,))
+    assert made.startswith("| scenario | filter | 6 logs |") and "| `nominal` | `ekf` | " in made
+
+
+def test_a_study_that_never_saw_the_truth_comes_close_to_one_that_did():
+    found = hide_truth("ekf", find_problem("nominal"), trials=22, runs=12, held_out=24)
+    assert found.ratio.value < 1.02 and found.seen != found.blind
