@@ -62,7 +62,7 @@ class Identification(NamedTuple):
         for one in self.optima:
             apart = np.abs(coordinates.of(list(one.values.values())) - top)
             close = best.log_likelihood - one.log_likelihood < EQUAL_VALUES
-            near += bool(close or (apart < EQUAL * scale)[known].all())
+            near += bool(close or (known.any() and (apart < EQUAL * scale)[known].all()))
         return near
 
     @property
@@ -102,9 +102,8 @@ class Identification(NamedTuple):
         if not ends and not wide:
             said.append("The data determine every free parameter.")
         if wide:
-            said.append(
-                f"The data do not determine {', '.join(wide)}: a 95 % interval takes half the range, or a factor of ten."
-            )
+            rule = "a 95 % interval takes half the range, or a factor of ten"
+            said.append(f"The data do not determine {', '.join(wide)}: {rule}.")
         if ends:
             said.append(f"At an end of the range: {', '.join(ends)}. A wider one may fit better.")
         for one, other, correlation in self.traded:
