@@ -21,6 +21,7 @@ from tuning.problems.parameter import Parameter
 from tuning.search.interruption import stop_on_interrupt
 
 STARTS = 4  # the one given, and others drawn about it
+NEARER = 5  # times that a start without a likelihood is moved halfway to the first
 REACH = 0.25  # of a range, to either side of the start, within which others are drawn
 
 Progress = Callable[[int, float, dict[str, float]], None]
@@ -49,9 +50,10 @@ def identify(
     the likelihood.
 
     The first start is `start`; the others are drawn uniformly (in coordinates) within a quarter of each range to
-    either side of it. With `simulation_first` each start is first brought to where the model, simulated without
-    process noise, is nearest to the measurements, if that is likelier: innovations forgive a model that is far
-    off as long as its filter follows the measurements.
+    either side of it; one at which the filter does not stay finite is moved halfway to the first, and so on. With
+    `simulation_first` each start is first brought to where the model, simulated without process noise, is nearest
+    to the measurements, if that is likelier: innovations forgive a model that is far off as long as its filter
+    follows the measurements.
 
     Args:
         data: `Data`, a `Log`, a sequence of such, or a function of some of the parameters, named as
@@ -89,6 +91,7 @@ def identify(
     with stop_on_interrupt() as asked:
         ascents = []
         for number, point in enumerate(points):
+            points[number] = point = _finite_start(objective, point, first)
 
             def tell(at, found, number=number):
                 if progress is not None:
@@ -108,7 +111,7 @@ def identify(
             )
             for point, one in zip(points, ascents, strict=False)
         )
-        best = max(ascents, key=lambda one: one.found.value if math.isfinite(one.found.value) else -math.inf)
+        best = max(ascents, key=lambda one: one.found.value)
         if gate < math.inf:
             objective, best = _gated(objective, best, gate, asked, tell)
         return identification_of(
@@ -139,6 +142,15 @@ def _climb_from(objective: Objective, point, simulation_first: bool, stop, tell)
         if objective.value(nearest.at) > objective.value(point):
             point = nearest.at
     return climb(objective, point, *bounds, stop=stop, progress=tell)
+
+
+def _finite_start(objective: Objective, point: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """The point, moved towards the first start until the filter stays finite on all runs."""
+    for _ in range(NEARER):
+        if point is first or math.isfinite(objective.value(point)):
+            break
+        point = (point + first) / 2
+    return point
 
 
 def _others(coordinates: Coordinates, first: np.ndarray, starts, seed: int) -> list[np.ndarray]:

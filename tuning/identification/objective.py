@@ -105,8 +105,7 @@ class Objective:
 
     def value(self, at: np.ndarray) -> float:
         """Log-likelihood of all runs; minus infinity where it has none."""
-        value = float(self._smooth_part(at, ()).value)
-        return value if math.isfinite(value) else -math.inf
+        return self._smooth_part(at, ()).value
 
     def __call__(self, at: np.ndarray) -> Evaluation:
         """Value and slopes at coordinates."""
@@ -145,7 +144,9 @@ class Objective:
         )
         scores = np.concatenate(found.block_gradients)
         information = found.information.sum(axis=0)
-        return Evaluation(float(found.values.sum()), scores.sum(axis=0), information, scores, found.values)
+        value = float(found.values.sum())
+        value = value if math.isfinite(value) else -math.inf
+        return Evaluation(value, scores.sum(axis=0), information, scores, found.values)
 
     def _slopes(self, at: np.ndarray, places: Sequence[int]) -> ModelSlopes:
         pairs = [self._pair(at, j) for j in places]

@@ -9,12 +9,12 @@ import numpy as np
 from tuning.identification.ascent import Ascent
 from tuning.identification.coordinates import Coordinates
 from tuning.identification.objective import Objective
-from tuning.likelihood.identifiability import COMPANION, TWO_SIDED
+from tuning.likelihood.identifiability import COMPANION, KNOWN_WITHIN, TWO_SIDED
 
 WIDEST = 0.5  # of its range, that a 95 % interval of a determined parameter may take
 TRADED = 0.95  # correlation from which on two parameters are said to trade off
-EQUAL = 0.1  # optima whose parameters are within so many standard errors, or so little of the likelihood, are one
-EQUAL_VALUES = 0.01
+EQUAL = 0.25  # optima whose determined parameters are within so many standard errors are one,
+EQUAL_VALUES = 0.01  # or within so little of the likelihood
 FLAT = 1e-10  # of a range^-2: curvature below which there is none
 
 
@@ -38,7 +38,7 @@ class Identification(NamedTuple):
     cov: np.ndarray  # (p, p)
     at: np.ndarray  # (p,), coordinates
     at_end: dict[str, bool]  # whether a value is at an end of its range
-    determined: dict[str, bool]  # 95 % interval below half the range, and not at its end
+    determined: dict[str, bool]  # as `is_narrow` says, and not at an end of the range
     log_likelihood: float
     start_log_likelihood: float
     optima: tuple[Optimum, ...]  # one a start
@@ -54,14 +54,15 @@ class Identification(NamedTuple):
 
     @property
     def agreement(self) -> int:
-        """How many starts led to the best maximum: within 0.01 in log L, or 0.1 standard errors everywhere."""
+        """How many starts led to the best maximum, in log L or in all determined parameters."""
         coordinates, scale, near = self.objective.coordinates, np.sqrt(np.diag(self.cov)), 0
         best = max(self.optima, key=lambda one: one.log_likelihood)
+        known = np.array([self.determined[name] for name in self.names])
         top = coordinates.of(list(best.values.values()))
         for one in self.optima:
             apart = np.abs(coordinates.of(list(one.values.values())) - top)
             close = best.log_likelihood - one.log_likelihood < EQUAL_VALUES
-            near += bool(close or (apart < EQUAL * scale).all())
+            near += bool(close or (known.any() and (apart < EQUAL * scale)[known].all()))
         return near
 
     @property
@@ -99,9 +100,10 @@ class Identification(NamedTuple):
         ends = [name for name in self.names if self.at_end[name]]
         wide = [name for name in self.names if not self.determined[name] and not self.at_end[name]]
         if not ends and not wide:
-            said.append("The data determine every free parameter: no 95 % interval takes half its range.")
+            said.append("The data determine every free parameter.")
         if wide:
-            said.append(f"The data do not determine {', '.join(wide)}: a 95 % interval takes half its range.")
+            rule = "a 95 % interval takes half the range, or a factor of ten"
+            said.append(f"The data do not determine {', '.join(wide)}: {rule}.")
         if ends:
             said.append(f"At an end of the range: {', '.join(ends)}. A wider one may fit better.")
         for one, other, correlation in self.traded:
@@ -158,8 +160,13 @@ def identification_of(
 
 
 def is_narrow(cov: np.ndarray, coordinates: Coordinates) -> np.ndarray:
-    """Whether the 95 % interval of each parameter takes less than half its range, (p,) bool."""
-    return 2 * TWO_SIDED * np.sqrt(np.diag(cov)) < WIDEST * (coordinates.high - coordinates.low)
+    """Whether the 95 % interval of each parameter takes less than half its range, (p,) bool.
+
+    On a logarithmic scale it must be within a factor of ten, too: a variance has a wide range.
+    """
+    reach = TWO_SIDED * np.sqrt(np.diag(cov))
+    known = ~coordinates.log | (reach < KNOWN_WITHIN)
+    return known & (2 * reach < WIDEST * (coordinates.high - coordinates.low))
 
 
 def covariance(information: np.ndarray, scores: np.ndarray, width: np.ndarray) -> np.ndarray:
