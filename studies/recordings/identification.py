@@ -68,7 +68,8 @@ class Structure(NamedTuple):
 
     def model(self, **values: float) -> StateSpaceModel:
         """The model, with the load cell, for values of the free numbers."""
-        return with_values(to_identify(self.ambient), {**self.fixed, **values})
+        mount = MOUNT[0] in self.free
+        return with_values(to_identify(self.ambient, mount), {**self.fixed, **values})
 
 
 STATIC = (*MOTOR, *BAND, *LAG, *BLADES, *SIDES, *NOISE)

@@ -57,14 +57,16 @@ class Constants(NamedTuple):
 
 STATES = (
     Quantity("motor speed", "n", "rad/s"),
-    Quantity("speed that the tachometer shows", "y", "rad/s"),
+    Quantity("tachometer speed", "y", "rad/s"),
     Quantity("axial flow", "v", "m/s"),
     Quantity("effective command", "d", "V"),
+)
+MOUNT = (
     Quantity("force in the mount", "q", "N"),
     Quantity("rate of the force in the mount", "r", "N/s"),
 )
-INITIAL = (30.0, 30.0, 0.03, 0.0, 5.0, 200.0)  # standard deviations
-PROCESS = (5.0, 1.0, 3e-3, 0.0, 0.0, 0.0)  # standard deviations of the noise of a step
+INITIAL = (30.0, 30.0, 0.03, 0.0), (5.0, 200.0)  # standard deviations, of the mount last
+PROCESS = (5.0, 1.0, 3e-3, 0.0), (0.0, 0.0)  # standard deviations of the noise of a step
 COMMAND = Quantity("command", "u", "V")
 AMBIENT = Quantity("measured ambient flow", "flow", "m/s")
 TACHOMETER = Quantity("motor speed without its sign", "tach", "rad/s")
@@ -97,36 +99,46 @@ def thrust(x, c):
     return blades(x[0], x[2], c) + c.inertia * acceleration(x, c)
 
 
-def load(x, c):
-    """What the load cell shows [N]."""
+def through_mount(x, c):
+    """What the load cell shows where the mount swings [N]."""
     return thrust(x, c) * (1.0 - c.mount_share) + c.mount_share * x[4]
 
 
 def rates(x, u, c):
     """How fast the state changes under u = (effective command, ambient flow)."""
-    w = 2.0 * math.pi * c.mount_frequency
     lift = blades(x[0], x[2] - c.ambient_factor * u[1], c)
     return (
         acceleration(x, c),
         (x[0] - x[1]) / c.tachometer_lag,
         c.flow_gain * lift - (c.flow_linear + c.flow_quadratic * abs(x[2])) * x[2],
         0.0,
-        x[5],
-        w * w * (lift + c.inertia * acceleration(x, c) - x[4]) - 2.0 * c.mount_damping * w * x[5],
     )
 
 
-_step = runge_kutta(rates, len(STATES))
+def rates_with_mount(x, u, c):
+    """How fast the state and the force in the mount change."""
+    w = 2.0 * math.pi * c.mount_frequency
+    swing = w * w * (thrust(x, c) - x[4]) - 2.0 * c.mount_damping * w * x[5]
+    dn, dy, dv, dd = rates(x, u, c)
+    return dn, dy, dv, dd, x[5], swing
+
+
+_step, _step_with_mount = runge_kutta(rates, 4), runge_kutta(rates_with_mount, 6)
 
 
 def transition(x, u, c):
     """One of the equal parts of a step under the command."""
-    return _step((x[0], x[1], x[2], effective(u[0], c), x[4], x[5]), (u[0], 0.0), c)
+    return _step((x[0], x[1], x[2], effective(u[0], c)), (u[0], 0.0), c)
 
 
 def transition_in_flow(x, u, c):
     """One of the equal parts of a step under command and measured ambient flow."""
-    return _step((x[0], x[1], x[2], effective(u[0], c), x[4], x[5]), (u[0], u[1]), c)
+    return _step((x[0], x[1], x[2], effective(u[0], c)), (u[0], u[1]), c)
+
+
+def transition_with_mount(x, u, c):
+    """One of the equal parts of a step of thruster and mount."""
+    return _step_with_mount((x[0], x[1], x[2], effective(u[0], c), x[4], x[5]), (u[0], 0.0), c)
 
 
 def shown(x, c):
@@ -136,32 +148,37 @@ def shown(x, c):
 
 def shown_with_load(x, c):
     """What tachometer and load cell show."""
-    return (abs(x[1]), load(x, c))
+    return (abs(x[1]), thrust(x, c))
 
 
-def to_identify(ambient: bool = False) -> StateSpaceModel:
+def shown_through_mount(x, c):
+    """What tachometer and load cell show where the mount swings."""
+    return (abs(x[1]), through_mount(x, c))
+
+
+def to_identify(ambient: bool = False, mount: bool = False) -> StateSpaceModel:
     """The model with the load cell among its channels and round numbers, from which identification starts.
 
     Args:
         ambient: whether the measured ambient flow is an input.
+        mount: whether the mount swings, which is two states more; not along with ambient flow.
     """
+    parts = 1 + mount
+    move = transition_with_mount if mount else transition_in_flow if ambient else transition
     return StateSpaceModel(
-        transition=transition_in_flow if ambient else transition,
-        observe=shown_with_load,
-        process_noise_cov=[deviation**2 for deviation in PROCESS],
+        transition=move,
+        observe=shown_through_mount if mount else shown_with_load,
+        process_noise_cov=[deviation**2 for part in PROCESS[:parts] for deviation in part],
         measurement_noise_cov=[deviation**2 for deviation in SENSORS],
-        prior_mean=[0.0] * len(STATES),
-        prior_cov=[deviation**2 for deviation in INITIAL],
+        prior_mean=[0.0] * (4 + 2 * mount),
+        prior_cov=[deviation**2 for part in INITIAL[:parts] for deviation in part],
         inputs=1 + ambient,
         constants=Constants(),
         substeps=SUBSTEPS,
-        states=STATES,
+        states=STATES + MOUNT * mount,
         input_quantities=(COMMAND, AMBIENT)[: 1 + ambient],
         measurements=(TACHOMETER, LOAD_CELL),
-        outputs={
-            "T": Output(Quantity("thrust", "T", "N"), thrust),
-            "load": Output(Quantity("load cell", "load", "N"), load),
-        },
+        outputs={"T": Output(Quantity("thrust", "T", "N"), thrust)},
     )
 
 
