@@ -17,7 +17,7 @@ from filters.filter import Filter
 from filters.registry import FILTERS, tunable_numbers
 
 FEW_RULES = {"fuzzy": {"premises": [0, 5]}}  # u and r; twelve states would make 4096
-SENSORS = {("kf-steady", "navigation"): "usbl"}  # where no position is measured there is no steady state
+WITH_POSITION = ("navigation", "current")  # of which there is no steady state unless a position is measured
 
 
 def filter_of(name: str, states: str) -> Filter:
@@ -25,7 +25,8 @@ def filter_of(name: str, states: str) -> Filter:
     own = {"ensemble_size": 10} if "ensemble_size" in tunable_numbers(name) else {}
     if MODELS[states].count > 8:
         own |= FEW_RULES.get(name, {})
-    return make_filter(name, auv_model(states=states, sensors=SENSORS.get((name, states))), **own)
+    sensors = "usbl" if name == "kf-steady" and states in WITH_POSITION else None
+    return make_filter(name, auv_model(states=states, sensors=sensors), **own)
 
 
 def main() -> None:

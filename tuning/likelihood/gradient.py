@@ -147,7 +147,7 @@ def _minimum(slopes: Callable, first: np.ndarray, bounds: list, is_large: bool):
             return value, gradient
         return DIVERGED, np.zeros_like(gradient)  # the line search takes a shorter step
 
-    options = {"ftol": COARSE if is_large else PRECISE}
+    options = {"ftol": COARSE, "maxcor": 2 * len(first)} if is_large else {"ftol": PRECISE}
     return minimize(negative, first, jac=True, bounds=bounds, method="L-BFGS-B", options=options)
 
 
