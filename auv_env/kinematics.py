@@ -111,6 +111,25 @@ def in_body_axes(attitude, psi, north, east, below):
 
 
 @inlined
+def in_body_axes_tangent(attitude, d_attitude, psi, d_psi, vector, d_vector):
+    """Directional derivative of `in_body_axes`; the vector and its change are (north, east, down)."""
+    (north, east, below), (d_north, d_east, d_below) = vector, d_vector
+    c_phi, s_phi, c_theta, s_theta = attitude
+    dc_phi, ds_phi, dc_theta, ds_theta = d_attitude
+    c_psi, s_psi = cosine_and_sine(psi)
+    ahead, aside = north * c_psi + east * s_psi, east * c_psi - north * s_psi
+    d_ahead = d_north * c_psi + d_east * s_psi + aside * d_psi
+    d_aside = d_east * c_psi - d_north * s_psi - ahead * d_psi
+    across = ahead * s_theta + below * c_theta
+    d_across = d_ahead * s_theta + ahead * ds_theta + d_below * c_theta + below * dc_theta
+    return (
+        d_ahead * c_theta + ahead * dc_theta - d_below * s_theta - below * ds_theta,
+        d_aside * c_phi + aside * dc_phi + d_across * s_phi + across * ds_phi,
+        d_across * c_phi + across * dc_phi - d_aside * s_phi - aside * ds_phi,
+    )
+
+
+@inlined
 def planar_kinematics(nu, psi):
     """The papers' rates of x, y, z [m/s] and psi [rad/s], which turn by yaw alone.
 

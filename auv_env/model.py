@@ -1,4 +1,4 @@
-"""The vehicle as a `StateSpaceModel`: what a filter assumes of it, with six, eight or twelve states."""
+"""The vehicle as a `StateSpaceModel`: what a filter assumes of it, with six to fourteen states."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from auv_env.kinematics import angle_rates, attitude_of, in_earth_axes
 from auv_env.operating import cruise_thrust, operating_range
 from auv_env.parameters import VehicleParameters, checked
 from auv_env.plant import CRUISE_SPEED, Plant, make_plant
-from auv_env.quantities import ATTITUDE_INPUTS, STATES, SYMBOLS
+from auv_env.quantities import ATTITUDE_INPUTS, CURRENT_STATES, STATES, SYMBOLS
 from numerics.checks import covariance, one_of, positive
 from numerics.compiled import inlined
 from numerics.pickling import makes_functions
@@ -54,9 +54,17 @@ MODELS = {
             "euler": (dynamics.navigation_euler, dynamics.navigation_euler_jacobian),
         },
     ),
+    "current": Steps(
+        14,
+        {
+            "runge-kutta": (dynamics.drifting_substep, dynamics.drifting_jacobian),
+            "euler": (dynamics.drifting_euler, dynamics.drifting_euler_jacobian),
+        },
+    ),
 }
-"""Models by name: the papers' six velocities; these with roll and pitch; these with yaw and position."""
+"""Models by name: the papers' six velocities; with roll and pitch; with yaw and position; with the current."""
 
+CURRENT_STD, CURRENT_TIME = 0.2, 60.0  # m/s, s; assumed, of tides and wind about a coast
 METHODS = ("runge-kutta", "euler")
 ATTITUDES = ("input", "level")
 
@@ -122,6 +130,8 @@ def auv_model(
     attitude: str = "input",
     parameter_factors: Mapping[str, float] | None = None,
     operating_speed: float = CRUISE_SPEED,
+    current_std: float = CURRENT_STD,
+    current_time: float = CURRENT_TIME,
     process_noise_cov=None,
     measurement_noise_cov=None,
     prior_cov_factor: float = 1.0,
@@ -131,13 +141,17 @@ def auv_model(
 
     Args:
         states: "velocities" for (u, v, w, p, q, r), "motion" for these with (phi, theta), "navigation" for those
-            with (psi, x, y, z); None for "motion", or "navigation" if a sensor asks for it.
+            with (psi, x, y, z), "current" for those with the current (c_x, c_y) to the north and east; None for
+            "motion", or "navigation" if a sensor asks for it.
         sensors: as `auv_env.plant.make_plant` takes them; None for those of the suite "default" that the states
             predict.
         integration: "runge-kutta", or "euler" as the papers have it.
         attitude: of "velocities" alone: "input" for phi and theta as two further inputs, "level" for zeros.
         parameter_factors: factors on fields of `VehicleParameters`, by which the assumed vehicle differs.
         operating_speed: where a Kalman filter approximates the model, straight ahead [m/s].
+        current_std: of "current" alone: standard deviation of each component of the current at the start [m/s].
+        current_time: of "current" alone: it wanders at random, by a variance of 2 current_std^2 t / current_time
+            in a time t, as one does at first that changes within a time constant of so many seconds.
         process_noise_cov: Q of the model's n states, (n, n) or n variances; the plant's if None.
         measurement_noise_cov: R, (m, m) or m variances; the plant's if None.
         prior_cov_factor: P_0, the covariance of the filter's prior, over that of the plant's initial state.
@@ -157,6 +171,8 @@ def auv_model(
         attitude=attitude,
         parameter_factors=parameter_factors,
         operating_speed=operating_speed,
+        current_std=current_std,
+        current_time=current_time,
         process_noise_cov=process_noise_cov,
         measurement_noise_cov=measurement_noise_cov,
         prior_cov_factor=prior_cov_factor,
@@ -171,6 +187,8 @@ def model_of_plant(
     attitude: str = "input",
     parameter_factors: Mapping[str, float] | None = None,
     operating_speed: float = CRUISE_SPEED,
+    current_std: float = CURRENT_STD,
+    current_time: float = CURRENT_TIME,
     process_noise_cov=None,
     measurement_noise_cov=None,
     prior_cov_factor: float = 1.0,
@@ -191,9 +209,10 @@ def model_of_plant(
     thrust = cruise_thrust(plant.parameters, speed)
     torque = plant.propeller_torque or 0.0
     at_cruise = {"X_prop": thrust, "K_prop": torque * thrust}
-    high = operating_range(plant.parameters, plant.max_thrust)[:n]
+    std, wandering = positive("current_std", current_std), positive("current_time", current_time)
+    high = state_range(plant, n, std)
     prior_factor = positive("prior_cov_factor", prior_cov_factor)
-    q, r = _block(plant.process_noise_cov, n), plant.measurement_noise_cov
+    q, r = _block(plant.process_noise_cov, n, 2.0 * std**2 * plant.dt / wandering), plant.measurement_noise_cov
     if process_noise_cov is not None:
         q = covariance("process_noise_cov", process_noise_cov, n)
     if measurement_noise_cov is not None:
@@ -205,8 +224,8 @@ def model_of_plant(
         observe_jacobian=observe_jacobian,
         process_noise_cov=q,
         measurement_noise_cov=r,
-        prior_mean=plant.initial_mean[:n],
-        prior_cov=prior_factor * _block(plant.initial_cov, n),
+        prior_mean=np.append(plant.initial_mean, np.zeros(2))[:n],
+        prior_cov=prior_factor * _block(plant.initial_cov, n, std**2),
         inputs=len(inputs),
         constants=plant.constants,
         substeps=plant.substeps,
@@ -214,11 +233,17 @@ def model_of_plant(
         operating_input=[at_cruise.get(quantity.symbol, 0.0) for quantity in inputs],
         state_low=np.where(np.arange(n) == 0, 0.0, -high),
         state_high=high,
-        states=STATES[:n],
+        states=(*STATES, *CURRENT_STATES)[:n],
         input_quantities=inputs,
         measurements=[CHANNELS[name].quantity for name in plant.channels],
         outputs={symbol: output for symbol, output in OUTPUTS.items() if n > 6 or symbol == "U"},
     )
+
+
+def state_range(plant: Plant, n: int, current_std: float = CURRENT_STD) -> np.ndarray:
+    """Largest state (n,) of normal operation of n states; a current's is three standard deviations."""
+    own = operating_range(plant.parameters, plant.max_thrust)
+    return np.append(own, [3.0 * current_std] * len(CURRENT_STATES))[:n]
 
 
 MODEL_ARGUMENTS = tuple(inspect.signature(model_of_plant).parameters)[1:]
@@ -230,5 +255,8 @@ def _smallest(channels: tuple[str, ...]) -> str:
     return "motion" if all(MEASURED[channel] in within for channel in channels) else "navigation"
 
 
-def _block(cov: np.ndarray, n: int) -> np.ndarray:
-    return cov[:n, :n]
+def _block(cov: np.ndarray, n: int, of_current: float) -> np.ndarray:
+    """The covariance of the first n states, those of the vehicle and then those of the current."""
+    whole = np.diag(np.append(np.zeros(len(cov)), [of_current] * len(CURRENT_STATES)))
+    whole[: len(cov), : len(cov)] = cov
+    return whole[:n, :n]

@@ -18,6 +18,9 @@ STATES = (
     Quantity("position east", "y", "m"),
     Quantity("depth", "z", "m"),
 )
+CURRENT_STATES = (Quantity("current north", "c_x", "m/s"), Quantity("current east", "c_y", "m/s"))
+"""The current where a model estimates it; the vehicle's own states are the twelve above."""
+
 SYMBOLS = tuple(state.symbol for state in STATES)
 
 THRUST = Quantity("thrust", "X_prop", "N")
@@ -32,8 +35,4 @@ COMMANDS = (THRUST, *PLANES)
 ATTITUDE_INPUTS = STATES[6:8]
 """Roll and pitch where they are told from outside."""
 
-CURRENT_INPUTS = (
-    Quantity("current north", "c_x", "m/s"),
-    Quantity("current east", "c_y", "m/s"),
-    Quantity("current down", "c_z", "m/s"),
-)
+CURRENT_INPUTS = (*CURRENT_STATES, Quantity("current down", "c_z", "m/s"))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from auv_env.engine.copies import Copies
-from auv_env.engine.memory import READINGS, STATE, VALID, N
+from auv_env.engine.memory import CURRENT, READINGS, STATE, VALID, N
 from auv_env.plant import Plant
 from auv_env.task import make_task
 from plants.record import check_finite, record
@@ -19,6 +19,7 @@ class Simulation(NamedTuple):
     states: np.ndarray  # (B, K + 1, 12)
     measurements: np.ndarray  # (B, K + 1, m)
     valid: np.ndarray  # (B, K + 1, m), false where a measurement is missing and the last one repeated
+    current: np.ndarray  # (B, K + 1, 3), to the north, to the east and down [m/s]
 
     def checked(self, what: str = "a simulation") -> Simulation:
         """The same; ValueError that names the first step at which a number is not finite."""
@@ -37,4 +38,6 @@ def simulate(plant: Plant, keys: np.ndarray, inputs: np.ndarray) -> Simulation:
     m = len(plant.channels)
     reports = record(lambda count: Copies(plant, make_task(), count), keys, inputs, "inputs", len(plant.inputs))
     valid = reports[..., VALID : VALID + m] > 0.0
-    return Simulation(reports[..., STATE : STATE + N], reports[..., READINGS : READINGS + m], valid)
+    parts = (reports[..., first : first + count] for first, count in ((STATE, N), (READINGS, m), (CURRENT, 3)))
+    states, measurements, current = parts
+    return Simulation(states, measurements, valid, current)

@@ -60,20 +60,24 @@ def use_once(filter_: Filter) -> None:
     filter_.update(belief, np.zeros(filter_.model.m))
 
 
-def first_use(name: str, n: int, m: int) -> tuple[float, float]:
-    """Processor time [s] and growth of memory [MB] of a filter's first use."""
+def filter_of(name: str, n: int, m: int) -> Filter:
+    """A filter on a model of n states and m measurements."""
     numbers = {"ensemble_size": 10} if "ensemble_size" in tunable_numbers(name) else {}
-    filter_ = make_filter(name, model_of(name, n, m), **numbers)
+    return make_filter(name, model_of(name, n, m), **numbers)
+
+
+def timed_use(filter_: Filter) -> tuple[float, float]:
+    """Processor time [s] and growth of memory [MB] of a filter's first use."""
     memory, begin = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
     use_once(filter_)
     spent = time.process_time() - begin
     return spent, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory) / 1024
 
 
-def measured(name: str, n: int, m: int) -> tuple[float, float]:
-    """`first_use` in a process of its own, whose cache is empty."""
+def measured(module: str, *arguments: str) -> tuple[float, float]:
+    """What a module prints of `timed_use` in a process of its own, whose cache is empty."""
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", __spec__.name, str(n), str(m), name]
+        command = [sys.executable, "-m", module, *arguments]
         environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     return tuple(json.loads(done.stdout.splitlines()[-1]))
@@ -84,13 +88,14 @@ def main() -> None:
     if len(sys.argv) > 1:
         n, m, *names = sys.argv[1:]
         for name in names:
-            print(json.dumps(first_use(name, int(n), int(m))), flush=True)
+            print(json.dumps(timed_use(filter_of(name, int(n), int(m)))), flush=True)
         return
     print("| filter | " + " | ".join(f"n = {n}, m = {m}" for n, m in SIZES) + " |")
     print("|---|" + "--:|" * len(SIZES))
     for name in FILTERS:
         cells = (
-            f"{seconds:.1f} s, {megabytes:.0f} MB" for seconds, megabytes in (measured(name, *s) for s in SIZES)
+            f"{seconds:.1f} s, {megabytes:.0f} MB"
+            for seconds, megabytes in (measured(__spec__.name, str(n), str(m), name) for n, m in SIZES)
         )
         print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
 

@@ -7,16 +7,33 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.innovation_slopes import log_likelihood_slope
-from filters.recursion import recursion_of
-from filters.sensitivity_parts import slope_along
+from filters.likelihood_slopes import (
+    contraction,
+    curvature_by_components,
+    half_product,
+    log_likelihood_slope,
+    masked_inverse,
+    no_curvature,
+    present_rows_of,
+    slope_along,
+    with_transposed,
+)
 from numerics.angles import kept
 from numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
 from numerics.formulas import formula
-from numerics.matrices import innovation_likelihood
+from numerics.matrices import (
+    cholesky_factor,
+    factored_inverse,
+    innovation_likelihood,
+    masked,
+    row_solver,
+    vector_solver,
+)
+from numerics.sources import is_array
 from numerics.threads import spread
-from plants.layout import number_places
-from plants.shape import Functions, Shape, observation_slopes, transition_slopes
+from numerics.tuples import matrix_reader, matrix_writer, vector_reader, vector_writer
+from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape, innovation_of, observation_slopes, transition_slopes
 from plants.state_space import StateSpaceModel
 
 
@@ -35,8 +52,9 @@ def likelihood(
         log L = -1/2 sum_k (v' S^-1 v + log det 2 pi S),  v = z - h(m),  S = H P H' + R
 
     Beside mean m and covariance P the recursion carries dm and dP for each parameter: the derivative of every
-    equation of the filter. F = df/dx and H = dh/dx depend on the parameters through m; their derivatives along dm
-    are central differences of the model's Jacobians. For affine models they vanish and the gradient is exact.
+    equation of the filter, in which products that all parameters share are formed once a step. F = df/dx and H =
+    dh/dx depend on the parameters through m; their derivatives along dm are central differences of the model's
+    Jacobians, of large models along each component of x. For affine models they vanish and the gradient is exact.
 
     Args:
         model: holds Q and R, at which the gradient is taken.
@@ -78,47 +96,55 @@ def check_shapes(given: dict[str, np.ndarray], model: StateSpaceModel, *of_slope
 @cache
 def _build(functions: Functions, shape: Shape, interpreting: bool):
     n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
-    transition_matrix = transition_slopes(functions, shape)
-    observation_matrix = observation_slopes(functions, shape)
+    transition_matrix, observation_matrix = (
+        transition_slopes(functions, shape),
+        observation_slopes(functions, shape),
+    )
     transition = kept(transition, "x, u, c", shape.state_angles)
-    substeps = number_places(n, m).substeps
-    (
-        constants,
-        scales,
-        control,
-        reading,
-        prior_mean,
-        prior_cov,
-        q,
-        r,
-        q_slope,
-        r_slope,
-        mean_slope,
-        cov_slope,
-        store_mean_slope,
-        store_cov_slope,
-        difference,
-        root_of,
-        divide,
-        present_rows,
-        present,
-        moved,
-        moved_slope,
-        grown,
-        seen,
-        seen_slope,
-        correlation,
-        uneven_gain,
-        corrected,
-        corrected_slope,
-        reduced,
-        reduced_slope,
-    ) = recursion_of(shape)
-    motion_slope = slope_along(n, n, transition_matrix, "u, c")
+    places = number_places(n, m)
+    constants, scales, control = (
+        constants_reader(shape),
+        vector_reader(n, places.scales),
+        vector_reader(shape.inputs),
+    )
+    prior_mean = kept(vector_reader(n, places.prior_mean), "numbers", shape.state_angles)
+    prior_cov = matrix_reader(n, n, places.prior_cov)
+    q, r = matrix_reader(n, n, places.q), matrix_reader(m, m, places.r)
+    control, reading = vector_reader(shape.inputs), vector_reader(m)
+    q_slope, r_slope = matrix_reader(n, n), matrix_reader(m, m)
+    mean_slope, cov_slope = vector_reader(n), matrix_reader(n, n, n)  # a parameter's row: dx, then dP
+    store_mean_slope, store_cov_slope = vector_writer(n), matrix_writer(n, n, n)
+    difference, root_of, log_likelihood = (
+        innovation_of(shape),
+        cholesky_factor(m),
+        innovation_likelihood(m),
+    )
+    large = is_array(n, n)
+    curved = curvature_by_components(n, n, transition_matrix, "u, c") if large else no_curvature
+    motion_slope = contraction(n, n) if large else slope_along(n, n, transition_matrix, "u, c")
     observation_slope = slope_along(m, n, observation_matrix, "c")
-    log_likelihood, likelihood_slope = innovation_likelihood(m), log_likelihood_slope(m)
-    moved_mean_slope = formula("F dx", F=(n, n), dx=(n,))
-    seen_mean_slope = formula("H dx", H=(m, n), dx=(n,))  # less the slope of the innovation
+    present_rows, present = present_rows_of(m, n), masked(m)
+    divide, divide_one, inverse = row_solver(n, m), vector_solver(m), factored_inverse(m)  # by S, and its inverse
+    known, likelihood_slope = masked_inverse(m), log_likelihood_slope(m)
+
+    nn, mn, mm, nm = (n, n), (m, n), (m, m), (n, m)
+    moved = formula("F P F'", F=nn, P=nn)
+    carried = formula("P F'", P=nn, F=nn)
+    half_slope, moved_slope = formula("dF G", dF=nn, G=nn), with_transposed(n)  # dF P F' and its transpose
+    grown = formula("P + Q", P=nn, Q=nn)
+    seen = formula("H P H' + R", H=mn, P=nn, R=mm)
+    correlation = formula("P H'", P=nn, H=mn)
+    correlation_slope = formula("dP H' + P dH'", P=nn, dP=nn, H=mn, dH=mn)
+    seen_slope = formula("H C + dH B + dR", H=mn, dH=mn, C=nm, B=nm, dR=mm)
+    moved_mean_slope = formula("F dx", F=nn, dx=(n,))
+    seen_mean_slope = formula("H dx", H=mn, dx=(n,))  # less the slope of the innovation
+    corrected = kept(formula("x + K v", x=(n,), K=nm, v=(m,)), "x, K, v", shape.state_angles)
+    of_noise, corrected_slope = (
+        formula("K dS", K=nm, dS=mm),
+        formula("dx + C w - T w - K dy", dx=(n,), C=nm, T=nm, w=(m,), K=nm, dy=(m,)),
+    )
+    reduced = formula("P - K S K'", P=nn, K=nm, S=mm)
+    half_reduced, reduced_slope = half_product(n, m), with_transposed(n)
     fingerprint = function_fingerprint(transition, transition_matrix, observe, observation_matrix, within=__name__)
 
     def accumulate(all_inputs, measurements, numbers, q_slopes, r_slopes, out, first, last):
@@ -131,13 +157,14 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
             for k in range(measurements.shape[1]):
                 if k > 0:
                     u = control(all_inputs[b, k - 1])
-                    for _ in range(int(numbers[substeps])):
-                        f = transition_matrix(x, s, u, c)
+                    for _ in range(int(numbers[places.substeps])):
+                        f, curvature = transition_matrix(x, s, u, c), curved(x, s, u, c)
+                        g = carried(p, f)
                         for j in range(rows.shape[0]):
                             dx, dp = mean_slope(rows[j]), cov_slope(rows[j])
-                            df = motion_slope(x, s, dx, u, c)
+                            df = motion_slope(curvature, x, s, dx, u, c)
                             store_mean_slope(rows[j], moved_mean_slope(f, dx))
-                            store_cov_slope(rows[j], moved_slope(f, df, p, dp))
+                            store_cov_slope(rows[j], moved_slope(moved(f, dp), half_slope(df, g)))
                         x, p = transition(x, u, c), moved(f, p)
                     p = grown(p, q(numbers))
                     for j in range(rows.shape[0]):
@@ -146,17 +173,18 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
                 h = present_rows(observation_matrix(x, s, c), z)
                 v, spread_of_v = difference(z, observe(x, c)), seen(h, p, present(r(numbers), z))
                 root = root_of(spread_of_v)
-                gain = divide(correlation(p, h), root)
+                shared = correlation(p, h)
+                gain, w, s_inverse = divide(shared, root), divide_one(v, root), known(inverse(root), z)
                 out[b, 0] += log_likelihood(v, root, z)
                 for j in range(rows.shape[0]):
                     dx, dp = mean_slope(rows[j]), cov_slope(rows[j])
-                    dh = present_rows(observation_slope(x, s, dx, c), z)
-                    dy = seen_mean_slope(h, dx)
-                    ds = seen_slope(h, dh, p, dp, present(r_slope(r_slopes[j]), z))
-                    dgain = divide(uneven_gain(h, dh, p, dp, gain, ds), root)
-                    out[b, 1 + j] += likelihood_slope(v, dy, root, ds, z)
-                    store_mean_slope(rows[j], corrected_slope(dx, gain, dgain, v, dy))
-                    store_cov_slope(rows[j], reduced_slope(dp, gain, dgain, spread_of_v, ds))
+                    dh = present_rows(observation_slope(0.0, x, s, dx, c), z)
+                    dy, both = seen_mean_slope(h, dx), correlation_slope(p, dp, h, dh)
+                    ds = seen_slope(h, dh, both, shared, present(r_slope(r_slopes[j]), z))
+                    turned = of_noise(gain, ds)
+                    out[b, 1 + j] += likelihood_slope(w, s_inverse, dy, ds)
+                    store_mean_slope(rows[j], corrected_slope(dx, both, turned, w, gain, dy))
+                    store_cov_slope(rows[j], reduced_slope(dp, half_reduced(both, turned, gain)))
                 x, p = corrected(x, gain, v), reduced(p, gain, spread_of_v)
 
     return CompiledOrPython(accumulate)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from numerics.compiled import inlined
+from numerics.compiled import inlined, kept_apart
 
 
 def called(function):
@@ -16,7 +16,7 @@ def called(function):
     return inlined(function, into_callers=False)
 
 
-@called
+@kept_apart
 def _products_of_rows(a, b, lower):
     """A b', or its part on and below the diagonal: two rows and four share what is read, the last ones again.
 
@@ -49,13 +49,13 @@ def _products_of_rows(a, b, lower):
     return out
 
 
-@called
+@kept_apart
 def product_of_rows(a, b):
     """A b'."""
     return _products_of_rows(a, b, False)
 
 
-@called
+@kept_apart
 def add_product(out, a, b):
     """Add a b to the first rows of an array: four rows of b at a time are added to a row of it."""
     rows, inner, columns = a.shape[0], b.shape[0], b.shape[1]
@@ -79,7 +79,7 @@ def product(a, b):
     return out
 
 
-@called
+@kept_apart
 def deviations(table, first, rows, means, size):
     """Distances from means (rows,) in so many rows of a table from the first on, and `size` columns."""
     out = np.empty((rows, size))
@@ -104,7 +104,7 @@ def weighted_square_of_rows(d, table, weights):
     return out
 
 
-@called
+@kept_apart
 def square_of_rows(a):
     """A a', exactly symmetric."""
     out = _products_of_rows(a, a, True)
@@ -114,7 +114,7 @@ def square_of_rows(a):
     return out
 
 
-@called
+@kept_apart
 def solve_rows(b, factor):
     """B (l l')^-1 for a lower triangular l, of all rows of b at a time: forwards, then backwards."""
     rows, size = b.shape

@@ -31,7 +31,8 @@ _packages: dict[str, tuple[str, ...]] = {}  # see `may_be_inlined`
 _waiting: list[Callable] = []
 _marked: set[Callable] = set()
 _called: set[Callable] = set()  # of these, functions that are called and not inlined
-_lessons: list[Callable[[], None]] = [lambda: optimise_once(_called.__contains__, _is_large)]
+_apart: set[Callable] = set()  # of these, functions of which there is one copy
+_lessons: list[Callable[[], None]] = [lambda: optimise_once(_called.__contains__, _is_large, _apart.__contains__)]
 _interpreting = False
 
 
@@ -51,6 +52,16 @@ def inlined(function: Callable, *, into_callers: bool = True) -> Callable:
             _called.add(function)
         _waiting.append(function)
     return function
+
+
+def kept_apart(function: Callable) -> Callable:
+    """Mark a plain function that is called, of which there is one copy, however many functions call it.
+
+    For long loops, to which a call is nothing. Other functions that are called may still become part of callers,
+    where LLVM finds that worth while.
+    """
+    _apart.add(function)
+    return inlined(function, into_callers=False)
 
 
 def _is_large(function: Callable) -> bool:
@@ -106,7 +117,9 @@ def compiled(function: Callable) -> Callable:
         _lessons.pop()()
     while _waiting:
         inner = _waiting.pop()
-        register_jitable(forceinline=inner not in _called)(inner)  # by itself LLVM inlines small ones only
+        register_jitable(forceinline=inner not in _called, no_cfunc_wrapper=True)(
+            inner
+        )  # by itself LLVM inlines small ones only
     return keep_code(numba.njit(nogil=True, fastmath=set(FASTMATH), error_model="numpy")(function))
 
 

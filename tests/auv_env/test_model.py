@@ -13,7 +13,7 @@ from filters.registry import tunable_numbers
 from plants.affine import linearize
 from tests.auv_env.textbook import random_states
 
-SENSORS = {"velocities": "papers", "motion": "motion", "navigation": "usbl"}
+SENSORS = {"velocities": "papers", "motion": "motion", "navigation": "usbl", "current": "usbl"}
 
 
 def given(model, seed=0):
@@ -54,6 +54,30 @@ def test_six_velocities_get_roll_and_pitch_as_inputs_or_are_level():
     assert level.transition(x, (3.0, 0.1, 0.0), c) == told.transition(x, (3.0, 0.1, 0.0, 0.0, 0.0), c) != pitched
 
 
+def test_a_current_among_the_states_is_what_the_vehicle_goes_in():
+    model = auv_model(states="current")
+    navigation = auv_model(states="navigation")
+    x, u, c = (1.0, 0.1, -0.1, 0.1, -0.1, 0.1, 0.1, -0.2, 0.7, 3.0, -2.0, 5.0), (3.0, 0.1, -0.1), model.constants
+    still = model.transition((*x, 0.0, 0.0), u, c)
+    np.testing.assert_allclose(still, (*navigation.transition(x, u, c), 0.0, 0.0), rtol=1e-13)
+    drifting = (*x, 0.3, -0.2)
+    moved = dynamics.current_substep(
+        x, (3.0, -0.006 * 3.0, 0.1, -0.1, 0.3, -0.2, 0.0), derive_constants(SEGOROGENI, 0.05)
+    )
+    np.testing.assert_allclose(model.transition(drifting, u, c), (*moved, 0.3, -0.2), rtol=1e-13)
+    slopes = linearize(model.replace(transition_jacobian=None), drifting, u).matrices()[0]
+    np.testing.assert_allclose(model.transition_jacobian(drifting, u, c), slopes, atol=1e-8)
+
+
+def test_a_current_wanders_as_much_as_one_of_its_standard_deviation_and_time():
+    model = auv_model(states="current", current_std=0.3, current_time=100.0)
+    np.testing.assert_allclose(np.diag(model.process_noise_cov)[12:], 2 * 0.3**2 * 0.05 / 100.0)
+    np.testing.assert_allclose(np.diag(model.prior_cov)[12:], 0.3**2)
+    for name in ("current_std", "current_time"):
+        with pytest.raises(ValueError, match=f"{name} must be positive"):
+            auv_model(states="current", **{name: 0.0})
+
+
 def test_the_papers_integrate_by_euler():
     model = auv_model(states="velocities", sensors="papers", integration="euler", dt=0.001, propeller_torque=None)
     x, u = (1.0, 0.1, 0.0, 0.0, 0.1, 0.1), (3.0, 0.0, 0.1, 0.05, 0.0, 0.0)
@@ -68,7 +92,7 @@ def test_models_name_what_they_are_made_of():
     for states, (count, _) in MODELS.items():
         model = auv_model(states=states)
         assert (model.n, len(model.states)) == (count, count)
-        assert [one.symbol for one in model.states if one.angle] == ["psi"] * (count == 12)
+        assert [one.symbol for one in model.states if one.angle] == ["psi"] * (count >= 12)
         assert tuple(model.outputs) == (("U",) if count == 6 else ("U", "z_dot", "psi_dot"))
         assert (model.state_low < model.state_high).all() and model.state_low[0] == 0.0
         np.testing.assert_array_equal(model.operating_state, np.eye(count)[0])
@@ -119,7 +143,7 @@ def test_a_filter_may_assume_another_vehicle_and_other_noise():
             {"states": "velocities", "sensors": ["phi"]},
             "sensors of a model of 6 states must measure u, v, w, p, q, r, ",
         ),
-        ({"states": "pose"}, "states must be one of velocities, motion, navigation, but got 'pose'"),
+        ({"states": "pose"}, "states must be one of velocities, motion, navigation, current, but got 'pose'"),
         ({"integration": "heun"}, "integration must be one of runge-kutta, euler, but got 'heun'"),
         ({"attitude": "steep"}, "attitude must be one of input, level, but got 'steep'"),
         ({"parameter_factors": {"drag": 2}}, "parameter_factors must name fields of m, W, B"),

@@ -49,7 +49,7 @@ def function_of(folder):
     """A function whose source is a file in a folder."""
     path = folder / "doubling.py"
     path.write_text(SOURCE)
-    names = {}
+    names = {"__name__": __name__}  # where numba looks for what a function needs when it reads it from a cache
     exec(compile(SOURCE, str(path), "exec"), names)
     return names["double"]
 

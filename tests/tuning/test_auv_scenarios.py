@@ -7,7 +7,7 @@ import pytest
 import auv_env  # noqa: F401 - registers the envs
 import thruster_env  # noqa: F401 - as well
 from auv_env.manoeuvres import MANOEUVRES
-from filters import EstimateState, make_filter
+from filters import EstimateState, make_filter, run
 from numerics.streams import episode_keys
 from tests.tuned_files import write_untuned
 from tuning.auv.find import find_scenario
@@ -25,7 +25,7 @@ def short(name, **changes):
     return find_scenario(name).replace(steps=60, first_scored_step=10, **changes)
 
 
-@pytest.mark.parametrize("name", ["auv:dvl_dropout", "auv:current", "auv:papers"])
+@pytest.mark.parametrize("name", ["auv:dvl_dropout", "auv:estimated_current", "auv:papers"])
 def test_data_are_those_of_the_env_with_the_same_seed(name):
     scenario = short(name)
     data = scenario.data([5])
@@ -33,7 +33,8 @@ def test_data_are_those_of_the_env_with_the_same_seed(name):
     _, info = env.reset(seed=5)
     for k, action in enumerate([*data.inputs[0], None]):
         seen = np.where(info.get("measurement_valid", True), info["measurement"], np.nan)
-        np.testing.assert_array_equal(data.states[0, k], info["state"][: scenario.count])
+        whole = np.append(info["state"], info["current"])
+        np.testing.assert_array_equal(data.states[0, k], whole[: scenario.count])
         np.testing.assert_array_equal(data.measurements[0, k], seen)
         if action is not None:
             info = env.step(action)[-1]
@@ -117,7 +118,7 @@ def test_a_file_says_whose_scenario_it_is(tmp_path, monkeypatch):
             {"states": "motion", "scale": (1.0,) * 8},
             "sensors of a model of 8 states must measure u, v, .*, but got psi, z",
         ),
-        ({"states": "all"}, "states must be one of velocities, motion, navigation, but got 'all'"),
+        ({"states": "all"}, "states must be one of velocities, motion, navigation, current, but got 'all'"),
         ({"scale": (1.0,) * 8}, "scale must be 12 finite numbers"),
         (
             {"measurement_noise_cov": 1.0},
@@ -148,3 +149,18 @@ def test_a_tuned_file_keeps_which_states_its_model_has_and_goes_on_an_env(tmp_pa
             EstimateState(gym.make("SegorogeniAUV-v0", **{"sensors": "motion", **other}), tuned="tuned.json")
     with pytest.raises(ValueError, match="a plant's data must have"):
         EstimateState(gym.make("BowThruster-v0"), tuned="tuned.json")
+
+
+def test_a_filter_that_estimates_the_current_is_consistent_where_one_without_it_is_lost():
+    lost, told = (short(name).replace(steps=300) for name in ("auv:current", "auv:estimated_current"))
+    nees = []
+    for scenario in (lost, told):
+        data = scenario.data(range(8))
+        found = run(
+            make_filter("ekf", scenario.model(**scenario.true)), data.filter_keys, data.inputs, data.measurements
+        )
+        error = (found.means - data.states)[:, 10:, :8]
+        inverse = np.linalg.inv(found.covs[:, 10:, :8, :8])
+        nees.append(np.einsum("bki,bkij,bkj->bk", error, inverse, error).mean())
+    assert nees[0] > 100.0
+    assert nees[1] == pytest.approx(8.0, abs=1.0)

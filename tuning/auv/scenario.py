@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from auv_env.channels import MAX_CHANNELS
-from auv_env.model import MODELS, model_of_plant
-from auv_env.operating import operating_range
+from auv_env.model import MODELS, model_of_plant, state_range
 from auv_env.plant import DEFAULT_DT, DEFAULT_PROCESS_NOISE, DEFAULT_PROPELLER_TORQUE, Plant, make_plant
 from auv_env.plant_data import check_same_plant, plant_data
 from auv_env.quantities import STATES
@@ -34,15 +33,16 @@ class Scenario(BaseScenario):
     """A vehicle, an excitation and what a filter assumes of the vehicle.
 
     A filter's model has the first states of the twelve; it is the vehicle's, but for `parameter_factors`, and
-    knows the distribution of the initial state. Of sensor effects and the current it knows nothing.
+    knows the distribution of the initial state. Of sensor effects it knows nothing; the current is among the
+    states of "current", and unknown to the others.
 
     Attributes, beside those of `BaseScenario`:
         process_noise_cov: the vehicle's Q, twelve variances a step.
         measurement_noise_cov: the vehicle's R, a variance a channel.
         scale: of each of the model's states, the root of the Riccati covariance along the noise-free path, fixed
             numbers made by `scale.computed_scale`.
-        states: those of the model, "velocities" (6), "motion" (8) or "navigation" (12). With "velocities" roll and
-            pitch are inputs, true ones.
+        states: those of the model, "velocities" (6), "motion" (8), "navigation" (12) or "current" (14). With
+            "velocities" roll and pitch are inputs, true ones.
         preset: the vehicle, as for `auv_env.plant.make_plant`; so are all that follow.
         dt: sample time [s].
         propeller_torque: over thrust [m]; None makes it an input.
@@ -124,7 +124,7 @@ class Scenario(BaseScenario):
     @property
     def untuned(self) -> dict:
         """Model arguments of the untuned filter: R from the sheets, Q from 1 % of each state's range."""
-        top = operating_range(self.plant.parameters, self.plant.max_thrust)[: self.count]
+        top = state_range(self.plant, self.count)
         deviation = UNTUNED_RANGE_FRACTION * np.where(np.arange(self.count) == 0, 1.0, 2.0) * top
         return {
             "process_noise_cov": tuple(float(v) for v in deviation**2),
@@ -134,7 +134,9 @@ class Scenario(BaseScenario):
     @property
     def true(self) -> dict:
         """Model arguments of the filter that knows the vehicle's Q and R."""
-        return {**super().true, "process_noise_cov": self.process_noise_cov[: self.count]}
+        own = tuple(self.process_noise_cov[: self.count])
+        of_current = np.diag(model_of_plant(self.plant, states=self.states).process_noise_cov)[len(STATES) :]
+        return {**super().true, "process_noise_cov": (*own, *of_current.tolist())}
 
     def bound(self, data: Data) -> np.ndarray:
         """Riccati's standard deviation of each state (n,) along noise-free paths, over scored steps.
@@ -157,7 +159,8 @@ class Scenario(BaseScenario):
         inputs = commands
         if self.states == "velocities":
             inputs = np.concatenate([commands, found.states[:, :-1, 6:8]], axis=2)
-        states = np.ascontiguousarray(found.states[..., : self.count])
+        whole = np.concatenate([found.states, found.current], axis=2)
+        states = np.ascontiguousarray(whole[..., : self.count])
         model = self.model()
         outputs = {symbol: model.output(symbol, states) for symbol in model.outputs}
         measurements = np.where(found.valid, found.measurements, np.nan)  # as filters take missing ones

@@ -58,6 +58,9 @@ NAVIGATION_SCALE = (
     0.03428,
     0.004844,
 )
+CURRENT = {
+    direction: [{"name": "gauss-markov", "std": 0.2, "time_constant": 60.0}] for direction in ("north", "east")
+}
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
     for scenario in (
@@ -178,11 +181,32 @@ SCENARIOS: dict[str, Scenario] = {
             about="a current of about 0.2 m/s each way, slow to change, that the filter does not know",
             states="navigation",
             sensors="default",
-            current={
-                direction: [{"name": "gauss-markov", "std": 0.2, "time_constant": 60.0}]
-                for direction in ("north", "east")
-            },
+            current=CURRENT,
             scale=NAVIGATION_SCALE,
+            **MINUTE,
+        ),
+        Scenario(
+            name="auv:estimated_current",
+            about="the same current, two further states of the filter's model",
+            states="current",
+            sensors="default",
+            current=CURRENT,
+            scale=(
+                0.009718,
+                0.009672,
+                0.006036,
+                0.00252,
+                0.002223,
+                0.00218,
+                0.0006729,
+                0.0009328,
+                0.001792,
+                0.0536,
+                0.0539,
+                0.005383,
+                0.02306,
+                0.02347,
+            ),
             **MINUTE,
         ),
     )

@@ -10,6 +10,7 @@ import numpy as np
 
 from filters.likelihood import Likelihood, likelihood
 from numerics.checks import one_of
+from numerics.sources import is_array
 from tuning.likelihood.identifiability import KNOWN_WITHIN, TWO_SIDED
 from tuning.likelihood.noise import noise_family
 from tuning.problems.data import Data
@@ -24,6 +25,9 @@ STEP = 1e-3  # in the logarithms, of the differences of gradients that give the 
 FLAT = 1e-12  # curvature over the largest one, below which there is none
 DIVERGED = 1e12  # stands in for -log L where the filter diverges
 EQUAL_LOGARITHMS = 0.02  # optima this close in every logarithm are one
+PRECISE = 1e-13  # part of -log L, by which an iteration gains at least
+FEW_RUNS = 4  # with which a search of many states begins
+COARSE = 1e-9  # the same of many states, of whose log L, a million, no data can show a thousandth
 
 
 class Optimum(NamedTuple):
@@ -70,13 +74,10 @@ def maximise_likelihood(
 
     Source: Huber (1967), "The behavior of maximum likelihood estimates under nonstandard conditions".
     """
-    from scipy.optimize import minimize
-
     one_of("filter", filter_name, DIFFERENTIABLE)
     begin = time.perf_counter()
     parameters = model_parameters(problem)
     untuned = untuned_choice(filter_name, problem)
-    reference = np.array([one.get(untuned) for one in parameters], dtype=np.float64)
     noise_at = noise_family(untuned, problem, parameters)
     beginning = data.beginning if problem.leads_in and data.first_scored else None
 
@@ -89,21 +90,9 @@ def maximise_likelihood(
         before = likelihood(*noise_at(values, beginning))
         return Likelihood(found.values - before.values, found.gradients - before.gradients)
 
-    def negative(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
-        found = slopes(logarithms)
-        value, gradient = -found.values.sum(), -found.gradients.sum(axis=0)
-        if np.isfinite(value) and np.isfinite(gradient).all():
-            return value, gradient
-        return DIVERGED, np.zeros_like(gradient)  # the line search takes a shorter step
-
     bounds = [tuple(np.log([one.low, one.high])) for one in parameters]
-    optima = []
-    for start in starts_of(parameters) if starts is None else starts:
-        factors = np.broadcast_to(np.asarray(start, dtype=np.float64), reference.shape)
-        first = np.log(reference * factors)
-        found = minimize(negative, first, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": 1e-13})
-        start = tuple(factors.tolist())
-        optima.append(Optimum(start, np.exp(found.x), -found.fun, found.nfev, bool(found.success)))
+    given = starts_of(parameters) if starts is None else starts
+    optima = [optimum(filter_name, problem, data, start) for start in given]
     best = max(optima, key=lambda optimum: optimum.log_likelihood)
     errors = _standard_errors(slopes, np.log(best.variances))
     inside = np.array(
@@ -124,6 +113,48 @@ def maximise_likelihood(
         agree=all((distances < EQUAL_LOGARITHMS).all() for distances in apart),
         seconds=time.perf_counter() - begin,
     )
+
+
+def optimum(filter_name: str, problem: Problem, data: Data, start: Sequence[float] | float = 1.0) -> Optimum:
+    """The maximum to which one start leads, without the errors that `maximise_likelihood` tells.
+
+    Of models with many states, whose likelihood takes long, it is first sought on some runs alone, and the search
+    on all of them begins there; it ends where an iteration gains less than 1e-9 of log L.
+
+    Args:
+        filter_name: "kf" or "ekf".
+        problem: as for `maximise_likelihood`.
+        data: the runs to learn from.
+        start: factors on the untuned numbers, one for all or one each, (Q11, Q22, ..., R).
+    """
+    parameters = model_parameters(problem)
+    untuned = untuned_choice(filter_name, problem)
+    reference = np.array([one.get(untuned) for one in parameters], dtype=np.float64)
+    noise_at = noise_family(untuned, problem, parameters)
+    bounds = [tuple(np.log([one.low, one.high])) for one in parameters]
+    factors = np.broadcast_to(np.asarray(start, dtype=np.float64), reference.shape)
+    point, count = np.log(reference * factors), len(data.measurements)
+    is_large = is_array(len(problem.quantities.states), len(problem.quantities.states))
+    for runs in (FEW_RUNS, count) if is_large and count > FEW_RUNS else (count,):
+        some = data.slice(0, runs)
+        found = _minimum(lambda at, some=some: likelihood(*noise_at(np.exp(at), some)), point, bounds, is_large)
+        point = found.x
+    return Optimum(tuple(factors.tolist()), np.exp(point), -found.fun, found.nfev, bool(found.success))
+
+
+def _minimum(slopes: Callable, first: np.ndarray, bounds: list, is_large: bool):
+    """The least -log L of all runs, from a first point of logarithms on."""
+    from scipy.optimize import minimize
+
+    def negative(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
+        found = slopes(logarithms)
+        value, gradient = -found.values.sum(), -found.gradients.sum(axis=0)
+        if np.isfinite(value) and np.isfinite(gradient).all():
+            return value, gradient
+        return DIVERGED, np.zeros_like(gradient)  # the line search takes a shorter step
+
+    options = {"ftol": COARSE, "maxcor": 2 * len(first)} if is_large else {"ftol": PRECISE}
+    return minimize(negative, first, jac=True, bounds=bounds, method="L-BFGS-B", options=options)
 
 
 def starts_of(parameters: Sequence[Parameter]) -> list[tuple[float, ...]]:

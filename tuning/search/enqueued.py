@@ -6,9 +6,10 @@ import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from tuning.likelihood.gradient import maximise_likelihood
+from tuning.likelihood.gradient import optimum
 from tuning.search.cost import COST
 from tuning.search.outcome import best_trial, is_consistent, is_over_budget
+from tuning.search.parameters import model_parameters
 from tuning.search.plan import Plan
 from tuning.search.space import KIND, trial_parameters, untuned_choice
 from tuning.search.trials import NIS
@@ -120,11 +121,12 @@ def _enqueue_likeliest(study: optuna.Study, plan: Plan) -> None:
     if best is None:
         return
     name = "kf" if plan.kinds == ("kf",) else "ekf"
-    found = maximise_likelihood(name, plan.scenarios[0], plan.training_data()[0], [1.0])
+    found = optimum(name, plan.scenarios[0], plan.training_data()[0])
+    names = [one.name for one in model_parameters(plan.scenarios[0])]
     space = plan.space()
     likeliest = {
         name: float(np.clip(value, space[name].low, space[name].high))
-        for name, value in zip(found.names, found.best.variances, strict=True)
+        for name, value in zip(names, found.variances, strict=True)
     }
     study.enqueue_trial({**best.params, **likeliest}, user_attrs={LIKELIEST: True})
     if any(problem.leads_in for problem in plan.scenarios):  # recorded runs, whose likelihood is all there is
