@@ -6,10 +6,10 @@ from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
+from filters.likelihood_slopes import present_rows_of
 from numerics.angles import kept
 from numerics.formulas import formula
 from numerics.matrices import cholesky_factor, masked, row_solver
-from numerics.sources import entrywise
 from numerics.tuples import matrix_reader, matrix_writer, vector_reader, vector_writer
 from plants.layout import constants_reader, number_places
 from plants.shape import Shape, innovation_of
@@ -74,7 +74,7 @@ def recursion_of(shape: Shape) -> Recursion:
         difference=innovation_of(shape),
         root_of=cholesky_factor(m),
         divide=row_solver(n, m),  # by S
-        present_rows=_present_rows(m, n),
+        present_rows=present_rows_of(m, n),
         present=masked(m),
         moved=formula("F P F'", F=nn, P=nn),
         moved_slope=formula("dF P F' + F dP F' + F P dF'", F=nn, dF=nn, P=nn, dP=nn),
@@ -87,13 +87,4 @@ def recursion_of(shape: Shape) -> Recursion:
         corrected_slope=formula("dx + dK v - K dy", dx=(n,), K=nm, dK=nm, v=(m,), dy=(m,)),
         reduced=formula("P - K S K'", P=nn, K=nm, S=mm),
         reduced_slope=formula("dP - dK S K' - K dS K' - K S dK'", dP=nn, K=nm, dK=nm, S=mm, dS=mm),
-    )
-
-
-@cache
-def _present_rows(rows: int, columns: int):
-    """`keep(h, z)`: h with zeros in the rows of channels that are NaN in z."""
-    shape = rows, columns
-    return entrywise(
-        "keep", "h, z", shape, lambda i, j: f"h[{i}][{j}] if z[{i}] == z[{i}] else 0.0", h=shape, z=(rows,)
     )

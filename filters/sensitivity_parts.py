@@ -13,7 +13,7 @@ from numerics.angles import NAMES, short_way
 from numerics.compiled import inlined
 from numerics.derivatives import RELATIVE_STEP
 from numerics.formulas import formula
-from numerics.sources import Source, entrywise, matrix_of, tuple_of, written_out
+from numerics.sources import Source, entrywise, tuple_of, written_out
 from numerics.tuples import scaled_sum, vector_reader
 from plants.shape import Functions, Shape, constants_are_array, observation_slopes, transition_slopes
 
@@ -118,26 +118,3 @@ def _difference(rows: int, columns: int) -> Callable:
     return entrywise(
         "difference", "a, b, h", shape, lambda i, j: f"(a[{i}][{j}] - b[{i}][{j}]) / (2.0 * h)", a=shape, b=shape
     )
-
-
-@cache
-def slope_along(rows: int, columns: int, matrix, arguments: str):
-    """`slope(x, scales, d, <arguments>)`: the derivative of a Jacobian along d, by central differences."""
-    arrays = {"result": (rows, columns), "x": (columns,), "scales": (columns,), "d": (columns,)}
-    source = Source("slope", f"x, scales, d, {arguments}", **arrays)
-    if source.loops:
-        source.line("h = 1e-300")
-        for i in source.range(columns):
-            source.line(f"h = max(h, abs(d[{i}]) / (abs(x[{i}]) + scales[{i}]))")
-        source.line(f"h = {RELATIVE_STEP} / h")
-        source.line(f"above = matrix(move(x, h, d), scales, {arguments})")
-        source.line(f"below = matrix(move(x, -h, d), scales, {arguments})")
-        entry = source.matrix(rows, columns, lambda i, j: f"(above[{i}, {j}] - below[{i}, {j}]) / (2.0 * h)")
-        return source.function(entry, matrix=matrix, move=scaled_sum(columns))
-    sizes = ", ".join(f"abs(d[{i}]) / (abs(x[{i}]) + scales[{i}])" for i in range(columns))
-    lines = [f"h = {RELATIVE_STEP} / max(1e-300, {sizes})"]
-    for name, sign in (("above", "+"), ("below", "-")):
-        point = tuple_of(f"x[{i}] {sign} h * d[{i}]" for i in range(columns))
-        lines.append(f"{name} = matrix({point}, scales, {arguments})")
-    entry = matrix_of(rows, columns, lambda i, j: f"(above[{i}][{j}] - below[{i}][{j}]) / (2.0 * h)")
-    return written_out("slope", f"x, scales, d, {arguments}", *lines, entry, matrix=matrix)
