@@ -215,3 +215,24 @@ def test_shapes_and_degrees_that_do_not_fit_are_refused():
         sensitivity(make(**values), inputs, measurements, slopes._replace(constants=slopes.constants[:, 1:]))
     with pytest.raises(ValueError, match="degrees of freedom must be above 2, but got 1.0"):
         sensitivity(make(**values), inputs, measurements, slopes, degrees=1.0)
+
+
+def test_channels_that_are_only_predicted_move_nothing_and_count_after_the_others():
+    make, values, sizes, inputs, measurements = case("pendulum")
+    model, seen = make(**values), measurements.copy()
+    seen[..., 1] = np.nan
+    estimates = run(ExtendedKalmanFilter(model=model), episode_keys([0, 1]), inputs, seen)
+    errors = measurements[..., 1] - estimates.means[..., 1] - values["offset"]
+    r = model.measurement_noise_cov[1, 1]
+    of_predicted = np.nansum(0.5 * (errors**2 / r + np.log(2 * np.pi * r)), axis=1)
+    expected = estimates.log_likelihoods.sum(axis=1) - of_predicted
+
+    def found(changed):
+        slopes = slopes_of(make, changed, sizes)
+        return sensitivity(make(**changed), inputs, measurements, slopes, predicted=[False, True])
+
+    np.testing.assert_allclose(found(values).values, expected, rtol=1e-9)
+    for j, (one, size) in enumerate(sizes.items()):
+        above, below = (found({**values, one: values[one] + sign * 1e-4 * size}).values for sign in (1, -1))
+        slope = (above - below) / 2e-4
+        np.testing.assert_allclose(found(values).gradients[:, j], slope, rtol=1e-5, atol=1e-5 * abs(slope).max())
