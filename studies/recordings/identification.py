@@ -27,11 +27,11 @@ def _any(name: str, low: float, high: float, unit: str = "", default: float | No
 
 
 MOTOR = (
-    _positive("motor_rate", 8.0, 300.0, "1/s", 60.0),
+    _positive("motor_rate", 8.0, 200.0, "1/s", 60.0),
     _any("motor_gain", 40.0, 65.0, "rad/(s V)", 51.0),
 )
 BAND = (_any("dead_band_low", -1.2, -0.3, "V", -0.8), _any("dead_band_high", 0.3, 1.2, "V", 0.8))
-LAG = (_positive("tachometer_lag", 3e-3, 0.12, "s", 0.04),)
+LAG = (_positive("tachometer_lag", 8e-3, 0.12, "s", 0.04),)
 # Thrust over squared speed is 0.7 to 1.2 times 1e-3 within one ramp, and greatest before the water moves.
 BLADES = (_positive("thrust_factor", 8e-4, 2e-3, "N s^2", 1.5e-3),)
 SIDES = (_any("gain_ratio", 0.8, 1.25, default=1.0), _any("thrust_ratio", 0.8, 1.3, default=1.05))
@@ -91,7 +91,7 @@ STRUCTURES = {
     "no dead band": Structure(
         "... without the dead band", _without(BAND), {"dead_band_low": 0.0, "dead_band_high": 0.0}
     ),
-    "no lag": Structure("... without the tachometer's lag", _without(LAG), {"tachometer_lag": 3e-3}),
+    "no lag": Structure("... with a tachometer's lag of 8 ms", _without(LAG), {"tachometer_lag": 8e-3}),
     "symmetric": Structure(
         "... the same ahead and astern", _without(SIDES), {"gain_ratio": 1.0, "thrust_ratio": 1.0}
     ),

@@ -28,7 +28,7 @@ from plants.quantities import Output, Quantity
 from plants.state_space import StateSpaceModel
 
 DT = 0.04  # of the recordings [s]
-SUBSTEPS = 4
+SUBSTEPS = 4  # of 10 ms: stable for rates of up to 278 1/s
 IDENTIFIED = Path(__file__).with_name("identified.toml")
 
 
