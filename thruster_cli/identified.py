@@ -12,6 +12,7 @@ from thruster_env.preset_file import PresetFile, write_preset
 from tuning.identification.profiles import Profile, profile_figure
 from tuning.identification.result import Identification
 from tuning.identification.validation import Validation
+from tuning.identification.values import write_values
 from tuning.thruster.identification import ThrusterFamily
 
 
@@ -54,9 +55,12 @@ def write_files(
     plot: Path | None,
     logs: Sequence[str],
 ) -> list[str]:
-    """Write the preset file of a thruster, and the profiles; return the paths."""
+    """Write the preset file of a thruster or the values of a model, and the profiles; return the paths."""
     files = []
-    if out is not None:
+    if out is not None and not isinstance(family, ThrusterFamily):
+        write_values(out, found, logs)
+        files.append(str(out))
+    elif out is not None:
         write_preset(out, preset_of(found, family, logs), "A thruster as `thruster identify` found it.")
         files.append(str(out))
     if plot is not None and made:

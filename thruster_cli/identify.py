@@ -87,7 +87,7 @@ def command(
         Path | None, typer.Option(metavar="LOG", help="With --bollard: a step response, for the time constants.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help=f"Preset file; {DEFAULT_OUT} by default, for a thruster.")
+        Path | None, typer.Option(help=f"File of what is found, for --preset of other commands; {DEFAULT_OUT}.")
     ] = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Profile likelihoods.")] = None,
     seed: SeedOption = 0,
@@ -102,7 +102,8 @@ def command(
     With --predicted what is found is what predicts that channel best for a filter that does not have it: --sensor
     speed --sensor thrust --predicted thrust identifies on a stand what will estimate thrust on the ship.
 
-    Every --preset and gym.make(preset=...) take the preset file that comes out. Ctrl-C keeps the best so far.
+    The file that comes out is the --preset of other commands, of a thruster also of gym.make(preset=...); with
+    --model it holds the numbers of that model. Ctrl-C keeps the best so far.
 
     Example: thruster identify run*.csv --preset tunnel --free motor_damping,voltage_gain,dead_band
 
@@ -119,14 +120,13 @@ def command(
     options = {"sensors": sensor, "columns": column, "clock_offset": clock_offset, "dt": dt}
     if not logs:
         raise ValueError("identify must have at least one log, or --bollard TABLE.csv, but got none")
-    out = out or (DEFAULT_OUT if model is None else None)
+    out = out or DEFAULT_OUT
     family, runs, proving = split_runs(logs, held_out, use_all, preset, model, options, filter_name)
     family = family_of(family, runs, free, noise=not hold_noise)
     numbers, ranges = numbers_of("--start", pairs("--start", start)), ranges_of(pairs("--range", range_))
     parameters = with_ranges(family.free, ranges, numbers)
-    if out is not None and (model is not None or not is_file(out)):
-        rule = "be left out for a --model, whose values --json tells" if model else "end in .toml, a preset file"
-        raise ValueError(f"--out must {rule}, but got {str(out)!r}")
+    if out is not None and not is_file(out):
+        raise ValueError(f"--out must end in .toml, but got {str(out)!r}")
     for target in (out, plot):
         if target is not None:
             check_target(target)

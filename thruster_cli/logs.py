@@ -86,7 +86,7 @@ def read_named(
     Raises:
         ValueError: states the rule and the value.
     """
-    if model is not None and (preset is not None or sensors):
+    if model is not None and (sensors or (preset is not None and not str(preset).endswith(".toml"))):
         raise ValueError("a log must be of --model or of a thruster (--preset, --sensor), but got both")
     options = {
         "columns": pairs("--column", columns),
@@ -97,6 +97,10 @@ def read_named(
     }
     if model is not None:
         offer = object_named(model, "model")
+        if preset is not None:
+            from tuning.identification.values import with_values  # which imports Optuna
+
+            offer = with_values(offer, preset)
         return read_for(path, offer, **options)[0], offer
     log, _ = read_for(path, _states_of(preset or DEFAULT_PRESET, sensors), **options)
     return log, Preset(preset or DEFAULT_PRESET, sensors, log.dt)

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 from numerics.checks import finite, shown
 from numerics.files import write_whole
+from numerics.toml import as_toml
 from thruster_env.parameters import ThrusterParameters, checked
 
 SECTIONS = ("thruster", "dead_band", "recorder", "identified")
@@ -125,27 +126,4 @@ def write_preset(path: str | Path, preset: PresetFile, about: str = "") -> None:
         "recorder": preset.recorder,
         "identified": preset.identified,
     }
-    lines = [f"# {about}"] if about else []
-    for name, table in tables.items():
-        if table:
-            lines += [""] if lines else []
-            lines += [f"[{name}]", *(f"{_key(one)} = {_text(value)}" for one, value in table.items())]
-    write_whole(path, "\n".join(lines) + "\n")
-
-
-def _key(name: str) -> str:
-    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _text(name)
-
-
-def _text(value) -> str:
-    """A value as TOML has it."""
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{_key(name)} = {_text(part)}" for name, part in value.items()) + "}"
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(map(_text, value)) + "]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        characters = (f"\\u{ord(c):04X}" if ord(c) < 32 or c in '"\\\x7f' else c for c in value)
-        return '"' + "".join(characters) + '"'
-    return repr(float(value)) if isinstance(value, float) else repr(value)
+    write_whole(path, as_toml(tables, about))

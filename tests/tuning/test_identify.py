@@ -1,6 +1,7 @@
 """Parameters by maximum likelihood over innovations: values, standard errors, and what data do not determine."""
 
 import math
+import pickle
 import signal
 
 import numpy as np
@@ -15,6 +16,7 @@ from tuning.identification import identify, profile_figure, profiles, validate
 from tuning.identification.family import ModelFamily, with_ranges
 from tuning.identification.result import covariance
 from tuning.identification.runs import runs_of
+from tuning.identification.values import read_values, with_values, write_values
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 
@@ -237,3 +239,25 @@ def test_a_predicted_channel_is_learnt_from_but_never_seen(data):
         identify(data, pendulum, free, predicted=["a", "w"])
     with pytest.raises(ValueError, match="a predicted channel must be one of a, w, but got 'x'"):
         identify(data, pendulum, free, predicted=["x"])
+
+
+def test_values_of_a_model_go_into_a_file_and_back(found, tmp_path):
+    write_values(tmp_path / "mine.toml", found, ["a/run1.csv"])
+    assert read_values(tmp_path / "mine.toml") == found.values
+    made = with_values(pendulum, tmp_path / "mine.toml")
+    assert made(0.1).constants == pendulum(**found.values).constants
+    np.testing.assert_array_equal(made(0.1).process_noise_cov, pendulum(**found.values).process_noise_cov)
+    assert pickle.loads(pickle.dumps(made))(0.1).constants == made(0.1).constants
+    for text, rule in [
+        ("x = ", "must be TOML"),
+        ("[values]\nmass = 1.0", "free parameters must be of stiffness, .*mass"),
+        ("[values]\nstiffness = 'big'", "stiffness in .* must be a finite number"),
+        ("[thruster]\nlift = 1.0", r"must have the table \[values\]"),
+    ]:
+        (tmp_path / "bad.toml").write_text(text, encoding="utf-8")
+        with pytest.raises(ValueError, match=rule):
+            with_values(pendulum, tmp_path / "bad.toml")
+    with pytest.raises(ValueError, match="must be readable, but .*none.toml is not"):
+        read_values(tmp_path / "none.toml")
+    with pytest.raises(ValueError, match="must end in .toml"):
+        write_values(tmp_path / "mine.json", found, [])

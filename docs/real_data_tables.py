@@ -1,0 +1,64 @@
+"""Make the tables of docs/real_data.md from recordings that are no part of this project.
+
+    python -m docs.real_data_tables RECORDINGS [--results FILE.json] [FOLDER]
+
+RECORDINGS is the folder that `thruster study recordings --data` takes. What FILE.json, out/recordings.json by
+default, holds of identifications is not done again; without it they take a quarter of an hour on two cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from numerics.files import write_whole
+from numerics.markdown import table, with_tables
+from studies.recordings.comparison import estimates_of
+from studies.recordings.results import identify_all
+from studies.recordings.runs import read_recordings
+from studies.recordings.tables import (
+    CLOCK_HEADER,
+    LADDER_HEADER,
+    NUMBER_HEADER,
+    RATIO_HEADER,
+    baseline_header,
+    baseline_rows,
+    clock_rows,
+    ladder_rows,
+    number_rows,
+    ratio_rows,
+    sentences,
+)
+
+
+def tables_of(recordings: Path, results: Path) -> dict[str, Callable[[], str]]:
+    """What makes each table, by name."""
+    runs = read_recordings(recordings)
+    tasks = identify_all(runs, results, progress=lambda name, done, count: print(f"{done + 1}/{count} {name}"))
+    left_out, whole = estimates_of(runs, tasks), estimates_of(runs)
+    return {
+        "ratios": lambda: "\n\n".join(
+            [table(RATIO_HEADER, ratio_rows(runs, left_out)), *sentences(left_out, runs)]
+        ),
+        "all_runs": lambda: table(RATIO_HEADER, ratio_rows(runs, whole)),
+        "estimators": lambda: table(baseline_header(left_out), baseline_rows(runs, left_out)),
+        "clocks": lambda: table(CLOCK_HEADER, clock_rows(runs)),
+        "structures": lambda: table(LADDER_HEADER, ladder_rows(runs, tasks)),
+        "numbers": lambda: table(NUMBER_HEADER, number_rows(runs, tasks)),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write the page's tables anew."""
+    parser = argparse.ArgumentParser(prog="python -m docs.real_data_tables", description=__doc__.split("\n")[0])
+    parser.add_argument("recordings", type=Path)
+    parser.add_argument("--results", type=Path, default=Path("out") / "recordings.json")
+    parser.add_argument("folder", nargs="?", type=Path, default=Path(__file__).parent)
+    given = parser.parse_args(arguments)
+    page = given.folder / "real_data.md"
+    write_whole(page, with_tables(page.read_text(encoding="utf-8"), tables_of(given.recordings, given.results)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,76 @@
+"""Numbers that were found of somebody's own model, as a file that commands take with `--model` as its preset.
+
+[values]            of the model's arguments, named constants, Q11, Q22, ... and R11, ...
+[identified]        how they were found, for people
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+from numerics.checks import finite, shown
+from numerics.files import write_whole
+from numerics.toml import as_toml
+from plants.state_space import StateSpaceModel
+from tuning.identification.family import ModelFamily
+from tuning.identification.result import Identification
+
+TABLES = ("values", "identified")
+
+
+def write_values(path: str | Path, found: Identification, logs: Sequence[str]) -> None:
+    """Write what was found of a model; ValueError unless the path ends in .toml and can be written."""
+    if not str(path).endswith(".toml"):
+        raise ValueError(f"a file of values must end in .toml, but got {str(path)!r}")
+    identified = {
+        "logs": [Path(log).name for log in logs],
+        "log_likelihood": found.log_likelihood,
+        "standard_errors": found.standard_errors,
+        "determined": found.determined,
+    }
+    tables = {"values": found.values, "identified": identified}
+    write_whole(path, as_toml(tables, "Numbers of a model as `thruster identify` found them."))
+
+
+def read_values(path: str | Path) -> dict[str, float]:
+    """The numbers of such a file by name.
+
+    Raises:
+        ValueError: states the rule and the value, with the path.
+    """
+    try:
+        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"a file of values must be readable, but {path} is not: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:  # not TOML, nested too deeply, or not even text
+        raise ValueError(f"a file of values must be TOML, but {path} is not: {error}") from None
+    values = content.get("values")
+    if not isinstance(values, dict) or not values or set(content) - set(TABLES):
+        raise ValueError(f"a file of values must have the table [values], but {path} has {shown(sorted(content))}")
+    return {name: finite(f"{name} in {path}", value) for name, value in values.items()}
+
+
+def with_values(make: Callable | StateSpaceModel, path: str | Path) -> Callable[[float], StateSpaceModel]:
+    """A function of the sample time that makes a model with the numbers of a file.
+
+    Args:
+        make: the model, or what makes it, as `ModelFamily` takes it.
+        path: of the file.
+
+    Raises:
+        ValueError: if the file is off, or names what the model has not.
+    """
+    values = read_values(path)
+    made = partial(_made, make, values)
+    try:
+        made(1.0)
+    except ValueError as error:
+        raise ValueError(f"{error} (in {path})") from None
+    return made
+
+
+def _made(make: Callable | StateSpaceModel, values: dict[str, float], dt: float) -> StateSpaceModel:
+    return ModelFamily(make, tuple(values), noise=False, dt=dt).model(**values)
