@@ -40,7 +40,8 @@ class Objective:
 
     Args:
         data: `Data`, a `Log`, a sequence of such, or a function of some free parameters, named as its
-            arguments, that gives these: a clock offset moves the data.
+            arguments, that gives these: a clock offset moves the data. It may say by its `noise_factors` of the
+            same parameters what is left of R in channels, by symbol, where it interpolates.
         model: `model(**values)`, the model for values of the parameters; others than those of `data`.
         coordinates: of the parameters.
         filter: "ekf" or "kf".
@@ -92,6 +93,9 @@ class Objective:
         """The model at coordinates, as the filter runs on it."""
         values = {n: v for n, v in self.coordinates.named(at).items() if n not in self._of_data}
         model = make_filter(self.filter, self._model(**values)).kernel_model
+        if hasattr(self.data, "noise_factors"):
+            roots = np.sqrt(self._noise_factors(at, model))
+            model = model.replace(measurement_noise_cov=model.measurement_noise_cov * np.outer(roots, roots))
         if self.simulation:
             model = model.replace(process_noise_cov=np.zeros((model.n, model.n)))
         return model
@@ -102,6 +106,12 @@ class Objective:
             return self.data
         named = self.coordinates.named(at)
         return runs_of(self.data(**{name: named[name] for name in self._of_data}))
+
+    def _noise_factors(self, at: np.ndarray, model: StateSpaceModel) -> np.ndarray:
+        """What is left of R in each channel (m,), where the data are interpolated."""
+        named = self.coordinates.named(at)
+        factors = self.data.noise_factors(**{name: named[name] for name in self._of_data})
+        return np.array([factors.get(one.symbol, 1.0) for one in model.measurements])
 
     def value(self, at: np.ndarray) -> float:
         """Log-likelihood of all runs; minus infinity where it has none."""
@@ -144,9 +154,13 @@ class Objective:
         )
         scores = np.concatenate(found.block_gradients)
         information = found.information.sum(axis=0)
-        value = float(found.values.sum())
+        values = found.values
+        if hasattr(self.data, "noise_factors"):  # densities of the samples, whatever they are averaged to
+            counts = (~np.isnan(runs.measurements)).sum(axis=1)
+            values = values + 0.5 * counts @ np.log(self._noise_factors(at, model))
+        value = float(values.sum())
         value = value if math.isfinite(value) else -math.inf
-        return Evaluation(value, scores.sum(axis=0), information, scores, found.values)
+        return Evaluation(value, scores.sum(axis=0), information, scores, values)
 
     def _slopes(self, at: np.ndarray, places: Sequence[int]) -> ModelSlopes:
         pairs = [self._pair(at, j) for j in places]

@@ -39,6 +39,8 @@ class WithoutOutliers:
         """Take what `Objective` takes, and which samples (B, K + 1, m) are left out."""
         self._data, self.outliers = data, outliers
         self.parameters = getattr(data, "parameters", ())
+        if hasattr(data, "noise_factors"):
+            self.noise_factors = data.noise_factors
 
     def __call__(self, **values: float) -> Data:
         """The runs, NaN where a sample is left out."""

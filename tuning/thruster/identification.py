@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 
 from numerics.checks import shown
+from plants.logs.grid import NEIGHBOURS
 from plants.logs.log import Log, at_offset
 from plants.state_space import StateSpaceModel
 from thruster_env.logged import NO_BAND, Shown, lag_weights, with_shown
@@ -194,7 +196,12 @@ class ThrusterFamily:
 
 
 class ShiftedLogs:
-    """Logs as a function of clock offsets of their channels [s]."""
+    """Logs as a function of clock offsets of their channels [s].
+
+    Of a channel that is shifted every other row counts. Between two samples it is interpolated, and so the noise
+    of rows one after the other is correlated; a likelihood of white noise would then take a wrong offset for a
+    good one. Every other row shares no sample with the next.
+    """
 
     def __init__(self, logs: Sequence[Log], names: Sequence[str]):
         """Take logs, and the names clock_offset_CHANNEL."""
@@ -204,10 +211,40 @@ class ShiftedLogs:
         """The logs with the channels' clocks set."""
         return [self._shifted(log, offsets) for log in self.logs]
 
+    def noise_factors(self, **offsets: float) -> dict[str, float]:
+        """What is left of the variance of white noise in each shifted channel, by symbol.
+
+        A sample between two others is w and 1 - w of these, and its noise has w^2 + (1 - w)^2 of their variance. A
+        likelihood that does not know this would take offsets of half a sample for good models.
+        """
+        found = {}
+        for name, seconds in offsets.items():
+            channel = name.removeprefix("clock_offset_")
+            parts = [_left(log, f"measurement:{channel}", seconds) for log in self.logs]
+            found[channel] = float(np.mean(np.concatenate(parts)))
+        return found
+
     def _shifted(self, log: Log, offsets: Mapping[str, float]) -> Log:
         for name, seconds in offsets.items():
-            log = at_offset(log, f"measurement:{name.removeprefix('clock_offset_')}", seconds)
+            channel = f"measurement:{name.removeprefix('clock_offset_')}"
+            dense = np.median(np.diff(log.series(channel).times)) < NEIGHBOURS * log.dt
+            log = at_offset(log, channel, seconds)
+            if dense:
+                rows = log.measurements.copy()
+                rows[1::2, [one.symbol for one in log.measured].index(channel.partition(":")[2])] = np.nan
+                log = replace(log, measurements=rows)
         return log
+
+
+def _left(log: Log, channel: str, seconds: float) -> np.ndarray:
+    """w^2 + (1 - w)^2 of each row of a shifted channel that lies between two samples near one another."""
+    samples = log.series(channel).times
+    times = log.times + seconds
+    after = np.clip(np.searchsorted(samples, times), 1, len(samples) - 1)
+    gap = samples[after] - samples[after - 1]
+    w = (times - samples[after - 1]) / gap
+    between = (w >= 0) & (w <= 1) & (gap < NEIGHBOURS * log.dt)
+    return w[between] ** 2 + (1 - w[between]) ** 2 if between.any() else np.ones(1)
 
 
 def _about(name: str, value: float, unit: str) -> Parameter:
