@@ -15,6 +15,8 @@ from pathlib import Path
 from numerics.files import write_whole
 from numerics.markdown import table, with_tables
 from studies.recordings.comparison import estimates_of
+from studies.recordings.model import model
+from studies.recordings.regime import regimes
 from studies.recordings.results import identify_all
 from studies.recordings.runs import read_recordings
 from studies.recordings.tables import (
@@ -37,7 +39,16 @@ def tables_of(recordings: Path, results: Path) -> dict[str, Callable[[], str]]:
     runs = read_recordings(recordings)
     tasks = identify_all(runs, results, progress=lambda name, done, count: print(f"{done + 1}/{count} {name}"))
     left_out, whole = estimates_of(runs, tasks), estimates_of(runs)
+
+    def regime() -> str:
+        rows = [
+            [f"{one.factor:g}", f"{one.log_likelihood:.0f}", f"{one.nis:.2f}", f"{one.ratio:.3f}"]
+            for one in regimes(model(), runs)
+        ]
+        return table(["Q times", "log-likelihood of the tachometer", "mean NIS", "ratio, mean"], rows)
+
     return {
+        "regime": regime,
         "ratios": lambda: "\n\n".join(
             [table(RATIO_HEADER, ratio_rows(runs, left_out)), *sentences(left_out, runs)]
         ),

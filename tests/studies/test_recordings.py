@@ -12,6 +12,7 @@ from studies.recordings.comparison import LOOKUP, OURS, OWN, STATIC, estimates_o
 from studies.recordings.identification import CHOSEN, STRUCTURES, Structure, identified, thrusts
 from studies.recordings.measure import averaged, best_rmse, error, ratios, rmse, settled_rmse
 from studies.recordings.model import DT, model, to_identify, with_values
+from studies.recordings.regime import after_reversal, regimes
 from studies.recordings.results import identify_all, tasks_of
 from studies.recordings.runs import read_recordings
 from studies.recordings.tables import ladder_rows, number_rows
@@ -20,6 +21,7 @@ from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtur
 RECORDED = Path(__file__).parents[3] / "shared" / "data" / "rov_thruster"
 TRUTH = {"inertia": 0.01, "thrust_factor": 1.2e-3, "dead_band_high": 0.9, "Q11": 1.0, "Q22": 0.04, "R22": 0.04}
 OFFSET = 0.05
+SERIES = "times", "command", "flow", "tachometer", "load", "own", "desired"
 HEADER = (
     "t_s,Td_N,n_desired_rad_s,u_cmd_V,y_tach_abs_rad_s,y_flow_m_s,loadcell_thrust_N,loadcell_torque_Nm,"
     "loadcell_tach_abs_rad_s,authors_nhat_rad_s,authors_vhat_axial_m_s,authors_vahat_ambient_m_s"
@@ -105,6 +107,19 @@ def test_numbers_found_from_runs_estimate_thrust_where_the_load_cell_is_not(runs
     worse = thrusts(structure.model(thrust_factor=2e-3), runs)
     for one, other, run in zip(better, worse, runs, strict=True):
         assert len(one) == len(run.times) and settled_rmse(one, run) < 0.5 * settled_rmse(other, run)
+
+
+def test_more_noise_after_reversals_is_the_projects_filter_where_there_is_none(runs):
+    assert (
+        after_reversal(np.array([0.0, -1.0, -1.0, *[-1.0] * 12, 2.0, 2.0])).tolist()
+        == [True] * 11 + [False] * 4 + [True] * 2
+    )
+    short = [runs[1]._replace(**{name: getattr(runs[1], name)[:40] for name in SERIES})]
+    (one,) = regimes(with_values(to_identify(), TRUTH), short, [1.0])
+    ours = thrusts(with_values(to_identify(), TRUTH), short)[0]
+    assert one.ratio == pytest.approx(ratios(ours, short[0]).averaged, rel=1e-6)
+    (more,) = regimes(with_values(to_identify(), TRUTH), short, [16.0])
+    assert more.nis < one.nis
 
 
 def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
