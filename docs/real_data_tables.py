@@ -1,4 +1,4 @@
-"""Make the tables of docs/real_data.md from recordings that are no part of this project.
+"""Make the tables of docs/real_data.md, and the numbers that the project takes, from recordings of others.
 
     python -m docs.real_data_tables RECORDINGS [--results FILE.json] [FOLDER]
 
@@ -9,15 +9,17 @@ default, holds of identifications is not done again; without it they take a quar
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from numerics.files import write_whole
 from numerics.markdown import table, with_tables
+from numerics.toml import as_toml
 from studies.recordings.comparison import estimates_of
-from studies.recordings.model import model
+from studies.recordings.identification import CHOSEN
+from studies.recordings.model import IDENTIFIED, model
 from studies.recordings.regime import regimes
-from studies.recordings.results import identify_all
+from studies.recordings.results import Task, identify_all
 from studies.recordings.runs import read_recordings
 from studies.recordings.tables import (
     CLOCK_HEADER,
@@ -38,6 +40,7 @@ def tables_of(recordings: Path, results: Path) -> dict[str, Callable[[], str]]:
     """What makes each table, by name."""
     runs = read_recordings(recordings)
     tasks = identify_all(runs, results, progress=lambda name, done, count: print(f"{done + 1}/{count} {name}"))
+    keep(tasks[Task(CHOSEN).name], [run.name for run in runs])
     left_out, whole = estimates_of(runs, tasks), estimates_of(runs)
 
     def regime() -> str:
@@ -58,6 +61,13 @@ def tables_of(recordings: Path, results: Path) -> dict[str, Callable[[], str]]:
         "structures": lambda: table(LADDER_HEADER, ladder_rows(runs, tasks)),
         "numbers": lambda: table(NUMBER_HEADER, number_rows(runs, tasks)),
     }
+
+
+def keep(task: Mapping, runs: Sequence[str]) -> None:
+    """Write the numbers that the project takes."""
+    known = {name: task[name] for name in ("log_likelihood", "standard_errors", "determined")}
+    tables = {"values": task["values"], "identified": {"logs": list(runs), **known}}
+    write_whole(IDENTIFIED, as_toml(tables, "Found by `python -m docs.real_data_tables`; see docs/real_data.md."))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

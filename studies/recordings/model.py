@@ -19,13 +19,13 @@ Source of motor, dead band, blades and flow: J. A. Boehm (2019), MSc thesis, Uni
 from __future__ import annotations
 
 import math
-import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
 from numerics.integration import runge_kutta
 from plants.quantities import Output, Quantity
 from plants.state_space import StateSpaceModel
+from tuning.identification.values import read_values
 
 DT = 0.04  # of the recordings [s]
 SUBSTEPS = 4  # of 10 ms: stable for rates of up to 278 1/s
@@ -193,8 +193,7 @@ def model() -> StateSpaceModel:
 
     Its output T is the thrust; a load cell's column may be its reference (`--column T=HEADER`).
     """
-    values = tomllib.loads(IDENTIFIED.read_text(encoding="utf-8"))["values"]
-    return on_line(with_values(to_identify(), values))
+    return on_line(with_values(to_identify(), read_values(IDENTIFIED)))
 
 
 def with_values(base: StateSpaceModel, values: dict[str, float]) -> StateSpaceModel:
