@@ -15,7 +15,8 @@ from rich.text import Text
 from filters.filter import Filter
 from filters.registry import FILTERS, filter_class, tunable_numbers
 from thruster_cli.fitting import fit_table, fits_of
-from thruster_cli.output import PROBLEMS, JsonOption, console, emit, table
+from thruster_cli.output import JsonOption, console, emit, table
+from thruster_cli.problems import PROBLEMS
 from tuning.problems.find import find_problem
 from tuning.search.space import has_ensemble
 

@@ -67,7 +67,7 @@ def test_every_link_leads_somewhere():
 
 def test_the_command_that_makes_the_page_is_there():
     assert "thruster study policies --page docs/policies.md" in PAGE
-    assert [command.name for command in app.registered_commands] == ["policies"]
+    assert "policies" in [command.name for command in app.registered_commands]
 
 
 def test_filtered_state_closes_the_gap_and_noise_costs():

@@ -32,8 +32,7 @@ def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float 
 
     Raises ValueError if no steady state is found.
     """
-    from scipy.integrate import solve_ivp
-    from scipy.optimize import brentq, root
+    from scipy.optimize import brentq
 
     c = derive_constants(p, ambient_velocity)
     if voltage == 0 and ambient_velocity == 0:
@@ -59,6 +58,9 @@ def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float 
     omega = 2.0 * drive / (c.motor_damping + (c.motor_damping**2 + 4.0 * load * drive) ** 0.5)
     x = np.array([omega, ratio * omega]) * (sign if voltage else 0.0)
     if ambient_velocity != 0:
+        from scipy.integrate import solve_ivp  # a tenth of a second, which others need not wait
+        from scipy.optimize import root
+
         u = (voltage, ambient_velocity)
         settled = solve_ivp(lambda t, y: rates(tuple(y), u, c), (0.0, 1e5), x, method="LSODA", rtol=1e-8)
         solution = root(lambda y: rates(tuple(y), u, c), settled.y[:, -1], jac=lambda y: _plant_matrix(y, u, c))
