@@ -1,8 +1,20 @@
-"""Tables of plain values as TOML, which the standard library reads but does not write."""
+"""TOML files: read with one clear line for what is wrong, and written, which the standard library does not."""
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
+from pathlib import Path
+
+
+def read_toml(path: str | Path, what: str) -> dict:
+    """The content of a TOML file; ValueError, with the path and what it is ("a preset file"), if there is none."""
+    try:
+        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{what} must be readable, but {path} is not: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:  # not TOML, nested too deeply, or not even text
+        raise ValueError(f"{what} must be TOML, but {path} is not: {error}") from None
 
 
 def as_toml(tables: Mapping[str, Mapping], about: str = "") -> str:

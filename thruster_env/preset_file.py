@@ -13,14 +13,13 @@ too. Nothing in a file is run.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from numerics.checks import finite, shown
 from numerics.files import write_whole
-from numerics.toml import as_toml
+from numerics.toml import as_toml, read_toml
 from thruster_env.parameters import ThrusterParameters, checked
 
 SECTIONS = ("thruster", "dead_band", "recorder", "identified")
@@ -48,12 +47,7 @@ def read_preset(path: str | Path) -> PresetFile:
     Raises:
         ValueError: states the rule and the value, with the path.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"a preset file must be readable, but {path} is not: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:  # not TOML, nested too deeply, or not even text
-        raise ValueError(f"a preset file must be TOML, but {path} is not: {error}") from None
+    content = read_toml(path, "a preset file")
     try:
         return _checked(content)
     except ValueError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -10,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from numerics.checks import finite, positive, shown
+from numerics.toml import read_toml
 from plants.logs.columns import INPUT, MEASUREMENT, TIME, Column, Wanted, find_columns, find_wanted, quantities_of
 from plants.logs.grid import Grid, Series, grid_of, held, sampled
 from plants.logs.log import FEWEST_STEPS, Log
@@ -119,10 +119,7 @@ def _described(path: Path) -> Description:
     beside = path.with_suffix(".toml")
     if not beside.is_file():
         return Description()
-    try:
-        content = tomllib.loads(beside.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"what is said of a log must be TOML, but {beside} is not: {error}") from None
+    content = read_toml(beside, "what is said of a log")
     unknown = sorted(set(content) - set(Description._fields))
     if unknown:
         raise ValueError(

@@ -6,14 +6,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
 from numerics.checks import finite, shown
 from numerics.files import write_whole
-from numerics.toml import as_toml
+from numerics.toml import as_toml, read_toml
 from plants.state_space import StateSpaceModel
 from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification
@@ -41,12 +40,7 @@ def read_values(path: str | Path) -> dict[str, float]:
     Raises:
         ValueError: states the rule and the value, with the path.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"a file of values must be readable, but {path} is not: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:  # not TOML, nested too deeply, or not even text
-        raise ValueError(f"a file of values must be TOML, but {path} is not: {error}") from None
+    content = read_toml(path, "a file of values")
     values = content.get("values")
     if not isinstance(values, dict) or not values or set(content) - set(TABLES):
         raise ValueError(f"a file of values must have the table [values], but {path} has {shown(sorted(content))}")

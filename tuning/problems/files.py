@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import TypeVar
 
 from numerics.checks import one_of, shown
+from numerics.toml import read_toml
 from tuning.problems.rooms import ROOMS, room_of
 from tuning.problems.scenario import BaseScenario
 
@@ -36,12 +36,7 @@ def read_scenario(path: str | Path) -> BaseScenario:
     Raises:
         ValueError: states the rule and the value, with the path.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ValueError(f"a scenario file must be readable, but {path} is not: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:  # not TOML, nested too deeply, or not even text
-        raise ValueError(f"a scenario file must be TOML, but {path} is not: {error}") from None
+    content = read_toml(path, "a scenario file")
     room = _room(content, path)
     known = (PLANT, BASE, *_fields(room.Scenario))
     unknown = sorted(set(content) - set(known))
