@@ -12,7 +12,7 @@ from studies.recordings.model import model
 from studies.recordings.results import Task
 from studies.recordings.runs import Recording
 
-OURS, OWN, DESIRED, STATIC, LOOKUP = "ours", "recorder's own", "desired thrust", "static map", "lookup"
+OURS, OWN, DESIRED, STATIC, LOOKUP = "ours", "recorder's", "desired", "static map", "lookup"
 # Least squares on the table of steady states in the same source, ahead and astern.
 STATIC_FACTORS = 0.968e-3, 0.979e-3  # T = c n|n| [N s^2]
 LOOKUP_FACTORS, LOOKUP_BAND = (2.51, 2.62), 0.84  # T = k (|u| - 0.84)^2 [N/V^2, V]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from studies.recordings.comparison import OURS, OWN, structure_ratios
+from studies.recordings.comparison import OURS, structure_ratios
 from studies.recordings.identification import CHOSEN, STRUCTURES
 from studies.recordings.measure import ratios, rmse, settled_rmse
 from studies.recordings.results import Task
@@ -41,9 +41,7 @@ def baseline_rows(runs: Sequence[Recording], estimates: Estimates) -> list[list[
     """RMSE of every estimator over 0.2 s on each run: all rows, then settled ones [N]."""
     rows = []
     for place, run in enumerate(runs):
-        cells = [
-            f"{rmse(one[place], run):.2f} / {settled_rmse(one[place], run):.2f}" for one in estimates.values()
-        ]
+        cells = [f"{rmse(one[place], run):.2f}/{settled_rmse(one[place], run):.2f}" for one in estimates.values()]
         rows.append([run.name, *cells])
     return rows
 
@@ -80,7 +78,7 @@ def sentences(estimates: Estimates, runs: Sequence[Recording]) -> list[str]:
     found = np.array([ratios(one, run) for one, run in zip(estimates[OURS], runs, strict=True)])
     averaged, best, raw = found.T
     return [
-        f"Averaged over 0.2 s the error of the estimated thrust is {averaged.mean():.2f} times that of the {OWN} "
+        f"Averaged over 0.2 s the error of the estimated thrust is {averaged.mean():.2f} times that of the recorder's own "
         f"on average, at most {averaged.max():.2f}; with the best clock for each, at most {best.max():.2f}; on "
         f"raw rows {raw.min():.2f} to {raw.max():.2f}."
     ]
