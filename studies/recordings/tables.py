@@ -78,7 +78,7 @@ def sentences(estimates: Estimates, runs: Sequence[Recording]) -> list[str]:
     found = np.array([ratios(one, run) for one, run in zip(estimates[OURS], runs, strict=True)])
     averaged, best, raw = found.T
     return [
-        f"Averaged over 0.2 s the error of the estimated thrust is {averaged.mean():.2f} times that of the recorder's "
-        f"own on average, at most {averaged.max():.2f}; with the best clock for each, at most {best.max():.2f}; on "
-        f"raw rows {raw.min():.2f} to {raw.max():.2f}."
+        f"Averaged over 0.2 s the error of the estimated thrust is on average {averaged.mean():.2f} times that of "
+        f"the recorder's own, at most {averaged.max():.2f}; with the best clock for each, at most {best.max():.2f}; "
+        f"on raw rows {raw.min():.2f} to {raw.max():.2f}."
     ]
