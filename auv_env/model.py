@@ -11,6 +11,7 @@ import numpy as np
 from auv_env import dynamics
 from auv_env.channels import CHANNELS, MEASURED, channels_of, suite
 from auv_env.kinematics import angle_rates, attitude_of, in_earth_axes
+from auv_env.measured_attitude import derivative_by_attitude, split_channels
 from auv_env.operating import cruise_thrust, operating_range
 from auv_env.parameters import VehicleParameters, checked
 from auv_env.plant import CRUISE_SPEED, Plant, make_plant
@@ -66,7 +67,7 @@ MODELS = {
 
 CURRENT_STD, CURRENT_TIME = 0.2, 60.0  # m/s, s; assumed, of tides and wind about a coast
 METHODS = ("runge-kutta", "euler")
-ATTITUDES = ("input", "level")
+ATTITUDES = ("input", "measured", "level")
 
 
 @makes_functions
@@ -79,7 +80,7 @@ def transition_of(states: str, method: str, torque_is_input: bool, attitude: str
         inputs = ["u[0]", "c.propeller_torque * u[0]", "u[1]", "u[2]"]
     if states == "velocities":
         first = 4 if torque_is_input else 3
-        inputs += [f"u[{first}]", f"u[{first + 1}]"] if attitude == "input" else ["0.0", "0.0"]
+        inputs += [f"u[{first}]", f"u[{first + 1}]"] if attitude != "level" else ["0.0", "0.0"]
     source = f"move(x, {tuple_of(inputs)}, c)"
     return (
         written_out("transition", "x, u, c", source, move=step),
@@ -146,7 +147,8 @@ def auv_model(
         sensors: as `auv_env.plant.make_plant` takes them; None for those of the suite "default" that the states
             predict.
         integration: "runge-kutta", or "euler" as the papers have it.
-        attitude: of "velocities" alone: "input" for phi and theta as two further inputs, "level" for zeros.
+        attitude: of "velocities" alone: "input" for phi and theta as two further inputs, "measured" for these as
+            the sensors measure them, see `auv_env.measured_attitude`, "level" for zeros.
         parameter_factors: factors on fields of `VehicleParameters`, by which the assumed vehicle differs.
         operating_speed: where a Kalman filter approximates the model, straight ahead [m/s].
         current_std: of "current" alone: standard deviation of each component of the current at the start [m/s].
@@ -162,7 +164,7 @@ def auv_model(
     """
     if sensors is None:
         states = "motion" if states is None else one_of("states", states, tuple(MODELS))
-        known = SYMBOLS[: MODELS[states].count]
+        known = SYMBOLS[: max(MODELS[states].count, 8 if attitude == "measured" else 0)]
         sensors = [channel for channel in suite("default") if MEASURED[channel] in known]
     return model_of_plant(
         make_plant(sensors=sensors, **plant_arguments),
@@ -198,13 +200,13 @@ def model_of_plant(
     method = one_of("integration", integration, METHODS)
     attitude = one_of("attitude", attitude, ATTITUDES)
     n, torque_is_input = MODELS[states].count, plant.propeller_torque is None
-    observe, observe_jacobian = observation_of(plant.channels, n)
+    told, seen = split_channels(plant.channels, states, attitude)
+    observe, observe_jacobian = observation_of(tuple(plant.channels[i] for i in seen), n)
     if parameter_factors is not None:
         changed = scaled(plant.parameters, parameter_factors, VehicleParameters._fields)
         plant = plant._replace(parameters=checked(changed))
     move, move_jacobian = transition_of(states, method, torque_is_input, attitude)
-    told = ATTITUDE_INPUTS if states == "velocities" and attitude == "input" else ()
-    inputs = plant.inputs + told
+    inputs = plant.inputs + (ATTITUDE_INPUTS if states == "velocities" and attitude != "level" else ())
     speed = positive("operating_speed", operating_speed)
     thrust = cruise_thrust(plant.parameters, speed)
     torque = plant.propeller_torque or 0.0
@@ -212,11 +214,16 @@ def model_of_plant(
     std, wandering = positive("current_std", current_std), positive("current_time", current_time)
     high = state_range(plant, n, std)
     prior_factor = positive("prior_cov_factor", prior_cov_factor)
-    q, r = _block(plant.process_noise_cov, n, 2.0 * std**2 * plant.dt / wandering), plant.measurement_noise_cov
+    cruise, held = speed * np.eye(n)[0], [at_cruise.get(quantity.symbol, 0.0) for quantity in inputs]
+    q = _block(plant.process_noise_cov, n, 2.0 * std**2 * plant.dt / wandering)
+    r = plant.measurement_noise_cov[np.ix_(seen, seen)]
+    if told:
+        slopes = derivative_by_attitude(move, cruise, held, plant)
+        q = q + slopes @ plant.measurement_noise_cov[np.ix_(told, told)] @ slopes.T
     if process_noise_cov is not None:
         q = covariance("process_noise_cov", process_noise_cov, n)
     if measurement_noise_cov is not None:
-        r = covariance("measurement_noise_cov", measurement_noise_cov, len(plant.channels))
+        r = covariance("measurement_noise_cov", measurement_noise_cov, len(seen))
     return StateSpaceModel(
         transition=move,
         observe=observe,
@@ -229,13 +236,13 @@ def model_of_plant(
         inputs=len(inputs),
         constants=plant.constants,
         substeps=plant.substeps,
-        operating_state=speed * np.eye(n)[0],
-        operating_input=[at_cruise.get(quantity.symbol, 0.0) for quantity in inputs],
+        operating_state=cruise,
+        operating_input=held,
         state_low=np.where(np.arange(n) == 0, 0.0, -high),
         state_high=high,
         states=(*STATES, *CURRENT_STATES)[:n],
         input_quantities=inputs,
-        measurements=[CHANNELS[name].quantity for name in plant.channels],
+        measurements=[CHANNELS[plant.channels[i]].quantity for i in seen],
         outputs={symbol: output for symbol, output in OUTPUTS.items() if n > 6 or symbol == "U"},
     )
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from auv_env.plant import Plant
 from plants.modelled import ModelledEnv
+from plants.split import Split, split
 
 if TYPE_CHECKING:
     from auv_env.rendering import Overlay
@@ -32,8 +33,13 @@ class ModelledVehicle(ModelledEnv):
         return model_of_plant
 
     def state_space_model(self, **changes) -> StateSpaceModel:
-        """See `plants.modelled`; for "velocities" the attitude is level, as nobody tells it to a filter here."""
-        return super().state_space_model(**{"attitude": "level"} | changes)
+        """See `plants.modelled`; for "velocities" roll and pitch are as measured, or level without an AHRS."""
+        attitude = "measured" if {"phi", "theta"} <= set(self.plant.channels) else "level"
+        return super().state_space_model(**{"attitude": attitude} | changes)
+
+    def measured_inputs(self, model: StateSpaceModel) -> Split | None:
+        """Which channels are a model's inputs beside the action, by symbol; None where there are none."""
+        return split(model, len(self.plant.inputs), self.plant.channels)
 
     def tuned_differences(self, tuned_for: Mapping, file: str) -> list[str]:
         """See `plant_data.check_same_plant`."""

@@ -121,6 +121,20 @@ def filters_drag() -> str:
     return of_rows(rows_of("auv:wrong_drag", [EKF, scaled, *joint], RUNS))
 
 
+def filters_current() -> str:
+    """RMSE in a current, of a filter that does not know of it and of one with two states for it."""
+    shown = ("u", "v", "w", "phi", "psi", "x", "y", "z", "c_x", "c_y")
+    lines, units = [], {}
+    for name in ("auv:current", "auv:estimated_current"):
+        (row,) = rows_of(name, [EKF], RUNS)
+        found = row.evaluation
+        errors = {one.symbol: error for one, error in zip(found.states, found.rmse, strict=True)}
+        units |= {one.symbol: one.unit for one in found.states}
+        known = [digits(errors[symbol].value, 2) if symbol in errors else "" for symbol in shown]
+        lines.append([f"`{name}`, {len(errors)} states", *known, f"{about(found.nees)} of {len(errors)}"])
+    return table(["EKF", *(f"{symbol} [{units[symbol]}]" for symbol in shown), "NEES"], lines)
+
+
 def rows_of(scenario: str | Scenario, filters: Sequence[Contender], runs: int) -> list[Row]:
     """Filters on a scenario's held-out seeds."""
     one = find_scenario(scenario) if isinstance(scenario, str) else scenario
@@ -168,7 +182,15 @@ def plain(value: float) -> str:
 
 TABLES: Mapping[str, Callable[[], str]] = {
     made.__name__: made
-    for made in (filters_motion, filters_navigation, filters_members, filters_cures, filters_fast, filters_drag)
+    for made in (
+        filters_motion,
+        filters_navigation,
+        filters_current,
+        filters_members,
+        filters_cures,
+        filters_fast,
+        filters_drag,
+    )
 }
 
 

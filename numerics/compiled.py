@@ -15,13 +15,14 @@ import inspect
 import threading
 import types
 import warnings
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from numerics.code_cache import keep_code
-from numerics.optimising import optimise_once
+from numerics.optimising import Which, optimise_once
 
 # No "nnan" and "ninf": with them isfinite and isnan are compiled away, and failures would pass unseen.
 FASTMATH = frozenset({"contract", "reassoc", "arcp", "nsz", "afn"})
@@ -32,7 +33,8 @@ _waiting: list[Callable] = []
 _marked: set[Callable] = set()
 _called: set[Callable] = set()  # of these, functions that are called and not inlined
 _apart: set[Callable] = set()  # of these, functions of which there is one copy
-_lessons: list[Callable[[], None]] = [lambda: optimise_once(_called.__contains__, _is_large, _apart.__contains__)]
+_asked: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions that `compiled` has been given
+_lessons: list[Callable[[], None]] = [lambda: optimise_once(_which())]
 _interpreting = False
 
 
@@ -62,6 +64,16 @@ def kept_apart(function: Callable) -> Callable:
     """
     _apart.add(function)
     return inlined(function, into_callers=False)
+
+
+def _which() -> Which:
+    return Which(
+        asked=_asked.__contains__,
+        marked=_marked.__contains__,
+        called=_called.__contains__,
+        large=_is_large,
+        apart=_apart.__contains__,
+    )
 
 
 def _is_large(function: Callable) -> bool:
@@ -120,6 +132,7 @@ def compiled(function: Callable) -> Callable:
         register_jitable(forceinline=inner not in _called, no_cfunc_wrapper=True)(
             inner
         )  # by itself LLVM inlines small ones only
+    _asked.add(function)
     return keep_code(numba.njit(nogil=True, fastmath=set(FASTMATH), error_model="numpy")(function))
 
 

@@ -9,74 +9,103 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable
 from functools import wraps
+from typing import NamedTuple
 
 LEVEL = 2  # of LLVM's optimisation of large functions: of the third, loops over long rows gain a tenth
 
 LEVEL_INSIDE = 1  # of what becomes part of these, and is then optimised once more
 
-Which = Callable[[Callable], bool]
+RARELY = 1_000_000  # new objects after which garbage is collected meanwhile
 
 
-def optimise_once(is_called: Which, is_large: Which, is_apart: Which) -> None:
+class Which(NamedTuple):
+    """Of which functions machine code is made differently; each says so of a plain function."""
+
+    asked: Callable[[Callable], bool]  # whether it is ours to compile; of others' functions nothing is changed
+    marked: Callable[[Callable], bool]  # whether it is one that becomes part of these
+    called: Callable[[Callable], bool]  # whether it is one of those to leave as it is
+    large: Callable[[Callable], bool]  # whether it calls such functions
+    apart: Callable[[Callable], bool]  # whether it is called, and never to become part of a caller
+
+
+def optimise_once(which: Which) -> None:
     """Leave called functions as they are when they are compiled for a caller; what is asked for is optimised.
 
     Of those that only compiled code can call no machine code is made by itself. Without the places in numba that
-    this needs, everything still works, and takes longer to compile.
-
-    Args:
-        is_called: whether a plain function is one to leave.
-        is_large: whether a function that is asked for calls such functions.
-        is_apart: whether a function that is called is never to become part of a caller.
+    this needs, everything still works, and takes longer to compile. What others compile is untouched, and so is
+    what numba makes of its own, or of others' functions, on the way.
     """
     from numba.core import codegen, event
 
     library = getattr(codegen, "CPUCodeLibrary", None)
     if not hasattr(library, "_optimize_final_module"):
         return
-    compiling: list = []  # the dispatchers of a function, of one compiled for it, and so on; numba holds a lock
-    listener = _listener(event.Listener, compiling)
-    event.register("numba:compile", listener)
-    _optimise_outermost(library, compiling, (is_called, is_large, is_apart))
-    _emit_outermost(library, getattr(codegen, "JITCPUCodegen", None), compiling)
+    compiling = _listener(event.Listener, which.asked)
+    event.register("numba:compile", compiling)
+    _optimise_outermost(library, compiling, which)
+    _emit_outermost(library, getattr(codegen, "JITCPUCodegen", None), compiling, which)
 
 
-def _listener(base: type, compiling: list):
-    """Keeps the list of what is being compiled, during which no garbage is collected: there is hardly any."""
+def _listener(base: type, asked: Callable[[Callable], bool]):
+    """Keeps what is being compiled for a function of ours, which leaves hardly any garbage to collect.
+
+    numba holds a lock from the start to the end, which it tells however a compilation ends.
+    """
 
     class Compiling(base):
-        collecting = False  # whether garbage was collected before
+        def __init__(self):
+            self.dispatchers: list = []  # of the function, of one compiled for it, and so on
+            self.thresholds: tuple | None = None  # of garbage collection before
 
         def on_start(self, event):
-            if not compiling:
-                self.collecting = gc.isenabled()
-                gc.disable()
-            compiling.append(event.data["dispatcher"])
+            dispatcher = event.data["dispatcher"]
+            if not self.dispatchers:
+                if not asked(dispatcher.py_func):
+                    return
+                self.thresholds = gc.get_threshold()
+                gc.set_threshold(RARELY, *self.thresholds[1:])
+            self.dispatchers.append(dispatcher)
 
         def on_end(self, event):
-            compiling.pop()
-            if not compiling and self.collecting:
-                gc.enable()
+            ended = [other is event.data["dispatcher"] for other in self.dispatchers]
+            if True in ended:
+                del self.dispatchers[ended.index(True) :]
+            if not self.dispatchers and self.thresholds is not None:
+                if gc.get_threshold()[0] == RARELY:  # nobody else has changed it meanwhile
+                    gc.set_threshold(*self.thresholds)
+                self.thresholds = None
+
+        @property
+        def outermost(self) -> Callable | None:
+            """The function of ours that is being compiled, or None."""
+            return self.dispatchers[0].py_func if self.dispatchers else None
+
+        def function_of(self, library) -> Callable | None:
+            """The function, innermost of all, that a library is made of; None if it is made of something else."""
+            function = self.dispatchers[-1].py_func if self.dispatchers else None
+            return function if function is not None and library.name == function.__qualname__ else None
 
     return Compiling()
 
 
-def _optimise_outermost(library: type, compiling: list, which: tuple[Which, Which, Which]) -> None:
-    optimise, (is_called, is_large, is_apart) = library._optimize_final_module, which
+def _optimise_outermost(library: type, compiling, which: Which) -> None:
+    optimise = library._optimize_final_module
 
     @wraps(optimise)
     def optimise_outermost(self):
-        function = compiling[-1].py_func if compiling else None
-        if not compiling or not is_large(compiling[0].py_func):
+        function = compiling.function_of(self)
+        if compiling.outermost is None or not which.large(compiling.outermost):
             optimise(self)
-        elif not is_called(function):
+        elif function is None or not which.called(function):
             options = self._codegen
             before = getattr(options, "_opt_level", None)
             try:
-                options._opt_level = before and min(before, LEVEL if len(compiling) == 1 else LEVEL_INSIDE)
+                level = LEVEL if len(compiling.dispatchers) == 1 else LEVEL_INSIDE
+                options._opt_level = before and min(before, level)
                 optimise(self)
             finally:
                 options._opt_level = before
-        elif is_apart(function):
+        elif which.apart(function):
             for part in self._final_module.functions:
                 if not part.is_declaration and function.__name__ in part.name:
                     part.add_function_attribute("noinline")
@@ -84,7 +113,7 @@ def _optimise_outermost(library: type, compiling: list, which: tuple[Which, Whic
     library._optimize_final_module = optimise_outermost
 
 
-def _emit_outermost(library: type, codegen: type | None, compiling: list) -> None:
+def _emit_outermost(library: type, codegen: type | None, compiling, which: Which) -> None:
     """Make no machine code of functions without a wrapper for Python: their callers contain them."""
     names = "_finalize_final_module", "_finalize_dynamic_globals"
     if not all(hasattr(library, name) for name in names) or not hasattr(codegen, "set_env"):
@@ -94,7 +123,8 @@ def _emit_outermost(library: type, codegen: type | None, compiling: list) -> Non
 
     @wraps(emit)
     def emit_outermost(self):
-        if len(compiling) > 1 and getattr(compiling[-1], "targetoptions", {}).get("no_cpython_wrapper"):
+        function = compiling.function_of(self)
+        if function is not None and function is not compiling.outermost and which.marked(function):
             self._finalize_dynamic_globals()
             self._finalized = True
         else:

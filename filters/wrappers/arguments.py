@@ -67,9 +67,14 @@ EstimatorInSpec.__name__ = "Estimator (give filter='module:object' instead)"
 ModelInSpec.__name__ = "StateSpaceModel (give model='module:factory' instead)"
 
 
-def check_spaces(action_space: gym.Space, observation_space: gym.Space, model: StateSpaceModel) -> None:
-    """Raise ValueError unless both spaces are Box and the actions are the model's inputs."""
-    spaces = {"action": (action_space, model.inputs), "observation": (observation_space, model.m)}
+def check_spaces(
+    action_space: gym.Space, observation_space: gym.Space, model: StateSpaceModel, measured_inputs: int = 0
+) -> None:
+    """Raise ValueError unless both spaces are Box and the actions are the model's inputs but so many last ones."""
+    spaces = {
+        "action": (action_space, model.inputs - measured_inputs),
+        "observation": (observation_space, model.m),
+    }
     for name, (space, size) in spaces.items():
         if not isinstance(space, gym.spaces.Box):
             raise ValueError(f"the {name} space must be a Box, but got {space}")

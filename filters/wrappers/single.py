@@ -17,6 +17,7 @@ from filters.wrappers.arguments import (
     check_spaces,
     filter_for,
 )
+from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
 from numerics.checks import one_of, shown
 from numerics.checks import seed as checked_seed
 from numerics.streams import draw_key, filter_generator
@@ -35,6 +36,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     - "belief": the mean, then the standard deviations, (2 n,).
 
     What the env appends to its measurement (validity flags, a reference) stays at the end of the observation.
+    Of what an env measures some may be inputs of the model (`filters.wrappers.measured_inputs`): m counts them in
+    the observation, and not in the innovation.
 
     Info gains `estimate` (n,), `estimate_cov` (n, n), `innovation` (m,), `innovation_cov` (m, m) and
     `estimate_divergences`, the restarts from the prior after an estimate that was not finite. The measurement
@@ -84,13 +87,16 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         gym.Wrapper.__init__(self, env)
         self._form = one_of("observation", observation, OBSERVATIONS)
         self.filter = filter_for(env, filter, model, tuned, model_arguments, numbers)
-        check_spaces(env.action_space, env.observation_space, self.filter.model)
-        n, m = self.filter.model.n, self.filter.model.m
+        split = split_of(env, self.filter.model)
+        check_spaces(env.action_space, env.observation_space, self.filter.model, len(split.inputs))
+        n, m = self.filter.model.n, split.channels
         # What an env appends to its measurement, validity flags and the reference, stays in the observation.
         self._appended = env.get_wrapper_attr(APPENDED) if env.has_wrapper_attr(APPENDED) else 0
         length = {"estimate": n, "measurement+estimate": m + n, "belief": 2 * n}[observation] + self._appended
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
-        self._session = self.filter.session()
+        session = self.filter.session()
+        self._session = WithMeasuredInputs(session, split) if split.inputs else session
+        self._channels = split.channels
         self._generator = filter_generator(None)
         if hasattr(env.unwrapped, "overlay"):  # it draws the estimate beside the truth
             env.unwrapped.render_overlay = self._overlay
@@ -105,7 +111,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         if seed is not None:
             self._generator = filter_generator(seed)
         z = _measurement(observation, info)
-        m = self.filter.model.m
+        m = self._channels
         if np.shape(z) != (m,):
             raise ValueError(f"a measurement must have the model's {m} entries, but got {shown(z)}")
         self._held = np.zeros(m)

@@ -16,6 +16,7 @@ from filters.estimators.estimator import Estimator
 from filters.estimators.foreign import ForeignFilter
 from filters.estimators.session import EstimatorBeliefs
 from filters.wrappers.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for
+from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
 from numerics.checks import one_of, shown
 from numerics.keys import EpisodeKeys, reset_mask
 from numerics.streams import filter_generator
@@ -55,8 +56,10 @@ class EstimateStates(gym.vector.VectorWrapper):
         super().__init__(env)
         self._form = one_of("observation", observation, OBSERVATIONS)
         self.filter = filter_for(env, filter, model, tuned, model_arguments, numbers)
-        check_spaces(env.single_action_space, env.single_observation_space, self.filter.model)
-        self._n, self._m = self.filter.model.n, self.filter.model.m
+        split = split_of(env, self.filter.model)
+        inputs = len(split.inputs)
+        check_spaces(env.single_action_space, env.single_observation_space, self.filter.model, inputs)
+        self._n, self._m = self.filter.model.n, split.channels
         self._appended = getattr(env.unwrapped, APPENDED, 0)
         length = {"estimate": self._n, "measurement+estimate": self._m + self._n, "belief": 2 * self._n}[
             observation
@@ -67,6 +70,8 @@ class EstimateStates(gym.vector.VectorWrapper):
         self.autoreset_mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
         beliefs = EstimatorBeliefs if isinstance(self.filter, ForeignFilter) else Beliefs
         self._beliefs = beliefs(self.filter, self.num_envs)
+        if inputs:
+            self._beliefs = WithMeasuredInputs(self._beliefs, split)
         self._keys = EpisodeKeys(self.num_envs, filter_generator)
         self._held = np.zeros((self.num_envs, self._m))
         self._done = np.zeros(self.num_envs, dtype=bool)
@@ -140,7 +145,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         return z if valid is None else np.where(valid, z, np.nan)
 
     def _observe(self, observations, z, info: dict[str, Any], mask: np.ndarray | None = None) -> np.ndarray:
-        n, m, beliefs = self._n, self._m, self._beliefs
+        n, m, beliefs = self._n, self.filter.model.m, self._beliefs
         mean, cov = beliefs.part("mean", n), beliefs.part("cov", n, n)
         there = np.ones(self.num_envs, dtype=bool) if mask is None else mask.copy()
         added = {

@@ -16,7 +16,7 @@ from plants.simulate import Truth, simulate
 from studies.vehicle.estimators import Estimator
 from studies.vehicle.models import papers_model
 from studies.vehicle.paths import PATHS, find_path
-from studies.vehicle.pose import full_pose, planar_pose
+from studies.vehicle.pose import full_pose, planar_pose, pose_errors
 from studies.vehicle.printed import DT, MEASURED, RUNS
 from studies.vehicle.scores import Scores, joined
 
@@ -154,9 +154,11 @@ def scores_of(one: Estimator, truth: Truth, keys: np.ndarray, inputs: np.ndarray
         divergences = estimates.divergences
         velocities, errors = estimates.means[..., :6], all_errors[..., :6]
         attitude = np.square(all_errors[..., 6:]).mean(axis=1) if one.has_attitude else nothing[:, :2]
-        full = full_pose(velocities, estimates.means[..., 6:] if one.has_attitude else None, DT) - true_pose
+        reckoned = full_pose(velocities, estimates.means[..., 6:] if one.has_attitude else None, DT)
+        full = pose_errors(reckoned, true_pose)
     by_yaw = planar_pose(velocities, DT)
-    planar, both = by_yaw - true_pose, by_yaw - planar_pose(truth.states[..., :6], DT)
+    planar = pose_errors(by_yaw, true_pose)
+    both = pose_errors(by_yaw, planar_pose(truth.states[..., :6], DT))
     return Scores(
         np.square(errors).mean(axis=1),
         attitude,
@@ -193,7 +195,7 @@ def along_path(world: str, inputs: np.ndarray) -> tuple:
     """
     states, steps = noise_free(world, inputs), settled(len(inputs))
     pose = states[:, [9, 10, 11, 8]]
-    gap = planar_pose(states[None, :, :6], DT)[0] - pose
+    gap = pose_errors(planar_pose(states[None, :, :6], DT)[0], pose)
     beyond = (states[:, :6] < 0.0) | (states[:, :6] > 1.0)
     outside = np.append(beyond.mean(axis=0), beyond.any(axis=1).mean())
     covs = path_bound(papers_model("navigation", world), inputs[None])[0]

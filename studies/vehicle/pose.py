@@ -1,7 +1,8 @@
 """Position and yaw that follow from velocities over time, by the full transformation or by yaw alone.
 
-All integrals are trapezoids. Yaw counts turns, and its errors do: an estimate that has turned once too often has
-gone a way of its own. Source of the transformation by yaw alone: Ngatini, Nurhadi (2019), equations 1 to 4.
+All integrals are trapezoids. Yaw counts turns; its errors do not, they are the short way round.
+
+Source of the transformation by yaw alone: Ngatini, Nurhadi (2019), equations 1 to 4.
 """
 
 from __future__ import annotations
@@ -12,7 +13,10 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from auv_env.kinematics import angle_rates, attitude_of, in_earth_axes, planar_kinematics
+from numerics.angles import difference
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+
+POSE_ANGLES = (False, False, False, True)  # of x, y, z and yaw
 
 
 @inlined
@@ -72,6 +76,11 @@ def planar_pose(velocities: np.ndarray, dt: float) -> np.ndarray:
     yaw = _integral(components[5], dt)
     rates = planar_kinematics(tuple(components), yaw)
     return np.stack([*(_integral(rate, dt) for rate in rates[:3]), yaw], axis=-1)
+
+
+def pose_errors(poses: np.ndarray, true_poses: np.ndarray) -> np.ndarray:
+    """Errors (..., 4) of positions [m] and of yaw [rad], which are the short way round."""
+    return difference(poses, true_poses, POSE_ANGLES)
 
 
 def _integral(rates: np.ndarray, dt: float) -> np.ndarray:

@@ -145,7 +145,7 @@ def test_a_filter_may_assume_another_vehicle_and_other_noise():
         ),
         ({"states": "pose"}, "states must be one of velocities, motion, navigation, current, but got 'pose'"),
         ({"integration": "heun"}, "integration must be one of runge-kutta, euler, but got 'heun'"),
-        ({"attitude": "steep"}, "attitude must be one of input, level, but got 'steep'"),
+        ({"attitude": "steep"}, "attitude must be one of input, measured, level, but got 'steep'"),
         ({"parameter_factors": {"drag": 2}}, "parameter_factors must name fields of m, W, B"),
         ({"parameter_factors": {"Xuu": 0}}, "Xuu must be positive, but got 0"),
         ({"operating_speed": 0}, "operating_speed must be positive, but got 0"),

@@ -138,6 +138,17 @@ def test_pd_on_measurements_beats_holding_the_planes_still(name, path, share):
     assert on_truth == pytest.approx(pd, rel=0.2, abs=3.0)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "spread"), [(PATH, 0.34), (DEPTH, 0.72)])
+def test_the_reward_threshold_is_what_pd_on_measurements_has(name, spread):
+    """The mean of 100 episodes has a standard error of `spread`."""
+    env = gym.make_vec(name, 100)
+    assert episode(env, DepthAndCourse.for_env(env)) == pytest.approx(
+        gym.spec(name).reward_threshold, abs=3 * spread
+    )
+    assert gym.spec("SegorogeniAUV-v0").reward_threshold is None  # nobody sees its path
+
+
 @as_python
 def test_a_controller_takes_one_observation_or_many_and_forgets_where_an_episode_starts():
     env = gym.make_vec(PATH, 2, path="IV")

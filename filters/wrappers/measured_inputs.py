@@ -1,0 +1,56 @@
+"""Inputs of a model that an env measures, such as an attitude from an AHRS: they come with the action.
+
+    x_{k+1} = f(x_k, (u_k, a_k)) + w,   z_k
+
+An env says by `measured_inputs(model)` which of its channels are such inputs a, and which the model's measurements
+z. A filter predicts with what was measured last, and updates with the others.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from plants.split import Split
+from plants.state_space import StateSpaceModel
+
+HOOK = "measured_inputs"  # method of an env; what it returns is a `Split`, or None for an ordinary model
+
+
+def split_of(env, model: StateSpaceModel) -> Split:
+    """What an env says of a model; without a word all channels are its measurements."""
+    found = getattr(env.unwrapped, HOOK, lambda model: None)(model)
+    return Split((), tuple(range(model.m)), model.m) if found is None else found
+
+
+class WithMeasuredInputs:
+    """A session, or the beliefs of all copies, that takes whole measurements and makes inputs of some.
+
+    Where such a measurement is missing, the last one stands in, and zero before the first.
+    """
+
+    def __init__(self, runs, split: Split):
+        """Take what runs the filter, a session or beliefs; `start` comes next."""
+        self._runs, self._inputs, self._measurements = runs, list(split.inputs), list(split.measurements)
+        self._last = None
+
+    def __getattr__(self, name: str):
+        """The estimate and all else are those of the session or the beliefs."""
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self._runs, name)
+
+    def start(self, *arguments) -> None:
+        """Start with a key and a measurement, or copies (which, keys, measurements)."""
+        *which, keys, z = arguments
+        first = np.nan_to_num(z[..., self._inputs])
+        if not which or self._last is None:
+            self._last = first
+        if which:
+            self._last[which[0]] = first[which[0]]
+        self._runs.start(*which, keys, z[..., self._measurements])
+
+    def step(self, u, z: np.ndarray, **idle) -> None:
+        """Predict with the action and what was measured at the step's beginning, and update."""
+        self._runs.step(np.concatenate([u, self._last], axis=-1), z[..., self._measurements], **idle)
+        now = z[..., self._inputs]
+        self._last = np.where(np.isnan(now), self._last, now)
