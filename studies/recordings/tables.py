@@ -79,6 +79,6 @@ def sentences(estimates: Estimates, runs: Sequence[Recording]) -> list[str]:
     averaged, best, raw = found.T
     return [
         f"Averaged over 0.2 s the error of the estimated thrust is on average {averaged.mean():.2f} times that of "
-        f"the recorder's own, at most {averaged.max():.2f}; with the best clock for each at most {best.max():.2f}; "
+        f"the recorder's own, at most {averaged.max():.2f}; with the best clocks at most {best.max():.2f}; "
         f"on raw rows {raw.min():.2f} to {raw.max():.2f}."
     ]
