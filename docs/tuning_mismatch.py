@@ -129,7 +129,7 @@ def bought(trials: int = TRIALS, rows: Sequence[str] | None = None, seeds: int =
     """
     quiet_optuna()
     scenario = find_scenario(SCENARIO)
-    held_out = scenario.data(Plan("ekf", (scenario,), SEED).held_out_seeds(seeds))
+    held_out = scenario.data(scenario.held_out_seeds(SEED, seeds))
     default = scaled_default("ekf", scenario, SEED).choice
     known = scenario.replace(parameter_factors={})
     made: dict[str, Callable[[], Filter]] = {

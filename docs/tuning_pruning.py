@@ -49,7 +49,7 @@ def pair(kind: str, name: str, trials: int, seed: int) -> Pair:
     for prune in (True, False):
         plan = Plan(kind, (scenario,), seed, prune=prune)
         found[prune] = run_study(open_study("page", plan, None), plan, trials)
-    held_out, training = scenario.data(plan.held_out_seeds()), plan.training_data()
+    held_out, training = scenario.data(scenario.held_out_seeds(seed, HELD_OUT_SEEDS)), plan.training_data()
     pruning, without = (
         evaluate(found[prune].choice.filter(scenario), held_out, scenario.scale) for prune in (True, False)
     )

@@ -79,17 +79,7 @@ def maximise_likelihood(
     parameters = model_parameters(problem)
     untuned = untuned_choice(filter_name, problem)
     noise_at = noise_family(untuned, problem, parameters)
-    beginning = data.beginning if problem.leads_in and data.first_scored else None
-
-    def slopes(logarithms: np.ndarray) -> Likelihood:
-        """Log-likelihood of each run (B,), and its gradients (B, p) in the logarithms."""
-        values = np.exp(logarithms)
-        found = likelihood(*noise_at(values, data))
-        if beginning is None:
-            return found
-        before = likelihood(*noise_at(values, beginning))
-        return Likelihood(found.values - before.values, found.gradients - before.gradients)
-
+    slopes = _slopes_on(problem, data, noise_at)
     bounds = [tuple(np.log([one.low, one.high])) for one in parameters]
     given = starts_of(parameters) if starts is None else starts
     optima = [optimum(filter_name, problem, data, start) for start in given]
@@ -136,10 +126,24 @@ def optimum(filter_name: str, problem: Problem, data: Data, start: Sequence[floa
     point, count = np.log(reference * factors), len(data.measurements)
     is_large = is_array(len(problem.quantities.states), len(problem.quantities.states))
     for runs in (FEW_RUNS, count) if is_large and count > FEW_RUNS else (count,):
-        some = data.slice(0, runs)
-        found = _minimum(lambda at, some=some: likelihood(*noise_at(np.exp(at), some)), point, bounds, is_large)
+        found = _minimum(_slopes_on(problem, data.slice(0, runs), noise_at), point, bounds, is_large)
         point = found.x
     return Optimum(tuple(factors.tolist()), np.exp(point), -found.fun, found.nfev, bool(found.success))
+
+
+def _slopes_on(problem: Problem, data: Data, noise_at: Callable) -> Callable[[np.ndarray], Likelihood]:
+    """Log-likelihood of each run (B,), and its gradients (B, p), as functions of logarithms; lead-ins do not count."""
+    beginning = data.beginning if problem.leads_in and data.first_scored else None
+
+    def slopes(logarithms: np.ndarray) -> Likelihood:
+        values = np.exp(logarithms)
+        found = likelihood(*noise_at(values, data))
+        if beginning is None:
+            return found
+        before = likelihood(*noise_at(values, beginning))
+        return Likelihood(found.values - before.values, found.gradients - before.gradients)
+
+    return slopes
 
 
 def _minimum(slopes: Callable, first: np.ndarray, bounds: list, is_large: bool):

@@ -152,7 +152,7 @@ def main() -> None:
     quiet_optuna()
     plan = Plan(**orders["plan"])
     try:
-        logs = {name: _unpacked(text) for name, text in orders["logs"].items()}
+        logs = {name: _unpacked(text) for name, text in orders.get("logs", {}).items()}
         pairs = zip(plan.scenarios, orders["digests"], strict=True)
         scenarios = tuple(logs.get(name) or find_same(name, digest) for name, digest in pairs)
         objectives = tuple(plan.objectives)
