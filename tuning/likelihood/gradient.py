@@ -12,14 +12,13 @@ from filters.likelihood import Likelihood, likelihood
 from numerics.checks import one_of
 from numerics.sources import is_array
 from tuning.likelihood.identifiability import KNOWN_WITHIN, TWO_SIDED
-from tuning.likelihood.noise import noise_family
+from tuning.likelihood.noise import DIFFERENTIABLE, noise_family
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters
 from tuning.search.space import Choice, untuned_choice
 
-DIFFERENTIABLE = ("kf", "ekf")
 BAD_START = (1.0, 1e-2, 1e2)  # factors on Q11, Q22 and R, far from where they belong
 STEP = 1e-3  # in the logarithms, of the differences of gradients that give the Hessian
 FLAT = 1e-12  # curvature over the largest one, below which there is none
