@@ -19,7 +19,7 @@ from scipy.stats import t as student
 from docs.page import make_page, table
 from filters.consistency.intervals import Interval
 from tuning.evaluation.evaluate import evaluate, score_ratio
-from tuning.search.plan import TRAINING_SEEDS, Plan
+from tuning.search.plan import HELD_OUT_SEEDS, TRAINING_SEEDS, Plan
 from tuning.search.space import choice_of
 from tuning.search.study import open_study, quiet_optuna, run_study
 from tuning.search.trials import measure

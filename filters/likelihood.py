@@ -11,11 +11,15 @@ from filters.likelihood_slopes import (
     contraction,
     curvature_by_components,
     half_product,
+    information_sum,
     log_likelihood_slope,
     masked_inverse,
     no_curvature,
+    no_information,
+    no_terms,
     present_rows_of,
     slope_along,
+    terms_writer,
     with_transposed,
 )
 from numerics.angles import kept
@@ -69,18 +73,39 @@ def likelihood(
     Source: Gupta, Mehra (1974), "Computational aspects of maximum likelihood estimation and reduction in
     sensitivity function calculations", IEEE Trans. Automatic Control 19(6).
     """
-    inputs, measurements, q_slopes, r_slopes = (
-        np.ascontiguousarray(value, dtype=np.float64) for value in (inputs, measurements, q_slopes, r_slopes)
-    )
+    out, _ = _accumulated(model, (inputs, measurements, q_slopes, r_slopes), False)
+    return Likelihood(out[:, 0], out[:, 1:])
+
+
+def information(
+    model: StateSpaceModel, inputs: np.ndarray, measurements: np.ndarray, q_slopes, r_slopes
+) -> np.ndarray:
+    """Fisher's information on p parameters in the innovations of each of B trajectories, (B, p, p).
+
+        I_ij = sum_k dv_i' S^-1 dv_j + 1/2 tr(S^-1 dS_i S^-1 dS_j)
+
+    with v and S of the filter along that trajectory: the expectation of minus the second derivatives of log L
+    where the model is right. Arguments and errors are those of `likelihood`, and about what it costs.
+
+    Source: Gupta, Mehra (1974), as above.
+    """
+    _, found = _accumulated(model, (inputs, measurements, q_slopes, r_slopes), True)
+    return found
+
+
+def _accumulated(model: StateSpaceModel, given: tuple, informative: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Log-likelihood with gradient, (B, 1 + p), and the information, (B, p, p), or nothing in its place."""
+    inputs, measurements, q_slopes, r_slopes = (np.ascontiguousarray(value, dtype=np.float64) for value in given)
     n, m, count, parameters = model.n, model.m, len(measurements), len(q_slopes)
     given = {"inputs": inputs, "measurements": measurements, "q_slopes": q_slopes, "r_slopes": r_slopes}
     check_shapes(given, model, (parameters, n, n), (parameters, m, m))
     out = np.zeros((count, 1 + parameters))
-    accumulate = _build(model.functions, model.shape, is_interpreting())
+    told = np.zeros((count, parameters, parameters) if informative else (count, 0, 0))
+    accumulate = _build(model.functions, model.shape, informative, is_interpreting())
     slopes = q_slopes.reshape(parameters, -1), r_slopes.reshape(parameters, -1)
-    arguments = inputs, measurements, model.numbers, *slopes, out
+    arguments = inputs, measurements, model.numbers, *slopes, out, told
     spread(lambda first, last: accumulate(*arguments, first, last), count)
-    return Likelihood(out[:, 0], out[:, 1:])
+    return out, told
 
 
 def check_shapes(given: dict[str, np.ndarray], model: StateSpaceModel, *of_slopes: tuple[int, ...]) -> None:
@@ -94,7 +119,7 @@ def check_shapes(given: dict[str, np.ndarray], model: StateSpaceModel, *of_slope
 
 
 @cache
-def _build(functions: Functions, shape: Shape, interpreting: bool):
+def _build(functions: Functions, shape: Shape, informative: bool, interpreting: bool):
     n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
     transition_matrix, observation_matrix = (
         transition_slopes(functions, shape),
@@ -145,12 +170,13 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
     )
     reduced = formula("P - K S K'", P=nn, K=nm, S=mm)
     half_reduced, reduced_slope = half_product(n, m), with_transposed(n)
+    note, add_information = (terms_writer(m), information_sum(m)) if informative else (no_terms, no_information)
     fingerprint = function_fingerprint(transition, transition_matrix, observe, observation_matrix, within=__name__)
 
-    def accumulate(all_inputs, measurements, numbers, q_slopes, r_slopes, out, first, last):
+    def accumulate(all_inputs, measurements, numbers, q_slopes, r_slopes, out, told, first, last):
         fingerprint  # noqa: B018 - part of the cache's key
         c, s = constants(numbers), scales(numbers)
-        rows = np.zeros((q_slopes.shape[0], n + n * n))
+        rows, terms = np.zeros((q_slopes.shape[0], n + n * n)), np.zeros((q_slopes.shape[0], m + m * m))
         for b in range(first, last):
             x, p = prior_mean(numbers), prior_cov(numbers)
             rows[:] = 0.0
@@ -181,10 +207,12 @@ def _build(functions: Functions, shape: Shape, interpreting: bool):
                     dh = present_rows(observation_slope(0.0, x, s, dx, c), z)
                     dy, both = seen_mean_slope(h, dx), correlation_slope(p, dp, h, dh)
                     ds = seen_slope(h, dh, both, shared, present(r_slope(r_slopes[j]), z))
+                    note(terms[j], dy, ds)
                     turned = of_noise(gain, ds)
                     out[b, 1 + j] += likelihood_slope(w, s_inverse, dy, ds)
                     store_mean_slope(rows[j], corrected_slope(dx, both, turned, w, gain, dy))
                     store_cov_slope(rows[j], reduced_slope(dp, half_reduced(both, turned, gain)))
+                add_information(told[b], terms, s_inverse)
                 x, p = corrected(x, gain, v), reduced(p, gain, spread_of_v)
 
     return CompiledOrPython(accumulate)

@@ -6,11 +6,11 @@ from functools import cache
 
 import numpy as np
 
-from numerics.compiled import inlined
+from numerics.compiled import inlined, kept_apart
 from numerics.derivatives import RELATIVE_STEP
 from numerics.matrices import transposed_multiplier
 from numerics.sources import Source, entrywise, matrix_of, tuple_of, written_out
-from numerics.tuples import scaled_sum, vector_reader
+from numerics.tuples import matrix_writer, scaled_sum, vector_reader, vector_writer
 
 
 @cache
@@ -138,3 +138,61 @@ def log_likelihood_slope(size: int):
     square = source.sum(products)
     shift = source.sum(f"w[{i}] * dy[{i}]" for i in source.range(size))
     return source.function(f"0.5 * ({square}) + {shift}")
+
+
+@cache
+def terms_writer(size: int):
+    """`note(row, dy, ds)`: what the information takes of one parameter, kept in row[: size + size^2]."""
+    store, store_matrix = vector_writer(size), matrix_writer(size, size, size)
+
+    @inlined
+    def note(row, dy, ds):
+        store(row, dy)
+        store_matrix(row, ds)
+
+    return note
+
+
+@inlined
+def no_terms(row, dy, ds):
+    """In the place of these, where no information is asked for."""
+
+
+@cache
+def information_sum(size: int):
+    """`add(out, terms, s_inverse)`: what a measurement tells of the parameters, (p, p), is added to out.
+
+    It is dy_i' S^-1 dy_j + 1/2 tr(S^-1 dS_i S^-1 dS_j) with the terms (p, size + size^2) of `terms_writer`.
+    """
+    store = matrix_writer(size, size)
+
+    @kept_apart
+    def add(out, terms, s_inverse):
+        inverse = np.empty(size * size)
+        store(inverse, s_inverse)
+        weighted = np.zeros((terms.shape[0], size + size * size))
+        for p in range(terms.shape[0]):
+            for i in range(size):
+                for j in range(size):
+                    e = inverse[i * size + j]
+                    weighted[p, i] += e * terms[p, j]
+                    for k in range(size):
+                        weighted[p, size + i * size + k] += e * terms[p, size + j * size + k]
+        for p in range(terms.shape[0]):
+            for q in range(p + 1):
+                total = 0.0
+                for i in range(size):
+                    total += terms[p, i] * weighted[q, i]
+                    for j in range(size):
+                        a, b = weighted[p, size + i * size + j], weighted[q, size + j * size + i]
+                        total += 0.5 * a * b
+                out[p, q] += total
+                if q < p:
+                    out[q, p] += total
+
+    return add
+
+
+@inlined
+def no_information(out, terms, s_inverse):
+    """In the place of this, likewise."""

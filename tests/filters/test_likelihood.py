@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, KalmanFilter, affine_model, run
-from filters.likelihood import likelihood
+from filters.likelihood import information, likelihood
 from numerics.compiled import interpreted
 from numerics.formulas import formula
 from numerics.streams import episode_keys
@@ -106,6 +106,31 @@ def test_the_likelihood_is_the_filters_and_its_gradient_that_of_central_differen
         h = 1e-4 * min(np.diag(q).min() if dq.any() else 1.0, np.diag(r).min() if dr.any() else 1.0)
         slope = (values(q + h * dq, r + h * dr) - values(q - h * dq, r - h * dr)) / (2 * h)
         np.testing.assert_allclose(found.gradients[:, j], slope, rtol=accuracy, atol=accuracy * abs(slope).max())
+
+
+@pytest.mark.usefixtures("as_python")
+def test_the_information_is_that_of_the_innovations_slopes():
+    model = thruster()
+    keys, inputs, measurements = data_of(model, count=2, steps=7)
+    q_slopes, r_slopes = directions(model)
+    q, r = model.process_noise_cov, model.measurement_noise_cov
+
+    def innovations(sign, dq, dr):
+        h = sign * 1e-4 * (np.diag(q).min() if dq.any() else np.diag(r).min())
+        changed = model.replace(process_noise_cov=q + h * dq, measurement_noise_cov=r + h * dr)
+        found = run(ExtendedKalmanFilter(model=changed), keys, inputs, measurements)
+        return found.innovations[..., 0] / abs(2 * h), found.innovation_covs[..., 0, 0] / abs(2 * h)
+
+    pairs = [[innovations(sign, dq, dr) for sign in (1, -1)] for dq, dr in zip(q_slopes, r_slopes, strict=True)]
+    dv, ds = (np.array([above[i] - below[i] for above, below in pairs]) for i in (0, 1))
+    s = run(ExtendedKalmanFilter(model=model), keys, inputs, measurements).innovation_covs[..., 0, 0]
+    there = ~np.isnan(measurements[..., 0])
+    parts = [dv[:, None] * dv / s + ds[:, None] * ds / (2 * s**2), 0.0]
+    expected = np.where(there, *parts).sum(axis=-1).transpose(2, 0, 1)
+    found = information(model, inputs, measurements, q_slopes, r_slopes)
+    scale = np.sqrt(np.einsum("bii,bjj->bij", expected, expected))
+    np.testing.assert_allclose(found / scale, expected / scale, atol=1e-4)
+    assert (abs(expected / scale) > 0.01).all()
 
 
 def test_the_interpreted_likelihood_is_the_compiled_one():

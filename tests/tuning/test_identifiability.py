@@ -8,12 +8,13 @@ from numerics.streams import episode_keys
 from plants import simulate
 from thruster_cli.tune import tune
 from thruster_cli.tuning_report import as_json, report
-from tuning.likelihood import identifiability
+from tuning.likelihood import identifiability, noise
 from tuning.likelihood.gradient import maximise_likelihood
 from tuning.likelihood.identifiability import (
     Identifiability,
     as_data,
     covariance,
+    curvatures,
     identify,
     is_identified,
     maximum,
@@ -53,7 +54,7 @@ def likelihood_of(c, seed=0, count=24, steps=100):
 
 def known(log_likelihoods, starts=(TRUE,)):
     at = maximum(log_likelihoods, starts, BOUNDS)
-    cov = covariance(log_likelihoods, at)
+    cov = covariance(curvatures(log_likelihoods, at))
     return at, np.sqrt(np.diag(cov)), is_identified(log_likelihoods, at, cov, BOUNDS)
 
 
@@ -84,7 +85,7 @@ def test_two_variances_of_which_only_the_sum_shows_make_up_for_one_another():
     start, bounds = np.zeros(2), np.log([(1e-3, 1e3)] * 2)
     at = maximum(log_likelihoods, [start], bounds)
     assert np.exp(at).sum() == pytest.approx(2.0, rel=0.1)
-    cov = covariance(log_likelihoods, at)
+    cov = covariance(curvatures(log_likelihoods, at))
     assert not is_identified(log_likelihoods, at, cov, bounds).any()
     found = Identifiability(("a", "b"), np.ones(2), np.exp(at), cov, np.zeros(2, bool))
     assert min(found.loosest.values()) < 1 and max(found.loosest.values()) == pytest.approx(10.0)
@@ -96,14 +97,14 @@ def test_a_number_without_a_limit_below_is_not_determined_though_the_likelihood_
         return np.full(30, -0.004) * np.exp(2 * logarithms[0]) + 0.001 * np.arange(30)
 
     at, bounds = np.zeros(1), np.log([(1e-3, 1e3)])
-    cov = covariance(log_likelihoods, at)
+    cov = covariance(curvatures(log_likelihoods, at))
     assert np.exp(1.96 * np.sqrt(cov[0, 0])) < 100
     assert not is_identified(log_likelihoods, at, np.array([[0.25]]), bounds).any()
 
 
 def test_noise_is_no_information():
-    noise = np.random.default_rng(0)
-    cov = covariance(lambda logarithms: noise.normal(size=40), np.zeros(2))
+    chance = np.random.default_rng(0)
+    cov = covariance(curvatures(lambda logarithms: chance.normal(size=40), np.zeros(2)))
     assert (np.sqrt(np.diag(cov)) > 0.3).all()
 
 
@@ -132,6 +133,19 @@ def test_the_published_tunnel_tells_nothing_of_its_small_r():
     found = identify(true_choice("kf", scenario), plan.scenarios, plan.training_data(), plan.space())
     assert found.identified.tolist() == [False, True, False]
     assert "do not determine Q11 and R" in sentences(found)[1]
+
+
+@pytest.mark.parametrize(("name", "kind"), [("nominal", "ekf"), ("published_tunnel", "kf")])
+def test_fishers_information_gives_the_judgement_of_differences(name, kind, monkeypatch):
+    scenario = find_scenario(name)
+    plan = Plan(kind, (scenario,))
+    given = true_choice(kind, scenario), plan.scenarios, plan.training_data(), plan.space()
+    differences = identify(*given)
+    monkeypatch.setattr(noise, "LEAST_NUMBERS", 0)
+    information = identify(*given)
+    assert information.identified.tolist() == differences.identified.tolist()
+    widths = [np.log(found.factors) for found in (information, differences)]
+    np.testing.assert_allclose(widths[0][differences.identified], widths[1][differences.identified], rtol=0.3)
 
 
 def test_numbers_that_are_held_are_not_told_and_baselines_have_none():

@@ -12,14 +12,13 @@ from filters.likelihood import Likelihood, likelihood
 from numerics.checks import one_of
 from numerics.sources import is_array
 from tuning.likelihood.identifiability import KNOWN_WITHIN, TWO_SIDED
-from tuning.likelihood.noise import noise_family
+from tuning.likelihood.noise import DIFFERENTIABLE, noise_family
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters
 from tuning.search.space import Choice, untuned_choice
 
-DIFFERENTIABLE = ("kf", "ekf")
 BAD_START = (1.0, 1e-2, 1e2)  # factors on Q11, Q22 and R, far from where they belong
 STEP = 1e-3  # in the logarithms, of the differences of gradients that give the Hessian
 FLAT = 1e-12  # curvature over the largest one, below which there is none
@@ -132,7 +131,7 @@ def optimum(filter_name: str, problem: Problem, data: Data, start: Sequence[floa
 
 
 def _slopes_on(problem: Problem, data: Data, noise_at: Callable) -> Callable[[np.ndarray], Likelihood]:
-    """Log-likelihood of each run (B,), and its gradients (B, p), as functions of logarithms; lead-ins do not count."""
+    """The function that gives each run's log-likelihood (B,) and gradients (B, p); lead-ins do not count."""
     beginning = data.beginning if problem.leads_in and data.first_scored else None
 
     def slopes(logarithms: np.ndarray) -> Likelihood:

@@ -9,6 +9,7 @@ import numpy as np
 from optuna.distributions import BaseDistribution
 
 from filters.registry import filter_class
+from tuning.likelihood.noise import known_information
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.problem import Problem
@@ -92,7 +93,8 @@ def identify(
     untuned = parameters_of(untuned_choice(choice.name, scenarios[0]))
     starts = np.log(tuned), np.log([untuned.get(name, own[name]) for name in names])
     likeliest = maximum(log_likelihoods, starts, bounds)
-    cov = covariance(log_likelihoods, likeliest)
+    told = known_information(choice, scenarios, data, names, np.exp(likeliest))
+    cov = covariance(curvatures(log_likelihoods, likeliest) if told is None else told)
     identified = is_identified(log_likelihoods, likeliest, cov, bounds)
     return Identifiability(names, tuned, np.exp(likeliest), cov, identified)
 
@@ -139,38 +141,46 @@ def maximum(
     return found.x
 
 
-def covariance(log_likelihoods: Callable[[np.ndarray], np.ndarray], at: np.ndarray) -> np.ndarray:
-    """Covariance (p, p) of the logarithms of p numbers, from the curvature of a log-likelihood at its maximum.
-
-        H = - sum over runs of d2 log L / d theta2,   C = (H_sure + I / (ln 10)^2)^-1
-
-    with central differences of a factor of two. H_sure has H's directions. A direction's curvature there is that
-    in H less 1.96 of its standard errors over runs, and at least zero: noise is no information. The last term
-    stands for what is known before: the order of magnitude. So a number of which the data say nothing has a
-    standard error of a factor of ten.
+def curvatures(log_likelihoods: Callable[[np.ndarray], np.ndarray], at: np.ndarray) -> np.ndarray:
+    """Minus the second derivatives of B log-likelihoods, (B, p, p), by central differences of a factor of two.
 
     Args:
-        log_likelihoods: of each of B independent runs, (B,), as a function of logarithms (p,).
+        log_likelihoods: of each run, (B,), as a function of logarithms (p,).
         at: the logarithms, (p,).
-
-    Source: Kay (1993), "Fundamentals of statistical signal processing: estimation theory", chapter 7 (observed
-    information).
     """
     count, steps = len(at), STEP * np.eye(len(at))
     here = log_likelihoods(at)
     above, below = (np.array([log_likelihoods(at + sign * step) - here for step in steps]) for sign in (1, -1))
-    curvatures = np.empty((len(here), count, count))
+    found = np.empty((len(here), count, count))
     for i in range(count):
-        curvatures[:, i, i] = -(above[i] + below[i]) / STEP**2
+        found[:, i, i] = -(above[i] + below[i]) / STEP**2
         for j in range(i):
             both = sum(log_likelihoods(at + sign * (steps[i] + steps[j])) - here for sign in (1, -1))
             mixed = both - above[i] - below[i] - above[j] - below[j]
-            curvatures[:, i, j] = curvatures[:, j, i] = -mixed / (2.0 * STEP**2)
+            found[:, i, j] = found[:, j, i] = -mixed / (2.0 * STEP**2)
+    return found
+
+
+def covariance(curvatures: np.ndarray) -> np.ndarray:
+    """Covariance (p, p) of the logarithms of p numbers, from the curvature of a log-likelihood at its maximum.
+
+        H = - sum over runs of d2 log L / d theta2,   C = (H_sure + I / (ln 10)^2)^-1
+
+    H_sure has H's directions. A direction's curvature there is that in H less 1.96 of its standard errors over
+    runs, and at least zero: noise is no information. The last term stands for what is known before: the order of
+    magnitude. So a number of which the data say nothing has a standard error of a factor of ten.
+
+    Args:
+        curvatures: of each of B independent runs, (B, p, p), or their expectations, Fisher's information.
+
+    Source: Kay (1993), "Fundamentals of statistical signal processing: estimation theory", chapter 7 (observed
+    information).
+    """
     total, axes = np.linalg.eigh(curvatures.sum(axis=0))
     along = np.einsum("id,bij,jd->bd", axes, curvatures, axes)
     errors = np.sqrt(len(along)) * along.std(axis=0, ddof=1)
     sure = np.maximum(total - TWO_SIDED * errors, 0.0)
-    return np.linalg.inv(axes * sure @ axes.T + np.eye(count) / KNOWN_WITHIN**2)
+    return np.linalg.inv(axes * sure @ axes.T + np.eye(len(total)) / KNOWN_WITHIN**2)
 
 
 def is_identified(

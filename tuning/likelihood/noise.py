@@ -6,14 +6,17 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from filters.likelihood import information
 from filters.registry import make_filter
 from plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
-from tuning.search.parameters import MeasurementVariance, ProcessVariance
+from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters
 from tuning.search.space import Choice
 
+DIFFERENTIABLE = ("kf", "ekf")  # filters
+LEAST_NUMBERS = 8  # from which on the information is sooner found than differences
 STEP = 1e-4  # in the logarithms, of the differences of Q and R
 
 
@@ -61,6 +64,36 @@ def noise_family(choice: Choice, problem: Problem, parameters: Sequence[Paramete
         return model_at(values), data.inputs, data.measurements, q, r
 
     return noise_at
+
+
+def known_information(
+    choice: Choice, scenarios: Sequence[Problem], data: Sequence[Data], names: Sequence[str], values: np.ndarray
+) -> np.ndarray | None:
+    """Fisher's information on the logarithms of a Kalman filter's numbers in each of B runs, (B, p, p).
+
+    None for other filters, and where a number is more than noise. It takes the time of some fifteen runs of the
+    filter, where differences take two for each pair of numbers.
+
+    Args:
+        choice: of one kind of filter; its other numbers are held.
+        scenarios: whose runs count.
+        data: for each scenario, its runs.
+        names: of the p numbers.
+        values: at which the information is taken, (p,).
+    """
+    if choice.name not in DIFFERENTIABLE or len(names) < LEAST_NUMBERS:
+        return None
+    found = []
+    for scenario, one in zip(scenarios, data, strict=True):
+        known = {parameter.name: parameter for parameter in model_parameters(scenario)}
+        if not set(names) <= set(known):
+            return None
+        try:
+            noise_at = noise_family(choice, scenario, [known[name] for name in names])
+            found.append(information(*noise_at(values, one)))
+        except ValueError:  # more than Q and R changes
+            return None
+    return np.concatenate(found)
 
 
 def _variances(model: StateSpaceModel, parameters: Sequence[Parameter]) -> Callable:
