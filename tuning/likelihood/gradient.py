@@ -79,22 +79,11 @@ def maximise_likelihood(
     parameters = model_parameters(problem)
     untuned = untuned_choice(filter_name, problem)
     noise_at = noise_family(untuned, problem, parameters)
-    beginning = data.beginning if problem.leads_in and data.first_scored else None
-
-    def slopes(logarithms: np.ndarray) -> Likelihood:
-        """Log-likelihood of each run (B,), and its gradients (B, p) in the logarithms."""
-        values = np.exp(logarithms)
-        found = likelihood(*noise_at(values, data))
-        if beginning is None:
-            return found
-        before = likelihood(*noise_at(values, beginning))
-        return Likelihood(found.values - before.values, found.gradients - before.gradients)
-
     bounds = [tuple(np.log([one.low, one.high])) for one in parameters]
     given = starts_of(parameters) if starts is None else starts
     optima = [optimum(filter_name, problem, data, start) for start in given]
     best = max(optima, key=lambda optimum: optimum.log_likelihood)
-    errors = _standard_errors(slopes, np.log(best.variances))
+    errors = _standard_errors(slopes_of(problem, noise_at, data), np.log(best.variances))
     inside = np.array(
         [low < value < high for value, (low, high) in zip(np.log(best.variances), bounds, strict=True)]
     )
@@ -136,10 +125,27 @@ def optimum(filter_name: str, problem: Problem, data: Data, start: Sequence[floa
     point, count = np.log(reference * factors), len(data.measurements)
     is_large = is_array(len(problem.quantities.states), len(problem.quantities.states))
     for runs in (FEW_RUNS, count) if is_large and count > FEW_RUNS else (count,):
-        some = data.slice(0, runs)
-        found = _minimum(lambda at, some=some: likelihood(*noise_at(np.exp(at), some)), point, bounds, is_large)
+        found = _minimum(slopes_of(problem, noise_at, data.slice(0, runs)), point, bounds, is_large)
         point = found.x
     return Optimum(tuple(factors.tolist()), np.exp(point), -found.fun, found.nfev, bool(found.success))
+
+
+def slopes_of(problem: Problem, noise_at: Callable, data: Data) -> Callable[[np.ndarray], Likelihood]:
+    """Log-likelihood of each run (B,), and its gradients (B, p), as a function of the logarithms of parameters.
+
+    The lead-in of runs that have one, in which the filter settles, counts in neither.
+    """
+    beginning = data.beginning if problem.leads_in and data.first_scored else None
+
+    def slopes(logarithms: np.ndarray) -> Likelihood:
+        values = np.exp(logarithms)
+        found = likelihood(*noise_at(values, data))
+        if beginning is None:
+            return found
+        before = likelihood(*noise_at(values, beginning))
+        return Likelihood(found.values - before.values, found.gradients - before.gradients)
+
+    return slopes
 
 
 def _minimum(slopes: Callable, first: np.ndarray, bounds: list, is_large: bool):
