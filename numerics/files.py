@@ -8,7 +8,7 @@ import os
 import secrets
 import stat
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import BinaryIO
 
@@ -28,6 +28,17 @@ def check_target(path: str | Path) -> None:
             pass
     except OSError as error:
         raise _refusal(path, error) from None
+
+
+def check_not_read(path: str | Path, read: Iterable[str | Path]) -> None:
+    """Raise ValueError if a file to be written is one of those that are read, links followed."""
+    for one in read:
+        try:
+            same = os.path.samefile(path, one)
+        except OSError:  # one of them is not there
+            continue
+        if same:
+            raise ValueError(f"what is written must not replace what is read, but got {path} for both")
 
 
 def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], None]) -> None:

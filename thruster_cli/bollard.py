@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from numerics.files import check_target
 from studies.bollard_fit import FITTED, Identified, identify, relative_errors
 from studies.bollard_table import read_table
 from thruster_cli.logs import read_named
-from thruster_cli.output import announce_compilation, emit, table
+from thruster_cli.output import announce_compilation, check_targets, emit, table
 from thruster_env.logged import Shown
 from thruster_env.parameters import ThrusterParameters, preset_parameters
 from thruster_env.plant import make_plant
@@ -28,7 +27,13 @@ RATE = Parameter("motor_rate", 0.05, 20.0, default=1.0)  # the factor on all thr
 
 
 def identify_bollard(
-    path: Path, step: Path | None, logs: Sequence[Path] | None, preset: str | None, out: Path, json: str | None
+    path: Path,
+    step: Path | None,
+    logs: Sequence[Path] | None,
+    preset: str | None,
+    out: Path,
+    json: str | None,
+    **options,
 ) -> None:
     """Identify a thruster from a bollard table, write its preset file, and say how well it fits.
 
@@ -42,6 +47,7 @@ def identify_bollard(
         preset: whose other parameters are taken.
         out: the preset file.
         json: where the result goes as JSON.
+        **options: how the step response is read, as `read_named` takes them.
 
     Raises:
         ValueError: states the rule and the value.
@@ -50,7 +56,7 @@ def identify_bollard(
         raise ValueError(f"give either logs or --bollard TABLE.csv, but got both, {logs[0]} and {path}")
     if not is_file(out):
         raise ValueError(f"a preset file must end in .toml, but got {str(out)!r}")
-    check_target(out)
+    check_targets((out,), json, read=(path, step))
     read = read_table(path)
     supplies = np.unique(read.supply).tolist()
     held_out = supplies[2:-1:2] or supplies[1:2]  # between others, so that nothing is extrapolated
@@ -58,7 +64,7 @@ def identify_bollard(
     errors, parameters, timed = relative_errors(found, read, held_out), found.thruster, None
     if step is not None:
         announce_compilation()
-        timed, parameters = from_step(step, parameters, preset or INFERRED)
+        timed, parameters = from_step(step, parameters, preset or INFERRED, **options)
     identified = {
         "table": path.name,
         "held_out_supplies": held_out,
@@ -77,7 +83,7 @@ def identify_bollard(
 
 
 def from_step(
-    path: Path, parameters: ThrusterParameters, preset: str
+    path: Path, parameters: ThrusterParameters, preset: str, **options
 ) -> tuple[Identification, ThrusterParameters]:
     """The motor's rate and the mass of the water from a step response, by maximum likelihood.
 
@@ -85,11 +91,12 @@ def from_step(
         path: a log of the voltage and the motor's speed.
         parameters: from the table.
         preset: a thruster with the same quantities.
+        **options: columns, clock offsets and the like, as `read_named` takes them.
 
     Raises:
         ValueError: if the log cannot be read, or the voltage does not change in it.
     """
-    log, _ = read_named(path, preset, sensors=["speed"])
+    log, _ = read_named(path, preset, sensors=["speed"], **options)
     if not np.ptp(log.inputs):
         raise ValueError(f"a step response must have a step of the voltage, but {path} has none")
     largest = float(np.abs(log.inputs).max())

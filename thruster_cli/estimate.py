@@ -11,7 +11,6 @@ import typer
 from filters.logs.columns import columns_of
 from filters.logs.estimate import LogEstimate, estimate
 from filters.logs.findings import LogFindings, Residual, findings
-from numerics.files import check_target
 from plants.logs.write import check_suffix, write_columns
 from thruster_cli.logs import (
     ClockOption,
@@ -22,7 +21,15 @@ from thruster_cli.logs import (
     SensorOption,
     read_named,
 )
-from thruster_cli.output import FILTER_HELP, JsonOption, SeedOption, announce_compilation, emit, table
+from thruster_cli.output import (
+    FILTER_HELP,
+    JsonOption,
+    SeedOption,
+    announce_compilation,
+    check_targets,
+    emit,
+    table,
+)
 
 ALPHA = 0.05  # below which a p-value speaks against white innovations
 
@@ -69,9 +76,7 @@ def command(
     if out is not None:
         check_suffix(out)
     recorded, offer = read_named(log, preset, model, sensor, column, clock_offset, dt)
-    for target in (out, plot):
-        if target is not None:
-            check_target(target)
+    check_targets((out, plot), json, read=(log, tuned, preset))
     announce_compilation()
     numbers = {} if ensemble_size is None else {"ensemble_size": ensemble_size}
     options = {"tuned": tuned, "smoother": smoother, "lag": lag, "seed": seed, **numbers}

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import typer
 
-from numerics.files import check_target
 from thruster_cli.identified import as_json, report, write_files
 from thruster_cli.logs import (
     ClockOption,
@@ -20,7 +19,7 @@ from thruster_cli.logs import (
     SensorOption,
     pairs,
 )
-from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
+from thruster_cli.output import JsonOption, SeedOption, announce_compilation, check_targets, emit, progress_console
 from thruster_cli.to_identify import family_of, numbers_of, ranges_of, split_runs
 from thruster_env.preset_file import is_file
 from tuning.identification.coordinates import Coordinates
@@ -114,7 +113,8 @@ def command(
     if bollard is not None:
         from thruster_cli.bollard import identify_bollard
 
-        return identify_bollard(bollard, step, logs, preset, out or DEFAULT_OUT, json)
+        reading = {"columns": column, "clock_offset": clock_offset, "dt": dt}
+        return identify_bollard(bollard, step, logs, preset, out or DEFAULT_OUT, json, **reading)
     if step is not None:
         raise ValueError("--step must come with --bollard TABLE.csv, but got it alone")
     options = {"sensors": sensor, "columns": column, "clock_offset": clock_offset, "dt": dt}
@@ -127,9 +127,7 @@ def command(
     parameters = with_ranges(family.free, ranges, numbers)
     if out is not None and not is_file(out):
         raise ValueError(f"--out must end in .toml, but got {str(out)!r}")
-    for target in (out, plot):
-        if target is not None:
-            check_target(target)
+    check_targets((out, plot), json, read=(*logs, *(held_out or [])))
     announce_compilation()
     coordinates = Coordinates(parameters)
     objective = Objective(family.data, family.model, coordinates, filter=filter_name, predicted=predicted or ())

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from numerics.compiled import tell_when_compiling
-from numerics.files import write_whole
+from numerics.files import check_not_read, check_target, write_whole
 from numerics.progress import listening
 from thruster_cli.characters import showable
 from thruster_env.parameters import PRESETS
@@ -74,6 +75,22 @@ def emit(shown: list, data: dict, json_target: str | None) -> None:
         write_whole(json_target, as_text(data))
     for part in shown:
         console.print(part)
+
+
+def check_targets(targets: Iterable[str | Path | None], json_target: str | None, read: Iterable = ()) -> None:
+    """Raise ValueError unless all files can be written, before long work, and none of those read is among them.
+
+    Args:
+        targets: paths of what is to be written, None for those that nobody asked for.
+        json_target: of `--json`.
+        read: paths of what is read, None for those that nobody gave.
+    """
+    named = [one for one in (*targets, None if json_target == "-" else json_target) if one is not None]
+    given = [one for one in read if one is not None]
+    for target in named:
+        check_not_read(target, given)
+    for target in named:
+        check_target(target)
 
 
 @cache

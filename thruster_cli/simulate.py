@@ -10,8 +10,9 @@ import typer
 
 from numerics.checks import at_least, positive, within
 from numerics.streams import episode_keys
-from plants.logs.write import check_suffix, write_columns
+from plants.logs.write import check_suffix, header_of, write_columns
 from thruster_cli.output import JsonOption, PresetOption, SeedOption, announce_compilation, emit
+from thruster_env.channels import CHANNELS
 from thruster_env.plant import (
     DEFAULT_DT,
     DEFAULT_MEASUREMENT_NOISE,
@@ -22,7 +23,7 @@ from thruster_env.simulation import simulate
 from tuning.problems.excitation import held_levels
 
 MOST_STEPS = 10_000_000  # which take a gigabyte
-COLUMNS = ("time_s", "voltage_V", "omega_m_rad_per_s", "U_a_m_per_s", "thrust_N", "measured_thrust_N")
+TRUTH = ("time_s", "voltage_V", "omega_m_rad_per_s", "U_a_m_per_s", "thrust_N")
 
 
 def command(
@@ -39,10 +40,13 @@ def command(
     measurement_noise: Annotated[
         float, typer.Option(help="Variance of the thrust [N^2].")
     ] = DEFAULT_MEASUREMENT_NOISE,
+    sensor: Annotated[
+        list[str] | None, typer.Option(help=f"What is measured, thrust by default: {', '.join(CHANNELS)}.")
+    ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Simulate a thruster and write time, voltage, true state, true thrust and measured thrust to a log.
+    """Simulate a thruster and write time, voltage, true state, true thrust and measurements to a log.
 
     Row k holds the state at time k dt and the voltage that acts from then on; the last row has none. The
     numbers are those of BowThruster-v0 after reset(seed=SEED) under the same voltages. A simulation that does not
@@ -50,7 +54,15 @@ def command(
     """
     check_suffix(out)
     steps = at_least("steps", steps, 1, MOST_STEPS)
-    plant = make_plant(preset, dt, process_noise_cov=process_noise, measurement_noise_cov=measurement_noise)
+    sensors = sensor or ["thrust"]
+    variances = {**{name: one.variance for name, one in CHANNELS.items()}, "thrust": measurement_noise}
+    plant = make_plant(
+        preset,
+        dt,
+        process_noise_cov=process_noise,
+        measurement_noise_cov=[variances.get(channel, 0.0) for channel in sensors],
+        sensors=sensors,
+    )
     keys = episode_keys([seed])
     if voltage is not None:
         voltages = np.full((1, steps), within("voltage", voltage, plant.max_voltage))
@@ -68,6 +80,7 @@ def command(
         run.thrusts[0],
         *run.measurements[0].T,
     ]
-    write_columns(out, dict(zip(COLUMNS, values, strict=True)))
-    data = {"file": str(out), "rows": steps + 1, "columns": list(COLUMNS), "seed": seed, "preset": preset}
-    emit([f"{steps + 1} rows of {', '.join(COLUMNS)} in {out}"], data, json)
+    columns = [*TRUTH, *(header_of(CHANNELS[channel].quantity) for channel in plant.channels)]
+    write_columns(out, dict(zip(columns, values, strict=True)))
+    data = {"file": str(out), "rows": steps + 1, "columns": columns, "seed": seed, "preset": preset}
+    emit([f"{steps + 1} rows of {', '.join(columns)} in {out}"], data, json)

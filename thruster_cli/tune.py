@@ -29,6 +29,7 @@ from thruster_cli.output import (
     JsonOption,
     SeedOption,
     announce_compilation,
+    check_targets,
     emit,
     progress_console,
     working,
@@ -133,6 +134,7 @@ def command(
     of_logs = {"preset": preset, "model": model, "sensors": sensor, "columns": column}
     of_logs |= {"clock_offset": clock_offset, "dt": dt, "held_out": held_out, "blocks": blocks, "lead": lead}
     scenarios = problems_of(scenario, log, of_logs, "mismatch")
+    check_targets((out,), json, read=(*(log or []), *(held_out or [])))
     objectives = tuple(objective or ["score" if scenarios[0].scale is not None else "likelihood"])
     plan = Plan(
         filter_name,

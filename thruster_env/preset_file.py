@@ -14,12 +14,14 @@ too. Nothing in a file is run.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from numerics.checks import finite, shown
+from numerics.checks import finite, one_of, positive, shown
 from numerics.files import write_whole
 from numerics.toml import as_toml, read_toml
+from thruster_env.channels import CHANNELS
 from thruster_env.parameters import ThrusterParameters, checked
 
 SECTIONS = ("thruster", "dead_band", "recorder", "identified")
@@ -75,18 +77,42 @@ def _checked(content: dict) -> PresetFile:
         raise ValueError(f"thruster of a preset file must have the fields {names}, but {off}")
     if sorted(band) not in ([], ["high", "low"]):
         raise ValueError(f"dead_band of a preset file must have low and high, but got {shown(sorted(band))}")
+    for name, value in (*thruster.items(), *band.items()):
+        _check_no_switch(name, value)
     recorder = content.get("recorder", {})
+    _check_recorder(recorder)
+    ends = checked_band((band.get("low", 0.0), band.get("high", 0.0)))
+    return PresetFile(checked(ThrusterParameters(**thruster)), ends, recorder, content.get("identified", {}))
+
+
+def _check_recorder(recorder: dict) -> None:
+    """Raise ValueError for what is unknown or no number, whoever reads it later."""
     unknown = sorted(set(recorder) - set(RECORDER))
     if unknown:
         raise ValueError(f"recorder of a preset file must have {', '.join(RECORDER)}, but got {shown(unknown)}")
+    positive("dt of a preset file", recorder.get("dt", 1.0))
+    finite("ambient_velocity of a preset file", recorder.get("ambient_velocity", 0.0))
+    sensors = recorder.get("sensors", [])
+    if not isinstance(sensors, list) or not all(isinstance(channel, str) for channel in sensors):
+        raise ValueError(f"sensors of a preset file must be a list of channels, but got {shown(sensors)}")
+    known = [one_of("a channel of sensors", channel, tuple(CHANNELS)) for channel in sensors] or list(CHANNELS)
     for name in BY_CHANNEL:
         table = recorder.get(name, {})
         if not isinstance(table, dict):
             raise ValueError(f"{name} of a preset file must be a table by channel, but got {shown(table)}")
         for channel, value in table.items():
-            finite(f"{name} of {channel}", value)
-    ends = checked_band((band.get("low", 0.0), band.get("high", 0.0)))
-    return PresetFile(checked(ThrusterParameters(**thruster)), ends, recorder, content.get("identified", {}))
+            if channel not in known:
+                channels = ", ".join(known)
+                raise ValueError(
+                    f"{name} of a preset file must be of channels {channels}, but got {shown(channel)}"
+                )
+            check = finite if name in ("bias", "clock_offset") else partial(positive, zero_allowed=True)
+            check(f"{name} of {channel}", value)
+
+
+def _check_no_switch(name: str, value) -> None:
+    if isinstance(value, bool):  # which Python takes for a number
+        raise ValueError(f"{name} must be a finite number, but got {value}")
 
 
 def checked_band(ends) -> tuple[float, float]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from filters.logs.estimate import LogEstimate
+from filters.logs.estimate import SKIPPED, LogEstimate
 from filters.logs.findings import compared, estimated
 from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from plants.logs.columns import OUTPUT, STATE
@@ -15,12 +15,14 @@ TWO_SIDED = 1.96
 MOST_PANELS = 6  # of states and outputs
 TALL, LOW, WIDTH = 1.5, 1.1, 9.0  # [inch]
 ROOM = 0.6  # for title and legend [inch]
+MARGIN = 0.06  # of an axis above and below what it shows
 
 
 def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
     """Draw estimates beside the reference channels, and the innovations below; return the path.
 
-    References come first; of many states and outputs the first six are drawn.
+    References come first; of many states and outputs the first six are drawn. Bands of the first rows, in which a
+    filter settles from its prior, do not widen the axes.
     """
     model, references = found.model, compared(found)
     values = [f"{STATE}:{one.symbol}" for one in model.states] + [f"{OUTPUT}:{symbol}" for symbol in model.outputs]
@@ -36,6 +38,7 @@ def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
     for axis, key in zip(axes, shown, strict=False):
         mean, std = estimated(found, key)
         _band(axis, times, mean, std)
+        _limit(axis, mean, std, found.log.references[key] if key in references else mean)
         if key in references:
             axis.plot(times, found.log.references[key], color=DARK, linewidth=1.2, label="reference, not seen")
         axis.plot(times, mean, color=BLUE, linewidth=1.0, label="smoother" if found.smoothed else "estimate")
@@ -43,6 +46,7 @@ def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
     for j, (axis, one) in enumerate(zip(axes[len(shown) :], found.log.measured, strict=True)):
         std = np.sqrt(np.maximum(found.innovation_covs[:, j, j], 0.0))
         _band(axis, times, np.zeros_like(std), std)
+        _limit(axis, np.zeros_like(std), std, found.innovations[:, j])
         axis.plot(times, found.innovations[:, j], color=RUST, linewidth=0.8, label="innovation")
         axis.set_ylabel(f"innovation of\n{one.symbol}" + (f"\n[{one.unit}]" if one.unit else ""))
     axes[0].set_title(title, fontsize=11)
@@ -59,3 +63,14 @@ def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
 def _band(axis, times: np.ndarray, middle: np.ndarray, std: np.ndarray) -> None:
     low, high = middle - TWO_SIDED * std, middle + TWO_SIDED * std
     axis.fill_between(times, low, high, color=BLUE, alpha=0.25, linewidth=0, label="95 % band")
+
+
+def _limit(axis, middle: np.ndarray, std: np.ndarray, line: np.ndarray) -> None:
+    """Let an axis show both lines and, of the band, what is behind the first rows."""
+    reach = TWO_SIDED * std[min(SKIPPED, len(std) // 4) :]
+    ends = middle[len(std) - len(reach) :]
+    shown = np.concatenate((middle, line, ends - reach, ends + reach))
+    shown = shown[np.isfinite(shown)]
+    if shown.size and np.ptp(shown) > 0.0:
+        room = MARGIN * np.ptp(shown)
+        axis.set_ylim(shown.min() - room, shown.max() + room)

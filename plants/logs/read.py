@@ -75,7 +75,7 @@ def read_log(
     wanted = quantities_of(model)
     found = find_columns(wanted, table.names, said.columns, said.units, file)
     grid, start = _grid(table, found.get(TIME), said.dt, file)
-    offsets = _offsets(said.clock_offset, wanted, found, file)
+    offsets = _offsets(said.clock_offset, wanted, found, grid, file)
     source, parts, last = {}, {}, grid.rows - 1
     for one in wanted:
         if one.key not in found:
@@ -166,14 +166,21 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str) -> t
     return grid_of(stamps, dt), float(stamps[0])
 
 
-def _offsets(given: Mapping[str, float], wanted: list[Wanted], found: Mapping, file: str) -> dict[str, float]:
-    offsets = {}
+def _offsets(
+    given: Mapping[str, float], wanted: list[Wanted], found: Mapping, grid: Grid, file: str
+) -> dict[str, float]:
+    offsets, length = {}, grid.dt * (grid.rows - 1)
     for name, seconds in given.items():
         one = find_wanted(name, wanted)
         if one is None or one.key not in found:
             known = ", ".join(one.quantity.symbol for one in wanted if one.key in found)
             raise ValueError(f"clock offsets must be of channels {known}, but got {shown(name)} ({file})")
         offsets[one.key] = finite(f"the clock offset of {name}", seconds)
+        if abs(offsets[one.key]) >= length:  # nothing of the channel would be left
+            raise ValueError(
+                f"the clock offset of {name} must be shorter than the log, {length:g} s, but got {seconds:g} "
+                f"({file})"
+            )
     return offsets
 
 

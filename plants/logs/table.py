@@ -57,9 +57,8 @@ class Table:
                 found = np.array(texts, dtype=np.float64)
             except ValueError:
                 row = next(row for row, text in enumerate(texts) if not _is_number(text))
-                raise ValueError(
-                    f"columns must hold numbers, but got {shown(cells[row])} in {self.place(row, column)}"
-                ) from None
+                rule = "columns must hold numbers" + (", with decimal points" if _has_comma(texts[row]) else "")
+                raise ValueError(f"{rule}, but got {shown(cells[row])} in {self.place(row, column)}") from None
         if np.isinf(found).any():
             row = int(np.argmax(np.isinf(found)))
             raise ValueError(f"numbers must be finite, but got {found[row]} in {self.place(row, column)}")
@@ -92,7 +91,10 @@ def _read_csv(path: Path) -> Table:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ValueError(f"a CSV file must be text in UTF-8, but {path} is not: {error.reason}") from None
+        line = 1 + error.object[: error.start].count(b"\n")
+        raise ValueError(
+            f"a CSV file must be text in UTF-8, but {path} is not: {error.reason} in line {line}"
+        ) from None
     if not text.strip():
         raise ValueError(f"a log must have a header and rows, but {path} is empty")
     first = text.lstrip().splitlines()[0]
@@ -166,6 +168,11 @@ def _of_arrays(path: Path, cells: dict[str, np.ndarray]) -> Table:
         raise ValueError(f"a log must have columns of equal length with some rows, but {path} has not")
     count = rows.pop()
     return Table(str(path), cells, range(1, count + 1), "row")
+
+
+def _has_comma(text: str) -> bool:
+    """Whether a text is a number with a decimal comma."""
+    return text.count(",") == 1 and _is_number(text.replace(",", "."))
 
 
 def _is_number(text: str) -> bool:

@@ -68,7 +68,7 @@ def converted(values: np.ndarray, unit: str | None, wanted: str, where: str) -> 
         return np.asarray(registry.Quantity(values, given).to(target).magnitude, dtype=np.float64)
     except pint.DimensionalityError:
         raise ValueError(
-            f"the unit of {where} must be one of {wanted or 'a pure number'}, but got {unit!r}"
+            f"the unit of {where} must be one that converts to {wanted or 'a pure number'}, but got {unit!r}"
         ) from None
     except Exception as error:  # pint raises many kinds for text that is no unit
         raise ValueError(f"the unit of {where} must be one that pint knows, but got {unit!r}: {error}") from None

@@ -68,7 +68,10 @@ def test_units_are_converted(tmp_path):
     np.testing.assert_allclose(log.measurements[:, 0], 2 * np.pi * np.array([1, 2, 3]))
     again = log_of(tmp_path / "b.csv", text.replace("_rpm", ""), columns=columns | {"tach": "motor[rpm]"})
     np.testing.assert_array_equal(again.measurements, log.measurements)
-    for unit, said in (("kgf", "must be one of rad/s, but got 'kgf'"), ("furl", "must be one that pint knows")):
+    for unit, said in (
+        ("kgf", "must be one that converts to rad/s, but got 'kgf'"),
+        ("furl", "must be one that pint knows"),
+    ):
         with pytest.raises(ValueError, match=f"the unit of column 'motor' of .*b.csv {said}"):
             read_log(tmp_path / "b.csv", MODEL, columns | {"tach": f"motor[{unit}]"})
 

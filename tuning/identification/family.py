@@ -120,6 +120,8 @@ def with_ranges(
     for one in free:
         low, high = ranges.get(one.name, (one.low, one.high))
         at = finite(f"the start of {one.name}", start.get(one.name, one.start))
+        if not low < high:
+            raise ValueError(f"the range of {one.name} must be from low to high, but got {low:g} and {high:g}")
         if not low <= at <= high:
             raise ValueError(f"the start of {one.name} must be within {low:g} and {high:g}, but got {at:g}")
         found.append(replace(one, low=low, high=high, log=low > 0 and (one.log or one.name in ranges), default=at))

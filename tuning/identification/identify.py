@@ -21,6 +21,7 @@ from tuning.problems.parameter import Parameter
 from tuning.search.interruption import stop_on_interrupt
 
 STARTS = 4  # the one given, and others drawn about it
+MOST_STARTS = 1000
 NEARER = 5  # times that a start without a likelihood is moved halfway to the first
 REACH = 0.25  # of a range, to either side of the start, within which others are drawn
 
@@ -84,6 +85,8 @@ def identify(
     Source: Astrom (1980), "Maximum likelihood and prediction error methods", Automatica 16(5).
     """
     begin = time.perf_counter()
+    if not gate > 0:
+        raise ValueError(f"gate must be positive, but got {gate}")
     coordinates = Coordinates(free)
     objective = Objective(data, model, coordinates, filter=filter, degrees=degrees, predicted=predicted)
     first = coordinates.start(dict(start or {}))
@@ -158,5 +161,8 @@ def _others(coordinates: Coordinates, first: np.ndarray, starts, seed: int) -> l
     if not isinstance(starts, (int, np.integer)):
         return [coordinates.start(dict(one)) for one in starts]
     rng, width = np.random.default_rng(seed), REACH * (coordinates.high - coordinates.low)
-    drawn = [first + width * rng.uniform(-1, 1, len(first)) for _ in range(at_least("starts", starts, 1) - 1)]
+    drawn = [
+        first + width * rng.uniform(-1, 1, len(first))
+        for _ in range(at_least("starts", starts, 1, MOST_STARTS) - 1)
+    ]
     return [np.clip(point, coordinates.low, coordinates.high) for point in drawn]

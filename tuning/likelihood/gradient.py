@@ -12,13 +12,14 @@ from filters.likelihood import Likelihood, likelihood
 from numerics.checks import one_of
 from numerics.sources import is_array
 from tuning.likelihood.identifiability import KNOWN_WITHIN, TWO_SIDED
-from tuning.likelihood.noise import DIFFERENTIABLE, noise_family
+from tuning.likelihood.noise import noise_family
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters
 from tuning.search.space import Choice, untuned_choice
 
+DIFFERENTIABLE = ("kf", "ekf")
 BAD_START = (1.0, 1e-2, 1e2)  # factors on Q11, Q22 and R, far from where they belong
 STEP = 1e-3  # in the logarithms, of the differences of gradients that give the Hessian
 FLAT = 1e-12  # curvature over the largest one, below which there is none
@@ -78,12 +79,11 @@ def maximise_likelihood(
     parameters = model_parameters(problem)
     untuned = untuned_choice(filter_name, problem)
     noise_at = noise_family(untuned, problem, parameters)
-    slopes = _slopes_on(problem, data, noise_at)
     bounds = [tuple(np.log([one.low, one.high])) for one in parameters]
     given = starts_of(parameters) if starts is None else starts
     optima = [optimum(filter_name, problem, data, start) for start in given]
     best = max(optima, key=lambda optimum: optimum.log_likelihood)
-    errors = _standard_errors(slopes, np.log(best.variances))
+    errors = _standard_errors(slopes_of(problem, noise_at, data), np.log(best.variances))
     inside = np.array(
         [low < value < high for value, (low, high) in zip(np.log(best.variances), bounds, strict=True)]
     )
@@ -125,13 +125,16 @@ def optimum(filter_name: str, problem: Problem, data: Data, start: Sequence[floa
     point, count = np.log(reference * factors), len(data.measurements)
     is_large = is_array(len(problem.quantities.states), len(problem.quantities.states))
     for runs in (FEW_RUNS, count) if is_large and count > FEW_RUNS else (count,):
-        found = _minimum(_slopes_on(problem, data.slice(0, runs), noise_at), point, bounds, is_large)
+        found = _minimum(slopes_of(problem, noise_at, data.slice(0, runs)), point, bounds, is_large)
         point = found.x
     return Optimum(tuple(factors.tolist()), np.exp(point), -found.fun, found.nfev, bool(found.success))
 
 
-def _slopes_on(problem: Problem, data: Data, noise_at: Callable) -> Callable[[np.ndarray], Likelihood]:
-    """The function that gives each run's log-likelihood (B,) and gradients (B, p); lead-ins do not count."""
+def slopes_of(problem: Problem, noise_at: Callable, data: Data) -> Callable[[np.ndarray], Likelihood]:
+    """Log-likelihood of each run (B,), and its gradients (B, p), as a function of the logarithms of parameters.
+
+    The lead-in of runs that have one, in which the filter settles, counts in neither.
+    """
     beginning = data.beginning if problem.leads_in and data.first_scored else None
 
     def slopes(logarithms: np.ndarray) -> Likelihood:
