@@ -21,7 +21,7 @@ from studies.vehicle.findings import why_different
 from studies.vehicle.mean_propagation import MeanPropagatingEnKF
 from studies.vehicle.models import papers_model
 from studies.vehicle.paths import PATHS, find_path
-from studies.vehicle.pose import full_pose, planar_pose, reckoned_attitude
+from studies.vehicle.pose import full_pose, planar_pose, pose_errors, reckoned_attitude
 from studies.vehicle.printed import DT, NOISE, PrintedRow
 from studies.vehicle.statements import GOLDEN, MEAN_ONLY, unstable_corners
 from studies.vehicle.tasks import PAPERS
@@ -241,3 +241,8 @@ def test_a_wrong_argument_is_one_line(monkeypatch, capsys, arguments, rule):
     assert command_line(monkeypatch, *arguments) == 2
     said = capsys.readouterr()
     assert rule in " ".join(said.err.split()) and not said.out
+
+
+def test_errors_of_yaw_are_the_short_way_round():
+    true, found = np.array([[1.0, 2.0, 3.0, 6.2]]), np.array([[1.5, 2.0, 2.0, 0.1]])
+    np.testing.assert_allclose(pose_errors(found, true), [[0.5, 0.0, -1.0, 2 * np.pi - 6.1]], atol=1e-12)

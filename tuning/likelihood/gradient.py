@@ -123,9 +123,9 @@ def optimum(filter_name: str, problem: Problem, data: Data, start: Sequence[floa
     bounds = [tuple(np.log([one.low, one.high])) for one in parameters]
     factors = np.broadcast_to(np.asarray(start, dtype=np.float64), reference.shape)
     point, count = np.log(reference * factors), len(data.measurements)
-    is_large = is_array(len(problem.quantities.states), len(problem.quantities.states))
-    for runs in (FEW_RUNS, count) if is_large and count > FEW_RUNS else (count,):
-        found = _minimum(slopes_of(problem, noise_at, data.slice(0, runs)), point, bounds, is_large)
+    large = is_large(problem)
+    for runs in (FEW_RUNS, count) if large and count > FEW_RUNS else (count,):
+        found = _minimum(slopes_of(problem, noise_at, data.slice(0, runs)), point, bounds, large)
         point = found.x
     return Optimum(tuple(factors.tolist()), np.exp(point), -found.fun, found.nfev, bool(found.success))
 
@@ -148,7 +148,13 @@ def slopes_of(problem: Problem, noise_at: Callable, data: Data) -> Callable[[np.
     return slopes
 
 
-def _minimum(slopes: Callable, first: np.ndarray, bounds: list, is_large: bool):
+def is_large(problem: Problem) -> bool:
+    """Whether a problem's model has so many states that its likelihood takes long."""
+    count = len(problem.quantities.states)
+    return is_array(count, count)
+
+
+def _minimum(slopes: Callable, first: np.ndarray, bounds: list, large: bool):
     """The least -log L of all runs, from a first point of logarithms on."""
     from scipy.optimize import minimize
 
@@ -159,7 +165,7 @@ def _minimum(slopes: Callable, first: np.ndarray, bounds: list, is_large: bool):
             return value, gradient
         return DIVERGED, np.zeros_like(gradient)  # the line search takes a shorter step
 
-    options = {"ftol": COARSE, "maxcor": 2 * len(first)} if is_large else {"ftol": PRECISE}
+    options = {"ftol": COARSE, "maxcor": 2 * len(first)} if large else {"ftol": PRECISE}
     return minimize(negative, first, jac=True, bounds=bounds, method="L-BFGS-B", options=options)
 
 

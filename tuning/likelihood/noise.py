@@ -90,7 +90,10 @@ def known_information(
             return None
         try:
             noise_at = noise_family(choice, scenario, [known[name] for name in names])
-            found.append(information(*noise_at(values, one)))
+            told = information(*noise_at(values, one))
+            if scenario.leads_in and one.first_scored:  # that of the lead-in does not count
+                told = told - information(*noise_at(values, one.beginning))
+            found.append(told)
         except ValueError:  # more than Q and R changes
             return None
     return np.concatenate(found)

@@ -6,7 +6,7 @@ import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from tuning.likelihood.gradient import optimum
+from tuning.likelihood.gradient import is_large, optimum
 from tuning.search.cost import COST
 from tuning.search.outcome import best_trial, is_consistent, is_over_budget
 from tuning.search.parameters import model_parameters
@@ -23,6 +23,7 @@ FIRST_ROUND = 3  # trials for each kind, after which the noise of the best one i
 ROOM = 0.9  # of the budget, for which a smaller ensemble is meant
 LIKELIEST = "likeliest noise"  # attribute of the trial whose Q and R make the innovations likeliest
 LIKELIEST_AFTER = 20  # trials
+LIKELIEST_RUNS = 8  # of a model of many states: of Q and R a trial needs no more than these tell
 
 
 def enqueue_what_is_left(study: optuna.Study, plan: Plan) -> None:
@@ -121,7 +122,9 @@ def _enqueue_likeliest(study: optuna.Study, plan: Plan) -> None:
     if best is None:
         return
     name = "kf" if plan.kinds == ("kf",) else "ekf"
-    found = optimum(name, plan.scenarios[0], plan.training_data()[0])
+    data = plan.training_data()[0]
+    data = data.slice(0, LIKELIEST_RUNS) if is_large(plan.scenarios[0]) else data
+    found = optimum(name, plan.scenarios[0], data)
     names = [one.name for one in model_parameters(plan.scenarios[0])]
     space = plan.space()
     likeliest = {
