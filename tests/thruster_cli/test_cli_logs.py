@@ -180,3 +180,11 @@ def test_a_mistake_with_a_log_is_one_line_and_nothing_is_written(arguments, line
     assert done.returncode == 2 and line in done.stderr and done.stderr.count("thruster:") == 1
     assert (tmp_path / "run.csv").read_text().startswith("time_s,voltage_V,measured_thrust_N")
     assert {path.name for path in tmp_path.iterdir()} <= {"run.csv", "out"}
+
+
+def test_rows_in_which_nothing_was_measured_tell_nothing(thruster, tmp_path):  # noqa: F811
+    rows = [f"{0.01 * k:.2f},{k % 7},{k * 0.1 if k < 30 else ''}" for k in range(200)]
+    (tmp_path / "run.csv").write_text("time_s,voltage_V,measured_thrust_N\n" + "\n".join(rows) + "\n")
+    assert "Nothing was measured in the rows that count, from 50 on" in " ".join(
+        thruster("estimate", "run.csv").stdout.split()
+    )
