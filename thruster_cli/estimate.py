@@ -120,6 +120,8 @@ def _shown(found: LogEstimate, told: LogFindings, out: Path | None, plot: Path |
 
 
 def _sentences(told: LogFindings) -> list[str]:
+    if not told.rows:
+        return [f"Nothing was measured in the rows that count, from {told.first} on: there are no innovations."]
     if isnan(told.mean_nis):
         return ["This filter gives no covariance, so there is no NIS and no likelihood."]
     low, high = told.nis_band

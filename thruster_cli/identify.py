@@ -20,7 +20,7 @@ from thruster_cli.logs import (
     pairs,
 )
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, check_targets, emit, progress_console
-from thruster_cli.to_identify import family_of, numbers_of, ranges_of, split_runs
+from thruster_cli.to_identify import check_offsets, family_of, numbers_of, ranges_of, split_runs
 from thruster_env.preset_file import is_file
 from tuning.identification.coordinates import Coordinates
 from tuning.identification.excitation import check_excitation
@@ -125,6 +125,7 @@ def command(
     family = family_of(family, runs, free, noise=not hold_noise)
     numbers, ranges = numbers_of("--start", pairs("--start", start)), ranges_of(pairs("--range", range_))
     parameters = with_ranges(family.free, ranges, numbers)
+    check_offsets(parameters, runs)
     if out is not None and not is_file(out):
         raise ValueError(f"--out must end in .toml, but got {str(out)!r}")
     check_targets((out, plot), json, read=(*logs, *(held_out or [])))

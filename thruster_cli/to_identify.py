@@ -12,9 +12,11 @@ from plants.logs.log import Log
 from thruster_cli.logs import DEFAULT_PRESET, read_named
 from thruster_env.logged import logged_plant
 from tuning.identification.family import ModelFamily
+from tuning.problems.parameter import Parameter
 from tuning.thruster.identification import ThrusterFamily
 
 EVERY_THIRD = 3
+OFFSET_SHARE = 4  # of a log, that a clock offset may take away
 THRUSTER_FREE = "motor_damping,voltage_gain,lift_coefficient"  # where nothing is said
 
 
@@ -68,6 +70,17 @@ class LoggedFamily(ModelFamily):
     def shifted(self, logs: Sequence[Log]) -> tuple[Log, ...]:
         """Other logs as this family takes them."""
         return tuple(logs)
+
+
+def check_offsets(parameters: Sequence[Parameter], logs: Sequence[Log]) -> None:
+    """Raise ValueError unless the ranges of clock offsets leave most of each log: no data fit any model."""
+    most = min(log.times[-1] for log in logs) / OFFSET_SHARE
+    for one in parameters:
+        if one.name.startswith("clock_offset_") and max(-one.low, one.high) > most:
+            raise ValueError(
+                f"the range of {one.name} must be within a quarter of the shortest log, {most:g} s, but is from "
+                f"{one.low:g} to {one.high:g}"
+            )
 
 
 def ranges_of(given: Mapping[str, str]) -> dict[str, tuple[float, float]]:

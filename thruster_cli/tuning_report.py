@@ -63,7 +63,7 @@ def report(tuning: Tuning) -> list:
         span_of_seeds = f"{scenario.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}"
         where = f"held-out {span_of_seeds}, scenario {scenario.name}"
         shown += [choice_table(choices, scenario), comparison_table(evaluations, proof.bound, where)]
-        shown += gains(proof)
+        shown += gains(proof, scenario.seed_word)
         shown.append(_consistency_sentence(proof.tuned))
         if proof.tuned.has_truth and isnan(proof.bound).all():
             shown.append(
@@ -209,35 +209,35 @@ def ratios_as_json(proof: Comparison) -> dict:
     return {f"tuned_over_{key}": ratios.get(name) for key, name in names.items()}
 
 
-def gains(proof: Comparison) -> list[str]:
+def gains(proof: Comparison, seed_word: str) -> list[str]:
     """What tuning is worth, over each baseline, the one that counts first, and what that one is."""
     if not proof.tuned.has_truth:
-        return _likelihood_gains(proof)
+        return _likelihood_gains(proof, seed_word)
     ratios = proof.ratios
     parts = [f"x {span(ratio, 3)} that of the {name}" for name, ratio in ratios.items()]
-    first, place = next(iter(ratios)), f"{len(proof.seeds)} held-out seeds"
+    first, place = next(iter(ratios)), f"{len(proof.seeds)} held-out {seed_word}"
     said = f"Score of the tuned filter on {place}: {', '.join(parts)} (paired 95 % intervals)."
     scaling = scaling_sentence(proof)
-    return [f"{said} {_verdict(ratios[first], first)}", *([scaling] if scaling else [])]
+    return [f"{said} {_verdict(ratios[first], first, seed_word)}", *([scaling] if scaling else [])]
 
 
-def _likelihood_gains(proof: Comparison) -> list[str]:
+def _likelihood_gains(proof: Comparison, seed_word: str) -> list[str]:
     """What tuning is worth where there is no truth: by how much the log-likelihood of a run rises."""
     gained = {name: found for name, found in proof.likelihood_gains.items() if not isnan(found.value)}
     said, scaling = [without_truth("This problem")], scaling_sentence(proof)
     if gained:
         parts = [f"{span(found, 2)} above that of the {name}" for name, found in gained.items()]
-        place = f"{len(proof.seeds)} held-out seeds"
+        place = f"{len(proof.seeds)} held-out {seed_word}"
         said.append(f"Log-likelihood of a run of the tuned filter on {place}: {', '.join(parts)}.")
     return [*said, *([scaling] if scaling else [])]
 
 
-def _verdict(ratio: Interval, name: str) -> str:
+def _verdict(ratio: Interval, name: str, seed_word: str) -> str:
     if ratio.high < 1:
         return f"Tuning lowers the error by {100 * (1 - ratio.value):.0f} % against the {name}."
     if ratio.low > 1:
         return f"Tuning makes it worse than the {name}."
-    return f"No difference from the {name} that these seeds can show."
+    return f"No difference from the {name} that these {seed_word} can show."
 
 
 def _size_sentence(kept: int, result: StudyResult) -> str:

@@ -96,6 +96,8 @@ def find_columns(
         if one is None and name != TIME:
             known = ", ".join([*(known.quantity.symbol for known in wanted), TIME])
             raise ValueError(f"columns must be told for some of {known}, but got {shown(name)}={text} ({file})")
+        if not isinstance(text, str):
+            raise ValueError(f"the column for {name} must be a header, but got {shown(text)} ({file})")
         key = TIME if one is None else one.key
         if key in found:
             raise ValueError(

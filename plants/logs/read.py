@@ -71,6 +71,9 @@ def read_log(
         ValueError: states the rule and the value, with file, line and column.
     """
     file, table = str(path), read_table(path)
+    for name, given in (("columns", columns), ("clock offsets", clock_offset)):
+        if not isinstance(given, Mapping | None):
+            raise ValueError(f"{name} must be a mapping from quantities, but got {shown(given)}")
     said = _described(Path(path)).updated(Description(columns or {}, {}, clock_offset or {}, dt))
     wanted = quantities_of(model)
     found = find_columns(wanted, table.names, said.columns, said.units, file)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -78,6 +79,8 @@ def read_table(path: str | Path) -> Table:
     Raises:
         ValueError: states the rule and the value, with file, line and column.
     """
+    if not isinstance(path, (str, PathLike)):
+        raise ValueError(f"a log must be the path of a file, but got {shown(path)}")
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise ValueError(f"a log must be a file that ends in {', '.join(SUFFIXES)}, but got {shown(str(path))}")

@@ -108,3 +108,15 @@ def test_columns_and_picture_hold_all_of_it(log, tmp_path):
     np.testing.assert_array_equal(columns["innovation_tach_rad_per_s"], found.innovations[:, 0])
     assert {"P_W", "std_P_W", "reference_P_W", "innovation_std_tach_rad_per_s"} <= set(columns)
     assert log_figure(tmp_path / "est.png", found, "kf on run").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_prior_s_band_does_not_widen_the_picture(log, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("filters.logs.figure.save_figure", lambda figure, path: drawn.extend(figure.axes))
+    found = estimate(log, "kf", SEEN.replace(prior_cov=[1e6]))
+    log_figure(tmp_path / "est.png", found, "kf on run")
+    speed, innovation = drawn[0], drawn[-1]
+    for axis, line in ((speed, found.means[:, 0]), (innovation, found.innovations[:, 0])):
+        low, high = axis.get_ylim()
+        assert low < np.nanmin(line) and np.nanmax(line) < high
+        assert high - low < 3 * np.nanmax(np.abs(line)) + 6 * found.stds[-1, 0]

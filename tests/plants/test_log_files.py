@@ -104,6 +104,10 @@ def test_a_file_beside_tells_columns_units_and_clocks(tmp_path):
         ),
         (GOOD + "0.3,4\n", "rows must have as many cells as the header, 3, but got 2 in line 5"),
         (GOOD + "0.3,4,off\n", "columns must hold numbers, but got 'off' in line 5, column 'tach' of .*run.csv"),
+        (
+            "t;voltage;tach\n0;1,5;2\n1;2,5;3\n2;3;4\n",
+            "must hold numbers, with decimal points, but got '1,5' in line 2, column 'voltage'",
+        ),
         (GOOD + "0.3,4,inf\n", "numbers must be finite, but got inf in line 5, column 'tach'"),
         (GOOD + "0.15,4,5\n", "times must increase .* 0.15 s follows 0.2 s in line 5, column 'time_s'"),
         (GOOD + ",4,5\n", "every row must have a time, but there is none in line 5, column 'time_s'"),

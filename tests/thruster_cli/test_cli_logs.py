@@ -66,6 +66,19 @@ def test_estimating_imports_no_optimiser_and_draws_nothing_that_is_not_asked_for
     assert done.stdout.strip() == "[]"
 
 
+def test_what_is_simulated_has_the_sensors_that_are_asked_for(thruster, as_json):  # noqa: F811
+    options = "--steps", 100, "--sensor", "thrust", "--sensor", "speed"
+    data = as_json("simulate", "--out", "run.csv", *options)
+    assert data["columns"][-2:] == ["measured_thrust_N", "measured_speed_rad_per_s"]
+    table = np.genfromtxt("run.csv", delimiter=",", names=True)
+    errors = table["measured_speed_rad_per_s"] - table["omega_m_rad_per_s"]
+    assert abs(errors.mean()) < 0.8 and 1.5 < errors.std() < 2.5  # of 2 rad/s
+    as_json("simulate", "--out", "alone.csv", *options[:2])
+    alone = np.genfromtxt("alone.csv", delimiter=",", names=True)
+    np.testing.assert_array_equal(alone["measured_thrust_N"], table["measured_thrust_N"])
+    assert set(as_json("estimate", "run.csv", *options[2:])["one_step_ahead"]) == {"thrust", "speed"}
+
+
 def test_a_load_cell_is_held_against_what_the_tachometer_tells(simulated, as_json):  # noqa: F811
     simulated("run.csv")
     columns = "--column", "speed=omega_m_rad_per_s", "--column", "thrust=thrust_N"
@@ -142,6 +155,18 @@ def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  
         (("estimate", "run.csv", "--plot", "est.pdf"), "--plot must end in .png, but got 'est.pdf'"),
         (("estimate", "run.csv", "--skip", "9999"), "skip must be at most 60, but got 9999"),
         (("estimate", "run.csv", "--clock-offset", "thrust=late"), "--clock-offset thrust must be seconds"),
+        (("estimate", "run.csv", "--clock-offset", "thrust=-0.6"), "thrust must be shorter than the log, 0.6 s"),
+        (("estimate", "run.csv", "--out", "./run.csv"), "what is written must not replace what is read"),
+        (("estimate", "run.csv", "--out", "est.csv", "--json", "run.csv"), "must not replace what is read"),
+        (
+            ("estimate", "run.csv", "--out", "est.csv", "--json", "."),
+            "must be where it can be written, but . is",
+        ),
+        (("identify", "run.csv", "--json", "run.csv"), "must not replace what is read"),
+        (
+            ("simulate", "--out", "new.csv", "--sensor", "torque"),
+            "a channel of sensors must be one of thrust, speed",
+        ),
         (("tune", "--log", "run.csv"), "a log must have at least 75 rows"),
         (("tune", "--log", "run.csv", "--problem", "nominal"), "must be of --log or of --problem, but got both"),
         (("tune", "--blocks", "3"), "--blocks must come with --log, but there is none"),
@@ -153,4 +178,13 @@ def test_a_mistake_with_a_log_is_one_line_and_nothing_is_written(arguments, line
     (tmp_path / "run.csv").write_text("time_s,voltage_V,measured_thrust_N\n" + "\n".join(rows) + "\n")
     done = thruster(*arguments)
     assert done.returncode == 2 and line in done.stderr and done.stderr.count("thruster:") == 1
+    assert (tmp_path / "run.csv").read_text().startswith("time_s,voltage_V,measured_thrust_N")
     assert {path.name for path in tmp_path.iterdir()} <= {"run.csv", "out"}
+
+
+def test_rows_in_which_nothing_was_measured_tell_nothing(thruster, tmp_path):  # noqa: F811
+    rows = [f"{0.01 * k:.2f},{k % 7},{k * 0.1 if k < 30 else ''}" for k in range(200)]
+    (tmp_path / "run.csv").write_text("time_s,voltage_V,measured_thrust_N\n" + "\n".join(rows) + "\n")
+    assert "Nothing was measured in the rows that count, from 50 on" in " ".join(
+        thruster("estimate", "run.csv").stdout.split()
+    )

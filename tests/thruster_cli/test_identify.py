@@ -74,6 +74,13 @@ WITH_LOG = [
     (("--free", "mass"), "free parameters must be of lift_coefficient, .*, but got 'mass'"),
     (("--start", "voltage_gain=1e9"), "the start of voltage_gain must be within"),
     (("--predicted", "lift"), "a predicted channel must be one of thrust, speed, but got 'lift'"),
+    (("--range", "voltage_gain=5:1"), "the range of voltage_gain must be from low to high, but got 5 and 1"),
+    (
+        ("--free", "clock_offset_thrust", "--range", "clock_offset_thrust=-1:99"),
+        "the range of clock_offset_thrust must be within a quarter of the shortest log, .* from -1 to 99",
+    ),
+    (("--gate", "nan"), "gate must be positive, but got nan"),
+    (("--starts", "10000"), "starts must be at most 1000, but got 10000"),
     (("--range", "voltage_gain=5"), "--range must have the form NAME=LOW:HIGH, but got 'voltage_gain=5'"),
     (("--filter", "kf"), "a thruster must be identified with the ekf, but got --filter kf"),
     (("--held-out", "run0.csv"), "at least one log must be left to learn from"),
@@ -115,7 +122,10 @@ def test_a_bollard_table_and_a_step_response_make_a_preset(thruster, as_json, tm
     inputs = np.repeat([[[2.0], [10.0], [-8.0]]], 60, axis=1)
     drawn = simulate(model, episode_keys([0]), inputs).measurements[0]
     write_log("step.csv", Log("step", 0.01, inputs[0], drawn, model.input_quantities, model.measurements))
-    found = as_json("identify", "--bollard", "table.csv", "--step", "step.csv", "--out", "mine.toml")
+    renamed = (tmp_path / "step.csv").read_text().replace("measured_speed_rad_per_s", "tacho")
+    (tmp_path / "step.csv").write_text(renamed)
+    column = "--column", "speed=tacho"
+    found = as_json("identify", "--bollard", "table.csv", "--step", "step.csv", *column, "--out", "mine.toml")
     assert found["held_out_supplies"] == [14.0, 18.0]
     assert found["thruster"]["lift_coefficient"] == pytest.approx(truth.lift_coefficient, rel=1e-4)
     values, errors = found["step"]["values"], found["step"]["standard_errors"]

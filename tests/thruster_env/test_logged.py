@@ -124,6 +124,15 @@ WRONG = [
     ("GOOD\n[dead_band]\nlow = -1.0\n", "dead_band of a preset file must have low and high"),
     ("GOOD\n[dead_band]\nlow = 1.0\nhigh = 2.0\n", "dead_band must be from low <= 0 to high >= 0"),
     ("GOOD\n[recorder]\ncolour = 1\n", "recorder of a preset file must have dt, sensors, .*, but got .'colour'."),
+    ("GOOD\n[recorder]\ndt = 'x'\n", "dt of a preset file must be a finite number, but got 'x'"),
+    ("GOOD\n[recorder]\nsensors = 'thrust'\n", "sensors of a preset file must be a list of channels"),
+    ("GOOD\n[recorder]\nambient_velocity = nan\n", "ambient_velocity of a preset file must be a finite number"),
+    (
+        "GOOD\n[recorder]\nsensors = ['thrust']\nmeasurement_noise_cov = {speed = 1.0}\n",
+        "measurement_noise_cov of a preset file must be of channels thrust, but got 'speed'",
+    ),
+    ("GOOD\n[recorder]\nlag = {thrust = -1.0}\n", "lag of thrust must be zero or positive, but got -1"),
+    ("GOOD\n[dead_band]\nlow = false\nhigh = 1.0\n", "low must be a finite number, but got False"),
     ("GOOD\n[recorder]\nbias = {thrust = 'x'}\n", "bias of thrust must be a finite number"),
 ]
 
