@@ -96,7 +96,7 @@ def command(
     shown = [choice_table(choices, chosen), comparison_table(evaluations, proof.bound, where)]
     if tuned is None and not proof.tuned.has_truth:
         shown.append(without_truth(chosen.name))
-    shown += [scaling_sentence(proof)] if tuned is None else gains(proof)
+    shown += [scaling_sentence(proof)] if tuned is None else gains(proof, chosen.seed_word)
     if consistency is not None:
         name = RULE if tuned is None else TUNED
         with working("checking the covariance"):
