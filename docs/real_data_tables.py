@@ -21,19 +21,8 @@ from studies.recordings.model import IDENTIFIED, model
 from studies.recordings.regime import regimes
 from studies.recordings.results import Task, identify_all
 from studies.recordings.runs import read_recordings
-from studies.recordings.tables import (
-    CLOCK_HEADER,
-    LADDER_HEADER,
-    NUMBER_HEADER,
-    RATIO_HEADER,
-    baseline_header,
-    baseline_rows,
-    clock_rows,
-    ladder_rows,
-    number_rows,
-    ratio_rows,
-    sentences,
-)
+from studies.recordings.tables import sentences
+from studies.recordings.tables import tables_of as rows_of
 
 
 def tables_of(recordings: Path, results: Path) -> dict[str, Callable[[], str]]:
@@ -50,16 +39,13 @@ def tables_of(recordings: Path, results: Path) -> dict[str, Callable[[], str]]:
         ]
         return table(["Q times", "log-likelihood of the tachometer", "mean NIS", "ratio, mean"], rows)
 
+    made = {name: (lambda one=one: table(*one)) for name, one in rows_of(runs, left_out, tasks).items()}
+    ratios = made["ratios"]
     return {
+        **made,
+        "ratios": lambda: "\n\n".join([ratios(), *sentences(left_out, runs)]),
+        "all_runs": lambda: table(*rows_of(runs, whole)["ratios"]),
         "regime": regime,
-        "ratios": lambda: "\n\n".join(
-            [table(RATIO_HEADER, ratio_rows(runs, left_out)), *sentences(left_out, runs)]
-        ),
-        "all_runs": lambda: table(RATIO_HEADER, ratio_rows(runs, whole)),
-        "estimators": lambda: table(baseline_header(left_out), baseline_rows(runs, left_out)),
-        "clocks": lambda: table(CLOCK_HEADER, clock_rows(runs)),
-        "structures": lambda: table(LADDER_HEADER, ladder_rows(runs, tasks)),
-        "numbers": lambda: table(NUMBER_HEADER, number_rows(runs, tasks)),
     }
 
 
@@ -76,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("recordings", type=Path)
     parser.add_argument("--results", type=Path, default=Path("out") / "recordings.json")
     parser.add_argument("folder", nargs="?", type=Path, default=Path(__file__).parent)
-    given = parser.parse_args(arguments)
+    given = parser.parse_intermixed_args(arguments)
     page = given.folder / "real_data.md"
     write_whole(page, with_tables(page.read_text(encoding="utf-8"), tables_of(given.recordings, given.results)))
 

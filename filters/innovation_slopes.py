@@ -7,8 +7,8 @@ from collections.abc import Callable
 from functools import cache
 
 from numerics.compiled import inlined
-from numerics.matrices import innovation_likelihood, row_solver, vector_solver
-from numerics.sources import Source, entrywise
+from numerics.matrices import innovation_likelihood, present_part, row_solver, vector_solver
+from numerics.sources import Source
 from numerics.tuples import matrix_writer, vector_writer
 
 
@@ -58,7 +58,7 @@ def statistics_of(m: int) -> tuple[Callable, ...]:
     square = source.sum(f"v[{i}] * w[{i}]" for i in source.range(m))
     count = source.sum(f"(1.0 if z[{i}] == z[{i}] else 0.0)" for i in source.range(m))
     measure = source.function(f"({square}, {count})")
-    mask, trace = _present(m), _present_trace(m)
+    mask, trace = present_part(m), _present_trace(m)
     store, store_weighted, store_ratio = vector_writer(m), vector_writer(m, m), matrix_writer(m, m, 2 * m)
 
     @inlined
@@ -100,19 +100,6 @@ def statistics_of(m: int) -> tuple[Callable, ...]:
                     information[j, i] += total
 
     return weigh, log_likelihood, slope, note, sum_up
-
-
-@cache
-def _present(m: int) -> Callable:
-    """Return `mask(ds, z)`: ds, zero where a channel is NaN in z."""
-    return entrywise(
-        "mask",
-        "ds, z",
-        (m, m),
-        lambda i, j: f"(ds[{i}][{j}] if z[{i}] == z[{i}] and z[{j}] == z[{j}] else 0.0)",
-        ds=(m, m),
-        z=(m,),
-    )
 
 
 @cache

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import cache
 
 from numerics import arrays
-from numerics.sources import Source, is_array
+from numerics.sources import Source, entrywise, is_array
 from numerics.triangles import (
     cholesky_factor,
     factored_inverse,
@@ -151,6 +151,19 @@ def innovation(size: int, first: int = 0) -> Callable:
         return f"z[{i}] - y[{first + i}] if z[{i}] == z[{i}] else 0.0"
 
     return source.function(source.vector(size, entry))
+
+
+@cache
+def present_part(size: int) -> Callable:
+    """Return `part(a, z)`: the matrix a with zeros in rows and columns of channels that are NaN in z."""
+    return entrywise(
+        "of_present",
+        "a, z",
+        (size, size),
+        lambda i, j: f"(a[{i}][{j}] if z[{i}] == z[{i}] and z[{j}] == z[{j}] else 0.0)",
+        a=(size, size),
+        z=(size,),
+    )
 
 
 @cache

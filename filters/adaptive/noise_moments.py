@@ -65,19 +65,6 @@ def mixer(size: int) -> Callable:
 
 
 @cache
-def present_part(size: int) -> Callable:
-    """Return `part(a, z)`: the matrix a with zeros in rows and columns of channels that are NaN in z."""
-    return entrywise(
-        "of_present",
-        "a, z",
-        (size, size),
-        lambda i, j: f"(a[{i}][{j}] if z[{i}] == z[{i}] and z[{j}] == z[{j}] else 0.0)",
-        a=(size, size),
-        z=(size,),
-    )
-
-
-@cache
 def trace_of(size: int) -> Callable:
     """Return `trace(a)`, the sum of the diagonal."""
     source = Source("trace", "a", a=(size, size))

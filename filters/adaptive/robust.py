@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import ClassVar
 
-from filters.adaptive.noise_moments import measurement_noise_moment, mixer, present_part, trace_of
+from filters.adaptive.noise_moments import measurement_noise_moment, mixer, trace_of
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
@@ -40,7 +40,7 @@ def robust_kernels(functions: Functions, shape: Shape) -> Kernels:
         mixer(m),
         matrices.masked(m),
     )
-    of_present, trace, counting = present_part(m), trace_of(m), Source("count", "z", z=(m,))
+    of_present, trace, counting = matrices.present_part(m), trace_of(m), Source("count", "z", z=(m,))
     ones = (f"(1.0 if z[{i}] == z[{i}] else 0.0)" for i in counting.range(m))
     count = counting.function(counting.sum(ones))
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters.adaptive.noise_moments import mixer, outer, present_part, trace_of
+from filters.adaptive.noise_moments import mixer, outer, trace_of
 from filters.engine.belief import Belief, Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
@@ -75,7 +75,7 @@ def sage_husa_kernels(functions: Functions, shape: Shape) -> Kernels:
     move = extended_prediction(functions, shape)
     step_r, step_q, square_m, square_n = bounded_step(m), bounded_step(n), outer(m), outer(n)
     mix, change = mixer(n), scaled_sum(n)
-    of_present = present_part(m)
+    of_present = matrices.present_part(m)
 
     @inlined
     def start(memory, numbers, size):

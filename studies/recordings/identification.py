@@ -10,11 +10,12 @@ import numpy as np
 from filters.engine.batch import run
 from filters.gaussian.extended import ExtendedKalmanFilter
 from plants.state_space import StateSpaceModel
-from studies.recordings.model import LOAD_CELL, on_line, to_identify, with_values
+from studies.recordings.model import LOAD_CELL, on_line, to_identify
 from studies.recordings.runs import Recording
 from tuning.identification.identify import identify
 from tuning.identification.result import Identification
 from tuning.identification.runs import runs_of
+from tuning.identification.values import valued
 from tuning.problems.parameter import Parameter
 
 
@@ -69,7 +70,7 @@ class Structure(NamedTuple):
     def model(self, **values: float) -> StateSpaceModel:
         """The model, with the load cell, for values of the free numbers."""
         mount = MOUNT[0] in self.free
-        return with_values(to_identify(self.ambient, mount), {**self.fixed, **values})
+        return valued(to_identify(self.ambient, mount), {**self.fixed, **values})
 
 
 STATIC = (*MOTOR, *BAND, *LAG, *BLADES, *SIDES, *NOISE)

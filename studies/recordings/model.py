@@ -25,7 +25,7 @@ from typing import NamedTuple
 from numerics.integration import runge_kutta
 from plants.quantities import Output, Quantity
 from plants.state_space import StateSpaceModel
-from tuning.identification.values import read_values
+from tuning.identification.values import read_values, valued
 
 DT = 0.04  # of the recordings [s]
 SUBSTEPS = 4  # of 10 ms: stable for rates of up to 278 1/s
@@ -193,16 +193,4 @@ def model() -> StateSpaceModel:
 
     Its output T is the thrust; a load cell's column may be its reference (`--column T=HEADER`).
     """
-    return on_line(with_values(to_identify(), read_values(IDENTIFIED)))
-
-
-def with_values(base: StateSpaceModel, values: dict[str, float]) -> StateSpaceModel:
-    """A model with other constants, and variances Q11, Q22, ..., R11, R22, by name."""
-    constants = {name: value for name, value in values.items() if name in Constants._fields}
-    q, r = base.process_noise_cov.copy(), base.measurement_noise_cov.copy()
-    for name, value in values.items():
-        if name not in constants:
-            place = int(name[1]) - 1
-            (q if name[0] == "Q" else r)[place, place] = value
-    changed = base.constants._replace(**constants)
-    return base.replace(constants=changed, process_noise_cov=q, measurement_noise_cov=r)
+    return on_line(valued(to_identify(), read_values(IDENTIFIED)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,28 @@ NUMBER_HEADER = ["constant", "value", "standard error", "without one run", "unit
 Estimates = Mapping[str, Sequence[np.ndarray]]
 
 
+class Table(NamedTuple):
+    """A header and rows of cells."""
+
+    header: list[str]
+    rows: list[list[str]]
+
+
+def tables_of(
+    runs: Sequence[Recording], estimates: Estimates, tasks: Mapping[str, Mapping] | None = None
+) -> dict[str, Table]:
+    """All tables by name, in their order; those of structures and numbers where these were identified anew."""
+    made = {
+        "ratios": Table(RATIO_HEADER, ratio_rows(runs, estimates)),
+        "estimators": Table(["run", *estimates], baseline_rows(runs, estimates)),
+        "clocks": Table(CLOCK_HEADER, clock_rows(runs)),
+    }
+    if tasks is not None:
+        made["structures"] = Table(LADDER_HEADER, ladder_rows(runs, tasks))
+        made["numbers"] = Table(NUMBER_HEADER, number_rows(runs, tasks))
+    return made
+
+
 def ratio_rows(runs: Sequence[Recording], estimates: Estimates) -> list[list[str]]:
     """Our error over that of the recorder's own, on each run and on average."""
     found = [ratios(one, run) for one, run in zip(estimates[OURS], runs, strict=True)]
@@ -30,11 +53,6 @@ def ratio_rows(runs: Sequence[Recording], estimates: Estimates) -> list[list[str
         own = f"{rmse(run.own, run):.2f}{mark}"
         rows.append([run.name, own, f"{rmse(ours, run):.2f}", *(f"{value:.2f}" for value in one)])
     return [*rows, [MEAN, "", "", *(f"{value:.2f}" for value in np.mean(found, axis=0))]]
-
-
-def baseline_header(estimates: Estimates) -> list[str]:
-    """Of `baseline_rows`."""
-    return ["run", *estimates]
 
 
 def baseline_rows(runs: Sequence[Recording], estimates: Estimates) -> list[list[str]]:

@@ -11,12 +11,13 @@ from studies.recordings.clock import clock_offset
 from studies.recordings.comparison import LOOKUP, OURS, OWN, STATIC, estimates_of
 from studies.recordings.identification import CHOSEN, STRUCTURES, Structure, identified, thrusts
 from studies.recordings.measure import averaged, best_rmse, error, ratios, rmse, settled_rmse
-from studies.recordings.model import DT, model, to_identify, with_values
+from studies.recordings.model import DT, model, to_identify
 from studies.recordings.regime import after_reversal, regimes
 from studies.recordings.results import identify_all, tasks_of
 from studies.recordings.runs import read_recordings
 from studies.recordings.tables import ladder_rows, number_rows
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from tuning.identification.values import valued
 
 RECORDED = Path(__file__).parents[3] / "shared" / "data" / "rov_thruster"
 TRUTH = {"inertia": 0.01, "thrust_factor": 1.2e-3, "dead_band_high": 0.9, "Q11": 1.0, "Q22": 0.04, "R22": 0.04}
@@ -34,7 +35,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recorded")
     times = DT * np.arange(251)
     commands = [2.5 * np.sin(2 * np.pi * times / 10), np.where(times < 5, -2.5, 2.0)]
-    made = with_values(to_identify(), TRUTH)
+    made = valued(to_identify(), TRUTH)
     runs = simulate(made, episode_keys([1, 2]), np.stack(commands)[:, :-1, None])
     for place, name in enumerate(("Ramp", "CLLookupStep")):
         tachometer, load = runs.measurements[place].T
@@ -115,10 +116,10 @@ def test_more_noise_after_reversals_is_the_projects_filter_where_there_is_none(r
         == [True] * 11 + [False] * 4 + [True] * 2
     )
     short = [runs[1]._replace(**{name: getattr(runs[1], name)[:40] for name in SERIES})]
-    (one,) = regimes(with_values(to_identify(), TRUTH), short, [1.0])
-    ours = thrusts(with_values(to_identify(), TRUTH), short)[0]
+    (one,) = regimes(valued(to_identify(), TRUTH), short, [1.0])
+    ours = thrusts(valued(to_identify(), TRUTH), short)[0]
     assert one.ratio == pytest.approx(ratios(ours, short[0]).averaged, rel=1e-6)
-    (more,) = regimes(with_values(to_identify(), TRUTH), short, [16.0])
+    (more,) = regimes(valued(to_identify(), TRUTH), short, [16.0])
     assert more.nis < one.nis
 
 

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -58,7 +58,7 @@ def with_values(make: Callable | StateSpaceModel, path: str | Path) -> Callable[
         ValueError: if the file is off, or names what the model has not.
     """
     values = read_values(path)
-    made = partial(_made, make, values)
+    made = partial(valued, make, values)
     try:
         made(1.0)
     except ValueError as error:
@@ -66,5 +66,8 @@ def with_values(make: Callable | StateSpaceModel, path: str | Path) -> Callable[
     return made
 
 
-def _made(make: Callable | StateSpaceModel, values: dict[str, float], dt: float) -> StateSpaceModel:
+def valued(
+    make: Callable | StateSpaceModel, values: Mapping[str, float], dt: float | None = None
+) -> StateSpaceModel:
+    """A model with other values of some of its numbers, by name; see `ModelFamily` for the names and errors."""
     return ModelFamily(make, tuple(values), noise=False, dt=dt).model(**values)
