@@ -14,7 +14,7 @@ from tuning.evaluation.baselines import ORACLE
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison
 from tuning.problems.problem import Problem
-from tuning.report.consistency_figures import consistency_figure
+from tuning.reporting.consistency_figures import consistency_figure
 from tuning.search.space import Choice
 
 

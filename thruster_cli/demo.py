@@ -15,8 +15,8 @@ from thruster_cli.tune import tune
 from thruster_cli.tuning_report import Tuning, as_json, report
 from tuning.evaluation.worth import worth
 from tuning.problems.seeds import held_out_seeds
-from tuning.report.figures import comparison_figure, history_figure
-from tuning.report.time_figures import estimates_figure
+from tuning.reporting.figures import comparison_figure, history_figure
+from tuning.reporting.time_figures import estimates_figure
 from tuning.search.plan import Plan
 from tuning.search.space import true_choice
 from tuning.thruster.find import find_scenario

@@ -11,8 +11,8 @@ from thruster_cli.log_problems import LogModelOption, problems_in
 from thruster_cli.output import CodeOption, JsonOption, announce_compilation, emit, working
 from thruster_cli.tune import DEFAULT_STORAGE
 from tuning.problems.find import find_problem
-from tuning.report.report import write_report
-from tuning.report.subject import is_file
+from tuning.reporting.report import write_report
+from tuning.reporting.subject import is_file
 from tuning.search.study import quiet_optuna
 
 

@@ -10,7 +10,7 @@ from rich.table import Table
 from thruster_cli.output import table
 from tuning.likelihood.gradient import GradientResult
 from tuning.problems.problem import Problem
-from tuning.report.units import number_rows
+from tuning.reporting.units import number_rows
 from tuning.search.filter_types import Kind
 from tuning.search.plan import Plan
 from tuning.search.space import Choice

@@ -9,7 +9,7 @@ import pytest
 import auv_env  # noqa: F401 - registers the envs
 from auv_env.channels import SUITES
 from auv_env.effects.current import CURRENT_SIGNALS
-from docs import auv_figures, auv_filters, auv_papers
+from pages import auv_figures, auv_filters, auv_papers
 from tuning.auv.scenarios import SCENARIOS
 
 PAGE = (Path(__file__).parents[2] / "docs" / "auv.md").read_text()

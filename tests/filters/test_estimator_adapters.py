@@ -109,7 +109,7 @@ def test_stone_soup_s_extended_filter_gives_what_ours_gives():
 
 def test_a_network_learns_from_data_alone_and_gives_the_same_with_the_same_seed():
     torch = pytest.importorskip("torch")
-    from docs.ranking_network import trained
+    from pages.ranking_network import trained
 
     problem = find_scenario("outliers").replace(steps=80)
     data = problem.data(range(24))

@@ -37,7 +37,7 @@ NUMBER = r"(\d+(?:\.\d+)?(?:e-?\d+)?)"
 FILTER_PAGE = (ROOT / "docs" / "filters.md").read_text()
 TUNING_PAGE = (ROOT / "docs" / "tuning.md").read_text()
 PAGES = {"plant": PAGE, "filters": FILTER_PAGE, "tuning": TUNING_PAGE}
-SCRIPTS = {"plant": "docs.plant_figures", "filters": "docs.filter_figures", "tuning": "docs.tuning_figures"}
+SCRIPTS = {"plant": "pages.plant_figures", "filters": "pages.filter_figures", "tuning": "pages.tuning_figures"}
 FILTER_EXAMPLES = re.findall(r"```python\n(.*?)```", FILTER_PAGE, flags=re.DOTALL)
 every_page = pytest.mark.parametrize("page", PAGES)
 KINDS = {
@@ -170,7 +170,7 @@ def test_every_family_of_filters_has_an_example_and_a_picture():
 
 
 def test_the_table_of_all_filters_is_that_of_the_code():
-    from docs.filter_tables import kinds
+    from pages.filter_tables import kinds
 
     table = kinds()
     assert table in FILTER_PAGE
@@ -207,7 +207,7 @@ def test_pictures_and_tables_are_those_of_the_code(page, tmp_path):
 
 
 def test_the_page_on_tuning_holds_what_its_script_makes():
-    import docs.tuning_figures as script
+    import pages.tuning_figures as script
 
     assert script.likeliest() in TUNING_PAGE
     lines = script.earned(["outliers"], trials=8).splitlines()[2:]

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from docs import ranking_estimators
-from docs.page import with_tables
-from docs.ranking_tables import TABLES, main, scenarios
+from pages import ranking_estimators
+from pages.page import with_tables
+from pages.ranking_tables import TABLES, main, scenarios
 from tuning.evaluation.compare import compare, contender
 from tuning.problems.excitation import EXCITATIONS
 from tuning.problems.seeds import held_out_seeds

@@ -20,13 +20,13 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import ensemble_sizes
 from tuning.evaluation.tuned import summary
 from tuning.evaluation.worth import worth
-from tuning.report.consistency_figures import consistency_figure
-from tuning.report.figures import comparison_figure
-from tuning.report.panels import shown_states
-from tuning.report.parts import advice, held_out_section
-from tuning.report.subject import Subject
-from tuning.report.tables import errors_table, numbers_table
-from tuning.report.time_figures import estimates_figure
+from tuning.reporting.consistency_figures import consistency_figure
+from tuning.reporting.figures import comparison_figure
+from tuning.reporting.panels import shown_states
+from tuning.reporting.parts import advice, held_out_section
+from tuning.reporting.subject import Subject
+from tuning.reporting.tables import errors_table, numbers_table
+from tuning.reporting.time_figures import estimates_figure
 from tuning.search.objectives import check_objectives, find_objective, nis_ratio
 from tuning.search.plan import Plan
 from tuning.search.space import true_choice, untuned_choice
@@ -241,6 +241,6 @@ def test_numbers_of_a_filter_have_the_units_of_their_states(proofs, monkeypatch)
     problem, _ = proofs[3, False]
     choice = true_choice("kf", problem)
     found = {"rule of thumb": untuned_choice("kf", problem), "oracle": choice}
-    monkeypatch.setattr("tuning.report.tables.baselines", lambda *arguments: found)
+    monkeypatch.setattr("tuning.reporting.tables.baselines", lambda *arguments: found)
     rows = numbers_table(choice, problem, 0).rows
     assert [row[0] for row in rows] == ["Q11 [m²]", "Q22 [(m/s)²]", "Q33 [m²]", "R11 [m²]", "R22 [(m/s)²]"]

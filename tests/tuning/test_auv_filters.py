@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from docs.auv_filters import EKF, FILTERS, MOTION, NAVIGATION, TABLES, about, main, restless, rows_of, small
 from filters.consistency.intervals import Interval
+from pages.auv_filters import EKF, FILTERS, MOTION, NAVIGATION, TABLES, about, main, restless, rows_of, small
 from tuning.auv.find import find_scenario
 
 PAGE = (Path(__file__).parents[2] / "docs" / "auv.md").read_text()
@@ -89,7 +89,7 @@ def test_numbers_are_printed_with_half_their_interval():
 
 def test_only_the_table_that_is_asked_for_is_made(tmp_path, monkeypatch):
     made = {name: (lambda: "new") for name in TABLES}
-    monkeypatch.setattr("docs.auv_filters.TABLES", made)
+    monkeypatch.setattr("pages.auv_filters.TABLES", made)
     page = tmp_path / "page.md"
     page.write_text("<!-- table filters_fast -->\n<!-- end -->\n<!-- table filters_drag -->\n<!-- end -->\n")
     main([str(page), "--table", "filters_drag"])

@@ -26,7 +26,7 @@ from numerics.streams import episode_keys
 from plants import simulate
 from tests.models import scalar_model
 from tuning.problems.seeds import held_out_seeds
-from tuning.report.consistency_figures import consistency_figure
+from tuning.reporting.consistency_figures import consistency_figure
 from tuning.thruster.find import find_scenario
 
 

@@ -14,7 +14,7 @@ from tests.tuned_files import rewrite, write_untuned
 from training.setup import in_scenario, make_setup, setup_from_json
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.verify import verify
-from tuning.report.report import write_report
+from tuning.reporting.report import write_report
 from tuning.thruster.find import find_scenario
 
 TRAP = f"{__name__}:trap"

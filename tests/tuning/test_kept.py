@@ -14,9 +14,9 @@ from tuning.evaluation.kept import kept_comparison, kept_sizes, sizes_as_data
 from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.tuned import metrics, read_tuned
 from tuning.evaluation.worth import scaling_sentence, worth
-from tuning.report import report as reports
-from tuning.report.report import write_report
-from tuning.report.tables import errors_table, numbers_table
+from tuning.reporting import report as reports
+from tuning.reporting.report import write_report
+from tuning.reporting.tables import errors_table, numbers_table
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.thruster.find import find_scenario

@@ -7,9 +7,9 @@ import numpy as np
 import optuna
 import pytest
 
-from docs import log_tables
 from filters import run
 from filters.likelihood import likelihood
+from pages import log_tables
 from plants.affine import affine_model
 from plants.logs.log import Log
 from plants.simulate import simulate

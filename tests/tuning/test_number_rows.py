@@ -4,7 +4,7 @@ import numpy as np
 
 from filters import affine_model
 from tuning.problems.model_problem import ModelProblem
-from tuning.report.units import number_rows
+from tuning.reporting.units import number_rows
 from tuning.search.space import Choice
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from docs.tuning_pruning import TOP_RUNS, over_studies, pair
+from pages.tuning_pruning import TOP_RUNS, over_studies, pair
 from tuning.search.plan import TRAINING_SEEDS
 from tuning.search.study import quiet_optuna
 

@@ -13,11 +13,11 @@ from filters.consistency.intervals import Interval
 from thruster_cli.main import main
 from tuning.evaluation.held_out import Comparison, prove
 from tuning.evaluation.tuned import write_tuned
-from tuning.report.figures import early_trials
-from tuning.report.page import Picture, Section, Table, Words, html_page, markdown_page
-from tuning.report.parts import advice
-from tuning.report.report import write_report
-from tuning.report.search_figures import FEWEST_TRIALS, importances
+from tuning.reporting.figures import early_trials
+from tuning.reporting.page import Picture, Section, Table, Words, html_page, markdown_page
+from tuning.reporting.parts import advice
+from tuning.reporting.report import write_report
+from tuning.reporting.search_figures import FEWEST_TRIALS, importances
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.storage import open_storage
@@ -118,7 +118,7 @@ def test_without_its_study_a_tuned_file_still_has_a_page():
 
 
 def test_a_study_of_two_scenarios_and_objectives_has_a_front(monkeypatch):
-    monkeypatch.setattr("tuning.report.subject.HELD_OUT_SEEDS", 6)
+    monkeypatch.setattr("tuning.reporting.subject.HELD_OUT_SEEDS", 6)
     plan = Plan("ekf", (MISMATCH, OUTLIERS), objectives=("score", "consistency"), consistent=False)
     run_study(open_study("front", plan, open_storage(STORAGE)), plan, FEWEST_TRIALS)
     report = write_report("front", STORAGE)

@@ -23,7 +23,7 @@ from training.setup import make_setup
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.verify import verify
 from tuning.problems.files import scenario_of
-from tuning.report.subject import find_subject
+from tuning.reporting.subject import find_subject
 from tuning.thruster.find import find_scenario
 from tuning.thruster.scenarios import SCENARIOS
 

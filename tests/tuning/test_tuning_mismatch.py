@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from docs.tuning_mismatch import LIFT, RIGHT, SLOPES, UNKNOWNS, bought, lifted, plans
+from pages.tuning_mismatch import LIFT, RIGHT, SLOPES, UNKNOWNS, bought, lifted, plans
 from tuning.thruster.find import find_scenario
 
 MISMATCH = find_scenario("mismatch")

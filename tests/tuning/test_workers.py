@@ -170,7 +170,7 @@ def test_the_page_names_options_that_there_are():
 
 
 def test_the_page_has_the_picture_and_the_lines_that_its_script_makes():
-    import docs.workers_figures as script
+    import pages.workers_figures as script
 
     folder = Path(__file__).parents[2] / "docs"
     page = (folder / "workers.md").read_text()
@@ -185,7 +185,7 @@ def test_the_page_has_the_picture_and_the_lines_that_its_script_makes():
 
 @pytest.mark.slow
 def test_a_worker_gets_through_trials_while_it_is_watched(tmp_path):
-    from docs.workers_rates import NOTHING, rate
+    from pages.workers_rates import NOTHING, rate
 
     path = str(tmp_path / "j")
     assert 0 <= rate(NOTHING, path, 1) < math.inf  # none in a window of a second, if the machine is busy

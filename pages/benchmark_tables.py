@@ -1,0 +1,83 @@
+"""Make the tables of docs/benchmarks.md: standard problems that others have solved, beside ours.
+
+    python -m pages.benchmark_tables [PAGE] [--table NAME]...
+
+The tables between the comments of PAGE, docs/benchmarks.md by default, are written anew, in some minutes. Every
+run gives the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+from numerics.files import write_whole
+from numerics.markdown import with_tables
+from pages.page import DOCS, table
+from studies import BENCHMARKS
+from studies.benchmark import find_benchmark
+from studies.lorenz63 import problem as lorenz63
+from studies.pendulum import problem as pendulum
+from studies.tuned_inflation import tune_inflation
+from tuning.evaluation.held_out import prove
+from tuning.search.plan import Plan
+from tuning.search.study import open_study, quiet_optuna, run_study
+
+RUNS, TRIALS = 16, 20
+
+
+def published(name: str) -> str:
+    """A standard problem: theirs, ours, why different."""
+    benchmark = find_benchmark(name)
+    remarks = "\n".join(f"- {remark}" for remark in benchmark.remarks)
+    return f"{table(benchmark.header, [row.cells() for row in benchmark.reproduce(RUNS)])}\n\n{remarks}"
+
+
+def inflation() -> str:
+    """Inflation that a study finds on Lorenz-63."""
+    rows = []
+    for name in ("enkf", "etkf", "denkf"):
+        choice, score = tune_inflation(name, lorenz63, TRIALS, RUNS)
+        found = choice.numbers
+        numbers = [f"{found['ensemble_size']}", f"{found['inflation']:.3f}", f"{found['relaxation']:.3f}"]
+        rows.append([name, *numbers, f"{score.value:.3f} [{score.low:.3f}, {score.high:.3f}]"])
+    return table(["filter", "N", "inflation", "relaxation", "rmse.a on held-out seeds"], rows)
+
+
+def pendulum_errors() -> str:
+    """Filters of the pendulum before and after tuning."""
+    quiet_optuna()
+    rows = []
+    for name in ("ekf", "ukf"):
+        plan = Plan(name, (pendulum,))
+        choice = run_study(open_study("pendulum", plan, None), plan, TRIALS).choice
+        proof = prove(choice, pendulum, 0)
+        for word, one in (("rule of thumb", proof.untuned), ("tuned", proof.tuned)):
+            sigma = choice.model["sigma"] if word == "tuned" else pendulum.untuned["sigma"]
+            errors = [f"{part.value:.3f} ± {(part.high - part.low) / 2:.3f}" for part in one.rmse]
+            rows.append([name, word, f"{sigma:.3f}", *errors, f"{one.nees.value:.2f}", f"{one.nis.value:.2f}"])
+    header = ["filter", "", "sigma [rad/s]", "theta [rad]", "omega [rad/s]", "mean NEES", "mean NIS"]
+    return table(header, rows)
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    **{name.replace("-", "_"): partial(published, name) for name in BENCHMARKS},
+    "inflation": inflation,
+    "pendulum": pendulum_errors,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(prog="python -m pages.benchmark_tables", description=__doc__.splitlines()[0])
+    parser.add_argument("page", nargs="?", type=Path, default=DOCS / "benchmarks.md", metavar="PAGE")
+    parser.add_argument("--table", action="append", choices=list(TABLES), help="only this one; may be repeated")
+    given = parser.parse_args(arguments)
+    for name in given.table or TABLES:  # written one by one, so that what is done stays
+        write_whole(given.page, with_tables(given.page.read_text(), {name: TABLES[name]}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""Runs of the thruster for docs/filters.md, and what a filter makes of them; every seed is fixed."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from filters import Estimates, run
+from filters.consistency.nees import normalized_squares
+from filters.filter import Filter
+from numerics.plots import BLUE, DARK, RUST
+from numerics.streams import episode_keys, filter_keys
+from pages.page import MUSTARD, SKY
+from thruster_env.plant import Plant, make_plant
+from thruster_env.simulation import simulate
+from tuning.problems.data import FIRST_SCORED_STEP
+from tuning.problems.excitation import held_levels
+
+SEED, RUNS, STEPS, AMPLITUDE, HOLD, DT = 1, 60, 500, 12.0, 25, 0.01
+PUBLISHED_NOISE = {"process_noise_cov": (0.5, 0.5), "measurement_noise_cov": 0.5}
+
+# A filter keeps its colour and its dashes over the whole page.
+LOOKS = {
+    "truth": {"color": DARK, "linewidth": 1.1},
+    "ekf": {"color": BLUE},
+    "kf": {"color": RUST, "linestyle": "--"},
+    "scheduled": {"color": MUSTARD, "linestyle": "-."},
+    "iekf": {"color": MUSTARD, "linestyle": "--"},
+    "ukf": {"color": SKY, "linestyle": "-."},
+    "ckf": {"color": DARK, "linestyle": (0, (1, 1))},
+    "gsf": {"color": RUST},
+    "enkf": {"color": RUST},
+    "etkf": {"color": SKY, "linestyle": "-."},
+    "denkf": {"color": MUSTARD, "linestyle": "--"},
+    "ienkf": {"color": MUSTARD, "linestyle": "--"},
+    "pf": {"color": SKY},
+    "fuzzy": {"color": MUSTARD, "linestyle": "-."},
+    "vb": {"color": MUSTARD, "linestyle": "--"},
+    "sage-husa": {"color": SKY, "linestyle": "-."},
+    "ekf-robust": {"color": RUST},
+    "open-loop": {"color": MUSTARD, "linestyle": "--"},
+    "low-pass": {"color": SKY},
+    "inversion": {"color": RUST, "linewidth": 0.8},
+}
+
+
+class Runs(NamedTuple):
+    """What B runs of K steps give a filter, and the truth."""
+
+    keys: np.ndarray  # (B, 2), the filters'
+    inputs: np.ndarray  # (B, K, 1) [V]
+    measurements: np.ndarray  # (B, K + 1, m), NaN where missing
+    states: np.ndarray  # (B, K + 1, 2)
+
+    @property
+    def given(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What `filters.run` takes."""
+        return self.keys, self.inputs, self.measurements
+
+
+def runs_of(plant: Plant, voltages: np.ndarray) -> Runs:
+    """Runs of a plant under voltages (B, K), with the seeds 0, 1, ..."""
+    seeds = range(len(voltages))
+    simulated = simulate(plant, episode_keys(seeds), voltages)
+    measurements = np.where(simulated.valid, simulated.measurements, np.nan)
+    return Runs(filter_keys(seeds), voltages[..., None], measurements, simulated.states)
+
+
+def held_runs(runs: int = RUNS, amplitude: float = AMPLITUDE, centre: float = 0.0, **plant) -> Runs:
+    """Runs of `make_plant(**plant)` under levels about a centre [V], each held for a quarter of a second."""
+    levels = held_levels(episode_keys(range(runs)), amplitude, HOLD, STEPS)
+    return runs_of(make_plant(**plant), centre + levels)
+
+
+def rmse(estimates: Estimates, runs: Runs) -> np.ndarray:
+    """RMSE of (omega_m [rad/s], U_a [m/s]) from step 50 on, over all runs."""
+    errors = estimates.means[..., :2] - runs.states
+    return np.sqrt((errors[:, FIRST_SCORED_STEP:] ** 2).mean(axis=(0, 1)))
+
+
+def nees(estimates: Estimates, runs: Runs) -> float:
+    """Mean NEES of (omega_m, U_a) from step 50 on; 2 is right. NaN without a covariance."""
+    errors = (estimates.means[..., :2] - runs.states)[:, FIRST_SCORED_STEP:]
+    squares = normalized_squares(errors, estimates.covs[:, FIRST_SCORED_STEP:, :2, :2])
+    there = squares[~np.isnan(squares)]  # singular covariances are left out
+    return float(there.mean()) if there.size else float("nan")
+
+
+def judged(filter_: Filter, runs: Runs) -> tuple[float, float, float]:
+    """RMSE of omega_m [rad/s], RMSE of U_a [m/s] and mean NEES of a filter."""
+    estimates = run(filter_, *runs.given)
+    return (*rmse(estimates, runs), nees(estimates, runs))
+
+
+def deviations(estimates: Estimates, state: int) -> np.ndarray:
+    """Standard deviations (B, K + 1) that a filter claims for a state."""
+    return np.sqrt(estimates.covs[..., state, state])
+
+
+def times(count: int) -> np.ndarray:
+    """Times [s] of so many steps, from 0 on."""
+    return DT * np.arange(count)

@@ -1,0 +1,167 @@
+"""Make the tables of docs/ranking.md: which filter beats which where, on held-out seeds.
+
+    python -m pages.ranking_tables [PAGE] [--table NAME]...
+
+The tables between the comments `<!-- table NAME -->` and `<!-- end -->` of PAGE, docs/ranking.md by default, are
+written anew; all of them take some ten minutes on two cores. Every run gives the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from filters.consistency.intervals import Interval
+from numerics.files import write_whole
+from pages.page import DOCS, with_tables
+from thruster_cli.error_tables import unless_blank
+from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender
+from tuning.problems.excitation import Steps
+from tuning.problems.seeds import held_out_seeds
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenario import Scenario
+from tuning.thruster.scenarios import SCENARIOS
+
+SEEDS = 200
+REFERENCE_SEEDS, REFERENCE_SIZE = 20, 100_000
+EKF, ROBUST, IEKF, UKF, GSF = (contender(name) for name in ("ekf", "ekf-robust", "iekf", "ukf", "gsf"))
+PF, MANY = contender("pf"), contender("pf", ensemble_size=5000)
+ENKF, IENKF = (contender(name, ensemble_size=100) for name in ("enkf", "ienkf"))
+SMALL = contender("enkf", ensemble_size=30)
+INFLATED, SMALL_INFLATED = (contender("enkf", ensemble_size=size, inflation=1.1) for size in (100, 30))
+IENKF_INFLATED = contender("ienkf", ensemble_size=100, inflation=1.1)
+FLOW = {"ambient_velocity": None}
+COLUMNS = ("omega_m [rad/s]", "over {0}", "U_a [m/s]", "over {0}", "NEES", "NIS", "log L")
+
+
+def speed() -> str:
+    """|speed| at slow crossings and dwells."""
+    by_speed = contender("gsf", component=0)  # the sum is split along omega_m
+    return table_of(leaderboard(find_scenario("speed_magnitude"), [EKF, UKF, by_speed, ENKF, PF, MANY]))
+
+
+def fast() -> str:
+    """|speed| at fast reversals."""
+    slow = find_scenario("speed_magnitude")
+    scenario = slow.replace(name="fast_reversals", excitation=Steps(12.0), measurement_noise_cov=25.0)
+    return table_of(leaderboard(scenario, [EKF, UKF, MANY]))
+
+
+def outliers() -> str:
+    """Outliers in the thrust."""
+    return table_of(leaderboard(find_scenario("outliers"), [EKF, ROBUST, ENKF, PF]))
+
+
+def ambient() -> str:
+    """A flow that the filter does not know, and filters that estimate it."""
+    joint = [contender("ekf", unknown=FLOW), contender("enkf", unknown=FLOW, ensemble_size=100)]
+    return table_of(leaderboard(find_scenario("ambient"), [EKF, joint[0], ENKF, joint[1]]))
+
+
+def published() -> str:
+    """The published noise."""
+    ensembles = [SMALL, SMALL_INFLATED, ENKF, INFLATED, IENKF, IENKF_INFLATED]
+    return table_of(leaderboard(find_scenario("published_noise"), [EKF, IEKF, UKF, *ensembles, GSF, PF, MANY]))
+
+
+def reference() -> str:
+    """The published noise, beside a particle filter with so many particles that more change nothing."""
+    best = contender("pf", ensemble_size=REFERENCE_SIZE)
+    filters = [best, EKF, IEKF, UKF, ENKF, IENKF, GSF, PF, MANY]
+    return table_of(leaderboard(find_scenario("published_noise"), filters, REFERENCE_SEEDS))
+
+
+def startup() -> str:
+    """RMSE of the first 50 steps from an unknown state."""
+    lines = ["| filter | omega_m [rad/s] | U_a [m/s] |", "|---|---|---|"]
+    for row in leaderboard(find_scenario("startup"), [EKF, IEKF, UKF, ENKF, GSF, PF]).rows:
+        speed_error, flow_error = row.evaluation.start_up_rmse
+        lines.append(f"| {row.label} | {speed_error:.1f} | {flow_error:.3f} |")
+    return "\n".join(lines)
+
+
+def scores() -> str:
+    """Scores over that of the EKF, a row a scenario."""
+    filters = [EKF, ROBUST, IEKF, UKF, ENKF, GSF, PF]
+    boards = [leaderboard(scenario, filters) for scenario in SCENARIOS.values()]
+    labels = [one.label for one in filters[1:]]
+    lines = [f"| scenario | ekf: score | {' | '.join(labels)} |", "|---" * (len(labels) + 2) + "|"]
+    for board in boards:
+        first, *others = board.rows
+        cells = [f"`{board.scenario.name}`", f"{first.evaluation.score.value:.2f}", *map(ratio_cell, others)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def scenarios() -> str:
+    """What each scenario is."""
+    lines = ["| scenario | what it is | excitation | scale |", "|---|---|---|---|"]
+    for one in SCENARIOS.values():
+        arguments = [f"{key} {value}" for key, value in one.excitation.as_mapping().items() if key != "name"]
+        excitation = f"`{one.excitation.name}`: {', '.join(arguments)}"
+        speed_scale, flow_scale = one.scale
+        lines.append(f"| `{one.name}` | {one.about} | {excitation} | {speed_scale} rad/s, {flow_scale} m/s |")
+    return "\n".join(lines)
+
+
+def leaderboard(scenario: Scenario, filters: Sequence[Contender], seeds: int = SEEDS) -> Leaderboard:
+    """Filters on a scenario's held-out seeds."""
+    (board,), interrupted = compare(filters, [scenario], held_out_seeds(0, seeds))
+    if interrupted:
+        raise KeyboardInterrupt
+    return board
+
+
+def table_of(board: Leaderboard) -> str:
+    """RMSE by state with its distance from the bound, the paired ratio, and consistency, a row a filter."""
+    lines = [f"| filter | {' | '.join(COLUMNS).format(board.rows[0].label)} |", "|---" * 8 + "|"]
+    for row in board.rows:
+        cells = [row.label]
+        for rmse, above, ratio, digits in zip(
+            row.evaluation.rmse, row.above_bound, row.ratios, (3, 4), strict=True
+        ):
+            cells.append(f"{_about(rmse, digits)} ({100 * above:+.0f} %)")
+            cells.append("" if row is board.rows[0] else _about(ratio, 3))
+        nees = f"{row.nees:.2f} (median)" if row.nees_is_median else unless_blank(row.nees, ".3g")
+        cells += [nees, unless_blank(row.evaluation.nis.value, ".3g")]
+        cells.append(unless_blank(row.evaluation.log_likelihood, ".0f"))
+        lines.append(f"| {' | '.join(cells)} |")
+    bound = f"| bound | {board.bound[0]:.3f} | | {board.bound[1]:.4f} | | 2 (median 1.39) | 1 | |"
+    return "\n".join([*lines, bound])
+
+
+def ratio_cell(row: Row) -> str:
+    """The ratio of scores; bold where the filter is significantly better, in brackets where no worse either."""
+    text = f"{row.score_ratio.value:.3f}"
+    return {"better": f"**{text}**", "worse": text, "tie": f"({text})"}[row.verdict]
+
+
+def _about(value: Interval, digits: int) -> str:
+    return f"{value.value:.{digits}f} ± {(value.high - value.low) / 2:.{digits}f}"
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    table.__name__: table
+    for table in (speed, fast, outliers, ambient, published, reference, startup, scores, scenarios)
+}
+
+
+def main(
+    arguments: Sequence[str] | None = None,
+    tables: Mapping[str, Callable[[], str]] = TABLES,
+    module: str = "pages.ranking_tables",
+    about: str = __doc__,
+    page: Path = DOCS / "ranking.md",
+) -> None:
+    """Run the command line of a script that makes tables of a page."""
+    parser = argparse.ArgumentParser(prog=f"python -m {module}", description=about.splitlines()[0])
+    parser.add_argument("page", nargs="?", type=Path, default=page, metavar="PAGE")
+    parser.add_argument("--table", action="append", choices=list(tables), help="only this one; may be repeated")
+    given = parser.parse_args(arguments)
+    for name in given.table or tables:  # written one by one, so that what is done stays
+        write_whole(given.page, with_tables(given.page.read_text(), {name: tables[name]}))
+
+
+if __name__ == "__main__":
+    main()

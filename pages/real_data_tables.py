@@ -1,0 +1,72 @@
+"""Make the tables of docs/real_data.md, and the numbers that the project takes, from recordings of others.
+
+    python -m pages.real_data_tables RECORDINGS [--results FILE.json] [FOLDER]
+
+RECORDINGS is the folder that `thruster study recordings --data` takes. What FILE.json, out/recordings.json by
+default, holds of identifications is not done again; without it they take a quarter of an hour on two cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from numerics.files import write_whole
+from numerics.markdown import table, with_tables
+from numerics.toml import as_toml
+from pages.page import DOCS
+from studies.recordings.comparison import estimates_of
+from studies.recordings.identification import CHOSEN
+from studies.recordings.model import IDENTIFIED, model
+from studies.recordings.regime import regimes
+from studies.recordings.results import Task, identify_all
+from studies.recordings.runs import read_recordings
+from studies.recordings.tables import sentences
+from studies.recordings.tables import tables_of as rows_of
+
+
+def tables_of(recordings: Path, results: Path) -> dict[str, Callable[[], str]]:
+    """What makes each table, by name."""
+    runs = read_recordings(recordings)
+    tasks = identify_all(runs, results, progress=lambda name, done, count: print(f"{done + 1}/{count} {name}"))
+    keep(tasks[Task(CHOSEN).name], [run.name for run in runs])
+    left_out, whole = estimates_of(runs, tasks), estimates_of(runs)
+
+    def regime() -> str:
+        rows = [
+            [f"{one.factor:g}", f"{one.log_likelihood:.0f}", f"{one.nis:.2f}", f"{one.ratio:.3f}"]
+            for one in regimes(model(), runs)
+        ]
+        return table(["Q times", "log-likelihood of the tachometer", "mean NIS", "ratio, mean"], rows)
+
+    made = {name: (lambda one=one: table(*one)) for name, one in rows_of(runs, left_out, tasks).items()}
+    ratios = made["ratios"]
+    return {
+        **made,
+        "ratios": lambda: "\n\n".join([ratios(), *sentences(left_out, runs)]),
+        "all_runs": lambda: table(*rows_of(runs, whole)["ratios"]),
+        "regime": regime,
+    }
+
+
+def keep(task: Mapping, runs: Sequence[str]) -> None:
+    """Write the numbers that the project takes."""
+    known = {name: task[name] for name in ("log_likelihood", "standard_errors", "determined")}
+    tables = {"values": task["values"], "identified": {"logs": list(runs), **known}}
+    write_whole(IDENTIFIED, as_toml(tables, "Found by `python -m pages.real_data_tables`; see docs/real_data.md."))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write the page's tables anew."""
+    parser = argparse.ArgumentParser(prog="python -m pages.real_data_tables", description=__doc__.split("\n")[0])
+    parser.add_argument("recordings", type=Path)
+    parser.add_argument("--results", type=Path, default=Path("out") / "recordings.json")
+    parser.add_argument("folder", nargs="?", type=Path, default=DOCS)
+    given = parser.parse_intermixed_args(arguments)
+    page = given.folder / "real_data.md"
+    write_whole(page, with_tables(page.read_text(encoding="utf-8"), tables_of(given.recordings, given.results)))
+
+
+if __name__ == "__main__":
+    main()

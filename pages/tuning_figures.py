@@ -1,0 +1,145 @@
+"""Make the picture of docs/tuning.md and its computed tables.
+
+    python -m pages.tuning_figures [FOLDER]
+
+The picture goes into FOLDER, docs/ by default. If there is a tuning.md in it, its tables between the comments
+`<!-- table NAME -->` and `<!-- end -->` are written anew, which takes some minutes. Every run gives the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from filters.consistency.intervals import Interval
+from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from pages.page import log_ticks, make_page, table
+from pages.tuning_recovery import TABLES as RECOVERY_TABLES
+from pages.tuning_recovery import bad_start
+from tuning.evaluation.baselines import ORACLE, RULE, SCALED
+from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
+from tuning.evaluation.held_out import prove
+from tuning.likelihood.gradient import maximise_likelihood
+from tuning.search.objectives import NIS_BAND
+from tuning.search.plan import Plan
+from tuning.search.space import Choice
+from tuning.search.study import StudyResult, open_study, quiet_optuna, run_study
+from tuning.thruster.find import find_scenario
+from tuning.thruster.scenario import Scenario
+
+SEED, TRIALS = 0, 100
+COLUMNS = [
+    "scenario",
+    "filter",
+    *(f"over {name}" for name in (SCALED, RULE, ORACLE)),
+    "N",
+    "NEES",
+    "NIS",
+    "price of NIS",
+]
+FILTERS = ("kf", "ekf", "enkf")
+EARNING = ("mismatch", "ambient", "deadband", "outliers")  # where the true Q and R are not the best ones
+FACTORS = np.geomspace(1e-3, 1e3, 31)
+
+
+def ridge(path: Path) -> Path:
+    """Score and mean NIS of an EKF over common factors on Q and on R."""
+    scenario = find_scenario("nominal")
+    data = Plan("ekf", (scenario,), SEED).training_data()[0]
+    found = [[_scaled(scenario, data, q, r) for q in FACTORS] for r in FACTORS]
+    scores, ratios = np.array([[(e.score.value, e.nis.value) for e in row] for row in found]).transpose(2, 0, 1)
+    figure = new_figure((9.6, 4.0))
+    plane, line = figure.subplots(1, 2, width_ratios=(3, 2))
+    for axis in (plane.xaxis, plane.yaxis, line.xaxis, line.yaxis):
+        log_ticks(axis, (1e-3, 1e-2, 0.1, 1, 10, 100, 1000))
+    lines = plane.contour(FACTORS, FACTORS, scores, [1.005, 1.02, 1.1, 1.4, 2.0], colors=BLUE)
+    plane.clabel(lines, fmt="%g", fontsize=8)
+    plane.contourf(FACTORS, FACTORS, ratios, NIS_BAND, colors=RUST, alpha=0.3)
+    plane.plot(1, 1, "o", color=DARK, label="the plant's own Q and R")
+    plane.fill_between([], [], color=RUST, alpha=0.3, label="mean NIS between 0.8 and 1.25")
+    plane.plot([], [], color=BLUE, label="score over that of the bound")
+    plane.set(xlabel="factor on Q [-]", ylabel="factor on R [-]")
+    both = np.diag(scores), np.diag(ratios)
+    for values, colour, dashes, label in zip(both, (BLUE, RUST), ("-", "--"), ("score", "mean NIS"), strict=True):
+        line.plot(FACTORS, values, color=colour, linestyle=dashes, label=label)
+    line.set(xlabel="one factor on both, Q and R [-]", ylabel="score, mean NIS [-]")
+    tidy([plane, line])
+    plane.legend(loc="upper left", fontsize=8)
+    line.legend(frameon=False)
+    return save_figure(figure, path)
+
+
+def _scaled(scenario: Scenario, data, q: float, r: float) -> Evaluation:
+    model = {
+        "process_noise_cov": tuple(q * v for v in scenario.process_noise_cov),
+        "measurement_noise_cov": r * scenario.measurement_noise_cov,
+    }
+    return evaluate(Choice("ekf", model, {}).filter(scenario), data, scenario.scale)
+
+
+def studied(name: str, scenario: Scenario, start: Choice | None = None, trials: int = TRIALS) -> StudyResult:
+    """A study in memory."""
+    quiet_optuna()
+    plan = Plan(name, (scenario,), SEED)
+    return run_study(open_study("page", plan, None, start), plan, trials).or_interrupted()
+
+
+def earned(scenarios: Sequence[str] = EARNING, trials: int = TRIALS) -> str:
+    """What a study gains over the scaled default, the rule of thumb and the oracle."""
+    rows = []
+    for name in scenarios:
+        scenario = find_scenario(name)
+        for kind in FILTERS:
+            result = studied(kind, scenario, trials=trials)
+            proof = prove(result.choice, scenario, SEED)
+            found = proof.ratios
+            ratios = [_about(found[one]) if one in found else "none" for one in (SCALED, RULE, ORACLE)]
+            ratios.append(f"{result.choice.numbers['ensemble_size']}" if result.sizes else "")
+            nees = proof.tuned.nees.value
+            honesty = f"{nees:.3g}" if nees < 1000 else "> 1000", f"{proof.tuned.nis.value:.2f}"
+            price = f"{100 * (result.best_value / result.free_value - 1):.1f} %"
+            rows.append([f"`{name}`" if kind == FILTERS[0] else "", f"`{kind}`", *ratios, *honesty, price])
+    return table(COLUMNS, rows)
+
+
+def recovered() -> str:
+    """Studies of a perfect linear model, from a bad start."""
+    rows = []
+    for name in ("published_tunnel", "published_open_bladed"):
+        scenario = find_scenario(name)
+        bad = bad_start("kf", scenario)
+        proof = prove(studied("kf", scenario, bad).choice, scenario, SEED)
+        started = evaluate(bad.filter(scenario), scenario.data(proof.seeds), scenario.scale)
+        ratios = (score_ratio(one, proof.true) for one in (started, proof.tuned))
+        rows.append([f"`{name}`", *(_about(ratio, 4) for ratio in ratios)])
+    return table(["scenario", "start over oracle", "tuned over oracle"], rows)
+
+
+def likeliest() -> str:
+    """The maximum of the likelihood beside the true numbers."""
+    scenario = find_scenario("nominal")
+    found = maximise_likelihood("ekf", scenario, Plan("ekf", (scenario,), SEED).training_data()[0])
+    true = (*scenario.process_noise_cov, scenario.measurement_noise_cov)
+    columns = zip(found.names, true, found.best.variances, found.standard_errors, strict=True)
+    rows = [[name, f"{value:.4g}", f"{best:.4g}", f"{100 * error:.0f} %"] for name, value, best, error in columns]
+    return table(["", "true", "most likely", "standard error"], rows)
+
+
+def _about(value: Interval, digits: int = 3) -> str:
+    return f"{value.value:.{digits}f} ± {(value.high - value.low) / 2:.{digits}f}"
+
+
+FIGURES: dict[str, Callable[[Path], Path]] = {"tuning_ridge.png": ridge}
+TABLES: dict[str, Callable[[], str]] = {made.__name__: made for made in (earned, recovered, likeliest)}
+TABLES |= RECOVERY_TABLES
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    make_page("tuning", "pages.tuning_figures", FIGURES, TABLES, __doc__.splitlines()[0], arguments)
+
+
+if __name__ == "__main__":
+    main()

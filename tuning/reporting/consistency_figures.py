@@ -1,0 +1,217 @@
+"""One picture of whether a filter's covariance is consistent: a panel for each check of `filters.consistency`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from filters.consistency.intervals import Interval
+from filters.consistency.nees import SquaresCheck
+from filters.consistency.report import ConsistencyReport
+from filters.consistency.scores import LEVELS
+from filters.consistency.verdicts import probability_text, rounded
+from numerics.plots import BLUE, DARK, RUST, panels, save_figure
+from tuning.reporting.panels import COLUMNS, shown_states
+
+FOUND = BLUE
+COLOURS = (BLUE, RUST, "#5a8f3c", "#7a5195", "#9aa5ad", "#c9a227")  # of states
+CHANNEL_COLOURS = ("#44aa99", "#cc6677", "#999933", "#882255", "#ddaa33", "#332288")
+PANEL = (4.0, 3.0)  # [inch]
+MOST_HANDLES = 5  # of a legend side by side
+MOST_VALUES = 3  # in the title of a panel
+LOGARITHMIC_FROM = 20  # times the right value
+
+
+def consistency_figure(
+    path: str | Path,
+    report: ConsistencyReport,
+    title: str,
+    comparison: Mapping[str, tuple[Interval, ...]] | None = None,
+    scored: Collection[int] | None = None,
+) -> Path:
+    """Draw a consistency report; dashed lines show the expected value, grey bands what chance allows.
+
+    Of many states some are drawn; without truth the checks are those of the innovations.
+
+    Args:
+        path: PNG file to write.
+        report: the checks of one filter.
+        title: said above the picture.
+        comparison: RMSE ratios by state, from `intervals.rmse_ratios`, under the names of the pairs.
+        scored: places of the states that count in the score, which come first where not all are drawn.
+
+    Raises:
+        ValueError: if there is nothing to draw, or nothing can be written.
+    """
+    places, left_out = shown_states(report.states, scored)
+    checks = _panels(report, comparison, places)
+    if not checks:
+        raise ValueError("a figure needs something to draw, but the filter gives no covariance")
+    figure, axes = panels(len(checks), COLUMNS, PANEL, extra=0.4)
+    for axis, draw in zip(axes, checks, strict=True):
+        draw(axis)
+        axis.title.set_fontsize(10)
+    _legend(figure, report, places, left_out)
+    figure.suptitle(title, fontsize=11)
+    return save_figure(figure, path)
+
+
+def _panels(report: ConsistencyReport, comparison: Mapping | None, places: Sequence[int]) -> list[Callable]:
+    """A function on axes for each check of which there are numbers."""
+    squares = [check for check in (report.nees, report.nis) if not np.isnan(check.mean.value)]
+    found: list[Callable] = [partial(_squares, check=check, report=report) for check in squares]
+    if report.whiteness.statistic > 0:
+        found.append(partial(_correlations, report=report))
+    found += [partial(_distribution, check=check) for check in squares]
+    if not np.isnan(report.coverage_by_level).all():
+        shares = {"found": report.coverage, "by_level": report.coverage_by_level}
+        found.append(partial(_coverage, what="truth", colours=_of_states(places), **shares))
+        found.append(partial(_crps, report=report, places=places))
+    elif not (report.has_truth or np.isnan(report.innovation_coverage_by_level).all()):
+        shares = {"found": report.innovation_coverage, "by_level": report.innovation_coverage_by_level}
+        found.append(partial(_coverage, what="measurements", colours=_of_channels(report), **shares))
+    if report.ensemble is not None:
+        found.append(partial(_ranks, report=report, places=places))
+    if comparison:
+        found.append(partial(_comparison, comparison=comparison, places=places))
+    return found
+
+
+def _of_states(places: Sequence[int]) -> dict[int, str]:
+    """Colours of the states that are drawn."""
+    return {i: COLOURS[row % len(COLOURS)] for row, i in enumerate(places)}
+
+
+def _of_channels(report: ConsistencyReport) -> dict[int, str]:
+    """Colours of the channels, others than those of states; a single one has that of all that was found."""
+    count = len(report.channels)
+    return {j: FOUND if count == 1 else CHANNEL_COLOURS[j % len(CHANNEL_COLOURS)] for j in range(count)}
+
+
+def _legend(figure, report: ConsistencyReport, places: Sequence[int], left_out: str) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles = [
+        Line2D([], [], color=DARK, linestyle="--", linewidth=1, label="what is right"),
+        Patch(color=DARK, alpha=0.15, linewidth=0, label="95 % of chance"),
+        Line2D([], [], color=FOUND, linewidth=1, label=f"found in {report.runs} runs"),
+    ]
+    named = {report.states[i]: colour for i, colour in _of_states(places).items()} if report.has_truth else {}
+    if len(report.channels) > 1:
+        named |= {report.channels[j]: colour for j, colour in _of_channels(report).items()}
+    handles += [Line2D([], [], color=colour, marker="o", label=name) for name, colour in named.items()]
+    title = left_out if report.has_truth and left_out else None
+    options = {"ncols": min(len(handles), MOST_HANDLES), "frameon": False, "title": title}
+    figure.legend(handles=handles, loc="outside lower center", **options)
+
+
+def _steps(report: ConsistencyReport) -> np.ndarray:
+    return report.first_step + np.arange(len(report.nees.step_means))
+
+
+def _right(axis, value: float) -> None:
+    axis.axhline(value, color=DARK, linestyle="--", linewidth=1, zorder=3)
+
+
+def _squares(axis, check: SquaresCheck, report: ConsistencyReport) -> None:
+    steps = _steps(report)
+    axis.fill_between(steps, *check.band.T, color=DARK, alpha=0.15, linewidth=0)
+    axis.plot(steps, check.step_means, color=FOUND, linewidth=0.8)
+    _right(axis, check.dimension)
+    if np.nanmax(check.step_means, initial=0.0) > LOGARITHMIC_FROM * check.dimension:
+        axis.set_yscale("log", subs=(2, 5))
+        axis.yaxis.set_major_formatter("{x:g}")
+        axis.yaxis.set_minor_formatter("{x:g}")
+    axis.set_title(f"{check.name}: mean {rounded(check.mean.value)} where {check.dimension:.3g} is right")
+    axis.set_xlabel("step")
+    axis.set_ylabel("mean over runs")
+    axis.margins(x=0.01)
+
+
+def _correlations(axis, report: ConsistencyReport) -> None:
+    found = report.whiteness
+    lags, channels = np.arange(1, len(found.correlations) + 1), found.correlations.shape[1]
+    for i, colour in _of_channels(report).items():
+        places, values = lags + (i - (channels - 1) / 2) * 0.6 / channels, found.correlations[:, i, i]
+        axis.vlines(places, 0, values, color=colour, linewidth=1.5)
+        axis.plot(places, values, "o", color=colour, markersize=3)
+    half = found.half_widths[:, 0, 0]
+    axis.fill_between(lags, -half, half, color=DARK, alpha=0.15, linewidth=0)
+    _right(axis, 0)
+    widest = 1.15 * max(np.abs(np.diagonal(found.correlations, axis1=1, axis2=2)).max(), 2 * half.max())
+    axis.set_ylim(-widest, widest)
+    axis.set_title(f"innovations: white? {probability_text(found.p_value)}")
+    axis.set_xlabel("steps apart")
+    axis.set_ylabel("correlation")
+
+
+def _distribution(axis, check: SquaresCheck) -> None:
+    found = check.distribution
+    errors = np.abs(found.frequency_band - found.frequencies[:, None]).T
+    centres = (found.edges[:-1] + found.edges[1:]) / 2
+    axis.bar(centres, found.frequencies, 0.92 * np.diff(found.edges), color=FOUND, alpha=0.5)
+    axis.errorbar(centres, found.frequencies, errors, fmt="none", ecolor=FOUND, elinewidth=1)
+    _right(axis, 1)
+    axis.set_title(f"{check.name}: {100 * check.beyond.value:.1f} % beyond the 95 % point")
+    axis.set_xlabel("probability under chi-square")
+    axis.set_ylabel("frequency over the right one")
+
+
+def _coverage(
+    axis, found: Sequence[Interval], by_level: np.ndarray, what: str, colours: Mapping[int, str]
+) -> None:
+    axis.plot([0, 100], [0, 100], color=DARK, linestyle="--", linewidth=1)
+    for i, colour in colours.items():
+        axis.plot(100 * LEVELS, 100 * by_level[:, i], ".-", linewidth=1, color=colour)
+    axis.set_title(f"95 % intervals hold {_told([100 * part.value for part in found], '{:.1f} %'.format)}")
+    axis.set_xlabel("level of the interval [%]")
+    axis.set_ylabel(f"{what} found in it [%]")
+
+
+def _told(values: Sequence[float], form: Callable[[float], str]) -> str:
+    """Few values as they are, many as their range."""
+    if len(values) <= MOST_VALUES:
+        return ", ".join(map(form, values))
+    return f"{form(np.nanmin(values))} to {form(np.nanmax(values))}"
+
+
+def _crps(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
+    for i, colour in _of_states(places).items():
+        axis.plot(_steps(report), report.crps_ratio[:, i], color=colour, linewidth=0.8)
+    _right(axis, 1)
+    axis.set_ylim(bottom=0)
+    axis.set_title(f"mean CRPS {_told([part.value for part in report.crps], rounded)}")
+    axis.set_xlabel("step")
+    axis.set_ylabel("CRPS over its expectation")
+    axis.margins(x=0.01)
+
+
+def _ranks(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
+    size = report.ensemble.size
+    for i, colour in _of_states(places).items():
+        found = report.ensemble.ranks[i]
+        axis.stairs(found.frequencies, found.edges * (size + 1), color=colour, linewidth=1.4)
+    _right(axis, 1)
+    axis.set_ylim(bottom=0)
+    axis.set_title(f"rank of the truth among {size} members")
+    axis.set_xlabel("members below the truth")
+    axis.set_ylabel("frequency over the right one")
+
+
+def _comparison(axis, comparison: Mapping[str, tuple[Interval, ...]], places: Sequence[int]) -> None:
+    apart = min(0.2, 0.8 / len(places))
+    for place, ratios in enumerate(comparison.values()):
+        for row, (i, colour) in enumerate(_of_states(places).items()):
+            ratio, height = ratios[i], -place - apart * (row - (len(places) - 1) / 2)
+            axis.plot([ratio.low, ratio.high], [height, height], "|-", color=colour)
+            axis.plot(ratio.value, height, "o", color=colour)
+    axis.axvline(1, color=DARK, linestyle="--", linewidth=1)
+    axis.set_yticks(-np.arange(len(comparison)), list(comparison))
+    axis.set_ylim(0.5 - len(comparison), 0.5)
+    axis.grid(axis="y", visible=False)
+    axis.set_title("RMSE over that of the other")
+    axis.set_xlabel("ratio with its 95 % interval, paired by run")

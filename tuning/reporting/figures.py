@@ -1,0 +1,101 @@
+"""Pictures of studies and of what they are worth, each saved as one PNG file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from optuna.trial import FrozenTrial, TrialState
+
+from numerics.plots import BLUE, RUST, panels, save_figure
+from tuning.evaluation.baselines import ORACLE, RULE, SCALED, TUNED
+from tuning.evaluation.held_out import Comparison
+from tuning.reporting.panels import COLUMNS, shown_states
+from tuning.search.outcome import is_consistent
+
+SCORE = "score: mean RMSE over bound [-]"
+ESTIMATE, BOUND = BLUE, RUST
+GREY = "#9aa5ad"
+COLOURS = {RULE: "#c5ccd1", SCALED: "#8a959d", TUNED: ESTIMATE, ORACLE: "#5a8f3c"}
+
+
+def history_figure(path: Path, trials: Sequence[FrozenTrial], title: str, label: str = SCORE) -> Path:
+    """First objective of every trial of a study and the best so far; the first trial is the untuned filter.
+
+    Hollow circles are trials whose mean NIS is outside its band: they are not among the best, unless all are.
+    Crosses are pruned trials: the mean of the seeds that they came to.
+    """
+    figure, (axis,) = panels(1, 1, (6.4, 4.4))
+    done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    values = [trial.values[0] for trial in done]
+    early = early_trials(trials)
+    if early:
+        x, y = [trial.number + 1 for trial, _ in early], [value for _, value in early]
+        axis.plot(x, y, "x", color=GREY, markersize=4, label="pruned: mean of its seeds")
+    for inside, face, name in ((True, GREY, "trial"), (False, "none", "NIS outside its band")):
+        some = [trial for trial in done[1:] if is_consistent(trial) == inside]
+        if some:
+            x, y = [trial.number + 1 for trial in some], [trial.values[0] for trial in some]
+            axis.plot(x, y, "o", color=GREY, markerfacecolor=face, markersize=4, label=name)
+    if done:
+        axis.plot(done[0].number + 1, values[0], "s", color=BOUND, markersize=7, label="first trial")
+        kept = [is_consistent(trial) for trial in done]
+        counted = np.where(kept, values, np.inf) if any(kept) else values
+        best = np.minimum.accumulate(counted)
+        best[np.isinf(best)] = np.nan
+        axis.step([t.number + 1 for t in done], best, where="post", color=ESTIMATE, label="best so far")
+        beyond = limit_values(axis, values + [value for _, value in early])
+        figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    above = f" ({beyond} of {len(done) + len(early)} lie above the axis)" if done and beyond else ""
+    axis.set_xlabel(f"trial{above}")
+    axis.set_ylabel(label)
+    axis.set_title(title, fontsize=11)
+    return save_figure(figure, path)
+
+
+def early_trials(trials: Sequence[FrozenTrial]) -> list[tuple[FrozenTrial, float]]:
+    """Pruned trials, each with the mean of what it reported: scores of single seeds."""
+    early = [trial for trial in trials if trial.state == TrialState.PRUNED and trial.intermediate_values]
+    return [(trial, float(np.mean(list(trial.intermediate_values.values())))) for trial in early]
+
+
+def limit_values(axis, values: list[float]) -> int:
+    """Let an axis of objective values show the good ones and the first; return how many lie above it."""
+    low, spread = min(values), max(values) - min(values)
+    room = 0.1 * abs(low) or 0.1 * spread or 1.0
+    top = max(low + 3 * room, values[0] + 1.5 * room)
+    axis.set_ylim(low - room, top)
+    return sum(value > top for value in values)
+
+
+def comparison_figure(path: Path, proof: Comparison, title: str) -> Path:
+    """RMSE of a tuned filter and its baselines on held-out seeds with 95 % intervals, and the bound.
+
+    A panel is a state; of many some are shown.
+
+    Raises:
+        ValueError: if there is no truth, and so no RMSE.
+    """
+    if not proof.tuned.has_truth:
+        raise ValueError("a figure of errors needs the truth, but there is none")
+    names, states = proof.evaluations, proof.tuned.states
+    places, left_out = shown_states(states, proof.tuned.scored)
+    width = 4.0 if len(places) > 1 else 5.2
+    figure, axes = panels(len(places), COLUMNS, (width, 3.4), extra=0.6)
+    for axis, i in zip(axes, places, strict=True):
+        for place, (name, evaluation) in enumerate(names.items()):
+            rmse = evaluation.rmse[i]
+            whiskers = [[rmse.value - rmse.low], [rmse.high - rmse.value]]
+            axis.bar(place, rmse.value, 0.62, yerr=whiskers, color=COLOURS[name], capsize=4)
+            axis.annotate(f"{rmse.value:.3g}", (place, rmse.high), (0, 4), textcoords="offset points", ha="center")
+        if np.isfinite(proof.bound[i]):
+            axis.axhline(proof.bound[i], color=BOUND, linestyle="--", label="posterior Cramér-Rao bound")
+        axis.set_xticks(range(len(names)), [name.replace(" ", "\n", 1) for name in names])
+        axis.set_ylabel(f"RMSE of {states[i].plot_label}")
+        axis.margins(y=0.15)
+        axis.grid(axis="x", visible=False)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", frameon=False, title=left_out or None)
+    figure.suptitle(title, fontsize=11)
+    return save_figure(figure, path)

@@ -1,0 +1,136 @@
+"""Pictures of what a study searched and found: importance, slices, Pareto front, ensemble sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import optuna
+from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+from optuna.trial import FrozenTrial, TrialState
+
+from numerics.plots import BLUE, RUST, grid_of, new_figure, panels, save_figure, tidy
+from tuning.evaluation.sizes import SizeRow
+from tuning.reporting.figures import GREY, early_trials, limit_values
+from tuning.reporting.panels import COLUMNS, shown_states
+from tuning.search.outcome import best_trial, is_consistent
+from tuning.search.space import KIND
+
+FEWEST_TRIALS = 10  # complete ones, for importances to mean anything
+CROSS = {"color": GREY, "markersize": 4, "markeredgewidth": 0.8}
+
+
+def importances(study: optuna.Study) -> dict[str, float]:
+    """How much each number matters for a trial to be among the best tenth; empty where trials are too few.
+
+    With two objectives the best are those nearest to the Pareto front. In a study over several kinds of filters
+    only numbers that all kinds have are told.
+
+    Source: Watanabe et al. (2023), "PED-ANOVA: efficiently quantifying hyperparameter importance in arbitrary
+    subspaces".
+    """
+    complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    if len(complete) < FEWEST_TRIALS:
+        return {}
+    shared = [name for name in complete[0].params if all(name in trial.params for trial in complete)]
+    return get_param_importances(study, evaluator=PedAnovaImportanceEvaluator(), params=shared)
+
+
+def importance_figure(path: Path, found: Mapping[str, float]) -> Path:
+    """Importance of each number, the largest above."""
+    figure = new_figure((6.4, 0.9 + 0.4 * len(found)))
+    axis = figure.subplots()
+    tidy([axis])
+    names, values = list(found)[::-1], list(found.values())[::-1]
+    axis.barh([words(name) for name in names], values, 0.6, color=BLUE)
+    for place, value in enumerate(values):
+        axis.annotate(f"{value:.2f}", (value, place), (4, 0), textcoords="offset points", va="center", fontsize=9)
+    axis.margins(x=0.12)
+    axis.grid(axis="y", visible=False)
+    axis.set_xlabel("importance, of a sum of 1")
+    return save_figure(figure, path)
+
+
+def slices_figure(path: Path, trials: Sequence[FrozenTrial], label: str) -> Path:
+    """First objective against each number, a panel a number; dashed is the best trial.
+
+    Hollow circles have a mean NIS outside its band; crosses were pruned and stand at the mean of their seeds.
+    """
+    done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    early, names = early_trials(trials), [name for name in done[0].params if name != KIND]
+    figure, axes = panels(len(names), COLUMNS, (3.2, 2.7), extra=0.4, sharey=True)
+    best, values = best_trial(done), [trial.values[0] for trial in done]
+    faces = [BLUE if is_consistent(trial) else "white" for trial in done]
+    for axis, name in zip(axes, names, strict=True):
+        places = [trial.params[name] for trial in done]
+        axis.scatter(places, values, s=16, facecolors=faces, edgecolors=BLUE, linewidths=0.8, alpha=0.7)
+        axis.plot([trial.params[name] for trial, _ in early], [value for _, value in early], "x", **CROSS)
+        axis.axvline(best.params[name], color=RUST, linestyle="--", linewidth=1)
+        if getattr(best.distributions[name], "log", False):
+            axis.set_xscale("log")
+        if name == "N" or name.endswith(" N"):
+            _size_axis(axis, sorted(trial.params[name] for trial in trials if name in trial.params))
+        axis.set_xlabel(words(name))
+    limit_values(axes[0], values)
+    for axis in axes[:: grid_of(len(names), COLUMNS)[1]]:
+        axis.set_ylabel(label, fontsize=9)
+    return save_figure(figure, path)
+
+
+def front_figure(
+    path: Path, trials: Sequence[FrozenTrial], front: Sequence[FrozenTrial], labels: Sequence[str]
+) -> Path:
+    """Trials by their two objectives, and those that no other beats in both."""
+    figure = new_figure((6.4, 4.4))
+    axis = figure.subplots()
+    tidy([axis])
+    done = np.array([trial.values for trial in trials if trial.state == TrialState.COMPLETE])
+    best = np.array(sorted(trial.values for trial in front))
+    axis.plot(*done.T, "o", color=GREY, markersize=4, label="trial")
+    axis.plot(*best.T, "o-", color=BLUE, markersize=6, linewidth=1, drawstyle="steps-post", label="Pareto front")
+    axis.plot(*best[0], "s", color=RUST, markersize=8, label="best in the first objective")
+    for axis_name, column in (("x", 0), ("y", 1)):
+        low, high = best[:, column].min(), best[:, column].max()
+        room = 0.5 * (high - low) or 0.2 * abs(low) or 1.0
+        shown = done[done[:, column] <= high + room, column]
+        pad = 0.08 * (shown.max() - low) or room
+        getattr(axis, f"set_{axis_name}lim")(low - pad, shown.max() + pad)
+    axis.set_xlabel(labels[0])
+    axis.set_ylabel(labels[1])
+    axis.legend(frameon=False)
+    return save_figure(figure, path)
+
+
+def sizes_figure(path: Path, sizes: Sequence[SizeRow], kept: int) -> Path:
+    """RMSE of every state against ensemble size with 95 % intervals; dashed is the size that was kept."""
+    states, numbers = sizes[0].evaluation.states, [row.size for row in sizes]
+    places, left_out = shown_states(states, sizes[0].evaluation.scored)
+    width = 4.0 if len(places) > 1 else 5.2
+    figure, axes = panels(len(places), COLUMNS, (width, 3.6))
+    for axis, i in zip(axes, places, strict=True):
+        found = np.array([row.evaluation.rmse[i] for row in sizes])
+        axis.fill_between(numbers, found[:, 1], found[:, 2], color=BLUE, alpha=0.2, linewidth=0)
+        axis.plot(numbers, found[:, 0], "o-", color=BLUE, markersize=4, linewidth=1)
+        axis.axvline(kept, color=RUST, linestyle="--", linewidth=1)
+        place = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+        axis.annotate(f"N = {kept}", (kept, 1), (4, -10), **place, color=RUST, fontsize=9)
+        _size_axis(axis, numbers)
+        axis.set_xlabel("ensemble size N")
+        axis.set_ylabel(f"RMSE of {states[i].plot_label}")
+    if left_out:
+        figure.supxlabel(left_out, fontsize=9)
+    return save_figure(figure, path)
+
+
+def words(name: str) -> str:
+    """A trial parameter as it is said in a picture."""
+    return name.replace("_", " ")
+
+
+def _size_axis(axis, sizes: Sequence[int]) -> None:
+    """A logarithmic axis of ensemble sizes, smallest first, with round numbers."""
+    ticks = [n for n in (5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000) if sizes[0] <= n <= sizes[-1]]
+    axis.set_xscale("log")
+    axis.set_xticks(ticks, [str(tick) for tick in ticks])
+    axis.set_xticks([], minor=True)

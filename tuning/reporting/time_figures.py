@@ -1,0 +1,142 @@
+"""A picture of one run over time: states, estimates, and errors or innovations in their bands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.engine.batch import Estimates, run
+from filters.filter import Filter
+from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from plants.quantities import Quantity
+from tuning.evaluation.runs import state_errors
+from tuning.problems.data import Data
+from tuning.reporting.panels import axis_label, shown_states
+
+TRUTH, ESTIMATE, ERROR = DARK, BLUE, RUST
+WIDTH = 5.4  # of a filter [inch]
+TALL, LOW = 2.0, 1.3  # relative heights of panels of values and of errors ...
+UNIT, UNIT_OF_MANY = 8.0 / 6.6, 0.9  # ... in so many inches, for up to two states and for more
+
+
+class Run(NamedTuple):
+    """One run of a filter, as panels draw it; truth and errors are None where there is no truth."""
+
+    time: np.ndarray  # (K + 1,)
+    truth: np.ndarray | None  # (K + 1, n)
+    errors: np.ndarray | None  # (K + 1, n)
+    estimates: Estimates  # of this run alone
+    innovations: np.ndarray  # (K + 1, m), NaN where nothing was measured
+
+
+class Row(NamedTuple):
+    """A row of panels, one a filter."""
+
+    height: float
+    label: str
+    draw: Callable  # draw(axis, run)
+
+
+def estimates_figure(
+    path: Path,
+    filters: Mapping[str, Filter],
+    data: Data,
+    run_index: int,
+    dt: float | None,
+    scored: Collection[int] | None = None,
+    **options,
+) -> Path:
+    """Truth and estimate of every state over time, and the error in its 95 % band; one column a filter.
+
+    Without truth it is the estimates, and the innovation of every channel in the band that the filter expects. Of
+    many states some are shown.
+
+    Args:
+        path: PNG file to write.
+        filters: by what stands above their columns.
+        data: of a problem.
+        run_index: which of its runs.
+        dt: sample time [s]; None for an axis of steps.
+        scored: places of the states that count in the score, which come first where not all are shown.
+        **options: of matplotlib's `subplots`, such as `sharey="row"`.
+    """
+    model = next(iter(filters.values())).model
+    states = model.states if data.states is None else model.states[: data.states.shape[-1]]
+    places, left_out = shown_states(states, scored)
+    rows = _rows(states, places, model.measurements, data.states is not None)
+    heights = [row.height for row in rows]
+    unit = UNIT if len(places) <= 2 else UNIT_OF_MANY
+    figure = new_figure((WIDTH * len(filters), unit * sum(heights)))
+    options = {"sharex": True, "height_ratios": heights, **options}
+    axes = figure.subplots(len(rows), len(filters), squeeze=False, **options)
+    tidy(axes.flat)
+    for column, (title, filter_) in zip(axes.T, filters.items(), strict=True):
+        found = _run(filter_, data, run_index, dt)
+        for axis, row in zip(column, rows, strict=True):
+            row.draw(axis, found)
+        column[0].set_title(title, fontsize=11)
+        column[-1].set_xlabel("step" if dt is None else "time [s]")
+    for axis, row in zip(axes[:, 0], rows, strict=True):
+        axis.set_ylabel(row.label)
+    figure.align_ylabels(axes[:, 0])
+    named = {}
+    for axis in axes[:, 0]:
+        handles, labels = axis.get_legend_handles_labels()
+        named |= dict(zip(labels, handles, strict=True))
+    options = {"ncols": len(named), "frameon": False, "title": left_out or None}
+    figure.legend(named.values(), named, loc="outside lower center", **options)
+    return save_figure(figure, path)
+
+
+def _rows(
+    states: tuple[Quantity, ...], places: list[int], channels: tuple[Quantity, ...], has_truth: bool
+) -> list[Row]:
+    """Each state above its error; without truth all states, then the innovations of the channels."""
+    rows = []
+    for i in places:
+        rows.append(Row(TALL, axis_label(states[i]), partial(_values, i=i)))
+        if has_truth:
+            rows.append(Row(LOW, axis_label(Quantity("error", "error", states[i].unit)), partial(_error, i=i)))
+    if not has_truth:
+        seen, _ = shown_states(channels)
+        rows += [Row(LOW, axis_label(channels[j]), partial(_innovation, j=j)) for j in seen]
+    return rows
+
+
+def _run(filter_: Filter, data: Data, index: int, dt: float | None) -> Run:
+    one = slice(index, index + 1)
+    estimates = run(filter_, data.filter_keys[one], data.inputs[one], data.measurements[one])
+    time = (1.0 if dt is None else dt) * np.arange(data.measurements.shape[1])
+    innovations = np.where(np.isnan(data.measurements[index]), np.nan, estimates.innovations[0])
+    if data.states is None:
+        return Run(time, None, None, estimates, innovations)
+    errors = state_errors(filter_, estimates, data._replace(states=data.states[one]))[0]
+    return Run(time, data.states[index], errors, estimates, innovations)
+
+
+def _values(axis, found: Run, i: int) -> None:
+    mean, band = found.estimates.means[0, :, i], 1.96 * np.sqrt(found.estimates.covs[0, :, i, i])
+    axis.fill_between(found.time, mean - band, mean + band, color=ESTIMATE, alpha=0.3, linewidth=0)
+    if found.truth is not None:
+        axis.plot(found.time, found.truth[:, i], color=TRUTH, linewidth=1.6, label="truth")
+    axis.plot(found.time, mean, color=ESTIMATE, linewidth=1.0, label="estimate")
+
+
+def _error(axis, found: Run, i: int) -> None:
+    band = 1.96 * np.sqrt(found.estimates.covs[0, :, i, i])
+    _in_band(axis, found.time, found.errors[:, i], band, "error of the estimate")
+
+
+def _innovation(axis, found: Run, j: int) -> None:
+    band = 1.96 * np.sqrt(found.estimates.innovation_covs[0, :, j, j])
+    _in_band(axis, found.time, found.innovations[:, j], band, "innovation")
+
+
+def _in_band(axis, time: np.ndarray, values: np.ndarray, band: np.ndarray, label: str) -> None:
+    """An error over time in the band that a filter believes in."""
+    axis.fill_between(time, -band, band, color=ESTIMATE, alpha=0.3, linewidth=0, label="95 % band of the filter")
+    axis.plot(time, values, color=ERROR, linewidth=0.9, label=label)
