@@ -1,1 +1,1 @@
-"""Scenarios, evaluation and Optuna studies of a filter's free numbers, proved on data the study never saw."""
+"""Scenarios, Optuna studies of a filter's free parameters, and evaluation on held-out data."""

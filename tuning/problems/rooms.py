@@ -1,4 +1,4 @@
-"""The rooms of `tuning` that know a plant, named as text: they are imported when a name is looked for."""
+"""The packages of `tuning` that know a plant, named as text: they are imported when a scenario is looked up."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ ROOMS = {"thruster": "tuning.thruster.find", "auv": "tuning.auv.find"}
 
 
 def room_of(plant: str) -> ModuleType:
-    """The room of a plant by its key in `ROOMS`."""
+    """The package of a plant by its key in `ROOMS`."""
     return importlib.import_module(ROOMS[plant])
 
 
 def built_in() -> dict[str, ModuleType]:
-    """Names of the problems that come with the package, and the room of each."""
+    """Names of the built-in problems, and the package of each."""
     return {name: room for room in map(room_of, ROOMS) for name in room.NAMES}
