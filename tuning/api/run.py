@@ -93,7 +93,7 @@ def run_tuning(
         raise ValueError(f"study must be a name without slashes, but got {shown(name)}")
     if out is not None:
         check_target(out)
-    with _quiet_optuna():
+    with quiet_optuna():
         study = open_study(name, plan, None if storage is None else open_storage(storage))
         already = finished_trials(study)
         if already:
@@ -159,7 +159,7 @@ def short_name(problem: Problem) -> str:
 
 
 @contextmanager
-def _quiet_optuna() -> Iterator[None]:
+def quiet_optuna() -> Iterator[None]:
     """Within this context Optuna reports errors only: there is progress of our own."""
     before = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.ERROR)
