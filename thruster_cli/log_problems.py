@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from filters.tuned_file import read_tuned_file
 from numerics.checks import shown
@@ -17,26 +14,6 @@ from tuning.problems.find import find_problem
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Problem
 
-LogOption = Annotated[
-    list[Path] | None,
-    typer.Option("--log", help="In place of a problem: a recorded run, .csv, .parquet or .npz; may be repeated."),
-]
-HeldOutOption = Annotated[
-    list[Path] | None,
-    typer.Option("--held-out", help="Recorded run that only proves the choice; by default every third one."),
-]
-BlocksOption = Annotated[
-    int | None, typer.Option("--blocks", help="How many blocks a run is cut into; about 24 in all by default.")
-]
-LeadOption = Annotated[
-    int | None, typer.Option("--lead", help="Rows at the beginning of a block that do not count; 50 by default.")
-]
-LogModelOption = Annotated[
-    str | None,
-    typer.Option(
-        "--model", metavar="MODULE:OBJECT", help="The model of the logs that it was tuned on, where that is code."
-    ),
-]
 OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt")  # of `read_named`
 CUTS = ("held_out", "blocks", "lead")
 

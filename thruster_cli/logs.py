@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from numerics.checks import shown
 from numerics.modules import object_named
@@ -16,42 +14,8 @@ from plants.state_space import StateSpaceModel
 from thruster_env.logged import NO_BAND, logged_plant, with_shown
 from thruster_env.model import model_of_plant
 from thruster_env.modelled import ModelledThruster
-from thruster_env.parameters import PRESETS
 
 DEFAULT_PRESET = "tunnel"
-
-LogPresetOption = Annotated[
-    str | None,
-    typer.Option(
-        "--preset", help=f"The thruster that it is of: {', '.join(PRESETS)}, or a FILE.toml of `identify`."
-    ),
-]
-ModelOption = Annotated[
-    str | None,
-    typer.Option(
-        "--model",
-        metavar="MODULE:OBJECT",
-        help="In place of a thruster: a StateSpaceModel, or a function that makes one (of dt, if it takes it).",
-    ),
-]
-SensorOption = Annotated[
-    list[str] | None, typer.Option("--sensor", help="What the filter sees of a thruster: thrust, speed, ...")
-]
-ColumnOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--column",
-        metavar="NAME=HEADER[UNIT]",
-        help="Which column is which input, measurement, state or output; may be repeated.",
-    ),
-]
-ClockOption = Annotated[
-    list[str] | None,
-    typer.Option("--clock-offset", metavar="NAME=SECONDS", help="How far the clock of a channel is ahead."),
-]
-DtOption = Annotated[
-    float | None, typer.Option("--dt", help="Sample time [s]: of a log without times, or to put it on.")
-]
 
 
 class Preset(ModelledThruster):

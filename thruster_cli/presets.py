@@ -2,22 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-import typer
-
-from thruster_env.parameters import PRESETS
 from tuning.problems.files import FILE_SEQUENCES
 from tuning.problems.problem import Problem
 from tuning.thruster.scale import computed_scale
 from tuning.thruster.scenario import Scenario
-
-OfPresetOption = Annotated[
-    str | None,
-    typer.Option(
-        "--preset", help=f"The scenario of another thruster: {', '.join(PRESETS)}, or a FILE.toml of `identify`."
-    ),
-]
 
 
 def of_preset(problem: Problem, preset: str | None, sequences: int = FILE_SEQUENCES) -> Problem:

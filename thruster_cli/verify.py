@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
-from thruster_cli.log_problems import LogModelOption, problems_in
-from thruster_cli.output import CodeOption, JsonOption, announce_compilation, emit, table, working
+from thruster_cli.log_problems import problems_in
+from thruster_cli.options import CodeOption, JsonOption, LogModelOption
+from thruster_cli.output import announce_compilation, emit, table, working
 from tuning.evaluation.verify import TOLERANCE, Verification, verify
 from tuning.problems.find import find_problem
 
