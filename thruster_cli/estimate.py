@@ -12,7 +12,6 @@ from filters.logs.columns import columns_of
 from filters.logs.estimate import LogEstimate, estimate
 from filters.logs.findings import LogFindings, Residual, findings
 from plants.logs.write import check_suffix, write_columns
-from thruster_cli.logs import read_named
 from thruster_cli.options import (
     FILTER,
     FILTER_HELP,
@@ -29,6 +28,7 @@ from thruster_cli.options import (
     filter_option,
 )
 from thruster_cli.output import announce_compilation, check_targets, emit, table
+from tuning.logs.read import read_named
 
 ALPHA = 0.05  # below which a p-value speaks against white innovations
 

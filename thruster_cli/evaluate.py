@@ -9,7 +9,6 @@ import typer
 
 from thruster_cli.consistency import check_covariance, check_request
 from thruster_cli.error_tables import comparison_table
-from thruster_cli.log_problems import problems_in
 from thruster_cli.options import (
     FILTER,
     FILTER_HELP,
@@ -31,6 +30,7 @@ from tuning.evaluation.baselines import RULE, TUNED, baselines, rule_of_thumb
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import metrics, read_choice, read_tuned
 from tuning.evaluation.worth import scaling_sentence, without_truth
+from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem
 from tuning.search.plan import HELD_OUT_SEEDS
 

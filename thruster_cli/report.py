@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from thruster_cli.log_problems import problems_in
 from thruster_cli.options import INPUT, OUTPUT, CodeOption, JsonOption, LogModelOption
 from thruster_cli.output import announce_compilation, emit, working
 from thruster_cli.tune import DEFAULT_STORAGE
+from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem
 from tuning.reporting.report import write_report
 from tuning.reporting.subject import is_file
