@@ -15,7 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 PANELS = {
-    "First steps": ("demo", "inspect", "simulate", "filters"),
+    "First steps": ("demo", "inspect", "simulate", "filters", "new"),
     "Tune a filter and prove it": ("tune", "evaluate", "report", "verify", "compare"),
     "Recorded logs": ("identify", "estimate"),
     "Policies": ("train", "score", "play"),
