@@ -9,16 +9,20 @@ import typer
 
 from thruster_cli.consistency import check_covariance, check_request
 from thruster_cli.error_tables import comparison_table
-from thruster_cli.log_problems import LogModelOption, problems_in
-from thruster_cli.output import (
+from thruster_cli.options import (
+    FILTER,
     FILTER_HELP,
+    INPUT,
+    OUTPUT,
+    RUNS,
     JsonOption,
+    LogModelOption,
+    OfPresetOption,
     SeedOption,
-    announce_compilation,
-    emit,
-    working,
+    filter_option,
 )
-from thruster_cli.presets import OfPresetOption, of_preset
+from thruster_cli.output import announce_compilation, emit, working
+from thruster_cli.presets import of_preset
 from thruster_cli.problems import PROBLEMS
 from thruster_cli.tables import choice_table
 from thruster_cli.tuning_report import gains
@@ -26,26 +30,34 @@ from tuning.evaluation.baselines import RULE, TUNED, baselines, rule_of_thumb
 from tuning.evaluation.held_out import prove
 from tuning.evaluation.tuned import metrics, read_choice, read_tuned
 from tuning.evaluation.worth import scaling_sentence, without_truth
+from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem
 from tuning.search.plan import HELD_OUT_SEEDS
 
 
 def command(
-    tuned: Annotated[Path | None, typer.Option(help="Tuned file; it names filter, numbers and scenario.")] = None,
-    filter_name: Annotated[
-        str | None, typer.Option("--filter", help=f"Without a tuned file. {FILTER_HELP}")
+    tuned: Annotated[
+        Path | None,
+        typer.Option(help="Tuned file; it names filter, numbers and scenario.", rich_help_panel=FILTER),
     ] = None,
+    filter_name: Annotated[str | None, filter_option(f"Without a tuned file. {FILTER_HELP}")] = None,
     scenario: Annotated[
         str | None,
-        typer.Option("--problem", "--scenario", help=f"By default the tuned file's, or nominal. {PROBLEMS}"),
+        typer.Option(
+            "--problem",
+            "--scenario",
+            help=f"By default the tuned file's, or nominal. {PROBLEMS}",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     preset: OfPresetOption = None,
-    seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,
+    seeds: Annotated[int, typer.Option(help="Number of held-out seeds.", rich_help_panel=RUNS)] = HELD_OUT_SEEDS,
     consistency: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
             help="Also say whether the filter's covariance is consistent, and draw that: a .png file.",
+            rich_help_panel=OUTPUT,
         ),
     ] = None,
     model: LogModelOption = None,

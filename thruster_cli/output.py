@@ -1,4 +1,4 @@
-"""What every command shares: options, tables on the terminal, JSON for programs."""
+"""What every command shares: tables on the terminal, JSON for programs."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
@@ -22,27 +21,7 @@ from numerics.compiled import tell_when_compiling
 from numerics.files import check_not_read, check_target, write_whole
 from numerics.progress import listening
 from thruster_cli.characters import showable
-from thruster_env.parameters import PRESETS
-
-JsonOption = Annotated[
-    str | None,
-    typer.Option("--json", metavar="FILE", help="Also write the result as JSON; - for standard output."),
-]
-PresetOption = Annotated[
-    str, typer.Option("--preset", help=f"{', '.join(PRESETS)}, or a FILE.toml of `thruster identify`.")
-]
-SeedOption = Annotated[
-    int, typer.Option("--seed", min=0, help="Seed of all randomness; the same seed repeats all.")
-]
-CodeOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--problem",
-        metavar="MODULE:OBJECT",
-        help="What it was tuned on, where that is code: nothing that a file or a study names is imported.",
-    ),
-]
-FILTER_HELP = "Name of a filter; `thruster filters` lists them."
+from thruster_cli.options import JsonOption, SeedOption  # noqa: F401 - for `demo`
 
 console = Console(markup=False, highlight=False)
 progress_console = Console(stderr=True, markup=False, highlight=False)
