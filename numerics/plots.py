@@ -50,8 +50,12 @@ def panels(count: int, columns: int, size: tuple[float, float], extra: float = 0
 
 
 def save_figure(figure, path: str | Path | None):
-    """Write a figure as PNG, whole or not at all, and return the path; without a path return the figure itself."""
+    """Write a figure, whole or not at all, and return the path; without a path return the figure itself.
+
+    It is SVG where the name ends in .svg, else PNG.
+    """
     if path is None:
         return figure
-    write_whole(path, lambda stream: figure.savefig(stream, format="png"))
+    form = "svg" if Path(path).suffix == ".svg" else "png"
+    write_whole(path, lambda stream: figure.savefig(stream, format=form))
     return Path(path)
