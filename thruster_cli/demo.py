@@ -100,23 +100,32 @@ def error_table(tuning: Tuning) -> Table:
 
 def draw(tuning: Tuning, out: Path) -> dict[Path, str]:
     """Draw the tuned filter before and after, errors and search; return what each picture shows, by its file."""
-    scenario, proof, choice = tuning.scenario, tuning.proof, tuning.result.choice
-    found = proof.evaluations
-    others = baselines(FILTER, scenario, tuning.plan.seed)
-    before = min((name for name in others if name != ORACLE), key=lambda name: found[name].score.value)
-    filters = {
-        f"before: {before}": others[before].filter(scenario),
-        f"after: {TUNED}": choice.filter(scenario),
-    }
-    label, data = f"{choice.name} on {scenario.name}", scenario.data(proof.seeds[:1])
-    run = estimates_figure(out / "estimates.png", filters, data, 0, scenario.dt, sharey="row")
+    proof, label = tuning.proof, f"{tuning.result.choice.name} on {tuning.scenario.name}"
     errors = comparison_figure(out / "rmse.png", proof, f"{label}: RMSE on {len(proof.seeds)} held-out seeds")
     search = history_figure(out / "history.png", tuning.result.trials, f"Study of {label}")
     return {
-        run: f"one of these runs: {before}, then tuned",
+        before_and_after(out / "estimates.png", tuning): f"one of these runs: {best_baseline(tuning)}, then tuned",
         errors: "the errors of the table",
         search: "the search, trial by trial",
     }
+
+
+def before_and_after(path: Path, tuning: Tuning) -> Path:
+    """Draw the first held-out run of the best baseline and of the tuned filter, with their 95 % bands."""
+    scenario, before = tuning.scenario, best_baseline(tuning)
+    choices = baselines(FILTER, scenario, tuning.plan.seed)
+    filters = {
+        f"before: {before}": choices[before].filter(scenario),
+        f"after: {TUNED}": tuning.result.choice.filter(scenario),
+    }
+    data = scenario.data(tuning.proof.seeds[:1])
+    return estimates_figure(path, filters, data, 0, scenario.dt, sharey="row")
+
+
+def best_baseline(tuning: Tuning) -> str:
+    """The baseline with the least score, of those that anybody can have: not the oracle."""
+    found = tuning.proof.evaluations
+    return min((name for name in found if name not in (TUNED, ORACLE)), key=lambda name: found[name].score.value)
 
 
 def files(tuning: Tuning, pictures: dict[Path, str], report: Report) -> list[str]:
