@@ -20,7 +20,7 @@ BENCH := $(VENV)/.bench
 help: ## this list
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1 - \2/p' Makefile
 
-demo: $(BASE) ## install what is needed (once) and run the main job from end to end
+demo: $(BASE) ## install what is needed (once), tune a filter, prove it, draw it, report it
 	@$(BIN)/thruster demo $(ARGS)
 
 test: $(TEST) ## install what tests need (once) and run all tests; ARGS="-k name" picks some
