@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -61,7 +61,7 @@ def draw_log(found: LogEstimate, title: str, *, states: bool = True) -> Figure:
     axes[0].set_title(title, fontsize=11)
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
-    named = {}
+    named: dict[str, Any] = {}
     for axis in axes:
         handles, texts = axis.get_legend_handles_labels()
         named |= dict(zip(texts, handles, strict=True))
