@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from filters.augmented import Unknown
-from filters.estimators.find import is_foreign, label_of
-from filters.registry import FILTERS, filter_class
+from filters.estimators.find import is_foreign
+from filters.registry import filter_class
 from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least, shown
 from tuning.api.comparison import FilterComparison
 from tuning.api.evaluate import NOMINAL
-from tuning.api.problems import given_for, problems_of
+from tuning.api.problems import given_for, is_filter, problems_of
 from tuning.api.progress import console_for, row_bar
 from tuning.api.study import Study
 from tuning.api.tune import tune
@@ -26,7 +26,6 @@ from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice, has_ensemble
 
 DEFAULT_FILTERS = ("ekf", "enkf", "pf")
-Sizes = Mapping[str | None, int]  # of each filter by name; None for all others
 Beliefs = Mapping[str, Unknown | None]
 
 
@@ -78,12 +77,13 @@ def compare(
     """
     some = list(filters) if isinstance(filters, list | tuple) else [filters]
     problems = problems_of(_default(some) if problem is None else problem, preset)
-    sizes = {None: ensemble_size} if isinstance(ensemble_size, int) else dict(ensemble_size or {})
+    each = ensemble_size if isinstance(ensemble_size, Mapping) else {None: ensemble_size}
+    sizes = {name: size for name, size in each.items() if size is not None}
     if trials is not None:
         if knows is not None:
             raise ValueError(f"knows must be left out where filters are tuned, but got {shown(knows)} and trials")
         some = [
-            tune(list(problems), one, trials=trials, seed=seed, progress=progress) if _is_filter(one) else one
+            tune(list(problems), one, trials=trials, seed=seed, progress=progress) if _is_named(one) else one
             for one in some
         ]
     knows = _knowledge(problems) if knows is None else knows
@@ -120,18 +120,18 @@ def contenders_of(
     """
     for name, size in sizes.items():
         if name is not None and not has_ensemble(name):
-            raise ValueError(f"--ensemble-size must be for a filter with an ensemble, but got {name}={size}")
-        at_least("--ensemble-size", size, 2)
-    out: list[Contender] = []
+            raise ValueError(f"ensemble_size must be for a filter with an ensemble, but got {name}: {size}")
+        at_least("ensemble_size", size, 2)
+    others, out = sizes.get(None), list[Contender]()
     for one in filters:
         if isinstance(one, Study):
-            size = sizes.get(one.choice.name, sizes.get(None))
-            out.append(Contender(_new(f"{one.choice.name} tuned", out), _always(sized(one.choice, size))))
-        elif not _is_filter(one):
-            size = sizes.get(read_tuned_file(one)["filter"]["name"], sizes.get(None))
+            choice = sized(one.choice, sizes.get(one.choice.name, others))
+            out.append(Contender(_new(f"{choice.name} tuned", out), partial(_same, choice)))
+        elif not is_filter(one):
+            size = sizes.get(read_tuned_file(one)["filter"]["name"], others)
             out.append(Contender(_new(Path(one).stem, out), partial(_from_file, Path(one), size)))
         else:
-            size = sizes.get(one, sizes.get(None)) if not is_foreign(one) and has_ensemble(one) else None
+            size = sizes.get(one, others) if not is_foreign(one) and has_ensemble(one) else None
             out.append(contender(one, knows, seed=seed, ensemble_size=size))
             if unknown and filter_class(one).has_covariance:
                 out.append(contender(one, knows, unknown, seed, ensemble_size=size))
@@ -151,19 +151,8 @@ def beliefs_of(augment: Sequence[str] | Mapping[str, Any]) -> dict[str, Unknown 
     return found
 
 
-def _is_filter(given: Any) -> bool:
-    """Whether something is a filter or an estimator, and no tuned file or study."""
-    if isinstance(given, Study):
-        return False
-    if isinstance(given, str) and given in FILTERS:
-        return True
-    if isinstance(given, str | Path) and (str(given).endswith(".json") or Path(given).is_file()):
-        return False
-    if isinstance(given, str) or is_foreign(given):
-        label_of(given)
-        filter_class(given)  # a clear error for an unknown name
-        return True
-    raise ValueError(f"a filter must be a name, a tuned file, a Study or an estimator, but got {shown(given)}")
+def _is_named(given: Any) -> bool:
+    return not isinstance(given, Study) and is_filter(given)
 
 
 def _default(filters: Sequence[Any]) -> Any:
@@ -171,7 +160,7 @@ def _default(filters: Sequence[Any]) -> Any:
     for one in filters:
         if isinstance(one, Study):
             return list(one.problems)
-        if not _is_filter(one):
+        if not is_filter(one):
             return read_tuned(one, given_for(one))[1]
     return NOMINAL
 
@@ -183,10 +172,6 @@ def _knowledge(problems: Sequence[Problem]) -> str:
 
 def _from_file(file: Path, size: int | None, problem: Problem) -> Choice:
     return sized(read_choice(file, problem), size)
-
-
-def _always(choice: Choice) -> Callable[[Problem], Choice]:
-    return partial(_same, choice)
 
 
 def _same(choice: Choice, problem: Problem) -> Choice:

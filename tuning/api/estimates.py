@@ -74,7 +74,7 @@ class LogEstimates:
         Raises:
             ValueError: if pandas is not installed.
         """
-        return frame(columns_of(self.found), "time_s")
+        return frame(dict(columns_of(self.found)), "time_s")
 
     def save(self, path: str | Path) -> Path:
         """Write the same columns to a .csv, .parquet or .npz file; return the path.

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def frame(columns: Mapping[str, Sequence[Any]], index: str | None = None) -> pandas.DataFrame:
+def frame(columns: Mapping[str, Any], index: str | None = None) -> pandas.DataFrame:
     """Columns as a table of pandas.
 
     Args:
