@@ -27,8 +27,8 @@ def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
     return save_figure(draw_log(found, title), path)
 
 
-def draw_log(found: LogEstimate, title: str) -> Figure:
-    """Estimates beside the reference channels, and the innovations below.
+def draw_log(found: LogEstimate, title: str, *, states: bool = True) -> Figure:
+    """Estimates beside the reference channels, and the innovations below; without `states` these alone.
 
     References come first; of many states and outputs the first six are drawn. Bands of the first rows, in which a
     filter settles from its prior, do not widen the axes.
@@ -36,7 +36,7 @@ def draw_log(found: LogEstimate, title: str) -> Figure:
     model, references = found.model, compared(found)
     values = [f"{STATE}:{one.symbol}" for one in model.states] + [f"{OUTPUT}:{symbol}" for symbol in model.outputs]
     shown = sorted(values, key=lambda key: key not in references)[:MOST_PANELS]
-    shown = [key for key in values if key in shown]
+    shown = [key for key in values if key in shown] if states else []
     heights = [TALL] * len(shown) + [LOW] * len(found.log.measured)
     figure = new_figure((WIDTH, sum(heights) + ROOM))
     axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
