@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq -c constraints.txt
-TEST_EXTRAS := rl,render,peers,db,samplers,parquet,units,dev
+TEST_EXTRAS := rl,render,peers,db,samplers,parquet,units,frames,dev
 BENCH_EXTRAS := rl,peers,bench
 ARGS :=
 

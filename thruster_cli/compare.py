@@ -20,7 +20,6 @@ from numerics.checks import at_least
 from thruster_cli.leaderboard import as_json, report
 from thruster_cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption, SeedOption, filter_option
 from thruster_cli.output import announce_compilation, emit, progress_console
-from thruster_cli.presets import of_preset
 from thruster_cli.problems import PROBLEMS
 from tuning.evaluation.compare import Contender, compare, contender, sized
 from tuning.evaluation.tuned import read_choice, read_tuned
@@ -28,6 +27,7 @@ from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice, has_ensemble
+from tuning.thruster.logs import of_preset
 
 DEFAULT_FILTERS = ("ekf", "enkf", "pf")
 

@@ -22,7 +22,6 @@ from thruster_cli.options import (
     filter_option,
 )
 from thruster_cli.output import announce_compilation, emit, working
-from thruster_cli.presets import of_preset
 from thruster_cli.problems import PROBLEMS
 from thruster_cli.tables import choice_table
 from thruster_cli.tuning_report import gains
@@ -33,6 +32,7 @@ from tuning.evaluation.worth import scaling_sentence, without_truth
 from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem
 from tuning.search.plan import HELD_OUT_SEEDS
+from tuning.thruster.logs import of_preset
 
 
 def command(

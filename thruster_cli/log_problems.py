@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from thruster_cli.presets import of_preset
 from tuning.logs.problem import log_problem
 from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
+from tuning.thruster.logs import of_preset
 
 
 def problems_of(

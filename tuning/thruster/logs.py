@@ -13,6 +13,8 @@ from plants.state_space import StateSpaceModel
 from thruster_env.logged import NO_BAND, logged_plant, with_shown
 from thruster_env.model import model_of_plant
 from thruster_env.modelled import ModelledThruster
+from tuning.problems.files import FILE_SEQUENCES
+from tuning.problems.problem import Problem
 
 DEFAULT_PRESET = "tunnel"
 FREE = ("motor_damping", "voltage_gain", "lift_coefficient")  # to be identified, where nothing is said
@@ -34,6 +36,30 @@ class Preset(ModelledThruster):
         """The model, with what logs show beside the equations."""
         bare = self.plant._replace(dead_band=NO_BAND)
         return with_shown(model_of_plant(bare, **changes), bare, self._seen)
+
+
+def of_preset(problem: Problem, preset: str | Path | None, sequences: int = FILE_SEQUENCES) -> Problem:
+    """A scenario of another thruster, whose scale is computed anew; the problem itself where no preset is given.
+
+    Args:
+        problem: a scenario.
+        preset: a preset's name or file.
+        sequences: of inputs, that the scale is made of.
+
+    Raises:
+        ValueError: for a problem that is no scenario of a thruster that moves by its equations.
+    """
+    if preset is None:
+        return problem
+    from tuning.thruster.scale import computed_scale
+    from tuning.thruster.scenario import Scenario
+
+    preset = str(preset)
+    if not isinstance(problem, Scenario) or problem.system is not None:
+        raise ValueError(f"--preset must come with scenarios of the thruster's equations, but got {problem.name}")
+    name = f"{problem.name} ({preset})"
+    made = problem.replace(preset=preset, name=name, scale=problem.scale)
+    return made.replace(scale=tuple(float(one) for one in computed_scale(made, sequences)))
 
 
 def family_of_preset(
