@@ -91,12 +91,8 @@ def check_of_table(for_logs: Mapping[str, Any]) -> None:
     """
     for name, value in for_logs.items():
         if value:
-            what = (
-                name
-                if value is True
-                else f"{name} {', '.join(map(str, value)) if isinstance(value, list) else value}"
-            )
-            raise ValueError(f"{name} must come with logs, for --bollard fits what a table tells, but got {what}")
+            got = "" if value is True else f" {', '.join(map(str, value)) if isinstance(value, list) else value}"
+            raise ValueError(f"{name} must come with logs, for --bollard fits a table, but got {name}{got}")
 
 
 def from_step(

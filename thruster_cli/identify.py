@@ -162,9 +162,7 @@ def command(
 
         for_logs = {"--free": free, "--model": model, "--sensor": sensor, "--range": range_, "--start": start}
         for_logs |= {"--hold-noise": hold_noise, "--held-out": held_out, "--use-all": use_all, "--plot": plot}
-        check_of_table(
-            for_logs | {"--predicted": predicted, "--filter": filter_name if filter_name != "ekf" else ()}
-        )
+        check_of_table(for_logs | {"--predicted": predicted})
         reading = {"columns": column, "clock_offset": clock_offset, "dt": dt}
         return identify_bollard(bollard, step, logs, preset, out or DEFAULT_OUT, json, **reading)
     if step is not None:
