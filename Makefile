@@ -20,7 +20,7 @@ BENCH := $(VENV)/.bench
 help: ## this list
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1 - \2/p' Makefile
 
-demo: $(BASE) ## install what is needed (once) and run the main job from end to end
+demo: $(BASE) ## install what is needed (once), tune a filter, prove it, draw it, report it
 	@$(BIN)/thruster demo $(ARGS)
 
 test: $(TEST) ## install what tests need (once) and run all tests; ARGS="-k name" picks some
@@ -32,12 +32,13 @@ bench: $(BENCH) ## install what benchmarks need (once) and time it against other
 fuzz: $(TEST) ## attack everything at random for ten minutes; ARGS="--seconds 60 --seed 1"
 	@$(BIN)/python -m tests.fuzz $(ARGS)
 
-lint: $(TEST) ## check style and formatting
+lint: $(TEST) ## check style, formatting and types
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
+	@$(BIN)/python -m tests.repository.types
 
 clean: ## remove .venv, build products and caches; results in out/ stay
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(MADE):

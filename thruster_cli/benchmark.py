@@ -43,11 +43,15 @@ def _table(benchmark: Benchmark, rows: list[Row], runs: int) -> Table:
     return out
 
 
+LEAST = 12  # width of a column of words
+
+
 def fitted(out: Table, rows: list[list[str]], flexible: str = "") -> Table:
     """The table with a blank line between rows of two lines, and numbers that do not wrap where there is room."""
     out.leading = 1
-    widths = [max(len(line) for row in rows for line in row[place].split("\n")) for place in range(len(rows[0]))]
-    if sum(widths) + 2 * len(widths) > console.width and not flexible:
+    fixed = [place for place, column in enumerate(out.columns) if str(column.header) != flexible]
+    widths = [max(len(line) for row in rows for line in row[place].split("\n")) for place in fixed]
+    if sum(widths) + 2 * len(out.columns) + (LEAST if flexible else 0) > console.width:
         return out
     for place, column in enumerate(out.columns):
         if str(column.header) == flexible:

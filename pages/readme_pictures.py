@@ -1,0 +1,79 @@
+"""Draw the two pictures of README.md: the thruster and its estimate, and a filter before and after tuning.
+
+    python -m pages.readme_pictures [FOLDER]
+
+They go into FOLDER, docs/ by default. Both show the filter that `make demo` tunes, tuned anew in some seconds. The
+moving picture needs pygame. Every run gives the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+from PIL import Image
+
+import thruster_env  # noqa: F401 - registers the envs
+from filters import EstimateState
+from numerics.files import write_whole
+from pages.page import DOCS
+from thruster_cli.demo import FILTER, SCENARIO, before_and_after
+from thruster_cli.tune import tune
+from thruster_cli.tuning_report import Tuning
+from tuning.search.plan import Plan
+from tuning.thruster.find import find_scenario
+
+SEED = 5
+FIRST, LAST, EVERY = 400, 1000, 8  # steps of the episode of 10 ms each: twelve pictures and a half a second
+COLOURS = 64
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(prog="python -m pages.readme_pictures", description=__doc__.splitlines()[0])
+    parser.add_argument("folder", nargs="?", type=Path, default=DOCS, metavar="FOLDER")
+    folder = parser.parse_args(arguments).folder
+    with tempfile.TemporaryDirectory() as scratch:
+        plan = Plan(FILTER, (find_scenario(SCENARIO),), seed=0)
+        tuning = tune(plan, 50, f"{scratch}/studies.journal", out=Path(scratch) / "tuned.json")
+        before_and_after(folder / "estimates.png", tuning)
+        thruster(folder / "thruster.gif", tuning)
+
+
+def thruster(path: Path, tuning: Tuning) -> Path:
+    """The reversal task, filmed: truth, measurements with outliers, and what the tuned filter believes.
+
+    The voltage is the one that would hold the reference in the steady state.
+    """
+    sensors = tuning.scenario.plant_arguments["sensors"]
+    env = gym.make("BowThrusterReversal-v0", render_mode="rgb_array", sensors=sensors)
+    env = EstimateState(env, tuned=str(tuning.file))
+    top, full = env.unwrapped.plant.max_voltage, env.unwrapped.thrust_scale
+    _, info = env.reset(seed=SEED)
+    frames = []
+    for step in range(1, LAST + 1):
+        share = info["reference"] / full  # the thrust grows nearly with the square of the voltage
+        voltage = top * math.copysign(abs(share) ** 0.5, share)
+        *_, info = env.step(np.array([voltage], dtype=np.float32))
+        if step > FIRST and step % EVERY == 0:
+            frames.append(Image.fromarray(env.render()))
+    env.close()
+    return save_gif(path, frames, milliseconds=10 * EVERY)
+
+
+def save_gif(path: Path, frames: Sequence[Image.Image], milliseconds: int) -> Path:
+    """Pictures as one that moves, for ever, with one palette for all."""
+    palette = frames[len(frames) // 2].quantize(COLOURS, method=Image.Quantize.MEDIANCUT)
+    first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    options = {"save_all": True, "append_images": others, "duration": milliseconds, "loop": 0, "optimize": True}
+    write_whole(path, lambda stream: first.save(stream, format="gif", **options))
+    return path
+
+
+if __name__ == "__main__":
+    main()
