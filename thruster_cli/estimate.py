@@ -84,7 +84,7 @@ def command(
     Example: thruster estimate run.csv --sensor speed --column speed=motor_rpm --column thrust=loadcell[kgf]
     """
     if tuned is not None and filter_name is not None:
-        raise ValueError("give either --tuned FILE or --filter NAME")
+        raise ValueError(f"give either --tuned FILE or --filter NAME, but got both, {tuned} and {filter_name}")
     if plot is not None and plot.suffix != ".png":
         raise ValueError(f"--plot must end in .png, but got {str(plot)!r}")
     if out is not None:

@@ -72,7 +72,8 @@ def command(
     Example: thruster evaluate --filter enkf --scenario mismatch --consistency calibrated.png
     """
     if (tuned is None) == (filter_name is None):
-        raise ValueError("give either --tuned FILE or --filter NAME")
+        got = "none" if tuned is None else f"both, {tuned} and {filter_name}"
+        raise ValueError(f"give either --tuned FILE or --filter NAME, but got {got}")
     choice, chosen, _ = subject_of(tuned or filter_name, scenario, preset, model)
     if consistency is not None:
         check_request(consistency, choice.filter(chosen))

@@ -154,12 +154,15 @@ def command(
     if plot is not None and plot.suffix != ".png":
         raise ValueError(f"--plot must end in .png, but got {str(plot)!r}")
     if bollard is not None:
-        from thruster_cli.bollard import identify_bollard
+        from thruster_cli.bollard import check_of_table, identify_bollard
 
+        for_logs = {"--free": free, "--model": model, "--sensor": sensor, "--range": range_, "--start": start}
+        for_logs |= {"--hold-noise": hold_noise, "--held-out": held_out, "--use-all": use_all, "--plot": plot}
+        check_of_table(for_logs | {"--predicted": predicted})
         reading = {"columns": column, "clock_offset": clock_offset, "dt": dt}
         return identify_bollard(bollard, step, logs, preset, out or DEFAULT_OUT, json, **reading)
     if step is not None:
-        raise ValueError("--step must come with --bollard TABLE.csv, but got it alone")
+        raise ValueError(f"--step must come with --bollard TABLE.csv, but got --step {step} alone")
     whose = {"preset": preset, "model": model, "sensors": sensor}
     options = whose | {"columns": column, "clock_offset": clock_offset, "dt": dt}
     if not logs:

@@ -33,9 +33,15 @@ def report(board: Leaderboard) -> list:
     else:
         errors = _errors_across if 2 * len(evaluation.states) < MOST_COLUMNS else _errors_below
         shown, said = [errors(board, f"{title}\nRMSE on {seeds}"), _against(board)], [f"{winners(board)}\n"]
-    for one in shown:
-        one.columns[0].overflow = "fold"
     return [*shown, *said]
+
+
+def winner(board: Leaderboard) -> int:
+    """Place of the row with the lowest score or, without truth, the highest log-likelihood; -1 if none has it."""
+    found = [row.evaluation for row in board.rows]
+    values = [one.score.value if one.has_truth else -one.log_likelihood for one in found]
+    known = [value for value in values if not isnan(value)]
+    return values.index(min(known)) if len(known) > 1 else -1
 
 
 def _errors_across(board: Leaderboard, title: str) -> Table:
@@ -53,7 +59,7 @@ def _errors_across(board: Leaderboard, title: str) -> Table:
     rows.append(["bound", *limits, *("" for _ in states)])
     heads = [head for state in states for head in (two_lines(state), "above\n[%]")]
     begun = [f"{'' if i else 'start-up'}\n{f'[{s.unit}]' if s.unit else ''}" for i, s in enumerate(states)]
-    return table(title, ["filter", *heads, *begun], rows, caption=_CAPTION)
+    return table(title, ["filter", *heads, *begun], rows, caption=_CAPTION, best=[winner(board)])
 
 
 def _errors_below(board: Leaderboard, title: str) -> Table:
@@ -74,7 +80,9 @@ def _errors_below(board: Leaderboard, title: str) -> Table:
     if any(cells[1] for cells in bounds):
         rows += [["bound" if i == 0 else "", *cells] for i, cells in enumerate(bounds)]
     heads = ["filter", "state", "RMSE", "above\n[%]", "start-up", f"over\n{board.rows[0].label}"]
-    return table(title, heads, rows, caption=_CAPTION)
+    first = winner(board) * len(states)
+    best = range(first, first + len(states)) if first >= 0 else ()
+    return table(title, heads, rows, caption=_CAPTION, best=best)
 
 
 _CAPTION = "above: the bound. ±: half of the 95 % interval. start-up: the first 50 steps."
@@ -101,7 +109,8 @@ def _against(board: Leaderboard) -> Table:
     right = f"NEES {n}, NIS {right_nis(board.rows[0].evaluation)}{_median(n) if medians else ''}"
     heads = ["filter", *(state.symbol for state in shown), "score", "NEES", "NIS", "div.", "us/step"]
     caption = f"±: half of the 95 % interval. Ideal: {right}. div.: restarts."
-    return table(f"Over {first}, paired; consistency and cost", heads, rows, caption=caption)
+    title = f"Over {first}, paired; consistency and cost"
+    return table(title, heads, rows, caption=caption, best=[winner(board)])
 
 
 def _median(n: int) -> str:
@@ -123,9 +132,8 @@ def _predictions(board: Leaderboard, title: str) -> Table:
         rows.append([row.label, *cells, str(found.divergences), f"{row.microseconds:.3g}"])
     right = right_nis(board.rows[0].evaluation)
     caption = f"log L: of a run. ±: half of the 95 % interval. Ideal: NIS {right}. div.: restarts."
-    return table(
-        title, ["filter", "log L", f"less that\nof {first}", "NIS", "div.", "us/step"], rows, caption=caption
-    )
+    heads = ["filter", "log L", f"less that\nof {first}", "NIS", "div.", "us/step"]
+    return table(title, heads, rows, caption=caption, best=[winner(board)])
 
 
 def as_json(boards: list[Leaderboard]) -> dict:

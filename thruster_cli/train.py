@@ -134,7 +134,7 @@ def command(
     scenario = plant.scenario if scenario is None else scenario
     chosen = plant.find_scenario(scenario)
     if untuned and tuned is not None:
-        raise ValueError("give either --tuned FILE or --untuned, but got both")
+        raise ValueError(f"give either --tuned FILE or --untuned, but got both, --tuned {tuned}")
     setup = make_setup(
         task,
         chosen,
