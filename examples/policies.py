@@ -2,8 +2,8 @@
 Policies on an estimate
 =======================
 
-Reinforcement learning from the raw sensor, or from what a filter makes of it? Both are trained in a script of your
-own, with Stable-Baselines3 (``pip install '.[rl]'``), for some seconds each.
+Reinforcement learning from the raw sensor, or from what a filter makes of it? Both are trained in a script of
+your own, with Stable-Baselines3 (``pip install '.[rl]'``), for some seconds each.
 """
 
 # %%

@@ -12,6 +12,8 @@ from pages.site.equations import latex_of
 PROSE_OR_CODE = re.compile(r"(``.+?``|`[^`]+`)", re.DOTALL)
 MISREAD = re.compile(r"(\||\*(?! - ))|(?<=\w)(_)(?!\w)")
 
+PYTHON = re.compile(r"^import |^\w+ = \w+\.|^\w+\.\w+\(", flags=re.MULTILINE)
+CODE = re.compile(rf"{PYTHON.pattern}|^\[\w+\]$|\"|^thruster ", flags=re.MULTILINE)
 NOT_OURS = ("Alias for field number", "dict() -> ")  # what namedtuple says of each field, and dict of itself
 
 
@@ -37,9 +39,10 @@ def readable(lines: list[str]) -> list[str]:
 def directive(block: list[str]) -> list[str]:
     """A block of equations as `math`; one of TOML or of commands as it stands."""
     text = "\n".join(line[4:] for line in block).rstrip()
-    if re.search(r'^\[\w+\]$|^\w+ = "|^thruster |^import |^>>> ', text, flags=re.MULTILINE):
-        return [".. code-block:: text", "", *(f"    {line}" for line in text.splitlines()), ""]
-    return [".. math::", "", f"    {latex_of(text)}", ""]
+    if not CODE.search(text):
+        return [".. math::", "", f"    {latex_of(text)}", ""]
+    language = "python" if PYTHON.search(text) else "text"
+    return [f".. code-block:: {language}", "", *(f"    {line}" for line in text.splitlines()), ""]
 
 
 def _without_markdown(lines: list[str]) -> list[str]:
