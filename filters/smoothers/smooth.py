@@ -33,7 +33,11 @@ class Smoothed(NamedTuple):
 
 
 def smooth(
-    filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray, lag: int | None = None
+    filter_: Filter,
+    keys: np.ndarray | None = None,
+    inputs: np.ndarray | None = None,
+    measurements: np.ndarray | None = None,
+    lag: int | None = None,
 ) -> Smoothed:
     """Filter trajectories forwards and correct the estimates by later measurements.
 
@@ -47,7 +51,7 @@ def smooth(
 
     Args:
         filter_: a filter of these kinds.
-        keys: random keys, one a trajectory, (B, 2).
+        keys: random keys, one a trajectory, (B, 2); those of seeds 0, 1, ..., B - 1 if None.
         inputs: u, (B, K, p).
         measurements: z, (B, K + 1, m), NaN where missing.
         lag: how many later measurements an estimate has seen, for use with a fixed delay; all of them if None.

@@ -7,7 +7,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TypeVar
 
-from numerics.checks import one_of, shown
+from numerics.checks import any_case, meant, one_of, shown
 from numerics.toml import read_toml
 from tuning.problems.rooms import ROOMS, room_of
 from tuning.problems.scenario import BaseScenario
@@ -72,10 +72,11 @@ def find_in(known: Mapping[str, S], kind: type[S], whose: str, name: str) -> S:
         if not isinstance(found, kind):
             raise ValueError(f"scenario must be {whose}, but {name} is of plant {found.plant_kind!r}")
         return found
-    if not isinstance(name, str) or name not in known:
-        names = ", ".join(known)
-        raise ValueError(f"scenario must be one of {names}, or a file that ends in .toml, but got {shown(name)}")
-    return known[name]
+    own = any_case(name, known)
+    if not isinstance(own, str) or own not in known:
+        rule = f"scenario must be one of {', '.join(known)}, or a file that ends in .toml"
+        raise ValueError(f"{rule}, but got {shown(name)}{meant(name, known)}")
+    return known[own]
 
 
 def scenario_of(content, name: str, file: str | Path) -> BaseScenario:

@@ -6,7 +6,7 @@ import copy
 from collections.abc import Sequence
 from pathlib import Path
 
-from numerics.checks import shown
+from numerics.checks import any_case, meant, shown
 from numerics.modules import is_code, object_named, said
 from tuning.problems.check import checked_problem
 from tuning.problems.files import read_scenario
@@ -22,15 +22,16 @@ def find_problem(name: str) -> Problem:
     Raises:
         ValueError: states the rule and the value, where there is no such problem, or the object is not a problem.
     """
-    known = built_in()  # their names may have a colon, too
-    if isinstance(name, str) and name in known:
-        return known[name].find_scenario(name)
+    known = built_in()  # whose names may have a colon, too
+    own = any_case(name, known)
+    if isinstance(own, str) and own in known:
+        return known[own].find_scenario(own)
     if is_code(name):
         return _from_module(name)
     if isinstance(name, str) and name.endswith(".toml"):
         return read_scenario(name)
     rule = f"problem must be one of {', '.join(known)}, a file that ends in .toml, or module:object"
-    raise ValueError(f"{rule}, but got {shown(name)}")
+    raise ValueError(f"{rule}, but got {shown(name)}{meant(name, known)}")
 
 
 def find_same(name: str, digest: str) -> Problem:

@@ -7,10 +7,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from numerics.progress import tell
+
+STOPPING = "stopping after what runs now; Ctrl-C again stops at once"
+
 
 @contextmanager
 def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Within this context the first Ctrl-C only makes the yielded function return True.
+    """Within this context the first Ctrl-C only makes the yielded function return True, and tells who listens.
 
     An exception within compiled code or a storage's lock could get lost or leave the lock behind. Outside the main
     thread, where Python delivers no signals, nothing changes.
@@ -24,6 +28,7 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
     def note(number, frame):
         caught.append(number)
         signal.signal(signal.SIGINT, before)
+        tell(STOPPING)
 
     signal.signal(signal.SIGINT, note)
     try:

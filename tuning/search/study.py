@@ -69,6 +69,13 @@ class StudyResult(NamedTuple):
         return self
 
 
+def checked(plan: Plan) -> Plan:
+    """A plan that can work, whose sampler is there; ValueError otherwise, before anything is stored."""
+    plan = plan.checked()
+    make_sampler(plan.sampler, plan.seed, 0, plan.space())
+    return plan
+
+
 def open_study(
     name: str,
     plan: Plan,
@@ -91,9 +98,7 @@ def open_study(
         ValueError: if the plan cannot work, or a study of this name was made for something else or by another
             version of Optuna.
     """
-    plan = plan.checked()
-    space = plan.space()
-    make_sampler(plan.sampler, plan.seed, 0, space)  # a clear error before anything is stored
+    plan, space = checked(plan), plan.space()
     study = optuna.create_study(
         study_name=name,
         storage=storage,
