@@ -63,4 +63,6 @@ def find_observation_set(name: str) -> ObservationSet:
 
 
 # Former names.
-Arm, ARMS, find_arm = ObservationSet, OBSERVATION_SETS, find_observation_set
+Arm = ObservationSet
+ARMS = OBSERVATION_SETS
+find_arm = find_observation_set

@@ -185,4 +185,6 @@ def configuration_from_json(text: str, name: str) -> TrainingConfiguration:
 
 
 # Former names.
-Setup, make_setup, setup_from_json = TrainingConfiguration, make_configuration, configuration_from_json
+Setup = TrainingConfiguration
+make_setup = make_configuration
+setup_from_json = configuration_from_json
