@@ -1,4 +1,4 @@
-"""What draws an episode of a plant: it remembers the last moments, and shows them as arrays or in a window."""
+"""Renderer of an episode of a plant: it keeps the last steps, and shows them as arrays or in a window."""
 
 from __future__ import annotations
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from plants.memory import TIME
 from plants.rendered import RenderedEnv
 from thruster_env.engine.memory import AMBIENT, COMMAND, FLOW, OMEGA, READINGS, REFERENCE, THRUST
@@ -17,12 +19,14 @@ from thruster_env.task import thrust_scale
 class RenderedThruster(RenderedEnv):
     """An env with a thruster as `plant`, and a `_memory` of one copy."""
 
+    _memory: np.ndarray
     metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 100}
 
     def make_renderer(self) -> Renderer:
         """What draws the thruster in its water."""
         p, top = self.plant.parameters, self.plant.max_voltage
         speed, flow = state_range(p, top) / 2
+        assert self.render_mode is not None  # a renderer is made for a mode only
         return Renderer(
             self.render_mode,
             gear_ratio=p.gear_ratio,

@@ -88,9 +88,10 @@ class Renderer(PlantRenderer):
         self._count_of_frame = 0
         self._omega_m = 0.0
 
-    def add(self, moment: Moment, overlay: Overlay | None = None) -> None:
+    def add(self, moment: tuple, overlay: tuple | None = None) -> None:
         """Note a moment, dt after the one before; the first of an episode is that of the reset."""
-        omega_m = moment.omega_m if abs(moment.omega_m) < ABSURD else 0.0
+        speed = Moment(*moment).omega_m
+        omega_m = speed if abs(speed) < ABSURD else 0.0
         if self._history.count:
             self._angle += 0.5 * (self._omega_m + omega_m) * self._dt / self._gear_ratio
         self._omega_m = omega_m
