@@ -23,6 +23,13 @@ def listening(listener: Callable[[str], None]) -> Iterator[None]:
         _listener.reset(before)
 
 
+def tell(text: str) -> None:
+    """Tell what goes on, if anybody listens."""
+    listener = _listener.get()
+    if listener is not None:
+        listener(text)
+
+
 def told(what: str, parts: Sequence[Part], sizes: Sequence[int] | None = None) -> Iterator[Part]:
     """Go through the parts of a computation, and report before each how much is done.
 

@@ -38,7 +38,11 @@ class Smoothed(NamedTuple):
 
 
 def smooth(
-    filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray, lag: int | None = None
+    filter_: Filter,
+    keys: np.ndarray | None = None,
+    inputs: np.ndarray | None = None,
+    measurements: np.ndarray | None = None,
+    lag: int | None = None,
 ) -> Smoothed:
     """Filter trajectories forwards and correct the estimates by later measurements.
 
@@ -57,8 +61,8 @@ def smooth(
 
     Args:
         filter_: a filter of one of these types.
-        keys: random keys, one a trajectory, (B, 2).
-        inputs: u, (B, K, p), in the units of the model's inputs.
+        keys: random keys, one a trajectory, (B, 2); those of seeds 0, 1, ..., B - 1 if None.
+        inputs: u, (B, K, p), in the units of the model's inputs; None for a model without inputs.
         measurements: z, (B, K + 1, m), in the units of the model's measurements, NaN where missing.
         lag: number of later measurements that each estimate uses (fixed-lag smoothing); all of them if None.
 

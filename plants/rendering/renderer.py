@@ -83,7 +83,7 @@ class PlantRenderer:
         """Start an episode: nothing is remembered."""
         self._history.clear()
 
-    def add(self, moment: tuple, overlay: tuple | None = None) -> None:
+    def add(self, moment: Any, overlay: Any = None) -> None:
         """Note a moment, a sample time after the one before; the first of an episode is that of the reset."""
         self._history.add(moment)
         self.amend(overlay)
