@@ -12,7 +12,7 @@ from numerics.checks import at_least, positive, within
 from numerics.streams import episode_keys
 from plants.logs.write import check_suffix, header_of, write_columns
 from thruster_cli.options import INPUT, OUTPUT, RUNS, JsonOption, PresetOption, SeedOption
-from thruster_cli.output import announce_compilation, emit
+from thruster_cli.output import announce_compilation, emit, warn_beyond
 from thruster_env.channels import CHANNELS
 from thruster_env.plant import (
     DEFAULT_DT,
@@ -82,6 +82,7 @@ def command(
         voltages = held_levels(
             keys, min(amplitude, plant.max_voltage), at_least("hold", hold, 1, MOST_STEPS), steps
         )
+    warn_beyond(preset, np.abs(voltages).max())
     announce_compilation()
     run = simulate(plant, keys, voltages).checked()
     values = [
