@@ -27,7 +27,7 @@ def report(board: Leaderboard) -> list:
     """Two tables of a scenario, one without truth, and a sentence on who wins."""
     scenario, evaluation = board.scenario, board.rows[0].evaluation
     title = f"{scenario.name}: {scenario.about}" if scenario.about else scenario.name
-    seeds = f"held-out seeds {board.seeds[0]} to {board.seeds[-1]}"
+    seeds = f"held-out {scenario.seed_word} {board.seeds[0]} to {board.seeds[-1]}"
     if not evaluation.has_truth:
         shown = [_predictions(board, f"{title}\nInnovations on {seeds}")]
         said = [without_truth(scenario.name), f"{winners(board)}\n"]

@@ -193,5 +193,5 @@ def _checked_logs(given) -> tuple[Log, ...]:
 
 def _name(logs: Sequence[Log]) -> str:
     """What logs are called together: the first one's name, and how many there are more."""
-    more = f"+{len(logs) - 1}" if len(logs) > 1 else ""
+    more = f" and {len(logs) - 1} more" if len(logs) > 1 else ""
     return f"{logs[0].name}{more}"
