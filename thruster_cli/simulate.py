@@ -28,15 +28,15 @@ TRUTH = ("time_s", "voltage_V", "omega_m_rad_per_s", "U_a_m_per_s", "thrust_N")
 
 
 def command(
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="File to write: .csv with units in the header, .parquet or .npz.", rich_help_panel=OUTPUT
-        ),
-    ],
+    *,
     preset: PresetOption = "tunnel",
     steps: Annotated[int, typer.Option(help="Number of steps.", rich_help_panel=RUNS)] = 500,
-    dt: Annotated[float, typer.Option(help="Sample time [s].", rich_help_panel=INPUT)] = DEFAULT_DT,
+    dt: Annotated[
+        float,
+        typer.Option(
+            help="Sample time [s]; covariances are per step of it and do not scale with it.", rich_help_panel=INPUT
+        ),
+    ] = DEFAULT_DT,
     voltage: Annotated[
         float | None, typer.Option(help="Constant voltage [V]; else random levels.", rich_help_panel=RUNS)
     ] = None,
@@ -55,6 +55,12 @@ def command(
         typer.Option(help=f"What is measured, thrust by default: {', '.join(CHANNELS)}.", rich_help_panel=INPUT),
     ] = None,
     seed: SeedOption = 0,
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="File to write: .csv with units in the header, .parquet or .npz.", rich_help_panel=OUTPUT
+        ),
+    ],
     json: JsonOption = None,
 ) -> None:
     """Simulate a thruster and write time, voltage, true state, true thrust and measurements to a log.

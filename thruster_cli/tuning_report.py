@@ -100,9 +100,9 @@ def _none_consistent(result: StudyResult, plan: Plan) -> str:
     word = plan.scenarios[0].seed_word
     ratios = [f"{ratio:.3g}" if isfinite(ratio) else "beyond all numbers" for ratio in result.nis]
     return (
-        f"No trial was consistent: a mean NIS must lie between {NIS_BAND[0]:g} and {NIS_BAND[1]:g} of what is "
-        f"right, but the tuned filter's is {' and '.join(ratios)} on the training {word}. It is the trial with the "
-        f"least {plan.objectives[0]}; do not rely on its covariance."
+        f"No trial was consistent: a mean NIS must lie between {NIS_BAND[0]:g} and {NIS_BAND[1]:g} of its "
+        f"expected value, but the tuned filter's is {' and '.join(ratios)} on the training {word}. It is the "
+        f"trial with the least {plan.objectives[0]}; do not rely on its covariance."
     )
 
 
