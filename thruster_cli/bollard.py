@@ -144,7 +144,7 @@ def _report(found: Identified, errors: dict, held_out, timed: Identification | N
         part += [table("From the step response", ["", "value", "standard error"], rows), *timed.sentences()]
     else:
         part.append(
-            "A static table does not determine time constants: those of the preset stay. --step LOG finds them, of a "
-            "log of voltage and motor speed."
+            "A static table does not determine time constants: those of the preset stay. --step LOG finds them, "
+            "of a log of voltage and motor speed."
         )
     return [*part, f"wrote {out}"]

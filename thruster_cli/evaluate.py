@@ -67,8 +67,8 @@ def command(
     is the same with one factor on Q that brings the mean NIS (normalised innovation squared) to 1. The oracle has
     the plant's own Q and R.
 
-    With --consistency a filter's errors and innovations are held against its own covariances: NEES, NIS, whiteness,
-    coverage, CRPS and, for ensembles, ranks; a sentence each, and a picture of all.
+    With --consistency a filter's errors and innovations are held against its own covariances: NEES, NIS,
+    whiteness, coverage, CRPS and, for ensembles, ranks; a sentence each, and a picture of all.
 
     Example: thruster evaluate --filter enkf --scenario mismatch --consistency calibrated.png
     """
