@@ -206,6 +206,6 @@ def _checked_logs(given) -> tuple[Log, ...]:
 
 
 def _name(logs: Sequence[Log]) -> str:
-    """The name of several logs: that of the first one, and the number of others."""
-    more = f"+{len(logs) - 1}" if len(logs) > 1 else ""
+    """What logs are called together: the first one's name, and how many there are more."""
+    more = f" and {len(logs) - 1} more" if len(logs) > 1 else ""
     return f"{logs[0].name}{more}"
