@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq -c constraints.txt
 TEST_EXTRAS := rl,render,peers,db,samplers,parquet,units,frames,dev
 BENCH_EXTRAS := rl,peers,bench
-DOCS_EXTRAS := docs,rl
+DOCS_EXTRAS := docs,rl,frames
 ARGS :=
 
 # Stamps: present only after a complete install, so a second run needs no network and an interrupted one starts over.
@@ -38,12 +38,13 @@ docs: $(DOCS) ## install what the site needs (once) and build it into build/docs
 fuzz: $(TEST) ## attack everything at random for ten minutes; ARGS="--seconds 60 --seed 1"
 	@$(BIN)/python -m tests.fuzz $(ARGS)
 
-lint: $(TEST) ## check style and formatting
+lint: $(TEST) ## check style, formatting and types
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
+	@$(BIN)/python -m tests.repository.types
 
 clean: ## remove .venv, build products and caches; results in out/ stay
-	rm -rf $(VENV) docs/tutorials build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) docs/tutorials build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(MADE):

@@ -22,14 +22,10 @@ from thruster_cli.logs import (
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, check_targets, emit, progress_console
 from thruster_cli.to_identify import names_of, numbers_of, ranges_of
 from thruster_env.preset_file import is_file
-from tuning.identification.coordinates import Coordinates
-from tuning.identification.excitation import check_excitation
-from tuning.identification.family import with_ranges
-from tuning.identification.identify import STARTS, identify
-from tuning.identification.objective import Objective
+from tuning.api.identify import identified
+from tuning.identification.identify import STARTS
 from tuning.identification.profiles import profiles
-from tuning.identification.validation import validate
-from tuning.logs.identify import check_offsets, family_of, split_runs
+from tuning.logs.identify import family_of, split_runs
 
 INTERRUPTED = 130
 DEFAULT_OUT = Path("out/identified.toml")
@@ -126,36 +122,16 @@ def command(
     runs, proving = split_runs(logs, held_out, use_all=use_all, **options)
     family = family_of(runs, names_of(free), **whose, noise=not hold_noise, filter=filter_name)
     numbers, ranges = numbers_of("--start", pairs("--start", start)), ranges_of(pairs("--range", range_))
-    parameters = with_ranges(family.free, ranges, numbers)
-    check_offsets(parameters, runs)
     if out is not None and not is_file(out):
         raise ValueError(f"--out must end in .toml, but got {str(out)!r}")
     check_targets((out, plot), json, read=(*logs, *(held_out or [])))
     announce_compilation()
-    coordinates = Coordinates(parameters)
-    objective = Objective(family.data, family.model, coordinates, filter=filter_name, predicted=predicted or ())
-    check_excitation(objective, runs, coordinates.start())
-    with progress_console.status("identifying ...") as status:
-
-        def tell(number: int, value: float, values: dict) -> None:
-            status.update(f"start {number + 1} of {starts}: log-likelihood {value:.2f}")
-
-        found = identify(
-            family.data,
-            family.model,
-            parameters,
-            filter=filter_name,
-            starts=starts,
-            seed=seed,
-            gate=gate,
-            degrees=degrees,
-            predicted=predicted or (),
-            progress=tell,
-        )
-        made = []
-        if plot is not None and not found.interrupted:
+    search = {"gate": gate, "degrees": degrees, "predicted": predicted or (), "starts": starts, "seed": seed}
+    whole = identified(family, runs, proving, ranges, numbers, progress_console, filter=filter_name, **search)
+    found, checked, made = whole.found, whole.validation, []
+    if plot is not None and not found.interrupted:
+        with progress_console.status("profiles ...") as status:
             made = profiles(found, progress=lambda name: status.update(f"profile of {name} ..."))
-    checked = validate(found, family.shifted(proving)) if proving else validate(found)
     files = write_files(found, family, made, out, plot, [log.name for log in runs])
     data = as_json(found, checked, made, runs, proving, files)
     emit(report(found, checked, runs, proving, files), data, json)

@@ -17,11 +17,9 @@ from thruster_cli.error_tables import (
     unless_blank,
 )
 from thruster_cli.output import table
-from tuning.evaluation.compare import Leaderboard, Row
+from tuning.evaluation.compare import Leaderboard, Row, winners
 from tuning.evaluation.tuned import summary
 from tuning.evaluation.worth import without_truth
-
-VERDICTS = {"better": "better", "worse": "worse", "tie": "no different", "unknown": "not to be told"}
 
 
 def report(board: Leaderboard) -> list:
@@ -31,26 +29,13 @@ def report(board: Leaderboard) -> list:
     seeds = f"held-out seeds {board.seeds[0]} to {board.seeds[-1]}"
     if not evaluation.has_truth:
         shown = [_predictions(board, f"{title}\nInnovations on {seeds}")]
-        said = [without_truth(scenario.name), winners(board)]
+        said = [without_truth(scenario.name), f"{winners(board)}\n"]
     else:
         errors = _errors_across if 2 * len(evaluation.states) < MOST_COLUMNS else _errors_below
-        shown, said = [errors(board, f"{title}\nRMSE on {seeds}"), _against(board)], [winners(board)]
+        shown, said = [errors(board, f"{title}\nRMSE on {seeds}"), _against(board)], [f"{winners(board)}\n"]
     for one in shown:
         one.columns[0].overflow = "fold"
     return [*shown, *said]
-
-
-def winners(board: Leaderboard) -> str:
-    """Who is significantly better or worse than the first filter."""
-    first, *others = board.rows
-    if not others:
-        return f"On {board.scenario.name} there is nothing to compare {first.label} with."
-    said = []
-    for verdict, words in VERDICTS.items():
-        names = [row.label for row in others if row.verdict == verdict]
-        said += [f"{words}: {', '.join(names)}"] if names else []
-    by = "score" if first.evaluation.has_truth else "log-likelihood"
-    return f"On {board.scenario.name}, against {first.label} by the {by}: {'; '.join(said)}.\n"
 
 
 def _errors_across(board: Leaderboard, title: str) -> Table:

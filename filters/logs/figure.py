@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -10,6 +11,9 @@ from filters.logs.estimate import SKIPPED, LogEstimate
 from filters.logs.findings import compared, estimated
 from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from plants.logs.columns import OUTPUT, STATE
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TWO_SIDED = 1.96
 MOST_PANELS = 6  # of states and outputs
@@ -19,7 +23,12 @@ MARGIN = 0.06  # of an axis above and below what it shows
 
 
 def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
-    """Draw estimates beside the reference channels, and the innovations below; return the path.
+    """Save what `draw_log` draws; return the path."""
+    return save_figure(draw_log(found, title), path)
+
+
+def draw_log(found: LogEstimate, title: str, *, states: bool = True) -> Figure:
+    """Estimates beside the reference channels, and the innovations below; without `states` these alone.
 
     References come first; of many states and outputs the first six are drawn. Bands of the first rows, in which a
     filter settles from its prior, do not widen the axes.
@@ -27,7 +36,7 @@ def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
     model, references = found.model, compared(found)
     values = [f"{STATE}:{one.symbol}" for one in model.states] + [f"{OUTPUT}:{symbol}" for symbol in model.outputs]
     shown = sorted(values, key=lambda key: key not in references)[:MOST_PANELS]
-    shown = [key for key in values if key in shown]
+    shown = [key for key in values if key in shown] if states else []
     heights = [TALL] * len(shown) + [LOW] * len(found.log.measured)
     figure = new_figure((WIDTH, sum(heights) + ROOM))
     axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
@@ -52,12 +61,12 @@ def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
     axes[0].set_title(title, fontsize=11)
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
-    named = {}
+    named: dict[str, Any] = {}
     for axis in axes:
         handles, texts = axis.get_legend_handles_labels()
         named |= dict(zip(texts, handles, strict=True))
     figure.legend(named.values(), named, loc="outside lower center", ncols=len(named), frameon=False)
-    return save_figure(figure, path)
+    return figure
 
 
 def _band(axis, times: np.ndarray, middle: np.ndarray, std: np.ndarray) -> None:

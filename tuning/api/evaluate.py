@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from filters.registry import FILTERS
-from numerics.checks import shown
 from tuning.api.held_out import HeldOut, on_held_out
-from tuning.api.problems import given_for, problem_of
+from tuning.api.problems import given_for, is_filter, problem_of
 from tuning.api.progress import console_for
 from tuning.api.study import Study
 from tuning.evaluation.baselines import rule_of_thumb
@@ -62,23 +60,17 @@ def evaluate(
 
 
 def subject_of(
-    tuned: str | Path | Study,
+    tuned: Any,
     problem: Any = None,
     preset: str | Path | None = None,
     model: Any = None,
 ) -> tuple[Choice, Problem, bool]:
     """The choice, the problem, and whether it was tuned; the arguments are those of `evaluate`."""
     if isinstance(tuned, Study):
-        if problem is None and preset is None:
-            return tuned.choice, tuned.problem, True
-        found = problem_of(tuned.problem if problem is None else problem, preset)
-        return tuned.choice, found, True
-    if isinstance(tuned, str) and tuned in FILTERS and not Path(tuned).is_file():
+        return tuned.choice, problem_of(tuned.problem if problem is None else problem, preset), True
+    if is_filter(tuned):
         found = problem_of(NOMINAL if problem is None else problem, preset)
         return rule_of_thumb(tuned, found), found, False
-    if not isinstance(tuned, str | Path):
-        known = f"a tuned file, a Study, or one of the filters {', '.join(FILTERS)}"
-        raise ValueError(f"what is evaluated must be {known}, but got {shown(tuned)}")
     if problem is None:
         if preset is not None:
             raise ValueError(

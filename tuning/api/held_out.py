@@ -121,9 +121,9 @@ class HeldOut:
         Raises:
             ValueError: if there is no truth, and so no RMSE.
         """
-        from tuning.reporting.figures import comparison_figure
+        from tuning.reporting.figures import draw_comparison
 
-        return drawn(comparison_figure, self.proof, f"{self.choice.name} on {self.problem.name}")
+        return drawn(draw_comparison(self.proof, f"{self.choice.name} on {self.problem.name}"))
 
     def plot_run(self, place: int = 0) -> Figure:
         """One held-out run over time, of the first baseline and the filter: truth, estimate and 95 % band.
@@ -131,7 +131,7 @@ class HeldOut:
         Args:
             place: of the run among the held-out seeds.
         """
-        from tuning.reporting.time_figures import estimates_figure
+        from tuning.reporting.time_figures import draw_estimates
 
         place = at_least("place", place, 0, len(self.seeds) - 1)
         pair = {RULE: self.choice}
@@ -141,7 +141,7 @@ class HeldOut:
             pair = {first: others[first], TUNED: self.choice}
         filters = {name: one.filter(self.problem) for name, one in pair.items()}
         data, scored = self.problem.data(self.seeds), self.evaluation.scored or None
-        return drawn(estimates_figure, filters, data, place, self.problem.dt, scored, sharey="row")
+        return drawn(draw_estimates(filters, data, place, self.problem.dt, scored, sharey="row"))
 
     def plot_consistency(self) -> Figure:
         """The checks of `check_consistency`, a panel each.
@@ -149,11 +149,11 @@ class HeldOut:
         Raises:
             ValueError: for a filter without a covariance.
         """
-        from tuning.reporting.consistency_figures import consistency_figure
+        from tuning.reporting.consistency_figures import draw_consistency
 
         title = f"{self.choice.name} on {len(self.seeds)} seeds of {self.problem.name}"
         scored = self.evaluation.scored or None
-        return drawn(consistency_figure, self.check_consistency(), title, scored=scored)
+        return drawn(draw_consistency(self.check_consistency(), title, scored=scored))
 
     def __repr__(self) -> str:
         what = f"{self.choice.name} on {self.problem.name}, {len(self.seeds)} held-out {self.problem.seed_word}"

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from filters.estimators.find import is_foreign
+from filters.registry import FILTERS, filter_class
 from filters.tuned_file import read_tuned_file
 from numerics.checks import shown
 from numerics.modules import is_code
@@ -64,6 +66,24 @@ def given_for(file: str | Path, problem: Any = None, model: str | None = None, *
     if any(one.name in kept for one in given):
         return given
     return [*given, *problems_in(Path(file), model)]
+
+
+def is_filter(given: Any) -> bool:
+    """Whether something is a filter or an estimator, and no tuned file: a `Path`, or what ends in .json.
+
+    Raises:
+        ValueError: for an unknown name, or what is neither.
+    """
+    if isinstance(given, Path) or (isinstance(given, str) and given not in FILTERS and _is_tuned_file(given)):
+        return False
+    if isinstance(given, str) or is_foreign(given):
+        filter_class(given)  # a clear error for an unknown name
+        return True
+    raise ValueError(f"a filter must be a name, a tuned file, a Study or an estimator, but got {shown(given)}")
+
+
+def _is_tuned_file(text: str) -> bool:
+    return text.endswith(".json") or Path(text).is_file()
 
 
 def _of_logs(model: Any, data: Any, preset: str | Path | None, options: dict[str, Any]) -> Problem:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import optuna
+from optuna.study import StudyDirection
 
 from numerics.checks import shown
 from numerics.files import check_target, write_whole
@@ -88,7 +89,7 @@ def _as_files(study: Study, folder: Path) -> Iterator[tuple[Path, str]]:
     """A study's tuned file, and a journal that holds its trials."""
     journal, tuning = str(folder / "study.journal"), study.tuning
     plan, sizes = tuning.plan, tuning.result.sizes
-    directions = ["minimize"] * len(plan.objectives)
+    directions = [StudyDirection.MINIMIZE] * len(plan.objectives)
     kept = optuna.create_study(study_name=study.name, storage=open_storage(journal), directions=directions)
     kept.set_user_attr("identity", plan.identity)
     if sizes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from html import escape
 from math import isfinite
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def frame(columns: Mapping[str, Sequence[Any]], index: str | None = None) -> pandas.DataFrame:
+def frame(columns: Mapping[str, Any], index: str | None = None) -> pandas.DataFrame:
     """Columns as a table of pandas.
 
     Args:
@@ -45,13 +45,7 @@ def html(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], note
     return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{below}"
 
 
-def drawn(draw: Callable[..., Any], *arguments: Any, **options: Any) -> Figure:
-    """The figure of a function that would save it where its first argument says; notebooks show it."""
-    figure = draw(None, *arguments, **options)
-    return shown_in_notebooks(figure)
-
-
-def shown_in_notebooks(figure: Any) -> Figure:
+def drawn(figure: Any) -> Figure:
     """The same figure, which a notebook shows even where nobody imported matplotlib.pyplot."""
     figure._repr_png_ = partial(_png, figure)
     return figure

@@ -114,11 +114,11 @@ class Study:
 
     def plot_history(self) -> Figure:
         """First objective of every trial, and the best so far."""
-        from tuning.reporting.figures import SCORE, history_figure
+        from tuning.reporting.figures import SCORE, draw_history
 
         objective = self.tuning.plan.objectives[0]
         label = SCORE if objective == "score" else objective
-        return drawn(history_figure, self.trials, f"Study {self.name}", label)
+        return drawn(draw_history(self.trials, f"Study {self.name}", label))
 
     def plot_errors(self) -> Figure:
         """RMSE before and after on held-out seeds, with 95 % intervals and the bound.
@@ -142,12 +142,12 @@ class Study:
         Raises:
             ValueError: for a filter without an ensemble, or a problem without truth.
         """
-        from tuning.reporting.search_figures import sizes_figure
+        from tuning.reporting.search_figures import draw_sizes
 
         rows = self.tuning.result.sizes
         if not rows:
             raise ValueError(f"a figure of ensemble sizes needs an ensemble and truth, but {self!r} has not both")
-        return drawn(sizes_figure, rows, self.choice.numbers["ensemble_size"])
+        return drawn(draw_sizes(rows, self.choice.numbers["ensemble_size"]))
 
     def report(self, out: str | Path | None = None) -> Path:
         """Write a page on it that any browser shows; see `tuning.report`."""

@@ -110,5 +110,6 @@ def tune(
         full_q=full_q,
     )
     where = None if storage is None else str(storage)
-    options = {"by_gradient": method == "gradient", "workers": workers}
-    return Study(run_tuning(plan, trials, console_for(progress), where, name, **options))
+    by_gradient = method == "gradient"
+    console = console_for(progress)
+    return Study(run_tuning(plan, trials, console, where, name, by_gradient=by_gradient, workers=workers))

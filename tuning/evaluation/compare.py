@@ -28,6 +28,7 @@ from tuning.search.space import Choice, ensemble_sizes_of, has_ensemble
 KNOWLEDGE = ("true", "scaled", "untuned")  # of the plant's Q and R: oracle, scaled default, rule of thumb
 # What is believed of a constant by default: a flow of so many m/s, of others a part of their value.
 FLOW_STD, RELATIVE_STD, WALK_PART = 0.5, 0.2, 0.02  # the last a step, as part of the prior's
+VERDICTS = {"better": "better", "worse": "worse", "tie": "no different", "unknown": "not to be told"}
 SYMBOLS = {"ambient_velocity": "U_0"}  # for labels
 
 
@@ -86,6 +87,19 @@ class Leaderboard(NamedTuple):
     seeds: Sequence[int]
     bound: np.ndarray  # (n,), of the scenario's Gaussian core on these seeds
     rows: list[Row]
+
+
+def winners(board: Leaderboard) -> str:
+    """Who is significantly better or worse than the first filter."""
+    first, *others = board.rows
+    if not others:
+        return f"On {board.scenario.name} there is nothing to compare {first.label} with."
+    said = []
+    for verdict, words in VERDICTS.items():
+        names = [row.label for row in others if row.verdict == verdict]
+        said += [f"{words}: {', '.join(names)}"] if names else []
+    by = "score" if first.evaluation.has_truth else "log-likelihood"
+    return f"On {board.scenario.name}, against {first.label} by the {by}: {'; '.join(said)}."
 
 
 def contender(

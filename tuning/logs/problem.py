@@ -46,7 +46,7 @@ def log_problem(
     pairs = [read_named(log, **options, name=name) for name, log in runs.items()]
     recorded = [log for log, _ in pairs]
     model = read_for(recorded[0], pairs[0][1])[1]()
-    cuts = {"held_out": proving, "blocks": blocks, "lead": lead}
+    cuts: dict[str, Any] = {"held_out": proving, "blocks": blocks, "lead": lead}
     cuts = {key: value for key, value in cuts.items() if value is not None and value != []}
     return LogProblem(recorded, model, **cuts, content=_content(runs, options, cuts))
 
@@ -95,7 +95,7 @@ def _content(runs: Mapping[str, Any], options: Mapping[str, Any], cuts: Mapping[
     told["preset"] = None if told.get("preset") is None else str(told["preset"])
     told["sensors"] = None if told.get("sensors") is None else list(told["sensors"])
     kept = {name: told[name] for name in options if told[name] is not None}
-    return {"options": kept | cuts}
+    return {"options": {**kept, **cuts}}
 
 
 def problems_in(file: Path, model: str | None = None) -> list[Problem]:

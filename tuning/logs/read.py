@@ -43,7 +43,7 @@ def read_named(
     if model is not None and (sensors or (preset is not None and not str(preset).endswith(".toml"))):
         raise ValueError("a log must be of --model or of a thruster (--preset, --sensor), but got both")
     offsets = pairs("--clock-offset", clock_offset)
-    options = {
+    options: dict[str, Any] = {
         "columns": pairs("--column", columns),
         "clock_offset": {key: _seconds(key, value) for key, value in offsets.items()},
         "dt": dt,

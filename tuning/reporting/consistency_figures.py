@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from filters.consistency.verdicts import probability_text, rounded
 from numerics.plots import BLUE, DARK, RUST, panels, save_figure
 from tuning.reporting.panels import COLUMNS, shown_states
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 FOUND = BLUE
 COLOURS = (BLUE, RUST, "#5a8f3c", "#7a5195", "#9aa5ad", "#c9a227")  # of states
 CHANNEL_COLOURS = ("#44aa99", "#cc6677", "#999933", "#882255", "#ddaa33", "#332288")
@@ -25,26 +29,29 @@ MOST_VALUES = 3  # in the title of a panel
 LOGARITHMIC_FROM = 20  # times the right value
 
 
-def consistency_figure(
-    path: str | Path,
+def consistency_figure(path: str | Path, report: ConsistencyReport, title: str, *arguments, **options) -> Path:
+    """Save what `draw_consistency` draws."""
+    return save_figure(draw_consistency(report, title, *arguments, **options), path)
+
+
+def draw_consistency(
     report: ConsistencyReport,
     title: str,
     comparison: Mapping[str, tuple[Interval, ...]] | None = None,
     scored: Collection[int] | None = None,
-) -> Path:
+) -> Figure:
     """Draw a consistency report; dashed lines show the expected value, grey bands what chance allows.
 
     Of many states some are drawn; without truth the checks are those of the innovations.
 
     Args:
-        path: PNG file to write.
         report: the checks of one filter.
         title: said above the picture.
         comparison: RMSE ratios by state, from `intervals.rmse_ratios`, under the names of the pairs.
         scored: places of the states that count in the score, which come first where not all are drawn.
 
     Raises:
-        ValueError: if there is nothing to draw, or nothing can be written.
+        ValueError: if there is nothing to draw.
     """
     places, left_out = shown_states(report.states, scored)
     checks = _panels(report, comparison, places)
@@ -56,7 +63,7 @@ def consistency_figure(
         axis.title.set_fontsize(10)
     _legend(figure, report, places, left_out)
     figure.suptitle(title, fontsize=11)
-    return save_figure(figure, path)
+    return figure
 
 
 def _panels(report: ConsistencyReport, comparison: Mapping | None, places: Sequence[int]) -> list[Callable]:

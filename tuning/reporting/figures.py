@@ -1,9 +1,10 @@
-"""Pictures of studies and of what they are worth, each saved as one PNG file."""
+"""Pictures of studies and of what they are worth: `draw_...` gives a figure, `..._figure` saves it as a file."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from optuna.trial import FrozenTrial, TrialState
@@ -14,13 +15,21 @@ from tuning.evaluation.held_out import Comparison
 from tuning.reporting.panels import COLUMNS, shown_states
 from tuning.search.outcome import is_consistent
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 SCORE = "score: mean RMSE over bound [-]"
 ESTIMATE, BOUND = BLUE, RUST
 GREY = "#9aa5ad"
 COLOURS = {RULE: "#c5ccd1", SCALED: "#8a959d", TUNED: ESTIMATE, ORACLE: "#5a8f3c"}
 
 
-def history_figure(path: Path, trials: Sequence[FrozenTrial], title: str, label: str = SCORE) -> Path:
+def history_figure(path: str | Path, trials: Sequence[FrozenTrial], title: str, label: str = SCORE) -> Path:
+    """Save what `draw_history` draws."""
+    return save_figure(draw_history(trials, title, label), path)
+
+
+def draw_history(trials: Sequence[FrozenTrial], title: str, label: str = SCORE) -> Figure:
     """First objective of every trial of a study and the best so far; the first trial is the untuned filter.
 
     Hollow circles are trials whose mean NIS is outside its band: they are not among the best, unless all are.
@@ -51,7 +60,7 @@ def history_figure(path: Path, trials: Sequence[FrozenTrial], title: str, label:
     axis.set_xlabel(f"trial{above}")
     axis.set_ylabel(label)
     axis.set_title(title, fontsize=11)
-    return save_figure(figure, path)
+    return figure
 
 
 def early_trials(trials: Sequence[FrozenTrial]) -> list[tuple[FrozenTrial, float]]:
@@ -69,7 +78,12 @@ def limit_values(axis, values: list[float]) -> int:
     return sum(value > top for value in values)
 
 
-def comparison_figure(path: Path, proof: Comparison, title: str) -> Path:
+def comparison_figure(path: str | Path, proof: Comparison, title: str) -> Path:
+    """Save what `draw_comparison` draws."""
+    return save_figure(draw_comparison(proof, title), path)
+
+
+def draw_comparison(proof: Comparison, title: str) -> Figure:
     """RMSE of a tuned filter and its baselines on held-out seeds with 95 % intervals, and the bound.
 
     A panel is a state; of many some are shown.
@@ -98,4 +112,4 @@ def comparison_figure(path: Path, proof: Comparison, title: str) -> Path:
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", frameon=False, title=left_out or None)
     figure.suptitle(title, fontsize=11)
-    return save_figure(figure, path)
+    return figure

@@ -12,26 +12,27 @@ from optuna.trial import FrozenTrial, TrialState
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import confidence, rounded, sentences
 from filters.registry import filter_class
+from numerics.plots import save_figure
 from tuning.evaluation.baselines import TUNED, baselines
 from tuning.evaluation.evaluate import Evaluation, check_consistency
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.versions import versions
 from tuning.evaluation.worth import scaling_sentence, without_truth, worth
-from tuning.reporting.consistency_figures import consistency_figure
-from tuning.reporting.figures import SCORE, comparison_figure, history_figure
+from tuning.reporting.consistency_figures import draw_consistency
+from tuning.reporting.figures import SCORE, draw_comparison, draw_history
 from tuning.reporting.page import Picture, Section, Table, Words
 from tuning.reporting.search_figures import (
     FEWEST_TRIALS,
-    front_figure,
-    importance_figure,
+    draw_front,
+    draw_importance,
+    draw_sizes,
+    draw_slices,
     importances,
-    sizes_figure,
-    slices_figure,
 )
 from tuning.reporting.subject import Subject
 from tuning.reporting.tables import errors_table
-from tuning.reporting.time_figures import estimates_figure
+from tuning.reporting.time_figures import draw_estimates
 from tuning.search.filter_types import kinds_tried, trials_of_kind
 from tuning.search.objectives import NIS_BAND, find_objective
 from tuning.search.plan import SIZE_SEEDS, TRAINING_SEEDS, Plan
@@ -46,8 +47,9 @@ class Sketchbook(NamedTuple):
     folder: Path
 
     def picture(self, caption: str, draw: Callable, *arguments, **options) -> Picture:
-        """What a function draws that takes a path first."""
-        return Picture(draw(self.folder / "picture.png", *arguments, **options).read_bytes(), caption)
+        """What a function draws that returns a figure."""
+        path = save_figure(draw(*arguments, **options), self.folder / "picture.png")
+        return Picture(path.read_bytes(), caption)
 
 
 def advice(choice: Choice, plan: Plan, proofs: Sequence[Comparison]) -> str:
@@ -90,7 +92,7 @@ def held_out_section(book: Sketchbook, subject: Subject, proofs: Sequence[Compar
         title = f"{subject.choice.name} on {scenario.name}"
         said = scaling_sentence(proof)
         parts += [errors_table(scenario, proof), *([Words([said])] if said else [])]
-        parts.append(book.picture(caption, comparison_figure, proof, title))
+        parts.append(book.picture(caption, draw_comparison, proof, title))
     return Section("Before and after, on held-out seeds", parts)
 
 
@@ -104,7 +106,7 @@ def search_section(book: Sketchbook, subject: Subject) -> Section:
     objectives = subject.plan.objectives
     labels = [SCORE if name == "score" else f"{name}:\n{find_objective(name).about}" for name in objectives]
     caption = "First objective of each trial on the training seeds, and the best so far."
-    parts = [book.picture(caption, history_figure, trials, f"Study {subject.name}", labels[0])]
+    parts = [book.picture(caption, draw_history, trials, f"Study {subject.name}", labels[0])]
     found = importances(study)
     if found:
         complete = [trial.state for trial in trials].count(TrialState.COMPLETE)
@@ -112,19 +114,19 @@ def search_section(book: Sketchbook, subject: Subject) -> Section:
             "How much each number matters for a trial to be among the best tenth: PED-ANOVA on "
             f"{complete} complete trials{', rough on so few' if complete < MANY_TRIALS else ''}."
         )
-        parts.append(book.picture(caption, importance_figure, found))
+        parts.append(book.picture(caption, draw_importance, found))
     else:
         parts.append(Words([f"Importances of the numbers need {FEWEST_TRIALS} complete trials or more."]))
     caption = (
         "First objective against each number; dashed is the best trial. Hollow: mean NIS outside its band. "
         "Crosses: pruned, at the mean of the seeds seen."
     )
-    parts.append(book.picture(caption, slices_figure, trials_of_kind(trials, subject.choice.name), labels[0]))
+    parts.append(book.picture(caption, draw_slices, trials_of_kind(trials, subject.choice.name), labels[0]))
     if subject.plan.filter == AUTO:
         parts.append(_kinds_table(trials, objectives[0]))
     if len(objectives) > 1:
         caption = "Trials by both objectives; no trial beats those of the Pareto front in both."
-        parts.append(book.picture(caption, front_figure, trials, study.best_trials, labels))
+        parts.append(book.picture(caption, draw_front, trials, study.best_trials, labels))
     return Section(title, parts)
 
 
@@ -156,7 +158,7 @@ def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) 
     columns = ["N", "score over the best", "upper end of its 95 % interval", "seeds"]
     if len({row.seeds for row in sizes}) == 1:
         columns, ratios = columns[:-1], [row[:-1] for row in ratios]
-    picture = book.picture(caption, sizes_figure, sizes, kept)
+    picture = book.picture(caption, draw_sizes, sizes, kept)
     return Section("Error against ensemble size", [picture, Table(said, columns, ratios)])
 
 
@@ -169,13 +171,13 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
     what = "Estimate and innovation, each with its" if data.states is None else "Truth, estimate and"
     caption = f"{what} 95 % band on {scenario.name}, held-out seed {proof.seeds.start}, before and after."
     scored = proof.tuned.scored or None
-    picture = book.picture(caption, estimates_figure, pair, data, 0, scenario.dt, scored, sharey="row")
+    picture = book.picture(caption, draw_estimates, pair, data, 0, scenario.dt, scored, sharey="row")
     sections = [Section("One run over time", [picture])]
     if filter_class(choice.name).has_covariance:
         report = check_consistency(tuned, data)
         caption = f"Checks of the tuned filter's covariance on {report.runs} held-out seeds of {scenario.name}."
         title = f"{choice.name}, tuned, on {report.runs} seeds of {scenario.name}"
-        picture = book.picture(caption, consistency_figure, report, title, scored=scored)
+        picture = book.picture(caption, draw_consistency, report, title, scored=scored)
         sections.append(Section("Is the covariance consistent?", [Words(sentences(report)), picture]))
     return sections
 

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import optuna
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.trial import FrozenTrial, TrialState
 
-from numerics.plots import BLUE, RUST, grid_of, new_figure, panels, save_figure, tidy
+from numerics.plots import BLUE, RUST, grid_of, new_figure, panels, tidy
 from tuning.evaluation.sizes import SizeRow
 from tuning.reporting.figures import GREY, early_trials, limit_values
 from tuning.reporting.panels import COLUMNS, shown_states
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.space import KIND
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FEWEST_TRIALS = 10  # complete ones, for importances to mean anything
 CROSS = {"color": GREY, "markersize": 4, "markeredgewidth": 0.8}
@@ -37,7 +40,7 @@ def importances(study: optuna.Study) -> dict[str, float]:
     return get_param_importances(study, evaluator=PedAnovaImportanceEvaluator(), params=shared)
 
 
-def importance_figure(path: Path, found: Mapping[str, float]) -> Path:
+def draw_importance(found: Mapping[str, float]) -> Figure:
     """Importance of each number, the largest above."""
     figure = new_figure((6.4, 0.9 + 0.4 * len(found)))
     axis = figure.subplots()
@@ -49,10 +52,10 @@ def importance_figure(path: Path, found: Mapping[str, float]) -> Path:
     axis.margins(x=0.12)
     axis.grid(axis="y", visible=False)
     axis.set_xlabel("importance, of a sum of 1")
-    return save_figure(figure, path)
+    return figure
 
 
-def slices_figure(path: Path, trials: Sequence[FrozenTrial], label: str) -> Path:
+def draw_slices(trials: Sequence[FrozenTrial], label: str) -> Figure:
     """First objective against each number, a panel a number; dashed is the best trial.
 
     Hollow circles have a mean NIS outside its band; crosses were pruned and stand at the mean of their seeds.
@@ -75,12 +78,10 @@ def slices_figure(path: Path, trials: Sequence[FrozenTrial], label: str) -> Path
     limit_values(axes[0], values)
     for axis in axes[:: grid_of(len(names), COLUMNS)[1]]:
         axis.set_ylabel(label, fontsize=9)
-    return save_figure(figure, path)
+    return figure
 
 
-def front_figure(
-    path: Path, trials: Sequence[FrozenTrial], front: Sequence[FrozenTrial], labels: Sequence[str]
-) -> Path:
+def draw_front(trials: Sequence[FrozenTrial], front: Sequence[FrozenTrial], labels: Sequence[str]) -> Figure:
     """Trials by their two objectives, and those that no other beats in both."""
     figure = new_figure((6.4, 4.4))
     axis = figure.subplots()
@@ -99,10 +100,10 @@ def front_figure(
     axis.set_xlabel(labels[0])
     axis.set_ylabel(labels[1])
     axis.legend(frameon=False)
-    return save_figure(figure, path)
+    return figure
 
 
-def sizes_figure(path: Path, sizes: Sequence[SizeRow], kept: int) -> Path:
+def draw_sizes(sizes: Sequence[SizeRow], kept: int) -> Figure:
     """RMSE of every state against ensemble size with 95 % intervals; dashed is the size that was kept."""
     states, numbers = sizes[0].evaluation.states, [row.size for row in sizes]
     places, left_out = shown_states(states, sizes[0].evaluation.scored)
@@ -120,7 +121,7 @@ def sizes_figure(path: Path, sizes: Sequence[SizeRow], kept: int) -> Path:
         axis.set_ylabel(f"RMSE of {states[i].plot_label}")
     if left_out:
         figure.supxlabel(left_out, fontsize=9)
-    return save_figure(figure, path)
+    return figure
 
 
 def words(name: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from plants.quantities import Quantity
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data
 from tuning.reporting.panels import axis_label, shown_states
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TRUTH, ESTIMATE, ERROR = DARK, BLUE, RUST
 WIDTH = 5.4  # of a filter [inch]
@@ -41,22 +44,25 @@ class Row(NamedTuple):
     draw: Callable  # draw(axis, run)
 
 
-def estimates_figure(
-    path: Path,
+def estimates_figure(path: str | Path, filters: Mapping[str, Filter], data: Data, *arguments, **options) -> Path:
+    """Save what `draw_estimates` draws."""
+    return save_figure(draw_estimates(filters, data, *arguments, **options), path)
+
+
+def draw_estimates(
     filters: Mapping[str, Filter],
     data: Data,
     run_index: int,
     dt: float | None,
     scored: Collection[int] | None = None,
     **options,
-) -> Path:
+) -> Figure:
     """Truth and estimate of every state over time, and the error in its 95 % band; one column a filter.
 
     Without truth it is the estimates, and the innovation of every channel in the band that the filter expects. Of
     many states some are shown.
 
     Args:
-        path: PNG file to write.
         filters: by what stands above their columns.
         data: of a problem.
         run_index: which of its runs.
@@ -89,7 +95,7 @@ def estimates_figure(
         named |= dict(zip(labels, handles, strict=True))
     options = {"ncols": len(named), "frameon": False, "title": left_out or None}
     figure.legend(named.values(), named, loc="outside lower center", **options)
-    return save_figure(figure, path)
+    return figure
 
 
 def _rows(
