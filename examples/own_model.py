@@ -88,9 +88,7 @@ print("upper and lower level", belief.mean.round(3), "+-", np.sqrt(belief.cov.di
 # A :term:`problem` is a pair: the model that makes the data, and the model that filters assume. Here they
 # differ, as they always do: the filter believes in an outflow that is a tenth too small.
 
-problem = ModelProblem(
-    tanks(0.055), tanks(0.05), inputs=Steps(amplitude=0.01, hold=40), steps=300, name="tanks"
-)
+problem = ModelProblem(tanks(0.055), tanks(0.05), inputs=Steps(amplitude=0.01, hold=40), steps=300, name="tanks")
 study = tuning.tune(problem, filter="ekf", trials=TRIALS)
 study
 
@@ -102,7 +100,8 @@ figure = study.plot_run()
 # The study puts the model's error where it is: in the upper level, which nobody measures. Errors are a third
 # smaller than with the :term:`scaled default`, on the same held-out seeds.
 #
-# The best answer to a wrong constant is not noise, though. ``augmented_model`` makes it a state, and the filter finds it.
+# The best answer to a wrong constant is not noise, though. ``augmented_model`` makes it a state, and the filter
+# finds it.
 
 from filters import Unknown, augmented_model
 
