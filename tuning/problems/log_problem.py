@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from numerics.checks import shown
+from numerics.checks import at_least, shown
 from numerics.streams import filter_keys
 from plants.logs.log import Log
+from plants.replay import ReplayEnv
 from plants.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, rows_of
 from tuning.problems.check import check_quantities
@@ -156,6 +158,17 @@ class LogProblem(AssumedProblem):
             return data
         outputs = {symbol: model.output(symbol, states) for symbol in model.outputs}
         return data._replace(states=states, outputs=outputs)
+
+    def make_env(self, *, run: int = 0, **arguments: Any) -> ReplayEnv:
+        """A recorded run as an env that replays it, whatever the action, and offers filters the assumed model.
+
+        Args:
+            run: place of the run among the logs.
+            **arguments: none.
+        """
+        if arguments:
+            raise ValueError(f"an env of recorded runs must come with run alone, but got {', '.join(arguments)}")
+        return ReplayEnv(self.logs[at_least("run", run, 0, len(self.logs) - 1)], self.model)
 
     def found_scale(self) -> np.ndarray:
         """The standard deviation of each true state over the scored steps of the blocks to learn from."""
