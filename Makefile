@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq -c constraints.txt
 TEST_EXTRAS := rl,render,peers,db,samplers,parquet,units,frames,dev
 BENCH_EXTRAS := rl,peers,bench
-DOCS_EXTRAS := docs,rl
+DOCS_EXTRAS := docs,rl,frames
 ARGS :=
 
 # Stamps: present only after a complete install, so a second run needs no network and an interrupted one starts over.
