@@ -3,7 +3,9 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq -c constraints.txt
+# The versions to install: make CONSTRAINTS=constraints-oldest.txt test, or none, make CONSTRAINTS= test, for the newest.
+CONSTRAINTS := constraints.txt
+PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq $(addprefix -c ,$(CONSTRAINTS))
 TEST_EXTRAS := rl,render,peers,db,samplers,parquet,units,dev
 BENCH_EXTRAS := rl,peers,bench
 ARGS :=
@@ -47,7 +49,7 @@ $(MADE):
 
 # The build tool comes first, pinned like the rest, so that pip does not fetch an unpinned one behind our back. The extras
 # are pinned by the same file, so neither install changes a version that the other one put there.
-$(BASE): pyproject.toml constraints.txt | $(MADE)
+$(BASE): pyproject.toml $(CONSTRAINTS) | $(MADE)
 	@echo "installing the base into $(VENV) (once, about a minute) ..."
 	@rm -f $(BASE) $(TEST) $(BENCH)
 	@$(PIP) setuptools
@@ -56,7 +58,7 @@ $(BASE): pyproject.toml constraints.txt | $(MADE)
 
 $(TEST): EXTRAS := $(TEST_EXTRAS)
 $(BENCH): EXTRAS := $(BENCH_EXTRAS)
-$(TEST) $(BENCH): pyproject.toml constraints.txt | $(MADE)
+$(TEST) $(BENCH): pyproject.toml $(CONSTRAINTS) | $(MADE)
 	@echo "installing what tests or benchmarks need into $(VENV) (once, some minutes) ..."
 	@rm -f $(BASE) $@
 	@$(PIP) setuptools
