@@ -49,7 +49,9 @@ def panels(count: int, columns: int, size: tuple[float, float], extra: float = 0
     return figure, axes[:count]
 
 
-def save_figure(figure, path: str | Path) -> Path:
-    """Write a figure as PNG, whole or not at all; return the path."""
+def save_figure(figure, path: str | Path | None):
+    """Write a figure as PNG, whole or not at all, and return the path; without a path return the figure itself."""
+    if path is None:
+        return figure
     write_whole(path, lambda stream: figure.savefig(stream, format="png"))
     return Path(path)

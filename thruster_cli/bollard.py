@@ -10,7 +10,6 @@ import numpy as np
 
 from studies.bollard_fit import FITTED, Identified, identify, relative_errors
 from studies.bollard_table import read_table
-from thruster_cli.logs import read_named
 from thruster_cli.output import announce_compilation, check_targets, emit, table
 from thruster_env.logged import Shown
 from thruster_env.parameters import ThrusterParameters, preset_parameters
@@ -18,6 +17,7 @@ from thruster_env.plant import make_plant
 from thruster_env.preset_file import PresetFile, is_file, write_preset
 from tuning.identification.identify import identify as identify_logs
 from tuning.identification.result import Identification
+from tuning.logs.read import read_named
 from tuning.problems.parameter import Parameter
 from tuning.thruster.identification import ThrusterFamily
 

@@ -20,7 +20,7 @@ from thruster_cli.logs import (
     pairs,
 )
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, check_targets, emit, progress_console
-from thruster_cli.to_identify import check_offsets, family_of, numbers_of, ranges_of, split_runs
+from thruster_cli.to_identify import names_of, numbers_of, ranges_of
 from thruster_env.preset_file import is_file
 from tuning.identification.coordinates import Coordinates
 from tuning.identification.excitation import check_excitation
@@ -29,6 +29,7 @@ from tuning.identification.identify import STARTS, identify
 from tuning.identification.objective import Objective
 from tuning.identification.profiles import profiles
 from tuning.identification.validation import validate
+from tuning.logs.identify import check_offsets, family_of, split_runs
 
 INTERRUPTED = 130
 DEFAULT_OUT = Path("out/identified.toml")
@@ -117,12 +118,13 @@ def command(
         return identify_bollard(bollard, step, logs, preset, out or DEFAULT_OUT, json, **reading)
     if step is not None:
         raise ValueError("--step must come with --bollard TABLE.csv, but got it alone")
-    options = {"sensors": sensor, "columns": column, "clock_offset": clock_offset, "dt": dt}
+    whose = {"preset": preset, "model": model, "sensors": sensor}
+    options = whose | {"columns": column, "clock_offset": clock_offset, "dt": dt}
     if not logs:
         raise ValueError("identify must have at least one log, or --bollard TABLE.csv, but got none")
     out = out or DEFAULT_OUT
-    family, runs, proving = split_runs(logs, held_out, use_all, preset, model, options, filter_name)
-    family = family_of(family, runs, free, noise=not hold_noise)
+    runs, proving = split_runs(logs, held_out, use_all=use_all, **options)
+    family = family_of(runs, names_of(free), **whose, noise=not hold_noise, filter=filter_name)
     numbers, ranges = numbers_of("--start", pairs("--start", start)), ranges_of(pairs("--range", range_))
     parameters = with_ranges(family.free, ranges, numbers)
     check_offsets(parameters, runs)

@@ -8,11 +8,17 @@ from types import ModuleType
 # Each has the class Scenario, NAMES of scenarios, the NOMINAL one, find_scenario(name) and
 # computed_scale(scenario, sequences).
 ROOMS = {"thruster": "tuning.thruster.find", "auv": "tuning.auv.find"}
+LOGS = "tuning.thruster.logs"
 
 
 def room_of(plant: str) -> ModuleType:
     """The room of a plant by its key in `ROOMS`."""
     return importlib.import_module(ROOMS[plant])
+
+
+def room_of_logs() -> ModuleType:
+    """What knows the plant that a log is of unless it is told, by its preset: `tuning.thruster.logs`."""
+    return importlib.import_module(LOGS)
 
 
 def built_in() -> dict[str, ModuleType]:
