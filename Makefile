@@ -40,12 +40,13 @@ docs: $(DOCS) ## install what the site needs (once) and build it into build/docs
 fuzz: $(TEST) ## attack everything at random for ten minutes; ARGS="--seconds 60 --seed 1"
 	@$(BIN)/python -m tests.fuzz $(ARGS)
 
-lint: $(TEST) ## check style and formatting
+lint: $(TEST) ## check style, formatting and types
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
+	@$(BIN)/python -m tests.repository.types
 
 clean: ## remove .venv, build products and caches; results in out/ stay
-	rm -rf $(VENV) docs/tutorials build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) docs/tutorials build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(MADE):

@@ -31,8 +31,8 @@ print(", ".join(f"{quantity.name} [{quantity.unit}]" for quantity in states))
 # Along a path, on the estimate
 # -----------------------------
 #
-# ``DepthAndCourse`` steers along a line of sight with PD on pitch and course. It sees what the filter estimates. The
-# sensors have rates of their own, so some measurements are missing in most steps; the filter knows.
+# ``DepthAndCourse`` steers along a line of sight with PD on pitch and course. It sees what the filter estimates.
+# The sensors have rates of their own, so some measurements are missing in most steps; the filter knows.
 
 controller, memory = DepthAndCourse.for_env(env, seen="navigation"), None
 truth, estimate, deviation, distances = [], [], [], []

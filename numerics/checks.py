@@ -161,6 +161,6 @@ def covariance_root(cov: np.ndarray) -> np.ndarray:
     """A lower triangular L with L L' = cov for a positive semidefinite covariance, zero variances allowed."""
     eigenvalues, vectors = np.linalg.eigh(cov)
     root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
-    lower = np.linalg.qr(root.T, mode="r").T
+    lower = np.linalg.qr(root.T).R.T
     signs = np.where(np.diag(lower) < 0, -1.0, 1.0)
     return lower * signs

@@ -42,7 +42,8 @@ def told(what: str, parts: Sequence[Part], sizes: Sequence[int] | None = None) -
         for part, size in zip(parts, sizes, strict=True):
             text = f"{around}{what}: {done} of {sum(sizes)}"
             _around.set(f"{text}, ")
-            _listener.get()(text)
+            if (listener := _listener.get()) is not None:  # whoever listened may have stopped meanwhile
+                listener(text)
             yield part
             done += size
     finally:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -104,7 +104,7 @@ def trajectories(
     """The arguments of `run` as the arrays that compiled code takes; ValueError if something is off."""
     model = filter_.kernel_model
     # Arrays that may be written to: others are another type to numba, which compiles once more for them.
-    requirements = "C_CONTIGUOUS", "WRITEABLE"
+    requirements: tuple[Literal["C_CONTIGUOUS", "WRITEABLE"], ...] = "C_CONTIGUOUS", "WRITEABLE"
     given = {"keys": keys, "inputs": inputs, "measurements": measurements}
     keys, inputs, z = (np.require(_floats(name, value), np.float64, requirements) for name, value in given.items())
     if z.ndim != 3 or inputs.ndim != 3 or keys.shape != (len(z), 2):

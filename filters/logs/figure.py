@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -52,7 +53,7 @@ def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
     axes[0].set_title(title, fontsize=11)
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
-    named = {}
+    named: dict[str, Any] = {}
     for axis in axes:
         handles, texts = axis.get_legend_handles_labels()
         named |= dict(zip(texts, handles, strict=True))

@@ -32,9 +32,11 @@ class Description(NamedTuple):
 
     def updated(self, other: Description) -> Description:
         """This one, but for what the other says."""
-        pairs = zip(self[:3], other[:3], strict=True)
         return Description(
-            *({**mine, **theirs} for mine, theirs in pairs), self.dt if other.dt is None else other.dt
+            columns={**self.columns, **other.columns},
+            units={**self.units, **other.units},
+            clock_offset={**self.clock_offset, **other.clock_offset},
+            dt=self.dt if other.dt is None else other.dt,
         )
 
 
