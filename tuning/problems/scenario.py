@@ -75,11 +75,6 @@ class BaseScenario(Problem):
         """Fields of the plant and `scale` as they are to be stored; ValueError for wrong ones."""
         raise NotImplementedError
 
-    @property
-    def plant_arguments(self) -> dict:
-        """Arguments of the env of the same plant."""
-        raise NotImplementedError
-
     def make(self, seeds: tuple[int, ...]) -> Data:
         """The data of some seeds; `data` caches the last ones."""
         raise NotImplementedError
