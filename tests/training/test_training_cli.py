@@ -74,7 +74,7 @@ def test_the_commands_train_score_and_play(thruster, monkeypatch, tmp_path):
     assert contents(tmp_path / "out") == before
     if importlib.util.find_spec("pygame") and importlib.util.find_spec("moviepy"):
         played = thruster("play", folder, "--out", "film.gif")
-        assert played.returncode == 0 and "Film: film.gif" in played.stdout
+        assert played.returncode == 0 and "Video: film.gif" in played.stdout
 
 
 def small_algorithm(name):
