@@ -193,7 +193,7 @@ def covariance(information: np.ndarray, scores: np.ndarray, width: np.ndarray) -
 
     J is the Fisher information, g_b the scores of B nearly independent runs, or of blocks where there are few
     runs. The first holds for a wrong model, too; the second is for directions in which the scatter is too small.
-    In a direction on which the data have no information the standard deviation is at least that of the range.
+    In a direction on which the data have no information the standard deviation is larger than the range.
 
     Args:
         information: J, (p, p).
