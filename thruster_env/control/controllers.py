@@ -64,7 +64,7 @@ class PIController:
             time_constant: what `lambda_gains` gives the loop [s].
 
         Raises:
-            ValueError: if the env does not measure its thrust, an argument is off, or the rule finds no gains.
+            ValueError: if the env does not measure its thrust, an argument is wrong, or the rule finds no gains.
         """
         plant = env.unwrapped.plant
         if "thrust" not in plant.channels:

@@ -33,7 +33,7 @@ def lambda_gains(
         time_constant: lambda [s]; by default that of the motor, or two sample times if these are longer.
 
     Raises:
-        ValueError: if an argument is off, or the plant is unstable or its thrust has no slope there.
+        ValueError: if an argument is wrong, or the plant is unstable or its thrust has no slope there.
 
     Source: E. B. Dahlin (1968), "Designing and tuning digital controllers", Instruments and Control Systems 41(6);
     for zeros, S. Skogestad (2003), "Simple analytic rules for model reduction and PID controller tuning",
