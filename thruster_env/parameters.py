@@ -177,6 +177,11 @@ PRESETS: dict[str, ThrusterParameters] = {
 }
 
 
+LARGEST_VOLTAGE = {
+    "t200": 13.3
+}  # [V], that the data behind a preset reach; of the others plant.DEFAULT_MAX_VOLTAGE
+
+
 def preset_parameters(preset: str | Mapping | ThrusterParameters) -> ThrusterParameters:
     """Parameters from a preset's name, a preset FILE.toml, a mapping of all fields, or parameters.
 

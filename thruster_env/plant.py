@@ -17,7 +17,8 @@ from thruster_env.effects.flow import FLOW_SIGNALS
 from thruster_env.effects.uncertainty import LogNormal, Uniform, extreme_parameters, make_uncertainty
 from thruster_env.linear.analysis import LinearModel
 from thruster_env.linear.steady_state import required_substeps, steady_state
-from thruster_env.parameters import ThrusterParameters, derive_constants, preset_and_dead_band
+from thruster_env.parameters import LARGEST_VOLTAGE, ThrusterParameters, derive_constants, preset_and_dead_band
+from thruster_env.preset_file import is_file, read_preset
 
 DEFAULT_DT = 0.01  # [s], the sample time of the published experiments
 DEFAULT_MAX_VOLTAGE = 24.0  # [V]
@@ -66,6 +67,13 @@ class Plant(NamedTuple):
     def dropping_channels(self) -> tuple[int, ...]:
         """Numbers of the channels whose measurements may be missing."""
         return dropping_channels(self.sensors)
+
+
+def largest_known_voltage(preset) -> float:
+    """The voltage up to which a preset is known [V]: what the logs of an identified one reached, or its data."""
+    if is_file(preset):
+        return float(read_preset(preset).identified.get("largest_voltage", DEFAULT_MAX_VOLTAGE))
+    return LARGEST_VOLTAGE.get(preset, DEFAULT_MAX_VOLTAGE) if isinstance(preset, str) else DEFAULT_MAX_VOLTAGE
 
 
 def make_plant(
