@@ -15,7 +15,7 @@ from thruster_env.task import Task, thrust_scale
 def lambda_gains(
     plant: Plant, operating_voltage: float | None = None, time_constant: float | None = None
 ) -> tuple[float, float]:
-    """Gains K_p [V/N] and K_i [V/(N s)] of a PI controller from the time constant lambda that its loop is to have.
+    """Gains K_p [V/N] and K_i [V/(N s)] of a PI controller for a closed-loop time constant lambda.
 
         K_p = (1 - exp(-dt/lambda))/(C B_d),    K_i dt = K_p (1 - p)
 
