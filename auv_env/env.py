@@ -110,7 +110,7 @@ class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
         self._set_up(action_space(plant), rows, render_mode)
 
     def copies_of(self, count: int) -> Copies:
-        """So many vehicles with the env's task."""
+        """Return `count` vehicles with the env's task."""
         return Copies(self.plant, self.task, count)
 
 
