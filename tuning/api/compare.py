@@ -118,10 +118,10 @@ def contenders_of(
         sizes: ensemble size by name; under None that of all others.
         seed: of the study whose training runs scale the scaled default.
     """
-    for name, size in sizes.items():
+    for name, number in sizes.items():
         if name is not None and not has_ensemble(name):
-            raise ValueError(f"ensemble_size must be for a filter with an ensemble, but got {name}: {size}")
-        at_least("ensemble_size", size, 2)
+            raise ValueError(f"ensemble_size must be for a filter with an ensemble, but got {name}: {number}")
+        at_least("ensemble_size", number, 2)
 
     def size_of(name: Any) -> int | None:
         return sizes[name] if name in sizes else sizes.get(None)
