@@ -19,6 +19,7 @@ from thruster_cli.tuning_report import as_json as tuning_as_json
 from tuning.problems.find import find_problem
 
 TRIALS = 5
+SHORT = find_problem("nominal").replace(steps=70, name="short")  # quick to tune on
 FIGURES = ("plot_history", "plot_errors", "plot_run", "plot_consistency")
 
 
@@ -56,15 +57,16 @@ def test_the_tuned_filter_is_ready_to_use(study, tmp_path):
     np.testing.assert_allclose(wrapped.filter.model.process_noise_cov, study.filter.model.process_noise_cov)
 
 
-def test_a_study_in_memory_is_that_of_a_storage_and_goes_on_there(study, tmp_path, capsys):
+def test_a_study_in_memory_is_that_of_a_storage_and_goes_on_there(tmp_path, capsys):
     storage = tmp_path / "studies.journal"
     options = {"storage": storage, "progress": True}
-    short = tuning.tune("mismatch", trials=2, **options)
-    whole = tuning.tune("mismatch", trials=TRIALS, **options)
+    short = tuning.tune(SHORT, trials=2, **options)
+    whole = tuning.tune(SHORT, trials=TRIALS, **options)
     assert "goes on after 2 finished trials" in capsys.readouterr().err
-    first = [trial.params for trial in study.trials[:2]]
+    alone = tuning.tune(SHORT, trials=2, progress=False)
+    first = [trial.params for trial in alone.trials]
     assert first == [trial.params for trial in short.trials] == [trial.params for trial in whole.trials[:2]]
-    page = tuning.report(whole.name, tmp_path / "page.html", storage=storage, progress=False)
+    page = tuning.report(whole.name, tmp_path / "page.html", storage=storage, problem=SHORT, progress=False)
     assert "Study &#x27;" not in page.read_text() and page.with_suffix(".md").is_file()
 
 
@@ -135,17 +137,17 @@ def test_ctrl_c_keeps_what_is_finished(monkeypatch):
         return run_trial(trial, *arguments)
 
     monkeypatch.setattr(module, "run_trial", interrupted)
-    found = tuning.tune("nominal", trials=30, progress=False)
+    found = tuning.tune(SHORT, trials=30, progress=False)
     assert found.interrupted and found.tuning.result.finished == 3 and "3 trials, interrupted" in repr(found)
     assert found.filter.name == "ekf" and found.held_out.score.value > 0
 
 
 def test_progress_is_silent_where_nobody_looks(capsys):
     before = optuna.logging.get_verbosity()
-    tuning.tune("nominal", trials=1)
+    tuning.tune(SHORT, trials=1)
     assert capsys.readouterr() == ("", "") and optuna.logging.get_verbosity() == before
-    tuning.tune("nominal", trials=1, progress=True)
-    assert "tuning ekf on nominal" in capsys.readouterr().err
+    tuning.tune(SHORT, trials=1, progress=True)
+    assert "tuning ekf on short" in capsys.readouterr().err
 
 
 def test_importing_tuning_is_light_and_says_what_there_is():
@@ -172,7 +174,7 @@ WRONG = [
     (lambda: tuning.report(3), "a report must be of a Study, a tuned file or the name of a study, but got 3"),
     (lambda: tuning.report("no such study"), "a report must be of a tuned file or of a study in"),
     (
-        lambda: tuning.tune("nominal", trials=1).plot_sizes(),
+        lambda: tuning.tune(SHORT, trials=1).plot_sizes(),
         "a figure of ensemble sizes needs an ensemble and truth",
     ),
     (lambda: tuning.evaluate("ekf", seeds=2).plot_run(2), "place must be at most 1, but got 2"),
