@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import (
@@ -19,6 +19,7 @@ from rich.progress import (
 
 from numerics.checks import shown
 from numerics.progress import listening
+from tuning.api.notebook import NotebookLine
 from tuning.search.interruption import STOPPING
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from tuning.search.plan import Plan
     from tuning.search.study import OnTrial
 
+WIDTH = 100  # of a line in a notebook
 ShowKinds = Callable[[Sequence[str]], None]
 
 
@@ -41,10 +43,11 @@ def console_for(progress: bool | None) -> Console:
     if progress not in (True, False, None):
         raise ValueError(f"progress must be True, False or None, but got {shown(progress)}")
     console = Console(stderr=True, markup=False, highlight=False)
-    if console.is_jupyter and importlib.util.find_spec("ipywidgets") is None:  # by which rich shows live displays
-        console = Console(stderr=True, markup=False, highlight=False, force_jupyter=False)
-        return console if progress else Console(quiet=True)
-    console.quiet = progress is False or (progress is None and not (console.is_terminal or console.is_jupyter))
+    shown_live = console.is_terminal or console.is_jupyter
+    if console.is_jupyter and importlib.util.find_spec("ipywidgets") is None:  # by which rich draws in notebooks
+        options: dict[str, Any] = {"force_jupyter": False, "force_terminal": True, "color_system": None}
+        console = Console(file=NotebookLine(), width=WIDTH, markup=False, highlight=False, **options)
+    console.quiet = progress is False or (progress is None and not shown_live)
     return console
 
 
