@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from filters.augmented import Unknown
-from filters.estimators.find import is_foreign
+from filters.estimators.find import is_foreign, label_of
 from filters.registry import filter_class
 from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least, shown
@@ -130,7 +130,7 @@ def contenders_of(
     for one in filters:
         if isinstance(one, Study):
             choice = sized(one.choice, size_of(one.choice.name))
-            out.append(Contender(_new(f"{choice.name} tuned", out), partial(_same, choice)))
+            out.append(Contender(_new(f"{label_of(choice.name)} tuned", out), partial(_same, choice)))
         elif not is_filter(one):
             size = size_of(read_tuned_file(one)["filter"]["name"])
             out.append(Contender(_new(Path(one).stem, out), partial(_from_file, Path(one), size)))

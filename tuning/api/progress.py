@@ -17,6 +17,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from filters.estimators.find import label_of
 from numerics.checks import shown
 from numerics.progress import listening
 from tuning.api.notebook import NotebookLine
@@ -74,7 +75,7 @@ def trial_bar(
     from tuning.search.filter_types import kinds_running
     from tuning.search.outcome import best_trial
 
-    title = f"tuning {{}} on {names}"
+    title, named = f"tuning {{}} on {names}", label_of(plan.filter)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -83,11 +84,11 @@ def trial_bar(
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console) as progress:
-        task = progress.add_task(title.format(plan.filter), total=total, completed=min(done, total), best="-")
+        task = progress.add_task(title.format(named), total=total, completed=min(done, total), best="-")
 
         def show_kinds(kinds: Sequence[str]) -> None:
             if len(plan.kinds) > 1:
-                progress.update(task, description=title.format(f"{plan.filter} ({', '.join(kinds)})"))
+                progress.update(task, description=title.format(f"{named} ({', '.join(kinds)})"))
 
         def advance(study, finished: int) -> None:
             trials = study.get_trials(deepcopy=False)
