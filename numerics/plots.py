@@ -49,13 +49,8 @@ def panels(count: int, columns: int, size: tuple[float, float], extra: float = 0
     return figure, axes[:count]
 
 
-def save_figure(figure, path: str | Path | None):
-    """Write a figure, whole or not at all, and return the path; without a path return the figure itself.
-
-    It is SVG where the name ends in .svg, else PNG.
-    """
-    if path is None:
-        return figure
+def save_figure(figure, path: str | Path) -> Path:
+    """Write a figure as SVG where the name ends in .svg, else as PNG, whole or not at all; return the path."""
     form = "svg" if Path(path).suffix == ".svg" else "png"
     write_whole(path, lambda stream: figure.savefig(stream, format=form))
     return Path(path)

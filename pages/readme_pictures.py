@@ -20,17 +20,21 @@ from PIL import Image
 
 import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState
+from filters.engine.batch import run
 from numerics.files import write_whole
+from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from pages.page import DOCS
 from thruster_cli.demo import FILTER, SCENARIO, before_and_after
 from thruster_cli.tune import tune
 from thruster_cli.tuning_report import Tuning
+from tuning.reporting.panels import axis_label
 from tuning.search.plan import Plan
 from tuning.thruster.find import find_scenario
 
 SEED = 5
 FIRST, LAST, EVERY = 400, 1000, 8  # steps of the episode of 10 ms each: twelve pictures and a half a second
 COLOURS = 64
+FLOW = 1  # place of the flow velocity in the state
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -41,8 +45,33 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         plan = Plan(FILTER, (find_scenario(SCENARIO),), seed=0)
         tuning = tune(plan, 50, f"{scratch}/studies.journal", out=Path(scratch) / "tuned.json")
-        before_and_after(folder / "estimates.png", tuning)
+        tuned(folder / "tuned.png", tuning)
         thruster(folder / "thruster.gif", tuning)
+
+
+def tuned(path: Path, tuning: Tuning) -> Path:
+    """The flow velocity, which nothing measures, on a held-out run: estimate and error before and after tuning."""
+    scenario = tuning.scenario
+    data, unit = scenario.data(tuning.proof.seeds[:1]), scenario.model().states[FLOW]
+    time = scenario.dt * np.arange(data.states.shape[1])
+    figure = new_figure((10.8, 4.4))
+    axes = figure.subplots(2, 2, sharex=True, sharey="row", height_ratios=(3, 2))
+    tidy(axes.flat)
+    for (above, below), (title, filter_) in zip(axes.T, before_and_after(tuning).items(), strict=True):
+        found, truth = run(filter_, data.filter_keys, data.inputs, data.measurements), data.states[0, :, FLOW]
+        mean, band = found.means[0, :, FLOW], 1.96 * np.sqrt(found.covs[0, :, FLOW, FLOW])
+        above.fill_between(time, mean - band, mean + band, color=BLUE, alpha=0.3, linewidth=0, label="95 % band")
+        above.plot(time, truth, color=DARK, linewidth=2.4, label="truth")
+        above.plot(time, mean, color=BLUE, linewidth=1.0, label="estimate")
+        below.fill_between(time, -band, band, color=BLUE, alpha=0.3, linewidth=0)
+        below.plot(time, mean - truth, color=RUST, linewidth=1.0, label="error of the estimate")
+        above.set_title(title)
+        below.set_xlabel("time [s]")
+    axes[0, 0].set_ylabel(axis_label(unit))
+    axes[1, 0].set_ylabel(f"error\n[{unit.unit}]")
+    named = [pair for axis in axes[:, 0] for pair in zip(*axis.get_legend_handles_labels(), strict=True)]
+    figure.legend(*zip(*named, strict=True), loc="outside lower center", ncols=len(named), frameon=False)
+    return save_figure(figure, path)
 
 
 def thruster(path: Path, tuning: Tuning) -> Path:

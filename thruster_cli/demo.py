@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from filters.filter import Filter
 from thruster_cli.error_tables import above_bound, consistency_cells
 from thruster_cli.output import JsonOption, SeedOption, emit, table, working
 from thruster_cli.tune import tune
@@ -66,10 +67,10 @@ def command(
 def result(tuning: Tuning, report: Report, seconds: float) -> list[str | Table]:
     """What was tuned on what, the errors before and after, and one sentence on what it was worth."""
     found, seeds = tuning.result, len(tuning.proof.seeds)
-    stopped = "interrupted, on the trials that were finished: " if found.interrupted else ""
+    stopped = ", interrupted," if found.interrupted else ""
     return [
-        f"An extended Kalman filter (EKF) where {tuning.scenario.about}:",
-        f"{stopped}{found.finished} trials on {TRAINING_SEEDS} runs, proved on {seeds} others; {seconds:.0f} s.",
+        f"An extended Kalman filter (EKF) where {tuning.scenario.about}: {found.finished} trials{stopped} on "
+        f"{TRAINING_SEEDS} runs, proved on {seeds} others, in {seconds:.0f} s.",
         report.advice,
         "",
         error_table(tuning),
@@ -100,26 +101,24 @@ def error_table(tuning: Tuning) -> Table:
 
 def draw(tuning: Tuning, out: Path) -> dict[Path, str]:
     """Draw the tuned filter before and after, errors and search; return what each picture shows, by its file."""
-    proof, label = tuning.proof, f"{tuning.result.choice.name} on {tuning.scenario.name}"
+    proof, scenario = tuning.proof, tuning.scenario
+    label, data = f"{tuning.result.choice.name} on {scenario.name}", scenario.data(proof.seeds[:1])
+    run = estimates_figure(out / "estimates.png", before_and_after(tuning), data, 0, scenario.dt, sharey="row")
     errors = comparison_figure(out / "rmse.png", proof, f"{label}: RMSE on {len(proof.seeds)} held-out seeds")
     search = history_figure(out / "history.png", tuning.result.trials, f"Study of {label}")
     return {
-        before_and_after(out / "estimates.png", tuning): f"one of these runs: {best_baseline(tuning)}, then tuned",
+        run: f"one of these runs: {best_baseline(tuning)}, then tuned",
         errors: "the errors of the table",
         search: "the search, trial by trial",
     }
 
 
-def before_and_after(path: Path, tuning: Tuning) -> Path:
-    """Draw the first held-out run of the best baseline and of the tuned filter, with their 95 % bands."""
-    scenario, before = tuning.scenario, best_baseline(tuning)
-    choices = baselines(FILTER, scenario, tuning.plan.seed)
-    filters = {
-        f"before: {before}": choices[before].filter(scenario),
-        f"after: {TUNED}": tuning.result.choice.filter(scenario),
-    }
-    data = scenario.data(tuning.proof.seeds[:1])
-    return estimates_figure(path, filters, data, 0, scenario.dt, sharey="row")
+def before_and_after(tuning: Tuning) -> dict[str, Filter]:
+    """The best baseline and the tuned filter, by what stands above their pictures."""
+    before = best_baseline(tuning)
+    choices = {before: baselines(FILTER, tuning.scenario, tuning.plan.seed)[before], TUNED: tuning.result.choice}
+    words = (f"before: {before}", f"after: {TUNED}")
+    return {word: choice.filter(tuning.scenario) for word, choice in zip(words, choices.values(), strict=True)}
 
 
 def best_baseline(tuning: Tuning) -> str:
@@ -143,7 +142,7 @@ def next_steps() -> list[str]:
     """What to do next, for each thing that a user may have come for."""
     steps = {
         "others": f"thruster compare --filter ekf --filter ekf-robust --scenario {SCENARIO}",
-        "my plant": "thruster tune --problem my_module:problem     (docs/problems.md)",
+        "my plant": "thruster new problem NAME                     (docs/problems.md)",
         "my log": "thruster tune --filter ekf --log run.csv      (docs/logs.md)",
         "policies": "thruster train --observe ekf                  (docs/policies.md)",
     }

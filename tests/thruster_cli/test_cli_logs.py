@@ -143,7 +143,7 @@ def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  
             ("estimate", "run.csv", "--column", "thrust"),
             "--column must have the form NAME=VALUE, but got 'thrust'",
         ),
-        (("estimate", "run.csv", "--column", "flow=x"), "columns must be told for some of V_s, thrust, omega_m"),
+        (("estimate", "run.csv", "--column", "flow=x"), "columns must be given for some of V_s, thrust, omega_m"),
         (
             ("estimate", "run.csv", "--column", "thrust=x"),
             "the column for thrust must be one of time_s, voltage_V",
