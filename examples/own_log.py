@@ -24,7 +24,8 @@ import numpy as np
 import tuning
 from thruster_env import PRESETS
 
-TRIALS, ROWS = 20, 1000
+TRIALS = 20
+ROWS = 1000
 
 TRUE_GAIN = 0.9 * PRESETS["tunnel_physical"].voltage_gain
 WORN = PRESETS["tunnel_physical"]._replace(voltage_gain=TRUE_GAIN)

@@ -70,6 +70,7 @@ def escaped(lines: list[str]) -> list[str]:
     """Lines in which bars, asterisks and underscores at the end of a name are only what they are."""
     parts = PROSE_OR_CODE.split("\n".join(lines))
     parts[::2] = [MISREAD.sub(r"\\\g<0>", part) for part in parts[::2]]
+    parts[2::2] = [rf"\ {part}" if part[:1].isalnum() else part for part in parts[2::2]]  # the plural of a name
     return "".join(parts).split("\n") if lines else []
 
 
