@@ -3,7 +3,9 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq -c constraints.txt
+# The versions to install: make CONSTRAINTS=constraints-oldest.txt test, or none, make CONSTRAINTS= test, for the newest.
+CONSTRAINTS := constraints.txt
+PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq $(addprefix -c ,$(CONSTRAINTS))
 TEST_EXTRAS := rl,render,peers,db,samplers,parquet,units,frames,dev
 BENCH_EXTRAS := rl,peers,bench
 DOCS_EXTRAS := docs,rl,frames
@@ -22,7 +24,7 @@ DOCS := $(VENV)/.docs
 help: ## this list
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1 - \2/p' Makefile
 
-demo: $(BASE) ## install what is needed (once) and run the main job from end to end
+demo: $(BASE) ## install what is needed (once), tune a filter, prove it, draw it, report it
 	@$(BIN)/thruster demo $(ARGS)
 
 test: $(TEST) ## install what tests need (once) and run all tests; ARGS="-k name" picks some
@@ -54,7 +56,7 @@ $(MADE):
 
 # The build tool comes first, pinned like the rest, so that pip does not fetch an unpinned one behind our back. The extras
 # are pinned by the same file, so neither install changes a version that the other one put there.
-$(BASE): pyproject.toml constraints.txt | $(MADE)
+$(BASE): pyproject.toml $(CONSTRAINTS) | $(MADE)
 	@echo "installing the base into $(VENV) (once, about a minute) ..."
 	@rm -f $(BASE) $(TEST) $(BENCH) $(DOCS)
 	@$(PIP) setuptools
@@ -64,7 +66,7 @@ $(BASE): pyproject.toml constraints.txt | $(MADE)
 $(TEST): EXTRAS := $(TEST_EXTRAS)
 $(BENCH): EXTRAS := $(BENCH_EXTRAS)
 $(DOCS): EXTRAS := $(DOCS_EXTRAS)
-$(TEST) $(BENCH) $(DOCS): pyproject.toml constraints.txt | $(MADE)
+$(TEST) $(BENCH) $(DOCS): pyproject.toml $(CONSTRAINTS) | $(MADE)
 	@echo "installing what tests, benchmarks or the site need into $(VENV) (once, some minutes) ..."
 	@rm -f $(BASE) $@
 	@$(PIP) setuptools

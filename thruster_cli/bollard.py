@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json as json_module
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,7 @@ def identify_bollard(
 ) -> None:
     """Identify a thruster from a bollard table, write its preset file, and say how well it fits.
 
-    The table tells thrust, torque and speed in steady state; a step response, where there is one, how fast motor
+    The table has thrust, torque and speed in steady state; a step response, where there is one, how fast motor
     and flow follow. All else is that of a preset.
 
     Args:
@@ -80,6 +81,18 @@ def identify_bollard(
         "files": [str(out)],
     }
     emit(_report(found, errors, held_out, timed, out), json_module.loads(json_module.dumps(data)), json)
+
+
+def check_of_table(for_logs: Mapping[str, Any]) -> None:
+    """Raise ValueError for an option that only logs can follow, where a table is given in their place.
+
+    Args:
+        for_logs: values of such options by name, empty or false where they are not given.
+    """
+    for name, value in for_logs.items():
+        if value:
+            got = "" if value is True else f" {', '.join(map(str, value)) if isinstance(value, list) else value}"
+            raise ValueError(f"{name} must come with logs, for --bollard fits a table, but got {name}{got}")
 
 
 def from_step(
@@ -131,7 +144,7 @@ def _report(found: Identified, errors: dict, held_out, timed: Identification | N
         part += [table("From the step response", ["", "value", "standard error"], rows), *timed.sentences()]
     else:
         part.append(
-            "A static table tells no time constants: those of the preset stay. --step LOG finds them, of a log of "
-            "voltage and motor speed."
+            "A static table does not determine time constants: those of the preset stay. --step LOG finds them, "
+            "of a log of voltage and motor speed."
         )
     return [*part, f"wrote {out}"]

@@ -13,8 +13,8 @@ from filters.augmented import Unknown
 from filters.registry import FILTERS
 from numerics.checks import at_least
 from thruster_cli.leaderboard import as_json, report
-from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
-from thruster_cli.presets import OfPresetOption, of_preset
+from thruster_cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption, SeedOption, filter_option
+from thruster_cli.output import announce_compilation, emit, progress_console
 from thruster_cli.problems import PROBLEMS
 from tuning.api.compare import DEFAULT_FILTERS, compared, contenders_of
 from tuning.evaluation.tuned import read_choice, read_tuned
@@ -22,6 +22,7 @@ from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import has_ensemble
+from tuning.thruster.logs import of_preset
 
 
 def command(
@@ -30,23 +31,23 @@ def command(
     ] = None,
     filters: Annotated[
         list[str] | None,
-        typer.Option(
-            "--filter",
-            help=f"{', '.join(FILTERS)}, or module:object for somebody else's estimator; may be repeated. Without "
-            "any, or a file: ekf, enkf, pf.",
+        filter_option(
+            f"{', '.join(FILTERS)}, or module:object for somebody else's estimator; may be repeated. Without any, "
+            f"or a file: {', '.join(DEFAULT_FILTERS)}."
         ),
     ] = None,
     scenarios: Annotated[
         list[str] | None,
-        typer.Option("--problem", "--scenario", help=f"{PROBLEMS} May be repeated."),
+        typer.Option("--problem", "--scenario", help=f"{PROBLEMS} May be repeated.", rich_help_panel=INPUT),
     ] = None,
     preset: OfPresetOption = None,
-    seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,
+    seeds: Annotated[int, typer.Option(help="Number of held-out seeds.", rich_help_panel=RUNS)] = HELD_OUT_SEEDS,
     knows: Annotated[
         str,
         typer.Option(
             help="What a filter named by --filter knows of the plant's noise: true (oracle), scaled (scaled "
-            "default) or untuned (rule of thumb)."
+            "default) or untuned (rule of thumb).",
+            rich_help_panel=FILTER,
         ),
     ] = "true",
     augment: Annotated[
@@ -55,11 +56,16 @@ def command(
             metavar="NAME[:STD[:WALK]]",
             help="Give each --filter a second row, where it also estimates this constant of its model, such as "
             "ambient_velocity, believed to within STD at first and to change by WALK a step.",
+            rich_help_panel=FILTER,
         ),
     ] = None,
     ensemble_size: Annotated[
         list[str] | None,
-        typer.Option(metavar="[FILTER=]N", help="Ensemble size, of all filters or of one; may be repeated."),
+        typer.Option(
+            metavar="[FILTER=]N",
+            help="Ensemble size, of all filters or of one; 30, of particles 1000, by default. May be repeated.",
+            rich_help_panel=FILTER,
+        ),
     ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,

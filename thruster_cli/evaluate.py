@@ -9,17 +9,19 @@ import typer
 
 from thruster_cli.consistency import check_covariance, check_request
 from thruster_cli.error_tables import comparison_table
-from thruster_cli.log_problems import LogModelOption
-from thruster_cli.output import (
+from thruster_cli.options import (
+    FILTER,
     FILTER_HELP,
+    INPUT,
+    OUTPUT,
+    RUNS,
     JsonOption,
+    LogModelOption,
+    OfPresetOption,
     SeedOption,
-    announce_compilation,
-    emit,
-    progress_console,
-    working,
+    filter_option,
 )
-from thruster_cli.presets import OfPresetOption
+from thruster_cli.output import announce_compilation, emit, progress_console, working
 from thruster_cli.problems import PROBLEMS
 from thruster_cli.tables import choice_table
 from thruster_cli.tuning_report import gains
@@ -31,21 +33,28 @@ from tuning.search.plan import HELD_OUT_SEEDS
 
 
 def command(
-    tuned: Annotated[Path | None, typer.Option(help="Tuned file; it names filter, numbers and scenario.")] = None,
-    filter_name: Annotated[
-        str | None, typer.Option("--filter", help=f"Without a tuned file. {FILTER_HELP}")
+    tuned: Annotated[
+        Path | None,
+        typer.Option(help="Tuned file; it names filter, numbers and scenario.", rich_help_panel=FILTER),
     ] = None,
+    filter_name: Annotated[str | None, filter_option(f"Without a tuned file. {FILTER_HELP}")] = None,
     scenario: Annotated[
         str | None,
-        typer.Option("--problem", "--scenario", help=f"By default the tuned file's, or nominal. {PROBLEMS}"),
+        typer.Option(
+            "--problem",
+            "--scenario",
+            help=f"By default the tuned file's, or nominal. {PROBLEMS}",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     preset: OfPresetOption = None,
-    seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,
+    seeds: Annotated[int, typer.Option(help="Number of held-out seeds.", rich_help_panel=RUNS)] = HELD_OUT_SEEDS,
     consistency: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
             help="Also say whether the filter's covariance is consistent, and draw that: a .png file.",
+            rich_help_panel=OUTPUT,
         ),
     ] = None,
     model: LogModelOption = None,
@@ -54,16 +63,18 @@ def command(
 ) -> None:
     """Run a filter on held-out seeds of a scenario, beside its baselines: scaled default, rule of thumb, oracle.
 
-    The rule of thumb takes R from the sensor's sheet and Q from 1 % of each state's range. The scaled default is
-    the same with one factor on Q that brings the mean NIS to 1. The oracle has the plant's own Q and R.
+    The rule of thumb takes R from the sensor's data sheet and Q from 1 % of each state's range. The scaled default
+    is the same with one factor on Q that brings the mean NIS (normalised innovation squared) to 1. The oracle has
+    the plant's own Q and R.
 
-    With --consistency its errors and innovations are held against its own covariances: NEES, NIS, whiteness,
-    coverage, CRPS and, for ensembles, ranks; a sentence each, and a picture of all.
+    With --consistency a filter's errors and innovations are held against its own covariances: NEES, NIS,
+    whiteness, coverage, CRPS and, for ensembles, ranks; a sentence each, and a picture of all.
 
     Example: thruster evaluate --filter enkf --scenario mismatch --consistency calibrated.png
     """
     if (tuned is None) == (filter_name is None):
-        raise ValueError("give either --tuned FILE or --filter NAME")
+        got = "none" if tuned is None else f"both, {tuned} and {filter_name}"
+        raise ValueError(f"give either --tuned FILE or --filter NAME, but got {got}")
     choice, chosen, _ = subject_of(tuned or filter_name, scenario, preset, model)
     if consistency is not None:
         check_request(consistency, choice.filter(chosen))

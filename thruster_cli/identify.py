@@ -10,22 +10,29 @@ from typing import Annotated
 import typer
 
 from thruster_cli.identified import as_json, report, write_files
-from thruster_cli.logs import (
+from thruster_cli.options import (
+    FILTER,
+    INPUT,
+    OUTPUT,
+    SEARCH,
     ClockOption,
     ColumnOption,
     DtOption,
+    JsonOption,
     LogPresetOption,
     ModelOption,
+    SeedOption,
     SensorOption,
-    pairs,
+    filter_option,
 )
-from thruster_cli.output import JsonOption, SeedOption, announce_compilation, check_targets, emit, progress_console
+from thruster_cli.output import announce_compilation, check_targets, emit, progress_console
 from thruster_cli.to_identify import names_of, numbers_of, ranges_of
 from thruster_env.preset_file import is_file
 from tuning.api.identify import identified
 from tuning.identification.identify import STARTS
 from tuning.identification.profiles import profiles
 from tuning.logs.identify import family_of, split_runs
+from tuning.logs.read import pairs
 
 INTERRUPTED = 130
 DEFAULT_OUT = Path("out/identified.toml")
@@ -37,7 +44,10 @@ def command(
     ] = None,
     free: Annotated[
         str | None,
-        typer.Option(help="Names of what is to be found, with commas between; a wrong one lists those known."),
+        typer.Option(
+            help="Names of what is to be found, with commas between; a wrong one lists those known.",
+            rich_help_panel=SEARCH,
+        ),
     ] = None,
     preset: LogPresetOption = None,
     model: ModelOption = None,
@@ -47,45 +57,81 @@ def command(
     dt: DtOption = None,
     range_: Annotated[
         list[str] | None,
-        typer.Option("--range", metavar="NAME=LOW:HIGH", help="Within which one is looked for; may be repeated."),
+        typer.Option(
+            "--range",
+            metavar="NAME=LOW:HIGH",
+            help="Within which one is looked for; may be repeated.",
+            rich_help_panel=SEARCH,
+        ),
     ] = None,
     start: Annotated[
-        list[str] | None, typer.Option("--start", metavar="NAME=VALUE", help="Where the search begins.")
+        list[str] | None,
+        typer.Option("--start", metavar="NAME=VALUE", help="Where the search begins.", rich_help_panel=SEARCH),
     ] = None,
     hold_noise: Annotated[
-        bool, typer.Option("--hold-noise", help="Leave Q and R as they are; else their variances are found, too.")
+        bool,
+        typer.Option(
+            "--hold-noise",
+            help="Leave Q and R as they are; else their variances are found, too.",
+            rich_help_panel=SEARCH,
+        ),
     ] = False,
     held_out: Annotated[
         list[Path] | None,
-        typer.Option("--held-out", help="Run that only validates; by default every third of three or more."),
+        typer.Option(
+            "--held-out",
+            help="Run that only validates; by default every third of three or more.",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
-    use_all: Annotated[bool, typer.Option("--use-all", help="Hold no run out.")] = False,
-    filter_name: Annotated[str, typer.Option("--filter", help="ekf, or kf for affine models.")] = "ekf",
+    use_all: Annotated[bool, typer.Option("--use-all", help="Hold no run out.", rich_help_panel=INPUT)] = False,
+    filter_name: Annotated[str, filter_option("ekf, or kf for affine models.")] = "ekf",
     predicted: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="CHANNEL", help="The filter predicts it but never sees it, such as a load cell's thrust."
+            metavar="CHANNEL",
+            help="The filter predicts it but never sees it, such as a load cell's thrust.",
+            rich_help_panel=FILTER,
         ),
     ] = None,
     degrees: Annotated[
         float,
-        typer.Option(help="Of freedom of Student-t errors, such as 20, of predicted channels, if there are any."),
+        typer.Option(
+            help="Of freedom of Student-t errors, such as 20, of predicted channels, if there are any.",
+            rich_help_panel=SEARCH,
+        ),
     ] = math.inf,
     gate: Annotated[
-        float, typer.Option(help="Leave out samples beyond so many standard deviations, such as 5, as outliers.")
+        float,
+        typer.Option(
+            help="Leave out samples beyond so many standard deviations, such as 5, as outliers.",
+            rich_help_panel=SEARCH,
+        ),
     ] = math.inf,
-    starts: Annotated[int, typer.Option(help="Searches from so many starts.")] = STARTS,
+    starts: Annotated[int, typer.Option(help="Searches from so many starts.", rich_help_panel=SEARCH)] = STARTS,
     bollard: Annotated[
         Path | None,
-        typer.Option(metavar="TABLE.csv", help="In place of logs: a static bollard table (docs/identify.md)."),
+        typer.Option(
+            metavar="TABLE.csv",
+            help="In place of logs: a static bollard table (docs/identify.md).",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     step: Annotated[
-        Path | None, typer.Option(metavar="LOG", help="With --bollard: a step response, for the time constants.")
+        Path | None,
+        typer.Option(
+            metavar="LOG", help="With --bollard: a step response, for the time constants.", rich_help_panel=INPUT
+        ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help=f"File of what is found, for --preset of other commands; {DEFAULT_OUT}.")
+        Path | None,
+        typer.Option(
+            help=f"File of what is found, for --preset of other commands; {DEFAULT_OUT}.", rich_help_panel=OUTPUT
+        ),
     ] = None,
-    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Profile likelihoods.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Profile likelihoods.", rich_help_panel=OUTPUT)
+    ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
@@ -108,12 +154,15 @@ def command(
     if plot is not None and plot.suffix != ".png":
         raise ValueError(f"--plot must end in .png, but got {str(plot)!r}")
     if bollard is not None:
-        from thruster_cli.bollard import identify_bollard
+        from thruster_cli.bollard import check_of_table, identify_bollard
 
+        for_logs = {"--free": free, "--model": model, "--sensor": sensor, "--range": range_, "--start": start}
+        for_logs |= {"--hold-noise": hold_noise, "--held-out": held_out, "--use-all": use_all, "--plot": plot}
+        check_of_table(for_logs | {"--predicted": predicted})
         reading = {"columns": column, "clock_offset": clock_offset, "dt": dt}
         return identify_bollard(bollard, step, logs, preset, out or DEFAULT_OUT, json, **reading)
     if step is not None:
-        raise ValueError("--step must come with --bollard TABLE.csv, but got it alone")
+        raise ValueError(f"--step must come with --bollard TABLE.csv, but got --step {step} alone")
     whose = {"preset": preset, "model": model, "sensors": sensor}
     options = whose | {"columns": column, "clock_offset": clock_offset, "dt": dt}
     if not logs:

@@ -12,6 +12,7 @@ from thruster_cli.error_tables import (
     consistency_cells,
     decimals,
     limit_cell,
+    lowest,
     right_nis,
     two_lines,
     unless_blank,
@@ -26,16 +27,20 @@ def report(board: Leaderboard) -> list:
     """Two tables of a scenario, one without truth, and a sentence on who wins."""
     scenario, evaluation = board.scenario, board.rows[0].evaluation
     title = f"{scenario.name}: {scenario.about}" if scenario.about else scenario.name
-    seeds = f"held-out seeds {board.seeds[0]} to {board.seeds[-1]}"
+    seeds = f"held-out {scenario.seed_word} {board.seeds[0]} to {board.seeds[-1]}"
     if not evaluation.has_truth:
         shown = [_predictions(board, f"{title}\nInnovations on {seeds}")]
         said = [without_truth(scenario.name), f"{winners(board)}\n"]
     else:
         errors = _errors_across if 2 * len(evaluation.states) < MOST_COLUMNS else _errors_below
         shown, said = [errors(board, f"{title}\nRMSE on {seeds}"), _against(board)], [f"{winners(board)}\n"]
-    for one in shown:
-        one.columns[0].overflow = "fold"
     return [*shown, *said]
+
+
+def winner(board: Leaderboard) -> int | None:
+    """Place of the row with the lowest score, without truth the highest log-likelihood; None if none has it."""
+    found = [row.evaluation for row in board.rows]
+    return lowest([one.score.value if one.has_truth else -one.log_likelihood for one in found])
 
 
 def _errors_across(board: Leaderboard, title: str) -> Table:
@@ -53,7 +58,7 @@ def _errors_across(board: Leaderboard, title: str) -> Table:
     rows.append(["bound", *limits, *("" for _ in states)])
     heads = [head for state in states for head in (two_lines(state), "above\n[%]")]
     begun = [f"{'' if i else 'start-up'}\n{f'[{s.unit}]' if s.unit else ''}" for i, s in enumerate(states)]
-    return table(title, ["filter", *heads, *begun], rows, caption=_CAPTION)
+    return table(title, ["filter", *heads, *begun], rows, caption=_CAPTION, best=[winner(board)])
 
 
 def _errors_below(board: Leaderboard, title: str) -> Table:
@@ -74,7 +79,9 @@ def _errors_below(board: Leaderboard, title: str) -> Table:
     if any(cells[1] for cells in bounds):
         rows += [["bound" if i == 0 else "", *cells] for i, cells in enumerate(bounds)]
     heads = ["filter", "state", "RMSE", "above\n[%]", "start-up", f"over\n{board.rows[0].label}"]
-    return table(title, heads, rows, caption=_CAPTION)
+    place, lines = winner(board), len(states)
+    best = () if place is None else range(place * lines, (place + 1) * lines)
+    return table(title, heads, rows, caption=_CAPTION, best=best)
 
 
 _CAPTION = "above: the bound. ±: half of the 95 % interval. start-up: the first 50 steps."
@@ -101,7 +108,8 @@ def _against(board: Leaderboard) -> Table:
     right = f"NEES {n}, NIS {right_nis(board.rows[0].evaluation)}{_median(n) if medians else ''}"
     heads = ["filter", *(state.symbol for state in shown), "score", "NEES", "NIS", "div.", "us/step"]
     caption = f"±: half of the 95 % interval. Ideal: {right}. div.: restarts."
-    return table(f"Over {first}, paired; consistency and cost", heads, rows, caption=caption)
+    title = f"Over {first}, paired; consistency and cost"
+    return table(title, heads, rows, caption=caption, best=[winner(board)])
 
 
 def _median(n: int) -> str:
@@ -123,9 +131,8 @@ def _predictions(board: Leaderboard, title: str) -> Table:
         rows.append([row.label, *cells, str(found.divergences), f"{row.microseconds:.3g}"])
     right = right_nis(board.rows[0].evaluation)
     caption = f"log L: of a run. ±: half of the 95 % interval. Ideal: NIS {right}. div.: restarts."
-    return table(
-        title, ["filter", "log L", f"less that\nof {first}", "NIS", "div.", "us/step"], rows, caption=caption
-    )
+    heads = ["filter", "log L", f"less that\nof {first}", "NIS", "div.", "us/step"]
+    return table(title, heads, rows, caption=caption, best=[winner(board)])
 
 
 def as_json(boards: list[Leaderboard]) -> dict:

@@ -9,24 +9,30 @@ from typing import Annotated
 import typer
 
 from numerics.checks import one_of
-from thruster_cli.log_problems import BlocksOption, HeldOutOption, LeadOption, LogOption, problems_of
-from thruster_cli.logs import (
+from thruster_cli.log_problems import problems_of
+from thruster_cli.options import (
+    FILTER,
+    FILTER_HELP,
+    INPUT,
+    OUTPUT,
+    RUNS,
+    SEARCH,
+    BlocksOption,
     ClockOption,
     ColumnOption,
     DtOption,
+    HeldOutOption,
+    JsonOption,
+    LeadOption,
+    LogOption,
     LogPresetOption,
     ModelOption,
-    SensorOption,
-)
-from thruster_cli.output import (
-    FILTER_HELP,
-    JsonOption,
     SeedOption,
-    announce_compilation,
-    check_targets,
-    emit,
-    progress_console,
+    SensorOption,
+    filter_option,
+    spelt,
 )
+from thruster_cli.output import announce_compilation, check_targets, emit, progress_console
 from thruster_cli.problems import PROBLEMS
 from thruster_cli.tuning_report import Tuning, as_json, report
 from tuning.api.run import METHODS, name_of, run_tuning
@@ -41,39 +47,71 @@ TUNED_FILTER_HELP = f"{FILTER_HELP} Or auto: the best of all within --budget."
 
 
 def command(
-    filter_name: Annotated[str, typer.Option("--filter", help=TUNED_FILTER_HELP)] = "enkf",
+    filter_name: Annotated[str, filter_option(TUNED_FILTER_HELP)] = "enkf",
     scenario: Annotated[
-        list[str] | None, typer.Option("--problem", "--scenario", help=f"{PROBLEMS} Several are averaged.")
+        list[str] | None,
+        typer.Option("--problem", "--scenario", help=f"{PROBLEMS} Several are averaged.", rich_help_panel=INPUT),
     ] = None,
-    trials: Annotated[int, typer.Option(help="Finished trials that the study shall have in total.")] = 50,
+    trials: Annotated[
+        int, typer.Option(help="Finished trials that the study shall have in total.", rich_help_panel=SEARCH)
+    ] = 50,
     objective: Annotated[
         list[str] | None,
-        typer.Option(help=f"What to minimise: {', '.join(OBJECTIVES)}, output:SYMBOL; two for a Pareto front."),
+        typer.Option(
+            help=f"What to minimise: {', '.join(OBJECTIVES)}, output:SYMBOL; two for a Pareto front.",
+            rich_help_panel=SEARCH,
+        ),
     ] = None,
     any_nis: Annotated[
         bool,
-        typer.Option("--no-consistency", help="Do not hold the mean NIS between 0.8 and 1.25 of what is right."),
+        typer.Option(
+            "--no-consistency",
+            help="Do not hold the mean NIS between 0.8 and 1.25 of its expected value.",
+            rich_help_panel=SEARCH,
+        ),
     ] = False,
-    hold_r: Annotated[bool, typer.Option("--hold-r", help="Leave R at the sensor's sheet, tune Q alone.")] = False,
-    full_q: Annotated[bool, typer.Option("--full-q", help="Tune the correlations of Q, too.")] = False,
+    hold_r: Annotated[
+        bool,
+        typer.Option("--hold-r", help="Keep R of the sensor's data sheet, tune Q alone.", rich_help_panel=SEARCH),
+    ] = False,
+    full_q: Annotated[
+        bool, typer.Option("--full-q", help="Tune the correlations of Q, too.", rich_help_panel=SEARCH)
+    ] = False,
     budget: Annotated[
         float | None,
-        typer.Option(metavar="MICROSECONDS", help="What a step of the filter may cost, in time of one core."),
+        typer.Option(
+            metavar="MICROSECONDS",
+            help="What a step of the filter may cost, in time of one core.",
+            rich_help_panel=FILTER,
+        ),
     ] = None,
-    sampler: Annotated[str, typer.Option(help=", ".join(SAMPLERS))] = "tpe",
+    sampler: Annotated[
+        str, typer.Option(help=", ".join(SAMPLERS), callback=spelt(SAMPLERS), rich_help_panel=SEARCH)
+    ] = "tpe",
     no_pruning: Annotated[
         bool,
         typer.Option(
-            "--no-pruning", help="Do not end a trial that is significantly worse than the best on the same seeds."
+            "--no-pruning",
+            help="Do not end a trial that is significantly worse than the best on the same seeds.",
+            rich_help_panel=SEARCH,
         ),
     ] = False,
     method: Annotated[
         str,
-        typer.Option(help="optuna, or gradient: maximum likelihood, for kf and ekf; optuna runs for comparison."),
+        typer.Option(
+            help="optuna, or gradient: maximum likelihood, for kf and ekf; optuna runs for comparison.",
+            rich_help_panel=SEARCH,
+        ),
     ] = "optuna",
-    workers: Annotated[int, typer.Option(help="Processes on this host that share the study.")] = 1,
+    workers: Annotated[
+        int, typer.Option(help="Processes on this host that share the study.", rich_help_panel=RUNS)
+    ] = 1,
     storage: Annotated[
-        str, typer.Option(help="Journal file for one host; for several, a database as docs/workers.md tells.")
+        str,
+        typer.Option(
+            help="Journal file for one host; for several, a database as docs/workers.md tells.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = DEFAULT_STORAGE,
     log: LogOption = None,
     held_out: HeldOutOption = None,
@@ -85,25 +123,29 @@ def command(
     column: ColumnOption = None,
     clock_offset: ClockOption = None,
     dt: DtOption = None,
-    study: Annotated[str | None, typer.Option(help="Name of the study; by default from the above.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Tuned file; out/STUDY.json by default.")] = None,
+    study: Annotated[
+        str | None, typer.Option(help="Name of the study; by default from the above.", rich_help_panel=OUTPUT)
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Tuned file; out/STUDY.json by default.", rich_help_panel=OUTPUT)
+    ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
     """Find the Q, R and ensemble size that make a filter's estimate best, and prove it on held-out seeds.
 
-    The score is the mean over states of RMSE over its bound, on 32 training seeds that every trial shares.
-    The first trial is the rule of thumb: R from the sensor's sheet, Q from 1 % of each state's range. Ctrl-C
+    The score is the mean over states of RMSE over its bound, on 32 training seeds that every trial shares. The
+    first trial is the rule of thumb: R from the sensor's data sheet, Q from 1 % of each state's range. Ctrl-C
     keeps all finished trials: the same command goes on with the study. The report is on 200 seeds that no trial
-    saw, against the scaled default first: the rule of thumb with one factor on its Q that makes the mean NIS on
-    the training runs right.
+    saw, against the scaled default first: the rule of thumb with one factor on its Q that brings the mean NIS
+    (normalised innovation squared) on the training runs to 1.
 
-    RMSE alone hardly tells Q and R: only their ratio matters to the estimate. So the mean NIS is held in a band
-    unless --no-consistency is given, and the report says what that costs. Where no trial is in the band, the one
-    with the least error is written, the report and the file say so, and the exit code is 3.
+    RMSE alone hardly determines Q and R: only their ratio matters to the estimate. So the mean NIS is held in a
+    band unless --no-consistency is given, and the report says what that costs. Where no trial is in the band, the
+    one with the least error is written, the report and the file say so, and the exit code is 3.
 
-    With --log it learns from recorded runs instead, cut into blocks of which every third proves the choice. What
-    is made small is the negative log-likelihood of the innovations, unless the logs hold the true states.
+    With --log it learns from recorded runs instead, cut into blocks of which every third is held out. What is
+    minimised is the negative log-likelihood of the innovations, unless the logs hold the true states.
 
     Example: thruster tune --filter ekf --scenario mismatch --scenario outliers --trials 100
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from numerics.checks import between, one_of, positive, shown, within
+from numerics.checks import between, meant, one_of, positive, shown, within
 from thruster_env.dynamics import Constants
 
 LARGEST = 1e12  # of a parameter, and one over it the smallest positive one: floating point overflows far beyond
@@ -48,7 +48,7 @@ class ThrusterParameters(NamedTuple):
 
 def checked(parameters: ThrusterParameters) -> ThrusterParameters:
     """Return the parameters as floats; raise ValueError that names the rule and the value if one is off."""
-    values = {}
+    values: dict[str, Any] = {}
     for name, value in parameters._asdict().items():
         if name == "angles":
             values[name] = one_of("angles", value, ANGLES)
@@ -177,6 +177,11 @@ PRESETS: dict[str, ThrusterParameters] = {
 }
 
 
+LARGEST_VOLTAGE = {
+    "t200": 13.3
+}  # [V], that the data behind a preset reach; of the others plant.DEFAULT_MAX_VOLTAGE
+
+
 def preset_parameters(preset: str | Mapping | ThrusterParameters) -> ThrusterParameters:
     """Parameters from a preset's name, a preset FILE.toml, a mapping of all fields, or parameters.
 
@@ -208,7 +213,8 @@ def _parameters(preset: str | Mapping | ThrusterParameters) -> ThrusterParameter
             raise ValueError(f"a preset mapping must have the fields {names}: {error}") from None
     if not isinstance(preset, str) or preset not in PRESETS:
         names = ", ".join(PRESETS)
-        raise ValueError(f"preset must be one of {names}, or a file that ends in .toml, but got {shown(preset)}")
+        rule = f"preset must be one of {names}, or a file that ends in .toml"
+        raise ValueError(f"{rule}, but got {shown(preset)}{meant(preset, PRESETS)}")
     return PRESETS[preset]
 
 

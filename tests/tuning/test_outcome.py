@@ -9,7 +9,7 @@ import pytest
 from filters.consistency.intervals import Interval
 from thruster_cli.main import main
 from tuning.evaluation.sizes import SizeRow, sufficient_size
-from tuning.search.enqueued import TWIN
+from tuning.search.enqueued import RESCALED
 from tuning.search.objectives import NIS_BAND
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.plan import Plan
@@ -57,7 +57,7 @@ def test_the_best_trial_has_the_least_error_of_the_consistent_ones_else_of_all(t
 def test_a_study_without_a_consistent_trial_says_so_everywhere(thruster, tmp_path):
     code, said = thruster("tune", "--filter", "ekf", "--trials", 1, "--json", "one.json")
     assert code == 3 and "in its band" not in said
-    assert "No trial was consistent: a mean NIS must lie between 0.8 and 1.25 of what is right, but" in said
+    assert "No trial was consistent: a mean NIS must lie between 0.8 and 1.25 of its expected value, but" in said
     data = json.loads((tmp_path / "one.json").read_text())
     study = json.loads((tmp_path / "out" / "ekf-mismatch-seed0.json").read_text())["study"]
     for found in (data, study):
@@ -91,7 +91,7 @@ def test_a_study_names_its_best_trial_to_programs_that_know_no_constraints(tmp_p
     study = optuna.load_study(study_name="s", storage=storage)
     best = best_trial(study.trials)
     assert study.user_attrs[BEST] == best.number == study.best_trial.number
-    assert is_consistent(best) and TWIN in best.user_attrs
+    assert is_consistent(best) and RESCALED in best.user_attrs
     study.set_user_attr(BEST, 0)  # what a slower worker wrote last
     run_study(open_study("s", PLAN, storage), PLAN, 4)
     assert study.user_attrs[BEST] == best.number

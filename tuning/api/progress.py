@@ -19,6 +19,7 @@ from rich.progress import (
 
 from numerics.checks import shown
 from numerics.progress import listening
+from tuning.search.interruption import STOPPING
 
 if TYPE_CHECKING:
     from tuning.problems.problem import Problem
@@ -93,7 +94,9 @@ def trial_bar(
                 show_kinds(running)
 
         def show_rest(far: str) -> None:
-            if progress.tasks[task].finished:  # what comes after the last trial
+            if far == STOPPING:
+                progress.update(task, description=far, refresh=True)
+            elif progress.tasks[task].finished:  # what comes after the last trial
                 progress.update(task, description=f"ensemble sizes, {far}" if far.startswith("N: ") else far)
 
         with listening(show_rest):
@@ -112,5 +115,10 @@ def row_bar(total: int, console: Console) -> Iterator[Callable[[Problem, str], N
             progress.update(task, description=f"{label} on {problem.name}", completed=len(begun))
             begun.append(label)
 
-        yield on_row
+        def show(far: str) -> None:
+            if far == STOPPING:
+                progress.update(task, description=far, refresh=True)
+
+        with listening(show):
+            yield on_row
         progress.update(task, completed=len(begun))

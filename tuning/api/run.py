@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -21,7 +22,7 @@ from tuning.likelihood.identifiability import Identifiability, identify
 from tuning.problems.problem import Problem
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage
-from tuning.search.study import StudyResult, finished_trials, open_study, run_study, run_trials
+from tuning.search.study import StudyResult, checked, finished_trials, open_study, run_study, run_trials
 from tuning.search.workers import run_in_workers
 
 MOST_TRIALS = 1_000_000
@@ -94,6 +95,7 @@ def run_tuning(
     if out is not None:
         check_target(out)
     with quiet_optuna():
+        plan = checked(plan)  # before there is a journal
         study = open_study(name, plan, None if storage is None else open_storage(storage))
         already = finished_trials(study)
         if already:
@@ -110,7 +112,7 @@ def run_tuning(
         rival = prove(result.choice, plan.scenarios[0], plan.seed)
         result = result._replace(choice=gradient.choice, consistent=None, nis=())
     try:
-        with working("proving the choice on held-out seeds", console):
+        with working(f"proving the choice on held-out {plan.scenarios[0].seed_word}", console):
             proofs = tuple(prove(result.choice, scenario, plan.seed) for scenario in plan.scenarios)
     except KeyboardInterrupt:
         if storage is not None:
@@ -153,9 +155,10 @@ def names_of(plan: Plan) -> str:
 
 
 def short_name(problem: Problem) -> str:
-    """A problem's name as that of a study and of a file has it: without folders and colons."""
+    """A problem's name as that of a study and of a file has it: without folders and what shells read."""
     name = Path(problem.name)
-    return (name.stem if name.suffix == ".toml" else name.name).replace(":", "-").replace(" ", "-")
+    text = name.stem if name.suffix == ".toml" else name.name
+    return re.sub(r"[^\w.+-]+", "-", text.replace(".toml)", ")")).strip("-")
 
 
 @contextmanager

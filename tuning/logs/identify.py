@@ -37,7 +37,7 @@ def split_runs(
     """
     runs, proving = runs_by_name(logs, held_out)
     if use_all and proving:
-        raise ValueError("give either --held-out or --use-all, but got both")
+        raise ValueError(f"give either --held-out or --use-all, but got both, --held-out {proving[0]}")
     names = list(runs)
     if not proving and not use_all and len(names) >= EVERY_THIRD:
         proving = names[EVERY_THIRD - 1 :: EVERY_THIRD]

@@ -29,7 +29,8 @@ def read_named(
 
     Args:
         path: of a file; a table, as a pandas.DataFrame or a mapping from headers to arrays; or a `Log`.
-        preset: the thruster that it is of, by name or file; of a model a FILE.toml with its numbers.
+        preset: the thruster that it is of, by name or file, whose clock offsets are taken off; of a model a
+            FILE.toml with its numbers.
         model: in place of a thruster: a `StateSpaceModel`, what makes or offers one, or "module:object".
         sensors: what a filter sees of a thruster.
         columns: headers by quantity, a mapping or texts NAME=HEADER[UNIT].
@@ -63,7 +64,12 @@ def read_named(
         return read_for(path, offer, **options)[0], offer
     room = room_of_logs()
     whose = room.DEFAULT_PRESET if preset is None else str(preset)
-    log, _ = read_for(path, room.Preset(whose, sensors, ANY_DT).state_space_model(), **options)
+    thruster = room.Preset(whose, sensors, ANY_DT)
+    log, _ = read_for(path, thruster.state_space_model(), **options)
+    known = {key: value for key, value in thruster.clock_offset.items() if f"measurement:{key}" not in log.offsets}
+    if known and not isinstance(path, Log):  # what the user or the log itself says goes first
+        options["clock_offset"] |= known
+        log, _ = read_for(path, thruster.state_space_model(), **options)
     return log, room.Preset(whose, sensors, log.dt)
 
 

@@ -13,6 +13,7 @@ from plants.state_space import StateSpaceModel
 from thruster_env.logged import NO_BAND, logged_plant, with_shown
 from thruster_env.model import model_of_plant
 from thruster_env.modelled import ModelledThruster
+from thruster_env.preset_file import is_file, read_preset
 from tuning.problems.files import FILE_SEQUENCES
 from tuning.problems.problem import Problem
 
@@ -23,7 +24,8 @@ FREE = ("motor_damping", "voltage_gain", "lift_coefficient")  # to be identified
 class Preset(ModelledThruster):
     """A thruster of a preset, of which logs are: it offers the model, and checks tuned files.
 
-    Of a preset file the model has the recorder, too: biases, lags, ambient flow, Q and R.
+    Of a preset file the model has the recorder, too: biases, lags, ambient flow, Q and R; `clock_offset` [s], by
+    measured channel, is for who reads the logs.
     """
 
     def __init__(self, preset: str, sensors: Sequence[str] | None, dt: float):
@@ -31,6 +33,8 @@ class Preset(ModelledThruster):
         self.plant, self._seen = logged_plant(
             preset=preset, dt=dt, **({"sensors": tuple(sensors)} if sensors else {})
         )
+        offsets = read_preset(preset).recorder.get("clock_offset", {}) if is_file(preset) else {}
+        self.clock_offset = {name: value for name, value in offsets.items() if name in self.plant.channels}
 
     def state_space_model(self, **changes) -> StateSpaceModel:
         """The model, with what logs show beside the equations."""
@@ -101,11 +105,13 @@ def preset_of(found: Any, family: Any, logs: Sequence[str]):
     from thruster_env.preset_file import PresetFile
 
     plant, seen = family.plant_at(found.values), family.shown_at(found.values)
-    offsets = {
-        name.removeprefix("clock_offset_"): value
+    offsets = {channel: _taken_off(family.logs, channel) for channel in plant.channels}
+    offsets |= {
+        name.removeprefix("clock_offset_"): value + offsets[name.removeprefix("clock_offset_")]
         for name, value in found.values.items()
         if name.startswith("clock_offset_")
     }
+    offsets = {channel: value for channel, value in offsets.items() if value}
     variances = plant.measurement_noise_cov.diagonal().tolist()
     recorder: Mapping[str, Any] = {
         "dt": plant.dt,
@@ -122,9 +128,16 @@ def preset_of(found: Any, family: Any, logs: Sequence[str]):
         "log_likelihood": found.log_likelihood,
         "standard_errors": found.standard_errors,
         "determined": found.determined,
+        "largest_voltage": float(max(np.abs(log.inputs).max() for log in family.logs)),
     }
     kept = {name: value for name, value in recorder.items() if value not in ({}, 0.0)}
     return PresetFile(plant.parameters, (seen.dead_band_low, seen.dead_band_high), kept, identified)
+
+
+def _taken_off(logs: Sequence[Log], channel: str) -> float:
+    """The clock offset with which all logs were read; 0 if they differ, and so belong to the logs."""
+    found = {log.offsets.get(f"measurement:{channel}", 0.0) for log in logs}
+    return found.pop() if len(found) == 1 else 0.0
 
 
 def write_identified(path: str | Path, found: Any, family: Any, logs: Sequence[str]) -> None:
