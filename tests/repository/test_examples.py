@@ -8,6 +8,8 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import pytest
 
+from pages.site.gallery import SHOWN_ONLY
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 QUICK = {
     "first_steps": {"STEPS": 30},
@@ -32,7 +34,7 @@ def quick(name):
 
 
 def test_every_example_is_run():
-    assert sorted(QUICK) == sorted(path.stem for path in EXAMPLES.glob("*.py"))
+    assert sorted([*QUICK, *SHOWN_ONLY]) == sorted(path.stem for path in EXAMPLES.glob("*.py"))
 
 
 @pytest.mark.slow
