@@ -58,6 +58,7 @@ sphinx_gallery_conf = {
     "gallery_dirs": "tutorials",
     "filename_pattern": rf"/(?!{'|'.join(SHOWN_ONLY)})\w+\.py$",
     "within_subsection_order": "pages.site.gallery.in_order",
+    "image_scrapers": ("matplotlib", "pages.site.gallery.result_figures"),
     "capture_repr": ("_repr_html_", "__repr__"),
     "download_all_examples": False,
     "show_signature": False,

@@ -80,6 +80,11 @@ def _process(app, what, name, obj, options, lines: list[str]) -> None:
     lines[:] = readable(lines)
 
 
+def _skip(app, what, name, obj, skip: bool, options) -> bool | None:
+    """Fields of named tuples stand in the list of attributes, with shapes and units."""
+    return True if what == "class" and type(obj).__name__ == "_tuplegetter" else None
+
+
 def setup(app) -> dict[str, bool]:
     """Come before napoleon, which reads the sections; what it calls variables are attributes to everybody else."""
     from sphinx.domains.python import PyObject
@@ -88,4 +93,5 @@ def setup(app) -> dict[str, bool]:
         if field.name == "variable":
             field.label = "Attributes"
     app.connect("autodoc-process-docstring", _process, priority=100)
+    app.connect("autodoc-skip-member", _skip)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
