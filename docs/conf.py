@@ -59,6 +59,7 @@ sphinx_gallery_conf = {
     "filename_pattern": rf"/(?!{'|'.join(SHOWN_ONLY)})\w+\.py$",
     "within_subsection_order": "pages.site.gallery.in_order",
     "image_scrapers": ("matplotlib", "pages.site.gallery.result_figures"),
+    "default_thumb_file": str(ROOT / "docs" / "plant_frame.png"),
     "capture_repr": ("_repr_html_", "__repr__"),
     "download_all_examples": False,
     "show_signature": False,
