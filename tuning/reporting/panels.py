@@ -26,5 +26,6 @@ def shown_states(states: Sequence[Quantity], scored: Collection[int] | None = No
 
 def axis_label(quantity: Quantity) -> str:
     """Name and symbol above the unit, as axes of narrow panels have it."""
-    label = quantity._replace(unit="").plot_label
+    named = quantity.symbol in quantity.name.split()  # as "measured thrust" is
+    label = quantity.name if named else quantity._replace(unit="").plot_label
     return f"{label}\n[{quantity.unit}]" if quantity.unit else label

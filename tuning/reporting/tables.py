@@ -93,7 +93,7 @@ def numbers_table(choice: Choice, scenario: Problem, seed: int, default: Scaled 
     choices, default = {TUNED: choice, **found}, found[RULE].numbers
     whole = [one._replace(numbers={**default, **one.numbers}) for one in choices.values()]
     rows = number_rows(whole, choice.name, scenario, _number, "²")
-    return Table(f"Numbers of the {choice.name} filter", ["", *choices], rows)
+    return Table(f"Parameters of the {choice.name} filter", ["", *choices], rows)
 
 
 def _number(value: float | None) -> str:
