@@ -4,8 +4,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq -c constraints.txt
-TEST_EXTRAS := rl,render,peers,db,samplers,parquet,units,dev
+TEST_EXTRAS := rl,render,peers,db,samplers,parquet,units,frames,dev
 BENCH_EXTRAS := rl,peers,bench
+DOCS_EXTRAS := docs,rl
 ARGS :=
 
 # Stamps: present only after a complete install, so a second run needs no network and an interrupted one starts over.
@@ -13,14 +14,15 @@ MADE := $(VENV)/.made
 BASE := $(VENV)/.base
 TEST := $(VENV)/.test
 BENCH := $(VENV)/.bench
+DOCS := $(VENV)/.docs
 
-.PHONY: help demo test bench fuzz lint clean
+.PHONY: help demo test bench docs fuzz lint clean
 .NOTPARALLEL:
 
 help: ## this list
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1 - \2/p' Makefile
 
-demo: $(BASE) ## install what is needed (once) and run the main job from end to end
+demo: $(BASE) ## install what is needed (once), tune a filter, prove it, draw it, report it
 	@$(BIN)/thruster demo $(ARGS)
 
 test: $(TEST) ## install what tests need (once) and run all tests; ARGS="-k name" picks some
@@ -29,15 +31,20 @@ test: $(TEST) ## install what tests need (once) and run all tests; ARGS="-k name
 bench: $(BENCH) ## install what benchmarks need (once) and time it against other packages, side by side
 	@$(BIN)/python -m benchmarks $(ARGS)
 
+docs: $(DOCS) ## install what the site needs (once) and build it into build/docs; ARGS=linkcheck tries external links
+	@$(BIN)/python -m sphinx -b $(or $(ARGS),html) -W --keep-going -q docs build/docs
+	@echo "build/docs/index.html"
+
 fuzz: $(TEST) ## attack everything at random for ten minutes; ARGS="--seconds 60 --seed 1"
 	@$(BIN)/python -m tests.fuzz $(ARGS)
 
-lint: $(TEST) ## check style and formatting
+lint: $(TEST) ## check style, formatting and types
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
+	@$(BIN)/python -m tests.repository.types
 
 clean: ## remove .venv, build products and caches; results in out/ stay
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) docs/tutorials build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(MADE):
@@ -49,15 +56,16 @@ $(MADE):
 # are pinned by the same file, so neither install changes a version that the other one put there.
 $(BASE): pyproject.toml constraints.txt | $(MADE)
 	@echo "installing the base into $(VENV) (once, about a minute) ..."
-	@rm -f $(BASE) $(TEST) $(BENCH)
+	@rm -f $(BASE) $(TEST) $(BENCH) $(DOCS)
 	@$(PIP) setuptools
 	@$(PIP) --no-build-isolation -e .
 	@touch $(BASE)
 
 $(TEST): EXTRAS := $(TEST_EXTRAS)
 $(BENCH): EXTRAS := $(BENCH_EXTRAS)
-$(TEST) $(BENCH): pyproject.toml constraints.txt | $(MADE)
-	@echo "installing what tests or benchmarks need into $(VENV) (once, some minutes) ..."
+$(DOCS): EXTRAS := $(DOCS_EXTRAS)
+$(TEST) $(BENCH) $(DOCS): pyproject.toml constraints.txt | $(MADE)
+	@echo "installing what tests, benchmarks or the site need into $(VENV) (once, some minutes) ..."
 	@rm -f $(BASE) $@
 	@$(PIP) setuptools
 	@$(PIP) --no-build-isolation -e ".[$(EXTRAS)]"

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from benchmarks.rows import COLUMNS, machine, machine_lines
+from benchmarks.speed_page import check_page, write_page
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
 from training.extras import check_installed
 
@@ -27,6 +29,9 @@ def command(
     quick: Annotated[
         bool, typer.Option("--quick", help="Few rounds: shows that all runs; the times are rough.")
     ] = False,
+    page: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the table into a page anew: docs/speed.md.")
+    ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
@@ -40,6 +45,8 @@ def command(
             "FilterPy must be installed to compare with: `make bench` does it, or pip install -e '.[peers]'"
         )
     check_installed()
+    if page is not None:
+        check_page(page)
     # After the checks: they import FilterPy, or Stable-Baselines3.
     from benchmarks import (
         assimilation,
@@ -76,8 +83,11 @@ def command(
         resident = studies.resident_memory(seed, quick)
     facts = machine()
     shown = table("Speed, side by side", COLUMNS, [row.cells() for row in rows], caption=CAPTION)
+    memory = [vectors.memory_line(), studies.memory_line(resident)]
+    if page is not None:
+        write_page(page, rows, facts, memory)
     emit(
-        [shown, vectors.memory_line(), studies.memory_line(resident), *machine_lines(facts)],
+        [shown, *memory, *machine_lines(facts)],
         {
             "rows": [row.as_json() for row in rows],
             "study_resident_megabytes": resident,

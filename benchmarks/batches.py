@@ -19,7 +19,7 @@ from thruster_env.dynamics import Constants, substep
 from thruster_env.plant import Plant
 from tuning.evaluation.evaluate import evaluate
 from tuning.problems.seeds import training_seeds
-from tuning.search.space import Choice, true_choice
+from tuning.search.space import Choice, oracle_choice
 from tuning.thruster.find import find_scenario
 
 SEEDS, ENSEMBLE_SIZE = 64, 50
@@ -36,7 +36,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     rounds = 5 if quick else 60
     scenario = find_scenario("nominal")
     data = scenario.data(training_seeds(seed, SEEDS))
-    choice = true_choice("enkf", scenario).with_size(ENSEMBLE_SIZE)
+    choice = oracle_choice("enkf", scenario).with_size(ENSEMBLE_SIZE)
     count = SEEDS * scenario.steps * ENSEMBLE_SIZE
 
     def judge():

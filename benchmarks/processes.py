@@ -18,12 +18,12 @@ TUNING_IMPORTS = """
 from tuning.evaluation.evaluate import evaluate
 from tuning.thruster.find import find_scenario
 from tuning.problems.seeds import training_seeds
-from tuning.search.space import true_choice
+from tuning.search.space import oracle_choice
 """
 FIRST_EVALUATION = """
 scenario = find_scenario("nominal")
 data = scenario.data(training_seeds({seed}, 64))
-evaluate(true_choice("enkf", scenario).with_size(50).filter(scenario), data, scenario.scale)
+evaluate(oracle_choice("enkf", scenario).with_size(50).filter(scenario), data, scenario.scale)
 """
 
 

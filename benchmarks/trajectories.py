@@ -18,7 +18,7 @@ from filters.filter import Filter
 from numerics.threads import cores
 from tuning.problems.data import Data
 from tuning.problems.seeds import training_seeds
-from tuning.search.space import true_choice
+from tuning.search.space import oracle_choice
 from tuning.thruster.find import find_scenario
 
 TRAJECTORIES, ENSEMBLE_SIZE = 256, 100
@@ -32,11 +32,11 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     count = TRAJECTORIES // 4 if quick else TRAJECTORIES
     data, steps = scenario.data(training_seeds(seed, count)), count * scenario.steps
     for name, goal in ALONE:
-        filter_ = true_choice(name, scenario).filter(scenario)
+        filter_ = oracle_choice(name, scenario).filter(scenario)
         measure = shared(partial(estimates, filter_, data), steps)
         yield Row(f"{name.upper()} batch, a step", None, alone(measure, 5 if quick else 40), time_goal=goal)
 
-    filter_ = true_choice("enkf", scenario).with_size(ENSEMBLE_SIZE).filter(scenario)
+    filter_ = oracle_choice("enkf", scenario).with_size(ENSEMBLE_SIZE).filter(scenario)
     ours = shared(partial(estimates, filter_, data), steps * ENSEMBLE_SIZE)
     rounds, what = 2 if quick else 10, f"EnKF batch, N = {ENSEMBLE_SIZE}"
     yield Row(what, None, alone(ours, 5 * rounds), time_goal=8e-9)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -61,14 +61,17 @@ def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unkno
         walks.append(positive(f"walk_std of {name}", unknown.walk_std, zero_allowed=True) ** 2)
     if not places:
         raise ValueError("parameters must name at least one constant, but got none")
-    functions = _augmented_functions(*model.functions, model.shape, tuple(places))
+    functions: dict[str, Any] = _augmented_functions(*model.functions, model.shape, tuple(places))
     spread = np.sqrt(np.add(variances, walks))
-    further = {
+    further: dict[str, Any] = {
         "operating_state": means,
         "state_low": np.subtract(means, 2.0 * spread),
         "state_high": np.add(means, 2.0 * spread),
     }
-    known = {name: getattr(model, name) for name in further}
+    given = {name: getattr(model, name) for name in further}
+    helpful: dict[str, Any] = {
+        name: None if value is None else np.append(value, further[name]) for name, value in given.items()
+    }
     return StateSpaceModel(
         **functions,
         process_noise_cov=_block_diagonal(model.process_noise_cov, walks),
@@ -82,7 +85,7 @@ def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unkno
         states=(*model.states, *(Quantity(str(name), str(name)) for name in parameters)),
         input_quantities=model.input_quantities,
         measurements=model.measurements,
-        **{name: None if value is None else np.append(value, further[name]) for name, value in known.items()},
+        **helpful,
     )
 
 
@@ -121,7 +124,7 @@ def _augmented_functions(
 ) -> dict[str, Callable | None]:
     """Functions of the augmented model; its constants are the model's own, then the spread of each parameter."""
     n, m, form, count, added = shape.n, shape.m, shape.form, shape.constants, len(places)
-    names = {
+    names: dict[str, Any] = {
         "f": transition,
         "h": observe,
         "fill": _filler(form, count, places),
@@ -149,7 +152,7 @@ def _augmented_functions(
         ones = {f"one{q}": ((1, 1), n + q, n + q) for q in range(added) if identity}
         for q in range(added):
             lines.append(f"slope{q} = difference(above{q}, below{q}, step{q})")
-        tools = {
+        tools: dict[str, Any] = {
             "difference": _difference_quotient(size, angles),
             "one": entrywise("one", "", (1, 1), lambda i, j: "1.0"),
             "whole": assembled(

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from filters.engine.belief import Belief, Innovation, Kernels
-from filters.engine.session import Session
+from filters.engine.session import Running, Session
 from plants.state_space import StateSpaceModel
 
 
@@ -57,7 +57,7 @@ class Filter:
 
     def init(self, key: tuple[int, int] = (0, 0)) -> Belief:
         """The prior as a belief; key is two integers from 0 to 2^32 - 1, else it raises ValueError."""
-        session = self.session()
+        session = Session(self)
         session.set_key(key)
         session.run("start")
         return session.belief()
@@ -71,7 +71,7 @@ class Filter:
         Raises ValueError for an input that is not p finite numbers, and for a belief that is none: of another kind
         of filter, not finite, or with a covariance that is not positive semidefinite.
         """
-        session = self.session()
+        session = Session(self)
         session.load(belief)
         self.check_noise(process_noise_cov)
         session.set_noise(process_noise_cov=process_noise_cov)
@@ -85,7 +85,7 @@ class Filter:
 
         Raises ValueError for a measurement that is not m numbers, finite or NaN, and as `predict` for a belief.
         """
-        session = self.session()
+        session = Session(self)
         session.load(belief)
         self.check_noise(measurement_noise_cov)
         session.set_noise(measurement_noise_cov=measurement_noise_cov)
@@ -99,6 +99,6 @@ class Filter:
                 f"Q and R of the filter {self.name!r} cannot vary from step to step, but got one that does"
             )
 
-    def session(self) -> Session:
+    def session(self) -> Running:
         """This filter at work in place on one belief, which is quicker than values."""
         return Session(self)

@@ -97,8 +97,8 @@ def _accumulated(model: StateSpaceModel, given: tuple, informative: bool) -> tup
     """Log-likelihood with gradient, (B, 1 + p), and the information, (B, p, p), or nothing in its place."""
     inputs, measurements, q_slopes, r_slopes = (np.ascontiguousarray(value, dtype=np.float64) for value in given)
     n, m, count, parameters = model.n, model.m, len(measurements), len(q_slopes)
-    given = {"inputs": inputs, "measurements": measurements, "q_slopes": q_slopes, "r_slopes": r_slopes}
-    check_shapes(given, model, (parameters, n, n), (parameters, m, m))
+    arrays = {"inputs": inputs, "measurements": measurements, "q_slopes": q_slopes, "r_slopes": r_slopes}
+    check_shapes(arrays, model, (parameters, n, n), (parameters, m, m))
     out = np.zeros((count, 1 + parameters))
     told = np.zeros((count, parameters, parameters) if informative else (count, 0, 0))
     accumulate = _build(model.functions, model.shape, informative, is_interpreting())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from numerics.tuples import matrix_writer, scaled_sum, vector_reader, vector_wri
 @cache
 def slope_along(rows: int, columns: int, matrix, arguments: str):
     """`slope(curvature, x, scales, d, <arguments>)`: a Jacobian's derivative along d, by central differences."""
-    arrays = {"result": (rows, columns), "x": (columns,), "scales": (columns,), "d": (columns,)}
+    arrays: dict[str, Any] = {"result": (rows, columns), "x": (columns,), "scales": (columns,), "d": (columns,)}
     source = Source("slope", f"curvature, x, scales, d, {arguments}", **arrays)
     if source.loops:
         source.line("h = 1e-300")

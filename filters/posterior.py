@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -128,7 +128,7 @@ def _posterior_bound(model: StateSpaceModel, inputs: np.ndarray, keys: np.ndarra
     def gather(about_mean: bool) -> None:
         add = _gatherer(model.functions, model.shape, about_mean, is_interpreting())
         for some in told("truths", parts, [part.shape[1] for part in parts]):
-            spread(lambda first, last, some=some: add(some, *fixed, *sums, first, last), count)
+            spread(partial(add, some, *fixed, *sums), count)
 
     gather(False)
     for part in sums:

@@ -97,8 +97,8 @@ def _step(count: int) -> Callable:
 @cache
 def _moved(rows: int, columns: int, angles: tuple[bool, ...]) -> Callable:
     """Return `move(a, dx, above, below, h)`: a dx + (above - below)/2h, angles the short way round."""
-    product, vectors = formula("A dx", A=(rows, columns), dx=(columns,)), ("y", "above", "below")
-    source = Source("total", "y, above, below, h", result=(rows,), **dict.fromkeys(vectors, (rows,)))
+    product, row = formula("A dx", A=(rows, columns), dx=(columns,)), (rows,)
+    source = Source("total", "y, above, below, h", result=row, y=row, above=row, below=row)
     entries = source.vector(
         rows, lambda i: f"y[{i}] + " + short_way(f"(above[{i}] - below[{i}])", i, angles) + " / (2.0 * h)"
     )

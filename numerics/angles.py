@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,7 @@ def wrapped(x):
     return x - whole_turns(x)
 
 
-NAMES = {  # of sources about angles
+NAMES: dict[str, Any] = {  # of sources about angles
     "wrapped": wrapped,
     "whole_turns": whole_turns,
     "sin": np.sin,

@@ -7,6 +7,7 @@ writing one does not slow the reading of another.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -74,8 +75,10 @@ def spin_for_call(flags, call):
 @cache
 def teach_numba() -> None:
     """Have numba compile `read`, `post`, `take` and `yield_core` to what the processor has for it."""
-    from numba import types
-    from numba.extending import intrinsic, overload
+    from numba import extending, types
+    from numba.extending import overload
+
+    intrinsic: Callable = extending.intrinsic  # numba passes the context, of which its annotations do not know
 
     @intrinsic
     def load(context, flags, place):

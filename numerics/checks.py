@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
 from types import NoneType
 
 import numpy as np
@@ -105,10 +106,27 @@ def options(value) -> Mapping:
 
 
 def one_of(name: str, value, choices: Iterable[str]) -> str:
-    """Return value; raise ValueError unless it is one of the choices."""
-    if not isinstance(value, str) or value not in tuple(choices):
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, but got {shown(value)}")
+    """Return value; raise ValueError, with the name that comes nearest, unless it is one of the choices."""
+    known = tuple(choices)
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"{name} must be one of {', '.join(known)}, but got {shown(value)}{meant(value, known)}")
     return value
+
+
+def any_case(value, choices: Iterable[str]):
+    """The choice that differs from a value in its case at most; the value itself where there is none."""
+    if isinstance(value, str):
+        return next((one for one in choices if one.casefold() == value.casefold()), value)
+    return value
+
+
+def meant(value, choices: Iterable[str]) -> str:
+    """The end of a message on an unknown name: "; did you mean 'ekf'?", empty if no choice is near."""
+    if not isinstance(value, str):
+        return ""
+    plain = {one.casefold(): one for one in choices}
+    near = get_close_matches(value.casefold(), plain, n=1)
+    return f"; did you mean {plain[near[0]]!r}?" if near else ""
 
 
 def vector(name: str, value, size: int | None = None) -> np.ndarray:
@@ -161,6 +179,6 @@ def covariance_root(cov: np.ndarray) -> np.ndarray:
     """A lower triangular L with L L' = cov for a positive semidefinite covariance, zero variances allowed."""
     eigenvalues, vectors = np.linalg.eigh(cov)
     root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
-    lower = np.linalg.qr(root.T, mode="r").T
+    lower = np.linalg.qr(root.T).R.T
     signs = np.where(np.diag(lower) < 0, -1.0, 1.0)
     return lower * signs

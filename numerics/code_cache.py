@@ -15,6 +15,7 @@ import threading
 import warnings
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 RULE = "machine code must be kept where it can be written: set NUMBA_CACHE_DIR to a folder of yours; "
 _changing_config = threading.Lock()
@@ -110,9 +111,10 @@ def private_folder() -> str | None:
 
 def _in_folder(function, folder: str):
     """The cache of a function below a folder."""
-    from numba import config
+    import numba
     from numba.core.caching import FunctionCache
 
+    config: Any = numba.config  # a module that makes its settings when it is imported
     with _changing_config:
         before, config.CACHE_DIR = config.CACHE_DIR, folder
         try:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 
@@ -14,6 +16,8 @@ from numerics.sources import Index, is_array, matrix_of, tuple_of, written_out
 
 RELATIVE_STEP = 6e-6  # cube root of the float64 resolution balances truncation and rounding
 COMPLEX_STEP = 1e-100  # nothing is subtracted, so it may be as small as one likes
+
+_EXACT: WeakSet[Callable] = WeakSet()  # what `complex_step` has returned
 
 
 def _stores(rows: int, entry: Callable) -> list[str]:
@@ -45,13 +49,13 @@ def complex_step(function: Callable, rows: int, columns: int, arguments: str) ->
         lines.append(f"y{j} = function({point}, {arguments})")
     source = matrix_of(rows, columns, lambda i, j: f"(0j + y{j}[{i}]).imag / {COMPLEX_STEP}")
     made = written_out("jacobian", f"x, {arguments}", *lines, source, function=inlined(function))
-    made.differentiates = function
+    _EXACT.add(made)
     return made
 
 
 def _complex_step_in_loops(function: Callable, rows: int, columns: int, arguments: str) -> Callable:
     if is_array(columns):
-        point = "point = x + 0j", f"point[j] = complex(x[j], {COMPLEX_STEP})"
+        point: tuple[str, ...] = "point = x + 0j", f"point[j] = complex(x[j], {COMPLEX_STEP})"
     else:
         step = f"{COMPLEX_STEP} if j == {{0}} else 0.0"
         point = ("point = " + tuple_of(f"complex(x[{i}], {step.format(i)})" for i in range(columns)),)
@@ -65,8 +69,13 @@ def _complex_step_in_loops(function: Callable, rows: int, columns: int, argument
     made = written_out(
         "jacobian", f"x, {arguments}", *lines, "out", _loops=True, function=inlined(function), np=np
     )
-    made.differentiates = function
+    _EXACT.add(made)
     return made
+
+
+def by_complex_step(function: Callable) -> bool:
+    """Whether a Jacobian is one that `complex_step` has returned."""
+    return function in _EXACT
 
 
 def _differences_in_loops(
@@ -87,7 +96,7 @@ def _differences_in_loops(
     body = f"h = {RELATIVE_STEP} * (abs({size}) + {scale})", *sides, *stores
     start = f"out = np.empty(({rows}, {columns}))", *copies, f"for j in range({columns}):"
     lines = *start, *(f"    {line}" for line in body)
-    names = {"function": inlined(function), "np": np, **NAMES}
+    names: dict[str, Any] = {"function": inlined(function), "np": np, **NAMES}
     return written_out("jacobian", f"x, scales, {arguments}", *lines, "out", _loops=True, **names)
 
 

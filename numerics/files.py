@@ -66,8 +66,8 @@ def write_whole(path: str | Path, content: str | bytes | Callable[[BinaryIO], No
         if found is None or _is_replaced(found):
             _replace(_target(path), content, found)
         else:
-            with open(path, "ab") as stream:
-                stream.write(content)
+            with open(path, "ab") as there:
+                there.write(content)
     except OSError as error:
         raise _refusal(path, error) from None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 from numerics.matrices import multiplier, transposed_multiplier, transposer, vector_multiplier
 from numerics.sources import LONGEST_TEXT, Source, is_array, matrix_of, tuple_of, written_out
@@ -82,7 +83,10 @@ def _size(name: str, shapes: dict) -> tuple[int, int]:
 
 def _product_by_product(text: str, products: list[tuple[str, str]], shapes: dict) -> Callable:
     """The same formula as calls of functions of two matrices."""
-    lines, names, parts, made = [], [], {}, set()
+    lines: list[str] = []
+    names: list[str] = []
+    parts: dict[str, Any] = {}
+    made: set[tuple[int, int, int]] = set()
 
     def call(function: Callable, *arguments: str) -> str:
         parts[f"f{len(parts)}"] = function
@@ -109,14 +113,15 @@ def _product_by_product(text: str, products: list[tuple[str, str]], shapes: dict
     rows, columns, dimensions = _only(made, text, shapes)
     shape = (rows, columns)[:dimensions]
     terms = [f"a{place}" for place in range(len(names))]
-    source = Source("total", ", ".join(terms), result=shape, **dict.fromkeys(terms, shape))
+    of_terms: dict[str, Any] = dict.fromkeys(terms, shape)
+    source = Source("total", ", ".join(terms), result=shape, **of_terms)
     signs = [sign or "+" for sign, _ in products]
 
     def entry(*place):
         at = "".join(f"[{i}]" for i in place)
         return " ".join(f"{sign} {term}{at}" for sign, term in zip(signs, terms, strict=True))
 
-    total = source.function((source.vector if dimensions == 1 else source.matrix)(*shape, entry))
+    total = source.function(source.entries(shape, entry))
     result = f"total({', '.join(names)})"
     return written_out("formula", ", ".join(shapes), *lines, result, total=total, _loops=True, **parts)
 

@@ -113,10 +113,10 @@ def quadratic_form(rows: int, columns: int) -> Callable:
 
         return source.function(source.matrix(columns, columns, entry))
 
-    def entry(i, j):
+    def sum_of_products(i, j):
         return " + ".join(f"a[{p}][{i}] * w[{p}][{q}] * a[{q}][{j}]" for p in range(rows) for q in range(rows))
 
-    return source.function(source.matrix(columns, columns, entry))
+    return source.function(source.matrix(columns, columns, sum_of_products))
 
 
 @cache

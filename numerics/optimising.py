@@ -9,7 +9,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable
 from functools import wraps
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 LEVEL = 2  # of LLVM's optimisation of large functions: of the third, loops over long rows gain a tenth
 
@@ -88,7 +88,7 @@ def _listener(base: type, asked: Callable[[Callable], bool]):
     return Compiling()
 
 
-def _optimise_outermost(library: type, compiling, which: Which) -> None:
+def _optimise_outermost(library: Any, compiling, which: Which) -> None:
     optimise = library._optimize_final_module
 
     @wraps(optimise)
@@ -113,7 +113,7 @@ def _optimise_outermost(library: type, compiling, which: Which) -> None:
     library._optimize_final_module = optimise_outermost
 
 
-def _emit_outermost(library: type, codegen: type | None, compiling, which: Which) -> None:
+def _emit_outermost(library: Any, codegen: Any, compiling, which: Which) -> None:
     """Make no machine code of functions without a wrapper for Python: their callers contain them."""
     names = "_finalize_final_module", "_finalize_dynamic_globals"
     if not all(hasattr(library, name) for name in names) or not hasattr(codegen, "set_env"):

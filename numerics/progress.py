@@ -23,6 +23,13 @@ def listening(listener: Callable[[str], None]) -> Iterator[None]:
         _listener.reset(before)
 
 
+def tell(text: str) -> None:
+    """Tell what goes on, if anybody listens."""
+    listener = _listener.get()
+    if listener is not None:
+        listener(text)
+
+
 def told(what: str, parts: Sequence[Part], sizes: Sequence[int] | None = None) -> Iterator[Part]:
     """The parts of some work one after the other; before each it is told how much is done.
 
@@ -42,7 +49,8 @@ def told(what: str, parts: Sequence[Part], sizes: Sequence[int] | None = None) -
         for part, size in zip(parts, sizes, strict=True):
             text = f"{around}{what}: {done} of {sum(sizes)}"
             _around.set(f"{text}, ")
-            _listener.get()(text)
+            if (listener := _listener.get()) is not None:  # whoever listened may have stopped meanwhile
+                listener(text)
             yield part
             done += size
     finally:

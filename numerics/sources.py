@@ -15,9 +15,7 @@ import numpy as np
 
 from numerics.written import matrix_of, tuple_of, written_out
 
-LARGEST_TUPLE = (
-    36  # entries of a vector or matrix that is a tuple; as many have the nine sigma points of four states
-)
+LARGEST_TUPLE = 36  # entries of a vector or matrix that is a tuple: as many have nine sigma points of four states
 LARGEST_SIDE = 5  # of a matrix that is one
 LONGEST_TEXT = 128  # products that are written out: those of two matrices of five rows
 
@@ -248,6 +246,10 @@ class Source:
                 self.line(f"{out[i, j]} = {entry(i, j)}")
         return self.whole(out)
 
+    def entries(self, shape: tuple[int, ...], entry: Callable) -> str:
+        """Source of a vector or matrix of this shape, as `vector` or `matrix` has it."""
+        return self.vector(shape[0], entry) if len(shape) == 1 else self.matrix(shape[0], shape[1], entry)
+
     def symmetric(self, name: str, size: int, entry: Callable) -> str:
         """Source of a symmetric matrix whose entries on and below the diagonal have the sources entry(i, j)."""
         out = self.local(name, size, size)
@@ -277,7 +279,8 @@ class Source:
             return local.name
         if len(local.shape) == 1:
             return tuple_of(local[i] for i in range(local.shape[0]))
-        return matrix_of(*local.shape, (lambda i, j: local[i, j]) if self.loops else entry)
+        rows, columns = local.shape
+        return matrix_of(rows, columns, (lambda i, j: local[i, j]) if self.loops else entry)
 
     def function(self, result: str = "None", **names) -> Callable:
         """The function, which returns the expression `result`; `names` are its globals."""
@@ -290,4 +293,4 @@ def entrywise(
 ) -> Callable:
     """Return the function of a vector or matrix whose entries have the sources entry(i) or entry(i, j)."""
     source = Source(name, arguments, result=shape, work=work, **shapes)
-    return source.function((source.vector if len(shape) == 1 else source.matrix)(*shape, entry))
+    return source.function(source.entries(shape, entry))

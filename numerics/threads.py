@@ -88,7 +88,7 @@ class WorkerThreads:
         """Start `helpers` threads."""
         self._flags, self._nothing = new_flags(1), new_flags(1)
         self._calls = itertools.count(1)
-        self._jobs = [SimpleQueue() for _ in range(helpers)]
+        self._jobs: list[SimpleQueue] = [SimpleQueue() for _ in range(helpers)]
         for place, jobs in enumerate(self._jobs, 1):
             name, arguments = f"numerics-worker-{place}", (place, jobs)
             threading.Thread(target=self._help, args=arguments, name=name, daemon=True).start()
@@ -106,7 +106,8 @@ class WorkerThreads:
 
     def _share(self, part: Callable, count: int, arguments: tuple) -> None:
         flags, helpers, call = self._flags, len(self._jobs), next(self._calls)
-        marks, errors = new_flags(helpers + 1), []
+        marks = new_flags(helpers + 1)
+        errors: list[BaseException] = []
         try:
             for place, jobs in enumerate(self._jobs, 1):
                 if jobs.qsize() < BEHIND:  # else it would keep the arguments of calls that are over

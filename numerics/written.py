@@ -43,11 +43,17 @@ def _shown_in_tracebacks(name: str, text: str) -> str:
     shown = ", ".join(str(size) for size in sizes if type(size) is int)
     stem = f"{name}, written out by {frame.f_globals.get('__name__')}.{code.co_name}({shown})"
     number, file = 1, f"<{stem}>"
-    while file in linecache.cache and "".join(linecache.cache[file][2]) != text:
+    while _holds_another(file, text):
         number += 1
         file = f"<{stem} {number}>"
     linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
     return file
+
+
+def _holds_another(file: str, text: str) -> bool:
+    """Whether `linecache` holds another text under a name."""
+    held = linecache.cache.get(file)
+    return held is not None and (len(held) == 1 or "".join(held[2]) != text)
 
 
 def made_here(function: Callable) -> bool:

@@ -21,7 +21,7 @@ from studies.benchmark import find_benchmark
 from studies.lorenz63 import problem as lorenz63
 from studies.pendulum import problem as pendulum
 from studies.tuned_inflation import tune_inflation
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, quiet_optuna, run_study
 
@@ -53,7 +53,7 @@ def pendulum_errors() -> str:
     for name in ("ekf", "ukf"):
         plan = Plan(name, (pendulum,))
         choice = run_study(open_study("pendulum", plan, None), plan, TRIALS).choice
-        proof = prove(choice, pendulum, 0)
+        proof = evaluate_held_out(choice, pendulum, 0)
         for word, one in (("rule of thumb", proof.untuned), ("tuned", proof.tuned)):
             sigma = choice.model["sigma"] if word == "tuned" else pendulum.untuned["sigma"]
             errors = [f"{part.value:.3f} ± {(part.high - part.low) / 2:.3f}" for part in one.rmse]

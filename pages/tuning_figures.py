@@ -20,7 +20,7 @@ from pages.tuning_recovery import TABLES as RECOVERY_TABLES
 from pages.tuning_recovery import bad_start
 from tuning.evaluation.baselines import ORACLE, RULE, SCALED
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.likelihood.gradient import maximise_likelihood
 from tuning.search.objectives import NIS_BAND
 from tuning.search.plan import Plan
@@ -93,7 +93,7 @@ def earned(scenarios: Sequence[str] = EARNING, trials: int = TRIALS) -> str:
         scenario = find_scenario(name)
         for kind in FILTERS:
             result = studied(kind, scenario, trials=trials)
-            proof = prove(result.choice, scenario, SEED)
+            proof = evaluate_held_out(result.choice, scenario, SEED)
             found = proof.ratios
             ratios = [_about(found[one]) if one in found else "none" for one in (SCALED, RULE, ORACLE)]
             ratios.append(f"{result.choice.numbers['ensemble_size']}" if result.sizes else "")
@@ -110,7 +110,7 @@ def recovered() -> str:
     for name in ("published_tunnel", "published_open_bladed"):
         scenario = find_scenario(name)
         bad = bad_start("kf", scenario)
-        proof = prove(studied("kf", scenario, bad).choice, scenario, SEED)
+        proof = evaluate_held_out(studied("kf", scenario, bad).choice, scenario, SEED)
         started = evaluate(bad.filter(scenario), scenario.data(proof.seeds), scenario.scale)
         ratios = (score_ratio(one, proof.true) for one in (started, proof.tuned))
         rows.append([f"`{name}`", *(_about(ratio, 4) for ratio in ratios)])

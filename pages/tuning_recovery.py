@@ -16,11 +16,11 @@ import numpy as np
 from filters.consistency.intervals import Interval
 from pages.page import make_page, table
 from tuning.evaluation.evaluate import score_ratio
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.likelihood.gradient import BAD_START
 from tuning.likelihood.identifiability import Identifiability, identify
 from tuning.search.plan import Plan
-from tuning.search.space import Choice, parameters_of, true_choice
+from tuning.search.space import Choice, oracle_choice, parameters_of
 from tuning.search.study import open_study, quiet_optuna, run_study
 from tuning.thruster.find import find_scenario
 from tuning.thruster.scenario import Scenario
@@ -40,7 +40,7 @@ class Found(NamedTuple):
 
 def bad_start(kind: str, scenario: Scenario) -> Choice:
     """The true filter with a hundredth of Q22 and a hundred times R."""
-    true = true_choice(kind, scenario)
+    true = oracle_choice(kind, scenario)
     q, r = np.array(true.model["process_noise_cov"]), true.model["measurement_noise_cov"]
     bad = {"process_noise_cov": tuple((q * BAD_START[:2]).tolist()), "measurement_noise_cov": r * BAD_START[2]}
     return true._replace(model=bad)
@@ -51,12 +51,12 @@ def found_again(kind: str, name: str, trials: int, seeds: Sequence[int] = SEEDS)
     """What studies with several seeds find from the bad start."""
     quiet_optuna()
     scenario = find_scenario(name)
-    true, found = parameters_of(true_choice(kind, scenario)), []
+    true, found = parameters_of(oracle_choice(kind, scenario)), []
     for seed in seeds:
         plan = Plan(kind, (scenario,), seed)
         study = open_study("page", plan, None, bad_start(kind, scenario))
         choice = run_study(study, plan, trials).or_interrupted().choice
-        proof = prove(choice, scenario, seed)
+        proof = evaluate_held_out(choice, scenario, seed)
         known = identify(choice, plan.scenarios, plan.training_data(), plan.space())
         ratios = known.tuned / [true[number] for number in known.names]
         found.append(Found(ratios, score_ratio(proof.tuned, proof.true), known))

@@ -28,7 +28,9 @@ def affine_functions(n: int, m: int, p: int) -> dict[str, Callable]:
 
     def function(name: str, arguments: str, rows: int, matrices: dict, offset: int) -> Callable:
         """The sum of products of matrices, by their first places and columns, with vectors, and of the offset."""
-        shapes = {argument: sizes[argument] for argument in arguments.split(", ") if argument in sizes}
+        shapes: dict[str, Any] = {
+            argument: sizes[argument] for argument in arguments.split(", ") if argument in sizes
+        }
         source = Source(name, arguments, result=(rows,), work=rows * (n + p), **shapes)
 
         def entry(i):
@@ -41,7 +43,8 @@ def affine_functions(n: int, m: int, p: int) -> dict[str, Callable]:
         return source.function(source.vector(rows, entry))
 
     def slopes(name: str, arguments: str, rows: int, first: int) -> Callable:
-        source = Source(name, arguments, result=(rows, n), **{key: sizes[key] for key in "c" if key in sizes})
+        shapes: dict[str, Any] = {key: sizes[key] for key in "c" if key in sizes}
+        source = Source(name, arguments, result=(rows, n), **shapes)
         return source.function(source.matrix(rows, n, lambda i, j: f"c[{i * n + j + first}]"))
 
     a, b, state_offset, c, measurement_offset = starts

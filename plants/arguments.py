@@ -48,8 +48,9 @@ def takes_arguments_of(
             bound.apply_defaults()
             return function(**bound.arguments)
 
-        call.__signature__ = signature
-        return call
+        decorated: Any = call
+        decorated.__signature__ = signature
+        return decorated
 
     return decorate
 

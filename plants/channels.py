@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from numerics.compiled import inlined
 from numerics.results import as_array
@@ -51,7 +51,9 @@ def reader_of(channels: Sequence[Channel], of_copy: Callable[[Callable], Callabl
     codes = sorted(channel.code for channel in channels)
     if len(set(codes)) < len(codes):
         raise ValueError(f"codes of channels must differ from one another, but got {codes}")
-    functions = {f"read_{channel.code}": inlined(of_copy(inlined(channel.read))) for channel in channels}
+    functions: dict[str, Any] = {
+        f"read_{channel.code}": inlined(of_copy(inlined(channel.read))) for channel in channels
+    }
     source = f"read_{codes[0]}({arguments})"
     for code in codes[1:]:
         source = f"read_{code}({arguments}) if code == {code} else {source}"
@@ -68,9 +70,18 @@ def functions_of(
         outputs: `outputs(x, c)`, the plant's outputs y.
         outputs_jacobian: `outputs_jacobian(x, c)`, their derivatives by rows.
         states: number of components of x.
+
+    Raises:
+        ValueError: if a channel depends on the input.
     """
-    reads = {f"read_{i}": inlined(channel.read) for i, channel in enumerate(channels)}
-    slopes = {f"slopes_{i}": inlined(channel.slopes) for i, channel in enumerate(channels)}
+    reads: dict[str, Any] = {f"read_{i}": inlined(channel.read) for i, channel in enumerate(channels)}
+    slopes: dict[str, Any] = {}
+    for i, channel in enumerate(channels):
+        if channel.slopes is None:
+            raise ValueError(
+                f"a channel of a model must not depend on the input, but {channel.quantity.name} does"
+            )
+        slopes[f"slopes_{i}"] = inlined(channel.slopes)
     readings = tuple_of(f"{name}(x, y, (), c)" for name in reads)
     rows = tuple_of(f"{name}(x, dy, c)" for name in slopes)
     observe = written_out("observe", "x, c", "y = outputs(x, c)", readings, outputs=outputs, **reads)

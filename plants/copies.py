@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from numerics.compiled import compiled, function_fingerprint, inlined, is_interpreting
+from numerics.compiled import CompiledOrPython, compiled, function_fingerprint, inlined, is_interpreting
 from numerics.threads import in_parts, worker_threads
 from plants.memory import KEY_0, KEY_1, gathered, new_memory, scatter, set_row
 
@@ -44,7 +44,7 @@ class PlantCopies:
         self.memory = new_memory(count, rows)
         self._find_machine_code()
 
-    def machine_code(self) -> tuple[Callable, Callable]:
+    def machine_code(self) -> tuple[Callable, CompiledOrPython]:
         """The compiled step, and the same for threads to share out, as `machine_code_of` gives both."""
         raise NotImplementedError
 
@@ -115,13 +115,13 @@ class PlantCopies:
         return out.reshape(self.reported, -1)
 
 
-def machine_code_of(step: Callable) -> tuple[Callable, Callable]:
+def machine_code_of(step: Callable) -> tuple[Callable, CompiledOrPython]:
     """The step of a plant's class as `PlantCopies.machine_code` has to give it, from a plain function."""
     return _machine_code_of(step, is_interpreting())
 
 
 @cache
-def _machine_code_of(step: Callable, interpreting: bool) -> tuple[Callable, Callable]:
+def _machine_code_of(step: Callable, interpreting: bool) -> tuple[Callable, CompiledOrPython]:
     inlined(step)
     fingerprint = function_fingerprint(step, within=step.__module__)
 

@@ -57,7 +57,7 @@ def _points(sizes: tuple[int, ...]) -> list[list[tuple[float, ...]]]:
 
 def _values(function: Callable, model: StateSpaceModel, sizes: tuple[int, ...]) -> list:
     """What a function returns at the points, in digits, or what it raises."""
-    found = []
+    found: list = []
     for point in _points(sizes):
         try:
             with np.errstate(all="ignore"):

@@ -38,6 +38,7 @@ class ModelEnv(gym.Env):
     """
 
     metadata = {"render_modes": []}
+    action_space: gym.spaces.Box
 
     def __init__(
         self,

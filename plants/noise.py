@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
 from numerics.compiled import inlined
 from numerics.streams import normal_block
@@ -33,7 +34,7 @@ def noise_adder(size: int, first: int, root: int, stream: int) -> Callable:
     for i in range(size):
         terms = " + ".join(f"numbers[{root + i * size + k}] * w{k}" for k in range(i + 1))
         lines.append(f"    memory[b, {first + i}, j] += {terms}")
-    names = {"normal_block": normal_block, "KEY_0": KEY_0, "KEY_1": KEY_1, "STEP": STEP}
+    names: dict[str, Any] = {"normal_block": normal_block, "KEY_0": KEY_0, "KEY_1": KEY_1, "STEP": STEP}
     return written_out("add", "memory, b, numbers", *lines, "None", **names)
 
 

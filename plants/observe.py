@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector.utils import batch_space
@@ -20,7 +22,7 @@ class ObserveState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         """Wrap the env; see the class."""
         gym.utils.RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
-        base = env.unwrapped
+        base: Any = env.unwrapped
         self._appended = base.appended_entries
         self.observation_space = _space(base.report_rows.states + self._appended)
 
@@ -45,14 +47,15 @@ class ObserveStateVector(gym.vector.VectorWrapper):
     def __init__(self, env: gym.vector.VectorEnv):
         """Wrap the envs; see the class."""
         super().__init__(env)
-        base = env.unwrapped
+        base: Any = env.unwrapped
         self._appended = base.appended_entries
         self.single_observation_space = _space(base.report_rows.states + self._appended)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict | None = None):
         """Reset the envs."""
-        observations, info = self.env.reset(seed=seed, options=options)
+        seeds: Any = seed  # Gymnasium takes a list of them, too, but its annotation does not say so
+        observations, info = self.env.reset(seed=seeds, options=options)
         return _observed(info["state"], observations, self._appended), info
 
     def step(self, actions):

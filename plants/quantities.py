@@ -93,12 +93,16 @@ def _quantity(kind: str, given) -> Quantity:
         made = Quantity(given, given.replace(" ", "_")) if isinstance(given, str) else Quantity(*given)
     except TypeError:
         made = None
-    texts = made is not None and all(isinstance(text, str) for text in made[:3]) and isinstance(made.angle, bool)
-    plain = texts and made.symbol and made.symbol.replace("_", "").replace("-", "").isalnum()
-    if not plain or (made.angle and made.unit != "rad"):
+    if made is None or not _is_valid(made):
         rule = f"each of {kind} must be a name, or have name, symbol (letters, digits, _ and -), unit and angle"
         raise ValueError(f"{rule}, and an angle the unit rad, but got {shown(given)}")
     return made
+
+
+def _is_valid(one: Quantity) -> bool:
+    texts = all(isinstance(text, str) for text in one[:3]) and isinstance(one.angle, bool)
+    plain = texts and one.symbol.replace("_", "").replace("-", "").isalnum()
+    return plain and (not one.angle or one.unit == "rad")
 
 
 def outputs(given: Mapping[str, Output | Sequence]) -> dict[str, Output]:

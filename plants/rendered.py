@@ -3,27 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
+
+if TYPE_CHECKING:
+    from plants.rendering.renderer import PlantRenderer
 
 
 class RenderedEnv(gym.Env):
     """An env with a `plant` that may draw itself, in the modes that its `metadata` name.
 
-    A plant's env says how: `make_renderer` gives what has `begin`, `add(moment)`, `amend(overlay)`, `draw` and
-    `close`, and `moment_of` what it adds of a step's report.
+    A plant's env defines `make_renderer`, which returns its renderer, and `moment_of`, what the renderer adds of a
+    step's report.
     """
 
     metadata: dict[str, Any] = {"render_modes": [], "render_fps": 100}
     render_overlay: Callable[[], Any] | None = None  # a filter wrapper's hook: what it shows beside the truth
 
-    def make_renderer(self):
+    plant: Any
+    _renderer: PlantRenderer | None = None
+
+    def make_renderer(self) -> PlantRenderer:
         """What draws this env in its `render_mode`."""
         raise NotImplementedError
 
-    def moment_of(self, report: list[float]):
+    def moment_of(self, report: list[float]) -> tuple:
         """What the renderer adds of a report."""
         raise NotImplementedError
 

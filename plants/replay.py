@@ -92,8 +92,8 @@ class ReplayEnv(gym.Env):
         return self._last.copy(), info
 
 
-def read_for(log: Log | str | Path, model, **options) -> tuple[Log, Callable[..., StateSpaceModel]]:
-    """A log, read if it is a path, and the function of changes that makes the model at its sample time.
+def read_for(log: Any, model, **options) -> tuple[Log, Callable[..., StateSpaceModel]]:
+    """A log, read if it is a path or a table, and the function of changes that makes the model at its sample time.
 
     Arguments and errors are those of `ReplayEnv`.
     """

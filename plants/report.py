@@ -27,7 +27,7 @@ class ReportRows(NamedTuple):
     def states(self) -> int:
         """Number of states, of a plant whose info has them."""
         place = self.info["state"]
-        return place.stop - place.start
+        return place.stop - place.start if isinstance(place, slice) else 1
 
     @property
     def flags(self) -> tuple[int, ...]:

@@ -25,7 +25,7 @@ class Shape(NamedTuple):
     @property
     def constants(self) -> int:
         """Number of the model's constants."""
-        return self.form if isinstance(self.form, int) else len(self.form._fields)
+        return self.form if isinstance(self.form, int) else len(getattr(self.form, "_fields", ()))
 
 
 class Functions(NamedTuple):

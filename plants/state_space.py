@@ -6,13 +6,13 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from numerics.checks import at_least, covariance, covariance_root, one_of, vector
 from numerics.compiled import inlined
-from numerics.derivatives import complex_step
+from numerics.derivatives import by_complex_step, complex_step
 from numerics.pickling import as_function, as_made
 from numerics.results import array_valued
 from numerics.sources import is_array
@@ -94,7 +94,7 @@ class StateSpaceModel:
         mean = vector("prior_mean", self.prior_mean)
         n, r = len(mean), self.measurement_noise_cov
         m = len(r) if isinstance(r, (list, tuple, np.ndarray)) and np.ndim(r) else 1
-        checked = {
+        checked: dict[str, Any] = {
             "prior_mean": mean,
             "prior_cov": covariance("prior_cov", self.prior_cov, n),
             "process_noise_cov": covariance("process_noise_cov", self.process_noise_cov, n),
@@ -129,7 +129,7 @@ class StateSpaceModel:
     def _exact(self, name: str, rows: int, columns: int, arguments: str) -> Callable:
         """The Jacobian given, or one by complex steps; one that was made before `replace` is made anew."""
         given, function = getattr(self, f"{name}_jacobian"), getattr(self, name)
-        if given is not None and not hasattr(given, "differentiates"):
+        if given is not None and not by_complex_step(given):
             return given
         return complex_step(function, rows, columns, arguments)
 
@@ -163,7 +163,7 @@ class StateSpaceModel:
         """The constants as functions get them: an array where there are more than fit into a tuple."""
         return np.array(self.constants) if constants_are_array(self.shape.form) else self.constants
 
-    def replace(self, **changes) -> StateSpaceModel:
+    def replace(self, **changes) -> Self:
         """The same model with some fields changed."""
         return dataclasses.replace(self, **changes)
 

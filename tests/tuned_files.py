@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from filters.tuned_file import OLD_FORMAT, sealed
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
@@ -22,7 +22,7 @@ def write_untuned(
     found = find_scenario(scenario) if isinstance(scenario, str) else scenario
     choice = untuned_choice(name, found)
     result = StudyResult(choice, 1.0, [], [], 0.0, False)
-    write_tuned(path, Plan(name, (found,)), result, [prove(choice, found, 0, seeds)], "s")
+    write_tuned(path, Plan(name, (found,)), result, [evaluate_held_out(choice, found, 0, seeds)], "s")
     return Path(path)
 
 

@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
+import sys
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-COMMANDS = (
-    *(
-        "demo",
-        "inspect",
-        "simulate",
-        "estimate",
-        "identify",
-        "tune",
-        "evaluate",
-        "report",
-        "verify",
-        "compare",
-        "filters",
-    ),
-    *("reproduce", "train", "play", "score", "study"),
-)
+PANELS = {
+    "First steps": ("demo", "inspect", "simulate", "filters", "new"),
+    "Tune a filter and prove it": ("tune", "evaluate", "report", "verify", "compare"),
+    "Recorded logs": ("identify", "estimate"),
+    "Policies": ("train", "score", "play"),
+    "Published results and long studies": ("reproduce", "study"),
+}
+COMMANDS = {name: panel for panel, names in PANELS.items() for name in names}
 MARKUP = "markdown"
+LOADING = "loading ..."
 
 
 class Commands(TyperGroup):
     """The group of commands, each of the module of its name: a `command`, or an `app` of further ones."""
+
+    _listing = False
 
     def list_commands(self, ctx) -> list[str]:
         """Names in the order of the help."""
@@ -36,19 +37,29 @@ class Commands(TyperGroup):
 
     @property
     def commands(self) -> dict:
-        """All commands by name, their modules imported."""
-        for name in COMMANDS:
-            self.get_command(None, name)
-        return self._made
+        """All commands by name, as they are listed."""
+        return {name: listed(name) for name in COMMANDS}
 
     @commands.setter
     def commands(self, given: dict) -> None:
         self._made = given
 
+    def format_help(self, ctx, formatter) -> None:
+        """List the commands without importing them, which takes a second."""
+        self._listing = True
+        try:
+            super().format_help(ctx, formatter)
+        finally:
+            self._listing = False
+
     def get_command(self, ctx, name: str):
         """The command of a name, None if there is none."""
-        if name in COMMANDS and name not in self._made:
-            module = importlib.import_module(f"thruster_cli.{name}")
+        if name not in COMMANDS:
+            return None
+        if self._listing:
+            return listed(name)
+        if name not in self._made:
+            module = imported(f"thruster_cli.{name}")
             alone = typer.Typer(add_completion=False, rich_markup_mode=MARKUP, pretty_exceptions_enable=False)
             if hasattr(module, "app"):
                 alone = module.app
@@ -56,12 +67,42 @@ class Commands(TyperGroup):
                 alone.command(name)(module.command)
             self._made[name] = get_command(alone)
             self._made[name].name = name
-        return self._made.get(name)
+        return self._made[name]
+
+
+def listed(name: str) -> TyperCommand:
+    """A command with its name, panel and help alone, read from its file."""
+    tree = ast.parse(Path(find_spec(f"thruster_cli.{name}").origin).read_text(encoding="utf-8"))
+    functions = [part for part in tree.body if isinstance(part, ast.FunctionDef) and part.name == "command"]
+    text = ast.get_docstring(functions[0] if functions else tree)
+    return TyperCommand(
+        name, help=text if functions else text.partition(": ")[2].capitalize(), rich_help_panel=COMMANDS[name]
+    )
+
+
+def imported(module: str):
+    """A module; on a terminal a word stands there while it is imported, which takes up to a second."""
+    if not sys.stderr.isatty():
+        return importlib.import_module(module)
+    sys.stderr.write(LOADING)
+    sys.stderr.flush()
+    try:
+        return importlib.import_module(module)
+    finally:
+        sys.stderr.write("\r" + " " * len(LOADING) + "\r")
+        sys.stderr.flush()
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"thruster-env {version('thruster-env')}")
+        raise typer.Exit
 
 
 app = typer.Typer(
     cls=Commands,
-    help="A ship's bow thruster, the filters that estimate its hidden state, and the tuning that makes them good.",
+    help="A ship's bow thruster, the filters that estimate its hidden state, and the tuning that makes them good; "
+    "filters and tuning also for any model, env or log of yours.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=MARKUP,
@@ -70,5 +111,9 @@ app = typer.Typer(
 
 
 @app.callback()
-def _callback() -> None:
+def _callback(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
     pass

@@ -8,7 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from studies.benchmark import WHY, Benchmark, Row, find_benchmark
-from thruster_cli.output import announce_compilation, progress_console, table
+from thruster_cli.output import announce_compilation, console, progress_console, table
 
 
 def reproduce_benchmark(name: str, runs: int, seed: int) -> tuple[list, dict]:
@@ -43,9 +43,16 @@ def _table(benchmark: Benchmark, rows: list[Row], runs: int) -> Table:
     return out
 
 
+LEAST = 12  # width of a column of words
+
+
 def fitted(out: Table, rows: list[list[str]], flexible: str = "") -> Table:
-    """The table with numbers that never wrap, and a blank line between rows of two lines."""
+    """The table with a blank line between rows of two lines, and numbers that do not wrap where there is room."""
     out.leading = 1
+    fixed = [place for place, column in enumerate(out.columns) if str(column.header) != flexible]
+    widths = [max(len(line) for row in rows for line in row[place].split("\n")) for place in fixed]
+    if sum(widths) + 2 * len(out.columns) + (LEAST if flexible else 0) > console.width:
+        return out
     for place, column in enumerate(out.columns):
         if str(column.header) == flexible:
             column.justify = "left"

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json as json_module
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from studies.bollard_fit import FITTED, Identified, identify, relative_errors
 from studies.bollard_table import read_table
-from thruster_cli.logs import read_named
 from thruster_cli.output import announce_compilation, check_targets, emit, table
 from thruster_env.logged import Shown
 from thruster_env.parameters import ThrusterParameters, preset_parameters
@@ -18,6 +18,7 @@ from thruster_env.plant import make_plant
 from thruster_env.preset_file import PresetFile, is_file, write_preset
 from tuning.identification.identify import identify as identify_logs
 from tuning.identification.result import Identification
+from tuning.logs.read import read_named
 from tuning.problems.parameter import Parameter
 from tuning.thruster.identification import ThrusterFamily
 
@@ -80,6 +81,18 @@ def identify_bollard(
         "files": [str(out)],
     }
     emit(_report(found, errors, held_out, timed, out), json_module.loads(json_module.dumps(data)), json)
+
+
+def check_of_table(for_logs: Mapping[str, Any]) -> None:
+    """Raise ValueError for an option that only logs can follow, where a table is given in their place.
+
+    Args:
+        for_logs: values of such options by name, empty or false where they are not given.
+    """
+    for name, value in for_logs.items():
+        if value:
+            got = "" if value is True else f" {', '.join(map(str, value)) if isinstance(value, list) else value}"
+            raise ValueError(f"{name} must come with logs, for --bollard fits a table, but got {name}{got}")
 
 
 def from_step(

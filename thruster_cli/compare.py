@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from filters.augmented import Unknown
-from filters.registry import FILTERS, filter_class
-from filters.tuned_file import read_tuned_file
+from filters.registry import FILTERS
 from numerics.checks import at_least
 from thruster_cli.leaderboard import as_json, report
-from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console
-from thruster_cli.presets import OfPresetOption, of_preset
+from thruster_cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption, SeedOption, filter_option
+from thruster_cli.output import announce_compilation, emit, progress_console
 from thruster_cli.problems import PROBLEMS
-from tuning.evaluation.compare import Contender, compare, contender, sized
+from tuning.api.compare import DEFAULT_FILTERS, compared, contenders_of
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
 from tuning.search.plan import HELD_OUT_SEEDS
-from tuning.search.space import Choice, has_ensemble
-
-DEFAULT_FILTERS = ("ekf", "enkf", "pf")
+from tuning.search.space import has_ensemble
+from tuning.thruster.logs import of_preset
 
 
 def command(
@@ -37,23 +31,23 @@ def command(
     ] = None,
     filters: Annotated[
         list[str] | None,
-        typer.Option(
-            "--filter",
-            help=f"{', '.join(FILTERS)}, or module:object for somebody else's estimator; may be repeated. Without "
-            "any, or a file: ekf, enkf, pf.",
+        filter_option(
+            f"{', '.join(FILTERS)}, or module:object for somebody else's estimator; may be repeated. Without any, "
+            f"or a file: {', '.join(DEFAULT_FILTERS)}."
         ),
     ] = None,
     scenarios: Annotated[
         list[str] | None,
-        typer.Option("--problem", "--scenario", help=f"{PROBLEMS} May be repeated."),
+        typer.Option("--problem", "--scenario", help=f"{PROBLEMS} May be repeated.", rich_help_panel=INPUT),
     ] = None,
     preset: OfPresetOption = None,
-    seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,
+    seeds: Annotated[int, typer.Option(help="Number of held-out seeds.", rich_help_panel=RUNS)] = HELD_OUT_SEEDS,
     knows: Annotated[
         str,
         typer.Option(
             help="What a filter named by --filter knows of the plant's noise: true (oracle), scaled (scaled "
-            "default) or untuned (rule of thumb)."
+            "default) or untuned (rule of thumb).",
+            rich_help_panel=FILTER,
         ),
     ] = "true",
     augment: Annotated[
@@ -62,11 +56,16 @@ def command(
             metavar="NAME[:STD[:WALK]]",
             help="Give each --filter a second row, where it also estimates this constant of its model, such as "
             "ambient_velocity, believed to within STD at first and to change by WALK a step.",
+            rich_help_panel=FILTER,
         ),
     ] = None,
     ensemble_size: Annotated[
         list[str] | None,
-        typer.Option(metavar="[FILTER=]N", help="Ensemble size, of all filters or of one; may be repeated."),
+        typer.Option(
+            metavar="[FILTER=]N",
+            help="Ensemble size, of all filters or of one; may be repeated.",
+            rich_help_panel=FILTER,
+        ),
     ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
@@ -85,16 +84,14 @@ def command(
     chosen = [of_preset(one, preset) for one in chosen]
     for file, problem in product(files or [], chosen):
         read_choice(file, problem)  # a clear error for a file that is for another plant
-    contenders = _contenders(files or [], filters or [], knows, augment or [], ensemble_size or [], seed)
-
-    def held_out(problem: Problem) -> range:
-        return problem.held_out_seeds(seed, seeds)
-
+    names = filters or ([] if files else list(DEFAULT_FILTERS))
+    sizes, unknown = dict(map(_size, ensemble_size or [])), dict(map(_unknown, augment or []))
+    contenders = contenders_of([*(files or []), *names], knows, unknown, sizes, seed)
     for problem in chosen:
-        held_out(problem)  # a clear error before any filter runs
+        problem.held_out_seeds(seed, seeds)  # a clear error before any filter runs
     announce_compilation()
-    with _bar(len(contenders) * len(chosen)) as on_row:
-        boards, interrupted = compare(contenders, chosen, held_out, on_row)
+    found = compared(contenders, chosen, seed, seeds, progress_console)
+    boards, interrupted = list(found.boards), found.interrupted
     shown = [part for board in boards for part in report(board)]
     if interrupted:
         shown.append("Interrupted: these are the rows that were done.")
@@ -106,26 +103,6 @@ def command(
 def _default(files: list[Path]) -> Problem:
     """The problem where none is named: that of the first file, or nominal."""
     return [read_tuned(file)[1] for file in files][0] if files else find_problem("nominal")
-
-
-def _contenders(files, filters, knows, augment, sizes, seed) -> list[Contender]:
-    """The filters that take part."""
-    wanted = dict(_size(text) for text in sizes)
-    unknown = dict(_unknown(text) for text in augment)
-    out = []
-    for file in files:
-        size = wanted.get(read_tuned_file(file)["filter"]["name"], wanted.get(None))
-        out.append(Contender(file.stem, partial(_from_file, file, size)))
-    for name in filters or ([] if files else DEFAULT_FILTERS):
-        size = wanted.get(name, wanted.get(None)) if has_ensemble(name) else None
-        out.append(contender(name, knows, seed=seed, ensemble_size=size))
-        if unknown and filter_class(name).has_covariance:
-            out.append(contender(name, knows, unknown, seed, ensemble_size=size))
-    return out
-
-
-def _from_file(file: Path, size: int | None, problem: Problem) -> Choice:
-    return sized(read_choice(file, problem), size)
 
 
 def _size(text: str) -> tuple[str | None, int]:
@@ -143,17 +120,3 @@ def _unknown(text: str) -> tuple[str, Unknown | None]:
         return name, Unknown(*map(float, numbers)) if numbers else None
     except (TypeError, ValueError):
         raise ValueError(f"--augment must be NAME, NAME:STD or NAME:STD:WALK, but got {text!r}") from None
-
-
-@contextmanager
-def _bar(total: int) -> Iterator:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=progress_console) as progress:
-        task, begun = progress.add_task("comparing ...", total=total), []
-
-        def on_row(scenario: Problem, label: str) -> None:
-            progress.update(task, description=f"{label} on {scenario.name}", completed=len(begun))
-            begun.append(label)
-
-        yield on_row
-        progress.update(task, completed=len(begun))

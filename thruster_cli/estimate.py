@@ -12,24 +12,23 @@ from filters.logs.columns import columns_of
 from filters.logs.estimate import LogEstimate, estimate
 from filters.logs.findings import LogFindings, Residual, findings
 from plants.logs.write import check_suffix, write_columns
-from thruster_cli.logs import (
+from thruster_cli.options import (
+    FILTER,
+    FILTER_HELP,
+    OUTPUT,
+    RUNS,
     ClockOption,
     ColumnOption,
     DtOption,
+    JsonOption,
     LogPresetOption,
     ModelOption,
-    SensorOption,
-    read_named,
-)
-from thruster_cli.output import (
-    FILTER_HELP,
-    JsonOption,
     SeedOption,
-    announce_compilation,
-    check_targets,
-    emit,
-    table,
+    SensorOption,
+    filter_option,
 )
+from thruster_cli.output import announce_compilation, check_targets, emit, table
+from tuning.logs.read import read_named
 
 ALPHA = 0.05  # below which a p-value speaks against white innovations
 
@@ -37,25 +36,40 @@ ALPHA = 0.05  # below which a p-value speaks against white innovations
 def command(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="A .csv, .parquet or .npz file with a header.")],
     filter_name: Annotated[
-        str | None, typer.Option("--filter", help=f"Without a tuned file; ekf by default. {FILTER_HELP}")
+        str | None,
+        filter_option(f"Without a tuned file; ekf by default. {FILTER_HELP}"),
     ] = None,
-    tuned: Annotated[Path | None, typer.Option(help="Tuned file: filter, Q, R and the like.")] = None,
+    tuned: Annotated[
+        Path | None, typer.Option(help="Tuned file: filter, Q, R and the like.", rich_help_panel=FILTER)
+    ] = None,
     preset: LogPresetOption = None,
     model: ModelOption = None,
     sensor: SensorOption = None,
     column: ColumnOption = None,
     clock_offset: ClockOption = None,
     dt: DtOption = None,
-    ensemble_size: Annotated[int | None, typer.Option(help="Of a filter with an ensemble.")] = None,
-    smoother: Annotated[bool, typer.Option("--smoother", help="Correct estimates by later measurements.")] = False,
-    lag: Annotated[int | None, typer.Option(help="How many later ones; all by default.")] = None,
+    ensemble_size: Annotated[
+        int | None, typer.Option(help="Of a filter with an ensemble.", rich_help_panel=FILTER)
+    ] = None,
+    smoother: Annotated[
+        bool, typer.Option("--smoother", help="Correct estimates by later measurements.", rich_help_panel=FILTER)
+    ] = False,
+    lag: Annotated[
+        int | None, typer.Option(help="How many later ones; all by default.", rich_help_panel=FILTER)
+    ] = None,
     skip: Annotated[
-        int | None, typer.Option(help="First rows that do not count; 50, a quarter of a short log, by default.")
+        int | None,
+        typer.Option(
+            help="First rows that do not count; 50, a quarter of a short log, by default.", rich_help_panel=RUNS
+        ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Estimates, bands and innovations as .csv, .parquet or .npz.")
+        Path | None,
+        typer.Option(help="Estimates, bands and innovations as .csv, .parquet or .npz.", rich_help_panel=OUTPUT),
     ] = None,
-    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Picture of all over time.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Picture of all over time.", rich_help_panel=OUTPUT)
+    ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
@@ -70,7 +84,7 @@ def command(
     Example: thruster estimate run.csv --sensor speed --column speed=motor_rpm --column thrust=loadcell[kgf]
     """
     if tuned is not None and filter_name is not None:
-        raise ValueError("give either --tuned FILE or --filter NAME")
+        raise ValueError(f"give either --tuned FILE or --filter NAME, but got both, {tuned} and {filter_name}")
     if plot is not None and plot.suffix != ".png":
         raise ValueError(f"--plot must end in .png, but got {str(plot)!r}")
     if out is not None:

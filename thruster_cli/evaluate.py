@@ -9,43 +9,52 @@ import typer
 
 from thruster_cli.consistency import check_covariance, check_request
 from thruster_cli.error_tables import comparison_table
-from thruster_cli.log_problems import LogModelOption, problems_in
-from thruster_cli.output import (
+from thruster_cli.options import (
+    FILTER,
     FILTER_HELP,
+    INPUT,
+    OUTPUT,
+    RUNS,
     JsonOption,
+    LogModelOption,
+    OfPresetOption,
     SeedOption,
-    announce_compilation,
-    emit,
-    working,
+    filter_option,
 )
-from thruster_cli.presets import OfPresetOption, of_preset
+from thruster_cli.output import announce_compilation, emit, progress_console, working
 from thruster_cli.problems import PROBLEMS
 from thruster_cli.tables import choice_table
 from thruster_cli.tuning_report import gains
-from tuning.evaluation.baselines import RULE, TUNED, baselines, rule_of_thumb
-from tuning.evaluation.held_out import prove
-from tuning.evaluation.tuned import metrics, read_choice, read_tuned
+from tuning.api.evaluate import subject_of
+from tuning.api.held_out import on_held_out
+from tuning.evaluation.baselines import RULE, TUNED
 from tuning.evaluation.worth import scaling_sentence, without_truth
-from tuning.problems.find import find_problem
 from tuning.search.plan import HELD_OUT_SEEDS
 
 
 def command(
-    tuned: Annotated[Path | None, typer.Option(help="Tuned file; it names filter, numbers and scenario.")] = None,
-    filter_name: Annotated[
-        str | None, typer.Option("--filter", help=f"Without a tuned file. {FILTER_HELP}")
+    tuned: Annotated[
+        Path | None,
+        typer.Option(help="Tuned file; it names filter, numbers and scenario.", rich_help_panel=FILTER),
     ] = None,
+    filter_name: Annotated[str | None, filter_option(f"Without a tuned file. {FILTER_HELP}")] = None,
     scenario: Annotated[
         str | None,
-        typer.Option("--problem", "--scenario", help=f"By default the tuned file's, or nominal. {PROBLEMS}"),
+        typer.Option(
+            "--problem",
+            "--scenario",
+            help=f"By default the tuned file's, or nominal. {PROBLEMS}",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     preset: OfPresetOption = None,
-    seeds: Annotated[int, typer.Option(help="Number of held-out seeds.")] = HELD_OUT_SEEDS,
+    seeds: Annotated[int, typer.Option(help="Number of held-out seeds.", rich_help_panel=RUNS)] = HELD_OUT_SEEDS,
     consistency: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE",
             help="Also say whether the filter's covariance is consistent, and draw that: a .png file.",
+            rich_help_panel=OUTPUT,
         ),
     ] = None,
     model: LogModelOption = None,
@@ -63,37 +72,16 @@ def command(
     Example: thruster evaluate --filter enkf --scenario mismatch --consistency calibrated.png
     """
     if (tuned is None) == (filter_name is None):
-        raise ValueError("give either --tuned FILE or --filter NAME")
-    if tuned is not None:
-        if scenario is None and preset is not None:
-            raise ValueError(
-                "--preset must come with --scenario, for a tuned file names its own, but got it alone"
-            )
-        if scenario is None:
-            choice, chosen, _ = read_tuned(tuned, problems_in(tuned, model))
-        else:
-            chosen = of_preset(find_problem(scenario), preset)
-            choice = read_choice(tuned, chosen)
-    else:
-        chosen = of_preset(find_problem(scenario or "nominal"), preset)
-        choice = rule_of_thumb(filter_name, chosen)
+        got = "none" if tuned is None else f"both, {tuned} and {filter_name}"
+        raise ValueError(f"give either --tuned FILE or --filter NAME, but got {got}")
+    choice, chosen, _ = subject_of(tuned or filter_name, scenario, preset, model)
     if consistency is not None:
         check_request(consistency, choice.filter(chosen))
     announce_compilation()
-    with working(f"{choice.name} on {seeds} seeds of {chosen.name}"):
-        proof = prove(choice, chosen, seed, seeds)
-    evaluations, said = proof.evaluations, metrics(proof)
-    choices = {TUNED: choice, **baselines(choice.name, chosen, seed)}
-    if tuned is None:
-        del evaluations[TUNED], said["tuned"]
-    choices = {name: choices[name] for name in evaluations}
-    data = {
-        "filter": choice._asdict(),
-        "scenario": chosen.name,
-        **said,
-    }
+    found = on_held_out(choice, chosen, seed, seeds, is_tuned=tuned is not None, console=progress_console)
+    proof, data = found.proof, found.to_dict()
     where = f"held-out {chosen.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
-    shown = [choice_table(choices, chosen), comparison_table(evaluations, proof.bound, where)]
+    shown = [choice_table(found.choices, chosen), comparison_table(found.evaluations, proof.bound, where)]
     if tuned is None and not proof.tuned.has_truth:
         shown.append(without_truth(chosen.name))
     shown += [scaling_sentence(proof)] if tuned is None else gains(proof, chosen.seed_word)

@@ -15,7 +15,8 @@ from rich.text import Text
 from filters.filter import Filter
 from filters.registry import FILTERS, filter_class, tunable_numbers
 from thruster_cli.fitting import fit_table, fits_of
-from thruster_cli.output import JsonOption, console, emit, table
+from thruster_cli.options import INPUT, JsonOption, spelt
+from thruster_cli.output import console, emit, table
 from thruster_cli.problems import PROBLEMS
 from tuning.problems.find import find_problem
 from tuning.search.space import has_ensemble
@@ -44,10 +45,14 @@ class Entry(NamedTuple):
 
 
 def command(
-    name: Annotated[str | None, typer.Argument(help="A filter, to be shown in full.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="A filter, to be shown in full.", callback=spelt(FILTERS))
+    ] = None,
     problem: Annotated[
         str | None,
-        typer.Option("--problem", "--scenario", help=f"Tell which filters fit its model. {PROBLEMS}"),
+        typer.Option(
+            "--problem", "--scenario", help=f"Tell which filters fit its model. {PROBLEMS}", rich_help_panel=INPUT
+        ),
     ] = None,
     json: JsonOption = None,
 ) -> None:

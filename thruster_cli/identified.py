@@ -8,12 +8,10 @@ from pathlib import Path
 from numerics.plots import save_figure
 from plants.logs.log import Log
 from thruster_cli.output import table
-from thruster_env.preset_file import PresetFile, write_preset
 from tuning.identification.profiles import Profile, profile_figure
 from tuning.identification.result import Identification
 from tuning.identification.validation import Validation
-from tuning.identification.values import write_values
-from tuning.thruster.identification import ThrusterFamily
+from tuning.logs.identify import write_found
 
 
 def report(
@@ -57,46 +55,13 @@ def write_files(
 ) -> list[str]:
     """Write the preset file of a thruster or the values of a model, and the profiles; return the paths."""
     files = []
-    if out is not None and not isinstance(family, ThrusterFamily):
-        write_values(out, found, logs)
-        files.append(str(out))
-    elif out is not None:
-        write_preset(out, preset_of(found, family, logs), "A thruster as `thruster identify` found it.")
+    if out is not None:
+        write_found(out, found, family, logs)
         files.append(str(out))
     if plot is not None and made:
         save_figure(profile_figure(found, made), plot)
         files.append(str(plot))
     return files
-
-
-def preset_of(found: Identification, family: ThrusterFamily, logs: Sequence[str]) -> PresetFile:
-    """The identified thruster as a preset file holds it."""
-    plant, seen = family.plant_at(found.values), family.shown_at(found.values)
-    offsets = {
-        name.removeprefix("clock_offset_"): value
-        for name, value in found.values.items()
-        if name.startswith("clock_offset_")
-    }
-    recorder = {
-        "dt": plant.dt,
-        "sensors": list(plant.channels),
-        "ambient_velocity": plant.ambient_velocity,
-        "process_noise_cov": plant.process_noise_cov.diagonal().tolist(),
-        "measurement_noise_cov": dict(
-            zip(plant.channels, plant.measurement_noise_cov.diagonal().tolist(), strict=True)
-        ),
-        "bias": dict(seen.bias),
-        "lag": dict(seen.lag),
-        "clock_offset": offsets,
-    }
-    identified = {
-        "logs": [Path(log).name for log in logs],
-        "log_likelihood": found.log_likelihood,
-        "standard_errors": found.standard_errors,
-        "determined": found.determined,
-    }
-    kept = {name: value for name, value in recorder.items() if value not in ({}, 0.0)}
-    return PresetFile(plant.parameters, (seen.dead_band_low, seen.dead_band_high), kept, identified)
 
 
 def as_json(

@@ -10,25 +10,29 @@ from typing import Annotated
 import typer
 
 from thruster_cli.identified import as_json, report, write_files
-from thruster_cli.logs import (
+from thruster_cli.options import (
+    FILTER,
+    INPUT,
+    OUTPUT,
+    SEARCH,
     ClockOption,
     ColumnOption,
     DtOption,
+    JsonOption,
     LogPresetOption,
     ModelOption,
+    SeedOption,
     SensorOption,
-    pairs,
+    filter_option,
 )
-from thruster_cli.output import JsonOption, SeedOption, announce_compilation, check_targets, emit, progress_console
-from thruster_cli.to_identify import check_offsets, family_of, numbers_of, ranges_of, split_runs
+from thruster_cli.output import announce_compilation, check_targets, emit, progress_console
+from thruster_cli.to_identify import names_of, numbers_of, ranges_of
 from thruster_env.preset_file import is_file
-from tuning.identification.coordinates import Coordinates
-from tuning.identification.excitation import check_excitation
-from tuning.identification.family import with_ranges
-from tuning.identification.identify import STARTS, identify
-from tuning.identification.objective import Objective
+from tuning.api.identify import identified
+from tuning.identification.identify import STARTS
 from tuning.identification.profiles import profiles
-from tuning.identification.validation import validate
+from tuning.logs.identify import family_of, split_runs
+from tuning.logs.read import pairs
 
 INTERRUPTED = 130
 DEFAULT_OUT = Path("out/identified.toml")
@@ -40,7 +44,10 @@ def command(
     ] = None,
     free: Annotated[
         str | None,
-        typer.Option(help="Names of what is to be found, with commas between; a wrong one lists those known."),
+        typer.Option(
+            help="Names of what is to be found, with commas between; a wrong one lists those known.",
+            rich_help_panel=SEARCH,
+        ),
     ] = None,
     preset: LogPresetOption = None,
     model: ModelOption = None,
@@ -50,45 +57,81 @@ def command(
     dt: DtOption = None,
     range_: Annotated[
         list[str] | None,
-        typer.Option("--range", metavar="NAME=LOW:HIGH", help="Within which one is looked for; may be repeated."),
+        typer.Option(
+            "--range",
+            metavar="NAME=LOW:HIGH",
+            help="Within which one is looked for; may be repeated.",
+            rich_help_panel=SEARCH,
+        ),
     ] = None,
     start: Annotated[
-        list[str] | None, typer.Option("--start", metavar="NAME=VALUE", help="Where the search begins.")
+        list[str] | None,
+        typer.Option("--start", metavar="NAME=VALUE", help="Where the search begins.", rich_help_panel=SEARCH),
     ] = None,
     hold_noise: Annotated[
-        bool, typer.Option("--hold-noise", help="Leave Q and R as they are; else their variances are found, too.")
+        bool,
+        typer.Option(
+            "--hold-noise",
+            help="Leave Q and R as they are; else their variances are found, too.",
+            rich_help_panel=SEARCH,
+        ),
     ] = False,
     held_out: Annotated[
         list[Path] | None,
-        typer.Option("--held-out", help="Run that only validates; by default every third of three or more."),
+        typer.Option(
+            "--held-out",
+            help="Run that only validates; by default every third of three or more.",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
-    use_all: Annotated[bool, typer.Option("--use-all", help="Hold no run out.")] = False,
-    filter_name: Annotated[str, typer.Option("--filter", help="ekf, or kf for affine models.")] = "ekf",
+    use_all: Annotated[bool, typer.Option("--use-all", help="Hold no run out.", rich_help_panel=INPUT)] = False,
+    filter_name: Annotated[str, filter_option("ekf, or kf for affine models.")] = "ekf",
     predicted: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="CHANNEL", help="The filter predicts it but never sees it, such as a load cell's thrust."
+            metavar="CHANNEL",
+            help="The filter predicts it but never sees it, such as a load cell's thrust.",
+            rich_help_panel=FILTER,
         ),
     ] = None,
     degrees: Annotated[
         float,
-        typer.Option(help="Of freedom of Student-t errors, such as 20, of predicted channels, if there are any."),
+        typer.Option(
+            help="Of freedom of Student-t errors, such as 20, of predicted channels, if there are any.",
+            rich_help_panel=SEARCH,
+        ),
     ] = math.inf,
     gate: Annotated[
-        float, typer.Option(help="Leave out samples beyond so many standard deviations, such as 5, as outliers.")
+        float,
+        typer.Option(
+            help="Leave out samples beyond so many standard deviations, such as 5, as outliers.",
+            rich_help_panel=SEARCH,
+        ),
     ] = math.inf,
-    starts: Annotated[int, typer.Option(help="Searches from so many starts.")] = STARTS,
+    starts: Annotated[int, typer.Option(help="Searches from so many starts.", rich_help_panel=SEARCH)] = STARTS,
     bollard: Annotated[
         Path | None,
-        typer.Option(metavar="TABLE.csv", help="In place of logs: a static bollard table (docs/identify.md)."),
+        typer.Option(
+            metavar="TABLE.csv",
+            help="In place of logs: a static bollard table (docs/identify.md).",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     step: Annotated[
-        Path | None, typer.Option(metavar="LOG", help="With --bollard: a step response, for the time constants.")
+        Path | None,
+        typer.Option(
+            metavar="LOG", help="With --bollard: a step response, for the time constants.", rich_help_panel=INPUT
+        ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help=f"File of what is found, for --preset of other commands; {DEFAULT_OUT}.")
+        Path | None,
+        typer.Option(
+            help=f"File of what is found, for --preset of other commands; {DEFAULT_OUT}.", rich_help_panel=OUTPUT
+        ),
     ] = None,
-    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Profile likelihoods.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Profile likelihoods.", rich_help_panel=OUTPUT)
+    ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
@@ -111,49 +154,33 @@ def command(
     if plot is not None and plot.suffix != ".png":
         raise ValueError(f"--plot must end in .png, but got {str(plot)!r}")
     if bollard is not None:
-        from thruster_cli.bollard import identify_bollard
+        from thruster_cli.bollard import check_of_table, identify_bollard
 
+        for_logs = {"--free": free, "--model": model, "--sensor": sensor, "--range": range_, "--start": start}
+        for_logs |= {"--hold-noise": hold_noise, "--held-out": held_out, "--use-all": use_all, "--plot": plot}
+        check_of_table(for_logs | {"--predicted": predicted})
         reading = {"columns": column, "clock_offset": clock_offset, "dt": dt}
         return identify_bollard(bollard, step, logs, preset, out or DEFAULT_OUT, json, **reading)
     if step is not None:
-        raise ValueError("--step must come with --bollard TABLE.csv, but got it alone")
-    options = {"sensors": sensor, "columns": column, "clock_offset": clock_offset, "dt": dt}
+        raise ValueError(f"--step must come with --bollard TABLE.csv, but got --step {step} alone")
+    whose = {"preset": preset, "model": model, "sensors": sensor}
+    options = whose | {"columns": column, "clock_offset": clock_offset, "dt": dt}
     if not logs:
         raise ValueError("identify must have at least one log, or --bollard TABLE.csv, but got none")
     out = out or DEFAULT_OUT
-    family, runs, proving = split_runs(logs, held_out, use_all, preset, model, options, filter_name)
-    family = family_of(family, runs, free, noise=not hold_noise)
+    runs, proving = split_runs(logs, held_out, use_all=use_all, **options)
+    family = family_of(runs, names_of(free), **whose, noise=not hold_noise, filter=filter_name)
     numbers, ranges = numbers_of("--start", pairs("--start", start)), ranges_of(pairs("--range", range_))
-    parameters = with_ranges(family.free, ranges, numbers)
-    check_offsets(parameters, runs)
     if out is not None and not is_file(out):
         raise ValueError(f"--out must end in .toml, but got {str(out)!r}")
     check_targets((out, plot), json, read=(*logs, *(held_out or [])))
     announce_compilation()
-    coordinates = Coordinates(parameters)
-    objective = Objective(family.data, family.model, coordinates, filter=filter_name, predicted=predicted or ())
-    check_excitation(objective, runs, coordinates.start())
-    with progress_console.status("identifying ...") as status:
-
-        def tell(number: int, value: float, values: dict) -> None:
-            status.update(f"start {number + 1} of {starts}: log-likelihood {value:.2f}")
-
-        found = identify(
-            family.data,
-            family.model,
-            parameters,
-            filter=filter_name,
-            starts=starts,
-            seed=seed,
-            gate=gate,
-            degrees=degrees,
-            predicted=predicted or (),
-            progress=tell,
-        )
-        made = []
-        if plot is not None and not found.interrupted:
+    search = {"gate": gate, "degrees": degrees, "predicted": predicted or (), "starts": starts, "seed": seed}
+    whole = identified(family, runs, proving, ranges, numbers, progress_console, filter=filter_name, **search)
+    found, checked, made = whole.found, whole.validation, []
+    if plot is not None and not found.interrupted:
+        with progress_console.status("profiles ...") as status:
             made = profiles(found, progress=lambda name: status.update(f"profile of {name} ..."))
-    checked = validate(found, family.shifted(proving)) if proving else validate(found)
     files = write_files(found, family, made, out, plot, [log.name for log in runs])
     data = as_json(found, checked, made, runs, proving, files)
     emit(report(found, checked, runs, proving, files), data, json)

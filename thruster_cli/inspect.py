@@ -9,7 +9,8 @@ import numpy as np
 import typer
 
 from numerics.checks import within
-from thruster_cli.output import JsonOption, PresetOption, SeedOption, emit, table
+from thruster_cli.options import INPUT, OUTPUT, JsonOption, PresetOption, SeedOption
+from thruster_cli.output import emit, table
 from thruster_env.linear.analysis import (
     GAIN_UNITS,
     INPUTS,
@@ -31,11 +32,13 @@ OUTPUTS = ("omega_m [rad/s]", "U_a [m/s]", "T [N]")
 
 def command(
     preset: PresetOption = "tunnel",
-    voltage: Annotated[float, typer.Option(help="Operating voltage [V].")] = 12.0,
-    ambient_velocity: Annotated[float, typer.Option(help="Ambient flow along the axis U_0 [m/s].")] = 0.0,
-    dt: Annotated[float, typer.Option(help="Sample time [s].")] = DEFAULT_DT,
+    voltage: Annotated[float, typer.Option(help="Operating voltage [V].", rich_help_panel=INPUT)] = 12.0,
+    ambient_velocity: Annotated[
+        float, typer.Option(help="Ambient flow along the axis U_0 [m/s].", rich_help_panel=INPUT)
+    ] = 0.0,
+    dt: Annotated[float, typer.Option(help="Sample time [s].", rich_help_panel=INPUT)] = DEFAULT_DT,
     max_voltage: Annotated[
-        float, typer.Option(help="Voltage range the integration must follow [V].")
+        float, typer.Option(help="Voltage range the integration must follow [V].", rich_help_panel=INPUT)
     ] = DEFAULT_MAX_VOLTAGE,
     out: Annotated[
         Path | None,
@@ -43,6 +46,7 @@ def command(
             metavar="FILE",
             help="Bode plot and step response, a .png file.",
             show_default="out/inspect-PRESET-VOLTAGE.png",
+            rich_help_panel=OUTPUT,
         ),
     ] = None,
     seed: SeedOption = 0,

@@ -17,11 +17,9 @@ from thruster_cli.error_tables import (
     unless_blank,
 )
 from thruster_cli.output import table
-from tuning.evaluation.compare import Leaderboard, Row
+from tuning.evaluation.compare import Leaderboard, Row, winners
 from tuning.evaluation.tuned import summary
 from tuning.evaluation.worth import without_truth
-
-VERDICTS = {"better": "better", "worse": "worse", "tie": "no different", "unknown": "not to be told"}
 
 
 def report(board: Leaderboard) -> list:
@@ -31,26 +29,19 @@ def report(board: Leaderboard) -> list:
     seeds = f"held-out seeds {board.seeds[0]} to {board.seeds[-1]}"
     if not evaluation.has_truth:
         shown = [_predictions(board, f"{title}\nInnovations on {seeds}")]
-        said = [without_truth(scenario.name), winners(board)]
+        said = [without_truth(scenario.name), f"{winners(board)}\n"]
     else:
         errors = _errors_across if 2 * len(evaluation.states) < MOST_COLUMNS else _errors_below
-        shown, said = [errors(board, f"{title}\nRMSE on {seeds}"), _against(board)], [winners(board)]
-    for one in shown:
-        one.columns[0].overflow = "fold"
+        shown, said = [errors(board, f"{title}\nRMSE on {seeds}"), _against(board)], [f"{winners(board)}\n"]
     return [*shown, *said]
 
 
-def winners(board: Leaderboard) -> str:
-    """Who is significantly better or worse than the first filter."""
-    first, *others = board.rows
-    if not others:
-        return f"On {board.scenario.name} there is nothing to compare {first.label} with."
-    said = []
-    for verdict, words in VERDICTS.items():
-        names = [row.label for row in others if row.verdict == verdict]
-        said += [f"{words}: {', '.join(names)}"] if names else []
-    by = "score" if first.evaluation.has_truth else "log-likelihood"
-    return f"On {board.scenario.name}, against {first.label} by the {by}: {'; '.join(said)}.\n"
+def winner(board: Leaderboard) -> int:
+    """Place of the row with the lowest score or, without truth, the highest log-likelihood; -1 if none has it."""
+    found = [row.evaluation for row in board.rows]
+    values = [one.score.value if one.has_truth else -one.log_likelihood for one in found]
+    known = [value for value in values if not isnan(value)]
+    return values.index(min(known)) if len(known) > 1 else -1
 
 
 def _errors_across(board: Leaderboard, title: str) -> Table:
@@ -68,7 +59,7 @@ def _errors_across(board: Leaderboard, title: str) -> Table:
     rows.append(["bound", *limits, *("" for _ in states)])
     heads = [head for state in states for head in (two_lines(state), "above\n[%]")]
     begun = [f"{'' if i else 'start-up'}\n{f'[{s.unit}]' if s.unit else ''}" for i, s in enumerate(states)]
-    return table(title, ["filter", *heads, *begun], rows, caption=_CAPTION)
+    return table(title, ["filter", *heads, *begun], rows, caption=_CAPTION, best=[winner(board)])
 
 
 def _errors_below(board: Leaderboard, title: str) -> Table:
@@ -89,7 +80,9 @@ def _errors_below(board: Leaderboard, title: str) -> Table:
     if any(cells[1] for cells in bounds):
         rows += [["bound" if i == 0 else "", *cells] for i, cells in enumerate(bounds)]
     heads = ["filter", "state", "RMSE", "above\n[%]", "start-up", f"over\n{board.rows[0].label}"]
-    return table(title, heads, rows, caption=_CAPTION)
+    first = winner(board) * len(states)
+    best = range(first, first + len(states)) if first >= 0 else ()
+    return table(title, heads, rows, caption=_CAPTION, best=best)
 
 
 _CAPTION = "above: the bound. ±: half of the 95 % interval. start-up: the first 50 steps."
@@ -116,7 +109,8 @@ def _against(board: Leaderboard) -> Table:
     right = f"NEES {n}, NIS {right_nis(board.rows[0].evaluation)}{_median(n) if medians else ''}"
     heads = ["filter", *(state.symbol for state in shown), "score", "NEES", "NIS", "div.", "us/step"]
     caption = f"±: half of the 95 % interval. Ideal: {right}. div.: restarts."
-    return table(f"Over {first}, paired; consistency and cost", heads, rows, caption=caption)
+    title = f"Over {first}, paired; consistency and cost"
+    return table(title, heads, rows, caption=caption, best=[winner(board)])
 
 
 def _median(n: int) -> str:
@@ -138,9 +132,8 @@ def _predictions(board: Leaderboard, title: str) -> Table:
         rows.append([row.label, *cells, str(found.divergences), f"{row.microseconds:.3g}"])
     right = right_nis(board.rows[0].evaluation)
     caption = f"log L: of a run. ±: half of the 95 % interval. Ideal: NIS {right}. div.: restarts."
-    return table(
-        title, ["filter", "log L", f"less that\nof {first}", "NIS", "div.", "us/step"], rows, caption=caption
-    )
+    heads = ["filter", "log L", f"less that\nof {first}", "NIS", "div.", "us/step"]
+    return table(title, heads, rows, caption=caption, best=[winner(board)])
 
 
 def as_json(boards: list[Leaderboard]) -> dict:

@@ -1,20 +1,19 @@
-"""What every command shares: options, tables on the terminal, JSON for programs."""
+"""What every command shares: tables on the terminal, JSON for programs."""
 
 from __future__ import annotations
 
 import json
 import math
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
@@ -22,48 +21,70 @@ from numerics.compiled import tell_when_compiling
 from numerics.files import check_not_read, check_target, write_whole
 from numerics.progress import listening
 from thruster_cli.characters import showable
-from thruster_env.parameters import PRESETS
+from thruster_cli.options import JsonOption, SeedOption  # noqa: F401 - for `demo`
 
-JsonOption = Annotated[
-    str | None,
-    typer.Option("--json", metavar="FILE", help="Also write the result as JSON; - for standard output."),
-]
-PresetOption = Annotated[
-    str, typer.Option("--preset", help=f"{', '.join(PRESETS)}, or a FILE.toml of `thruster identify`.")
-]
-SeedOption = Annotated[
-    int, typer.Option("--seed", min=0, help="Seed of all randomness; the same seed repeats all.")
-]
-CodeOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--problem",
-        metavar="MODULE:OBJECT",
-        help="What it was tuned on, where that is code: nothing that a file or a study names is imported.",
-    ),
-]
-FILTER_HELP = "Name of a filter; `thruster filters` lists them."
+BEST = "bold green"  # style of rows that win
 
 console = Console(markup=False, highlight=False)
 progress_console = Console(stderr=True, markup=False, highlight=False)
 
 
+class WholeTable(Table):
+    """A table whose title and caption are as wide as the terminal, and not broken where the table ends."""
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """The title, the table, the caption."""
+        title, caption = self.title, self.caption
+        self.title = self.caption = None
+        try:
+            yield from [Text(title, style="table.title")] if title else []
+            yield from super().__rich_console__(console, options)
+            yield from [Text(caption, style="table.caption")] if caption else []
+        finally:
+            self.title, self.caption = title, caption
+
+
 def table(
-    title: str, columns: list[str], rows: list[list[Any]], *, caption: str | None = None, words: bool = False
+    title: str,
+    columns: list[str],
+    rows: list[list[Any]],
+    *,
+    caption: str | None = None,
+    words: bool = False,
+    best: Container[int] = (),
 ) -> Table:
-    """A table for the terminal; the first column is left-aligned, others to the right unless they hold words."""
+    """A table for the terminal; where it is narrow, cells fold and no column is lost.
+
+    Args:
+        title: above it.
+        columns: their headers; the first one is left-aligned.
+        rows: cells.
+        caption: below it.
+        words: whether the other columns hold words, and are left-aligned, too.
+        best: places of rows that win, which stand out on a terminal.
+    """
     title, caption = (part and showable(part, console.encoding) for part in (title, caption))
-    out = Table(title=title, caption=caption, title_justify="left", caption_justify="left", box=SIMPLE_HEAD)
+    out = WholeTable(title=title, caption=caption, box=SIMPLE_HEAD)
     out.padding, out.pad_edge = (0, 1, 0, 0), False  # five figures with their intervals fit into 80 columns
     for index, column in enumerate(columns):
-        out.add_column(
-            Text(showable(column, console.encoding)), justify="left" if index == 0 or words else "right"
-        )
-    for row in rows:  # Text: units in brackets are no markup
-        out.add_row(
-            *[cell if isinstance(cell, Text) else Text(showable(str(cell), console.encoding)) for cell in row]
-        )
+        justify = "left" if index == 0 or words else "right"
+        out.add_column(Text(showable(column, console.encoding), overflow="fold"), justify=justify, overflow="fold")
+    for place, row in enumerate(rows):  # Text: units in brackets are no markup
+        cells = [cell if isinstance(cell, Text) else Text(showable(str(cell), console.encoding)) for cell in row]
+        out.add_row(*cells, style=BEST if place in best else None)
+    _keep_words_whole(out)
     return out
+
+
+def _keep_words_whole(out: Table) -> None:
+    """Let cells fold between words only, if there is room for the longest one of each column."""
+    columns = [[column.header, *column.cells] for column in out.columns]
+    longest = [max((len(word) for cell in cells for word in str(cell).split()), default=1) for cells in columns]
+    if sum(longest) + 2 * len(longest) > console.width:
+        out.padding = 0
+    if sum(longest) + len(longest) + 1 <= console.width:
+        for column, width in zip(out.columns, longest, strict=True):
+            column.min_width = width
 
 
 def emit(shown: list, data: dict, json_target: str | None) -> None:

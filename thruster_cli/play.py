@@ -1,4 +1,4 @@
-"""`thruster play`: watch a trained policy, as a film or in a window."""
+"""`thruster play`: watch a policy, a sequence of voltages or a log, as a film or in a window."""
 
 from __future__ import annotations
 
@@ -8,47 +8,174 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from thruster_cli.output import announce_compilation, emit, progress_console
-from training.extras import check_installed
+from numerics.checks import one_of
+from plants.rendering.film import Played, check_drawing
+from thruster_cli.options import (
+    FILTER,
+    FILTER_HELP,
+    INPUT,
+    OUTPUT,
+    RUNS,
+    ColumnOption,
+    JsonOption,
+    LogPresetOption,
+    SensorOption,
+    filter_option,
+)
+from thruster_cli.output import announce_compilation, check_targets, emit, progress_console
 from tuning.problems.seeds import held_out_seeds
+
+STEPS = 500
 
 
 def command(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Folder that `thruster train` made.")],
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="An .mp4 or .gif; by default an .mp4 in MODEL.")
+    model: Annotated[
+        Path | None, typer.Argument(metavar="MODEL", help="Folder of a policy, that `thruster train` made.")
     ] = None,
-    window: Annotated[bool, typer.Option("--window", help="Show it in a window instead, at true speed.")] = False,
+    policy: Annotated[
+        str | None,
+        typer.Option(
+            help="pi: the controller, on the measured thrust, follows a reference.", rich_help_panel=INPUT
+        ),
+    ] = None,
+    voltage: Annotated[float | None, typer.Option(help="A constant voltage [V].", rich_help_panel=INPUT)] = None,
+    excitation: Annotated[
+        str | None,
+        typer.Option(help="A sequence of voltages: steps, prbs, levels, multi-sine, ...", rich_help_panel=INPUT),
+    ] = None,
+    log: Annotated[Path | None, typer.Option(help="A recorded run of a thruster.", rich_help_panel=INPUT)] = None,
+    preset: LogPresetOption = None,
+    sensor: SensorOption = None,
+    column: ColumnOption = None,
+    filter_name: Annotated[
+        str | None, filter_option(f"Its estimate is drawn; ekf by default. {FILTER_HELP}")
+    ] = None,
+    tuned: Annotated[
+        Path | None, typer.Option(help="Tuned file, in place of --filter.", rich_help_panel=FILTER)
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(help=f"Steps of an episode; {STEPS} by default.", rich_help_panel=RUNS)
+    ] = None,
     seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the episode; by default one that is held out.")
+        int | None,
+        typer.Option(
+            min=0, help="Seed of the episode; of a policy by default one that is held out.", rich_help_panel=RUNS
+        ),
     ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="An .mp4 or .gif; by default an .mp4 in MODEL, or in out.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
+    window: Annotated[
+        bool,
+        typer.Option("--window", help="Show it in a window instead, at true speed.", rich_help_panel=OUTPUT),
+    ] = False,
+    json: JsonOption = None,
 ) -> None:
-    """Show one episode of a trained policy, beside what it believes of the hidden state.
+    """Show an episode: what the thruster does, and what a filter believes of its hidden state.
 
-    The policy sees what it was trained on: the same measurements, filter and scaling. The strip charts show the
+    Without MODEL there is no policy to load, and torch is not needed: a PI controller follows a reference, a
+    constant voltage or a sequence drives the thruster, or a log is shown as it was recorded, with the estimate in
+    the place of the truth where the log has none.
+
+    A policy sees what it was trained on: the same measurements, filter and scaling. The strip charts show the
     thrust, its reference and its measurement, and the filter's estimate with a band of two standard deviations.
 
-    Needs the extras rl and render: pip install 'thruster-env[rl,render]'
+    Needs the extra render, for MODEL also rl: pip install 'thruster-env[rl,render]'
 
-    Example: thruster play out/policies/tracking-nominal-ekf-ppo-seed0 --out ekf.gif
+    Example: thruster play --policy pi --filter enkf --out pi.gif
+
+    Example: thruster play out/policies/tracking-nominal-ekf-ppo-seed0
     """
-    check_installed()
     if window and out is not None:
-        raise ValueError("give either --window or --out FILE, but got both")
+        raise ValueError(f"give either --window or --out FILE, but got both, --out {out}")
+    if filter_name is not None and tuned is not None:
+        raise ValueError(f"give either --tuned FILE or --filter NAME, but got both, {tuned} and {filter_name}")
+    chosen = {"MODEL": model, "--policy": policy, "--voltage": voltage, "--excitation": excitation, "--log": log}
+    what = one_given(chosen)
+    _check_options(what, {"--sensor": sensor, "--column": column}, ("--log",))
+    _check_options(what, {"--steps": steps}, ("--policy", "--voltage", "--excitation"))
+    if what == "MODEL":
+        given = {"--preset": preset, "--filter": filter_name, "--tuned": tuned}
+        _check_options(what, given, tuple(name for name in chosen if name != "MODEL"))
+        played, shown, film = _of_policy(model, out, window, seed, json)
+    else:
+        film = None if window else out or Path("out") / f"play-{_name(chosen[what])}.mp4"
+        check_drawing(film)
+        check_targets((film,), json, read=(log, tuned, preset))
+        options = {"filter": filter_name, "tuned": tuned}
+        played, shown = _without_policy(
+            what, chosen[what], film, seed or 0, preset, steps, sensor, column, options
+        )
+    data = {**played._asdict(), "film": None if film is None else str(film)}
+    if film is not None:
+        shown.append(f"Film: {film}")
+    emit(shown, data, json)
+
+
+def one_given(chosen: dict) -> str:
+    """The one name whose value is given; ValueError unless there is exactly one."""
+    given = [name for name, value in chosen.items() if value is not None]
+    if len(given) != 1:
+        rule = f"play must be given one of {', '.join(chosen)}"
+        raise ValueError(f"{rule}, but got {' and '.join(given) or 'none'}")
+    return given[0]
+
+
+def _check_options(what: str, given: dict, fitting: tuple[str, ...]) -> None:
+    """Raise ValueError for an option that does not go with what is played."""
+    for name, value in given.items():
+        if value is not None and what not in fitting:
+            raise ValueError(f"{name} must come with {' or '.join(fitting)}, but got it with {what}")
+
+
+def _name(chosen) -> str:
+    return chosen.stem if isinstance(chosen, Path) else f"{chosen:g}V" if isinstance(chosen, float) else chosen
+
+
+def _of_policy(model: Path, out: Path | None, window: bool, seed: int | None, json: str | None) -> tuple:
+    from training.extras import check_installed
+
+    check_installed()
     with progress_console.status("loading torch ..."):
-        from training.play import check_drawing, play
+        from training.play import play
         from training.saved import find_saved, read_setup
     folder = find_saved(model)
-    if seed is None:
-        seed = held_out_seeds(read_setup(folder).seed, 2)[0]
+    seed = held_out_seeds(read_setup(folder).seed, 2)[0] if seed is None else seed
     film = None if window else out or model / f"episode-seed{seed}.mp4"
     check_drawing(film)
+    check_targets((film,), json)
     announce_compilation()
+    played = _drawn(lambda on_step: play(folder, film, seed, on_step))
+    said = f"Episode {seed}: return {played.total_reward:.3f} in {played.steps} steps, {played.seconds:.1f} s."
+    return played, [said], film
+
+
+def _without_policy(what, given, film, seed, preset, steps, sensor, column, options) -> tuple[Played, list[str]]:
+    from thruster_cli.episodes import POLICIES, play_log, play_pi, play_voltages
+    from tuning.logs.read import read_named
+
+    announce_compilation()
+    if what == "--log":
+        log, offer = read_named(given, preset, None, sensor, column)
+        played = _drawn(lambda on_step: play_log(film, log, offer, on_step, seed=seed, **options))
+        return played, [f"{log.name}: {played.steps} steps, {played.seconds:.1f} s."]
+    options |= {"preset": preset or "tunnel", "steps": STEPS if steps is None else steps}
+    if what == "--policy":
+        one_of("policy", given, POLICIES)
+        played = _drawn(lambda on_step: play_pi(film, seed, on_step, **options))
+        said = f"return {played.total_reward:.3f} in "
+    else:
+        played, said = _drawn(lambda on_step: play_voltages(film, seed, on_step, given, **options)), ""
+    return played, [f"Episode {seed}: {said}{played.steps} steps, {played.seconds:.1f} s."]
+
+
+def _drawn(play) -> Played:
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with Progress(*columns, console=progress_console) as progress:
         task = progress.add_task("drawing", total=None)
-        played = play(folder, film, seed, lambda steps, count: progress.update(task, completed=steps, total=count))
-    shown = [f"Episode {seed}: return {played.total_reward:.3f} in {played.steps} steps, {played.seconds:.1f} s."]
-    if film is not None:
-        shown.append(f"Film: {film}")
-    emit(shown, {}, None)
+        return play(lambda steps, count: progress.update(task, completed=steps, total=count))

@@ -9,24 +9,33 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from numerics.files import check_target
-from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
+from thruster_cli.options import INPUT, OUTPUT, RUNS, JsonOption
+from thruster_cli.output import announce_compilation, emit, progress_console, table
 
 RESULTS = Path("out") / "recordings.json"
 
 
 def command(
     data: Annotated[
-        Path, typer.Option(help="Folder with the recorded runs as .csv files, or with a folder closed_loop_25Hz.")
+        Path,
+        typer.Option(
+            help="Folder with the recorded runs as .csv files, or with a folder closed_loop_25Hz.",
+            rich_help_panel=INPUT,
+        ),
     ],
     identify: Annotated[
         bool,
         typer.Option(
             "--identify",
             help="Find all numbers anew, of nine structures, with and without each run: a quarter of an hour.",
+            rich_help_panel=RUNS,
         ),
     ] = False,
     out: Annotated[
-        Path, typer.Option(help="With --identify: file of results; what is there is not done again.")
+        Path,
+        typer.Option(
+            help="With --identify: file of results; what is there is not done again.", rich_help_panel=OUTPUT
+        ),
     ] = RESULTS,
     json: JsonOption = None,
 ) -> None:

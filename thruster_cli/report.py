@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
-from thruster_cli.log_problems import LogModelOption, problems_in
-from thruster_cli.output import CodeOption, JsonOption, announce_compilation, emit, working
+from thruster_cli.options import INPUT, OUTPUT, CodeOption, JsonOption, LogModelOption
+from thruster_cli.output import announce_compilation, emit, working
 from thruster_cli.tune import DEFAULT_STORAGE
+from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem
 from tuning.reporting.beside import write_beside
 from tuning.reporting.report import write_report
@@ -23,10 +24,14 @@ def command(
         typer.Argument(metavar="FILE_OR_STUDY...", help="Tuned file, or name of a study; of two: side by side."),
     ],
     storage: Annotated[
-        str, typer.Option(help="Where the study is: a journal file, or an Optuna storage URL.")
+        str,
+        typer.Option(help="Where the study is: a journal file, or an Optuna storage URL.", rich_help_panel=INPUT),
     ] = DEFAULT_STORAGE,
     out: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Where to write; by default beside the tuned file.")
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Where to write; by default beside the tuned file.", rich_help_panel=OUTPUT
+        ),
     ] = None,
     problem: CodeOption = None,
     model: LogModelOption = None,

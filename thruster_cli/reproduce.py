@@ -18,15 +18,10 @@ from studies.findings import findings, general_statements, study_statements
 from studies.series import all_series, series_figure
 from studies.vehicle.experiment import MOST_RUNS as MOST_VEHICLE_RUNS
 from studies.vehicle.printed import RUNS as VEHICLE_RUNS
+from thruster_cli import options
 from thruster_cli.benchmark import fitted, list_of, reproduce_benchmark
-from thruster_cli.output import (
-    JsonOption,
-    SeedOption,
-    announce_compilation,
-    emit,
-    progress_console,
-    table,
-)
+from thruster_cli.options import JsonOption, SeedOption
+from thruster_cli.output import announce_compilation, emit, progress_console, table
 from thruster_cli.vehicle import reproduce_vehicle
 
 ALL = "all"
@@ -47,11 +42,16 @@ def command(
         typer.Option(
             help=f"Independent runs, at least 2; by default {RUNS} of 100 steps for a paper on the thruster, "
             f"{VEHICLE_RUNS} of some 25000 for one on the vehicle, and {BENCHMARK_RUNS} for a standard problem; "
-            "with fewer the intervals are wide."
+            "with fewer the intervals are wide.",
+            rich_help_panel=options.RUNS,
         ),
     ] = None,
     members: Annotated[
-        int | None, typer.Option(help=f"Ensemble size N of the papers' EnKF, at least 2; {MEMBERS} by default.")
+        int | None,
+        typer.Option(
+            help=f"Ensemble size N of the papers' EnKF, at least 2; {MEMBERS} by default.",
+            rich_help_panel=options.FILTER,
+        ),
     ] = None,
     series: Annotated[
         Path | None,
@@ -59,11 +59,15 @@ def command(
             metavar="FILE.png",
             help="Also draw one run over time for each system and q, as the papers do, or the vehicle's paths; "
             "into --json, too.",
+            rich_help_panel=options.OUTPUT,
         ),
     ] = None,
     steps: Annotated[
         int | None,
-        typer.Option(help="First steps of 1 ms of each of the vehicle's paths, for a quick look; all by default."),
+        typer.Option(
+            help="First steps of 1 ms of each of the vehicle's paths, for a quick look; all by default.",
+            rich_help_panel=options.RUNS,
+        ),
     ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,

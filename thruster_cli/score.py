@@ -12,7 +12,8 @@ import typer
 from filters.consistency.intervals import mean_interval
 from numerics.checks import one_of
 from thruster_cli.error_tables import about, unless_blank
-from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
+from thruster_cli.options import INPUT, RUNS, JsonOption, SeedOption
+from thruster_cli.output import announce_compilation, emit, progress_console, table
 from thruster_cli.train import LEARNABLE
 from training.extras import check_installed
 from training.observations import find_arm
@@ -41,16 +42,21 @@ def command(
     models: Annotated[list[Path], typer.Argument(metavar="MODEL", help="Folders that `thruster train` made.")],
     scenario: Annotated[
         str | None,
-        typer.Option(help=f"Another plant than that of training: {LEARNABLE}, or a .toml file."),
+        typer.Option(
+            help=f"Another plant than that of training: {LEARNABLE}, or a .toml file.", rich_help_panel=INPUT
+        ),
     ] = None,
     classical: Annotated[
         list[str] | None,
         typer.Option(
             help="pi, lqr, one-step or mpc; may be repeated. A controller that observes what each policy does; "
-            "all but pi a state only."
+            "all but pi a state only.",
+            rich_help_panel=INPUT,
         ),
     ] = None,
-    seeds: Annotated[int, typer.Option(help="Number of held-out episodes.")] = HELD_OUT_SEEDS,
+    seeds: Annotated[
+        int, typer.Option(help="Number of held-out episodes.", rich_help_panel=RUNS)
+    ] = HELD_OUT_SEEDS,
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:

@@ -11,7 +11,8 @@ import typer
 from numerics.checks import at_least, positive, within
 from numerics.streams import episode_keys
 from plants.logs.write import check_suffix, header_of, write_columns
-from thruster_cli.output import JsonOption, PresetOption, SeedOption, announce_compilation, emit
+from thruster_cli.options import INPUT, OUTPUT, RUNS, JsonOption, PresetOption, SeedOption
+from thruster_cli.output import announce_compilation, emit
 from thruster_env.channels import CHANNELS
 from thruster_env.plant import (
     DEFAULT_DT,
@@ -27,21 +28,31 @@ TRUTH = ("time_s", "voltage_V", "omega_m_rad_per_s", "U_a_m_per_s", "thrust_N")
 
 
 def command(
-    out: Annotated[Path, typer.Option(help="File to write: .csv with units in the header, .parquet or .npz.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="File to write: .csv with units in the header, .parquet or .npz.", rich_help_panel=OUTPUT
+        ),
+    ],
     preset: PresetOption = "tunnel",
-    steps: Annotated[int, typer.Option(help="Number of steps.")] = 500,
-    dt: Annotated[float, typer.Option(help="Sample time [s].")] = DEFAULT_DT,
-    voltage: Annotated[float | None, typer.Option(help="Constant voltage [V]; else random levels.")] = None,
-    amplitude: Annotated[float, typer.Option(help="Random levels lie within plus and minus this [V] ...")] = 12.0,
-    hold: Annotated[int, typer.Option(help="... and are held for so many steps.")] = 25,
+    steps: Annotated[int, typer.Option(help="Number of steps.", rich_help_panel=RUNS)] = 500,
+    dt: Annotated[float, typer.Option(help="Sample time [s].", rich_help_panel=INPUT)] = DEFAULT_DT,
+    voltage: Annotated[
+        float | None, typer.Option(help="Constant voltage [V]; else random levels.", rich_help_panel=RUNS)
+    ] = None,
+    amplitude: Annotated[
+        float, typer.Option(help="Random levels lie within plus and minus this [V] ...", rich_help_panel=RUNS)
+    ] = 12.0,
+    hold: Annotated[int, typer.Option(help="... and are held for so many steps.", rich_help_panel=RUNS)] = 25,
     process_noise: Annotated[
-        tuple[float, float], typer.Option(help="Variances a step of omega_m and U_a.")
+        tuple[float, float], typer.Option(help="Variances a step of omega_m and U_a.", rich_help_panel=INPUT)
     ] = DEFAULT_PROCESS_NOISE,
     measurement_noise: Annotated[
-        float, typer.Option(help="Variance of the thrust [N^2].")
+        float, typer.Option(help="Variance of the thrust [N^2].", rich_help_panel=INPUT)
     ] = DEFAULT_MEASUREMENT_NOISE,
     sensor: Annotated[
-        list[str] | None, typer.Option(help=f"What is measured, thrust by default: {', '.join(CHANNELS)}.")
+        list[str] | None,
+        typer.Option(help=f"What is measured, thrust by default: {', '.join(CHANNELS)}.", rich_help_panel=INPUT),
     ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,

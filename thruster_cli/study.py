@@ -16,7 +16,8 @@ from rich.progress import (
 )
 
 from thruster_cli import recordings
-from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
+from thruster_cli.options import OUTPUT, RUNS, JsonOption
+from thruster_cli.output import announce_compilation, emit, progress_console, table
 
 RESULTS = Path("out") / "comparison"
 
@@ -34,23 +35,45 @@ app.command("recordings")(recordings.command)
 @app.command("policies")
 def policies(
     quick: Annotated[
-        bool, typer.Option("--quick", help="One noise, two seeds, few steps: whether it works, not what it says.")
+        bool,
+        typer.Option(
+            "--quick",
+            help="One noise, two seeds, few steps: whether it works, not what it says.",
+            rich_help_panel=RUNS,
+        ),
     ] = False,
     seeds: Annotated[
-        int | None, typer.Option(min=1, max=1000, help="Training seeds of each learnt policy; 5.")
+        int | None,
+        typer.Option(min=1, max=1000, help="Training seeds of each learnt policy; 5.", rich_help_panel=RUNS),
     ] = None,
     steps: Annotated[
         int | None,
-        typer.Option(min=1, max=10**12, help="Steps that each learns from; as many as `thruster train` takes."),
+        typer.Option(
+            min=1,
+            max=10**12,
+            help="Steps that each learns from; as many as `thruster train` takes.",
+            rich_help_panel=RUNS,
+        ),
     ] = None,
     recurrent: Annotated[
-        bool, typer.Option("--recurrent", help="Also PPO with an LSTM on raw measurements: many hours.")
+        bool,
+        typer.Option(
+            "--recurrent", help="Also PPO with an LSTM on raw measurements: many hours.", rich_help_panel=RUNS
+        ),
     ] = False,
-    jobs: Annotated[int | None, typer.Option(min=1, max=1000, help="Processes; as many as cores.")] = None,
-    out: Annotated[Path, typer.Option(help="Folder of results; what is there is not done again.")] = RESULTS,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, max=1000, help="Processes; as many as cores.", rich_help_panel=RUNS)
+    ] = None,
+    out: Annotated[
+        Path, typer.Option(help="Folder of results; what is there is not done again.", rich_help_panel=OUTPUT)
+    ] = RESULTS,
     page: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.md", help="Page whose tables are written anew, with the pictures beside it."),
+        typer.Option(
+            metavar="FILE.md",
+            help="Page whose tables are written anew, with the pictures beside it.",
+            rich_help_panel=OUTPUT,
+        ),
     ] = None,
     json: JsonOption = None,
 ) -> None:

@@ -53,7 +53,8 @@ def kinds_table(kinds: Sequence[Kind], plan: Plan) -> Table:
     ]
     columns = ["filter", "trials", "pruned", "over\nbudget", f"best\n{plan.objectives[0]}", "us/step"]
     caption = "us/step: of the best trial; of the cheapest where none is complete. *: mean NIS outside its band."
-    return table("Filters that were tried, on the training seeds", columns, rows, caption=caption)
+    best = [0] if len(rows) > 1 else []
+    return table("Filters that were tried, on the training seeds", columns, rows, caption=caption, best=best)
 
 
 def _best(kind: Kind) -> str:

@@ -15,7 +15,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least
-from thruster_cli.output import JsonOption, announce_compilation, emit, progress_console, table
+from thruster_cli.options import FILTER, INPUT, LEARNING, OUTPUT, JsonOption, spelt
+from thruster_cli.output import announce_compilation, emit, progress_console, table
 from training.algorithms import ALGORITHMS
 from training.extras import check_installed
 from training.observations import ARMS
@@ -35,39 +36,80 @@ FEWEST_STEPS = ", ".join(f"{name} {algorithm.steps}" for name, algorithm in ALGO
 
 
 def command(
-    task: Annotated[str, typer.Option(help=f"{', '.join(TASKS)}.")] = "tracking",
-    observe: Annotated[str, typer.Option(metavar="ARM", help=f"What the policy sees: {', '.join(ARMS)}.")] = "ekf",
-    algo: Annotated[str, typer.Option(help=f"{', '.join(ALGORITHMS)}.")] = "ppo",
+    task: Annotated[
+        str, typer.Option(help=f"{', '.join(TASKS)}.", callback=spelt(TASKS), rich_help_panel=INPUT)
+    ] = "tracking",
+    observe: Annotated[
+        str,
+        typer.Option(
+            metavar="ARM",
+            help=f"What the policy sees: {', '.join(ARMS)}.",
+            callback=spelt(ARMS),
+            rich_help_panel=FILTER,
+        ),
+    ] = "ekf",
+    algo: Annotated[
+        str, typer.Option(help=f"{', '.join(ALGORITHMS)}.", callback=spelt(ALGORITHMS), rich_help_panel=LEARNING)
+    ] = "ppo",
     steps: Annotated[
-        int | None, typer.Option(metavar="N", help=f"Steps of the env to learn from; by default {FEWEST_STEPS}.")
+        int | None,
+        typer.Option(
+            metavar="N",
+            help=f"Steps of the env to learn from; by default {FEWEST_STEPS}.",
+            rich_help_panel=LEARNING,
+        ),
     ] = None,
     scenario: Annotated[
         str | None,
-        typer.Option(help=f"The plant and its noise: {LEARNABLE}, or a .toml file; by default {DEFAULTS}."),
+        typer.Option(
+            help=f"The plant and its noise: {LEARNABLE}, or a .toml file; by default {DEFAULTS}.",
+            rich_help_panel=INPUT,
+        ),
     ] = None,
     tuned: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Tuned file of the filter, from `thruster tune`."),
+        typer.Option(
+            metavar="FILE", help="Tuned file of the filter, from `thruster tune`.", rich_help_panel=FILTER
+        ),
     ] = None,
     untuned: Annotated[
         bool,
-        typer.Option("--untuned", help="Give the filter R by the sensor's sheet and Q by a rule of thumb."),
+        typer.Option(
+            "--untuned",
+            help="Give the filter R by the sensor's sheet and Q by a rule of thumb.",
+            rich_help_panel=FILTER,
+        ),
     ] = False,
     controller: Annotated[
         str | None,
-        typer.Option(help=f"Let the policy correct one of {CORRECTABLE}, in place of acting alone."),
+        typer.Option(
+            help=f"Let the policy correct one of {CORRECTABLE}, in place of acting alone.",
+            rich_help_panel=LEARNING,
+        ),
     ] = None,
-    envs: Annotated[int | None, typer.Option(metavar="N", help="Copies of the env, stepped together.")] = None,
+    envs: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Copies of the env, stepped together.", rich_help_panel=LEARNING),
+    ] = None,
     evaluations: Annotated[
-        int, typer.Option(metavar="N", help="How often the policy is tried out meanwhile.")
+        int,
+        typer.Option(metavar="N", help="How often the policy is tried out meanwhile.", rich_help_panel=LEARNING),
     ] = 20,
-    checkpoints: Annotated[int, typer.Option(metavar="N", help="How often it is saved meanwhile.")] = 10,
-    no_tensorboard: Annotated[bool, typer.Option("--no-tensorboard", help="Do not write what it shows.")] = False,
+    checkpoints: Annotated[
+        int, typer.Option(metavar="N", help="How often it is saved meanwhile.", rich_help_panel=OUTPUT)
+    ] = 10,
+    no_tensorboard: Annotated[
+        bool, typer.Option("--no-tensorboard", help="Do not write what it shows.", rich_help_panel=OUTPUT)
+    ] = False,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="By default one in out/policies, named after all these."),
+        typer.Option(
+            metavar="FOLDER", help="By default one in out/policies, named after all these.", rich_help_panel=OUTPUT
+        ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the network, the noise and the episodes.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the network, the noise and the episodes.", rich_help_panel=LEARNING)
+    ] = 0,
     json: JsonOption = None,
 ) -> None:
     """Train a policy on raw, filtered or true state, with Stable-Baselines3.
@@ -92,7 +134,7 @@ def command(
     scenario = plant.scenario if scenario is None else scenario
     chosen = plant.find_scenario(scenario)
     if untuned and tuned is not None:
-        raise ValueError("give either --tuned FILE or --untuned, but got both")
+        raise ValueError(f"give either --tuned FILE or --untuned, but got both, --tuned {tuned}")
     setup = make_setup(
         task,
         chosen,

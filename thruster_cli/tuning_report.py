@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from math import isfinite
-from pathlib import Path
-from typing import NamedTuple
 
 from numpy import isnan
 
@@ -12,44 +10,20 @@ from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import mean_sentence
 from thruster_cli.error_tables import comparison_table, span
 from thruster_cli.tables import choice_table, front_table, gradient_table, kinds_table
+from tuning.api.run import Tuning
 from tuning.evaluation.baselines import ORACLE, RULE, SCALED, TUNED, baselines
 from tuning.evaluation.evaluate import Evaluation, likelihood_gain, score_ratio
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SIZE_TOLERANCE
 from tuning.evaluation.tuned import consistency, metrics
 from tuning.evaluation.worth import scaling_sentence, without_truth
-from tuning.likelihood.gradient import GradientResult
-from tuning.likelihood.identifiability import Identifiability, as_data, sentences, too_many
-from tuning.problems.problem import Problem
+from tuning.likelihood.identifiability import as_data, sentences, too_many
 from tuning.search.filter_types import kinds_tried
 from tuning.search.objectives import NIS_BAND
 from tuning.search.outcome import is_over_budget
 from tuning.search.plan import Plan
 from tuning.search.space import size_ladder
 from tuning.search.study import StudyResult
-
-
-class Tuning(NamedTuple):
-    """All that a tuning made."""
-
-    study: str
-    plan: Plan
-    result: StudyResult
-    proofs: tuple[Comparison, ...]  # one for each scenario
-    file: Path
-    gradient: GradientResult | None = None  # where the choice is the maximum of the likelihood ...
-    rival: Comparison | None = None  # ... and what an Optuna study in its stead would have chosen
-    known: Identifiability | None = None  # what the innovations determine; None without a covariance
-
-    @property
-    def scenario(self) -> Problem:
-        """The first scenario."""
-        return self.plan.scenarios[0]
-
-    @property
-    def proof(self) -> Comparison:
-        """The proof on the first scenario."""
-        return self.proofs[0]
 
 
 def report(tuning: Tuning) -> list:

@@ -8,9 +8,10 @@ from typing import Annotated
 
 import typer
 
-from thruster_cli.log_problems import LogModelOption, problems_in
-from thruster_cli.output import CodeOption, JsonOption, announce_compilation, emit, table, working
+from thruster_cli.options import CodeOption, JsonOption, LogModelOption
+from thruster_cli.output import announce_compilation, emit, table, working
 from tuning.evaluation.verify import TOLERANCE, Verification, verify
+from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem
 
 LISTED = 10  # differences in the table; --json has all

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numerics.checks import between, one_of, positive, shown, within
+from numerics.checks import between, meant, one_of, positive, shown, within
 from thruster_env.dynamics import Constants
 
 LARGEST = 1e12  # of a parameter, and one over it the smallest positive one: floating point overflows far beyond
@@ -208,7 +208,8 @@ def _parameters(preset: str | Mapping | ThrusterParameters) -> ThrusterParameter
             raise ValueError(f"a preset mapping must have the fields {names}: {error}") from None
     if not isinstance(preset, str) or preset not in PRESETS:
         names = ", ".join(PRESETS)
-        raise ValueError(f"preset must be one of {names}, or a file that ends in .toml, but got {shown(preset)}")
+        rule = f"preset must be one of {names}, or a file that ends in .toml"
+        raise ValueError(f"{rule}, but got {shown(preset)}{meant(preset, PRESETS)}")
     return PRESETS[preset]
 
 

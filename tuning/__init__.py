@@ -1,1 +1,39 @@
-"""Scenarios, evaluation and Optuna studies of a filter's free numbers, proved on data the study never saw."""
+"""Tune state estimators, and show what that is worth: problems, studies, held-out evaluation, identification.
+
+    tune        find the Q, R and other numbers that make a filter good, and prove them on held-out seeds
+    evaluate    a filter, tuned or not, beside its baselines on seeds that no study saw
+    compare     several filters on the same seeds, with paired intervals
+    estimate    a filter or a smoother over a recorded log
+    identify    a model's parameters from recorded runs, and which of them these determine
+    report      a page on a tuned filter that any browser shows
+
+Each does what the command of its name does, in one call. A problem is a name, such as "mismatch" or "auv:motion",
+a `Problem`, "module:object", or a pair (model, data) of a model and recorded runs.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tuning.api.compare import compare
+    from tuning.api.estimate import estimate
+    from tuning.api.evaluate import evaluate
+    from tuning.api.identify import identify
+    from tuning.api.report import report
+    from tuning.api.tune import tune
+
+__all__ = ["compare", "estimate", "evaluate", "identify", "report", "tune"]
+
+
+def __getattr__(name: str) -> Any:
+    """A function, whose module is imported when it is asked for: `import tuning` alone is light."""
+    if name in __all__:
+        return getattr(import_module(f"tuning.api.{name}"), name)
+    raise AttributeError(f"module 'tuning' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Names of the functions."""
+    return sorted({*__all__, *globals()})

@@ -13,6 +13,7 @@ from auv_env.plant import Plant
 from auv_env.plant import state as checked_state
 from auv_env.task import Task
 from numerics.checks import options as checked_options
+from numerics.compiled import CompiledOrPython
 from plants.copies import PlantCopies
 
 
@@ -28,7 +29,7 @@ class Copies(PlantCopies):
         numbers, rows = encode(plant, task)
         super().__init__(count, numbers, FIXED_ROWS + rows)
 
-    def machine_code(self) -> tuple[Callable, Callable]:
+    def machine_code(self) -> tuple[Callable, CompiledOrPython]:
         """The compiled step, the same for every plant and task."""
         return machine_code()
 

@@ -35,7 +35,7 @@ from auv_env.engine.memory import (
     N,
 )
 from auv_env.engine.motion import begin_at_mean, move, read_state, take_commands
-from numerics.compiled import inlined
+from numerics.compiled import CompiledOrPython, inlined
 from numerics.streams import INITIAL, MEASUREMENT, PROCESS
 from plants.channels import Channel, reader_of
 from plants.copies import machine_code_of
@@ -63,7 +63,7 @@ def _tell_time_and_end(memory, b, numbers):
         memory[b, TERMINATED, j] = 0.0 if kept else 1.0
 
 
-def machine_code() -> tuple[Callable, Callable]:
+def machine_code() -> tuple[Callable, CompiledOrPython]:
     """The compiled `step(first, last, memory, numbers, out, begin)` of all vehicles; see `plants.copies`."""
     return machine_code_of(_step(known_effects(), tuple(sorted(CHANNELS.values(), key=lambda one: one.code))))
 

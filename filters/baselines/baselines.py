@@ -174,7 +174,11 @@ class Inversion(OpenLoop):
     @property
     def own_numbers(self) -> tuple[float, ...]:
         """How far a root is looked for, and how much of the last measurement is kept in the next."""
-        return self.reach, 0.0
+        return self._numbers(0.0)
+
+    def _numbers(self, kept: float) -> tuple[float, ...]:
+        assert self.reach is not None  # it is set when the filter is made
+        return self.reach, kept
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -203,7 +207,7 @@ class LowPass(Inversion):
     @property
     def own_numbers(self) -> tuple[float, ...]:
         """How far a root is looked for, and how much of the last measurement is kept in the next."""
-        return self.reach, math.exp(-1.0 / self.time_constant)
+        return self._numbers(math.exp(-1.0 / self.time_constant))
 
 
 def place_of(name: str, value, count: int) -> int:

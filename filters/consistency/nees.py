@@ -42,7 +42,8 @@ def _by_runs(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
 
 def _by_entries(errors: np.ndarray, covs: np.ndarray) -> np.ndarray:
     d = errors.shape[-1]
-    root, solved = {}, []
+    root: dict[tuple[int, int], np.ndarray] = {}
+    solved: list[np.ndarray] = []
     regular = np.ones(errors.shape[:-1], dtype=bool)
     for i in range(d):  # Cholesky factor and forward substitution, each entry an array over all covariances
         for j in range(i):

@@ -93,9 +93,18 @@ def findings(
 
 def joined(parts: Sequence[Findings]) -> Findings:
     """Findings of all runs from those of some after the others."""
-    errors, innovations, present, divergences = zip(*parts, strict=True)
-    both = [Residuals(*map(np.concatenate, zip(*some, strict=True))) for some in (errors, innovations)]
-    return Findings(*both, None if present[0] is None else np.concatenate(present), np.concatenate(divergences))
+    present = [one.present for one in parts if one.present is not None]
+    return Findings(
+        _joined([one.errors for one in parts]),
+        _joined([one.innovations for one in parts]),
+        np.concatenate(present) if present else None,
+        np.concatenate([one.divergences for one in parts]),
+    )
+
+
+def _joined(parts: Sequence[Residuals]) -> Residuals:
+    values, whitened_ones, deviations = (np.concatenate(some) for some in zip(*parts, strict=True))
+    return Residuals(values, whitened_ones, deviations)
 
 
 def _residuals(values: np.ndarray, covs: np.ndarray) -> Residuals:

@@ -105,7 +105,8 @@ def whiteness_sentence(found: Whiteness, channels: Sequence[str] = ()) -> str:
     """Whether innovations are white, and which way they are not; `channels` names the measurements."""
     if found.statistic == 0:
         return "No test of whiteness: the filter gives no innovation covariance, or nothing was measured."
-    lag, i, j = np.unravel_index(np.argmax(np.abs(found.correlations)), found.correlations.shape)
+    largest_at = np.unravel_index(np.argmax(np.abs(found.correlations)), found.correlations.shape)
+    lag, i, j = (int(place) for place in largest_at)
     largest = found.correlations[lag, i, j]
     after = "from one step to the next" if lag == 0 else f"over {lag + 1} steps"
     channels = channels or [f"channel {place + 1}" for place in range(found.correlations.shape[1])]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from numerics.checks import as_floats, covariance, shown
 from numerics.sources import is_array
+from numerics.streams import filter_keys
 from numerics.threads import spread
 from plants.layout import LANES, with_root
 
@@ -28,9 +29,9 @@ class Estimates(NamedTuple):
 
 def run(
     filter_: Filter,
-    keys: np.ndarray,
-    inputs: np.ndarray,
-    measurements: np.ndarray,
+    keys: np.ndarray | None = None,
+    inputs: np.ndarray | None = None,
+    measurements: np.ndarray | None = None,
     *,
     process_noise_covs: np.ndarray | None = None,
     measurement_noise_covs: np.ndarray | None = None,
@@ -39,8 +40,9 @@ def run(
 
     Args:
         filter_: any filter, or somebody else's estimator in the place of one.
-        keys: random keys, one a trajectory, (B, 2).
-        inputs: u, (B, K, p); the filter predicts with u[:, k] ...
+        keys: random keys, one a trajectory, (B, 2); those of seeds 0, 1, ..., B - 1 if None. Filters that draw
+            nothing do the same whatever the keys: run(filter_, inputs=u, measurements=z).
+        inputs: u, (B, K, p); None for a model without inputs; the filter predicts with u[:, k] ...
         measurements: ... and updates with z[:, k + 1]; (B, K + 1, m), NaN where missing.
         process_noise_covs: Q of every step, (K, n, n), in place of the model's.
         measurement_noise_covs: R of every measurement, (K + 1, m, m), in place of the model's.
@@ -99,12 +101,19 @@ def _run_side_by_side(filter_: Filter, data: tuple, noise: tuple, out: Estimates
 
 
 def trajectories(
-    filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray
+    filter_: Filter, keys: np.ndarray | None, inputs: np.ndarray | None, measurements: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The arguments of `run` as the arrays that compiled code takes; ValueError if something is off."""
     model = filter_.kernel_model
     # Arrays that may be written to: others are another type to numba, which compiles once more for them.
-    requirements = "C_CONTIGUOUS", "WRITEABLE"
+    requirements: tuple[Literal["C_CONTIGUOUS", "WRITEABLE"], ...] = "C_CONTIGUOUS", "WRITEABLE"
+    if measurements is None:
+        raise ValueError("measurements must be an array (B, K + 1, m), but got None")
+    if inputs is None or keys is None:
+        shape = np.shape(measurements)
+        count, steps = shape[:2] if len(shape) == 3 else (0, 1)
+        inputs = np.zeros((count, steps - 1, 0)) if inputs is None else inputs
+        keys = filter_keys(range(count)).reshape(count, 2) if keys is None else keys
     given = {"keys": keys, "inputs": inputs, "measurements": measurements}
     keys, inputs, z = (np.require(_floats(name, value), np.float64, requirements) for name, value in given.items())
     if z.ndim != 3 or inputs.ndim != 3 or keys.shape != (len(z), 2):

@@ -38,7 +38,7 @@ class Beliefs:
     def __setstate__(self, state: tuple) -> None:
         """Go on where the beliefs were."""
         filter_, rows, tables = state
-        self.__init__(filter_, len(rows))
+        type(self).__init__(self, filter_, len(rows))
         self._rows[:], self._tables[:] = rows, tables
 
     def start(self, which: np.ndarray, keys: np.ndarray, z: np.ndarray) -> None:

@@ -97,7 +97,7 @@ def _build_batch(kernels: Kernels) -> Callable:
     return batch
 
 
-def operation(kernels: Kernels) -> Callable:
+def operation(kernels: Kernels) -> CompiledOrPython:
     """`operate(*memory, size, given, numbers, task)` on one belief; it returns how often that diverged.
 
     given = (u, z) in one array, for each costs some 80 ns a call; task is a sum of START, PREDICT and UPDATE.
@@ -105,7 +105,7 @@ def operation(kernels: Kernels) -> Callable:
     return _runner(build_operation, kernels, is_interpreting())
 
 
-def batch(kernels: Kernels) -> Callable:
+def batch(kernels: Kernels) -> CompiledOrPython:
     """`batch(*memory, size, keys, inputs, measurements, numbers, noise, out, first, last)` on trajectories.
 
     noise = (qs, rs) has a row (Q, its root) for each step and a row (R, its root) for each measurement that stand
@@ -114,7 +114,7 @@ def batch(kernels: Kernels) -> Callable:
     return _runner(_build_batch, kernels, is_interpreting())
 
 
-def lanes(kernels: Kernels) -> Callable:
+def lanes(kernels: Kernels) -> CompiledOrPython:
     """The same for filters without an ensemble, many trajectories at a time; see `engine.simd.build_lanes`."""
     return _runner(build_lanes, kernels, is_interpreting())
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -20,6 +21,27 @@ STEP = PREDICT + UPDATE
 TASKS = {"start": START, "predict": PREDICT, "update": UPDATE}
 
 
+class Running(Protocol):
+    """A filter, or somebody else's estimator, at work in place on one trajectory.
+
+    Attributes:
+        mean, cov, innovation, innovation_cov: of the last step, (n,), (n, n), (m,), (m, m).
+        divergences: restarts from the prior, so far.
+    """
+
+    mean: np.ndarray
+    cov: np.ndarray
+    innovation: np.ndarray
+    innovation_cov: np.ndarray
+    divergences: int
+
+    def start(self, key, z) -> None:
+        """Begin with a random key (2,) and a first measurement z (m,)."""
+
+    def step(self, u, z) -> None:
+        """One step later, after input u (p,) and measurement z (m,); NaN marks a missing channel."""
+
+
 class Session:
     """One filter at work in place on its own memory: what a wrapper steps and `Filter.predict` borrows.
 
@@ -34,7 +56,8 @@ class Session:
         kernels, model, size = filter_.kernels(), filter_.kernel_model, filter_.size
         n, m = kernels.n, kernels.m
         places = memory_places(n, m)
-        self._name, self._kernels, self._operate = filter_.name, kernels, operation(kernels)
+        self._name, self._kernels = filter_.name, kernels
+        self._operate: Callable = operation(kernels)
         self._numbers, self._size, self._places = filter_.numbers, size, places
         self._kept_rows, self._noise_places = kernels.kept_rows, number_places(n, m)
         self._memory = new_memory(kernels, size)
@@ -57,10 +80,10 @@ class Session:
     def __setstate__(self, state: tuple) -> None:
         """Go on where the belief was."""
         filter_, divergences, arrays = state
-        self.__init__(filter_)
+        type(self).__init__(self, filter_)
         for own, kept in zip((*self._memory, self._values, self._numbers), arrays, strict=True):
             own[...] = kept
-        self.divergences, self._operate = divergences, self._operate.direct
+        self.divergences, self._operate = divergences, operation(self._kernels).direct
 
     def _do(self, task: int) -> None:
         self.divergences = self._operate(*self._given, task)

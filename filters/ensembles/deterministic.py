@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from filters.engine.belief import Kernels
 from filters.ensembles.ensemble import EnsembleFilter, measurement_moments
@@ -24,7 +24,7 @@ def moved_member(n: int, m: int, first: int) -> Callable:
 
     Shapes: shift (n,), g (n, m), means (m,).
     """
-    shapes = {"result": (n,), "shift": (n,), "g": (n, m), "means": (m,)}
+    shapes: dict[str, Any] = {"result": (n,), "shift": (n,), "g": (n, m), "means": (m,)}
     source = Source("moved", "table, j, shift, g, means", **shapes)
     d = source.local("d", m)
     for i in source.range(m):
@@ -39,7 +39,7 @@ def moved_member(n: int, m: int, first: int) -> Callable:
 @cache
 def member_mover(n: int, m: int, first: int) -> Callable:
     """Return `move(table, shift, g, means)`, which puts `moved_member` in the place of every member."""
-    shapes = {"shift": (n,), "g": (n, m), "means": (m,)}
+    shapes: dict[str, Any] = {"shift": (n,), "g": (n, m), "means": (m,)}
     source = Source("move", "table, shift, g, means", **shapes)
     if source.loops:
         shift, g, means = (source.array_of(name) for name in shapes)
@@ -142,4 +142,8 @@ class DeterministicEnsembleKalmanFilter(DeterministicUpdateFilter):
     """
 
     name: ClassVar[str] = "denkf"
-    analysis = staticmethod(half_gain_analysis)
+
+    @property
+    def analysis(self) -> Callable:
+        """The update, as `ensemble_kernels` takes it."""
+        return half_gain_analysis

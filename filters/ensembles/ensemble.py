@@ -142,7 +142,6 @@ class EnsembleFilter(Filter):
     for system errors in ensemble data assimilation", for relaxation to the prior spread.
     """
 
-    analysis: ClassVar[Callable]
     ensemble_size: int = 100
     inflation: float = 1.0
     relaxation: float = 0.0
@@ -158,6 +157,11 @@ class EnsembleFilter(Filter):
         object.__setattr__(self, "ensemble_size", size)
         object.__setattr__(self, "inflation", positive("inflation", self.inflation))
         object.__setattr__(self, "relaxation", relaxation)
+
+    @property
+    def analysis(self) -> Callable:
+        """The update, as `ensemble_kernels` takes it."""
+        raise NotImplementedError
 
     @property
     def size(self) -> int:

@@ -74,13 +74,13 @@ def iterated_analysis(observe: Callable, shape: Shape) -> Callable:
     of_states_and_slopes, none = row_covariances(0, n, slopes, m), zeros_of(m)
     silence = silencer(n, shape.measurement_angles)
     total = entrywise("total", "a, b", (m,), lambda i: f"a[{i}] + b[{i}]", a=(m,), b=(m,))
-    with_slopes = Source("with_slopes", "means", result=(n + 2 * m,), means=(n + m,))
-    known = with_slopes.local("known", n + 2 * m)
-    for i in with_slopes.range(n + m):
-        with_slopes.line(f"{known[i]} = means[{i}]")
-    for i in with_slopes.range(n + m, n + 2 * m):
-        with_slopes.line(f"{known[i]} = 0.0")
-    with_slopes = with_slopes.function(with_slopes.whole(known))
+    source = Source("with_slopes", "means", result=(n + 2 * m,), means=(n + m,))
+    known = source.local("known", n + 2 * m)
+    for i in source.range(n + m):
+        source.line(f"{known[i]} = means[{i}]")
+    for i in source.range(n + m, n + 2 * m):
+        source.line(f"{known[i]} = 0.0")
+    with_slopes = source.function(source.whole(known))
 
     at_once, store_state = is_array(n, m), column_writer(n)
 
@@ -149,8 +149,12 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     """
 
     name: ClassVar[str] = "ienkf"
-    analysis = staticmethod(iterated_analysis)
     iterations: int = 3
+
+    @property
+    def analysis(self) -> Callable:
+        """The update, as `ensemble_kernels` takes it."""
+        return iterated_analysis
 
     def __post_init__(self):
         """Check the numbers; raise ValueError that states the rule and the value."""

@@ -62,4 +62,8 @@ class SerialSquareRootFilter(DeterministicUpdateFilter):
     """
 
     name: ClassVar[str] = "ensrf"
-    analysis = staticmethod(serial_analysis)
+
+    @property
+    def analysis(self) -> Callable:
+        """The update, as `ensemble_kernels` takes it."""
+        return serial_analysis

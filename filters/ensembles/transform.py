@@ -33,8 +33,8 @@ def geometric_mean(size: int) -> Callable:
     close = 1.0 + CLOSE if is_array(size, size) else 0.0  # small ones take no time
     factor, solve = matrices.cholesky_factor(size), matrices.row_solver(size, size)
     times, add = matrices.multiplier(size, size, size), matrices.symmetric_sum(size)
-    unit = Source("unit", "l", l=(size, size))  # l l' over this has determinant 1
-    unit = unit.function(unit.product(f"l[{i}][{i}] ** {2.0 / size!r}" for i in unit.range(size)))
+    source = Source("unit", "l", l=(size, size))  # l l' over this has determinant 1
+    unit = source.function(source.product(f"l[{i}][{i}] ** {2.0 / size!r}" for i in source.range(size)))
     scaled = entrywise("scaled", "a, f", (size, size), lambda i, j: f"f * a[{i}][{j}]", a=(size, size))
 
     @inlined
@@ -101,4 +101,8 @@ class EnsembleTransformFilter(DeterministicUpdateFilter):
     """
 
     name: ClassVar[str] = "etkf"
-    analysis = staticmethod(transform_analysis)
+
+    @property
+    def analysis(self) -> Callable:
+        """The update, as `ensemble_kernels` takes it."""
+        return transform_analysis

@@ -35,7 +35,8 @@ def memberships(premises: tuple[int, ...]) -> Callable:
     That of rule r is the product over all k premises i of (high_i - x_i)/(high_i - low_i), or of one less that
     where the bit of r that belongs to i is set; each factor is held within 0 and 1.
     """
-    lines, products = [], []
+    lines: list[str] = []
+    products: list[tuple[str, ...]] = []
     for i in premises:
         lines.append(f"part = (x[{i}] - low[{i}]) / (high[{i}] - low[{i}])")
         lines.append(f"of_high{i} = 0.0 if part < 0.0 else 1.0 if part > 1.0 else part")

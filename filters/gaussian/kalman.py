@@ -93,9 +93,10 @@ class KalmanFilter(AffineFilter):
     @cached_property
     def own_numbers(self) -> tuple[float, ...]:
         """The inputs of a schedule, then the constants of the affine model at each."""
-        if self.schedule == 1:
+        operating_points = self.model.operating_points
+        if self.schedule == 1 or operating_points is None:
             return ()
-        points = self.model.operating_points(self.schedule)
+        points = operating_points(self.schedule)
         inputs = [float(u) for _, (u,) in points]
         if not (np.diff(inputs) > 0).all():
             raise ValueError(f"the inputs of operating points must increase, but got {inputs}")

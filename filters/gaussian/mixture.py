@@ -78,22 +78,22 @@ def blender(
     row[covs] and row[weights] on. Means of parts that are angles are put on one branch (`numerics.angles`).
     """
     mean_of = _mean_blender(count, means, weights, stride)
-    cov_of = Source("cov_of", "row, parts, mean", result=(count, count), mean=(count,))
-    total, d = cov_of.local("s", count, count), cov_of.local("d", count)
-    if not cov_of.loops:
+    source = Source("cov_of", "row, parts, mean", result=(count, count), mean=(count,))
+    total, d = source.local("s", count, count), source.local("d", count)
+    if not source.loops:
         for i, j in lower_pairs(count):
-            cov_of.line(f"{total[i, j]} = 0.0")
-    for _ in cov_of.inside("for part in range(parts):"):
-        cov_of.line(f"k = {stride} * part")
-        cov_of.line(f"w = row[k + {weights}]")
+            source.line(f"{total[i, j]} = 0.0")
+    for _ in source.inside("for part in range(parts):"):
+        source.line(f"k = {stride} * part")
+        source.line(f"w = row[k + {weights}]")
         if between:
-            for i in cov_of.range(count):
-                cov_of.line(f"{d[i]} = row[k + {means + i}] - mean[{i}]")
-        for i in cov_of.range(count):
-            for j in cov_of.range(i + 1):
+            for i in source.range(count):
+                source.line(f"{d[i]} = row[k + {means + i}] - mean[{i}]")
+        for i in source.range(count):
+            for j in source.range(i + 1):
                 apart = f" + {d[i]} * {d[j]}" if between else ""
-                cov_of.line(f"{total[i, j]} += w * (row[k + {covs + i * count + j}]{apart})")
-    cov_of = cov_of.function(cov_of.mirrored(total))
+                source.line(f"{total[i, j]} += w * (row[k + {covs + i * count + j}]{apart})")
+    cov_of = source.function(source.mirrored(total))
 
     @inlined
     def blend(row, parts):

@@ -38,14 +38,14 @@ def points_around(n: int, centre: bool) -> Callable:
     if not source.loops:
         points = [tuple_of(f"x[{a}] {sign} s * l[{a}][{i}]" for a in range(n)) for sign in "+-" for i in range(n)]
         return source.function(tuple_of(["x"] * centre + points))
-    points = source.local("points", count, n)
+    table = source.local("points", count, n)
     for a in source.range(n):
-        source.line(f"{points[0, a]} = x[{a}]")
+        source.line(f"{table[0, a]} = x[{a}]")
     for i in source.range(n):
         for a in source.range(n):
-            source.line(f"{points[i + first, a]} = x[{a}] + s * l[{a}][{i}]")
-            source.line(f"{points[i + (n + first), a]} = x[{a}] - s * l[{a}][{i}]")
-    return source.function(source.whole(points))
+            source.line(f"{table[i + first, a]} = x[{a}] + s * l[{a}][{i}]")
+            source.line(f"{table[i + (n + first), a]} = x[{a}] - s * l[{a}][{i}]")
+    return source.function(source.whole(table))
 
 
 @cache
@@ -54,8 +54,8 @@ def at_points(function: Callable, arguments: str, size: int, results: int, count
     name, others = ("transition", "u, c") if arguments == "x, u, c" else ("observe", "c")
     source = Source("values", arguments, result=(count, results), x=(count, size))
     if not source.loops:
-        values = tuple_of(f"{name}(x[{i}], {others})" for i in range(count))
-        return source.function(values, **{name: function})
+        calls = tuple_of(f"{name}(x[{i}], {others})" for i in range(count))
+        return source.function(calls, **{name: function})
     values = source.local("values", count, results)
     for i in source.range(count):
         source.line(f"store({values.name}, {i}, {name}(point({source.array_of('x')}, {i}), {others}))")
@@ -80,8 +80,8 @@ def deviations(size: int, count: int, centre: bool, angles: tuple[bool, ...] = (
     for a in source.range(size):
         values = source.range(first, first + count)
         if centre:
-            apart = (short_way(f"(y[{i}][{a}] - y[0][{a}])", a, angles) for i in values)
-            source.line(f"{shift[a]} = w * ({source.sum(apart)})")
+            distances = (short_way(f"(y[{i}][{a}] - y[0][{a}])", a, angles) for i in values)
+            source.line(f"{shift[a]} = w * ({source.sum(distances)})")
             source.line(f"{mean[a]} = y[0][{a}] + {shift[a]}")
         else:
             source.line(f"{shift[a]} = 0.0")

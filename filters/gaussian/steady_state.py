@@ -27,6 +27,7 @@ STABLE = 1.0 - 1e-7  # magnitude of an eigenvalue of A (I - K C): an error lasts
 def steady_kernels(functions: Functions, shape: Shape) -> Kernels:
     """Kernels for an affine model's functions and shape; the filter's own numbers are the gain (n, m)."""
     n, m, observe, observe_jacobian = shape.n, shape.m, functions.observe, functions.observe_jacobian
+    assert observe_jacobian is not None  # of an affine model it is known
     places, source = memory_places(n, m), number_places(n, m)
     (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
     constants, measured, read_r = constants_reader(shape), vector_reader(m), matrix_reader(m, m, source.r)

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.engine.batch import Estimates, run
+from filters.engine.session import Session
 from filters.estimators.estimator import Estimator
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
@@ -127,12 +128,15 @@ def estimate_with(
 
 def _stepped(filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray) -> Estimates:
     """What `run` gives of one trajectory, by the steps of a wrapper: the same to the last bit."""
-    session, z = filter_.session(), measurements[0]
+    session, z = Session(filter_), measurements[0]
     session.start(keys[0], z[0])
     rows = []
     for k in range(len(z)):
         if k:
             session.step(inputs[0, k - 1].tolist(), z[k])
-        innovation = session.innovation_copy()
-        rows.append((session.mean.copy(), session.cov.copy(), *innovation))
-    return Estimates(*(np.array(part)[None] for part in zip(*rows, strict=True)), np.array([session.divergences]))
+        rows.append((session.mean.copy(), session.cov.copy(), *session.innovation_copy()))
+    means, covs, innovations, innovation_covs, likelihoods = (
+        np.array(part)[None] for part in zip(*rows, strict=True)
+    )
+    counts = np.array([session.divergences])
+    return Estimates(means, covs, innovations, innovation_covs, likelihoods, counts)

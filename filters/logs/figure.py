@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,8 +27,8 @@ def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
     return save_figure(draw_log(found, title), path)
 
 
-def draw_log(found: LogEstimate, title: str) -> Figure:
-    """Estimates beside the reference channels, and the innovations below.
+def draw_log(found: LogEstimate, title: str, *, states: bool = True) -> Figure:
+    """Estimates beside the reference channels, and the innovations below; without `states` these alone.
 
     References come first; of many states and outputs the first six are drawn. Bands of the first rows, in which a
     filter settles from its prior, do not widen the axes.
@@ -36,7 +36,7 @@ def draw_log(found: LogEstimate, title: str) -> Figure:
     model, references = found.model, compared(found)
     values = [f"{STATE}:{one.symbol}" for one in model.states] + [f"{OUTPUT}:{symbol}" for symbol in model.outputs]
     shown = sorted(values, key=lambda key: key not in references)[:MOST_PANELS]
-    shown = [key for key in values if key in shown]
+    shown = [key for key in values if key in shown] if states else []
     heights = [TALL] * len(shown) + [LOW] * len(found.log.measured)
     figure = new_figure((WIDTH, sum(heights) + ROOM))
     axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
@@ -61,7 +61,7 @@ def draw_log(found: LogEstimate, title: str) -> Figure:
     axes[0].set_title(title, fontsize=11)
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
-    named = {}
+    named: dict[str, Any] = {}
     for axis in axes:
         handles, texts = axis.get_legend_handles_labels()
         named |= dict(zip(texts, handles, strict=True))

@@ -61,7 +61,7 @@ def findings(found: LogEstimate, skip: int | None = None) -> LogFindings:
     if found.filter.has_covariance and count:
         e = whitened(np.where(present, innovations, 0.0), covs)
         nis = float((np.where(present, e, 0.0) ** 2).sum() / count)
-        band = tuple(float(chdtri(count, p) / count) for p in (0.975, 0.025))
+        band = float(chdtri(count, 0.975) / count), float(chdtri(count, 0.025) / count)
         white = whiteness_of(e[None], present[None]) if len(e) > LAGS else None
     predictions = [_residual(quantity, -innovations[:, j]) for j, quantity in enumerate(log.measured)]
     references = [_residual(log.referred[key], reference_errors(found, key)[first:]) for key in compared(found)]

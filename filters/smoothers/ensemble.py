@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import cache, lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -34,8 +35,9 @@ def smooth_ensembles(
 
     Raises ValueError for a filter with rotations, which would part the members of different steps.
     """
-    if getattr(filter_, "rotations", 0):
-        raise ValueError(f"a smoothed filter must have rotations 0, but got {filter_.rotations}")
+    rotations = getattr(filter_, "rotations", 0)
+    if rotations:
+        raise ValueError(f"a smoothed filter must have rotations 0, but got {rotations}")
     paired = dataclasses.replace(filter_, model=_paired_model(filter_.kernel_model))
     kernels, pair_kernels, size = filter_.kernels(), paired.kernels(), filter_.size
     analyse_pair = filter_.analysis(paired.model.functions.observe, paired.model.shape)
@@ -75,7 +77,7 @@ def _paired_model(model: StateSpaceModel) -> StateSpaceModel:
 @cache
 def _paired_functions(transition: Callable, observe: Callable, n: int) -> tuple[Callable, Callable]:
     now, past = (vector_part(n, 2 * n, first) for first in (0, n))
-    names = {"now": now, "past": past, "join": joiner(n, n)}
+    names: dict[str, Any] = {"now": now, "past": past, "join": joiner(n, n)}
     moves = written_out("moves", "x, u, c", "join(f(now(x), u, c), past(x))", f=transition, **names)
     return moves, written_out("observe", "x, c", "h(now(x), c)", h=observe, now=now)
 

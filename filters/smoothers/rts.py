@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -99,8 +100,8 @@ def extended_relation(functions: Functions, shape: Shape) -> Callable:
     substeps_place, constants, control = source.substeps, constants_reader(shape), vector_reader(shape.inputs)
     read_q, read_scales = matrix_reader(n, n, source.q), vector_reader(n, source.scales)
     slopes, times = transition_slopes(functions, shape), matrices.multiplier(n, n, n)
-    identity = Source("identity", "", result=(n, n))
-    identity = identity.function(identity.matrix(n, n, lambda i, j: identity.if_same(i, j, "1.0", "0.0")))
+    unit = Source("identity", "", result=(n, n))
+    identity = unit.function(unit.matrix(n, n, lambda i, j: unit.if_same(i, j, "1.0", "0.0")))
     link = linear_link(n)
 
     @inlined
@@ -159,7 +160,7 @@ def _smoother(relate: Callable, n: int, angles: tuple[bool, ...], interpreting: 
         matrices.multiplier(n, n, n),
         matrices.transposed_multiplier(n, n, n),
     )
-    vectors = dict.fromkeys("xse", (n,))
+    vectors: dict[str, Any] = dict.fromkeys("xse", (n,))
     source = Source("corrected", "x, g, s, e", result=(n,), g=(n, n), **vectors)
 
     def sums(i):

@@ -20,8 +20,9 @@ from filters.smoothers.rts import extended_relation, scheduled_relation, smooth_
 from filters.smoothers.sigma_relation import sigma_relation
 from numerics.checks import at_least
 
-LINEARISED = (KalmanFilter, ExtendedKalmanFilter, IteratedExtendedKalmanFilter)
-WITH_POINTS = {UnscentedKalmanFilter: True, CubatureKalmanFilter: False}  # whether the mean is a point
+LINEARISED: tuple[type[Filter], ...] = (KalmanFilter, ExtendedKalmanFilter, IteratedExtendedKalmanFilter)
+# Filters with sigma points, and whether the mean is one of them.
+WITH_POINTS: dict[type[Filter], bool] = {UnscentedKalmanFilter: True, CubatureKalmanFilter: False}
 
 
 class Smoothed(NamedTuple):
@@ -32,7 +33,11 @@ class Smoothed(NamedTuple):
 
 
 def smooth(
-    filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray, lag: int | None = None
+    filter_: Filter,
+    keys: np.ndarray | None = None,
+    inputs: np.ndarray | None = None,
+    measurements: np.ndarray | None = None,
+    lag: int | None = None,
 ) -> Smoothed:
     """Filter trajectories forwards and correct the estimates by later measurements.
 
@@ -46,7 +51,7 @@ def smooth(
 
     Args:
         filter_: a filter of these kinds.
-        keys: random keys, one a trajectory, (B, 2).
+        keys: random keys, one a trajectory, (B, 2); those of seeds 0, 1, ..., B - 1 if None.
         inputs: u, (B, K, p).
         measurements: z, (B, K + 1, m), NaN where missing.
         lag: how many later measurements an estimate has seen, for use with a fixed delay; all of them if None.
@@ -73,7 +78,7 @@ def smooth(
 def relation_of(filter_: Filter) -> Callable:
     """What `smooth_backwards` needs to know of a filter; ValueError if it has no such smoother."""
     model, kind = filter_.kernel_model, type(filter_)
-    if kind is KalmanFilter and filter_.schedule > 1:
+    if isinstance(filter_, KalmanFilter) and kind is KalmanFilter and filter_.schedule > 1:
         return scheduled_relation(filter_.schedule, model.shape)
     if kind in LINEARISED:
         return extended_relation(model.functions, model.shape)

@@ -69,14 +69,19 @@ ModelInSpec.__name__ = "StateSpaceModel (give model='module:factory' instead)"
 
 def check_spaces(
     action_space: gym.Space, observation_space: gym.Space, model: StateSpaceModel, measured_inputs: int = 0
-) -> None:
-    """Raise ValueError unless both spaces are Box and the actions are the model's inputs but so many last ones."""
-    spaces = {
-        "action": (action_space, model.inputs - measured_inputs),
-        "observation": (observation_space, model.m),
-    }
-    for name, (space, size) in spaces.items():
-        if not isinstance(space, gym.spaces.Box):
-            raise ValueError(f"the {name} space must be a Box, but got {space}")
-        if name == "action" and int(np.prod(space.shape)) != size:
-            raise ValueError(f"the {name} space must have the model's {size} entries, but got {space}")
+) -> gym.spaces.Box:
+    """Return the action space; raise ValueError unless both spaces are Box, and actions fit the model.
+
+    They are the model's inputs, of which the last `measured_inputs` are left out.
+    """
+    actions, size = _box("action", action_space), model.inputs - measured_inputs
+    if int(np.prod(actions.shape)) != size:
+        raise ValueError(f"the action space must have the model's {size} entries, but got {actions}")
+    _box("observation", observation_space)
+    return actions
+
+
+def _box(name: str, space: gym.Space) -> gym.spaces.Box:
+    if not isinstance(space, gym.spaces.Box):
+        raise ValueError(f"the {name} space must be a Box, but got {space}")
+    return space

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Mapping
+from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator, register, registry
@@ -38,7 +39,7 @@ def make_env(
 
     `filter_arguments` are the filter's own numbers; what is not named here are arguments of the env.
     """
-    env = load_env_creator(gym.spec(env_id).entry_point)(**env_arguments)
+    env = _made(gym.spec(env_id).entry_point, env_arguments)
     numbers = _checked(filter_arguments)
     return EstimateState(env, filter, observation, model_arguments=model_arguments, **numbers)
 
@@ -52,9 +53,15 @@ def make_vector_env(
     **env_arguments,
 ) -> EstimateStates:
     """The native vector env of an id with a filter on every copy; see `EstimateStates` for the arguments."""
-    env = load_env_creator(gym.spec(env_id).vector_entry_point)(**env_arguments)
+    env = _made(gym.spec(env_id).vector_entry_point, env_arguments)
     numbers = _checked(filter_arguments)
     return EstimateStates(env, filter, observation, model_arguments=model_arguments, **numbers)
+
+
+def _made(entry: Any, arguments: Mapping) -> Any:
+    """An env by what makes it, "module:class" or the class itself."""
+    create = load_env_creator(entry) if isinstance(entry, str) else entry
+    return create(**arguments)
 
 
 def modelled_ids() -> list[str]:

@@ -31,7 +31,7 @@ class WithMeasuredInputs:
     def __init__(self, runs, split: Split):
         """Take what runs the filter, a session or beliefs; `start` comes next."""
         self._runs, self._inputs, self._measurements = runs, list(split.inputs), list(split.measurements)
-        self._last = None
+        self._last: np.ndarray | None = None
 
     def __getattr__(self, name: str):
         """The estimate and all else are those of the session or the beliefs."""
@@ -43,14 +43,16 @@ class WithMeasuredInputs:
         """Start with a key and a measurement, or copies (which, keys, measurements)."""
         *which, keys, z = arguments
         first = np.nan_to_num(z[..., self._inputs])
-        if not which or self._last is None:
-            self._last = first
+        last = first if not which or self._last is None else self._last
         if which:
-            self._last[which[0]] = first[which[0]]
+            last[which[0]] = first[which[0]]
+        self._last = last
         self._runs.start(*which, keys, z[..., self._measurements])
 
     def step(self, u, z: np.ndarray, **idle) -> None:
         """Predict with the action and what was measured at the step's beginning, and update."""
-        self._runs.step(np.concatenate([u, self._last], axis=-1), z[..., self._measurements], **idle)
+        last = self._last
+        assert last is not None  # `start` comes first
+        self._runs.step(np.concatenate([u, last], axis=-1), z[..., self._measurements], **idle)
         now = z[..., self._inputs]
-        self._last = np.where(np.isnan(now), self._last, now)
+        self._last = np.where(np.isnan(now), last, now)

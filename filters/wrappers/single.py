@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -88,7 +89,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self._form = one_of("observation", observation, OBSERVATIONS)
         self.filter = filter_for(env, filter, model, tuned, model_arguments, numbers)
         split = split_of(env, self.filter.model)
-        check_spaces(env.action_space, env.observation_space, self.filter.model, len(split.inputs))
+        actions = check_spaces(env.action_space, env.observation_space, self.filter.model, len(split.inputs))
         n, m = self.filter.model.n, split.channels
         # What an env appends to its measurement, validity flags and the reference, stays in the observation.
         self._appended = env.get_wrapper_attr(APPENDED) if env.has_wrapper_attr(APPENDED) else 0
@@ -98,9 +99,10 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self._session = WithMeasuredInputs(session, split) if split.inputs else session
         self._channels = split.channels
         self._generator = filter_generator(None)
-        if hasattr(env.unwrapped, "overlay"):  # it draws the estimate beside the truth
-            env.unwrapped.render_overlay = self._overlay
-        low, high = env.action_space.low.ravel(), env.action_space.high.ravel()
+        base: Any = env.unwrapped
+        if hasattr(base, "overlay"):  # it draws the estimate beside the truth
+            base.render_overlay = self._overlay
+        low, high = actions.low.ravel(), actions.high.ravel()
         self._bounds = list(zip(low.tolist(), high.tolist(), strict=True))
         self._has_one_input = len(self._bounds) == 1
 
@@ -143,7 +145,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
     def _overlay(self):
         label, model, session = self.filter.name, self.filter.model, self._session
-        return self.unwrapped.overlay(label, model, session.mean, session.cov)
+        base: Any = self.unwrapped
+        return base.overlay(label, model, session.mean, session.cov)
 
     def _observe(self, observation, z, info) -> np.ndarray:
         session = self._session

@@ -58,7 +58,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         self.filter = filter_for(env, filter, model, tuned, model_arguments, numbers)
         split = split_of(env, self.filter.model)
         inputs = len(split.inputs)
-        check_spaces(env.single_action_space, env.single_observation_space, self.filter.model, inputs)
+        actions = check_spaces(env.single_action_space, env.single_observation_space, self.filter.model, inputs)
         self._n, self._m = self.filter.model.n, split.channels
         self._appended = getattr(env.unwrapped, APPENDED, 0)
         length = {"estimate": self._n, "measurement+estimate": self._m + self._n, "belief": 2 * self._n}[
@@ -68,20 +68,20 @@ class EstimateStates(gym.vector.VectorWrapper):
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, shape=shape, dtype=np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.autoreset_mode = AutoresetMode(env.metadata.get("autoreset_mode", AutoresetMode.NEXT_STEP))
-        beliefs = EstimatorBeliefs if isinstance(self.filter, ForeignFilter) else Beliefs
-        self._beliefs = beliefs(self.filter, self.num_envs)
-        if inputs:
-            self._beliefs = WithMeasuredInputs(self._beliefs, split)
+        kind = EstimatorBeliefs if isinstance(self.filter, ForeignFilter) else Beliefs
+        beliefs = kind(self.filter, self.num_envs)
+        self._beliefs = WithMeasuredInputs(beliefs, split) if inputs else beliefs
         self._keys = EpisodeKeys(self.num_envs, filter_generator)
         self._held = np.zeros((self.num_envs, self._m))
         self._done = np.zeros(self.num_envs, dtype=bool)
-        self._low, self._high = env.single_action_space.low.ravel(), env.single_action_space.high.ravel()
+        self._low, self._high = actions.low.ravel(), actions.high.ravel()
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict | None = None):
         """Reset the env and the beliefs of the copies that it resets."""
         mask = reset_mask(options, self._keys)
         self._keys.seeds(seed)  # a wrong one changes nothing
-        observations, info = self.env.reset(seed=seed, options=options)
+        seeds: Any = seed  # Gymnasium takes a list of them, too, but its annotation does not say so
+        observations, info = self.env.reset(seed=seeds, options=options)
         which = np.ones(self.num_envs, dtype=bool) if mask is None else mask
         self._keys.seed(seed, which)
         z = self._measurements(observations, info)
@@ -122,7 +122,9 @@ class EstimateStates(gym.vector.VectorWrapper):
     def _end(self, u, z, done, info) -> None:
         """Update with the last measurements of episodes that end; put these estimates into final_obs and info."""
         final = np.full(self.num_envs, None, dtype=object) if "final_obs" not in info else info["final_obs"]
-        observations = np.zeros((self.num_envs, *self.env.single_observation_space.shape), dtype=np.float32)
+        observations = np.zeros(
+            (self.num_envs, *(self.env.single_observation_space.shape or ())), dtype=np.float32
+        )
         for i in np.flatnonzero(done):
             observations[i] = final[i]
         final_info = info.setdefault("final_info", {})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from numerics.compiled import inlined
 from numerics.tuples import written_out
@@ -19,7 +20,7 @@ from plants.disturbances.effects import (
 def _dispatch(effects: tuple[type[Effect], ...]) -> Callable:
     """Write out `run(kind, ...)`, which calls the function of one of some effects."""
     arguments = "memory, b, target, rows, number, numbers, at, begin"
-    functions = {f"act_{i}": inlined(effect.act) for i, effect in enumerate(effects)}
+    functions: dict[str, Any] = {f"act_{i}": inlined(effect.act) for i, effect in enumerate(effects)}
     lines = [line for i, name in enumerate(functions) for line in (f"if kind == {i}:", f"    {name}({arguments})")]
     return written_out("run", f"kind, {arguments}", *lines, "None", **functions)
 

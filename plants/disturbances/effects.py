@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -40,6 +40,7 @@ class Context:
 class Effect:
     """Base of all effects; fields of the dataclass are the arguments."""
 
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]  # every effect is a dataclass
     act: ClassVar[Callable]  # the function above, a staticmethod
     name: ClassVar[str]
     loses: ClassVar[bool] = False  # whether measurements may be missing: then their validity is observed
@@ -66,6 +67,9 @@ def dropping_channels(sensors: Mapping[str, tuple[Effect, ...]]) -> tuple[int, .
     return tuple(i for i, chain in enumerate(sensors.values()) if any(effect.loses for effect in chain))
 
 
+Kind = TypeVar("Kind", bound=Effect)
+
+
 class Registry:
     """Effects of one kind by name, and how to make them from mappings."""
 
@@ -74,10 +78,10 @@ class Registry:
         self.argument = argument
         self.effects: dict[str, type[Effect]] = {}
 
-    def register(self, name: str) -> Callable[[type], type]:
+    def register(self, name: str) -> Callable[[type[Kind]], type[Kind]]:
         """Return a class decorator that makes a frozen dataclass an effect of this name."""
 
-        def decorate(cls: type) -> type:
+        def decorate(cls: type[Kind]) -> type[Kind]:
             cls.name = name
             self.effects[name] = cls
             return cls
@@ -98,7 +102,8 @@ class Registry:
         return tuple(self._make_one(one) for one in given)
 
     def _make_one(self, given) -> Effect:
-        if isinstance(given, tuple(self.effects.values())):
+        known: tuple[type[Effect], ...] = tuple(self.effects.values())
+        if isinstance(given, known):
             return given
         names = ", ".join(self.effects)
         if not isinstance(given, Mapping) or given.get("name") not in tuple(self.effects):
@@ -157,7 +162,8 @@ def encoded(
 def _representable(effect: Effect, parameters: list[float]) -> list[float]:
     """What an effect comes to, as floats; ValueError where floating point would make infinity or zero of it."""
     smallest, largest = MAGNITUDES
-    given = [abs(value) for value in np.hstack([*_numbers(dataclasses.astuple(effect)), 0.0]) if value]
+    parts: list[Any] = [*_numbers(dataclasses.astuple(effect)), 0.0]
+    given = [abs(value) for value in np.hstack(parts) if value]
     if min(given, default=1.0) < smallest or not all(abs(value) <= largest for value in (*given, *parameters)):
         rule = f"arguments of {effect.name!r} must be zero, or from {smallest:g} to {largest:g} in magnitude"
         raise ValueError(f"{rule}, and so must what follows from them, but got {shown(effect)}")

@@ -82,6 +82,7 @@ class Dropout(Effect):
 
     def parameters(self, context: Context) -> list[float]:
         """Probabilities that a run of missing measurements begins, and that it ends; where validity stands."""
+        assert self.mean_length is not None  # it is set when the effect is made
         begins = self.probability / (1.0 - self.probability) / self.mean_length
         return [begins, 1.0 / self.mean_length, context.valid_offset]
 

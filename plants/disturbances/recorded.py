@@ -57,19 +57,23 @@ class RecordedSeries(Effect):
         set_field(self, "sample_time", positive("sample_time", self.sample_time))
         set_field(self, "repeat", bool(self.repeat))
 
+    @property
+    def _series(self) -> tuple[float, ...]:
+        return self.values or ()  # never None once it is made
+
     def as_mapping(self) -> dict:
         """Name and arguments; a file stays a file."""
         mapping = super().as_mapping()
-        mapping["values"] = None if self.file is not None else list(self.values)
+        mapping["values"] = None if self.file is not None else list(self._series)
         return mapping
 
     def largest(self) -> float:
         """Largest magnitude in the series."""
-        return max(map(abs, self.values))
+        return max(map(abs, self._series))
 
     def parameters(self, context: Context) -> list[float]:
         """What `recorded_value` takes."""
-        return [self.sample_time, float(self.repeat), float(len(self.values)), *self.values]
+        return [self.sample_time, float(self.repeat), float(len(self._series)), *self._series]
 
 
 def _column(file: str, column: str | None) -> np.ndarray:

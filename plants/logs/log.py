@@ -108,9 +108,8 @@ class Log:
     def true_states(self, model: StateSpaceModel) -> np.ndarray | None:
         """The states of a model where the log has all of them without a gap, (K + 1, n); else None."""
         found = [self.references.get(f"{STATE}:{one.symbol}") for one in model.states]
-        if any(one is None or np.isnan(one).any() for one in found):
-            return None
-        return np.column_stack(found)
+        whole = [one for one in found if one is not None and not np.isnan(one).any()]
+        return np.column_stack(whole) if len(whole) == len(found) else None
 
     def series(self, channel: str) -> Series:
         """Samples of a channel, at times [s] by its own clock, since row 0."""

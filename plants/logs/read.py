@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from numerics.toml import read_toml
 from plants.logs.columns import INPUT, MEASUREMENT, TIME, Column, Wanted, find_columns, find_wanted, quantities_of
 from plants.logs.grid import Grid, Series, grid_of, held, sampled
 from plants.logs.log import FEWEST_STEPS, Log
-from plants.logs.table import Table, read_table
+from plants.logs.table import Table, read_table, table_of
 from plants.logs.units import converted
 from plants.state_space import StateSpaceModel
 
@@ -31,19 +32,22 @@ class Description(NamedTuple):
 
     def updated(self, other: Description) -> Description:
         """This one, but for what the other says."""
-        pairs = zip(self[:3], other[:3], strict=True)
         return Description(
-            *({**mine, **theirs} for mine, theirs in pairs), self.dt if other.dt is None else other.dt
+            columns={**self.columns, **other.columns},
+            units={**self.units, **other.units},
+            clock_offset={**self.clock_offset, **other.clock_offset},
+            dt=self.dt if other.dt is None else other.dt,
         )
 
 
 def read_log(
-    path: str | Path,
+    path: Any,
     model: StateSpaceModel,
     columns: Mapping[str, str] | None = None,
     *,
     clock_offset: Mapping[str, float] | None = None,
     dt: float | None = None,
+    name: str = "a table",
 ) -> Log:
     """A log of a model's inputs and measurements from a file; columns of its states and outputs are references.
 
@@ -61,20 +65,25 @@ def read_log(
     and the arguments say what they name in its place.
 
     Args:
-        path: a file that ends in .csv, .parquet or .npz.
+        path: a file that ends in .csv, .parquet or .npz; or a table itself: a mapping from headers to arrays
+            (rows,), or a pandas.DataFrame.
         model: whose inputs and measurements it has to have.
         columns: headers by the symbol or name of a quantity, or "kind:symbol"; "HEADER[UNIT]" with another unit.
         clock_offset: how far a channel's clock is ahead [s].
         dt: sample time [s], of rows without a time column, or of the grid where stamps are on none.
+        name: of a log that is no file.
 
     Raises:
         ValueError: states the rule and the value, with file, line and column.
     """
-    file, table = str(path), read_table(path)
-    for name, given in (("columns", columns), ("clock offsets", clock_offset)):
+    is_file = isinstance(path, (str, PathLike))
+    table = read_table(path) if is_file else table_of(path, name)
+    file = table.file
+    for what, given in (("columns", columns), ("clock offsets", clock_offset)):
         if not isinstance(given, Mapping | None):
-            raise ValueError(f"{name} must be a mapping from quantities, but got {shown(given)}")
-    said = _described(Path(path)).updated(Description(columns or {}, {}, clock_offset or {}, dt))
+            raise ValueError(f"{what} must be a mapping from quantities, but got {shown(given)}")
+    beside = _described(Path(path)) if is_file else Description()
+    said = beside.updated(Description(columns or {}, {}, clock_offset or {}, dt))
     wanted = quantities_of(model)
     found = find_columns(wanted, table.names, said.columns, said.units, file)
     grid, start = _grid(table, found.get(TIME), said.dt, file)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -15,6 +16,7 @@ from numerics.checks import shown
 
 MISSING = {"", "nan", "na", "n/a", "null", "none"}  # what stands for a missing number, in any case of letters
 DELIMITERS = ",;\t"
+TIME_HEADER = "time_s"  # of an index of dates
 SUFFIXES = (".csv", ".parquet", ".npz")
 
 
@@ -165,7 +167,33 @@ def _read_npz(path: Path) -> Table:
     return _of_arrays(path, cells)
 
 
-def _of_arrays(path: Path, cells: dict[str, np.ndarray]) -> Table:
+def table_of(given: Any, name: str) -> Table:
+    """A table that is in memory: a mapping from headers to arrays (rows,), or a pandas.DataFrame.
+
+    An index of dates or of time differences is a column of seconds, and one that has a name is a column.
+
+    Raises:
+        ValueError: if it is neither, or its columns are not of equal length.
+    """
+    if hasattr(given, "columns") and hasattr(given, "index"):
+        given = _with_index(given)
+    if not isinstance(given, Mapping) or not all(isinstance(header, str) for header in given):
+        rule = "a log must be the path of a file, a pandas.DataFrame, a mapping from headers to arrays, or a Log"
+        raise ValueError(f"{rule}, but got {shown(given)}")
+    return _of_arrays(name, {header: np.asarray(values) for header, values in given.items()})
+
+
+def _with_index(frame: Any) -> dict:
+    """The columns of a DataFrame as arrays, and its index where that tells something."""
+    columns = {header: frame[header].to_numpy() for header in frame.columns}
+    index = frame.index
+    kind = getattr(index.dtype, "kind", "")
+    if kind in "mM":
+        return {TIME_HEADER: (index - index[0]).total_seconds().to_numpy(), **columns} if len(index) else columns
+    return columns if index.name is None else {index.name: index.to_numpy(), **columns}
+
+
+def _of_arrays(path: Path | str, cells: dict[str, np.ndarray]) -> Table:
     rows = {len(one) for one in cells.values() if one.ndim == 1}
     if len(rows) != 1 or 0 in rows or any(one.ndim != 1 for one in cells.values()):
         raise ValueError(f"a log must have columns of equal length with some rows, but {path} has not")

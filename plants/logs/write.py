@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -52,7 +53,8 @@ def write_columns(path: str | Path, columns: Mapping[str, np.ndarray], digits: s
             np.savetxt(text, table, delimiter=",", header=",".join(names), comments="", fmt=digits)
         write_whole(path, text.getvalue())
     elif Path(path).suffix == ".npz":
-        write_whole(path, lambda stream: np.savez(stream, **dict(zip(names, values, strict=True))))
+        arrays: dict[str, Any] = dict(zip(names, values, strict=True))
+        write_whole(path, lambda stream: np.savez(stream, **arrays))
     else:
         pyarrow = _pyarrow()
         table = pyarrow.table(dict(zip(names, values, strict=True)))

@@ -140,7 +140,11 @@ class Canvas:
 def _font_file() -> str | None:
     """DejaVu Sans as it comes with matplotlib: a light face with Greek letters. pygame brings a bold face only."""
     spec = find_spec("matplotlib")
-    path = Path(spec.origin).parent / "mpl-data" / "fonts" / "ttf" / "DejaVuSans.ttf" if spec else None
+    path = (
+        Path(spec.origin).parent / "mpl-data" / "fonts" / "ttf" / "DejaVuSans.ttf"
+        if spec and spec.origin
+        else None
+    )
     return str(path) if path and path.is_file() else None
 
 

@@ -76,7 +76,7 @@ class PlantRenderer:
     def __setstate__(self, state: tuple[dict, dict]) -> None:
         """Make the pictures anew, for what was remembered."""
         made_with, remembered = state
-        self.__init__(**made_with)
+        type(self).__init__(self, **made_with)
         vars(self).update(remembered)
 
     def begin(self) -> None:

@@ -20,16 +20,17 @@ class Window:
         """Keep calls of `show` frame_time [s] apart; the window opens with the first, under a caption."""
         self._caption = caption
         self._frame_time = frame_time
-        self._screen = None
+        self._screen: pygame.Surface | None = None
         self._closed_by_hand = False
 
     def show(self, picture: Callable[[], pygame.Surface]) -> None:
         """Show a picture, unless it is late or the window was closed by hand, and wait until its time is over."""
         if self._closed_by_hand:
             return
-        if self._screen is None or not pygame.display.get_init():  # perhaps another env called pygame.quit()
+        screen = self._screen
+        if screen is None or not pygame.display.get_init():  # perhaps another env called pygame.quit()
             pygame.display.init()
-            self._screen = pygame.display.set_mode(SIZE)
+            screen = self._screen = pygame.display.set_mode(SIZE)
             pygame.display.set_caption(self._caption)
             self._due, self._shown = time.perf_counter(), -math.inf
         if pygame.event.get((pygame.QUIT, pygame.WINDOWCLOSE)):  # all other events are left to the caller
@@ -38,7 +39,7 @@ class Window:
             return
         start = time.perf_counter()
         if start <= self._due + self._frame_time or start - self._shown > 1 / LEAST_RATE:
-            self._screen.blit(picture(), (0, 0))
+            screen.blit(picture(), (0, 0))
             pygame.display.flip()
             self._shown = start
         now = time.perf_counter()

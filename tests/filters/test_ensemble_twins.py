@@ -9,7 +9,7 @@ import pytest
 from filters import StateSpaceModel, make_filter, run
 from numerics.streams import filter_keys
 
-TWINS = json.loads((Path(__file__).parents[1] / "data" / "dapper_twins.json").read_text())
+MOST_RESCALINGS = json.loads((Path(__file__).parents[1] / "data" / "dapper_twins.json").read_text())
 RUNS = 16
 
 
@@ -38,12 +38,12 @@ def whole(x, c):
 
 @pytest.fixture(scope="module")
 def model():
-    mean, prior_cov = TWINS["prior"]
+    mean, prior_cov = MOST_RESCALINGS["prior"]
     return StateSpaceModel(
         transition=step,
         observe=whole,
-        process_noise_cov=TWINS["q"],
-        measurement_noise_cov=TWINS["r"],
+        process_noise_cov=MOST_RESCALINGS["q"],
+        measurement_noise_cov=MOST_RESCALINGS["r"],
         prior_mean=mean,
         prior_cov=prior_cov,
         substeps=2,
@@ -53,8 +53,8 @@ def model():
 
 def errors_and_spread(filter_):
     """Root mean square error and root mean variance of RUNS runs (RUNS, 2), as in `data/dapper_twins.py`."""
-    truth, first = np.array(TWINS["truth"]), TWINS["first scored"]
-    z = np.vstack([np.full((1, 3), np.nan), TWINS["z"]])  # nothing is seen of the initial state
+    truth, first = np.array(MOST_RESCALINGS["truth"]), MOST_RESCALINGS["first scored"]
+    z = np.vstack([np.full((1, 3), np.nan), MOST_RESCALINGS["z"]])  # nothing is seen of the initial state
     keys = filter_keys(range(RUNS))
     estimates = run(filter_, keys, np.zeros((RUNS, len(truth), 0)), np.repeat(z[None], RUNS, axis=0))
     errors = estimates.means[:, 1 + first :] - truth[first:]
@@ -72,10 +72,10 @@ def apart(found, expected):
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("kind", ["enkf", "etkf", "denkf"])
 def test_over_many_runs_errors_and_spread_are_those_of_dapper(kind, model):
-    found = errors_and_spread(make_filter(kind, model, ensemble_size=TWINS["members"]))
-    difference = apart(found, np.array(TWINS[kind]))
+    found = errors_and_spread(make_filter(kind, model, ensemble_size=MOST_RESCALINGS["members"]))
+    difference = apart(found, np.array(MOST_RESCALINGS[kind]))
     assert (np.abs(difference) < 3.0).all()
     if kind == "enkf":
         # Perturbations that are centred, as DAPPER's are by default, help an ensemble of ten: the runs show that.
-        centred, _ = apart(found, np.array(TWINS["enkf, perturbations centred"]))
+        centred, _ = apart(found, np.array(MOST_RESCALINGS["enkf, perturbations centred"]))
         assert centred > 3.0

@@ -9,9 +9,9 @@ import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
 from thruster_env.model import thruster_model
 from tuning.evaluation.evaluate import evaluate
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
-from tuning.search.enqueued import TWIN
+from tuning.search.enqueued import RESCALED
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
@@ -76,12 +76,12 @@ def test_a_study_tunes_p0_and_the_number_survives(tmp_path):
     factor = result.choice.model["prior_cov_factor"]
     assert factor < 0.5  # an EKF that starts blind should not trust what a wide prior makes of the first thrust
     assert result.best_value < 0.9 * result.trials[0].values[0]
-    for twin in (trial for trial in result.trials if TWIN in trial.user_attrs and "P0" in trial.params):
-        trial = result.trials[twin.user_attrs[f"{TWIN} of"]]
+    for twin in (trial for trial in result.trials if RESCALED in trial.user_attrs and "P0" in trial.params):
+        trial = result.trials[twin.user_attrs[f"{RESCALED} of"]]
         ratios = [twin.params[name] / trial.params[name] for name in ("P0", "R")]
         assert ratios[0] == pytest.approx(ratios[1], rel=1e-6)
     path = tmp_path / "t.json"
-    write_tuned(path, PLAN, result, [prove(result.choice, STARTUP, 0, 4)], "s")
+    write_tuned(path, PLAN, result, [evaluate_held_out(result.choice, STARTUP, 0, 4)], "s")
     assert read_tuned(path) == (result.choice, STARTUP, 0)
     env = gym.make("BowThruster-v0", initial_state={"mean": [0.0, 0.0], "cov": [[1e4, 0.0], [0.0, 4.0]]})
     env = EstimateState(env, tuned=str(path))

@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.jax_enkf import NORMALS, array_filter
 from benchmarks.rows import Row
+from benchmarks.speed_page import HEADER, check_page, write_page
 from benchmarks.timing import Timing
 from filters import EnsembleKalmanFilter, thruster_model
 from numerics.compiled import interpreted
@@ -75,3 +76,30 @@ def test_the_filter_written_for_jax_is_ours_given_our_random_numbers(process_noi
 )
 def test_a_row_says_whether_its_goal_is_met(row, shown):
     assert row.cells() == shown
+
+
+def test_rows_and_machine_are_written_into_the_page_on_speed_and_its_words_stay(tmp_path):
+    page = tmp_path / "speed.md"
+    page.write_text((Path(__file__).parents[2] / "docs" / "speed.md").read_text())
+    before = page.read_text().splitlines()
+    check_page(page)
+    rows = [
+        Row("a step", "b", Timing(1e-6, 4e-6, 0.25), ratio_goal=1 / 3),
+        Row("c", None, Timing(2e-9, None, None)),
+    ]
+    facts = {"cpu": "a processor", "cores": 2, "system": "Linux", "python": "3.11.7", "numba": "0.68.1"}
+    write_page(page, rows, facts, ["Memory: 8 bytes."])
+    after = page.read_text().splitlines()
+    table = after[after.index("<!-- table speed -->") + 1 :][:4]
+    assert table[0] == "| " + " | ".join(HEADER) + " |" and table[0] in before
+    assert table[2:] == ["| a step | b | 1 us | 4 us | 0.25 | 0.33 | yes |", "| c | | 2 ns | | | | |"]
+    machine = after[after.index("<!-- table machine -->") + 1]
+    assert machine == "Machine: a processor, 2 cores, Linux. Python 3.11.7, numba 0.68.1. Memory: 8 bytes."
+    assert {*before, *table, machine} > set(after) and "## What is compared with what" in after
+
+
+def test_a_page_without_a_place_for_the_table_is_refused(tmp_path):
+    (tmp_path / "other.md").write_text("# Other")
+    for name, rule in (("other.md", "with <!-- table speed -->"), ("none.md", "that can be read")):
+        with pytest.raises(ValueError, match=rule):
+            check_page(tmp_path / name)

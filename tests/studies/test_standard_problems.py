@@ -14,7 +14,7 @@ from studies import BENCHMARKS, benchmark, lorenz63, lorenz96, pendulum, range_b
 from studies.benchmark import Published, against_published, find_benchmark, mean_of_roots, noise_free_problem
 from studies.tuned_inflation import tune_inflation
 from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem
@@ -170,7 +170,7 @@ def test_a_study_tunes_inflation_and_nothing_else():
 def test_the_pendulum_goes_from_a_file_to_a_filter_around_the_env(tmp_path, thruster):  # noqa: F811
     plan = Plan("ekf", (checked_problem(find_problem("studies.pendulum:problem")),))
     result = run_study(open_study("pendulum", plan, optuna.storages.InMemoryStorage()), plan, 4)
-    path, proof = tmp_path / "pendulum.json", prove(result.choice, plan.scenarios[0], 0, 4)
+    path, proof = tmp_path / "pendulum.json", evaluate_held_out(result.choice, plan.scenarios[0], 0, 4)
     assert proof.tuned.score.value < proof.untuned.score.value
     write_tuned(path, plan, result, [proof], "pendulum")
     done = thruster("report", path, "--problem", "studies.pendulum:problem")

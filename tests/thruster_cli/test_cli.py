@@ -252,12 +252,3 @@ def test_the_installed_command_interrupted_keeps_its_trials_and_says_so(tmp_path
     stdout, stderr = process.communicate(timeout=60)
     assert process.returncode == 130 and "Traceback" not in stderr
     assert "Interrupted: this is on the trials that were finished" in stdout
-
-
-def test_demo_does_the_whole_job_and_draws(as_json, tmp_path):
-    data = as_json("demo", "--trials", 3)
-    assert data["tuning"]["trials"] == 3 and "nurhadi2022" in data["published"]["studies"]
-    assert len(data["pictures"]) == 3
-    for picture in data["pictures"]:
-        assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
-    assert EstimateState(gym.make("BowThruster-v0"), tuned=str(tmp_path / data["tuning"]["file"]))

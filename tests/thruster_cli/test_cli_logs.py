@@ -169,7 +169,7 @@ def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  
         ),
         (("tune", "--log", "run.csv"), "a log must have at least 75 rows"),
         (("tune", "--log", "run.csv", "--problem", "nominal"), "must be of --log or of --problem, but got both"),
-        (("tune", "--blocks", "3"), "--blocks must come with --log, but there is none"),
+        (("tune", "--blocks", "3"), "--blocks must come with --log, but got --blocks 3 without one"),
     ],
 )
 def test_a_mistake_with_a_log_is_one_line_and_nothing_is_written(arguments, line, thruster, tmp_path):  # noqa: F811

@@ -15,13 +15,13 @@ from plants.simulate import simulate
 from studies.identification import TRUTH, record
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.thruster_env.test_t200 import OTHER, recorded_rows, write_table
-from thruster_cli.presets import of_preset
 from thruster_env.logged import logged_model
 from thruster_env.model import thruster_model
 from thruster_env.parameters import TUNNEL_PHYSICAL
 from thruster_env.preset_file import PresetFile, read_preset, write_preset
 from tuning.problems.files import scenario_of
 from tuning.problems.find import find_problem
+from tuning.thruster.logs import of_preset
 
 FREE = ",".join(name for name in TRUTH if not name.startswith(("Q", "R")))
 OF_LOGS = ("--preset", "tunnel_physical", "--sensor", "thrust", "--sensor", "speed")

@@ -29,14 +29,14 @@ from tuning.reporting.tables import errors_table, numbers_table
 from tuning.reporting.time_figures import estimates_figure
 from tuning.search.objectives import check_objectives, find_objective, nis_ratio
 from tuning.search.plan import Plan
-from tuning.search.space import true_choice, untuned_choice
+from tuning.search.space import oracle_choice, untuned_choice
 
 SEEDS = range(8)
 
 
 def proof_on(problem):
     """Rule of thumb, oracle in the tuned filter's place, and oracle on a problem, none of them compiled."""
-    choices = [untuned_choice("kf", problem), true_choice("kf", problem), true_choice("kf", problem)]
+    choices = [untuned_choice("kf", problem), oracle_choice("kf", problem), oracle_choice("kf", problem)]
     with interpreted():
         data = problem.data(SEEDS)
         found = [evaluate(choice.filter(problem), data, problem.scale) for choice in choices]
@@ -64,7 +64,7 @@ def test_an_evaluation_has_one_of_everything_for_each_state_channel_and_output(p
     found, data = proof.true, problem.data(SEEDS)
     with interpreted():
         estimates = run(
-            true_choice("kf", problem).filter(problem), data.filter_keys, data.inputs, data.measurements
+            oracle_choice("kf", problem).filter(problem), data.filter_keys, data.inputs, data.measurements
         )
     late, errors = slice(10, None), estimates.means - data.states
     np.testing.assert_allclose([part.value for part in found.rmse], np.sqrt((errors[:, late] ** 2).mean((0, 1))))
@@ -83,10 +83,10 @@ def test_an_evaluation_has_one_of_everything_for_each_state_channel_and_output(p
 def test_states_with_an_infinite_scale_do_not_count():
     problem = LinearProblem(scale=(0.5, np.inf, 0.25))
     with interpreted():
-        found = evaluate(true_choice("kf", problem).filter(problem), problem.data(SEEDS), problem.scale)
+        found = evaluate(oracle_choice("kf", problem).filter(problem), problem.data(SEEDS), problem.scale)
     assert found.score.value == pytest.approx((found.rmse[0].value / 0.5 + found.rmse[2].value / 0.25) / 2)
     assert found.scored == [0, 2]
-    filter_, data = true_choice("kf", problem).filter(problem), problem.data(SEEDS)
+    filter_, data = oracle_choice("kf", problem).filter(problem), problem.data(SEEDS)
     for scale, rule in (((0.5, 0.5), "one number a state, 3"), ((np.inf,) * 3, "finite in some state")):
         with interpreted(), pytest.raises(ValueError, match=f"scale must be {rule}"):
             evaluate(filter_, data, scale)
@@ -156,8 +156,8 @@ def test_consistency_without_truth_is_that_of_the_innovations(tmp_path):
     problem = LinearProblem(truth=False)
     with interpreted():
         data = problem.data(range(30))
-        report = check_consistency(true_choice("enkf", problem).with_size(5).filter(problem), data)
-        known = check_consistency(true_choice("kf", problem).filter(problem), LinearProblem().data(range(30)))
+        report = check_consistency(oracle_choice("enkf", problem).with_size(5).filter(problem), data)
+        known = check_consistency(oracle_choice("kf", problem).filter(problem), LinearProblem().data(range(30)))
     said = sentences(report)
     assert said[0] == NO_TRUTH and not any("NEES" in one or "CRPS" in one for one in said)
     assert any(one.startswith("The 95 % interval of the expected range [m] holds the measurement") for one in said)
@@ -177,7 +177,7 @@ def test_consistency_without_truth_is_that_of_the_innovations(tmp_path):
 def test_of_many_states_sentences_tell_the_worst():
     problem = LinearProblem(8)
     with interpreted():
-        report = check_consistency(true_choice("kf", problem).filter(problem), problem.data(range(25)))
+        report = check_consistency(oracle_choice("kf", problem).filter(problem), problem.data(range(25)))
     assert sum("holds the truth" in one for one in sentences(report)) == 6
     assert any(
         one.startswith("Of 8 states these are the 6 whose coverage is furthest off") for one in sentences(report)
@@ -189,7 +189,7 @@ def test_figures_are_drawn_for_any_plant(proofs, case, tmp_path):
     problem, proof = proofs[case]
     filters = {
         "one": untuned_choice("kf", problem).filter(problem),
-        "two": true_choice("kf", problem).filter(problem),
+        "two": oracle_choice("kf", problem).filter(problem),
     }
     with interpreted():
         estimates_figure(tmp_path / "run.png", filters, problem.data(SEEDS), 1, problem.dt, sharey="row")
@@ -227,19 +227,19 @@ def test_objectives_say_what_they_need(proofs):
 
 def test_a_report_without_truth_says_so_and_has_no_errors(proofs):
     problem, proof = proofs[3, False]
-    plan, choice = Plan("kf", (problem,), objectives=("likelihood",)), true_choice("kf", problem)
+    plan, choice = Plan("kf", (problem,), objectives=("likelihood",)), oracle_choice("kf", problem)
     assert advice(choice, plan, [proof]).endswith(
         "the covariance is consistent (mean NIS 1.76 where 1.81 is right)."
     )
     said, table = held_out_section(None, Subject("s", plan, choice, None, 8, True), [proof]).parts
     assert said.sentences[0].startswith("linear-3 has no truth: filters are compared by how well they predict")
     assert table == errors_table(problem, proof)
-    assert ensemble_sizes(true_choice("enkf", problem), plan, []) == []
+    assert ensemble_sizes(oracle_choice("enkf", problem), plan, []) == []
 
 
 def test_numbers_of_a_filter_have_the_units_of_their_states(proofs, monkeypatch):
     problem, _ = proofs[3, False]
-    choice = true_choice("kf", problem)
+    choice = oracle_choice("kf", problem)
     found = {"rule of thumb": untuned_choice("kf", problem), "oracle": choice}
     monkeypatch.setattr("tuning.reporting.tables.baselines", lambda *arguments: found)
     rows = numbers_table(choice, problem, 0).rows

@@ -12,17 +12,17 @@ from rich.progress import Progress
 
 from filters.registry import FILTERS
 from thruster_cli.main import main
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.search import trials as tuning_trials
 from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
-from tuning.search.enqueued import HEIR, SMALLER, TWIN, UNTUNED, _ends_a_round
-from tuning.search.filter_types import kinds_tried, trials_of_kind
+from tuning.search.enqueued import RESCALED, SMALLER, TRANSFERRED, UNTUNED, _ends_a_round
+from tuning.search.filter_types import filter_types_tried, trials_of_type
 from tuning.search.outcome import best_trial, is_over_budget, violation
 from tuning.search.plan import Plan
 from tuning.search.space import (
-    AUTO_KINDS,
-    KIND,
+    AUTO_FILTER_TYPES,
+    FILTER_TYPE,
     choice_of,
     joint_distributions,
     trial_parameters,
@@ -45,7 +45,7 @@ def quiet():
 @pytest.fixture
 def priced(monkeypatch):
     """Few kinds, and costs that do not depend on the machine."""
-    monkeypatch.setattr("tuning.search.plan.AUTO_KINDS", FEW)
+    monkeypatch.setattr("tuning.search.plan.AUTO_FILTER_TYPES", FEW)
     monkeypatch.setattr(
         tuning_trials, "microseconds_a_step", lambda filter_, data: COSTS[filter_.name](filter_.size)
     )
@@ -56,13 +56,13 @@ def studied(plan, count):
 
 
 def test_the_kinds_are_all_filters_with_a_covariance_the_ekf_first():
-    assert AUTO_KINDS[0] == "ekf" and len(set(AUTO_KINDS)) == len(AUTO_KINDS)
-    assert set(AUTO_KINDS) == {name for name, kind in FILTERS.items() if kind.has_covariance}
+    assert AUTO_FILTER_TYPES[0] == "ekf" and len(set(AUTO_FILTER_TYPES)) == len(AUTO_FILTER_TYPES)
+    assert set(AUTO_FILTER_TYPES) == {name for name, kind in FILTERS.items() if kind.has_covariance}
 
 
-@pytest.mark.parametrize("kind", AUTO_KINDS)
+@pytest.mark.parametrize("kind", AUTO_FILTER_TYPES)
 def test_a_choice_of_any_kind_survives_its_trial_parameters(kind):
-    space, choice = joint_distributions(AUTO_KINDS, MISMATCH), untuned_choice(kind, MISMATCH)
+    space, choice = joint_distributions(AUTO_FILTER_TYPES, MISMATCH), untuned_choice(kind, MISMATCH)
     parameters = trial_parameters(choice, space)
     assert choice_of("auto", parameters, MISMATCH) == choice
     assert all(" " not in key or key.startswith(f"{kind} ") for key in parameters)
@@ -72,7 +72,7 @@ def test_a_choice_of_any_kind_survives_its_trial_parameters(kind):
 def test_numbers_of_a_kind_are_chosen_for_that_kind_alone_and_noise_for_all(priced):
     result = studied(PLAN, 30)
     for trial in result.trials:
-        kind = trial.params[KIND]
+        kind = trial.params[FILTER_TYPE]
         own = {key for key in trial.params if " " in key}
         assert {"Q11", "Q22", "R"} < set(trial.params) and all(key.startswith(f"{kind} ") for key in own)
         assert (f"{kind} N" in own) == (kind in ("enkf", "pf"))
@@ -83,9 +83,9 @@ def test_each_kind_is_tried_untuned_and_then_rescaled_before_the_next_one_is_beg
     untuned = [trial for trial in trials if UNTUNED in trial.user_attrs]
     found = [choice_of("auto", trial.params, MISMATCH) for trial in untuned]
     assert found == [untuned_choice(kind, MISMATCH) for kind in FEW]
-    kinds = [trial.params[KIND] for trial in trials[: untuned[-1].number]]
+    kinds = [trial.params[FILTER_TYPE] for trial in trials[: untuned[-1].number]]
     assert kinds == sorted(kinds, key=FEW.index) and kinds.count("ekf") == 2  # the rescaled one is the other
-    assert trials[1].user_attrs[TWIN] == 1
+    assert trials[1].user_attrs[RESCALED] == 1
 
 
 def test_kinds_that_were_not_begun_are_begun_by_whoever_goes_on(priced):
@@ -93,7 +93,7 @@ def test_kinds_that_were_not_begun_are_begun_by_whoever_goes_on(priced):
     for count in range(1, 9):
         trials = run_study(open_study("s", PLAN, storage), PLAN, count).trials
     assert [trial.user_attrs[UNTUNED] for trial in trials if UNTUNED in trial.user_attrs] == list(FEW)
-    assert TWIN in trials[1].user_attrs
+    assert RESCALED in trials[1].user_attrs
 
 
 def test_what_is_over_the_budget_ends_at_once_and_never_wins(priced):
@@ -102,22 +102,22 @@ def test_what_is_over_the_budget_ends_at_once_and_never_wins(priced):
     assert over and all(trial.state == TrialState.PRUNED and not trial.intermediate_values for trial in over)
     for trial in result.trials:
         if trial.state != TrialState.WAITING:
-            cost = COSTS[trial.params[KIND]](trial.params.get(f"{trial.params[KIND]} N", 0))
+            cost = COSTS[trial.params[FILTER_TYPE]](trial.params.get(f"{trial.params[FILTER_TYPE]} N", 0))
             assert trial.user_attrs[COST] == cost and trial.constraints[BUDGET] == math.log(cost / 1.0)
             assert is_over_budget(trial) == (cost > 1.0)
     best = best_trial(result.trials)
     assert best.user_attrs[COST] <= 1.0 and result.microseconds <= 1.0 and violation(best) <= 0
-    assert result.choice.name == best.params[KIND]
-    kinds = {kind.name: kind for kind in kinds_tried(result.trials)}
+    assert result.choice.name == best.params[FILTER_TYPE]
+    kinds = {kind.name: kind for kind in filter_types_tried(result.trials)}
     assert sum(kind.trials for kind in kinds.values()) == 40 and kinds["pf"].over_budget == kinds["pf"].trials
     assert kinds["pf"].value is None and kinds["pf"].microseconds > 1.0
-    assert kinds[best.params[KIND]].value == best.values[0] and list(kinds)[0] == best.params[KIND]
-    assert {t.params[KIND] for t in trials_of_kind(result.trials, "kf")} == {"kf"}
+    assert kinds[best.params[FILTER_TYPE]].value == best.values[0] and list(kinds)[0] == best.params[FILTER_TYPE]
+    assert {t.params[FILTER_TYPE] for t in trials_of_type(result.trials, "kf")} == {"kf"}
 
 
 def test_a_filter_over_the_budget_is_tried_with_fewer_members(priced):
     result = studied(PLAN, 12)
-    untuned = next(trial for trial in result.trials if trial.params[KIND] == "enkf")
+    untuned = next(trial for trial in result.trials if trial.params[FILTER_TYPE] == "enkf")
     (smaller,) = [trial for trial in result.trials if SMALLER in trial.user_attrs]  # none for pf: 200 are too many
     assert smaller.user_attrs[SMALLER] == untuned.number and smaller.params["enkf N"] == 18
     assert {**smaller.params, "enkf N": 30} == untuned.params and not is_over_budget(smaller)
@@ -126,11 +126,11 @@ def test_a_filter_over_the_budget_is_tried_with_fewer_members(priced):
 def test_other_kinds_inherit_the_noise_of_the_best_one(priced):
     assert [n for n in range(1, 65) if _ends_a_round(n, 4)] == [12, 24, 48]
     result = studied(PLAN._replace(prune=False), 17)
-    heirs = [trial for trial in result.trials if HEIR in trial.user_attrs]
-    (best,) = {trial.user_attrs[HEIR] for trial in heirs}
+    heirs = [trial for trial in result.trials if TRANSFERRED in trial.user_attrs]
+    (best,) = {trial.user_attrs[TRANSFERRED] for trial in heirs}
     best = result.trials[best]
-    kinds = [trial.params[KIND] for trial in heirs]
-    assert best.params[KIND] not in kinds and "pf" not in kinds  # which is over the budget
+    kinds = [trial.params[FILTER_TYPE] for trial in heirs]
+    assert best.params[FILTER_TYPE] not in kinds and "pf" not in kinds  # which is over the budget
     assert 2 <= len(kinds) == len(set(kinds))
     assert all(trial.params[key] == best.params[key] for trial in heirs for key in ("Q11", "Q22", "R"))
 
@@ -139,7 +139,7 @@ def test_a_budget_holds_one_kind_too_and_no_size_goes_beyond_it(priced):
     plan = Plan("enkf", (MISMATCH,), budget=1.0)
     result = studied(plan, 15)
     assert result.choice.numbers["ensemble_size"] <= 20 and max(row.size for row in result.sizes) <= 20
-    assert kinds_tried(result.trials) == []
+    assert filter_types_tried(result.trials) == []
 
 
 def test_a_budget_that_nothing_keeps_is_one_clear_line(priced):
@@ -150,7 +150,7 @@ def test_a_budget_that_nothing_keeps_is_one_clear_line(priced):
 def test_without_a_budget_a_front_of_error_against_cost_tells_the_kinds(priced):
     plan = PLAN._replace(budget=None, objectives=("score", "cost"))
     result = studied(plan, 10)
-    assert {trial.params[KIND] for trial in result.front} and result.choice.name in FEW
+    assert {trial.params[FILTER_TYPE] for trial in result.front} and result.choice.name in FEW
     assert min(trial.values[1] for trial in result.front) == 0.07
 
 
@@ -178,7 +178,7 @@ def test_budget_and_kinds_belong_to_the_identity(monkeypatch):
     open_study("s", PLAN, storage)
     with pytest.raises(ValueError, match="must be for {'budget': 2.0}, but it was made for {'budget': 1.0}"):
         open_study("s", PLAN._replace(budget=2.0), storage)
-    monkeypatch.setattr("tuning.search.plan.AUTO_KINDS", FEW)
+    monkeypatch.setattr("tuning.search.plan.AUTO_FILTER_TYPES", FEW)
     with pytest.raises(ValueError, match="must be for {'kinds': .*'pf'"):
         open_study("s", PLAN, storage)
 
@@ -224,7 +224,7 @@ def test_the_command_says_which_filters_it_tried_and_reports_on_the_winner(price
 def test_the_tuned_file_says_what_made_the_choice(tmp_path, method):
     plan, path = Plan("ekf", (MISMATCH,)), tmp_path / "t.json"
     result = studied(plan, 1)
-    write_tuned(path, plan, result, [prove(result.choice, MISMATCH, 0, 2)], "s", method)
+    write_tuned(path, plan, result, [evaluate_held_out(result.choice, MISMATCH, 0, 2)], "s", method)
     study = json.loads(path.read_text())["study"]
     assert study["method"] == method
     assert study["best_training_value"] == (result.best_value if method == "optuna" else None)

@@ -14,7 +14,7 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.tuned import write_tuned
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan
-from tuning.search.space import true_choice, untuned_choice
+from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import StudyResult
 from tuning.thruster.find import find_scenario
 
@@ -26,7 +26,7 @@ def test_a_row_is_the_filter_s_evaluation_beside_the_first_one_s():
     (board,), interrupted = compare(contenders, [NOMINAL], SEEDS)
     assert not interrupted and [row.label for row in board.rows] == ["ekf", "ukf"]
     data = NOMINAL.data(SEEDS)
-    ekf = evaluate(true_choice("ekf", NOMINAL).filter(NOMINAL), data, NOMINAL.scale)
+    ekf = evaluate(oracle_choice("ekf", NOMINAL).filter(NOMINAL), data, NOMINAL.scale)
     ukf = evaluate(untuned_choice("ukf", NOMINAL).filter(NOMINAL), data, NOMINAL.scale)
     first, second = board.rows
     assert first.evaluation.rmse == ekf.rmse and second.evaluation.rmse == ukf.rmse
@@ -69,9 +69,9 @@ def test_what_is_believed_by_default():
 
 
 def test_a_size_is_for_filters_that_have_an_ensemble():
-    assert sized(true_choice("ekf", NOMINAL), 50) == true_choice("ekf", NOMINAL)
-    assert sized(true_choice("enkf", NOMINAL), 50).numbers["ensemble_size"] == 50
-    assert sized(true_choice("enkf", NOMINAL), None).numbers["ensemble_size"] == 30
+    assert sized(oracle_choice("ekf", NOMINAL), 50) == oracle_choice("ekf", NOMINAL)
+    assert sized(oracle_choice("enkf", NOMINAL), 50).numbers["ensemble_size"] == 50
+    assert sized(oracle_choice("enkf", NOMINAL), None).numbers["ensemble_size"] == 30
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_the_command_ranks_filters_on_scenarios(thruster, tmp_path):
     options = ("--filter", "ekf", "--filter", "ekf-robust", "--seeds", 8)
     code, out, _ = thruster(*options, "--scenario", "outliers", "--scenario", "nominal", "--json", "board.json")
     assert code == 0
-    for word in ("outliers: one thrust in twenty", "RMSE on held-out seeds 500000 to 500007", "rad/s", "bound"):
+    for word in ("one measured thrust in twenty", "RMSE on held-out seeds 500000 to 500007", "rad/s", "bound"):
         assert word in out
     assert "On outliers, against ekf by the score: better: ekf-robust." in out
     content = json.loads((tmp_path / "board.json").read_text())

@@ -13,7 +13,7 @@ from tuning.evaluation.evaluate import check_consistency, evaluate, score_ratio
 from tuning.evaluation.tuned import summary
 from tuning.problems import in_parts
 from tuning.problems.seeds import held_out_seeds
-from tuning.search.space import choice_of, parameters_of, true_choice, untuned_choice
+from tuning.search.space import choice_of, oracle_choice, parameters_of, untuned_choice
 from tuning.thruster.find import find_scenario
 
 
@@ -29,7 +29,7 @@ def data(nominal):
 
 @pytest.fixture(scope="module")
 def ekf(nominal, data):
-    return evaluate(true_choice("ekf", nominal).filter(nominal), data, nominal.scale)
+    return evaluate(oracle_choice("ekf", nominal).filter(nominal), data, nominal.scale)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,9 @@ def untuned_ekf(nominal, data):
 def test_rmse_is_pooled_over_runs_and_steps_from_50_on(nominal, data, ekf):
     from filters import run
 
-    estimates = run(true_choice("ekf", nominal).filter(nominal), data.filter_keys, data.inputs, data.measurements)
+    estimates = run(
+        oracle_choice("ekf", nominal).filter(nominal), data.filter_keys, data.inputs, data.measurements
+    )
     errors = (estimates.means - data.states)[:, 50:]
     np.testing.assert_allclose([r.value for r in ekf.rmse], np.sqrt((errors**2).mean((0, 1))), rtol=1e-12)
     expected = np.mean([r.value / s for r, s in zip(ekf.rmse, nominal.scale, strict=True)])
@@ -49,7 +51,7 @@ def test_rmse_is_pooled_over_runs_and_steps_from_50_on(nominal, data, ekf):
 
 @pytest.mark.parametrize("name", ["ekf", "enkf"])
 def test_runs_may_be_evaluated_some_at_a_time(nominal, data, name, monkeypatch):
-    filter_, some = true_choice(name, nominal).filter(nominal), data.slice(0, 21)
+    filter_, some = oracle_choice(name, nominal).filter(nominal), data.slice(0, 21)
     whole = evaluate(filter_, some, nominal.scale), check_consistency(filter_, some)
     monkeypatch.setattr(in_parts, "MOST_BYTES", 1)
     monkeypatch.setattr(in_parts, "cores", lambda: 4)
@@ -80,7 +82,7 @@ def test_rmse_of_thrust_is_that_of_the_model_s_thrust_at_the_estimate(nominal, d
     from filters import run
     from thruster_env.model import observe
 
-    filter_ = true_choice("ekf", nominal).filter(nominal)
+    filter_ = oracle_choice("ekf", nominal).filter(nominal)
     estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
     states = np.moveaxis(estimates.means, -1, 0)
     errors = observe((states[0], states[1]), filter_.model.constants)[0] - data.outputs["T"]
@@ -91,7 +93,7 @@ def test_rmse_of_thrust_is_that_of_the_model_s_thrust_at_the_estimate(nominal, d
 def test_steps_without_a_measurement_do_not_lower_the_mean_nis(nominal, data):
     lost = np.random.default_rng(0).random(data.measurements.shape) < 0.3
     gappy = data._replace(measurements=np.where(lost, np.nan, data.measurements))
-    evaluation = evaluate(true_choice("ekf", nominal).filter(nominal), gappy, nominal.scale)
+    evaluation = evaluate(oracle_choice("ekf", nominal).filter(nominal), gappy, nominal.scale)
     assert evaluation.nis.low < 1.0 < evaluation.nis.high
 
 
@@ -113,7 +115,7 @@ def test_a_choice_survives_its_trial_parameters(nominal):
 
 def test_bad_scales_and_unequal_seeds_are_refused(nominal, data, ekf):
     with pytest.raises(ValueError, match="scale must be positive in every state, but got"):
-        evaluate(true_choice("ekf", nominal).filter(nominal), data, [1.0, 0.0])
+        evaluate(oracle_choice("ekf", nominal).filter(nominal), data, [1.0, 0.0])
     with pytest.raises(ValueError, match="same seeds, but got 200 and 199"):
         score_ratio(ekf, ekf._replace(mean_squares=ekf.mean_squares[1:]))
 

@@ -12,11 +12,11 @@ from filters import EstimateState
 from filters.tuned_file import read_tuned_file, sealed
 from thruster_cli.tables import choice_table
 from thruster_cli.tune import tune
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.evaluation.verify import verify
 from tuning.search.correlations import correlations_of, full_covariance
-from tuning.search.enqueued import TWIN
+from tuning.search.enqueued import RESCALED
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters_of, trial_parameters, untuned_choice
 from tuning.search.study import open_study, run_study
@@ -85,7 +85,7 @@ def test_a_study_of_a_full_q_ends_in_a_file_that_everything_reads(tmp_path):
     q = np.array(result.choice.model["process_noise_cov"])
     assert q.shape == (2, 2) and q[0, 1] == q[1, 0] != 0.0
     path = tmp_path / "t.json"
-    write_tuned(path, PLAN, result, [prove(result.choice, MISMATCH, 0, 4)], "s")
+    write_tuned(path, PLAN, result, [evaluate_held_out(result.choice, MISMATCH, 0, 4)], "s")
     assert read_tuned(path) == (result.choice, MISMATCH, 0) and verify(path).holds
     env = EstimateState(gym.make("BowThruster-v0"), tuned=str(path))
     np.testing.assert_array_equal(env.filter.model.process_noise_cov, q)
@@ -101,10 +101,10 @@ def test_a_study_of_a_full_q_ends_in_a_file_that_everything_reads(tmp_path):
 
 def test_a_consistent_twin_has_the_same_correlation():
     result = run_study(open_study("s", PLAN, optuna.storages.InMemoryStorage()), PLAN, 12)
-    twins = [trial for trial in result.trials if TWIN in trial.user_attrs and "R" in trial.params]
+    twins = [trial for trial in result.trials if RESCALED in trial.user_attrs and "R" in trial.params]
     assert twins
     for twin in twins:
-        trial = result.trials[twin.user_attrs[f"{TWIN} of"]]
+        trial = result.trials[twin.user_attrs[f"{RESCALED} of"]]
         assert twin.params["correlation_12"] == trial.params["correlation_12"]
         assert twin.params["R"] / trial.params["R"] == pytest.approx(twin.params["Q11"] / trial.params["Q11"])
 

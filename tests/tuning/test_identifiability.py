@@ -22,7 +22,7 @@ from tuning.likelihood.identifiability import (
     too_many,
 )
 from tuning.search.plan import Plan
-from tuning.search.space import choice_of, parameters_of, true_choice, untuned_choice
+from tuning.search.space import choice_of, oracle_choice, parameters_of, untuned_choice
 from tuning.thruster.find import find_scenario
 
 BOUNDS = np.log([(1e-4, 1e4)] * 3)
@@ -88,7 +88,7 @@ def test_two_variances_of_which_only_the_sum_shows_make_up_for_one_another():
     cov = covariance(curvatures(log_likelihoods, at))
     assert not is_identified(log_likelihoods, at, cov, bounds).any()
     found = Identifiability(("a", "b"), np.ones(2), np.exp(at), cov, np.zeros(2, bool))
-    assert min(found.loosest.values()) < 1 and max(found.loosest.values()) == pytest.approx(10.0)
+    assert min(found.least_determined.values()) < 1 and max(found.least_determined.values()) == pytest.approx(10.0)
     assert "do not determine a and b" in sentences(found)[1] and " x 10 and " in sentences(found)[1]
 
 
@@ -112,13 +112,13 @@ def test_an_ekf_has_the_intervals_of_the_gradient_method_from_a_bad_choice():
     scenario = find_scenario("nominal")
     plan = Plan("ekf", (scenario,))
     data = plan.training_data()
-    own = parameters_of(true_choice("ekf", scenario))
+    own = parameters_of(oracle_choice("ekf", scenario))
     bad = choice_of("ekf", {**own, "Q22": own["Q22"] / 100, "R": own["R"] * 100}, scenario)
     found = identify(bad, plan.scenarios, data, plan.space())
     right = maximise_likelihood("ekf", scenario, data[0], starts=[(1.0, 1.0, 1.0)])
     assert found.names == right.names == ("Q11", "Q22", "R") and found.identified.all()
     errors = np.log(found.factors) / 1.96
-    assert (abs(np.log(found.likeliest / right.best.variances)) < 0.5 * errors).all()
+    assert (abs(np.log(found.most_likely / right.best.variances)) < 0.5 * errors).all()
     np.testing.assert_allclose(errors, right.standard_errors, rtol=0.6)
     assert found.tuned.tolist() == [bad.model["process_noise_cov"][0], own["Q22"] / 100, own["R"] * 100]
     assert all(number["determined"] for number in as_data(found).values())
@@ -130,7 +130,7 @@ def test_an_ekf_has_the_intervals_of_the_gradient_method_from_a_bad_choice():
 def test_the_published_tunnel_tells_nothing_of_its_small_r():
     scenario = find_scenario("published_tunnel")
     plan = Plan("kf", (scenario,))
-    found = identify(true_choice("kf", scenario), plan.scenarios, plan.training_data(), plan.space())
+    found = identify(oracle_choice("kf", scenario), plan.scenarios, plan.training_data(), plan.space())
     assert found.identified.tolist() == [False, True, False]
     assert "do not determine Q11 and R" in sentences(found)[1]
 
@@ -139,7 +139,7 @@ def test_the_published_tunnel_tells_nothing_of_its_small_r():
 def test_fishers_information_gives_the_judgement_of_differences(name, kind, monkeypatch):
     scenario = find_scenario(name)
     plan = Plan(kind, (scenario,))
-    given = true_choice(kind, scenario), plan.scenarios, plan.training_data(), plan.space()
+    given = oracle_choice(kind, scenario), plan.scenarios, plan.training_data(), plan.space()
     differences = identify(*given)
     monkeypatch.setattr(noise, "LEAST_NUMBERS", 0)
     information = identify(*given)
@@ -179,11 +179,11 @@ def test_a_number_that_is_hardly_known_goes_along_no_further_than_ten_times_its_
 
 def test_of_more_numbers_than_can_be_paired_off_it_says_so():
     nominal = find_scenario("nominal")
-    choice, plan = true_choice("ekf", nominal), Plan("ekf", (nominal,))
+    choice, plan = oracle_choice("ekf", nominal), Plan("ekf", (nominal,))
     assert too_many(choice, plan.space()) == [] and identifiability.MOST_NUMBERS > len(plan.space())
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(identifiability, "MOST_NUMBERS", 2)
         assert identify(choice, plan.scenarios, [], plan.space()) is None
         (said,) = too_many(choice, plan.space())
         assert "at most 2 numbers" in said and "here are 3" in said
-        assert too_many(true_choice("open-loop", nominal), plan.space()) == []
+        assert too_many(oracle_choice("open-loop", nominal), plan.space()) == []

@@ -82,8 +82,8 @@ def test_what_stands_in_a_product_alone_trades_off_and_is_not_determined(data):
     assert product == pytest.approx(2.0, rel=0.1)
     assert found.determined == {"first": False, "second": False, "damping": True}
     assert found.traded[0][:2] == ("first", "second") and found.traded[0][2] < -0.95
-    assert found.loosest.keys() == {"first", "second"}
-    assert np.prod(np.sign(list(found.loosest.values()))) == -1
+    assert found.least_determined.keys() == {"first", "second"}
+    assert np.prod(np.sign(list(found.least_determined.values()))) == -1
     said = " ".join(found.sentences())
     assert "do not determine first, second" in said and "trade off" in said
 

@@ -9,7 +9,7 @@ from filters.consistency.intervals import Interval
 from filters.tuned_file import read_tuned_file
 from tests.tuned_files import rewrite, write_untuned
 from tuning.evaluation import kept
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.kept import kept_comparison, kept_sizes, sizes_as_data
 from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.tuned import metrics, read_tuned
@@ -28,7 +28,7 @@ NOMINAL = find_scenario("nominal")
 def test_a_comparison_reads_as_it_was(tmp_path, scenario):
     path = write_untuned(tmp_path / "ekf.json", scenario, seeds=3)
     choice, problem, _ = read_tuned(path)
-    content, fresh = read_tuned_file(path), prove(choice, problem, 0, 3)
+    content, fresh = read_tuned_file(path), evaluate_held_out(choice, problem, 0, 3)
     found = kept_comparison(content, choice, problem)
     assert metrics(found) == metrics(fresh) and found.ratios == fresh.ratios
     assert errors_table(problem, found) == errors_table(problem, fresh)
@@ -54,7 +54,7 @@ def test_what_other_packages_made_or_what_is_bent_is_computed_anew(tmp_path):
 def test_a_report_takes_what_the_file_keeps_unless_the_problem_has_changed(tmp_path, monkeypatch):
     path = write_untuned(tmp_path / "ekf.json")
     asked = []
-    monkeypatch.setattr(reports, "prove", lambda *given: asked.append(given) or prove(*given))
+    monkeypatch.setattr(reports, "prove", lambda *given: asked.append(given) or evaluate_held_out(*given))
     tables = write_report(path, "none.journal").tables.read_text()
     assert not asked
     rewrite(path, lambda content: content.update(digest="another"))
@@ -63,7 +63,7 @@ def test_a_report_takes_what_the_file_keeps_unless_the_problem_has_changed(tmp_p
 
 def test_ensemble_sizes_read_as_they_were_of_the_same_choice_alone(monkeypatch):
     plan, choice = Plan("enkf", (NOMINAL,)), untuned_choice("enkf", NOMINAL)
-    evaluation = prove(choice, NOMINAL, 0, 2).tuned
+    evaluation = evaluate_held_out(choice, NOMINAL, 0, 2).tuned
     rows = [SizeRow(n, evaluation, Interval(1.1, 1.0, 1.2), 0.5, 8) for n in (5, 30)]
     data = json.loads(json.dumps(sizes_as_data(rows, choice, plan), allow_nan=False))
     found = kept_sizes(data, choice.with_size(5), plan)

@@ -15,7 +15,7 @@ from plants.logs.log import Log
 from plants.simulate import simulate
 from studies.hidden_truth import hide_truth
 from tuning.evaluation.evaluate import evaluate
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.sizes import close_size
 from tuning.likelihood.gradient import maximise_likelihood
 from tuning.likelihood.identifiability import identify
@@ -144,7 +144,7 @@ def test_the_noise_of_a_simulation_is_found_again_without_its_truth():
     found = result.choice.model
     assert found["process_noise_cov"][0] == pytest.approx(Q, rel=0.3)
     assert found["measurement_noise_cov"] == pytest.approx(R, rel=0.15)
-    proof = prove(result.choice, problem, 0)
+    proof = evaluate_held_out(result.choice, problem, 0)
     assert proof.seeds == problem.parts.held_out and not proof.tuned.has_truth
     assert proof.likelihood_gains["rule of thumb"].low > 0
     known = identify(result.choice, (problem,), plan.training_data(), plan.space())

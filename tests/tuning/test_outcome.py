@@ -9,7 +9,7 @@ import pytest
 from filters.consistency.intervals import Interval
 from thruster_cli.main import main
 from tuning.evaluation.sizes import SizeRow, sufficient_size
-from tuning.search.enqueued import TWIN
+from tuning.search.enqueued import RESCALED
 from tuning.search.objectives import NIS_BAND
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.plan import Plan
@@ -91,7 +91,7 @@ def test_a_study_names_its_best_trial_to_programs_that_know_no_constraints(tmp_p
     study = optuna.load_study(study_name="s", storage=storage)
     best = best_trial(study.trials)
     assert study.user_attrs[BEST] == best.number == study.best_trial.number
-    assert is_consistent(best) and TWIN in best.user_attrs
+    assert is_consistent(best) and RESCALED in best.user_attrs
     study.set_user_attr(BEST, 0)  # what a slower worker wrote last
     run_study(open_study("s", PLAN, storage), PLAN, 4)
     assert study.user_attrs[BEST] == best.number

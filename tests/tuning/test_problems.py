@@ -24,7 +24,7 @@ from tuning.problems.excitation import BinarySequence, MultiSine
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.problem import scored_states
 from tuning.search.plan import Plan
-from tuning.search.space import choice_of, parameters, parameters_of, true_choice, untuned_choice
+from tuning.search.space import choice_of, oracle_choice, parameters, parameters_of, untuned_choice
 
 pytestmark = pytest.mark.usefixtures("as_python")
 
@@ -128,7 +128,7 @@ def test_a_pair_compares_the_states_that_both_have():
     drawn = ModelProblem(truth, None, np.ones((60, 2)), scale=(1.0, 1.0, 1.0)).data([1])
     np.testing.assert_array_equal(found.data([1]).states, drawn.states[..., [2, 0]])
     assert found.true is None and checked_problem(found).untuned[NOISE[0]][2] == pytest.approx(0.4)
-    assert true_choice("ekf", found) is None
+    assert oracle_choice("ekf", found) is None
 
 
 def test_inputs_are_an_array_a_function_of_seeds_an_excitation_or_none():

@@ -8,7 +8,7 @@ import optuna
 import pytest
 
 from tuning.evaluation.evaluate import evaluate
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.evaluation.verify import verify
 from tuning.search.plan import Plan
@@ -52,7 +52,7 @@ def test_a_study_and_its_file_do_without_a_bound(file):
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     plan = Plan("ekf", (file("process_noise_cov = [1.0, 0.0]\nsteps = 80"),))
     result = run_study(open_study("s", plan, optuna.storages.InMemoryStorage()), plan, 3)
-    write_tuned("t.json", plan, result, [prove(result.choice, plan.scenarios[0], 0, 4)], "s")
+    write_tuned("t.json", plan, result, [evaluate_held_out(result.choice, plan.scenarios[0], 0, 4)], "s")
     assert "NaN" not in Path("t.json").read_text() and verify("t.json").holds
 
 

@@ -15,12 +15,12 @@ from tuning.evaluation.baselines import (
 )
 from tuning.evaluation.compare import contender
 from tuning.evaluation.evaluate import evaluate, score_ratio
-from tuning.evaluation.held_out import Comparison, prove
+from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.worth import scaling_sentence, worth
 from tuning.problems.seeds import held_out_seeds, training_seeds
 from tuning.search.objectives import nis_ratio
 from tuning.search.plan import TRAINING_SEEDS
-from tuning.search.space import true_choice, untuned_choice
+from tuning.search.space import oracle_choice, untuned_choice
 from tuning.thruster.find import find_scenario
 
 MISMATCH, OUTLIERS = find_scenario("mismatch"), find_scenario("outliers")
@@ -53,7 +53,7 @@ def test_where_there_is_no_scaled_default_it_says_why():
     assert found.choice is None and found.reason.startswith(
         "no factor on Q brings the mean NIS of ekf to 1: it is 4."
     )
-    proof = prove(untuned_choice("ekf", startup), startup, 0, 4)
+    proof = evaluate_held_out(untuned_choice("ekf", startup), startup, 0, 4)
     assert proof.scaled is None and list(proof.evaluations) == [RULE, TUNED, ORACLE]
     assert scaling_sentence(proof).startswith(
         "There is no scaled default, so the rule of thumb comes first: no factor"
@@ -76,8 +76,8 @@ def test_a_nis_that_jumps_over_one_has_no_factor_either(monkeypatch):
 
 
 def test_a_proof_holds_all_baselines_on_the_same_seeds_and_names_the_one_that_counts_first():
-    choice = true_choice("ekf", MISMATCH)
-    proof = prove(choice, MISMATCH, 0, 40)
+    choice = oracle_choice("ekf", MISMATCH)
+    proof = evaluate_held_out(choice, MISMATCH, 0, 40)
     assert list(proof.evaluations) == [RULE, SCALED, TUNED, ORACLE] and list(proof.ratios) == [
         SCALED,
         RULE,

@@ -8,15 +8,15 @@ import pytest
 from optuna.trial import TrialState
 
 from tuning.evaluation.evaluate import evaluate, score_ratio
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.likelihood.gradient import BAD_START, maximise_likelihood
 from tuning.search import trials
-from tuning.search.enqueued import LIKELIEST, LIKELIEST_AFTER, TWIN
+from tuning.search.enqueued import MAXIMUM_LIKELIHOOD, MAXIMUM_LIKELIHOOD_AFTER, RESCALED
 from tuning.search.objectives import LARGEST, NIS_BAND, nis_violation
 from tuning.search.outcome import best_trial, violation
 from tuning.search.plan import Plan
 from tuning.search.samplers import SAMPLERS, make_sampler
-from tuning.search.space import choice_of, distributions, true_choice, untuned_choice
+from tuning.search.space import choice_of, distributions, oracle_choice, untuned_choice
 from tuning.search.study import open_study, run_study
 from tuning.search.trials import BLOCK, measure
 from tuning.thruster.find import find_scenario
@@ -46,31 +46,31 @@ def test_the_winner_of_a_study_is_consistent_on_its_training_seeds_at_hardly_any
 def test_a_common_factor_on_q_and_r_is_what_makes_a_trial_consistent():
     result = studied(PLAN, 3)
     untuned, twin = result.trials[:2]
-    assert violation(untuned) > 0 and twin.user_attrs[TWIN] == 1
+    assert violation(untuned) > 0 and twin.user_attrs[RESCALED] == 1
     factors = {name: twin.params[name] / untuned.params[name] for name in ("Q11", "Q22", "R")}
     assert factors["Q11"] == pytest.approx(factors["R"]) == pytest.approx(factors["Q22"])
     assert twin.values[0] == pytest.approx(untuned.values[0], rel=0.02) and violation(twin) <= 0
 
 
-def test_one_trial_has_the_likeliest_noise_and_finds_what_sampling_finds_late():
+def test_one_trial_has_the_most_likely_noise_and_finds_what_sampling_finds_late():
     plan = Plan("ekf", (NOMINAL,), seed=3)
-    result = studied(plan, LIKELIEST_AFTER + 2)
-    (likeliest,) = [trial for trial in result.trials if LIKELIEST in trial.user_attrs]
-    assert likeliest.number >= LIKELIEST_AFTER
+    result = studied(plan, MAXIMUM_LIKELIHOOD_AFTER + 2)
+    (most_likely,) = [trial for trial in result.trials if MAXIMUM_LIKELIHOOD in trial.user_attrs]
+    assert most_likely.number >= MAXIMUM_LIKELIHOOD_AFTER
     found = maximise_likelihood("ekf", NOMINAL, plan.training_data()[0], [(1, 1, 1)])
-    assert [likeliest.params[name] for name in found.names] == pytest.approx(found.best.variances)
-    true = evaluate(true_choice("ekf", NOMINAL).filter(NOMINAL), plan.training_data()[0], NOMINAL.scale)
-    assert likeliest.values[0] < 1.005 * true.score.value
+    assert [most_likely.params[name] for name in found.names] == pytest.approx(found.best.variances)
+    true = evaluate(oracle_choice("ekf", NOMINAL).filter(NOMINAL), plan.training_data()[0], NOMINAL.scale)
+    assert most_likely.values[0] < 1.005 * true.score.value
 
 
-def test_with_r_held_no_trial_has_the_likeliest_noise():
-    result = studied(Plan("ekf", (NOMINAL,), hold_r=True), LIKELIEST_AFTER + 2)
-    assert not any(LIKELIEST in trial.user_attrs for trial in result.trials)
+def test_with_r_held_no_trial_has_the_most_likely_noise():
+    result = studied(Plan("ekf", (NOMINAL,), hold_r=True), MAXIMUM_LIKELIHOOD_AFTER + 2)
+    assert not any(MAXIMUM_LIKELIHOOD in trial.user_attrs for trial in result.trials)
 
 
 def test_without_consistency_any_nis_will_do():
     result = studied(PLAN._replace(consistent=False), 8)
-    assert result.free_value is None and not any(TWIN in trial.user_attrs for trial in result.trials)
+    assert result.free_value is None and not any(RESCALED in trial.user_attrs for trial in result.trials)
     assert {violation(trial) for trial in result.trials} == {0.0}
 
 
@@ -156,12 +156,12 @@ def test_a_plan_that_cannot_work_is_refused(change, rule):
 @pytest.mark.parametrize(("name", "kind"), [("nominal", "ekf"), ("published_tunnel", "kf")])
 def test_from_a_bad_start_a_study_of_a_perfect_model_comes_within_half_a_per_cent_of_the_true_q_and_r(name, kind):
     scenario = find_scenario(name)
-    plan, true = Plan(kind, (scenario,)), true_choice(kind, scenario)
+    plan, true = Plan(kind, (scenario,)), oracle_choice(kind, scenario)
     factors = np.array(BAD_START)
     q, r = np.array(true.model["process_noise_cov"]) * factors[:2], scenario.measurement_noise_cov * factors[2]
     bad = true._replace(model={"process_noise_cov": tuple(q.tolist()), "measurement_noise_cov": float(r)})
     study = open_study("s", plan, optuna.storages.InMemoryStorage(), bad)
-    proof = prove(run_study(study, plan, 100).choice, scenario, plan.seed)
+    proof = evaluate_held_out(run_study(study, plan, 100).choice, scenario, plan.seed)
     started = evaluate(bad.filter(scenario), scenario.data(proof.seeds), scenario.scale)
     assert score_ratio(started, proof.true).low > 1.1
     assert score_ratio(proof.tuned, proof.true).high < 1.005
@@ -175,14 +175,14 @@ def test_a_trial_whose_nis_is_not_finite_is_inconsistent_and_has_no_twin(monkeyp
     monkeypatch.setattr(trials, "compute_metrics", lost)
     result = studied(PLAN, 3)
     assert len(result.trials) == 3 and all(violation(trial) == LARGEST for trial in result.trials)
-    assert not any(TWIN in trial.user_attrs for trial in result.trials)
+    assert not any(RESCALED in trial.user_attrs for trial in result.trials)
 
 
 def test_r_may_be_held_at_the_sensor_s_sheet():
     result = studied(PLAN._replace(hold_r=True), 10)
     assert set(result.trials[0].params) == {"Q11", "Q22"}
     assert result.choice.model["measurement_noise_cov"] == MISMATCH.measurement_noise_cov
-    assert not any(TWIN in trial.user_attrs for trial in result.trials)
+    assert not any(RESCALED in trial.user_attrs for trial in result.trials)
     assert result.best_value < result.trials[0].values[0]
 
 

@@ -9,7 +9,7 @@ import pytest
 from optuna.trial import TrialState
 
 from filters.tuned_file import sealed
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.search.plan import Plan
 from tuning.search.space import parameters_of, untuned_choice
@@ -39,7 +39,7 @@ def test_a_study_starts_untuned_never_sees_the_truth_and_improves_on_held_out_se
     assert first == pytest.approx(dict(parameters_of(untuned_choice("ekf", SCENARIO))))
     true = SCENARIO.true["process_noise_cov"]
     assert all((t.params["Q11"], t.params["Q22"]) != true for t in result.trials)
-    proof = prove(result.choice, SCENARIO, 0, 100)
+    proof = evaluate_held_out(result.choice, SCENARIO, 0, 100)
     assert proof.tuned.score.high < proof.untuned.score.low
     assert result.best_value < result.trials[0].value
 
@@ -187,7 +187,7 @@ def test_the_first_ctrl_c_lets_the_running_trial_finish(tmp_path):
 def test_a_tuned_file_edited_by_hand_is_refused(tmp_path, change, rule):
     result = run_study(study_in(optuna.storages.InMemoryStorage()), PLAN, 2)
     path = tmp_path / "tuned.json"
-    write_tuned(path, PLAN, result, [prove(result.choice, SCENARIO, 0, 2)], "s")
+    write_tuned(path, PLAN, result, [evaluate_held_out(result.choice, SCENARIO, 0, 2)], "s")
     content = json.loads(path.read_text())
     content["filter"]["model"].update(change)
     path.write_text(json.dumps(content))

@@ -19,7 +19,7 @@ from numerics.compiled import interpreted
 from tests import pendulum_problem
 from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
 from tests.tuned_files import rewrite
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_choice, read_tuned, write_tuned
 from tuning.evaluation.verify import verify
 from tuning.likelihood.gradient import maximise_likelihood
@@ -48,7 +48,7 @@ def tuned(tmp_path_factory):
     plan = Plan("ekf", (problem,))
     result = run_study(open_study("s", plan, optuna.storages.InMemoryStorage()), plan, 8)
     path = tmp_path_factory.mktemp("pendulum") / "ekf.json"
-    write_tuned(path, plan, result, [prove(result.choice, problem, 0, 4)], "s")
+    write_tuned(path, plan, result, [evaluate_held_out(result.choice, problem, 0, 4)], "s")
     return path, result, problem
 
 

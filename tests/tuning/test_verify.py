@@ -8,7 +8,7 @@ import pytest
 
 from filters.tuned_file import sealed
 from thruster_cli.main import main
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.evaluation.verify import Difference, verify
 from tuning.search.plan import Plan
@@ -23,7 +23,7 @@ def content(tmp_path_factory):
     """What a tuned file of a small study on two scenarios holds."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     result = run_study(open_study("s", PLAN, optuna.storages.InMemoryStorage()), PLAN, 2)
-    proofs = [prove(result.choice, scenario, PLAN.seed, 4) for scenario in PLAN.scenarios]
+    proofs = [evaluate_held_out(result.choice, scenario, PLAN.seed, 4) for scenario in PLAN.scenarios]
     path = tmp_path_factory.mktemp("tuned") / "tuned.json"
     write_tuned(path, PLAN, result, proofs, "s")
     return json.loads(path.read_text())

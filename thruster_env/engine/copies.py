@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from numerics.checks import options as checked_options
+from numerics.compiled import CompiledOrPython
 from plants.copies import PlantCopies
 from plants.memory import set_row
 from thruster_env.effects.uncertainty import drawn_parameters
@@ -30,7 +31,7 @@ class Copies(PlantCopies):
         numbers, self._extra_rows = encode(plant, task)
         super().__init__(count, numbers, FIXED_ROWS + self._extra_rows)
 
-    def machine_code(self) -> tuple[Callable, Callable]:
+    def machine_code(self) -> tuple[Callable, CompiledOrPython]:
         """The compiled step of this plant and task."""
         effects = known_effects(self.plant, self.task), is_plain(self.plant, self.task)
         return advance(*effects), advance_in_parts(*effects)

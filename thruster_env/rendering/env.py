@@ -9,9 +9,27 @@ from plants.memory import TIME
 from plants.rendered import RenderedEnv
 from thruster_env.engine.memory import AMBIENT, COMMAND, FLOW, OMEGA, READINGS, REFERENCE, THRUST
 from thruster_env.linear.steady_state import state_range
+from thruster_env.plant import Plant
 from thruster_env.rendering.history import Moment
 from thruster_env.rendering.renderer import MODES, Renderer
 from thruster_env.task import thrust_scale
+
+
+def renderer_of(plant: Plant, mode: str, frames_per_second: float) -> Renderer:
+    """What draws a plant, its scales those of the full voltage; arguments are those of `Renderer`."""
+    p, top = plant.parameters, plant.max_voltage
+    speed, flow = state_range(p, top) / 2
+    return Renderer(
+        mode,
+        gear_ratio=p.gear_ratio,
+        diameter=p.diameter,
+        max_voltage=top,
+        thrust_scale=thrust_scale(plant),
+        speed_scale=speed,
+        flow_scale=flow,
+        dt=plant.dt,
+        frames_per_second=frames_per_second,
+    )
 
 
 class RenderedThruster(RenderedEnv):
@@ -21,19 +39,7 @@ class RenderedThruster(RenderedEnv):
 
     def make_renderer(self) -> Renderer:
         """What draws the thruster in its water."""
-        p, top = self.plant.parameters, self.plant.max_voltage
-        speed, flow = state_range(p, top) / 2
-        return Renderer(
-            self.render_mode,
-            gear_ratio=p.gear_ratio,
-            diameter=p.diameter,
-            max_voltage=top,
-            thrust_scale=thrust_scale(self.plant),
-            speed_scale=speed,
-            flow_scale=flow,
-            dt=self.plant.dt,
-            frames_per_second=self.metadata["render_fps"],
-        )
+        return renderer_of(self.plant, self.render_mode, self.metadata["render_fps"])
 
     def moment_of(self, report: list[float]) -> Moment:
         """What the renderer adds of a report: truth, measured thrust, reference and voltage."""

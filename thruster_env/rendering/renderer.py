@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from math import isnan
+
 import numpy as np
 
 from numerics.checks import positive
-from plants.rendering.history import ABSURD
+from plants.rendering.history import ABSURD, newest
 from plants.rendering.renderer import MODES, PlantRenderer
 from thruster_env.rendering.history import Moment, Overlay
 
@@ -89,8 +91,14 @@ class Renderer(PlantRenderer):
         self._omega_m = 0.0
 
     def add(self, moment: Moment, overlay: Overlay | None = None) -> None:
-        """Note a moment, dt after the one before; the first of an episode is that of the reset."""
-        omega_m = moment.omega_m if abs(moment.omega_m) < ABSURD else 0.0
+        """Note a moment, dt after the one before; the first of an episode is that of the reset.
+
+        Where the truth is not known, NaN, the propeller turns and the water flows as the filter believes.
+        """
+        omega_m = moment.omega_m
+        if isnan(omega_m) and overlay is not None and overlay.omega_m is not None:
+            omega_m = overlay.omega_m
+        omega_m = omega_m if abs(omega_m) < ABSURD else 0.0
         if self._history.count:
             self._angle += 0.5 * (self._omega_m + omega_m) * self._dt / self._gear_ratio
         self._omega_m = omega_m
@@ -102,5 +110,7 @@ class Renderer(PlantRenderer):
             self._count_of_frame = count
             self._angle_of_last_frame, self._angle_of_frame = self._angle_of_frame, self._angle
         moment = Moment(*(float(columns[name][-1]) for name in Moment._fields))
+        believed = {name: newest(columns, f"estimated_{name}") for name in ("omega_m", "U_a", "thrust")}
+        moment = moment._replace(**{name: b for name, b in believed.items() if isnan(getattr(moment, name))})
         self._scene.draw(moment, self._angle_of_last_frame, self._angle_of_frame)
         self._gauges.draw(columns, self._charts.draw(columns, count - 1, label)[0])

@@ -1,4 +1,4 @@
-"""Inputs of the vehicle's scenarios: any excitation of thrust and planes, and the papers' manoeuvres."""
+"""Inputs of the vehicle's scenarios: any excitation of thrust and planes, and the manoeuvres of the papers."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from numerics.checks import one_of
 from plants.disturbances.effects import set_field
 from tuning.problems.excitation import EXCITATIONS, Excitation
 
-TORQUE = 1  # place of K_prop among the inputs of a manoeuvre
+TORQUE = 1  # index of K_prop among the inputs of a manoeuvre
 
 
 @EXCITATIONS.register("manoeuvre")
 @dataclass(frozen=True)
 class OfManoeuvre(Excitation):
-    """Thrust and planes of one of the vehicle's manoeuvres, the same for every seed; the last ones are held."""
+    """Thrust and planes of one of the vehicle's manoeuvres, the same for every seed; the last values are held."""
 
     path: str = "IV"
 
@@ -40,6 +40,6 @@ class OfManoeuvre(Excitation):
 
 
 def commands_of(excitation: Excitation, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
-    """Thrust, the torque where it is an input, and planes (B, steps, p), cut off where the env does."""
+    """Thrust, the torque where it is an input, and planes (B, steps, p), clipped to the limits of the env."""
     low, high = plant.input_limits
     return np.clip(excitation.inputs(keys, steps, plant.dt, len(plant.inputs)), low, high)

@@ -24,33 +24,33 @@ from tuning.problems.data import Data
 from tuning.problems.plain import plain
 from tuning.problems.scenario import BaseScenario
 
-UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as part of each state's range
-RUNS_AT_ONCE = 16  # whose covariances of every step the bound holds together
+UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as a fraction of each state's range
+RUNS_AT_ONCE = 16  # runs whose covariances of all steps are in memory at the same time
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario(BaseScenario):
     """A vehicle, an excitation and what a filter assumes of the vehicle.
 
-    A filter's model has the first states of the twelve; it is the vehicle's, but for `parameter_factors`, and
-    knows the distribution of the initial state. Of sensor effects it knows nothing; the current is among the
-    states of "current", and unknown to the others.
+    A filter's model has the first of the twelve states; it is the vehicle's model, except for `parameter_factors`,
+    and knows the distribution of the initial state. It does not know the sensor effects; the current is among the
+    states of "current", and unknown to the other models.
 
     Attributes, beside those of `BaseScenario`:
-        process_noise_cov: the vehicle's Q, twelve variances a step.
-        measurement_noise_cov: the vehicle's R, a variance a channel.
-        scale: of each of the model's states, the root of the Riccati covariance along the noise-free path, fixed
-            numbers made by `scale.computed_scale`.
+        process_noise_cov: the vehicle's Q, twelve variances per step; they do not scale with `dt`.
+        measurement_noise_cov: the vehicle's R, one variance for each channel; those of the data sheets if None.
+        scale: of each of the model's states, the standard deviation by the Riccati equation along the noise-free
+            path: fixed numbers, computed by `scale.computed_scale`.
         states: those of the model, "velocities" (6), "motion" (8), "navigation" (12) or "current" (14). With
             "velocities" roll and pitch are inputs, true ones.
         preset: the vehicle, as for `auv_env.plant.make_plant`; so are all that follow.
         dt: sample time [s].
-        propeller_torque: over thrust [m]; None makes it an input.
+        propeller_torque: divided by thrust [m]; None makes the torque an input.
         initial_state: None, twelve numbers, or a mapping.
         sensors: a suite's name, channels, or a mapping from them to lists of effects.
         current: three velocities [m/s], or signals by direction.
-        propeller_lag: [s], of which filters do not know.
-        plane_lag: the same of both planes [s].
+        propeller_lag: time constant of the thrust [s], unknown to filters.
+        plane_lag: time constant of both planes [s], unknown to filters.
     """
 
     plant_kind = "auv"
@@ -76,11 +76,11 @@ class Scenario(BaseScenario):
             "process_noise_cov": vector("process_noise_cov", self.process_noise_cov, len(STATES)).tolist(),
         }
         given = self.measurement_noise_cov
-        if given is None:  # of the instruments, so that the scenario says what they are
+        if given is None:  # those of the instruments, so that the scenario lists them
             own["measurement_noise_cov"] = np.diag(make_plant(sensors=self.sensors).measurement_noise_cov).tolist()
             return own
         if not isinstance(given, list | tuple) or not 1 <= len(given) <= MAX_CHANNELS:
-            rule = f"measurement_noise_cov must be 1 to {MAX_CHANNELS} variances, one a channel"
+            rule = f"measurement_noise_cov must be 1 to {MAX_CHANNELS} variances, one for each channel"
             raise ValueError(f"{rule}, but got {shown(given)}")
         return own | {"measurement_noise_cov": [positive("measurement_noise_cov", one) for one in given]}
 
@@ -108,7 +108,7 @@ class Scenario(BaseScenario):
 
     @property
     def held(self) -> dict:
-        """What the filter's model has of its own: its states, and wrong parameters."""
+        """Where the model differs from the vehicle in every choice: its states, and wrong parameters."""
         return {"states": self.states, **super().held}
 
     @property
@@ -123,7 +123,7 @@ class Scenario(BaseScenario):
 
     @property
     def untuned(self) -> dict:
-        """Model arguments of the untuned filter: R from the sheets, Q from 1 % of each state's range."""
+        """Model arguments of the untuned filter: R from the data sheets, Q from 1 % of each state's range."""
         top = state_range(self.plant, self.count)
         deviation = UNTUNED_RANGE_FRACTION * np.where(np.arange(self.count) == 0, 1.0, 2.0) * top
         return {
@@ -139,12 +139,14 @@ class Scenario(BaseScenario):
         return {**super().true, "process_noise_cov": (*own, *of_current.tolist())}
 
     def bound(self, data: Data) -> np.ndarray:
-        """Riccati's standard deviation of each state (n,) along noise-free paths, over scored steps.
+        """Standard deviation of each state (n,) by the Riccati equation along noise-free paths, over scored steps.
 
-        It is that of the nominal vehicle with the same Q, R and inputs, and with the measurements that the data
-        have. `posterior_bound` would be useless here: angles and positions have hardly any noise of their own.
+        It is that of the nominal vehicle with the same Q, R and inputs, and with the same missing measurements as
+        the data. `posterior_bound` would be useless here, because angles and positions have hardly any process
+        noise.
         """
-        exact, missing, total = model_of_plant(self.plant, states=self.states), np.isnan(data.measurements), 0.0
+        exact, missing = model_of_plant(self.plant, states=self.states), np.isnan(data.measurements)
+        total = np.zeros(exact.n)
         for first in range(0, len(data.seeds), RUNS_AT_ONCE):
             some = slice(first, first + RUNS_AT_ONCE)
             covs = path_bound(exact, data.inputs[some], missing[some])
@@ -163,5 +165,5 @@ class Scenario(BaseScenario):
         states = np.ascontiguousarray(whole[..., : self.count])
         model = self.model()
         outputs = {symbol: model.output(symbol, states) for symbol in model.outputs}
-        measurements = np.where(found.valid, found.measurements, np.nan)  # as filters take missing ones
+        measurements = np.where(found.valid, found.measurements, np.nan)  # NaN: missing
         return Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, states, outputs)

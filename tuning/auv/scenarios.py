@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import sys
+from typing import Any
 
 from auv_env.plant import make_plant
 from tuning.auv.excitation import OfManoeuvre
@@ -20,8 +21,8 @@ PLANE = math.radians(6.0)
 SAILING = Levels(low=(2.0, -PLANE, -PLANE), high=(4.0, PLANE, PLANE), shortest=60, longest=160)
 """Thrusts of 2 to 4 N and planes within 6 deg, each held for 3 to 8 s."""
 
-MINUTE = {"excitation": SAILING, "steps": 1200, "first_scored_step": 100}
-PAPERS = {
+MINUTE: dict[str, Any] = {"excitation": SAILING, "steps": 1200, "first_scored_step": 100}
+PAPERS: dict[str, Any] = {
     "sensors": "papers",
     "dt": 0.001,
     "process_noise_cov": (1e-6,) * 6 + (1e-12,) * 6,
@@ -42,7 +43,7 @@ def suite_with(name: str, channels: tuple[str, ...], effect: dict) -> dict[str, 
 
 
 DVL = ("u", "v", "w")
-# Riccati's standard deviations of 200 input sequences, good to one per cent; a test computes some anew.
+# Standard deviations by the Riccati equation for 200 input sequences, to one per cent; a test recomputes some.
 MOTION_SCALE = (0.007873, 0.004605, 0.005282, 0.002202, 0.002147, 0.002115, 0.0005593, 0.0009131)
 NAVIGATION_SCALE = (
     0.007821,
@@ -85,7 +86,7 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         Scenario(
             name="auv:velocities",
-            about="the papers' six states at 20 Hz, roll and pitch told by an ideal sensor",
+            about="the papers' six states at 20 Hz, roll and pitch from an ideal sensor",
             states="velocities",
             sensors="papers",
             scale=(0.0009238, 0.0009228, 0.000923, 0.004031, 0.004871, 0.0009219),
@@ -101,7 +102,7 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         Scenario(
             name="auv:usbl",
-            about="the same with a position by sound every 2 s",
+            about="the same with an acoustic position fix (USBL) every 2 s",
             states="navigation",
             sensors="usbl",
             scale=(
@@ -122,7 +123,7 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         Scenario(
             name="auv:no_dvl",
-            about="gyros, AHRS, compass and depth: the model tells the speed",
+            about="gyros, AHRS, compass and depth: the speed follows from the model",
             states="navigation",
             sensors="inertial",
             scale=(
@@ -143,7 +144,7 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         Scenario(
             name="auv:dvl_dropout",
-            about="the DVL loses the ground half of the time, for 10 s in a row",
+            about="the DVL loses bottom track half of the time, for 10 s on average",
             states="navigation",
             sensors=suite_with("default", DVL, {"name": "dropout", "probability": 0.5, "mean_length": 200}),
             scale=(
@@ -164,21 +165,21 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         Scenario(
             name="auv:dvl_outliers",
-            about="one velocity in twenty of the DVL is off by some 0.2 m/s",
+            about="one DVL velocity in twenty has an error of about 0.2 m/s",
             sensors=suite_with("motion", DVL, {"name": "outliers", "std": 0.2, "probability": 0.05}),
             scale=MOTION_SCALE,
             **MINUTE,
         ),
         Scenario(
             name="auv:wrong_drag",
-            about="the filter believes in half of the drag ahead and 20 % more across",
+            about="the filter assumes half of the drag ahead and 20 % more drag across",
             parameter_factors={"Xuu": 0.5, "Yvv": 1.2, "Zww": 1.2, "Yuv": 1.2, "Zuw": 1.2},
             scale=MOTION_SCALE,
             **MINUTE,
         ),
         Scenario(
             name="auv:current",
-            about="a current of about 0.2 m/s each way, slow to change, that the filter does not know",
+            about="a slowly changing current of about 0.2 m/s north and east, unknown to the filter",
             states="navigation",
             sensors="default",
             current=CURRENT,
@@ -187,7 +188,7 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         Scenario(
             name="auv:estimated_current",
-            about="the same current, two further states of the filter's model",
+            about="the same current, estimated as two further states of the filter's model",
             states="current",
             sensors="default",
             current=CURRENT,

@@ -1,4 +1,7 @@
-"""What a tuned filter is compared with: scaled default, rule of thumb and oracle, each defined once."""
+"""The baselines of a tuned filter: scaled default, rule of thumb and oracle.
+
+NIS is the normalised innovation squared.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +17,17 @@ from tuning.problems.assumed import rows_argument
 from tuning.problems.problem import Problem
 from tuning.search.objectives import LARGEST, nis_ratio
 from tuning.search.plan import TRAINING_SEEDS
-from tuning.search.space import Choice, true_choice, untuned_choice
+from tuning.search.space import Choice, oracle_choice, untuned_choice
 
-# The names by which tables, sentences and pictures call them.
+# Their names in tables, sentences and pictures.
 SCALED, RULE, ORACLE, TUNED = "scaled default", "rule of thumb", "oracle", "tuned"
-DECADES = 8  # the factor on Q is searched as far as so many powers of ten, up or down
-DIGITS = 4  # of the factor: what is said of it is what was used
-CLOSE = 0.02  # the mean NIS is called 1 within this: an ensemble's need not be continuous in Q
+DECADES = 8  # powers of ten, up and down, within which the factor on Q is searched
+DIGITS = 4  # to which the factor is rounded, so that the printed factor is the one in use
+CLOSE = 0.02  # tolerance of the mean NIS about 1: that of an ensemble need not be continuous in Q
 
 
 class Scaled(NamedTuple):
-    """The scaled default of a kind of filter, or why there is none."""
+    """The scaled default of a filter, or the reason why there is none."""
 
     choice: Choice | None
     factor: float | None  # on the rule of thumb's Q
@@ -33,32 +36,33 @@ class Scaled(NamedTuple):
 
 
 def rule_of_thumb(name: str, scenario: Problem) -> Choice:
-    """R from the sensor's sheet, Q = diag((1 % of each state's range)^2), N = 30 (particles: 1000)."""
+    """R from the sensor's data sheet, Q = diag((1 % of each state's range)^2), N = 30 (particles: 1000)."""
     return untuned_choice(name, scenario)
 
 
 def oracle(name: str, scenario: Problem) -> Choice | None:
-    """The filter that is told the plant's own Q and R, with the rule of thumb's N; None if they are unknown."""
-    return true_choice(name, scenario)
+    """The filter that knows the plant's own Q and R, with the rule of thumb's N; None if they are unknown."""
+    return oracle_choice(name, scenario)
 
 
 @lru_cache(maxsize=64)
 def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
-    """The rule of thumb with one factor on its Q, such that the mean NIS on the training runs is right.
+    """The rule of thumb with one factor on its Q, so that the mean NIS on the training runs is as expected.
 
         mean of nu' S(c Q, R)^-1 nu over runs and scored steps = m,  solved for log c
 
-    It is what an engineer does who looks at the innovations once. R stays. The runs are those that a study of this
-    seed learns from, the random numbers the same for each c, so the same arguments give the same factor.
+    An engineer who looks at the innovations once would do the same. R stays. The runs are the training runs of a
+    study with this seed, and the random numbers are the same for each c, so the same arguments give the same
+    factor.
 
     Args:
-        name: of the filter.
-        scenario: the training runs, and what the filter assumes of the plant.
-        seed: of the study.
+        name: name of the filter.
+        scenario: makes the training runs, and says what the filter assumes of the plant.
+        seed: seed of the study.
 
     Returns:
-        The choice with its factor and mean NIS; without them, and with the reason, for a filter that has no NIS,
-        or whose mean NIS no factor between 1e-8 and 1e8 brings to 1.
+        The choice with its factor and mean NIS; or the reason why there is none, for a filter that has no NIS or
+        whose mean NIS no factor between 1e-8 and 1e8 brings to 1.
     """
     if not rule_of_thumb(name, scenario).filter(scenario).has_covariance:
         return Scaled(None, None, None, f"{name} has no NIS by which its Q could be scaled")
@@ -94,12 +98,12 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
 
 
 def scaled_rule(rule: Choice, scenario: Problem, factor: float) -> Choice:
-    """A rule of thumb with a factor on its Q, even where that follows from other numbers."""
+    """A rule of thumb with a factor on its Q, even where Q follows from other parameters."""
     return scaled(_with_q(rule, scenario), factor)
 
 
 def scaled(choice: Choice, factor: float) -> Choice:
-    """The same choice with variances of the process noise that are a factor times as large."""
+    """The same choice with the process noise covariance multiplied by a factor."""
     q = choice.model["process_noise_cov"]
     if np.ndim(q) == 1:
         larger = tuple(factor * variance for variance in q)
@@ -109,7 +113,7 @@ def scaled(choice: Choice, factor: float) -> Choice:
 
 
 def _with_q(choice: Choice, scenario: Problem) -> Choice:
-    """The same choice, which says what Q is even where it follows from other numbers."""
+    """The same choice with Q among its arguments, even where Q follows from other parameters."""
     if "process_noise_cov" in choice.model:
         return choice
     q = rows_argument(scenario.model(**choice.model).process_noise_cov)
@@ -117,11 +121,11 @@ def _with_q(choice: Choice, scenario: Problem) -> Choice:
 
 
 def baselines(name: str, scenario: Problem, seed: int = 0, default: Scaled | None = None) -> dict[str, Choice]:
-    """All baselines of a kind of filter that there are, by what they are called, the one that counts first.
+    """All baselines of a filter that exist, by name, the most important one first.
 
     The scaled default is found for the study's seed, unless it is given.
     """
-    default = (scaled_default(name, scenario, seed) if default is None else default).choice
-    found = {SCALED: default} if default is not None else {}
+    scaled = (scaled_default(name, scenario, seed) if default is None else default).choice
+    found = {SCALED: scaled} if scaled is not None else {}
     known = oracle(name, scenario)
     return found | {RULE: rule_of_thumb(name, scenario)} | ({} if known is None else {ORACLE: known})

@@ -1,4 +1,7 @@
-"""Filters side by side on scenarios: errors, consistency, cost, and who beats whom on the same seeds."""
+"""Filters side by side on scenarios: errors, consistency, cost, and paired comparisons on the same seeds.
+
+NEES is the normalised estimation error squared.
+"""
 
 from __future__ import annotations
 
@@ -26,17 +29,18 @@ from tuning.search.interruption import stop_on_interrupt
 from tuning.search.space import Choice, ensemble_sizes_of, has_ensemble
 
 KNOWLEDGE = ("true", "scaled", "untuned")  # of the plant's Q and R: oracle, scaled default, rule of thumb
-# What is believed of a constant by default: a flow of so many m/s, of others a part of their value.
-FLOW_STD, RELATIVE_STD, WALK_PART = 0.5, 0.2, 0.02  # the last a step, as part of the prior's
+# Default belief of a constant: standard deviation of a flow [m/s], of others as a fraction of their value ...
+FLOW_STD, RELATIVE_STD, WALK_PART = 0.5, 0.2, 0.02  # ... and of a step's change, as a fraction of the prior's
+VERDICTS = {"better": "better", "worse": "worse", "tie": "no different", "unknown": "not to be told"}
 SYMBOLS = {"ambient_velocity": "U_0"}  # for labels
 
 
 class Contender(NamedTuple):
-    """A filter that takes part in a comparison, whatever the scenario."""
+    """A filter in a comparison, which may be made for any scenario."""
 
     label: str
     choose: Callable[[Problem], Choice]
-    unknown: Mapping[str, Unknown | None] = {}  # constants of the model that it estimates, too; None for a default
+    unknown: Mapping[str, Unknown | None] = {}  # constants that it estimates, too; None for a default
 
     def filter(self, scenario: Problem) -> Filter:
         """The filter, with what the scenario lets it assume of the plant."""
@@ -44,7 +48,8 @@ class Contender(NamedTuple):
         filter_ = choice.filter(scenario)
         if not self.unknown:
             return filter_
-        constants, beliefs = filter_.model.constants, {}
+        constants = filter_.model.constants
+        beliefs: dict[str | int, Unknown] = {}
         for name, belief in self.unknown.items():
             one_of("a constant to estimate", name, getattr(constants, "_fields", ()))
             beliefs[name] = default_belief(name, getattr(constants, name)) if belief is None else belief
@@ -52,15 +57,15 @@ class Contender(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What a filter achieved on a scenario, and against the first filter on the same seeds."""
+    """Metrics of a filter on a scenario, and its comparison with the first filter on the same seeds."""
 
     label: str
     filter_name: str
     evaluation: Evaluation
     above_bound: np.ndarray  # (n,), RMSE over the bound, less one
-    nees: float  # the mean, where n is right, or the median of a particle filter
+    nees: float  # the mean, whose expected value is n, or the median of a particle filter
     nees_is_median: bool
-    microseconds: float  # a step of one run, on all cores
+    microseconds: float  # time per step of one run, on all cores
     ratios: tuple[Interval, ...]  # by state, RMSE over the first filter's, paired
     score_ratio: Interval  # score over the first filter's, paired
     likelihood_gain: Interval  # log-likelihood of a run less the first filter's, paired
@@ -69,7 +74,7 @@ class Row(NamedTuple):
     def verdict(self) -> str:
         """Whether the score is significantly lower than the first filter's: "better", "worse" or "tie".
 
-        Without truth it is by the log-likelihood of the innovations; "unknown" of a filter that has none, either.
+        Without truth the log-likelihood of the innovations decides; "unknown" for a filter that has none.
         """
         if self.evaluation.has_truth:
             return "better" if self.score_ratio.high < 1 else "worse" if self.score_ratio.low > 1 else "tie"
@@ -84,8 +89,21 @@ class Leaderboard(NamedTuple):
 
     scenario: Problem
     seeds: Sequence[int]
-    bound: np.ndarray  # (n,), of the scenario's Gaussian core on these seeds
+    bound: np.ndarray  # (n,), for the scenario's Gaussian core on these seeds
     rows: list[Row]
+
+
+def winners(board: Leaderboard) -> str:
+    """Who is significantly better or worse than the first filter."""
+    first, *others = board.rows
+    if not others:
+        return f"On {board.scenario.name} there is nothing to compare {first.label} with."
+    said = []
+    for verdict, words in VERDICTS.items():
+        names = [row.label for row in others if row.verdict == verdict]
+        said += [f"{words}: {', '.join(names)}"] if names else []
+    by = "score" if first.evaluation.has_truth else "log-likelihood"
+    return f"On {board.scenario.name}, against {first.label} by the {by}: {'; '.join(said)}."
 
 
 def contender(
@@ -94,15 +112,16 @@ def contender(
     """A filter by name.
 
     Args:
-        name: of the filter; or an estimator, what makes one of a model, or "module:object" for either.
-        knows: "true" for the plant's own Q and R (the oracle), "scaled" for the scaled default, whose Q the mean
-            NIS on the training runs tells, "untuned" for the rule of thumb.
-        unknown: constants of the model to estimate with the states; None as a belief for `default_belief`.
-        seed: of the study whose training runs scale the scaled default.
-        **numbers: of the filter, such as `ensemble_size`; those of the rule of thumb by default.
+        name: name of a filter; or an estimator, a function that makes one from a model, or "module:object".
+        knows: "true" for the plant's own Q and R (the oracle), "scaled" for the scaled default, whose Q follows
+            from the mean NIS on the training runs, "untuned" for the rule of thumb.
+        unknown: constants of the model to estimate with the states; a belief of None stands for `default_belief`.
+        seed: seed of the study whose training runs scale the scaled default.
+        **numbers: parameters of the filter, such as `ensemble_size`; by default those of the rule of thumb.
 
     Raises:
-        ValueError: for an unknown name or knowledge. (Numbers and constants are checked as the filter is made.)
+        ValueError: for an unknown name or knowledge. (Parameters and constants are checked when the filter is
+            made.)
     """
     filter_class(name)
     one_of("knows", knows, KNOWLEDGE)
@@ -122,7 +141,7 @@ def contender(
 
 
 def _known(knows: str, name: str, scenario: Problem, seed: int) -> Choice:
-    """The choice of a filter that knows so much; ValueError where there is no scaled default, or no oracle."""
+    """The choice of a filter with this knowledge; ValueError where there is no scaled default, or no oracle."""
     if knows == "untuned":
         return rule_of_thumb(name, scenario)
     if knows == "true":
@@ -142,13 +161,13 @@ def sized(choice: Choice, ensemble_size: int | None) -> Choice:
 
 
 def default_belief(name: str, value: float) -> Unknown:
-    """What is believed of a constant of the model by default.
+    """The default belief of a constant of the model.
 
     Its prior has a standard deviation of 0.5 m/s for the ambient flow, and of a fifth of its value otherwise; a
     step changes it by 2 % of that.
 
     Raises:
-        ValueError: if the constant is zero, so that a part of it says nothing.
+        ValueError: if the constant is zero, because its spread is a fraction of its value.
     """
     std = FLOW_STD if name == "ambient_velocity" else RELATIVE_STD * abs(value)
     positive(f"the assumed {name}, of which a part is its spread,", std)
@@ -166,14 +185,14 @@ def compare(
     Ctrl-C ends it after the running filter and keeps what is done; a second one ends it at once.
 
     Args:
-        contenders: the filters; the first one is what the others are compared with.
-        scenarios: on what.
-        seeds: at least 2; held-out ones, for a comparison of tuned filters. Or a function that gives those of a
-            problem.
+        contenders: the filters; the others are compared with the first one.
+        scenarios: the problems that they are compared on.
+        seeds: at least 2, held-out ones for a comparison of tuned filters; or a function that returns the seeds of
+            a problem.
         on_row: called before each filter's run with the scenario and the filter's label.
 
     Returns:
-        A leaderboard a scenario, and whether it was interrupted.
+        A leaderboard for each scenario, and whether it was interrupted.
 
     Raises:
         ValueError: if there are no filters, two have the same label, or one cannot work on a scenario.
@@ -184,7 +203,7 @@ def compare(
         raise ValueError(f"a comparison must be of different filters, but got {', '.join(labels) or 'none'}")
     boards: list[Leaderboard] = []
     interrupted = False
-    # All filters are made before the first one runs: what is wrong with the last one is said at once.
+    # All filters are made before the first one runs, so that an error in the last one is raised at once.
     teams = [(scenario, [one.filter(scenario) for one in contenders]) for scenario in scenarios]
     try:
         with stop_on_interrupt() as stopped:
@@ -226,7 +245,7 @@ def _row(label: str, filter_: Filter, data: Data, board: Leaderboard) -> Row:
 
 
 def timed_runs(filter_: Filter, data: Data) -> tuple[RunMetrics, float]:
-    """What a filter achieved on some data, and the seconds that its runs took without compilation."""
+    """Metrics of a filter on some data, by run, and the seconds that its runs took without compilation."""
     few = data.filter_keys[:2], data.inputs[:2, :2], data.measurements[:2, :3]
     first = [np.ascontiguousarray(part) for part in few]
     for part in first:

@@ -1,4 +1,8 @@
-"""A filter on a problem's data: errors with intervals, consistency, and paired comparisons."""
+"""A filter on a problem's data: errors with intervals, consistency, and paired comparisons.
+
+NEES is the normalised estimation error squared, NIS the normalised innovation squared. Of a consistent filter
+their expected values are the number of states and the number of measured channels.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +20,14 @@ from tuning.evaluation.runs import RunMetrics, metrics_of_all
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts
 
-MEMBER_RUNS, MEMBER_STEPS = 40, 5  # rank histograms are made of so many runs, and of every fifth step
+MEMBER_RUNS, MEMBER_STEPS = 40, 5  # runs and step interval of rank histograms
 NOTHING = Interval(np.nan, np.nan, np.nan)
 
 
 class Evaluation(NamedTuple):
-    """What a filter achieved on B seeds; errors are pooled over seeds and over the steps that count.
+    """Metrics of a filter on B seeds; errors are pooled over seeds and scored steps.
 
-    Without truth all that is held against it is NaN: errors, score and NEES. What the innovations tell stays.
+    Without truth errors, score and NEES are NaN; what follows from the innovations is there.
     """
 
     states: tuple[Quantity, ...]  # of the plant
@@ -32,25 +36,25 @@ class Evaluation(NamedTuple):
     start_up_rmse: np.ndarray  # (n,), over the steps before 50
     score: Interval  # mean over states of RMSE over scale [-]
     output_rmse: Mapping[str, Interval]  # by symbol, of the output that the filter's model has at its estimate
-    nees: Interval  # mean; n is right; NaN for filters that give no covariance
-    median_nees: float  # for two states 1.39 is right; says more where a few steps have all of the mean
+    nees: Interval  # mean; expected value n; NaN for filters without a covariance
+    median_nees: float  # expected value 1.39 for two states; robust where a few steps dominate the mean
     nis: Interval  # mean ...
-    expected_nis: float  # ... and what is right: m, or less where channels are missing at times
+    expected_nis: float  # ... and its expected value: m, or less where channels are missing at times
     channels: int  # m
-    log_likelihood: float  # mean over seeds of the scored steps' sum; NaN for filters that give no covariance
+    log_likelihood: float  # mean over seeds of the sum over scored steps; NaN for filters without a covariance
     log_likelihoods: np.ndarray  # (B,), of each run, for paired comparisons
-    divergences: int  # restarts from the prior, over all seeds
+    divergences: int  # filter resets (restarts from the prior), over all seeds
     mean_squares: np.ndarray  # (B, n), mean square error of each run, for paired comparisons
-    scale: np.ndarray  # (n,), what the score measures errors in
+    scale: np.ndarray  # (n,), by which the score divides errors
 
     @property
     def has_truth(self) -> bool:
-        """Whether there was a truth to hold the estimates against."""
+        """Whether the estimates could be compared with a truth."""
         return not np.isnan(self.mean_squares).all()
 
     @property
     def scored(self) -> list[int]:
-        """Which states count in the score."""
+        """Indices of the states that count in the score."""
         return np.flatnonzero(np.isfinite(self.scale)).tolist()
 
 
@@ -60,17 +64,17 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
     Args:
         filter_: the filter; where it estimates more than the plant's n states, these come first.
         data: inputs and measurements, and the truth where it is known.
-        scale: (n,) what errors are measured in for the score, as the problem says: infinite for states that do
-            not count; None where there is no truth.
+        scale: (n,) by which the score divides errors, the problem's `scale`: infinite for states that do not
+            count; None where there is no truth.
 
     Raises:
-        ValueError: if the scale is not positive, or not one a state.
+        ValueError: if the scale is not positive, or not one number for each state.
     """
     return compute_metrics(filter_, metrics_of_all(filter_, data), data, scale)
 
 
 def compute_metrics(filter_: Filter, runs: RunMetrics, data: Data, scale) -> Evaluation:
-    """What a filter's runs on some data are worth together; other arguments and errors are those of `evaluate`."""
+    """Metrics of a filter from those of its runs; other arguments and errors are those of `evaluate`."""
     some = runs.present[runs.present > 0]
     return Evaluation(
         **_errors(filter_, runs, data, scale),
@@ -85,7 +89,8 @@ def compute_metrics(filter_: Filter, runs: RunMetrics, data: Data, scale) -> Eva
 
 def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale) -> dict:
     """The fields of an `Evaluation` that need the truth; NaN without it."""
-    if data.states is None:
+    mean_squares, nees, start_up = runs.mean_squares, runs.nees, runs.start_up_squares
+    if data.states is None or mean_squares is None or nees is None or start_up is None:
         n = filter_.model.n if scale is None else len(scale)
         return {
             "states": filter_.model.states[:n],
@@ -100,14 +105,13 @@ def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale) -> dict:
             "scale": np.full(n, np.nan),
         }
     n, scale = data.states.shape[-1], _checked(scale, data.states.shape[-1])
-    mean_squares, nees = runs.mean_squares, runs.nees
     resampled = np.sqrt(resampled_means(mean_squares))  # (resamples, n)
     outputs = {symbol: rmse_intervals(squares)[0] for symbol, squares in runs.output_mean_squares.items()}
     return {
         "states": filter_.model.states[:n],
         "outputs": {symbol: filter_.model.outputs[symbol].quantity for symbol in outputs},
         "rmse": rmse_intervals(mean_squares),
-        "start_up_rmse": np.sqrt(runs.start_up_squares.mean(axis=(0, 1))),
+        "start_up_rmse": np.sqrt(start_up.mean(axis=(0, 1))),
         "score": interval(score(mean_squares, scale), _scores(resampled, scale)),
         "output_rmse": outputs,
         "nees": mean_interval(nees),
@@ -129,7 +133,7 @@ def _checked(scale, n: int) -> np.ndarray:
 
 
 def check_consistency(filter_: Filter, data: Data) -> ConsistencyReport:
-    """Whether a filter's covariance is consistent on some data, and for an ensemble whether its members are."""
+    """Consistency of a filter's covariance on some data, and of an ensemble's members."""
     model, members, first = filter_.model, None, data.scored.start
     n = model.n if data.states is None else data.states.shape[-1]
     if filter_.size and data.states is not None:
@@ -163,7 +167,9 @@ def _scores(rmse: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 
 def run_scores(runs: RunMetrics, scale) -> np.ndarray:
-    """The score of each run by itself, (B,): mean over states of its RMSE over scale."""
+    """The score of each run, (B,): mean over states of its RMSE over scale; ValueError without truth."""
+    if runs.mean_squares is None:
+        raise ValueError("a score must be of runs with true states, but got runs without truth")
     return _scores(np.sqrt(runs.mean_squares), np.asarray(scale))
 
 
@@ -189,7 +195,7 @@ def resampled_ratios(a: Evaluation, b: Evaluation) -> np.ndarray:
 def likelihood_gain(a: Evaluation, b: Evaluation) -> Interval:
     """Log-likelihood of a less that of b, mean over runs with a paired interval: above 0, a predicts better.
 
-    It needs no truth. NaN where a filter gives no covariance.
+    It needs no truth. NaN for a filter without a covariance.
 
     Raises:
         ValueError: if the two were not evaluated on equally many seeds.

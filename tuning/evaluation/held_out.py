@@ -1,8 +1,8 @@
-"""What a choice is worth on seeds that no trial saw: beside its baselines, and the bound on these seeds."""
+"""Held-out evaluation: a choice and its baselines on seeds that no trial saw, with the bound on these seeds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,25 +19,25 @@ from tuning.search.space import Choice
 class Comparison(NamedTuple):
     """A choice and its baselines on the same held-out seeds, and the bound on these."""
 
-    untuned: Evaluation  # of the rule of thumb
+    untuned: Evaluation  # the rule of thumb
     tuned: Evaluation
-    true: Evaluation | None  # of the oracle; None where nobody knows the plant's Q and R
+    true: Evaluation | None  # the oracle; None where the plant's Q and R are unknown
     bound: np.ndarray  # (n,) bound on the standard error of each state
     seeds: range
-    scaled: Evaluation | None = None  # of the scaled default; None where there is none
-    default: Scaled | None = None  # its factor, or why there is none; None where it was not asked for
-    kept_ratios: Mapping[str, Interval] | None = None  # where evaluations are summaries, without their runs
+    scaled: Evaluation | None = None  # the scaled default; None where there is none
+    default: Scaled | None = None  # its factor, or the reason why there is none; None where it was not requested
+    kept_ratios: Mapping[str, Interval] | None = None  # given where evaluations are summaries without single runs
     kept_gains: Mapping[str, Interval] | None = None
 
     @property
     def evaluations(self) -> dict[str, Evaluation]:
-        """All evaluations by what they are called: what stands in a table, from top to bottom."""
+        """All evaluations by the names in tables, in the order of the rows."""
         found = {RULE: self.untuned, SCALED: self.scaled, TUNED: self.tuned, ORACLE: self.true}
         return {name: evaluation for name, evaluation in found.items() if evaluation is not None}
 
     @property
     def ratios(self) -> dict[str, Interval]:
-        """Score of the tuned filter over that of each baseline, paired, the one that counts first."""
+        """Score of the tuned filter over that of each baseline, paired, the most important baseline first."""
         if self.kept_ratios is not None:
             return dict(self.kept_ratios)
         found = self.evaluations
@@ -54,31 +54,40 @@ class Comparison(NamedTuple):
         return {name: likelihood_gain(self.tuned, found[name]) for name in names}
 
 
-def prove(choice: Choice, scenario: Problem, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:
+def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:
     """A choice and its baselines on seeds that the study never saw, with the bound on these seeds.
 
     Args:
         choice: of a study.
         scenario: on what.
         seed: of the study; its training seeds scale the scaled default.
-        count: number of held-out seeds, where the problem can make as many as are asked for.
+        count: number of held-out seeds; a problem of logs has a fixed number, and ignores it.
     """
     seeds = scenario.held_out_seeds(seed, count)
     data = scenario.data(seeds)
     default = scaled_default(choice.name, scenario, seed)
     choices = (rule_of_thumb(choice.name, scenario), choice, oracle(choice.name, scenario), default.choice)
-    done: list[tuple[Choice | None, Evaluation | None]] = [(None, None)]
+    done: list[tuple[Choice, Evaluation]] = []
     for one in told("filters on held-out seeds", choices):
-        if not any(_same(one, before) for before, _ in done):  # baselines may be the same filter
+        if one is not None and _found(one, done) is None:  # baselines may be the same filter
             done.append((one, evaluate(one.filter(scenario), data, scenario.scale)))
-    *found, scaled = (next(run for before, run in done if _same(one, before)) for one in choices)
-    return Comparison(*found, bound=scenario.bound(data), seeds=seeds, scaled=scaled, default=default)
+    untuned, tuned, true, scaled = (None if one is None else _found(one, done) for one in choices)
+    assert untuned is not None and tuned is not None  # these two choices are never None
+    return Comparison(untuned, tuned, true, scenario.bound(data), seeds, scaled, default)
 
 
-def _same(a: Choice | None, b: Choice | None) -> bool:
+prove = evaluate_held_out  # its former name
+
+
+def _found(choice: Choice, done: Sequence[tuple[Choice, Evaluation]]) -> Evaluation | None:
+    """The evaluation of the same filter, if there is one."""
+    return next((evaluation for before, evaluation in done if _same(choice, before)), None)
+
+
+def _same(a: Choice, b: Choice) -> bool:
     """Whether two choices are the same filter."""
-    if a is None or b is None or a.name != b.name:
-        return a is b
+    if a.name != b.name:
+        return False
     pairs = (a.model, b.model), (a.numbers, b.numbers)
     return all(
         one.keys() == other.keys() and all(np.array_equal(one[key], other[key]) for key in one)

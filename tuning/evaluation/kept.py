@@ -1,8 +1,8 @@
-"""What a study and a tuned file keep of long work, so that a report need not do it once more.
+"""Results of long computations that a study and a tuned file store, so that a report need not repeat them.
 
-It is kept with what it follows from, and used only where that is the same: the choice, the problems and the
-versions of all packages. A hash tells that, not who wrote it: `tuning.evaluation.verify` computes held-out metrics
-anew.
+They are stored with a digest of what they follow from, and used only where that is the same: the choice, the
+problems and the versions of all packages. The digest does not prove who wrote them: `tuning.evaluation.verify`
+recomputes held-out metrics.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ ROLES = ("untuned", "tuned", "true", "scaled")  # evaluations of a `Comparison`
 
 
 def sizes_as_data(rows: Sequence[SizeRow], choice: Choice, plan: Plan) -> dict:
-    """The table of ensemble sizes of a choice as plain data, with a digest of what it follows from."""
+    """The table of ensemble sizes of a choice as plain data, with a digest of its inputs."""
     found = [
         {
             "N": row.size,
@@ -43,12 +43,12 @@ def sizes_as_data(rows: Sequence[SizeRow], choice: Choice, plan: Plan) -> dict:
 
 
 def kept_sizes(data, choice: Choice, plan: Plan) -> list[SizeRow] | None:
-    """The table of ensemble sizes that was kept of this choice; None if it is of something else, or none.
+    """The stored table of ensemble sizes, if it is that of this choice; else None.
 
     Args:
-        data: what `sizes_as_data` gave, or anything.
-        choice: whose size stands in the table.
-        plan: what the study is for.
+        data: the result of `sizes_as_data`, or anything else.
+        choice: its size must be in the table.
+        plan: the plan of the study.
     """
     if not isinstance(data, Mapping) or data.get("digest") != _digest_of_sizes(choice, plan):
         return None
@@ -71,7 +71,7 @@ def kept_sizes(data, choice: Choice, plan: Plan) -> list[SizeRow] | None:
 def _digest_of_sizes(choice: Choice, plan: Plan) -> str:
     of_filter = {key: value for key, value in choice.numbers.items() if key != "ensemble_size"}
     own = {one.name: choice.model.get(one.name) for one in plan.scenarios[0].parameters or ()}
-    model = plan.scenarios[0].model(**choice.model)  # a file may say more of it than a trial
+    model = plan.scenarios[0].model(**choice.model)  # a file may contain more of it than a trial
     noise = [model.process_noise_cov.tolist(), model.measurement_noise_cov.tolist(), model.prior_cov.tolist()]
     of_problems = [one.digest for one in plan.scenarios], plan.consistent, plan.budget, plan.seed
     seeds = SIZE_SEEDS, TRAINING_SEEDS, size_ladder(choice.name)
@@ -79,33 +79,36 @@ def _digest_of_sizes(choice: Choice, plan: Plan) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def comparison_as_data(proof: Comparison) -> dict:
-    """What a report shows of a comparison beside the metrics that a tuned file holds."""
-    found = {role: getattr(proof, role) for role in ROLES}
+def comparison_as_data(comparison: Comparison) -> dict:
+    """What a report shows of a comparison in addition to the metrics in a tuned file."""
+    found = {role: getattr(comparison, role) for role in ROLES}
     return {
-        "expected_nis": _plain(proof.tuned.expected_nis),
+        "expected_nis": _plain(comparison.tuned.expected_nis),
         "median_nees": {role: one and _plain(one.median_nees) for role, one in found.items()},
-        "score_ratios": {name: numbers(ratio) for name, ratio in proof.ratios.items()},
-        "likelihood_gains": {name: numbers(gain) for name, gain in proof.likelihood_gains.items()},
-        "no_scaled_default": "" if proof.default is None else proof.default.reason,
+        "score_ratios": {name: numbers(ratio) for name, ratio in comparison.ratios.items()},
+        "likelihood_gains": {name: numbers(gain) for name, gain in comparison.likelihood_gains.items()},
+        "no_scaled_default": "" if comparison.default is None else comparison.default.reason,
     }
 
 
 def kept_comparison(content: Mapping, choice: Choice, problem: Problem) -> Comparison | None:
-    """The comparison on held-out seeds that a tuned file keeps of a problem; None if it has to be made anew.
+    """The held-out comparison on a problem that a tuned file stores; None if it has to be recomputed.
 
-    That is where the file does not hold it, or was made with other versions of packages.
+    That is where the file does not contain it, or was made with other versions of packages.
 
     Args:
-        content: of the tuned file.
-        choice: which it holds.
-        problem: one of those that it was tuned on, whose digest is known to be that of the file.
+        content: content of the tuned file.
+        choice: the file's choice.
+        problem: one of those that it was tuned on, with the digest that the file has.
     """
     if content.get("made_with") != versions():
         return None
     try:
         held_out, more = content["held_out"][problem.name], content["comparisons"][problem.name]
         found = {role: _summarised(role, held_out, more, problem) for role in ROLES}
+        untuned, tuned = found["untuned"], found["tuned"]
+        if untuned is None or tuned is None:
+            return None
         scaling, reason = held_out["scaled_default"], str(more["no_scaled_default"])
         default = Scaled(None, None, None, reason)
         if scaling["factor"] is not None:
@@ -113,7 +116,10 @@ def kept_comparison(content: Mapping, choice: Choice, problem: Problem) -> Compa
             default = Scaled(scaled_rule(rule_of_thumb(choice.name, problem), problem, factor), factor, nis)
         first, beyond = map(int, held_out["seeds"])
         return Comparison(
-            **found,
+            untuned,
+            tuned,
+            found["true"],
+            scaled=found["scaled"],
             bound=np.array([math.nan if part is None else float(part) for part in held_out["bound"]]),
             seeds=range(first, beyond),
             default=default,

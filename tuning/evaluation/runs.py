@@ -1,4 +1,7 @@
-"""What a filter achieved in each of its runs: all that metrics are made of, without covariances of every step."""
+"""Metrics of a filter in each of its runs, without the covariances of every step.
+
+NEES is the normalised estimation error squared, NIS the normalised innovation squared.
+"""
 
 from __future__ import annotations
 
@@ -14,16 +17,16 @@ from numerics.angles import difference
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.in_parts import estimates_in_parts
 
-FARTHEST = 1e100  # an output beyond this is this: its square is a number
+FARTHEST = 1e100  # outputs are clipped to this, so that their squares are finite
 
 
 class RunMetrics(NamedTuple):
-    """What a filter achieved in each of B runs, over T steps that count; without truth some of it is None."""
+    """Metrics of a filter in each of B runs, over T scored steps; those that need the truth may be None."""
 
     nis: np.ndarray  # (B, T), NaN where nothing was measured or S is singular
     present: np.ndarray  # (B, T), number of channels that were measured
-    log_likelihoods: np.ndarray  # (B,), of the steps that count; NaN for filters that give no covariance
-    divergences: np.ndarray  # (B,), restarts from the prior
+    log_likelihoods: np.ndarray  # (B,), of the scored steps; NaN for filters without a covariance
+    divergences: np.ndarray  # (B,), filter resets: restarts from the prior
     mean_squares: np.ndarray | None  # (B, n), mean square errors of the states
     start_up_squares: np.ndarray | None  # (B, steps before 50, n), square errors
     nees: np.ndarray | None  # (B, T)
@@ -31,9 +34,9 @@ class RunMetrics(NamedTuple):
 
 
 def metrics_by_run(filter_: Filter, estimates: Estimates, data: Data, nees: bool = True) -> RunMetrics:
-    """What the estimates of a filter on some data are worth, run by run, of the states that the plant has.
+    """Metrics of a filter's estimates on some data, run by run, for the states that the plant has.
 
-    The NEES is NaN where it is not wanted: of forty states it takes a tenth of what the filter takes.
+    The NEES is NaN unless it is wanted: for forty states it takes a tenth of the filter's own time.
     """
     late, measurements = data.scored, data.measurements
     present = (~np.isnan(measurements[:, late])).sum(axis=-1)
@@ -42,44 +45,67 @@ def metrics_by_run(filter_: Filter, estimates: Estimates, data: Data, nees: bool
     if filter_.has_covariance:
         likelihoods = estimates.log_likelihoods[:, late].sum(axis=1)
     nis = np.where(present > 0, squares, np.nan)
-    return RunMetrics(
-        nis, present, likelihoods, estimates.divergences, *_against_truth(filter_, estimates, data, nees)
-    )
+    found = RunMetrics(nis, present, likelihoods, estimates.divergences, None, None, None, {})
+    if data.states is None:
+        return found
+    return found._replace(**_against_truth(filter_, estimates, data, data.states, nees))
 
 
 def metrics_of_all(filter_: Filter, data: Data, nees: bool = True) -> RunMetrics:
-    """`metrics_by_run` of a filter on all runs of some data, some at a time: the same as of all at once."""
+    """`metrics_by_run` of a filter on all runs of some data, in parts: the same as for all at once."""
     parts = estimates_in_parts(filter_, data)
     return joined([metrics_by_run(filter_, found, some, nees) for some, found in parts])
 
 
 def joined(parts: Sequence[RunMetrics]) -> RunMetrics:
-    """The metrics of all runs from those of some after the others, of one filter."""
+    """The metrics of all runs of a filter, from those of consecutive parts."""
     if len(parts) == 1:
         return parts[0]
-    *arrays, outputs = zip(*parts, strict=True)
-    whole = [None if some[0] is None else np.concatenate(some) for some in arrays]
-    return RunMetrics(*whole, {symbol: np.concatenate([one[symbol] for one in outputs]) for symbol in outputs[0]})
+    outputs = [one.output_mean_squares for one in parts]
+    return RunMetrics(
+        nis=np.concatenate([one.nis for one in parts]),
+        present=np.concatenate([one.present for one in parts]),
+        log_likelihoods=np.concatenate([one.log_likelihoods for one in parts]),
+        divergences=np.concatenate([one.divergences for one in parts]),
+        mean_squares=_concatenated([one.mean_squares for one in parts]),
+        start_up_squares=_concatenated([one.start_up_squares for one in parts]),
+        nees=_concatenated([one.nees for one in parts]),
+        output_mean_squares={symbol: np.concatenate([one[symbol] for one in outputs]) for symbol in outputs[0]},
+    )
+
+
+def _concatenated(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
+    """Parts as one array; None where there is no truth."""
+    known = [part for part in parts if part is not None]
+    return np.concatenate(known) if known else None
 
 
 def state_errors(filter_: Filter, estimates: Estimates, data: Data) -> np.ndarray:
-    """Errors (B, K + 1, n) of the plant's n states, those of angles the short way round."""
-    n = data.states.shape[-1]
-    return difference(estimates.means[..., :n], data.states, filter_.model.shape.state_angles[:n])
+    """Errors (B, K + 1, n) of the plant's n states, those of angles the short way round; needs data with truth."""
+    return _errors(filter_, estimates, data.known_states)
 
 
-def _against_truth(filter_: Filter, estimates: Estimates, data: Data, wanted: bool) -> tuple:
-    """The last fields of `RunMetrics`."""
-    if data.states is None:
-        return None, None, None, {}
-    n, late = data.states.shape[-1], data.scored
-    errors = state_errors(filter_, estimates, data)
+def _errors(filter_: Filter, estimates: Estimates, states: np.ndarray) -> np.ndarray:
+    n = states.shape[-1]
+    return difference(estimates.means[..., :n], states, filter_.model.shape.state_angles[:n])
+
+
+def _against_truth(filter_: Filter, estimates: Estimates, data: Data, states: np.ndarray, wanted: bool) -> dict:
+    """The fields of `RunMetrics` that need the truth."""
+    n, late = states.shape[-1], data.scored
+    errors = _errors(filter_, estimates, states)
     late_errors = errors[:, late]
     nees = np.full(late_errors.shape[:2], np.nan)
     if wanted:
         nees = normalized_squares(late_errors, estimates.covs[:, late, :n, :n])
     mean_squares, start_up = (errors[:, late] ** 2).mean(axis=1), errors[:, :FIRST_SCORED_STEP] ** 2
-    return mean_squares, start_up, nees, _output_mean_squares(filter_, estimates, data)
+    outputs = _output_mean_squares(filter_, estimates, data)
+    return {
+        "mean_squares": mean_squares,
+        "start_up_squares": start_up,
+        "nees": nees,
+        "output_mean_squares": outputs,
+    }
 
 
 def _output_mean_squares(filter_: Filter, estimates: Estimates, data: Data) -> dict[str, np.ndarray]:
@@ -88,7 +114,7 @@ def _output_mean_squares(filter_: Filter, estimates: Estimates, data: Data) -> d
     for symbol, truth in (data.outputs or {}).items():
         if symbol not in filter_.model.outputs:
             continue
-        with np.errstate(all="ignore"):  # estimates far off, though finite, may have an output that is not
+        with np.errstate(all="ignore"):  # finite estimates that are far off may have an infinite output
             values = filter_.model.output(symbol, estimates.means[:, late])
         values, angle = np.clip(values, -FARTHEST, FARTHEST), filter_.model.outputs[symbol].quantity.angle
         errors = difference(values[..., None], truth[:, late, None], (angle,))[..., 0]

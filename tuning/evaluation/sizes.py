@@ -1,4 +1,4 @@
-"""The ensemble size: score against N on fresh seeds, and the smallest N that is surely as good as the best."""
+"""The ensemble size: score against N on fresh seeds, and the smallest N that is as good as the best."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from tuning.search.objectives import nis_violation
 from tuning.search.plan import SIZE_SEEDS, Plan
 from tuning.search.space import Choice, size_ladder
 
-FEW = 8  # of the fresh seeds, on which all sizes of a large model meet
-SURE = 0.0005  # of the resamples may say otherwise, where a size is left out after these
-SIZE_TOLERANCE = 0.01  # the score of the smallest sufficient ensemble is surely this close to the best
+FEW = 8  # of the fresh seeds, on which all sizes of a large model are compared first
+SURE = 0.0005  # quantile of the resamples by which a size is left out after these seeds
+SIZE_TOLERANCE = 0.01  # the score of the smallest sufficient ensemble is this close to the best (95 %)
 
 
 class SizeRow(NamedTuple):
-    """How an ensemble of one size does against the best one, on the seeds on which it was run."""
+    """An ensemble of one size compared with the best one, on the seeds on which it was run."""
 
     size: int
     evaluation: Evaluation  # on the first scenario
-    ratio: Interval  # score over the best score on the same seeds, paired; of several scenarios the largest
-    outside: float = 0.0  # how far the mean NIS is outside its band, as in `nis_violation`; of several the most
+    ratio: Interval  # score over the best score on the same seeds, paired; the largest of several scenarios
+    outside: float = 0.0  # `nis_violation`; the largest of several scenarios
     seeds: int = SIZE_SEEDS  # on which it was run
 
 
@@ -38,15 +38,15 @@ def ensemble_sizes(
 ) -> list[SizeRow]:
     """The score of a choice against ensemble size, paired on the same fresh seeds, smallest size first.
 
-    The seeds chose neither Q, R nor N (`seeds.size_seeds`). Where the plan has a budget, no size is above that
-    of the choice, which is known to be within it. Without truth there is no score, and no row. Sizes of models of
-    more than twelve states meet on a few of the seeds first: see `few_seeds_first`.
+    Neither Q nor R nor N was chosen on these seeds (`seeds.size_seeds`). Where the plan has a budget, no size is
+    above that of the choice, which is known to be within it. Without truth there is no score, and no row. For
+    models of more than twelve states the sizes are first compared on a few of the seeds: see `few_seeds_first`.
 
     Args:
-        choice: of a study.
-        plan: what the study was for.
-        training: the plan's training data, on which the mean NIS is held in its band, as in the trials.
-        consistent: whether the best one is that of the sizes whose mean NIS is in its band.
+        choice: the choice of a study.
+        plan: the plan of the study.
+        training: the plan's training data, on which the mean NIS has to be within its band, as in the trials.
+        consistent: whether the best size is sought among those whose mean NIS is within its band.
     """
     if any(problem.scale is None for problem in plan.scenarios):
         return []
@@ -68,14 +68,14 @@ def ensemble_sizes(
 def few_seeds_first(
     choice: Choice, plan: Plan, training: Sequence[Data], sizes: Sequence[int], consistent: bool
 ) -> list[SizeRow]:
-    """The same where a step is expensive: no size is run on all seeds of which a few tell that it will not do.
+    """The same where a step is expensive: a size is not run on all seeds if a few seeds show that it is too small.
 
-    All sizes meet on the first eight seeds. The one with the least score there, of each scenario, is the best
-    one, and run on all seeds; so are the others, smallest first, until one is sufficient. Those are left out whose
-    score is more than 1 % above that of the best on the first seeds already, by the lower end of a 99.9 %
-    interval: an early look has to be so sure that the interval in the end is worth its 95 % (Peto's rule). No size
-    is ever found sufficient early, for runs in which a small ensemble fails may be rare. The mean NIS is that of
-    the first fresh seeds, and of sizes on all seeds that of the training data.
+    All sizes are run on the first eight seeds. The one with the lowest score there, of each scenario, is the best
+    one, and is run on all seeds; so are the others, smallest first, until one is sufficient. A size is left out if
+    its score is more than 1 % above that of the best on the first seeds already, by the lower end of a 99.9 %
+    interval: an interim analysis needs this level so that the final interval keeps its 95 % (Peto's rule). No size
+    is accepted early, for runs in which a small ensemble fails may be rare. The mean NIS is that of the first
+    fresh seeds, and for sizes that are run on all seeds that of the training data.
 
     Source: Peto et al. (1976), "Design and analysis of randomized clinical trials requiring prolonged observation
     of each patient", British J. Cancer 34, 585-612.
@@ -130,7 +130,7 @@ def few_seeds_first(
 
 
 def _ratios_of(whole: Mapping[int, Sequence[Evaluation]], among: Sequence[int]) -> list[dict[int, Interval]]:
-    """Of each scenario, scores of the sizes that were run on all seeds over the best of those that count."""
+    """For each scenario, scores of the sizes that were run on all seeds over the best of the eligible ones."""
     places = list(whole)
     columns = zip(*whole.values(), strict=True)
     found = [_over_the_best(column, [places.index(i) for i in among]) for column in columns]
@@ -138,13 +138,13 @@ def _ratios_of(whole: Mapping[int, Sequence[Evaluation]], among: Sequence[int]) 
 
 
 def _counting_of(whole: Mapping[int, object], outside: Sequence[float], consistent: bool) -> list[int]:
-    """The sizes of `whole` that count."""
+    """The eligible sizes of `whole`."""
     places = list(whole)
     return [places[i] for i in _counting([outside[i] for i in places], consistent)]
 
 
 def _surely_worse(found: Sequence[Evaluation], best: Sequence[Sequence[Evaluation]]) -> bool:
-    """Whether the score is more than 1 % above the best on some scenario, so surely that few seeds suffice."""
+    """Whether the score is significantly more than 1 % above the best on some scenario, after a few seeds."""
     pairs = [(one, best[k][k]) for k, one in enumerate(found)]
     return any(np.quantile(resampled_ratios(*pair), SURE) > 1.0 + SIZE_TOLERANCE for pair in pairs)
 
@@ -159,7 +159,7 @@ def sufficient_size(sizes: Sequence[SizeRow], consistent: bool = False) -> int:
 
     With several scenarios there may be none that is so good on all of them; then it is the smallest whose interval
     ends within 1 % of where that of the best compromise ends. Where it has to be consistent, sizes whose mean NIS
-    is outside its band do not count.
+    is outside its band are not eligible.
     """
     rows = [sizes[i] for i in _counting([row.outside for row in sizes], consistent)]
     least, limit = min(row.ratio.high for row in rows), 1.0 + SIZE_TOLERANCE
@@ -172,13 +172,13 @@ def close_size(choice: Choice, plan: Plan, training: Sequence[Data]) -> int:
 
         mean of (m_N - m_L)^2 / P_L over runs, scored steps and states < 1.01^2 - 1
 
-    Where nothing is known of the truth this is what can be told: sampling adds this much to the mean square error,
-    in units of the variance that the largest ensemble believes in. The likelihood hardly feels it where R is
-    large. Where the plan has a budget, no size is above that of the choice.
+    Without truth this can still be computed: sampling adds this much to the mean square error, in units of the
+    variance that the largest ensemble assumes. The likelihood is insensitive to it where R is large. Where the
+    plan has a budget, no size is above that of the choice.
 
     Args:
-        choice: of a study.
-        plan: what the study was for.
+        choice: the choice of a study.
+        plan: the plan of the study.
         training: the plan's training data.
     """
     size = choice.numbers["ensemble_size"]
@@ -202,7 +202,7 @@ def _scored(choice: Choice, scenario: Problem, data: Data) -> tuple[np.ndarray, 
 
 
 def _counting(outside: Sequence[float], consistent: bool) -> list[int]:
-    """Places of the sizes that count: all, or those whose mean NIS is in its band, wherever there are any."""
+    """Indices of the eligible sizes: those with a mean NIS within its band, if required and if any has it."""
     everywhere = list(range(len(outside)))
     return [i for i in everywhere if outside[i] <= 0 or not consistent] or everywhere
 

@@ -14,7 +14,7 @@ from tuning.problems.problem import Problem
 
 
 def summary(evaluation: Evaluation) -> dict:
-    """The figures of an evaluation as plain numbers for JSON, None where there is nothing to tell."""
+    """The figures of an evaluation as plain numbers for JSON, None where there is no value."""
     return {
         "rmse": [numbers(value) for value in evaluation.rmse],
         "start_up_rmse": [None if math.isnan(part) else part for part in evaluation.start_up_rmse.tolist()],
@@ -30,12 +30,12 @@ def summary(evaluation: Evaluation) -> dict:
 def summarised(
     data: Mapping, problem: Problem, expected_nis: float | None = None, median_nees: float | None = None
 ) -> Evaluation:
-    """An evaluation that has the figures of a `summary`, and nothing of single runs: all are as one run.
+    """An evaluation with the figures of a `summary`, without single runs: it has the arrays of one run.
 
-    So no interval can be made of it anew, and it cannot be compared in pairs.
+    So no interval can be computed from it, and no paired comparison.
 
     Raises:
-        KeyError, TypeError, ValueError: if the data are none.
+        KeyError, TypeError, ValueError: if the data are not a summary.
     """
     model = problem.model()
     rmse = tuple(map(as_interval, data["rmse"]))
@@ -78,5 +78,5 @@ def _number(value) -> float:
 
 
 def _key(output: Quantity) -> str:
-    """What the RMSE of a derived output is called in a file: "thrust_rmse" of the thrust."""
+    """The key of a derived output's RMSE in a file: "thrust_rmse" for the thrust."""
     return f"{output.name.replace(' ', '_')}_rmse"

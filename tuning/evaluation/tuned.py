@@ -1,4 +1,4 @@
-"""The tuned file: one JSON file that carries a filter's numbers, where they come from and what they achieve."""
+"""The tuned file: one JSON file with a filter's parameters, their origin and their held-out metrics."""
 
 from __future__ import annotations
 
@@ -35,26 +35,27 @@ def write_tuned(
     path: str | Path,
     plan: Plan,
     result: StudyResult,
-    proofs: Sequence[Comparison],
+    comparisons: Sequence[Comparison],
     study_name: str,
     method: str = "optuna",
 ) -> None:
-    """Write a tuned file whole or not at all.
+    """Write a tuned file, completely or not at all.
 
     Args:
-        path: of the file.
-        plan: what the study was for.
-        result: the choice, and where it comes from.
-        proofs: on held-out seeds, one for each scenario.
-        study_name: of the study.
-        method: what made the choice, "optuna" or "gradient".
+        path: path of the file.
+        plan: the plan of the study.
+        result: its result, with the choice.
+        comparisons: held-out evaluations, one for each scenario.
+        study_name: name of the study.
+        method: how the choice was made, "optuna" or "gradient".
 
     Raises:
-        ValueError: if the folder cannot be written, or the filter is an estimator that is code.
+        ValueError: if the folder cannot be written, or the filter is an estimator, which is code.
     """
     choice, problem = result.choice, plan.scenarios[0]
     check_keepable(choice.name)
     model = problem.model(**choice.model)
+    pairs = list(zip(plan.scenarios, comparisons, strict=True))
     content = {
         "format": FILE_FORMAT,
         "version": FILE_VERSION,
@@ -78,17 +79,15 @@ def write_tuned(
             "microseconds_a_step": result.microseconds,
             **consistency(result),
         },
-        "held_out": {one.name: metrics(proof) for one, proof in zip(plan.scenarios, proofs, strict=True)},
-        "comparisons": {
-            one.name: comparison_as_data(proof) for one, proof in zip(plan.scenarios, proofs, strict=True)
-        },
+        "held_out": {problem.name: metrics(one) for problem, one in pairs},
+        "comparisons": {problem.name: comparison_as_data(one) for problem, one in pairs},
         "ensemble_sizes": sizes_as_data(result.sizes, choice, plan) if result.sizes else None,
     }
     write_whole(Path(path), json.dumps(sealed(content), indent=2) + "\n")
 
 
 def check_keepable(name) -> None:
-    """Raise ValueError for an estimator that is code: reading a tuned file must import nothing that it names."""
+    """Raise ValueError for an estimator, which is code: reading a tuned file must not import what it names."""
     if is_foreign(name):
         raise ValueError(
             f"a tuned file must be of a filter of filters.FILTERS, but got {label_of(name)!r}: "
@@ -97,29 +96,30 @@ def check_keepable(name) -> None:
 
 
 def _noise_of(model: StateSpaceModel) -> dict:
-    """Q and R as data, for those who know nothing of the numbers that they follow from."""
+    """Q and R as data, for readers that do not know the parameters that they follow from."""
     return {name: getattr(model, name).tolist() for name in NOISE}
 
 
 def _kept(problem: Problem) -> dict:
-    """A problem as a tuned file keeps it: its digest and, unless it is code, what makes it anew."""
+    """A problem as a tuned file stores it: its digest and, unless it is code, its full content."""
     return {"digest": problem.digest, "content": problem.as_mapping()}
 
 
 def problem_in(content: Mapping, name, path: str | Path, given: Sequence[Problem] = ()) -> Problem:
-    """A problem that a tuned file names: of the package, as the file keeps it, or as the caller gives it.
+    """A problem that a tuned file names: built in, stored in the file, or given by the caller.
 
     Nothing is imported that a file names: a problem that is code has to be given. A file of version 2 has only the
-    path of a scenario's own file, which is then read.
+    path of a scenario file, which is then read.
 
     Args:
-        content: of the tuned file, from `read_tuned_file`.
-        name: of the problem.
-        path: of the tuned file, for errors.
-        given: by the caller; each stands in for the one of its name or digest.
+        content: content of the tuned file, from `read_tuned_file`.
+        name: name of the problem.
+        path: path of the tuned file, for errors.
+        given: problems of the caller, which are found by name or digest.
 
     Raises:
-        ValueError: if there is no such problem, what is kept is none, or what is given is another one.
+        ValueError: if there is no such problem, the stored content is damaged, or the given problem is another
+            one.
     """
     kept = content["problems"].get(name) if isinstance(name, str) and name not in built_in() else None
     digest = kept.get("digest") if isinstance(kept, Mapping) else None
@@ -143,7 +143,7 @@ def problem_in(content: Mapping, name, path: str | Path, given: Sequence[Problem
 
 
 def _warn_of_changes(content: Mapping, path: str | Path) -> None:
-    """Warn of each scenario file that says something else now than what the tuned file keeps."""
+    """Warn of each scenario file that has changed since the tuned file stored its content."""
     for name in content["problems"]:
         if not name.endswith(".toml") or not Path(name).is_file():
             continue
@@ -155,19 +155,19 @@ def _warn_of_changes(content: Mapping, path: str | Path) -> None:
         if now != then:
             warnings.warn(
                 f"{name} is not the scenario that {path} was tuned on (digest {then} then, {now} now): "
-                "what was tuned on is what counts here",
+                "the stored scenario is used here",
                 stacklevel=3,
             )
 
 
 def read_tuned(path: str | Path, problems: Sequence[Problem] = ()) -> tuple[Choice, Problem, int]:
-    """Choice, problem and study seed of a tuned file; ValueError that says what is wrong with a bad one.
+    """Choice, problem and study seed of a tuned file; ValueError for a damaged one.
 
-    A scenario of a file of its own is that of the time of tuning; a warning says if the file has changed since.
+    A scenario from a file is as it was when the filter was tuned; a warning says if the file has changed since.
 
     Args:
-        path: of the file.
-        problems: what it was tuned on, where that is code, which the file only names.
+        path: path of the file.
+        problems: the problems it was tuned on, if these are code, which the file only names.
     """
     content = read_tuned_file(path)
     try:
@@ -175,7 +175,9 @@ def read_tuned(path: str | Path, problems: Sequence[Problem] = ()) -> tuple[Choi
         found = problem_in(content, content["problem"], path, problems)
         _warn_of_changes(content, path)
     except (KeyError, TypeError) as error:
-        raise ValueError(f"a tuned file must have all its entries, but {path} lacks or bends {error}") from None
+        raise ValueError(
+            f"a tuned file must have all its entries, but in {path} this is missing or no such value: {error}"
+        ) from None
     given = content["filter"]["model"]
     held = {name: given.get(name, {}) for name in {*found.held, *(set(given) & {FACTORS})}}
     if held != dict(found.held):
@@ -193,10 +195,10 @@ def read_tuned(path: str | Path, problems: Sequence[Problem] = ()) -> tuple[Choi
 
 
 def read_choice(path: str | Path, problem: Problem) -> Choice:
-    """The choice of a tuned file for any problem with the same plant, or the same states, inputs and sensors.
+    """The choice of a tuned file for a problem with the same plant, or with the same states, inputs and sensors.
 
     Raises:
-        ValueError: if the file is a bad one, or for another plant: another thruster, dt or sensor.
+        ValueError: if the file is damaged, or for another plant: another thruster, dt or sensor.
     """
     content = read_tuned_file(path)
     problem.check_tuned_for(content.get("plant"), path)
@@ -206,7 +208,7 @@ def read_choice(path: str | Path, problem: Problem) -> Choice:
 
 
 def _choice(content: Mapping, problem: Problem) -> Choice:
-    """The choice of a tuned file's content: the problem's own parameters if it has them, else Q and R."""
+    """The choice of a tuned file's content: the problem's parameters if it has any, else Q and R."""
     entry, model = content["filter"], problem.model()
     own = [one.name for one in problem.parameters or ()]
     chosen = {name: entry["model"][name] for name in own if name in entry["model"]}
@@ -218,25 +220,25 @@ def _choice(content: Mapping, problem: Problem) -> Choice:
     if PRIOR in entry["model"]:
         chosen[PRIOR] = positive(PRIOR, entry["model"][PRIOR])
     choice = Choice(entry["name"], chosen, dict(entry["numbers"]))
-    choice.filter(problem)  # a clear error for numbers that the filter does not take
+    choice.filter(problem)  # a clear error for parameters that the filter does not have
     return choice
 
 
 def _noise(name: str, given, size: int, *, positive_definite: bool):
-    """A covariance as a choice holds it: one variance, some, or the rows of a matrix."""
+    """A covariance as a choice stores it: one variance, several, or the rows of a matrix."""
     if np.ndim(given) == 0:
         return positive(name, given)
     matrix = covariance(name, given, size, positive_definite=positive_definite)
     return tuple(map(tuple, matrix.tolist())) if np.ndim(given) == 2 else tuple(np.diag(matrix).tolist())
 
 
-def metrics(proof: Comparison) -> dict:
-    """The figures of a proof on held-out seeds as plain numbers for JSON."""
+def metrics(comparison: Comparison) -> dict:
+    """The metrics of a held-out comparison as plain numbers for JSON."""
     return {
-        "seeds": [proof.seeds.start, proof.seeds.stop],
-        "bound": [None if math.isnan(part) else part for part in proof.bound.tolist()],
-        **{name: _summary_of(getattr(proof, name)) for name in ("untuned", "tuned", "true", "scaled")},
-        "scaled_default": scaling(proof),
+        "seeds": [comparison.seeds.start, comparison.seeds.stop],
+        "bound": [None if math.isnan(part) else part for part in comparison.bound.tolist()],
+        **{name: _summary_of(getattr(comparison, name)) for name in ("untuned", "tuned", "true", "scaled")},
+        "scaled_default": scaling(comparison),
     }
 
 
@@ -244,9 +246,9 @@ def _summary_of(evaluation: Evaluation | None) -> dict | None:
     return None if evaluation is None else summary(evaluation)
 
 
-def scaling(proof: Comparison) -> dict:
-    """The factor on Q that makes the scaled default, and its mean NIS on the training runs, or None."""
-    found = proof.default
+def scaling(comparison: Comparison) -> dict:
+    """The scaled default's factor on Q and its mean NIS on the training runs, or None."""
+    found = comparison.default
     return {"factor": found and found.factor, "mean_nis": found and found.nis}
 
 

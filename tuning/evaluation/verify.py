@@ -1,4 +1,4 @@
-"""Whether what a tuned file says of held-out seeds is so: its metrics, computed once more."""
+"""Verification of a tuned file: its held-out metrics, recomputed."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from typing import Any, NamedTuple
 
 from filters.tuned_file import read_tuned_file
 from numerics.checks import shown
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import metrics, problem_in, read_tuned
 from tuning.evaluation.versions import versions
 from tuning.problems.problem import Problem
 
-TOLERANCE = 1e-9  # relative: what the order of a sum may change
-LATER = ("scaled", "scaled_default")  # what older files lack
+TOLERANCE = 1e-9  # relative: the effect of the order of a sum
+LATER = ("scaled", "scaled_default")  # keys that older files lack
 
 
 class Difference(NamedTuple):
-    """A number of a tuned file that is not what comes out here."""
+    """A number of a tuned file that differs from the recomputed one."""
 
     place: str  # such as "mismatch: tuned nees 0"
     stored: Any
@@ -26,18 +26,18 @@ class Difference(NamedTuple):
 
     @property
     def relative(self) -> float:
-        """By how much the two differ, over the larger; infinite where one of them is no number."""
+        """The difference over the larger magnitude; infinite where one of them is not a number."""
         if not isinstance(self.stored, int | float) or not isinstance(self.found, int | float):
             return float("inf")
         return abs(self.stored - self.found) / max(abs(self.stored), abs(self.found))
 
 
 class Verification(NamedTuple):
-    """What came of computing a tuned file's metrics once more."""
+    """The result of recomputing a tuned file's metrics."""
 
     checked: int  # numbers that were compared
     differences: list[Difference]  # beyond rounding, the largest first
-    packages: dict[str, tuple[str, str]]  # of another version now: what the file was made with, and what is here
+    packages: dict[str, tuple[str, str]]  # of another version here: version in the file, and installed version
 
     @property
     def holds(self) -> bool:
@@ -46,14 +46,14 @@ class Verification(NamedTuple):
 
 
 def verify(path: str | Path, problems: Sequence[Problem] = ()) -> Verification:
-    """Compute the held-out metrics of a tuned file once more, on its seeds of each scenario.
+    """Recompute the held-out metrics of a tuned file, on its seeds of each scenario.
 
     Args:
         path: the tuned file.
-        problems: what it was tuned on, where that is code: nothing that a file names is imported.
+        problems: the problems it was tuned on, if these are code: nothing that a file names is imported.
 
     Raises:
-        ValueError: if the file is not a whole tuned file as it was written, or holds no metrics.
+        ValueError: if the file is not a complete tuned file as it was written, or has no metrics.
     """
     content, (choice, _, seed) = read_tuned_file(path), read_tuned(path, problems)
     held_out = content.get("held_out")
@@ -61,8 +61,10 @@ def verify(path: str | Path, problems: Sequence[Problem] = ()) -> Verification:
         raise ValueError(f"a tuned file must have held-out metrics to verify, but {path} has {shown(held_out)}")
     places, differences = 0, []
     for name, stored in held_out.items():
-        proof = prove(choice, problem_in(content, name, path, problems), seed, _count(stored, path))
-        found = {key: value for key, value in metrics(proof).items() if key in stored or key not in LATER}
+        comparison = evaluate_held_out(
+            choice, problem_in(content, name, path, problems), seed, _count(stored, path)
+        )
+        found = {key: value for key, value in metrics(comparison).items() if key in stored or key not in LATER}
         pairs = _numbers(stored), _numbers(found)
         names = list(dict.fromkeys([*pairs[0], *pairs[1]]))
         differing = [Difference(f"{name}: {place}", *(part.get(place) for part in pairs)) for place in names]
@@ -91,7 +93,7 @@ def _count(stored, path: str | Path) -> int:
 
 
 def _numbers(value, place: str = "") -> dict[str, Any]:
-    """All that is no mapping or list within a value, by where it is."""
+    """All values within nested mappings and lists, by their path."""
     return dict(_leaves(value, place))
 
 

@@ -1,4 +1,4 @@
-"""Versions of the packages on which numbers depend."""
+"""Versions of the packages that numerical results depend on."""
 
 from __future__ import annotations
 

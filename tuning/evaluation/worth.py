@@ -1,4 +1,4 @@
-"""What a proof says in words: the gain over each baseline, and what the scaled default is."""
+"""Held-out results in words: the gain over each baseline, and what the scaled default is."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from tuning.evaluation.held_out import Comparison
 
 
 def without_truth(name: str) -> str:
-    """What is compared where a problem, called `name`, has no truth."""
+    """A sentence on what is compared where a problem, called `name`, has no truth."""
     return (
         f"{name} has no truth: filters are compared by how well they predict the measurements, the log-likelihood "
         "and the NIS of their innovations."
     )
 
 
-def worth(proof: Comparison, what: str = "the score") -> str:
-    """What tuning does to `what`: against the scaled default, if there is one, and the rule of thumb.
+def worth(comparison: Comparison, what: str = "the score") -> str:
+    """The effect of tuning on `what`: against the scaled default, if there is one, and the rule of thumb.
 
-    Without truth it is what it does to the log-likelihood of a run's innovations.
+    Without truth it is the effect on the log-likelihood of a run's innovations.
     """
-    if not proof.tuned.has_truth:
-        return _likelihood_worth(proof)
-    ratios, seeds = proof.ratios, len(proof.seeds)
+    if not comparison.tuned.has_truth:
+        return _likelihood_worth(comparison)
+    ratios, seeds = comparison.ratios, len(comparison.seeds)
     names = [name for name in (SCALED, RULE) if name in ratios]
     first, *others = (f"{gain(ratios[name], seeds, what)} against the {name}" for name in names)
     shared = first.partition(" against " if "no difference" in first else " by ")[0]
     return " and ".join([first, *(other.removeprefix(f"{shared} ") for other in others)])
 
 
-def _likelihood_worth(proof: Comparison) -> str:
-    gains = {name: gained for name, gained in proof.likelihood_gains.items() if name in (SCALED, RULE)}
+def _likelihood_worth(comparison: Comparison) -> str:
+    gains = {name: gained for name, gained in comparison.likelihood_gains.items() if name in (SCALED, RULE)}
     parts = [
         f"by {gained.value:+.2f} [{gained.low:+.2f}, {gained.high:+.2f}] against the {name}"
         for name, gained in gains.items()
@@ -43,7 +43,7 @@ def _likelihood_worth(proof: Comparison) -> str:
 
 
 def gain(ratio: Interval, seeds: int, what: str = "the score") -> str:
-    """What a ratio of scores over those of a baseline says, with its interval."""
+    """A ratio of scores over those of a baseline in words, with its interval."""
     if ratio.low <= 1 <= ratio.high:
         return f"makes no difference that {seeds} seeds can show"
     ends = sorted(100 * abs(1 - part) for part in (ratio.low, ratio.high))
@@ -51,15 +51,17 @@ def gain(ratio: Interval, seeds: int, what: str = "the score") -> str:
     return f"{verb} {what} by {100 * abs(1 - ratio.value):.0f} % [{ends[0]:.0f}, {ends[1]:.0f}]"
 
 
-def scaling_sentence(proof: Comparison) -> str:
-    """What the scaled default is, or why there is none; empty where the proof does not know."""
-    found = proof.default
+def scaling_sentence(comparison: Comparison) -> str:
+    """What the scaled default is, or why there is none; empty where the comparison has no record of it."""
+    found = comparison.default
     if found is None:
         return ""
     if found.choice is None:
         return f"There is no {SCALED}, so the {RULE} comes first: {found.reason}."
-    oracle = f"; the {ORACLE} has the plant's own Q and R" if proof.true is not None else ""
+    if found.factor is None or found.nis is None:
+        raise ValueError(f"a scaled default must have its factor and mean NIS, but got {found}")
+    oracle = f"; the {ORACLE} has the plant's own Q and R" if comparison.true is not None else ""
     return (
         f"The {SCALED} is the {RULE} with its Q times {found.factor:.4g}, which brings the mean NIS on the "
-        f"training runs to {found.nis * proof.tuned.expected_nis:.2f}{oracle}."
+        f"training runs to {found.nis * comparison.tuned.expected_nis:.2f}{oracle}."
     )

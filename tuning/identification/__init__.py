@@ -1,4 +1,4 @@
-"""A plant's numbers from its logs: maximum likelihood over a filter's innovations, and what the data determine."""
+"""Identification of a plant from logs: maximum likelihood of a filter's innovations, and identifiability."""
 
 from tuning.identification.identify import identify
 from tuning.identification.profiles import Profile, profile_figure, profiles

@@ -10,13 +10,13 @@ import numpy as np
 from tuning.identification.objective import Evaluation
 
 ITERATIONS = 60  # at most
-ENOUGH = 1e-4  # rise in log-likelihood that one more step promises, below which the search ends
-LONGEST = 1.5  # a step, in coordinates
-LEAST_CURVATURE = 1e-6  # of the largest one; keeps directions of which the data say nothing in place
+ENOUGH = 1e-4  # predicted rise in log-likelihood below which the search ends
+LONGEST = 1.5  # longest step, in coordinates
+LEAST_CURVATURE = 1e-6  # of the largest one; fixes directions on which the data have no information
 
 
 class Ascent(NamedTuple):
-    """Where a search ended."""
+    """The end of a search."""
 
     at: np.ndarray  # (p,), coordinates
     found: Evaluation
@@ -35,24 +35,24 @@ def climb(
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[np.ndarray, Evaluation], None] = lambda at, found: None,
 ) -> Ascent:
-    """Climb a log-likelihood: steps d of (J + lambda diag J) d = g, with Fisher's information J and slopes g.
+    """Maximise a log-likelihood by steps d of (J + lambda diag J) d = g, Fisher information J and gradient g.
 
-    lambda falls where a step rises as promised, and grows where it does not. Parameters at an end of their range
-    that want to go on stay there.
+    lambda falls where the log-likelihood rises as predicted, and grows where it does not. Parameters at an end of
+    their range whose gradient points outwards stay there.
 
     Args:
-        evaluate: value, slopes and information at coordinates (p,).
-        start: coordinates (p,) where it begins.
+        evaluate: value, gradient and information at coordinates (p,).
+        start: coordinates (p,) where the search begins.
         low: the smallest coordinates.
         high: the largest ones.
-        held: which parameters stay as they are, (p,) bool.
-        iterations: at most.
-        stop: asked before each; True ends the search.
-        progress: told where it is after each rise.
+        held: which parameters are held, (p,) bool.
+        iterations: largest number of iterations.
+        stop: called before each iteration; True ends the search.
+        progress: called with coordinates and evaluation after each rise.
 
     Source: Osborne (1992), "Fisher's method of scoring", International Statistical Review 60(1); Marquardt (1963).
     """
-    at, found, damping = np.clip(start, low, high), None, 1e-3
+    at, damping = np.clip(start, low, high), 1e-3
     found = evaluate(at)
     held = np.zeros(len(at), dtype=bool) if held is None else held
     quiet = 0
@@ -97,6 +97,6 @@ def _usable(found: Evaluation) -> bool:
 
 
 def _positive(information: np.ndarray) -> np.ndarray:
-    """An information without negative directions, which differences of gradients may leave."""
+    """An information matrix with positive eigenvalues: differences of gradients may make some negative."""
     values, axes = np.linalg.eigh(information)
     return axes * np.abs(values) @ axes.T

@@ -1,4 +1,4 @@
-"""Scaled coordinates of free parameters: logarithms where they are positive, else parts of the range."""
+"""Scaled coordinates of free parameters: logarithms of positive parameters, fractions of the range of others."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 from numerics.checks import finite, shown
 from tuning.problems.parameter import Parameter
 
-PART = 0.1  # of the range of a parameter that has no logarithm: its unit
+PART = 0.1  # fraction of its range that is the unit of a parameter on a linear scale
 
 
 class Coordinates:
-    """Between values of p parameters and coordinates (p,), a unit of which is a sensible amount of each.
+    """Map values of p parameters to coordinates (p,) and back; one unit is a sensible change of each parameter.
 
     That is a factor of e for parameters on a logarithmic scale, a tenth of the range for others.
     """
@@ -26,15 +26,15 @@ class Coordinates:
             raise ValueError(f"free parameters must be some, each named once, but got {shown(list(self.names))}")
         if any(one.integer for one in self.free):
             whole = ", ".join(one.name for one in self.free if one.integer)
-            raise ValueError(f"free parameters must be no whole numbers, but got {whole}")
+            raise ValueError(f"free parameters must not be whole numbers, but got {whole}")
         self.log = np.array([one.log for one in self.free])
         self.units = np.array([1.0 if one.log else PART * (one.high - one.low) for one in self.free])
         self.low, self.high = self.of([one.low for one in self.free]), self.of([one.high for one in self.free])
 
     def of(self, values: Sequence[float]) -> np.ndarray:
         """Coordinates of values (p,)."""
-        values = np.asarray(values, dtype=np.float64)
-        return np.where(self.log, np.log(np.where(self.log, values, 1.0)), values) / self.units
+        given = np.asarray(values, dtype=np.float64)
+        return np.where(self.log, np.log(np.where(self.log, given, 1.0)), given) / self.units
 
     def values(self, at: np.ndarray) -> np.ndarray:
         """Values (p,) at coordinates."""

@@ -1,4 +1,4 @@
-"""Whether logs excite what is to be found in them."""
+"""Whether logs excite the free parameters."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from tuning.identification.result import covariance, is_narrow
 
 
 def check_excitation(objective: Objective, logs: Sequence[Log], start: np.ndarray) -> None:
-    """Refuse logs whose inputs are constant where these do not tell the free parameters apart.
+    """Raise ValueError for logs with constant inputs that do not determine the free parameters.
 
     Args:
-        objective: of the logs.
-        logs: as they were recorded.
+        objective: log-likelihood of the logs.
+        logs: the logs as recorded.
         start: coordinates (p,) of the free parameters.
 
     Raises:

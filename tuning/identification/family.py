@@ -1,4 +1,4 @@
-"""Any model as a function of its named numbers: arguments of what makes it, constants, Q and R."""
+"""Any model as a function of its named parameters: arguments of a function, constants, Q and R."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -14,31 +15,32 @@ from plants.state_space import StateSpaceModel
 from tuning.problems.parameter import Parameter, squared
 from tuning.search.parameters import r_name
 
-FACTOR = 10.0  # of its start, to either side, that a positive parameter may be
-NOISE_FACTOR = 1e4  # the same of variances
+FACTOR = 10.0  # range of a positive parameter about its start
+NOISE_FACTOR = 1e4  # range of a variance about its start
 
 
 class ModelFamily:
-    """The models that a function makes of its arguments, or that a model is for other constants.
+    """The models that a function makes from its arguments, or a model with other constants.
 
-    Known are the function's arguments that have a number for a default; the fields of the constants, where these
-    are a NamedTuple and no argument has the name; and Q11, Q22, ... and R, or R11, R22, ...
+    The parameters are the function's arguments that have a number for a default; the fields of the constants,
+    where these are a NamedTuple and no argument has the name; and Q11, Q22, ... and R, or R11, R22, ...
 
     Args:
         make: a function, or a model.
         free: names of free parameters.
-        noise: whether the variances of Q (as far as there are any) and R are free, too.
-        dt: given to the function where it takes it.
+        noise: whether the variances of Q (those that are not zero) and R are free, too.
+        dt: sample time [s], passed to the function if it has this argument; covariances do not scale with it.
 
     Raises:
-        ValueError: for an unknown name, with those that are known.
+        ValueError: for an unknown name; the message has the known ones.
     """
 
     def __init__(
         self, make: Callable | StateSpaceModel, free: Sequence[str], *, noise: bool = True, dt: float | None = None
     ):
         """Find the parameters by name."""
-        self._make = (lambda: make) if isinstance(make, StateSpaceModel) else make
+        self._make: Callable[..., StateSpaceModel]
+        self._make = partial(_same, make) if isinstance(make, StateSpaceModel) else make
         self._arguments = _numbers_of(self._make)
         if dt is not None and "dt" in inspect.signature(self._make).parameters:
             self._arguments.pop("dt", None)
@@ -58,7 +60,7 @@ class ModelFamily:
 
     @property
     def known(self) -> dict[str, Parameter]:
-        """Every parameter that may be free, with its range about where it starts."""
+        """Every parameter that may be free, with its range about its start."""
         starts = dict(self._arguments) | {one: getattr(self.base.constants, one) for one in self._fields}
         found = {name: about(name, float(value)) for name, value in starts.items()}
         units = [one.unit for one in (*self.base.states, *self.base.measurements)]
@@ -69,11 +71,12 @@ class ModelFamily:
         return found
 
     def model(self, **values: float) -> StateSpaceModel:
-        """The model for values of some parameters; others are as they are."""
+        """The model for values of some parameters; the others stay."""
         given = {name: value for name, value in values.items() if name in self._arguments}
         model = self._make(**given) if given else self.base
         fields = {name: value for name, value in values.items() if name in self._fields}
-        changes: dict = {"constants": model.constants._replace(**fields)} if fields else {}
+        constants: Any = model.constants  # a NamedTuple, if it has fields
+        changes: dict[str, Any] = {"constants": constants._replace(**fields)} if fields else {}
         for name in ("process_noise_cov", "measurement_noise_cov"):
             cov = getattr(model, name).copy()
             for one, value in values.items():
@@ -86,7 +89,7 @@ class ModelFamily:
         return model.replace(**changes) if changes else model
 
     def _variances(self) -> dict[str, tuple[str, int, float]]:
-        """Which covariance each variance is of, and its place."""
+        """The covariance of each variance, its index, and its value."""
         found = {}
         for i, variance in enumerate(np.diag(self.base.process_noise_cov).tolist()):
             if variance > 0:
@@ -94,6 +97,10 @@ class ModelFamily:
         for i, variance in enumerate(np.diag(self.base.measurement_noise_cov).tolist()):
             found[r_name(i, self.base.m)] = ("measurement_noise_cov", i, variance)
         return found
+
+
+def _same(model: StateSpaceModel) -> StateSpaceModel:
+    return model
 
 
 def about(name: str, value: float, unit: str = "") -> Parameter:
@@ -107,10 +114,10 @@ def about(name: str, value: float, unit: str = "") -> Parameter:
 def with_ranges(
     free: Sequence[Parameter], ranges: Mapping[str, tuple[float, float]], start: Mapping[str, float]
 ) -> tuple[Parameter, ...]:
-    """Free parameters with other ranges and starts; a range that reaches to zero or below has no logarithm.
+    """Free parameters with other ranges and starts; a range that reaches zero is not logarithmic.
 
     Raises:
-        ValueError: for a name that is not free, or a range or start that is none.
+        ValueError: for a name that is not free, an empty range, or a start outside its range.
     """
     names = [one.name for one in free]
     for name in (*ranges, *start):

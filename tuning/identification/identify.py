@@ -1,4 +1,4 @@
-"""A plant's numbers by maximum likelihood over a filter's innovations, from several starts."""
+"""A plant's parameters by maximum likelihood of a filter's innovations, from several starts."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.search.interruption import stop_on_interrupt
 
-STARTS = 4  # the one given, and others drawn about it
+STARTS = 4  # the given one, and others drawn about it
 MOST_STARTS = 1000
-NEARER = 5  # times that a start without a likelihood is moved halfway to the first
-REACH = 0.25  # of a range, to either side of the start, within which others are drawn
+NEARER = 5  # largest number of times that a start without a likelihood is moved halfway to the first
+REACH = 0.25  # fraction of a range, to either side of the start, within which other starts are drawn
 
 Progress = Callable[[int, float, dict[str, float]], None]
 
@@ -46,33 +46,32 @@ def identify(
     """Find the values of free parameters under which a filter's innovations are most likely.
 
     The search is Fisher scoring (`ascent.climb`) in logarithms of positive parameters and parts of the range of
-    others, with slopes by the filter's sensitivities for all that a parameter moves of a model: constants, Q, R
-    and prior, in any mixture. Parameters that move the data, or need other functions, are taken by differences of
-    the likelihood.
+    others, with gradients by the filter's sensitivities to constants, Q, R and prior, in any combination.
+    For parameters that move the data, or change the model's functions, differences of the likelihood are used.
 
     The first start is `start`; the others are drawn uniformly (in coordinates) within a quarter of each range to
-    either side of it; one at which the filter does not stay finite is moved halfway to the first, and so on. With
-    `simulation_first` each start is first brought to where the model, simulated without process noise, is nearest
-    to the measurements, if that is likelier: innovations forgive a model that is far off as long as its filter
-    follows the measurements.
+    either side of it; one at which the filter does not stay finite is moved halfway to the first, repeatedly. With
+    `simulation_first` each start is first moved to where the model, simulated without process noise, is closest to
+    the measurements, if that is more likely: innovations are small even for a model that is far off, as long as
+    its filter follows the measurements.
 
     Args:
-        data: `Data`, a `Log`, a sequence of such, or a function of some of the parameters, named as
-            its arguments, that gives these.
+        data: `Data`, a `Log`, a sequence of these, or a function of some of the parameters (its arguments) that
+            returns these.
         model: `model(**values)` of the other parameters.
-        free: what is to be found, with ranges; `default` is where the search starts.
-        filter: "ekf", or "kf" for affine models and such as have an operating point.
-        start: values at which to start, where they are not the defaults.
-        starts: how many, or the other starts themselves.
-        seed: of the draws.
-        degrees: of freedom of Student-t innovations, for logs with outliers; infinite for normal ones. Where there
-            are predicted channels, of their errors alone.
-        predicted: symbols of channels that the filter is to predict, but never sees, such as a load cell that will
-            not be there later. What it sees alone would be identified as it predicts best one step ahead; with a
-            channel of these, as it predicts that channel best.
-        gate: leave out samples whose innovations are beyond so many standard deviations of a robust filter's, and
-            identify anew, until they are the same; infinite to keep all. (Student-t innovations tell a scale in
-            spite of outliers, but the filter still follows these, and constants get a bias.)
+        free: the free parameters, with ranges; the search starts at `default`.
+        filter: "ekf", or "kf" for affine models and models with an operating point.
+        start: values at which to start, in place of the defaults.
+        starts: number of starts, or the other starts themselves.
+        seed: seed of the draws.
+        degrees: degrees of freedom of Student-t innovations, for logs with outliers; infinite for normal ones.
+            With predicted channels, those of their errors alone.
+        predicted: symbols of channels that the filter predicts, but never uses, such as a load cell that will not
+            be there later. Without them the model is identified for the best one-step prediction of the
+            measurements; with them, for the best prediction of these channels.
+        gate: leave out samples whose innovations exceed so many standard deviations of a robust filter, and
+            identify again, until the samples stay the same; infinite to keep all. (With Student-t innovations
+            alone the scale is robust, but the filter still follows outliers, and constants get a bias.)
         simulation_first: see above.
         progress: called with the number of the start, the log-likelihood and the values, after every rise.
 
@@ -80,7 +79,7 @@ def identify(
         `Identification`. After Ctrl-C, the best so far, with `interrupted`.
 
     Raises:
-        ValueError: for parameters, starts or data that do not fit, or if no start has a likelihood.
+        ValueError: for parameters, starts or data that do not fit each other, or if no start has a likelihood.
 
     Source: Astrom (1980), "Maximum likelihood and prediction error methods", Automatica 16(5).
     """
@@ -123,7 +122,7 @@ def identify(
 
 
 def _gated(objective: Objective, best: Ascent, gate: float, stop, tell) -> tuple[Objective, Ascent]:
-    """The objective without outliers, and its maximum: left out and identified anew until nothing changes."""
+    """The objective without outliers, and its maximum: repeated until the outliers stay the same."""
     coordinates, whole, left_out, spent = objective.coordinates, objective, None, objective.evaluations
     for _ in range(ROUNDS):
         found = outliers_of(whole.model_at(best.at), whole.data_at(best.at), gate)

@@ -1,12 +1,12 @@
-"""The log-likelihood of logs as a function of a model's free parameters, with its slopes."""
+"""The log-likelihood of logs as a function of a model's free parameters, with its derivatives."""
 
 from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,17 +20,17 @@ from tuning.identification.runs import runs_of
 from tuning.likelihood.gradient import DIFFERENTIABLE
 from tuning.problems.data import Data
 
-STEP = 1e-4  # of differences of the model's numbers, in coordinates
+STEP = 1e-4  # of differences of the model, in coordinates
 LARGE_STEP = 1e-2  # of differences of the likelihood itself
-BLOCKS = 20  # parts of all runs together, at least, whose scores tell the scatter
+BLOCKS = 20  # least number of blocks of all runs, whose scores give the scatter
 
 
 class Evaluation(NamedTuple):
-    """Log-likelihood and slopes in coordinates at one point."""
+    """Log-likelihood and its derivatives in coordinates at one point."""
 
     value: float  # of all runs
     gradient: np.ndarray  # (p,)
-    information: np.ndarray  # (p, p), Fisher's; differences of the gradient for parameters without sensitivities
+    information: np.ndarray  # (p, p), Fisher; differences of the gradient for parameters without sensitivities
     scores: np.ndarray  # (runs or blocks of them, p), gradients of parts that are nearly independent
     run_values: np.ndarray  # (runs,)
 
@@ -39,15 +39,15 @@ class Objective:
     """Log-likelihood of a filter's innovations over logs, as a function of coordinates (p,) of free parameters.
 
     Args:
-        data: `Data`, a `Log`, a sequence of such, or a function of some free parameters, named as its
-            arguments, that gives these: a clock offset moves the data. It may say by its `noise_factors` of the
-            same parameters what is left of R in channels, by symbol, where it interpolates.
-        model: `model(**values)`, the model for values of the parameters; others than those of `data`.
-        coordinates: of the parameters.
+        data: `Data`, a `Log`, a sequence of these, or a function of some free parameters (its arguments) that
+            returns these: a clock offset moves the data. Its attribute `noise_factors`, a function of the same
+            parameters, may return factors on R by channel, where it interpolates.
+        model: `model(**values)`, the model for values of the parameters that `data` does not take.
+        coordinates: coordinates of the parameters.
         filter: "ekf" or "kf".
         degrees: of freedom of Student-t innovations; infinite for normal ones.
-        predicted: symbols of channels that the filter predicts, but does not see.
-        simulation: whether Q is put to zero: the filter then simulates, and -log L is a sum of squares.
+        predicted: symbols of channels that the filter predicts, but does not use.
+        simulation: whether Q is set to zero: the filter then simulates, and -log L is a sum of squares.
 
     Raises:
         ValueError: where models or data do not fit.
@@ -64,13 +64,14 @@ class Objective:
         predicted: Sequence[str] = (),
         simulation: bool = False,
     ):
-        """Find out which parameters move the model's numbers alone."""
+        """Find the parameters that have sensitivities; see the class for the arguments."""
         self.filter = one_of("filter", filter, DIFFERENTIABLE)
         self.coordinates, self._model, self.degrees, self.simulation = coordinates, model, degrees, simulation
-        self.data, self.evaluations = data if callable(data) else runs_of(data), 0
+        self.data: Data | Callable[..., Any] = data if callable(data) else runs_of(data)
+        self.evaluations = 0
         self.predicted = tuple(predicted)
         self._of_data = _arguments_among(data, coordinates.names) if callable(data) else ()
-        self.rough: tuple[int, ...] = ()  # places of parameters that have no sensitivities
+        self.rough: tuple[int, ...] = ()  # indices of parameters without sensitivities
         at = coordinates.start()
         pairs = [self._pair(at, j) for j in range(len(at))]
         same = [_same_functions(*pair) for pair in pairs]
@@ -93,7 +94,7 @@ class Objective:
         """The model at coordinates, as the filter runs on it."""
         values = {n: v for n, v in self.coordinates.named(at).items() if n not in self._of_data}
         model = make_filter(self.filter, self._model(**values)).kernel_model
-        if hasattr(self.data, "noise_factors"):
+        if self._noise_factors_of is not None:
             roots = np.sqrt(self._noise_factors(at, model))
             model = model.replace(measurement_noise_cov=model.measurement_noise_cov * np.outer(roots, roots))
         if self.simulation:
@@ -107,18 +108,23 @@ class Objective:
         named = self.coordinates.named(at)
         return runs_of(self.data(**{name: named[name] for name in self._of_data}))
 
+    @property
+    def _noise_factors_of(self) -> Callable[..., Mapping[str, float]] | None:
+        """Of data that are interpolated: a function of their parameters that returns factors on R by channel."""
+        return getattr(self.data, "noise_factors", None)
+
     def _noise_factors(self, at: np.ndarray, model: StateSpaceModel) -> np.ndarray:
-        """What is left of R in each channel (m,), where the data are interpolated."""
-        named = self.coordinates.named(at)
-        factors = self.data.noise_factors(**{name: named[name] for name in self._of_data})
+        """Factors on R of each channel (m,)."""
+        of_data, named = self._noise_factors_of, self.coordinates.named(at)
+        factors = {} if of_data is None else of_data(**{name: named[name] for name in self._of_data})
         return np.array([factors.get(one.symbol, 1.0) for one in model.measurements])
 
     def value(self, at: np.ndarray) -> float:
-        """Log-likelihood of all runs; minus infinity where it has none."""
+        """Log-likelihood of all runs; minus infinity where it is not finite."""
         return self._smooth_part(at, ()).value
 
     def __call__(self, at: np.ndarray) -> Evaluation:
-        """Value and slopes at coordinates."""
+        """Log-likelihood and its derivatives at coordinates."""
         here = self._smooth_part(at, self._smooth)
         if not self.rough:
             return here
@@ -155,7 +161,7 @@ class Objective:
         scores = np.concatenate(found.block_gradients)
         information = found.information.sum(axis=0)
         values = found.values
-        if hasattr(self.data, "noise_factors"):  # densities of the samples, whatever they are averaged to
+        if self._noise_factors_of is not None:  # densities of the samples, not of their averages
             counts = (~np.isnan(runs.measurements)).sum(axis=1)
             values = values + 0.5 * counts @ np.log(self._noise_factors(at, model))
         value = float(values.sum())
@@ -175,7 +181,7 @@ class Objective:
         )
 
     def _pair(self, at: np.ndarray, place: int) -> list[StateSpaceModel]:
-        """Models a step above and below; at an end of the range a step within."""
+        """Models one step above and below; at an end of the range both are within it."""
         middle, step = np.array(at, dtype=np.float64), STEP * np.eye(len(at))[place]
         low, high = self.coordinates.low[place] + STEP, self.coordinates.high[place] - STEP
         middle[place] = np.clip(middle[place], low, high)
@@ -183,7 +189,7 @@ class Objective:
 
 
 def _arguments_among(function: Callable, names: Sequence[str]) -> tuple[str, ...]:
-    """The arguments of a function that are free parameters; it may list them as its `parameters`."""
+    """The arguments of a function that are free parameters; its attribute `parameters` may list them."""
     if hasattr(function, "parameters"):
         return tuple(name for name in names if name in function.parameters)
     arguments = set(inspect.signature(function).parameters)
@@ -197,7 +203,7 @@ def _same_functions(one: StateSpaceModel, other: StateSpaceModel) -> bool:
 
 
 def _check_runs(run: Data, model: StateSpaceModel) -> None:
-    """Raise ValueError unless runs have the model's inputs and measurements, and some that is no gap."""
+    """Raise ValueError unless runs have the model's inputs and measurements, and samples in each channel."""
     sizes = run.inputs.shape[-1], run.measurements.shape[-1]
     if sizes != (model.inputs, model.m):
         raise ValueError(
@@ -210,7 +216,7 @@ def _check_runs(run: Data, model: StateSpaceModel) -> None:
 
 
 def _checked_channels(predicted: Sequence[str], model: StateSpaceModel) -> list[bool]:
-    """Which channels are only predicted; ValueError for one that there is not, or if all are."""
+    """Which channels are only predicted; ValueError for an unknown one, or if all are."""
     symbols = [channel.symbol for channel in model.measurements]
     for symbol in predicted:
         one_of("a predicted channel", symbol, symbols)

@@ -1,4 +1,4 @@
-"""Outliers in logs: samples that a robust filter of the identified model finds far off are left out."""
+"""Outliers in logs: samples with large innovations of a robust filter are left out."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from tuning.identification.objective import Objective
 from tuning.identification.runs import runs_of
 from tuning.problems.data import Data
 
-ROUNDS = 6  # of leaving out and identifying anew, at most
+ROUNDS = 6  # of leaving out and identifying again, at most
 
 
 def outliers_of(model: StateSpaceModel, runs: Data, gate: float) -> np.ndarray:
-    """Which samples are outliers, (B, K + 1, m): innovations beyond so many standard deviations of their channel.
+    """Which samples are outliers, (B, K + 1, m): innovations of more than `gate` standard deviations.
 
-    The filter is the extended one with Student-t noise (`filters.adaptive.robust`): an outlier that the normal one
-    follows would make its neighbours look like outliers, too.
+    The filter is an extended Kalman filter with Student-t noise (`filters.adaptive.robust`): the normal one
+    follows outliers, so that their neighbours would look like outliers, too.
 
     Args:
-        model: as the filter runs on it.
-        runs: of the model's inputs and measurements.
-        gate: standard deviations.
+        model: the model of the filter.
+        runs: inputs and measurements.
+        gate: number of standard deviations.
     """
     found = run(RobustExtendedKalmanFilter(model=model), runs.filter_keys, runs.inputs, runs.measurements)
     spread = np.sqrt(np.einsum("bkii->bki", found.innovation_covs))
@@ -33,14 +33,15 @@ def outliers_of(model: StateSpaceModel, runs: Data, gate: float) -> np.ndarray:
 
 
 class WithoutOutliers:
-    """Data, or a function of parameters that gives these, without some samples."""
+    """Data, or a function of parameters that returns them, without some samples."""
 
     def __init__(self, data: Data | Callable, outliers: np.ndarray):
-        """Take what `Objective` takes, and which samples (B, K + 1, m) are left out."""
+        """Take the data of an `Objective`, and a mask (B, K + 1, m) of the samples to leave out."""
         self._data, self.outliers = data, outliers
         self.parameters = getattr(data, "parameters", ())
-        if hasattr(data, "noise_factors"):
-            self.noise_factors = data.noise_factors
+        noise_factors = getattr(data, "noise_factors", None)
+        if noise_factors is not None:
+            self.noise_factors = noise_factors
 
     def __call__(self, **values: float) -> Data:
         """The runs, NaN where a sample is left out."""
@@ -49,5 +50,5 @@ class WithoutOutliers:
 
 
 def without_outliers(objective: Objective, outliers: np.ndarray) -> Objective:
-    """The same objective, of the samples that are no outliers."""
+    """The same objective without the outliers."""
     return objective.with_changes(data=WithoutOutliers(objective.data, outliers))

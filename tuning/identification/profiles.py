@@ -15,11 +15,11 @@ from tuning.likelihood.identifiability import SIGNIFICANT
 from tuning.search.interruption import stop_on_interrupt
 
 REACH = (0.75, 1.5, 2.5)  # standard errors at which a parameter is held
-LEGS = 6  # steps that the others may take at each
+LEGS = 6  # iterations of the other parameters at each
 
 
 class Profile(NamedTuple):
-    """log L maximised over all other parameters, where one is held at some values."""
+    """log L maximised over all other parameters, with one parameter held at several values."""
 
     name: str
     values: np.ndarray  # (count,), rising
@@ -27,7 +27,7 @@ class Profile(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Where log L is within 1.92 of its maximum, a 95 % interval; infinite where it is not known to end."""
+        """Where log L is within 1.92 of its maximum, a 95 % interval; infinite where no end was found."""
         falls = self.log_likelihoods.max() - self.log_likelihoods
         best = int(np.argmin(falls))
         ends = []
@@ -52,9 +52,9 @@ def profiles(
 
     Args:
         found: from `identify`.
-        names: of the parameters; all if None.
-        reach: how many standard errors to either side a parameter is held, within its range.
-        progress: told the name of each.
+        names: names of the parameters; all if None.
+        reach: distances in standard errors, to either side, at which a parameter is held, within its range.
+        progress: called with the name of each parameter.
 
     Raises:
         ValueError: for an unknown name.
@@ -81,9 +81,10 @@ def profiles(
 
 
 def _side(found: Identification, place: int, reach: Sequence[float], asked) -> list[tuple[float, float]]:
-    """Points outwards; the others start along the direction in which they go with this parameter."""
+    """Points outwards; the other parameters start in the direction of their correlation with this one."""
     coordinates, error = found.objective.coordinates, np.sqrt(found.cov[place, place])
-    slope, points = found.cov[:, place] / found.cov[place, place], []
+    slope = found.cov[:, place] / found.cov[place, place]
+    points: list[tuple[float, float]] = []
     held = np.arange(len(found.at)) == place
     for part in reach:
         move = part * error

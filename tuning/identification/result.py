@@ -1,4 +1,4 @@
-"""What was identified: values, how sure they are, and what the data do not determine."""
+"""The result of identification: values, standard errors, and what the data do not determine."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from tuning.identification.coordinates import Coordinates
 from tuning.identification.objective import Objective
 from tuning.likelihood.identifiability import COMPANION, KNOWN_WITHIN, TWO_SIDED
 
-WIDEST = 0.5  # of its range, that a 95 % interval of a determined parameter may take
-TRADED = 0.95  # correlation from which on two parameters are said to trade off
-EQUAL = 0.25  # optima whose determined parameters are within so many standard errors are one,
-EQUAL_VALUES = 0.01  # or within so little of the likelihood
-FLAT = 1e-10  # of a range^-2: curvature below which there is none
+WIDEST = 0.5  # largest part of its range that the 95 % interval of a determined parameter may take
+TRADED = 0.95  # correlation from which two parameters are reported to trade off
+EQUAL = 0.25  # standard errors within which the determined parameters of two equal optima lie ...
+EQUAL_VALUES = 0.01  # ... or difference of their log-likelihoods
+FLAT = 1e-10  # in range^-2: curvature below which a direction counts as flat
 
 
 class Optimum(NamedTuple):
-    """Where one start led."""
+    """The result of one start."""
 
     start: dict[str, float]
     values: dict[str, float]
@@ -38,23 +38,23 @@ class Identification(NamedTuple):
     cov: np.ndarray  # (p, p)
     at: np.ndarray  # (p,), coordinates
     at_end: dict[str, bool]  # whether a value is at an end of its range
-    determined: dict[str, bool]  # as `is_narrow` says, and not at an end of the range
+    determined: dict[str, bool]  # by `is_narrow`, and not at an end of the range
     log_likelihood: float
     start_log_likelihood: float
-    optima: tuple[Optimum, ...]  # one a start
+    optima: tuple[Optimum, ...]  # one for each start
     objective: Objective
     interrupted: bool
     seconds: float
 
     @property
     def correlations(self) -> np.ndarray:
-        """Of the estimates, (p, p)."""
+        """Correlations of the estimates, (p, p)."""
         scale = np.sqrt(np.diag(self.cov))
         return self.cov / np.outer(scale, scale)
 
     @property
     def agreement(self) -> int:
-        """How many starts led to the best maximum, in log L or in all determined parameters."""
+        """Number of starts that led to the best maximum, by log L or by all determined parameters."""
         coordinates, scale, near = self.objective.coordinates, np.sqrt(np.diag(self.cov)), 0
         best = max(self.optima, key=lambda one: one.log_likelihood)
         known = np.array([self.determined[name] for name in self.names])
@@ -67,26 +67,26 @@ class Identification(NamedTuple):
 
     @property
     def left_out(self) -> int:
-        """How many samples were outliers."""
+        """Number of samples that were left out as outliers."""
         return int(np.sum(getattr(self.objective.data, "outliers", 0)))
 
     @property
     def evaluations(self) -> int:
-        """Of likelihood and slopes, all starts together."""
+        """Number of evaluations of likelihood and gradient, for all starts together."""
         return self.objective.evaluations
 
     @property
     def traded(self) -> list[tuple[str, str, float]]:
-        """Pairs of parameters that trade off, and their correlation."""
+        """Pairs of parameters that trade off, with their correlation."""
         found = self.correlations
         pairs = [(i, j) for i in range(len(found)) for j in range(i) if abs(found[i, j]) >= TRADED]
         return [(self.names[j], self.names[i], float(found[i, j])) for i, j in pairs]
 
     @property
-    def loosest(self) -> dict[str, float]:
-        """The direction that is known least: standard errors of its parameters, in ranges, with signs.
+    def least_determined(self) -> dict[str, float]:
+        """The least determined direction: signed standard errors of its parameters, as fractions of their ranges.
 
-        Parameters with less than a fifth of the largest part are left out.
+        Parameters with less than a fifth of the largest component are left out.
         """
         width = self.objective.coordinates.high - self.objective.coordinates.low
         variances, axes = np.linalg.eigh(self.cov / np.outer(width, width))
@@ -94,8 +94,23 @@ class Identification(NamedTuple):
         order = [i for i in np.argsort(-np.abs(axis)) if abs(axis[i]) >= COMPANION * np.abs(axis).max()]
         return {self.names[i]: float(axis[i]) for i in order}
 
+    @property
+    def loosest(self) -> dict[str, float]:
+        """The former name of `least_determined`."""
+        return self.least_determined
+
+    @property
+    def _at_zero(self) -> list[str]:
+        """Parameters at an end that is zero, beyond which there is nothing, as of the width of a dead band."""
+        free = self.objective.coordinates.free
+        return [
+            one.name
+            for one in free
+            if 0.0 in (one.low, one.high) and abs(self.values[one.name]) <= 1e-5 * (one.high - one.low)
+        ]
+
     def sentences(self) -> list[str]:
-        """What the data determine, and what they do not."""
+        """Sentences on what the data determine, and what they do not."""
         said = []
         ends = [name for name in self.names if self.at_end[name]]
         wide = [name for name in self.names if not self.determined[name] and not self.at_end[name]]
@@ -104,13 +119,17 @@ class Identification(NamedTuple):
         if wide:
             rule = "a 95 % interval takes half the range, or a factor of ten"
             said.append(f"The data do not determine {', '.join(wide)}: {rule}.")
-        if ends:
-            said.append(f"At an end of the range: {', '.join(ends)}. A wider one may fit better.")
+        gone = [name for name in ends if name in self._at_zero]
+        if gone:
+            said.append(f"At zero, where the range ends: {', '.join(gone)}. The data ask for none of it.")
+        if len(ends) > len(gone):
+            others = ", ".join(name for name in ends if name not in gone)
+            said.append(f"At an end of the range: {others}. A wider one may fit better.")
         for one, other, correlation in self.traded:
             said.append(f"{one} and {other} trade off (correlation {correlation:.3f}).")
-        if len(self.loosest) > 1 and wide:
-            parts = ", ".join(f"{name} {part:+.2g}" for name, part in self.loosest.items())
-            said.append(f"Known least is the direction of (in ranges) {parts}.")
+        if len(self.least_determined) > 1 and wide:
+            parts = ", ".join(f"{name} {part:+.2g}" for name, part in self.least_determined.items())
+            said.append(f"The least determined direction is (as fractions of the ranges) {parts}.")
         if len(self.optima) > 1:
             said.append(f"{self.agreement} of {len(self.optima)} starts led to this maximum.")
         if self.left_out:
@@ -129,7 +148,7 @@ def identification_of(
     interrupted: bool,
     seconds: float,
 ) -> Identification:
-    """Errors and judgements at the best maximum."""
+    """The result at the best maximum, with standard errors and what is determined."""
     coordinates, at = objective.coordinates, best.at
     width = coordinates.high - coordinates.low
     cov = covariance(best.found.information, best.found.scores, width)
@@ -162,7 +181,7 @@ def identification_of(
 def is_narrow(cov: np.ndarray, coordinates: Coordinates) -> np.ndarray:
     """Whether the 95 % interval of each parameter takes less than half its range, (p,) bool.
 
-    On a logarithmic scale it must be within a factor of ten, too: a variance has a wide range.
+    On a logarithmic scale it must also be within a factor of ten, because the range of a variance is wide.
     """
     reach = TWO_SIDED * np.sqrt(np.diag(cov))
     known = ~coordinates.log | (reach < KNOWN_WITHIN)
@@ -172,20 +191,20 @@ def is_narrow(cov: np.ndarray, coordinates: Coordinates) -> np.ndarray:
 def covariance(information: np.ndarray, scores: np.ndarray, width: np.ndarray) -> np.ndarray:
     """Covariance of estimates (p, p): J^-1 (sum_b g_b g_b') J^-1, or J^-1 in directions where that is larger.
 
-    J is Fisher's information, g_b the scores of B nearly independent runs, or of blocks where there are few. The
-    first holds for a wrong model, too; the second where scatter says too little. A direction of which the data say
-    nothing has a variance of a range and more.
+    J is the Fisher information, g_b the scores of B nearly independent runs, or of blocks where there are few
+    runs. The first holds for a wrong model, too; the second is for directions in which the scatter is too small.
+    In a direction on which the data have no information the standard deviation is at least that of the range.
 
     Args:
         information: J, (p, p).
-        scores: (B, p); of fewer than two there is no scatter.
-        width: of the parameters' ranges, (p,), in the same coordinates.
+        scores: (B, p); fewer than two have no scatter.
+        width: widths of the parameters' ranges, (p,), in the same coordinates.
 
     Source: Huber (1967), "The behavior of maximum likelihood estimates under nonstandard conditions".
     """
     scale = np.outer(width, width)
     values, axes = np.linalg.eigh(information * scale)
-    values = np.maximum(values, 1.0 / 12.0)  # what is known before: the variance of a uniform density is a twelfth
+    values = np.maximum(values, 1.0 / 12.0)  # the prior: the variance of a uniform density is a twelfth
     if len(scores) < 2:
         return axes / values @ axes.T * scale
     along = scores * width @ axes / values

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -13,12 +14,12 @@ from tuning.problems.data import Data
 
 
 def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
-    """Data and logs as one `Data`; keys are those of the runs' numbers.
+    """Data and logs as one `Data`; keys and seeds are those of the runs' indices 0, 1, ...
 
     Raises:
-        ValueError: for anything else, none at all, or runs of different inputs, measurements or sample times.
+        ValueError: for anything else, for no run, or for runs with different inputs, measurements or sample times.
     """
-    given = [data] if isinstance(data, Data | Log) else list(data) if isinstance(data, Sequence) else []
+    given = _listed(data)
     if not given or not all(isinstance(one, Data | Log) for one in given):
         raise ValueError(f"data must be some of Log or Data, but got {shown(data)}")
     if len(given) == 1 and isinstance(given[0], Data):
@@ -26,7 +27,8 @@ def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
     times = sorted({one.dt for one in given if isinstance(one, Log)})
     if times and times[-1] > times[0] * (1 + 1e-6):
         raise ValueError(f"logs must have one sample time, but got {', '.join(f'{dt:g} s' for dt in times)}")
-    inputs, measurements = [], []
+    inputs: list[np.ndarray] = []
+    measurements: list[np.ndarray] = []
     for one in given:
         inputs += [one.inputs] if isinstance(one, Log) else list(one.inputs)
         measurements += [one.measurements] if isinstance(one, Log) else list(one.measurements)
@@ -40,3 +42,10 @@ def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
         all_inputs[place, : len(u)], all_inputs[place, len(u) :] = u, u[-1:]
         all_measurements[place, : len(z)] = z
     return Data(seeds, all_inputs, all_measurements, filter_keys(seeds), 0)
+
+
+def _listed(data: Any) -> list[Data | Log]:
+    """One or several runs as a list; empty for what is neither."""
+    if isinstance(data, Data | Log):
+        return [data]
+    return list(data) if isinstance(data, Sequence) else []

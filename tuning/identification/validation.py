@@ -1,4 +1,7 @@
-"""What a model is worth on runs that it was not identified on: prediction, simulation and likelihood."""
+"""Validation of a model on runs that it was not identified on: prediction, simulation and likelihood.
+
+NIS is the normalised innovation squared.
+"""
 
 from __future__ import annotations
 
@@ -17,43 +20,47 @@ from tuning.problems.data import Data
 
 
 class Validation(NamedTuple):
-    """How a model does on some runs; by the measurements' symbols, in their units."""
+    """Metrics of a model on some runs, by the measurements' symbols, in their units."""
 
     log_likelihood: float  # of the innovations
     one_step: dict[str, float]  # RMSE of the one-step prediction
-    simulation: dict[str, float]  # RMSE of the simulation, which sees no measurement
+    simulation: dict[str, float]  # RMSE of the simulation, which uses no measurement
     fit: dict[str, float]  # 100 (1 - RMSE of the simulation / standard deviation of the measurement) [%]
     nis: float  # mean NIS over the number of channels; 1 for a consistent filter
 
 
 def validation_of(model: StateSpaceModel, runs: Data, unseen: Sequence[bool] | None = None) -> Validation:
-    """How a model does on runs.
+    """Metrics of a model on runs.
 
-    A filter without any noise of the plant, whose gain is zero, simulates.
+    The simulation is a filter without process noise and prior covariance, whose gain is zero.
 
     Args:
-        model: as the filter runs on it.
-        runs: with inputs and measurements.
-        unseen: (m,) which channels the filter predicts and never sees: their errors are those of the estimate.
+        model: the model of the filter.
+        runs: inputs and measurements.
+        unseen: (m,) which channels the filter only predicts: their errors are those of the estimate.
     """
     symbols = [one.symbol for one in model.measurements]
-    unseen = np.zeros(model.m, dtype=bool) if unseen is None else np.asarray(unseen)
+    hidden = np.zeros(model.m, dtype=bool) if unseen is None else np.asarray(unseen)
     there = ~np.isnan(runs.measurements)
-    shown = runs._replace(measurements=np.where(unseen, np.nan, runs.measurements))
+    shown = runs._replace(measurements=np.where(hidden, np.nan, runs.measurements))
     estimates, nothing = _estimates(model, shown), np.zeros((model.n, model.n))
     simulated = _estimates(model.replace(process_noise_cov=nothing, prior_cov=nothing), shown)
 
     def rmse(found: Estimates) -> np.ndarray:
-        errors = np.where(unseen, _less_predicted(model, runs, found, unseen), found.innovations)
+        errors = np.where(hidden, _less_predicted(model, runs, found, hidden), found.innovations)
         return np.sqrt((np.where(there, errors, 0.0) ** 2).sum(axis=(0, 1)) / there.sum(axis=(0, 1)))
 
     one_step, simulation = rmse(estimates), rmse(simulated)
     spread = np.array([runs.measurements[..., i][there[..., i]].std() for i in range(model.m)])
     fit = 100 * (1 - simulation / np.where(spread > 0, spread, np.nan))
     weighted = np.linalg.solve(estimates.innovation_covs, estimates.innovations[..., None])[..., 0]
-    nis = (weighted * estimates.innovations).sum() / there[..., ~unseen].sum()
-    columns = (dict(zip(symbols, map(float, one), strict=True)) for one in (one_step, simulation, fit))
-    return Validation(float(estimates.log_likelihoods.sum()), *columns, float(nis))
+    nis = (weighted * estimates.innovations).sum() / there[..., ~hidden].sum()
+
+    def by_symbol(values: np.ndarray) -> dict[str, float]:
+        return dict(zip(symbols, map(float, values), strict=True))
+
+    likelihood = float(estimates.log_likelihoods.sum())
+    return Validation(likelihood, by_symbol(one_step), by_symbol(simulation), by_symbol(fit), float(nis))
 
 
 def validate(
@@ -63,8 +70,8 @@ def validate(
 
     Args:
         found: from `identify`.
-        data: runs that it did not see; None for those it saw. A parameter that moves the data moves those that
-            were given as a function only, so that held-out runs are one, too, where there is one.
+        data: held-out runs; None for those of the identification. If a free parameter moves the data, held-out
+            runs must be given as a function of it, too.
     """
     objective = found.objective
     if data is not None:
@@ -83,9 +90,9 @@ def _estimates(model: StateSpaceModel, runs: Data):
     return run(ExtendedKalmanFilter(model=model), runs.filter_keys, runs.inputs, runs.measurements)
 
 
-def _less_predicted(model: StateSpaceModel, runs: Data, estimates: Estimates, unseen: np.ndarray) -> np.ndarray:
-    """Measurements less what the estimates predict of them, if some channels are unseen; else nothing."""
-    if not unseen.any():
+def _less_predicted(model: StateSpaceModel, runs: Data, estimates: Estimates, hidden: np.ndarray) -> np.ndarray:
+    """Measurements minus their prediction from the estimates, if some channels are hidden; else zeros."""
+    if not hidden.any():
         return np.zeros_like(runs.measurements)
     c = model.given_constants
     predicted = [[model.observe(tuple(x), c) for x in means] for means in estimates.means.tolist()]

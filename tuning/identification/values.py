@@ -1,7 +1,7 @@
-"""Numbers that were found of somebody's own model, as a file that commands take with `--model` as its preset.
+"""Identified values of a user's model, in a file that commands take as the preset of `--model`.
 
-[values]            of the model's arguments, named constants, Q11, Q22, ... and R11, ...
-[identified]        how they were found, for people
+[values]            the model's arguments, named constants, Q11, Q22, ... and R11, ...
+[identified]        how they were found, for readers
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ TABLES = ("values", "identified")
 
 
 def write_values(path: str | Path, found: Identification, logs: Sequence[str]) -> None:
-    """Write what was found of a model; ValueError unless the path ends in .toml and can be written."""
+    """Write the identified values of a model; ValueError unless the path ends in .toml and can be written."""
     if not str(path).endswith(".toml"):
         raise ValueError(f"a file of values must end in .toml, but got {str(path)!r}")
     identified = {
@@ -30,12 +30,12 @@ def write_values(path: str | Path, found: Identification, logs: Sequence[str]) -
         "standard_errors": found.standard_errors,
         "determined": found.determined,
     }
-    tables = {"values": found.values, "identified": identified}
+    tables: dict[str, Mapping] = {"values": found.values, "identified": identified}
     write_whole(path, as_toml(tables, "Numbers of a model as `thruster identify` found them."))
 
 
 def read_values(path: str | Path) -> dict[str, float]:
-    """The numbers of such a file by name.
+    """The values in such a file by name.
 
     Raises:
         ValueError: states the rule and the value, with the path.
@@ -48,14 +48,14 @@ def read_values(path: str | Path) -> dict[str, float]:
 
 
 def with_values(make: Callable | StateSpaceModel, path: str | Path) -> Callable[[float], StateSpaceModel]:
-    """A function of the sample time that makes a model with the numbers of a file.
+    """A function of the sample time that makes a model with the values in a file.
 
     Args:
-        make: the model, or what makes it, as `ModelFamily` takes it.
-        path: of the file.
+        make: the model, or a function that makes it, as for `ModelFamily`.
+        path: path of the file.
 
     Raises:
-        ValueError: if the file is off, or names what the model has not.
+        ValueError: if the file is damaged, or names a parameter that the model does not have.
     """
     values = read_values(path)
     made = partial(valued, make, values)
@@ -69,5 +69,5 @@ def with_values(make: Callable | StateSpaceModel, path: str | Path) -> Callable[
 def valued(
     make: Callable | StateSpaceModel, values: Mapping[str, float], dt: float | None = None
 ) -> StateSpaceModel:
-    """A model with other values of some of its numbers, by name; see `ModelFamily` for the names and errors."""
+    """A model with other values of some parameters, by name; see `ModelFamily` for the names and errors."""
     return ModelFamily(make, tuple(values), noise=False, dt=dt).model(**values)

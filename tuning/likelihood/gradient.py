@@ -1,4 +1,4 @@
-"""Q and R by maximum likelihood: the innovations say how large the noise is, and a gradient finds it."""
+"""Q and R by maximum likelihood of the innovations, with gradients."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from tuning.search.parameters import MeasurementVariance, ProcessVariance, model
 from tuning.search.space import Choice, untuned_choice
 
 DIFFERENTIABLE = ("kf", "ekf")
-BAD_START = (1.0, 1e-2, 1e2)  # factors on Q11, Q22 and R, far from where they belong
+BAD_START = (1.0, 1e-2, 1e2)  # factors on Q11, Q22 and R, far from the optimum
 STEP = 1e-3  # in the logarithms, of the differences of gradients that give the Hessian
-FLAT = 1e-12  # curvature over the largest one, below which there is none
-DIVERGED = 1e12  # stands in for -log L where the filter diverges
-EQUAL_LOGARITHMS = 0.02  # optima this close in every logarithm are one
-PRECISE = 1e-13  # part of -log L, by which an iteration gains at least
-FEW_RUNS = 4  # with which a search of many states begins
-COARSE = 1e-9  # the same of many states, of whose log L, a million, no data can show a thousandth
+FLAT = 1e-12  # curvature relative to the largest one, below which a direction counts as flat
+DIVERGED = 1e12  # in place of -log L where the filter diverges
+EQUAL_LOGARITHMS = 0.02  # optima this close in every logarithm are the same
+PRECISE = 1e-13  # relative decrease of -log L below which the search ends
+FEW_RUNS = 4  # with which the search for a model of many states begins
+COARSE = 1e-9  # the same for models of many states, whose log L is of the order of a million
 
 
 class Optimum(NamedTuple):
-    """Where one start led."""
+    """The result of one start."""
 
-    start: tuple[float, ...]  # factors on the untuned numbers
-    variances: np.ndarray  # (p,), the diagonals of Q, then of R; or the problem's own parameters
+    start: tuple[float, ...]  # factors on the untuned parameters
+    variances: np.ndarray  # (p,), the diagonals of Q, then of R; or the problem's parameters
     log_likelihood: float  # of all training runs
     evaluations: int  # of log-likelihood and gradient
     converged: bool
@@ -44,12 +44,12 @@ class GradientResult(NamedTuple):
     """A maximum of the likelihood, and how well the data determine it."""
 
     choice: Choice
-    names: tuple[str, ...]  # of the numbers
+    names: tuple[str, ...]  # of the parameters
     best: Optimum
     optima: tuple[Optimum, ...]  # one for each start
-    standard_errors: np.ndarray  # (p,), of the numbers' logarithms, from the scatter between runs
-    identified: np.ndarray  # (p,) whether a number's 95 % interval is within a factor of ten
-    agree: bool  # whether all starts led to the same place, in the identified variances
+    standard_errors: np.ndarray  # (p,), of the parameters' logarithms, from the scatter between runs
+    identified: np.ndarray  # (p,) whether a parameter's 95 % interval is within a factor of ten
+    agree: bool  # whether all starts led to the same optimum, in the identified variances
     seconds: float
 
 
@@ -58,19 +58,20 @@ def maximise_likelihood(
 ) -> GradientResult:
     """Find the diagonal Q and R under which a Kalman filter's innovations are most likely.
 
-    Works on the logarithms of the variances, by L-BFGS-B with the gradient of `filters.likelihood`, within the
+    The search is L-BFGS-B in the logarithms of the variances with the gradient of `filters.likelihood`, within the
     same ranges as an Optuna study. With the Hessian H of -log L and the gradients g_b of B independent runs, the
-    errors are the roots of the diagonal of H^-1 (sum_b g_b g_b') H^-1, which holds for a wrong model, too. Where
-    the problem has parameters of its own, from which Q and R follow, it finds these.
+    standard errors are the roots of the diagonal of H^-1 (sum_b g_b g_b') H^-1, which holds for a wrong model,
+    too. Where the problem has parameters of its own, from which Q and R follow, these are estimated.
 
     Args:
         filter_name: "kf" or "ekf".
-        problem: says what the filter assumes of the plant and what the untuned variances are.
-        data: the runs to learn from.
-        starts: factors on the untuned numbers, one for all or one each, (Q11, Q22, ..., R); `starts_of` if None.
+        problem: makes the assumed model, and has the untuned variances.
+        data: the training runs.
+        starts: factors on the untuned parameters, one for all or one each, (Q11, Q22, ..., R); `starts_of` if
+            None.
 
     Raises:
-        ValueError: for another filter, or a parameter of the problem's own that is more than noise.
+        ValueError: for another filter, or a parameter of the problem that changes more than Q and R.
 
     Source: Huber (1967), "The behavior of maximum likelihood estimates under nonstandard conditions".
     """
@@ -105,16 +106,16 @@ def maximise_likelihood(
 
 
 def optimum(filter_name: str, problem: Problem, data: Data, start: Sequence[float] | float = 1.0) -> Optimum:
-    """The maximum to which one start leads, without the errors that `maximise_likelihood` tells.
+    """The maximum to which one start leads, without the standard errors of `maximise_likelihood`.
 
-    Of models with many states, whose likelihood takes long, it is first sought on some runs alone, and the search
-    on all of them begins there; it ends where an iteration gains less than 1e-9 of log L.
+    For models with many states, whose likelihood takes long, the search is first on a few runs, and continues on
+    all runs from there; it ends where an iteration gains less than 1e-9 of log L.
 
     Args:
         filter_name: "kf" or "ekf".
         problem: as for `maximise_likelihood`.
-        data: the runs to learn from.
-        start: factors on the untuned numbers, one for all or one each, (Q11, Q22, ..., R).
+        data: the training runs.
+        start: factors on the untuned parameters, one for all or one each, (Q11, Q22, ..., R).
     """
     parameters = model_parameters(problem)
     untuned = untuned_choice(filter_name, problem)
@@ -133,7 +134,7 @@ def optimum(filter_name: str, problem: Problem, data: Data, start: Sequence[floa
 def slopes_of(problem: Problem, noise_at: Callable, data: Data) -> Callable[[np.ndarray], Likelihood]:
     """Log-likelihood of each run (B,), and its gradients (B, p), as a function of the logarithms of parameters.
 
-    The lead-in of runs that have one, in which the filter settles, counts in neither.
+    The lead-in of runs, in which the filter settles, is left out of both.
     """
     beginning = data.beginning if problem.leads_in and data.first_scored else None
 
@@ -155,7 +156,7 @@ def is_large(problem: Problem) -> bool:
 
 
 def _minimum(slopes: Callable, first: np.ndarray, bounds: list, large: bool):
-    """The least -log L of all runs, from a first point of logarithms on."""
+    """The minimum of -log L of all runs, from a start in logarithms."""
     from scipy.optimize import minimize
 
     def negative(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
@@ -170,7 +171,7 @@ def _minimum(slopes: Callable, first: np.ndarray, bounds: list, large: bool):
 
 
 def starts_of(parameters: Sequence[Parameter]) -> list[tuple[float, ...]]:
-    """Three starts, as factors on the untuned numbers: these themselves, a bad one, and little Q with much R."""
+    """Three starts, as factors on the untuned parameters: 1, a bad start, and a small Q with a large R."""
     channels = [isinstance(one.place, MeasurementVariance) for one in parameters]
     return [(1.0,) * len(parameters), tuple(map(_bad, parameters)), tuple(10.0 if r else 0.1 for r in channels)]
 
@@ -183,9 +184,9 @@ def _bad(parameter: Parameter) -> float:
 
 
 def _standard_errors(slopes: Callable, logarithms: np.ndarray) -> np.ndarray:
-    """Of the maximum's logarithms, (p,): those from the scatter between runs, or from the Hessian if larger.
+    """Standard errors of the logarithms, (p,): from the scatter between runs, or from the Hessian if larger.
 
-    Along a direction in which the likelihood is flat both scatter and Hessian vanish, and the Hessian tells.
+    In a direction in which the likelihood is flat both scatter and Hessian vanish, and the Hessian decides.
     """
     count = len(logarithms)
     hessian = np.empty((count, count))

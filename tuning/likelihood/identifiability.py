@@ -1,4 +1,4 @@
-"""How well the innovations determine a filter's noise covariances, on the runs that it was tuned on."""
+"""Identifiability of a filter's noise covariances from the innovations of the runs that it was tuned on."""
 
 from __future__ import annotations
 
@@ -14,38 +14,43 @@ from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.problem import Problem
 from tuning.search.parameters import places_in
-from tuning.search.space import Choice, choice_of, parameters_of, untuned_choice
+from tuning.search.space import Choice, choice_of, ends_of, parameters_of, untuned_choice
 
-KNOWN_WITHIN = np.log(10.0)  # a 95 % interval that reaches beyond a factor of ten determines nothing
+KNOWN_WITHIN = np.log(10.0)  # a parameter with a wider 95 % interval than a factor of ten is not determined
 TWO_SIDED = 1.96  # standard errors of a 95 % interval
 SIGNIFICANT = 1.92  # fall in log-likelihood: half of the 95 % point of chi-squared with one degree of freedom
 STEP = np.log(2.0)  # of differences, in logarithms: ensembles need large ones
-CLOSE = 0.02  # in logarithms, to which the maximum is found
-EVALUATIONS = 100  # at most, on the way there
-LEAST = -1e6  # stands in for the log-likelihood of a run that has none
-MOST_NUMBERS = 24  # a curvature takes a run of all data for each pair of numbers
-COMPANION = 0.2  # part in a direction, of the largest one, from which on a number is named
+CLOSE = 0.02  # tolerance of the maximum, in logarithms
+EVALUATIONS = 100  # at most, in the search of the maximum
+LEAST = -1e6  # in place of a log-likelihood that is not finite
+MOST_NUMBERS = 24  # a curvature takes a run of all data for each pair of parameters
+COMPANION = 0.2  # component of a direction, relative to the largest one, from which a parameter is named
 
 
 class Identifiability(NamedTuple):
-    """What the innovations of B runs say of p positive numbers; covariances are those of their logarithms."""
+    """What the innovations of B runs determine of p positive parameters; covariances are of their logarithms."""
 
     names: tuple[str, ...]
-    tuned: np.ndarray  # (p,), what the study chose
-    likeliest: np.ndarray  # (p,), under which the innovations are most likely
+    tuned: np.ndarray  # (p,), the choice of the study
+    most_likely: np.ndarray  # (p,), under which the innovations are most likely
     cov: np.ndarray  # (p, p)
     identified: np.ndarray  # (p,) bool, as `is_identified` says
 
     @property
     def factors(self) -> np.ndarray:
-        """The 95 % interval of each number is the likeliest one over and times this, (p,)."""
+        """The 95 % interval of each parameter is the most likely value, divided and multiplied by this, (p,)."""
         return np.exp(TWO_SIDED * np.sqrt(np.diag(self.cov)))
 
     @property
-    def loosest(self) -> dict[str, float]:
-        """The least known direction: factors by which the numbers go along while the first of them goes up by ten.
+    def likeliest(self) -> np.ndarray:
+        """The former name of `most_likely`."""
+        return self.most_likely
 
-        Only numbers with a part in it are told.
+    @property
+    def least_determined(self) -> dict[str, float]:
+        """The least determined direction: factors on the parameters when the first of them grows by ten.
+
+        Only parameters with a component in it are listed.
         """
         axis = np.linalg.eigh(self.cov)[1][:, -1]
         order = np.argsort(-abs(axis))
@@ -60,17 +65,17 @@ class Identifiability(NamedTuple):
 def identify(
     choice: Choice, scenarios: Sequence[Problem], data: Sequence[Data], space: Mapping[str, BaseDistribution]
 ) -> Identifiability | None:
-    """How well the innovations determine a choice's numbers of the model; None without a covariance.
+    """How well the innovations determine the parameters of a choice's model; None without a covariance.
 
-    By default these are Q's variances, R and the scale of P_0. Of more than 24 numbers it is None, too.
+    By default these are Q's variances, R and the scale of P_0. For more than 24 parameters it is None, too.
 
-    It works for every filter with a covariance: only its innovations' log-likelihood is needed.
+    It works for every filter with a covariance: only the log-likelihood of its innovations is needed.
 
     Args:
-        choice: of one kind of filter; its other numbers are held.
-        scenarios: whose runs count.
+        choice: choice of one filter type; the filter's own parameters are held.
+        scenarios: the problems.
         data: for each scenario, the training data.
-        space: numbers that were searched with their ranges, `Plan.space`.
+        space: distributions of the tuned parameters, `Plan.space`.
     """
     own = parameters_of(choice)
     names = _names(choice, space)
@@ -89,27 +94,27 @@ def identify(
         return np.where(np.isfinite(found), found, LEAST)
 
     tuned = np.array([own[name] for name in names])
-    bounds = np.log([(space[name].low, space[name].high) for name in names])
+    bounds = np.log([ends_of(space[name]) for name in names])
     untuned = parameters_of(untuned_choice(choice.name, scenarios[0]))
     starts = np.log(tuned), np.log([untuned.get(name, own[name]) for name in names])
-    likeliest = maximum(log_likelihoods, starts, bounds)
-    told = known_information(choice, scenarios, data, names, np.exp(likeliest))
-    cov = covariance(curvatures(log_likelihoods, likeliest) if told is None else told)
-    identified = is_identified(log_likelihoods, likeliest, cov, bounds)
-    return Identifiability(names, tuned, np.exp(likeliest), cov, identified)
+    best = maximum(log_likelihoods, starts, bounds)
+    told = known_information(choice, scenarios, data, names, np.exp(best))
+    cov = covariance(curvatures(log_likelihoods, best) if told is None else told)
+    identified = is_identified(log_likelihoods, best, cov, bounds)
+    return Identifiability(names, tuned, np.exp(best), cov, identified)
 
 
 def too_many(choice: Choice, space: Mapping[str, BaseDistribution]) -> list[str]:
-    """Why it is not worked out what the innovations determine, where that is for the number of numbers."""
+    """A sentence if identifiability is not computed because of too many parameters; else nothing."""
     count = len(_names(choice, space))
     if count <= MOST_NUMBERS:
         return []
-    rule = f"It is worked out for at most {MOST_NUMBERS} numbers which of them the innovations determine"
-    return [f"{rule}; here are {count}, and parameters of the problem's own would make them few."]
+    rule = f"Identifiability is computed for at most {MOST_NUMBERS} parameters"
+    return [f"{rule}; here are {count}. A problem may define fewer parameters of its own."]
 
 
 def _names(choice: Choice, space: Mapping[str, BaseDistribution]) -> tuple[str, ...]:
-    """The model's numbers that were searched; none without a covariance. Correlations have no logarithm."""
+    """The tuned parameters of the model; none without a covariance. Correlations have no logarithm."""
     places = places_in(choice) if filter_class(choice.name).has_covariance else ()
     return tuple(name for name, range_ in space.items() if name in places and getattr(range_, "log", False))
 
@@ -117,11 +122,11 @@ def _names(choice: Choice, space: Mapping[str, BaseDistribution]) -> tuple[str, 
 def maximum(
     log_likelihoods: Callable[[np.ndarray], np.ndarray], starts: Sequence[np.ndarray], bounds: np.ndarray
 ) -> np.ndarray:
-    """Where the log-likelihood of all runs is largest, (p,), found by quadratic models without derivatives.
+    """The maximum of the log-likelihood of all runs, (p,), by quadratic models without derivatives.
 
     Args:
-        log_likelihoods: of each run, (B,), as a function of logarithms (p,).
-        starts: points (p,), of which the likeliest one is where the search begins.
+        log_likelihoods: the function that returns those of all runs, (B,), at logarithms (p,).
+        starts: points (p,); the search begins at the most likely of them.
         bounds: low and high, (p, 2).
 
     Source: Ragonneau, Zhang (2023), "COBYQA: a derivative-free trust-region SQP method".
@@ -145,7 +150,7 @@ def curvatures(log_likelihoods: Callable[[np.ndarray], np.ndarray], at: np.ndarr
     """Minus the second derivatives of B log-likelihoods, (B, p, p), by central differences of a factor of two.
 
     Args:
-        log_likelihoods: of each run, (B,), as a function of logarithms (p,).
+        log_likelihoods: the function that returns those of all runs, (B,), at logarithms (p,).
         at: the logarithms, (p,).
     """
     count, steps = len(at), STEP * np.eye(len(at))
@@ -162,13 +167,13 @@ def curvatures(log_likelihoods: Callable[[np.ndarray], np.ndarray], at: np.ndarr
 
 
 def covariance(curvatures: np.ndarray) -> np.ndarray:
-    """Covariance (p, p) of the logarithms of p numbers, from the curvature of a log-likelihood at its maximum.
+    """Covariance (p, p) of the logarithms of p parameters, from the curvature of a log-likelihood at its maximum.
 
         H = - sum over runs of d2 log L / d theta2,   C = (H_sure + I / (ln 10)^2)^-1
 
-    H_sure has H's directions. A direction's curvature there is that in H less 1.96 of its standard errors over
-    runs, and at least zero: noise is no information. The last term stands for what is known before: the order of
-    magnitude. So a number of which the data say nothing has a standard error of a factor of ten.
+    H_sure has H's directions. The curvature in each direction is that of H minus 1.96 of its standard errors over
+    runs, and at least zero, because noise is not information. The last term is the prior: the order of magnitude
+    is known. So a parameter on which the data have no information has a standard error of a factor of ten.
 
     Args:
         curvatures: of each of B independent runs, (B, p, p), or their expectations, Fisher's information.
@@ -186,14 +191,14 @@ def covariance(curvatures: np.ndarray) -> np.ndarray:
 def is_identified(
     log_likelihoods: Callable[[np.ndarray], np.ndarray], at: np.ndarray, cov: np.ndarray, bounds: np.ndarray
 ) -> np.ndarray:
-    """Whether the data determine each of p numbers within a factor of ten, (p,) bool.
+    """Whether the data determine each of p parameters within a factor of ten, (p,) bool.
 
-    They do if its 95 % interval is within that, if ten times more and ten times less are significantly less
-    likely (log L falls by 1.92), where the other numbers go along as `cov` says, and if the maximum is not at an
-    end of the range. The second rule sees what a curvature does not: that there may be no limit on one side.
+    They do if its 95 % interval is within that, if ten times more and ten times less are significantly less likely
+    (log L falls by 1.92) when the other parameters move with it as in `cov`, and if the maximum is not at an end
+    of the range. The second rule detects what a curvature does not: that there may be no limit on one side.
 
     Args:
-        log_likelihoods: of each run, (B,), as a function of logarithms (p,).
+        log_likelihoods: the function that returns those of all runs, (B,), at logarithms (p,).
         at: the logarithms under which the runs are most likely, (p,).
         cov: from `covariance`.
         bounds: low and high, (p, 2).
@@ -206,7 +211,7 @@ def is_identified(
     narrow = TWO_SIDED * np.sqrt(variances) < KNOWN_WITHIN
     inside = (at > bounds[:, 0] + CLOSE) & (at < bounds[:, 1] - CLOSE)
     moves = KNOWN_WITHIN * cov / variances[:, None]
-    # Where one number is known far better than another, the other would go along by a hundred orders of magnitude.
+    # Where one parameter is known far better than another, the other would move by a hundred orders of magnitude.
     low, high = bounds[:, 0] - KNOWN_WITHIN, bounds[:, 1] + KNOWN_WITHIN
     falls = [
         [highest - log_likelihoods(np.clip(at + sign * move, low, high)).sum() for sign in (1, -1)]
@@ -216,24 +221,24 @@ def is_identified(
 
 
 def sentences(found: Identifiability) -> list[str]:
-    """What the innovations determine, and what they do not."""
+    """Sentences on what the innovations determine, and what they do not."""
     rows = list(zip(found.names, found.identified, found.factors, strict=True))
     known = [f"{name} within a factor of {factor:.3g}" for name, known, factor in rows if known]
     loose = [name for name, known, _ in rows if not known]
     said = [f"The innovations of the training runs determine {_listed(known or ['nothing'])} (95 %)."]
     if loose:
-        parts = [f"{name} x {factor:.2g}" for name, factor in found.loosest.items()]
-        trade = f" Least known is the direction of {_listed(parts)}." if len(parts) > 1 else ""
+        parts = [f"{name} x {factor:.2g}" for name, factor in found.least_determined.items()]
+        trade = f" The least determined direction is {_listed(parts)}." if len(parts) > 1 else ""
         said.append(
-            f"They do not determine {_listed(loose)}: a factor of ten makes no difference that they can show, or "
-            f"the likeliest value lies at the end of the range.{trade}"
+            f"They do not determine {_listed(loose)}: a factor of ten makes no significant difference, or "
+            f"the most likely value lies at the end of the range.{trade}"
         )
     return said
 
 
 def as_data(found: Identifiability) -> dict:
-    """The numbers as plain data, by name."""
-    columns = found.names, found.likeliest.tolist(), found.factors.tolist(), found.identified.tolist()
+    """The result as plain data, by parameter."""
+    columns = found.names, found.most_likely.tolist(), found.factors.tolist(), found.identified.tolist()
     return {
         name: {"most_likely": best, "known_within_a_factor_of": factor, "determined": known}
         for name, best, factor, known in zip(*columns, strict=True)

@@ -1,4 +1,4 @@
-"""Q and R of a model as functions of the numbers that are tuned, with their slopes."""
+"""Q and R of a model as functions of the tuned parameters, with their derivatives."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ from filters.likelihood import information
 from filters.registry import make_filter
 from plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
-from tuning.problems.parameter import Parameter
+from tuning.problems.parameter import Parameter, Place
 from tuning.problems.problem import Problem
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters
 from tuning.search.space import Choice
 
 DIFFERENTIABLE = ("kf", "ekf")  # filters
-LEAST_NUMBERS = 8  # from which on the information is sooner found than differences
+LEAST_NUMBERS = 8  # number of parameters from which the information is faster than differences
 STEP = 1e-4  # in the logarithms, of the differences of Q and R
 
 
 def noise_family(choice: Choice, problem: Problem, parameters: Sequence[Parameter]) -> Callable:
-    """The function noise_at(values, data) that gives the arguments of `filters.likelihood`.
+    """The function noise_at(values, data) that returns the arguments of `filters.likelihood`.
 
     These are the model with the Q and R that follow from positive values (p,), the data's inputs and measurements,
-    and dQ, dR along the logarithm of each value: exact for variances, else central differences of the model's.
+    and the derivatives of Q and R by the logarithm of each value: exact for variances, else central differences.
 
     Args:
-        choice: of a Kalman filter, whose model is changed.
-        problem: whose model it is.
-        parameters: the numbers, p of them.
+        choice: choice of a Kalman filter.
+        problem: makes the model.
+        parameters: the p parameters.
 
     Raises:
         ValueError: if a parameter is not on a logarithmic scale, or changes more of the model than Q and R.
@@ -69,16 +69,16 @@ def noise_family(choice: Choice, problem: Problem, parameters: Sequence[Paramete
 def known_information(
     choice: Choice, scenarios: Sequence[Problem], data: Sequence[Data], names: Sequence[str], values: np.ndarray
 ) -> np.ndarray | None:
-    """Fisher's information on the logarithms of a Kalman filter's numbers in each of B runs, (B, p, p).
+    """Fisher information on the logarithms of a Kalman filter's parameters in each of B runs, (B, p, p).
 
-    None for other filters, and where a number is more than noise. It takes the time of some fifteen runs of the
-    filter, where differences take two for each pair of numbers.
+    None for other filters, and where a parameter changes more than Q and R. It takes the time of about fifteen
+    runs of the filter; differences take two runs for each pair of parameters.
 
     Args:
-        choice: of one kind of filter; its other numbers are held.
-        scenarios: whose runs count.
+        choice: choice of one filter type; its other parameters are held.
+        scenarios: the problems.
         data: for each scenario, its runs.
-        names: of the p numbers.
+        names: names of the p parameters.
         values: at which the information is taken, (p,).
     """
     if choice.name not in DIFFERENTIABLE or len(names) < LEAST_NUMBERS:
@@ -91,7 +91,7 @@ def known_information(
         try:
             noise_at = noise_family(choice, scenario, [known[name] for name in names])
             told = information(*noise_at(values, one))
-            if scenario.leads_in and one.first_scored:  # that of the lead-in does not count
+            if scenario.leads_in and one.first_scored:  # the lead-in is left out
                 told = told - information(*noise_at(values, one.beginning))
             found.append(told)
         except ValueError:  # more than Q and R changes
@@ -102,7 +102,7 @@ def known_information(
 def _variances(model: StateSpaceModel, parameters: Sequence[Parameter]) -> Callable:
     n, m, count = model.n, model.m, len(parameters)
     diagonal = np.append(np.diag(model.process_noise_cov), np.diag(model.measurement_noise_cov))
-    places = [one.place.index + n * isinstance(one.place, MeasurementVariance) for one in parameters]
+    places = [_index(one.place, n) for one in parameters]
 
     def noise_at(values: np.ndarray, data: Data):
         variances = diagonal.copy()
@@ -114,6 +114,15 @@ def _variances(model: StateSpaceModel, parameters: Sequence[Parameter]) -> Calla
         return changed, data.inputs, data.measurements, slopes[:, :n, :n], slopes[:, n:, n:]
 
     return noise_at
+
+
+def _index(place: Place, n: int) -> int:
+    """The index of a variance in the diagonals of Q, (n,), then of R."""
+    if isinstance(place, MeasurementVariance):
+        return n + place.index
+    if isinstance(place, ProcessVariance):
+        return place.index
+    raise TypeError(f"a parameter must be a variance of Q or R, but got {place}")
 
 
 def _is_diagonal(cov: np.ndarray) -> bool:

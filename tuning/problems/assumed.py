@@ -1,10 +1,11 @@
-"""What problems of any plant share: the model that filters assume, the rule of thumb, and what is tuned."""
+"""What problems of any plant share: the model that filters assume, the rule of thumb, and the parameters."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -18,25 +19,25 @@ from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 
-RANGE_SEEDS = range(8)  # whose runs tell each state's range, where the model does not
-RANGE_FRACTION = 0.01  # standard deviation of the rule of thumb's Q, as part of each state's range
+RANGE_SEEDS = range(8)  # seeds whose runs determine each state's range, unless the model has it
+RANGE_FRACTION = 0.01  # standard deviation of the rule of thumb's Q, as a fraction of each state's range
 MOST_STEPS = 1_000_000
 
 
 class AssumedProblem(Problem):
-    """A problem whose filters assume a `StateSpaceModel`, or what a function makes of the problem's parameters.
+    """A problem whose filters assume a `StateSpaceModel`, or a function of parameters that returns one.
 
     Args:
-        assumed: the model, or a function of keyword arguments, the names of `parameters`, that makes it.
+        assumed: the model, or a function that makes it; its keyword arguments are the names of `parameters`.
         steps: length K of a run.
-        first_scored_step: where errors begin to count; below 50 the start-up counts, too, and a study then tunes
-            the scale of P_0.
-        scale: what errors of each state are measured in; found from the truth if None.
-        parameters: what a study tunes of the model, in place of the variances of Q and R.
+        first_scored_step: the first step whose error is scored; below 50 the start-up is scored, too, and a study
+            then tunes the scale of P_0.
+        scale: by which the score divides the error of each state; computed from the truth if None.
+        parameters: parameters of the model that a study tunes, in place of the variances of Q and R.
         untuned: arguments of the model before any tuning; by rule of thumb if None.
-        true: arguments of the model that knows the plant's own Q and R, if they are known.
-        dt: sample time [s], if there is one.
-        name: by which messages call it; that under which it is found takes its place.
+        true: arguments of the oracle's model, with the plant's own Q and R, if they are known.
+        dt: sample time [s], if there is one; covariances are per step and do not scale with it.
+        name: its name in messages; replaced by the name under which it is found.
         about: one line for tables.
 
     Raises:
@@ -79,16 +80,17 @@ class AssumedProblem(Problem):
 
     @abstractmethod
     def found_scale(self) -> np.ndarray:
-        """What errors are measured in where no scale is given."""
+        """The scale where none is given."""
 
     def model(self, **changes) -> StateSpaceModel:
-        """The assumed model, but for the changes; see `Problem.model`."""
-        noise = {key: changes.pop(key) for key in (*NOISE, PRIOR) if key in changes}
+        """The assumed model with some changes; see `Problem.model`."""
+        noise: dict[str, Any] = {key: changes.pop(key) for key in (*NOISE, PRIOR) if key in changes}
         given = {one.name: one.start for one in self._parameters or ()} | changes
-        model = self._assumed
-        if not isinstance(model, StateSpaceModel):
-            model = self._made(given)
-        elif given:
+        if not isinstance(self._assumed, StateSpaceModel):
+            model = self._made(self._assumed, given)
+        elif not given:
+            model = self._assumed
+        else:
             raise ValueError(
                 f"arguments of the model of problem {self.name} must be among {', '.join((*NOISE, PRIOR))}, "
                 f"but got {', '.join(given)}"
@@ -102,16 +104,16 @@ class AssumedProblem(Problem):
         """Inputs, measurements and, where it is known, truth for seeds."""
         return _data(self, tuple(int(seed) for seed in seeds))
 
-    @cached_property
-    def scale(self) -> tuple[float, ...] | None:
-        """What errors of each state are measured in, as it is given or else found; None without truth."""
+    @cached_property  # computed at first use, for it may take many runs
+    def scale(self) -> tuple[float, ...] | None:  # type: ignore[override]  # an attribute, as in other problems
+        """By which the score divides the error of each state, as given or computed; None without truth."""
         if self._scale is not None:
             return self._scale
         return None if self.data(self.range_seeds).states is None else tuple(self.found_scale().tolist())
 
     @property
     def parameters(self) -> tuple[Parameter, ...] | None:
-        """What a study tunes of the model; None for the variances of Q and R."""
+        """Parameters of the model that a study tunes; None for the variances of Q and R."""
         return self._parameters
 
     @property
@@ -123,17 +125,17 @@ class AssumedProblem(Problem):
 
     @property
     def true(self) -> dict | None:
-        """Arguments of the model that knows the plant's own Q and R; None if they are unknown."""
+        """Arguments of the oracle's model, with the plant's own Q and R; None if they are unknown."""
         return self._true
 
     @property
     def range_seeds(self) -> range:
-        """Seeds whose runs tell each state's range."""
+        """Seeds whose runs determine each state's range."""
         return RANGE_SEEDS
 
     @property
     def counts_start_up(self) -> bool:
-        """Whether the first steps count, in which P_0 is felt."""
+        """Whether the first steps are scored, on which P_0 has an effect."""
         return self.first_scored_step < FIRST_SCORED_STEP and bool(self.model().prior_cov.any())
 
     @property
@@ -143,13 +145,13 @@ class AssumedProblem(Problem):
 
     @property
     def assumptions(self) -> tuple:
-        """All that is said of it beside where the data come from, for its digest."""
+        """All arguments but those that the data come from, for the digest."""
         of_runs = self.steps, self.first_scored_step, self._scale, self._dt
         return self._assumed, self._parameters, self._untuned, self._true, *of_runs
 
     @cached_property
     def _thumb(self) -> dict:
-        """R of the assumed model, which is the data sheet's, and Q = diag((1 % of each state's range)^2)."""
+        """R of the assumed model (from the data sheet), and Q = diag((1 % of each state's range)^2)."""
         model = self.model()
         deviations = np.sqrt(np.diag(model.process_noise_cov))
         if model.state_low is not None and model.state_high is not None:
@@ -159,9 +161,9 @@ class AssumedProblem(Problem):
         variances = tuple(float(v) for v in deviations**2)
         return {"process_noise_cov": variances, "measurement_noise_cov": as_argument(model.measurement_noise_cov)}
 
-    def _made(self, given: Mapping) -> StateSpaceModel:
+    def _made(self, make: Callable[..., StateSpaceModel], given: Mapping) -> StateSpaceModel:
         try:
-            model = self._assumed(**given)
+            model = make(**given)
         except Exception as error:
             wanted = ", ".join(given) or "no arguments"
             raise ValueError(
@@ -188,7 +190,7 @@ def rows_of(states: np.ndarray, model: StateSpaceModel) -> np.ndarray:
 
 
 def as_argument(cov: np.ndarray):
-    """A covariance as a choice holds it: one variance, some, or the rows of a matrix."""
+    """A covariance as a choice stores it: one variance, several, or the rows of a matrix."""
     if np.count_nonzero(cov - np.diag(np.diag(cov))):
         return tuple(map(tuple, cov.tolist()))
     variances = tuple(np.diag(cov).tolist())
@@ -196,7 +198,7 @@ def as_argument(cov: np.ndarray):
 
 
 def rows_argument(cov: np.ndarray):
-    """As `as_argument`, but of one state a tuple, too, as a choice holds Q."""
+    """As `as_argument`, but a tuple for a single state, too, as a choice stores Q."""
     found = as_argument(cov)
     return found if isinstance(found, tuple) else (found,)
 

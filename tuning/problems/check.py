@@ -1,4 +1,4 @@
-"""Whether a problem is one: its model and its data have to fit each other in shape, names and units."""
+"""Checks of a problem: its model and its data have to agree in shapes, names and units."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 
-SEEDS = (0, 1)  # of the data that a problem is tried with
+SEEDS = (0, 1)  # with which a problem is checked
 
 
 def checked_problem(problem, name: str | None = None) -> Problem:
-    """A problem as it is given, tried with the data of two seeds.
+    """The same problem, checked with the data of two seeds.
 
     Args:
-        problem: what has to be one.
-        name: what messages call it, its own name if None.
+        problem: the object to check.
+        name: its name in messages; its own name if None.
 
     Raises:
-        ValueError: in one line, for what is no `Problem`, or one whose model, data, names, units or scale are not
-            of the same shape, or whose numbers are not finite.
+        ValueError: in one line, for an object that is not a `Problem`, or a problem whose model, data, names,
+            units or scale do not agree, or whose numbers are not finite.
     """
     if not isinstance(problem, Problem):
         raise ValueError(
@@ -43,7 +43,7 @@ def checked_problem(problem, name: str | None = None) -> Problem:
 
 
 def check_data(data: Data, model: StateSpaceModel, name: str) -> None:
-    """Raise ValueError unless data have the shapes of a model, and no number is infinite, or NaN but as a gap."""
+    """Raise ValueError unless data have the shapes of a model and are finite; measurements may be NaN."""
     count, steps = len(data.seeds), np.shape(data.inputs)[1] if np.ndim(data.inputs) == 3 else 0
     wanted = {
         "inputs": (count, steps, model.inputs),
@@ -78,7 +78,7 @@ def check_data(data: Data, model: StateSpaceModel, name: str) -> None:
 
 
 def check_model(model: StateSpaceModel, data: Data, name: str) -> None:
-    """Raise ValueError unless f and h of a model are finite where the data begin."""
+    """Raise ValueError unless f and h of a model are finite at the first states of the data."""
     points = {"its prior mean": model.prior_mean}
     if data.states is not None and data.states.shape[-1] == model.n:
         points["the first true state"] = data.states[0, 0]
@@ -90,16 +90,16 @@ def check_model(model: StateSpaceModel, data: Data, name: str) -> None:
             "observe": lambda x=x, c=c: model.observe(x, c),
         }
         for function, value in functions.items():
+            got: ArithmeticError | tuple
             try:
                 with np.errstate(all="ignore"):
                     result = np.asarray(value(), dtype=np.float64)
+                if np.isfinite(result).all():
+                    continue
+                got = tuple(result.tolist())
             except ArithmeticError as error:
-                result = error
-            if isinstance(result, ArithmeticError) or not np.isfinite(result).all():
-                got = result if isinstance(result, ArithmeticError) else tuple(result.tolist())
-                raise ValueError(
-                    f"{function} of the model of problem {name} must be finite at {where}, but got {got}"
-                )
+                got = error
+            raise ValueError(f"{function} of the model of problem {name} must be finite at {where}, but got {got}")
 
 
 def _check_scale(problem: Problem, data: Data, name: str) -> None:
@@ -120,14 +120,14 @@ def _check_scale(problem: Problem, data: Data, name: str) -> None:
 def check_quantities(
     kind: str, ones: tuple[Quantity, ...], others: tuple[Quantity, ...], whose: str, other: str
 ) -> None:
-    """Raise ValueError, with the first that differs, unless two vectors have the same symbols and units.
+    """Raise ValueError, with the first difference, unless two vectors have the same symbols and units.
 
     Args:
-        kind: of the vectors: "measurements".
-        ones: quantities of the first.
+        kind: what the vectors are, such as "measurements".
+        ones: quantities of the first vector.
         others: those of the second.
-        whose: what the first are of, for messages ...
-        other: ... and the second.
+        whose: owner of the first vector, for messages ...
+        other: ... and of the second.
     """
     if len(ones) != len(others):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""`Data`: inputs and measurements of many runs and, where there is a truth, its states and outputs."""
+"""`Data`: inputs and measurements of many runs and, where they are known, true states and outputs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-FIRST_SCORED_STEP = 50  # RMSE counts steps 50 to 500; start-up is reported apart
+FIRST_SCORED_STEP = 50  # RMSE is of steps 50 to 500; the start-up is reported separately
 
 
 class Data(NamedTuple):
@@ -16,15 +16,22 @@ class Data(NamedTuple):
     seeds: tuple[int, ...]
     inputs: np.ndarray  # (B, K, p)
     measurements: np.ndarray  # (B, K + 1, m), NaN where missing
-    filter_keys: np.ndarray  # (B, 2), of the filters' random numbers
-    first_scored: int = FIRST_SCORED_STEP  # the first step that counts
+    filter_keys: np.ndarray  # (B, 2), keys of the filters' random numbers
+    first_scored: int = FIRST_SCORED_STEP  # the first step that is scored
     states: np.ndarray | None = None  # (B, K + 1, n), the first states of the model; None where there is no truth
     outputs: Mapping[str, np.ndarray] | None = None  # (B, K + 1) each, by symbol; None where there is no truth
 
     @property
     def scored(self) -> slice:
-        """The steps that count."""
+        """The scored steps."""
         return slice(self.first_scored, None)
+
+    @property
+    def known_states(self) -> np.ndarray:
+        """The true states, (B, K + 1, n); ValueError where they are unknown."""
+        if self.states is None:
+            raise ValueError("data must have true states, but got data without truth")
+        return self.states
 
     @property
     def steps(self) -> int:
@@ -33,7 +40,7 @@ class Data(NamedTuple):
 
     @property
     def beginning(self) -> Data:
-        """The steps that do not count, without truth."""
+        """The steps before the first scored one, without truth."""
         first = self.first_scored
         inputs, measurements = self.inputs[:, : max(first - 1, 0)], self.measurements[:, :first]
         return self._replace(inputs=inputs, measurements=measurements, states=None, outputs=None)
@@ -51,7 +58,7 @@ class Data(NamedTuple):
         )
 
     def read_only(self) -> Data:
-        """The same data, whose arrays cannot be written to: those who share them see the same."""
+        """The same data with arrays that cannot be written to, so that they can be shared."""
         arrays = [self.inputs, self.measurements, self.filter_keys, self.states, *(self.outputs or {}).values()]
         for array in arrays:
             if array is not None:

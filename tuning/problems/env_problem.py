@@ -1,4 +1,4 @@
-"""`EnvProblem`: any Gymnasium env under a policy, and what filters assume of it."""
+"""`EnvProblem`: any Gymnasium env under a policy, and the model that filters assume for it."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ from plants.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_of
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.digest import digest_of
-from tuning.problems.excitation import EXCITATIONS, Excitation
+from tuning.problems.excitation import Excitation, excitation_of
 from tuning.problems.parameter import Parameter
 
-SCALE_SEEDS = range(16)  # whose true states' spread is the scale, where none is given
+SCALE_SEEDS = range(16)  # seeds whose true states' standard deviation is the scale, where none is given
 Policy = str | Mapping | Excitation | Callable
 
 
 class EnvProblem(AssumedProblem):
     """Runs of a Gymnasium env under a policy, one episode a seed, with the true state kept.
 
-    The inputs are the policy's actions, clipped to the action space as `EstimateState` clips them. The policy sees
-    the env's observations, not a filter's: all filters meet the same runs.
+    The inputs are the policy's actions, clipped to the action space as `EstimateState` clips them. The policy gets
+    the env's observations, not a filter's estimates: all filters get the same runs.
 
     Args:
         env: an env; its id; or a function that makes it.
         policy: "random" for actions that are uniform over the action space; a function of the observation, or an
             object with `predict(observation)` as Stable-Baselines3 has it; or an excitation, or a mapping with its
             name.
-        model: what filters assume: a `StateSpaceModel`, or a function of `parameters` that makes it.
-        steps: length K of a run; that of the env's spec if None. No episode may end before.
-        state_of: a function of the unwrapped env that gives its state (n,); `info["state"]` if None.
-        measure: a function of (observation, info) that gives the measurement (m,); if None
+        model: the `StateSpaceModel` that filters assume, or a function of `parameters` that makes it.
+        steps: length K of a run; that of the env's spec if None. No episode may terminate earlier.
+        state_of: a function of the unwrapped env that returns its state (n,); `info["state"]` if None.
+        measure: a function of (observation, info) that returns the measurement (m,); if None
             `info["measurement"]` (missing where `info["measurement_valid"]` is false), else the observation.
-        measurement_noise_cov: R of normal noise that is added to what the env shows; none if None.
-        has_truth: whether there is a state to compare with; without it only the innovations are judged.
-        scale: what errors of each state are measured in, infinite for states that do not count; if None the
-            standard deviation of each true state over 16 seeds: a score of 1 is then as good as knowing nothing.
-        env_arguments: of the id or the function.
+        measurement_noise_cov: R of normal noise that is added to the env's measurement; no noise if None.
+        has_truth: whether there is a state to compare with; without it all metrics are of the innovations.
+        scale: by which the score divides the error of each state, infinite for states that do not count; if None
+            the standard deviation of each true state over 16 seeds: a constant estimate then has a score of 1.
+        env_arguments: keyword arguments of the id or the function.
         first_scored_step, parameters, untuned, true, dt, name, about: those of `AssumedProblem`.
 
     Raises:
-        ValueError: if env, policy and model do not fit, or an argument is off.
+        ValueError: if env, policy and model do not fit each other, or an argument is invalid.
     """
 
     def __init__(
@@ -70,19 +70,18 @@ class EnvProblem(AssumedProblem):
         name: str = "an env",
         about: str = "",
     ):
-        """Make the env once, to see that all fits; see the class for the arguments."""
+        """Make the env once, to check that all parts fit; see the class for the arguments."""
         self.env, self.env_arguments = env, dict(env_arguments or {})
         self.state_of, self.measure, self.has_truth = state_of, measure, bool(has_truth)
         self.policy = _checked_policy(policy)
         made = self._make_env(name)
         try:
-            space = made.action_space
-            if not isinstance(space, gym.spaces.Box):
-                raise ValueError(f"the action space of problem {name} must be a Box, but got {space}")
+            space = _box(made, name)
             if steps is None:
                 steps = getattr(made.spec, "max_episode_steps", None) or 500
-            if dt is None and isinstance(getattr(made.unwrapped, "dt", None), float):
-                dt = made.unwrapped.dt
+            own_dt = getattr(made.unwrapped, "dt", None)
+            if dt is None and isinstance(own_dt, float):
+                dt = own_dt
         finally:
             self._close(made)
         super().__init__(
@@ -109,16 +108,19 @@ class EnvProblem(AssumedProblem):
 
     @property
     def digest(self) -> str:
-        """A hash of the env's id or function, the policy, the model and all else that makes the data."""
-        env = self.env
-        if isinstance(env, gym.Env):
-            env = env.spec.to_json() if env.spec is not None else type(env.unwrapped).__qualname__
+        """A hash of the env's id or function, the policy, the model and all else that determines the data."""
+        env: str | Callable
+        if isinstance(self.env, gym.Env):
+            spec = self.env.spec
+            env = spec.to_json() if spec is not None else type(self.env.unwrapped).__qualname__
+        else:
+            env = self.env
         shown_by = self.state_of, self.measure, self.has_truth, self._noise
         return digest_of(env, self.env_arguments, self.policy, shown_by, self.assumptions)
 
     @property
     def untuned(self) -> dict:
-        """As of any problem, with the noise that is added to the measurements as the data sheet's R."""
+        """As for any problem, with the R of the noise that is added to the measurements."""
         if self._noise is None or self._parameters is not None:
             return super().untuned
         return super().untuned | {"measurement_noise_cov": as_argument(self._noise)} | (self._untuned or {})
@@ -128,23 +130,23 @@ class EnvProblem(AssumedProblem):
         keys, env = episode_keys(seeds), self._make_env(self.name)
         given = None
         if isinstance(self.policy, Excitation):
-            size = int(np.prod(env.action_space.shape))
+            size = int(np.prod(_box(env, self.name).shape))
             given = self.policy.inputs(keys, self.steps, self._dt or 1.0, size)
         try:
             runs = [self._run(env, seed, None if given is None else given[i]) for i, seed in enumerate(seeds)]
         finally:
             self._close(env)
-        inputs, measurements, states = (np.array(part, dtype=np.float64) for part in zip(*runs, strict=True))
+        inputs, measurements, found = (np.array(part, dtype=np.float64) for part in zip(*runs, strict=True))
         if self._noise is not None:
             measurements = measurements + _noise(keys, measurements.shape, self._noise)
-        states = states if self.has_truth else None
+        states = found if self.has_truth else None
         outputs = None if states is None else self._outputs(states)
         return Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, states, outputs)
 
     def found_scale(self) -> np.ndarray:
         """The standard deviation of each true state over the scored steps of 16 seeds."""
         data = self.data(SCALE_SEEDS)
-        scale = rows_of(data.states[:, data.scored], self.model()).std(axis=0)
+        scale = rows_of(data.known_states[:, data.scored], self.model()).std(axis=0)
         if not (scale > 0).all():
             raise ValueError(
                 f"the scale of problem {self.name} must be given where a state does not move, "
@@ -159,7 +161,7 @@ class EnvProblem(AssumedProblem):
 
     def _run(self, env: gym.Env, seed: int, given: np.ndarray | None) -> tuple[list, list, list]:
         """Inputs (K, p), measurements (K + 1, m) and states (K + 1, n) of one episode."""
-        space, inputs = env.action_space, []
+        space, inputs = _box(env, self.name), []
         observation, info = env.reset(seed=seed)
         measurements, states = [self._measured(observation, info)], [self._state(env, info)]
         choose = _chooser(self.policy, space, seed)
@@ -215,9 +217,17 @@ class EnvProblem(AssumedProblem):
             env.close()
 
 
+def _box(env: gym.Env, name: str) -> gym.spaces.Box:
+    """The action space of an env; ValueError unless it is a Box."""
+    space = env.action_space
+    if not isinstance(space, gym.spaces.Box):
+        raise ValueError(f"the action space of problem {name} must be a Box, but got {space}")
+    return space
+
+
 def _checked_policy(given: Policy) -> str | Excitation | Callable:
     if isinstance(given, Excitation | Mapping):
-        return EXCITATIONS.make([given])[0]
+        return excitation_of(given)
     if given != "random" and not callable(given) and not hasattr(given, "predict"):
         rule = "policy must be 'random', a function of the observation, what has predict, or an excitation"
         raise ValueError(f"{rule}, but got {shown(given)}")
@@ -236,7 +246,7 @@ def _chooser(policy, space: gym.spaces.Box, seed: int) -> Callable:
 
 
 def _noise(keys: np.ndarray, shape: tuple[int, ...], cov: np.ndarray) -> np.ndarray:
-    """Normal noise (B, K + 1, m) of a covariance, a function of each episode's key and the step alone."""
+    """Normal noise (B, K + 1, m) with a covariance, a function of each episode's key and the step only."""
     steps = np.arange(shape[1])[None, :]
     blocks = [normal_block(b, steps, MEASUREMENT, keys[:, :1], keys[:, 1:]) for b in range(-(-shape[2] // 4))]
     draws = np.stack([one for block in blocks for one in block][: shape[2]], axis=-1)

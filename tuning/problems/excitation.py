@@ -1,13 +1,16 @@
-"""Excitations: inputs that stir a plant so that a filter has something to tell, drawn anew for every seed.
+"""Excitations: inputs that move a plant through its range, drawn anew for every seed.
 
-An excitation is a frozen dataclass of plain numbers, registered by name. What it gives is a function of the
-episodes' keys alone, so that all filters meet the same inputs.
+An excitation is a frozen dataclass of plain numbers, registered by name. Its inputs are a function of the
+episodes' keys alone, so that all filters get the same inputs.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -17,11 +20,12 @@ from plants.disturbances.effects import LONGEST, Effect, Registry, set_field
 from plants.disturbances.sensors import probability
 
 EXCITATIONS = Registry("excitation")
+MOST_STEPS = int(LONGEST)  # for which a level is held
 Level = float | tuple[float, ...]  # one for all inputs, or one each, in their units
 
 
 class Excitation(Effect):
-    """Base of all excitations; fields of the dataclass are the arguments."""
+    """Base class of all excitations; fields of the dataclass are the arguments."""
 
     def inputs(self, keys: np.ndarray, steps: int, dt: float, count: int) -> np.ndarray:
         """Inputs (B, steps, count) for keys (B, 2) and a sample time [s]."""
@@ -33,8 +37,16 @@ class Excitation(Effect):
         return np.stack(each, axis=2) if each else np.zeros((len(keys), steps, 0))
 
     def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
-        """One of the inputs, (B, steps), by its number from 0."""
+        """One of the inputs, (B, steps), by its index from 0."""
         raise TypeError(f"{type(self).__name__} has no inputs: use one of its subclasses")
+
+
+def excitation_of(given: Excitation | Mapping) -> Excitation:
+    """An excitation as it is, or from a mapping with its name; ValueError for an unknown one."""
+    (found,) = EXCITATIONS.make([given])
+    if not isinstance(found, Excitation):
+        raise TypeError(f"an excitation must be a subclass of Excitation, but got {type(found).__name__}")
+    return found
 
 
 @EXCITATIONS.register("steps")
@@ -48,7 +60,7 @@ class Steps(Excitation):
     def __post_init__(self):
         """Check the arguments."""
         set_field(self, "amplitude", levels("amplitude", self.amplitude))
-        set_field(self, "hold", at_least("hold", self.hold, 1, LONGEST))
+        set_field(self, "hold", at_least("hold", self.hold, 1, MOST_STEPS))
 
     def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
         """One of the inputs, (B, steps)."""
@@ -81,8 +93,8 @@ class Levels(Excitation):
         set_field(self, "high", levels("high", self.high, signed=True))
         if np.any(np.asarray(self.low) > np.asarray(self.high)):
             raise ValueError(f"low must be at most high, {self.high}, but got {self.low}")
-        set_field(self, "shortest", at_least("shortest", self.shortest, 1, LONGEST))
-        set_field(self, "longest", at_least("longest", self.longest, self.shortest, LONGEST))
+        set_field(self, "shortest", at_least("shortest", self.shortest, 1, MOST_STEPS))
+        set_field(self, "longest", at_least("longest", self.longest, self.shortest, MOST_STEPS))
 
     def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
         """One of the inputs, (B, steps)."""
@@ -135,8 +147,8 @@ class Dwells(Excitation):
     def __post_init__(self):
         """Check the arguments."""
         set_field(self, "amplitude", levels("amplitude", self.amplitude))
-        set_field(self, "ramp", at_least("ramp", self.ramp, 1, LONGEST))
-        set_field(self, "dwell", at_least("dwell", self.dwell, 0, LONGEST))
+        set_field(self, "ramp", at_least("ramp", self.ramp, 1, MOST_STEPS))
+        set_field(self, "dwell", at_least("dwell", self.dwell, 0, MOST_STEPS))
         set_field(self, "zeros", probability("zeros", self.zeros))
 
     def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
@@ -157,13 +169,13 @@ def held_levels(keys: np.ndarray, amplitude: float, hold: int, steps: int, numbe
 
 
 def uniforms(keys: np.ndarray, draws: np.ndarray, number: int = 0) -> tuple[np.ndarray, ...]:
-    """Four uniform numbers in (0, 1), each (B, K), for keys (B, 2), the draws (K,) and the input's number."""
+    """Four uniform numbers in (0, 1), each (B, K), for keys (B, 2), the draws (K,) and the input's index."""
     return uniform_block(number, draws[None, :], EXCITATION, keys[:, :1], keys[:, 1:])
 
 
-def levels(name: str, given, *, signed: bool = False) -> Level:
+def levels(name: str, given: Any, *, signed: bool = False) -> Level:
     """One level for all inputs, or one each; ValueError unless finite and, if not signed, not negative."""
-    check = finite if signed else (lambda name, value: positive(name, value, zero_allowed=True))
+    check: Callable[[str, Any], float] = finite if signed else partial(positive, zero_allowed=True)
     return tuple(check(name, one) for one in given) if isinstance(given, list | tuple) else check(name, given)
 
 

@@ -1,4 +1,4 @@
-"""Scenarios in TOML files: what a user may write, and one clear line about what is wrong with it."""
+"""Scenarios in TOML files, with a clear one-line error for a wrong file."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TypeVar
 
-from numerics.checks import one_of, shown
+from numerics.checks import any_case, meant, one_of, shown
 from numerics.toml import read_toml
 from tuning.problems.rooms import ROOMS, room_of
 from tuning.problems.scenario import BaseScenario
 
 FILE_SEQUENCES = 200  # input sequences for the scale of a file that gives none
-PLANT = "plant"  # the key that says whose scenario it is
+PLANT = "plant"  # the key that names the plant
 BASE = "base"
 S = TypeVar("S", bound=BaseScenario)
 
@@ -21,12 +21,12 @@ S = TypeVar("S", bound=BaseScenario)
 def read_scenario(path: str | Path) -> BaseScenario:
     """A scenario from a TOML file, named by the path.
 
-    Its keys are `plant`, one of `rooms.ROOMS`, "thruster" if it is left out; the fields of that plant's `Scenario`
-    but for the name; and `base`: the scenario whose fields are taken where the file has none of its own, the
-    plant's nominal one if it is left out. Where the file has no `scale`, it is computed.
+    Its keys are `plant`, one of `rooms.ROOMS` ("thruster" by default); the fields of that plant's `Scenario`
+    without the name; and `base`, the scenario whose fields are used where the file has none of its own (the
+    plant's nominal one by default). A `scale` that is not in the file is computed.
 
         base = "outliers"
-        about = "outliers under a binary sequence, with a flow that the filter does not know"
+        about = "outliers under a binary sequence, with a flow that is unknown to the filter"
         excitation = {name = "prbs", amplitude = 8.0, hold = 40}
         flow = [{name = "gusts", std = 0.5}]
 
@@ -60,9 +60,9 @@ def find_in(known: Mapping[str, S], kind: type[S], whose: str, name: str) -> S:
 
     Args:
         known: the plant's scenarios by name.
-        kind: the plant's class of them.
-        whose: they are, for messages.
-        name: that of one of them, or of a file that ends in .toml.
+        kind: the class of the plant's scenarios.
+        whose: the plant in messages, such as "the thruster's".
+        name: the name of one of them, or of a file that ends in .toml.
 
     Raises:
         ValueError: for an unknown name, a file that `read_scenario` refuses, or one of another plant.
@@ -72,14 +72,15 @@ def find_in(known: Mapping[str, S], kind: type[S], whose: str, name: str) -> S:
         if not isinstance(found, kind):
             raise ValueError(f"scenario must be {whose}, but {name} is of plant {found.plant_kind!r}")
         return found
-    if not isinstance(name, str) or name not in known:
-        names = ", ".join(known)
-        raise ValueError(f"scenario must be one of {names}, or a file that ends in .toml, but got {shown(name)}")
-    return known[name]
+    own = any_case(name, known)
+    if not isinstance(own, str) or own not in known:
+        rule = f"scenario must be one of {', '.join(known)}, or a file that ends in .toml"
+        raise ValueError(f"{rule}, but got {shown(name)}{meant(name, known)}")
+    return known[own]
 
 
 def scenario_of(content, name: str, file: str | Path) -> BaseScenario:
-    """The scenario of which `BaseScenario.as_mapping` is the content, as a tuned file keeps it.
+    """The scenario whose `BaseScenario.as_mapping` is the content, as a tuned file stores it.
 
     Args:
         content: the mapping.
@@ -100,7 +101,7 @@ def scenario_of(content, name: str, file: str | Path) -> BaseScenario:
 
 
 def _room(content: dict, path: str | Path):
-    """The room of the plant whose scenario a file's content is; takes the key away."""
+    """The package of the plant of a scenario file; removes the key from the content."""
     try:
         return room_of(one_of("plant of a scenario", content.pop(PLANT, next(iter(ROOMS))), tuple(ROOMS)))
     except ValueError as error:
@@ -112,17 +113,17 @@ def _fields(scenario: type[BaseScenario]) -> list[str]:
 
 
 def _checked(scenario: BaseScenario) -> BaseScenario:
-    scenario.model()  # which makes the plant: the rest is checked there
+    scenario.model()  # makes the plant, which checks the other fields
     return scenario
 
 
 def _made(make: Callable[[], BaseScenario], content: Mapping, path: str | Path) -> BaseScenario:
-    """What `make` makes of a file's content; a ValueError with the path where that cannot be."""
+    """The scenario that `make` makes from a file's content; a ValueError with the path if it fails."""
     try:
         return make()
     except ValueError as error:
         raise ValueError(f"{error} (in {path})") from None
-    except (TypeError, AttributeError) as error:  # a value of another kind than the plant takes
+    except (TypeError, AttributeError) as error:  # a value of another type than the plant takes
         raise ValueError(
             f"values of a scenario must be such as `Scenario` takes, but got {shown(content)} in {path}: {error}"
         ) from None

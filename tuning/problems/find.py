@@ -6,7 +6,7 @@ import copy
 from collections.abc import Sequence
 from pathlib import Path
 
-from numerics.checks import shown
+from numerics.checks import any_case, meant, shown
 from numerics.modules import is_code, object_named, said
 from tuning.problems.check import checked_problem
 from tuning.problems.files import read_scenario
@@ -15,26 +15,27 @@ from tuning.problems.rooms import built_in
 
 
 def find_problem(name: str) -> Problem:
-    """A problem by its name, from a FILE.toml, or by "module:object": the object, or what a function gives.
+    """A problem by its name, from a FILE.toml, or by "module:object": the object, or a function's result.
 
-    Modules are looked for where Python looks, then in the working folder.
+    Modules are looked for on Python's path, then in the working folder.
 
     Raises:
-        ValueError: states the rule and the value, where there is no such problem, or what is there is none.
+        ValueError: states the rule and the value, where there is no such problem, or the object is not a problem.
     """
     known = built_in()  # whose names may have a colon, too
-    if isinstance(name, str) and name in known:
-        return known[name].find_scenario(name)
+    own = any_case(name, known)
+    if isinstance(own, str) and own in known:
+        return known[own].find_scenario(own)
     if is_code(name):
         return _from_module(name)
     if isinstance(name, str) and name.endswith(".toml"):
         return read_scenario(name)
     rule = f"problem must be one of {', '.join(known)}, a file that ends in .toml, or module:object"
-    raise ValueError(f"{rule}, but got {shown(name)}")
+    raise ValueError(f"{rule}, but got {shown(name)}{meant(name, known)}")
 
 
 def find_same(name: str, digest: str) -> Problem:
-    """A problem by its name, which has to be what another process has: ValueError for another digest."""
+    """A problem by its name, which must be the same as in another process: ValueError for another digest."""
     found = find_problem(name)
     if found.digest != digest:
         raise ValueError(
@@ -44,14 +45,14 @@ def find_same(name: str, digest: str) -> Problem:
 
 
 def find_given(name, given: Sequence[Problem], where: str | Path) -> Problem:
-    """A problem that a file or a storage names, of those that the user gives or, if it is no code, by its name.
+    """A problem that a file or a storage names: one of the user's or, unless it is code, one found by its name.
 
     Nothing is imported that a file or a storage names.
 
     Args:
-        name: the problem's.
-        given: by the user.
-        where: the name comes from, for errors.
+        name: the problem's name.
+        given: problems given by the user.
+        where: the source of the name, for errors.
 
     Raises:
         ValueError: if there is no such problem, or it is code that is not given.
@@ -80,7 +81,7 @@ def _from_module(name: str) -> Problem:
 
 
 def named(problem: Problem, name: str) -> Problem:
-    """A problem under the name by which it was found, by which others find it again."""
+    """A problem under the name by which it was found."""
     if problem.name == name:
         return problem
     other = copy.copy(problem)

@@ -1,4 +1,4 @@
-"""Estimates of many runs, some runs at a time: covariances of every step of a large model fill memories."""
+"""Estimates of many runs, in parts: the covariances of all steps of a large model need much memory."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from numerics.threads import cores
 from plants.layout import LANES
 from tuning.problems.data import Data
 
-MOST_BYTES = 2**28  # of estimates at once: those of a run of 1000 steps with forty states and channels take 26 MB
+MOST_BYTES = 2**28  # of a part's estimates: a run of 1000 steps with forty states and channels takes 26 MB
 
 
 def estimates_in_parts(filter_: Filter, data: Data) -> Iterator[tuple[Data, Estimates]]:
-    """Run a filter on some runs after the others, in order: their data, and the estimates on them.
+    """Run a filter on parts of the runs, in order; yield the data of each part and the estimates on them.
 
-    Estimates at a time take some 256 MB, or those of as many runs as there are cores, so that what is made of them
-    need not hold the covariances of all.
+    The estimates of a part take at most about 256 MB, or are those of as many runs as there are cores.
     """
     parts = parts_of(filter_, data)
     for first, last in told("runs", parts, [last - first for first, last in parts]):
@@ -31,5 +30,5 @@ def parts_of(filter_: Filter, data: Data) -> list[tuple[int, int]]:
     n, (count, times, m) = filter_.kernel_model.n, data.measurements.shape
     a_run = 8 * times * (n + n * n + m + m * m + 1)
     size = max(MOST_BYTES // a_run, cores())
-    size = size // LANES * LANES or size  # of those without an ensemble so many are filtered side by side
+    size = size // LANES * LANES or size  # filters without an ensemble run so many side by side
     return [(first, min(first + size, count)) for first in range(0, count, size)]

@@ -21,25 +21,25 @@ SAME_DT = 1e-6  # relative: sample times of logs that are read off stamps
 
 
 class LogProblem(AssumedProblem):
-    """Blocks of recorded runs as the data of a study; the seeds of a block are its numbers.
+    """Blocks of recorded runs as the data of a study; the seed of a block is its number.
 
-    Which blocks a study learns from and which it never sees the problem says, whatever the seed of the study: see
-    `tuning.problems.log_parts`. A block has a lead-in that filters run through and that does not count. Blocks of
-    other lengths are padded with steps in which nothing is measured; where true states are known all blocks are as
-    long as the shortest.
+    The problem decides which blocks are for training and which are held out, whatever the seed of the study: see
+    `tuning.problems.log_parts`. A block has a lead-in that filters run through and that is not scored. Blocks of
+    other lengths are padded with steps in which nothing is measured; where true states are known all blocks are
+    cut to the length of the shortest.
 
-    Without true states there is no scale, and what can be made small is the negative log-likelihood of the
-    innovations. The rule of thumb has R of the model.
+    Without true states there is no scale, and the negative log-likelihood of the innovations is minimised. The
+    rule of thumb has the R of the model.
 
     Args:
-        logs: recorded runs, of one sample time, with the model's inputs and measurements.
-        assumed: what filters assume: a model, or a function of `parameters` that makes it.
+        logs: recorded runs with the same sample time, with the model's inputs and measurements.
+        assumed: the model that filters assume, or a function of `parameters` that makes it.
         lead: steps of a lead-in.
-        blocks: of each run; if None so many that there are about 24 in all.
-        held_out: names of runs that a study never sees; if None every third one, of fewer than three every third
-            block.
+        blocks: number of blocks of each run; if None there are about 24 in all.
+        held_out: names of the held-out runs; if None every third run, or every third block of fewer than three
+            runs.
         truth: whether the logs' true states are used, if they have all of them.
-        content: what makes the problem anew, as JSON can hold it: commands keep their options there.
+        content: the options that make the problem, as data for JSON; commands store theirs there.
         scale, parameters, untuned, name, about: those of `AssumedProblem`; the scale is by default the standard
             deviation of each true state.
 
@@ -86,7 +86,8 @@ class LogProblem(AssumedProblem):
             check_quantities("input", log.input_quantities, model.input_quantities, f"log {log.name}", "the model")
             check_quantities("measurement", log.measured, model.measurements, f"log {log.name}", "the model")
         found = [log.true_states(model) if truth else None for log in self.logs]
-        self._states = None if any(states is None for states in found) else found
+        known = [states for states in found if states is not None]
+        self._states = known if len(known) == len(found) else None
         if self._states is None and self._scale is not None:
             raise ValueError(f"a scale must come with logs of all true states, but {self.name} has not got them")
         if self._states is not None:
@@ -95,35 +96,35 @@ class LogProblem(AssumedProblem):
 
     @property
     def digest(self) -> str:
-        """A hash of the logs' numbers, their blocks and all else that makes the data and the score."""
+        """A hash of the logs' samples, their blocks and everything else that determines the data and the score."""
         logs = tuple(log.digest for log in self.logs)
         return digest_of(logs, self.parts.blocks, len(self.parts.training), self._states is None, self.assumptions)
 
     def training_seeds(self, seed: int, count: int) -> range:
-        """Numbers of all blocks to learn from, whatever is asked for."""
+        """Numbers of all training blocks, whatever the count."""
         return self.parts.training
 
     def size_seeds(self, seed: int, count: int) -> range:
-        """Numbers of the blocks that choose the ensemble size; those to learn from where there are none."""
+        """Numbers of the blocks on which the ensemble size is chosen; the training blocks where there are none."""
         return self.parts.sizes or self.parts.training
 
     def held_out_seeds(self, seed: int, count: int) -> range:
-        """Numbers of all blocks that a study never sees, whatever is asked for."""
+        """Numbers of all held-out blocks, whatever the count."""
         return self.parts.held_out
 
     @property
     def range_seeds(self) -> range:
-        """Seeds whose runs tell each state's range."""
+        """Blocks whose runs determine each state's range."""
         return self.parts.training
 
     @property
     def counts_start_up(self) -> bool:
-        """Whether the first steps count: not where most blocks begin in the middle of a run."""
+        """Whether the first steps are scored: they are not, since most blocks begin in the middle of a run."""
         return False
 
     @property
     def leads_in(self) -> bool:
-        """Whether the first steps are a lead-in: the prior is that of the beginning of a run, not of a block."""
+        """Whether the first steps are a lead-in: they are, since the prior belongs to a run's start."""
         return True
 
     def make(self, seeds: tuple[int, ...]) -> Data:
@@ -150,7 +151,7 @@ class LogProblem(AssumedProblem):
             data.inputs[place, : len(inputs)] = inputs
             data.inputs[place, len(inputs) :] = inputs[-1:]
             data.measurements[place, : len(measured)] = measured
-            if states is not None:
+            if states is not None and self._states is not None:
                 states[place] = self._states[block.run][some]
         if states is None:
             return data
@@ -158,9 +159,9 @@ class LogProblem(AssumedProblem):
         return data._replace(states=states, outputs=outputs)
 
     def found_scale(self) -> np.ndarray:
-        """The standard deviation of each true state over the scored steps of the blocks to learn from."""
+        """The standard deviation of each true state over the scored steps of the training blocks."""
         data = self.data(self.parts.training)
-        scale = rows_of(data.states[:, data.scored], self.model()).std(axis=0)
+        scale = rows_of(data.known_states[:, data.scored], self.model()).std(axis=0)
         if not (scale > 0).all():
             raise ValueError(
                 f"the scale of problem {self.name} must be given where a state does not move, "
@@ -169,7 +170,7 @@ class LogProblem(AssumedProblem):
         return scale
 
     def as_mapping(self) -> Mapping | None:
-        """The logs by path and digest, with the options that make the problem of them; None without these."""
+        """The logs by path and digest, with the options of the problem; None without options."""
         if self._content is None:
             return None
         return {"logs": [{"file": log.name, "digest": log.digest} for log in self.logs], **self._content}
@@ -192,6 +193,6 @@ def _checked_logs(given) -> tuple[Log, ...]:
 
 
 def _name(logs: Sequence[Log]) -> str:
-    """What logs are called together: the first one's name, and how many there are more."""
+    """The name of several logs: that of the first one, and the number of others."""
     more = f"+{len(logs) - 1}" if len(logs) > 1 else ""
     return f"{logs[0].name}{more}"

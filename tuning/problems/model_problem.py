@@ -1,4 +1,4 @@
-"""`ModelProblem`: a plant that is a model itself, and what filters assume of it."""
+"""`ModelProblem`: a plant that is itself a model, and the model that filters assume for it."""
 
 from __future__ import annotations
 
@@ -20,34 +20,34 @@ from tuning.problems.assumed import AssumedProblem, as_argument, rows_argument
 from tuning.problems.check import check_quantities
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.digest import digest_of
-from tuning.problems.excitation import EXCITATIONS, Excitation
+from tuning.problems.excitation import Excitation, excitation_of
 from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.parameter import Parameter
 
-SCALE_SEEDS = range(200)  # whose inputs the scale is the bound of, where none is given
+SCALE_SEEDS = range(200)  # seeds of the inputs for which the scale is the bound, where none is given
 Inputs = np.ndarray | Sequence | Mapping | Excitation | Callable | None
 
 
 class ModelProblem(AssumedProblem):
     """Data drawn from one state-space model, for filters that assume the same or another one.
 
-    The states that both have by symbol are compared; they come first in the assumed model. Measurements and
+    The states whose symbols both models have are compared; they come first in the assumed model. Measurements and
     inputs are the same in both.
 
     Args:
-        truth: draws states and measurements, `plants.simulate.simulate` with the keys of the seeds.
-        assumed: what filters assume: a model, or a function of `parameters` that makes it; the truth if None.
+        truth: the model from which states and measurements are drawn, with the keys of the seeds.
+        assumed: the model that filters assume, or a function of `parameters` that makes it; the truth if None.
         inputs: an array (K, p) that all seeds share (or (K,) for one input); an excitation, or a mapping with its
-            name ("steps", "prbs", "multi-sine", "dwells"); or a function of (seeds, steps) that gives (B, K, p).
+            name ("steps", "prbs", "multi-sine", "dwells"); or a function of (seeds, steps) that returns (B, K, p).
             None for a model without inputs.
         steps: length K of a run; that of the array if None, else 500.
-        scale: what errors of each state are measured in, infinite for states that do not count; if None the bound
-            of the true model over 200 seeds, or where Q is singular the RMSE of the open loop.
+        scale: by which the score divides the error of each state, infinite for states that do not count; if None
+            the bound of the true model over 200 seeds, or where Q is singular the RMSE of the open loop.
         first_scored_step, parameters, untuned, true, dt, name, about: those of `AssumedProblem`. The rule of thumb
-            has R of the assumed model, and the true choice Q and R of the truth, if both have the same states.
+            has the R of the assumed model, and the oracle the Q and R of the truth, if both have the same states.
 
     Raises:
-        ValueError: if the two models do not fit, or an argument is off.
+        ValueError: if the two models do not fit each other, or an argument is invalid.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class ModelProblem(AssumedProblem):
             self._true = {"process_noise_cov": rows_argument(truth.process_noise_cov), "measurement_noise_cov": r}
 
     def _shared_states(self, model: StateSpaceModel) -> list[int]:
-        """Places in the truth of the assumed model's first states."""
+        """Indices in the truth of the assumed model's first states."""
         places = {state.symbol: place for place, state in enumerate(self.truth.states)}
         known = [state.symbol in places for state in model.states]
         if not known[0] or any(later and not before for before, later in zip(known, known[1:], strict=False)):
@@ -111,7 +111,7 @@ class ModelProblem(AssumedProblem):
 
     @property
     def digest(self) -> str:
-        """A hash of both models, the inputs and all else that makes the data and the score."""
+        """A hash of both models, the inputs and everything else that determines the data and the score."""
         return digest_of(self.truth, self.inputs, self.assumptions)
 
     def make(self, seeds: tuple[int, ...]) -> Data:
@@ -129,7 +129,7 @@ class ModelProblem(AssumedProblem):
     def bound(self, data: Data) -> np.ndarray:
         """The posterior Cramér-Rao bound of the truth on these inputs, (n,); NaN where its Q is singular.
 
-        It is averaged over all inputs, and beyond twelve states over as many as `posterior_variances` takes.
+        It is averaged over all inputs; for more than twelve states over as many as `posterior_variances` takes.
         """
         return self._bound(data, 100)
 
@@ -178,7 +178,7 @@ class ModelProblem(AssumedProblem):
 
 
 class NamedArguments:
-    """A problem's `model`, whose signature names what it takes."""
+    """A problem's `model` with a signature that names its arguments."""
 
     def __init__(self, problem: ModelProblem):
         """Take the problem."""
@@ -202,7 +202,7 @@ def _checked_inputs(given: Inputs, count: int) -> np.ndarray | Excitation | Call
     if given is None and count == 0:
         return None
     if isinstance(given, Excitation | Mapping):
-        return EXCITATIONS.make([given])[0]
+        return excitation_of(given)
     if callable(given):
         return given
     try:

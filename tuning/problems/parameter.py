@@ -1,4 +1,4 @@
-"""`Parameter`: one number that a study may choose, with its range, its unit and where it stands in a choice."""
+"""`Parameter`: one number that a study may choose, with its range, its unit and its place in a choice."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from numerics.checks import at_least, finite, shown
 class Place(Protocol):
     """Where a number stands in a `Choice`."""
 
-    is_variance: bool  # whether noise of k times the variance has k times the number
+    @property
+    def is_variance(self) -> bool:
+        """Whether the number is proportional to variances: it doubles where the variance of noise doubles."""
 
     def get(self, choice) -> float | None:
         """The number, None if the choice does not have it."""
@@ -47,14 +49,14 @@ class Parameter:
         name: of the trials' parameter; by default the argument of the problem's model, too.
         low: the smallest value.
         high: the largest one.
-        unit: of SI, for tables.
+        unit: the SI unit, for tables.
         log: whether it is chosen on a logarithmic scale.
         integer: whether it is a whole number.
-        default: before any tuning; the middle of the range on its scale if None.
+        default: the value before any tuning; the middle of the range on its scale if None.
         place: where it stands in a choice; the argument of the model of the same name if None.
 
     Raises:
-        ValueError: for a range that is none, or a default outside it.
+        ValueError: for an empty range, or a default outside it.
     """
 
     name: str
@@ -64,7 +66,7 @@ class Parameter:
     log: bool = True
     integer: bool = False
     default: float | None = None
-    place: Place | None = None
+    place: Place = None  # type: ignore[assignment]  # None is replaced as soon as the parameter is made
 
     def __post_init__(self):
         """Check the range and fill in what is left out."""
@@ -98,8 +100,9 @@ class Parameter:
     @property
     def distribution(self) -> FloatDistribution | IntDistribution:
         """The range as Optuna takes it."""
-        kind = IntDistribution if self.integer else FloatDistribution
-        return kind(self.low, self.high, log=self.log)
+        if self.integer:
+            return IntDistribution(int(self.low), int(self.high), log=self.log)
+        return FloatDistribution(self.low, self.high, log=self.log)
 
     def get(self, choice) -> float | None:
         """The number in a choice, None if it does not have it."""

@@ -1,4 +1,4 @@
-"""Values of plain data: mappings and lists that cannot be changed, and as JSON takes them."""
+"""Plain data: mappings and lists as immutable values, and as values for JSON."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ DEEPEST = 10  # levels of mappings and lists
 
 
 def frozen(value, depth: int = 0):
-    """A value of mappings and lists as one that cannot be changed; ValueError if it is nested without end."""
+    """Mappings and lists as an immutable value; ValueError if they are nested too deep."""
     if depth > DEEPEST:
         raise ValueError(f"mappings and lists must be nested at most {DEEPEST} deep, but got {shown(value)}")
     if isinstance(value, Mapping):
@@ -20,7 +20,7 @@ def frozen(value, depth: int = 0):
 
 
 def plain(value):
-    """The inverse of `frozen`: dictionaries and lists, which JSON and deep copies take."""
+    """The inverse of `frozen`: dictionaries and lists, for JSON and deep copies."""
     if isinstance(value, Mapping):
         return {key: plain(part) for key, part in value.items()}
     return [plain(part) for part in value] if isinstance(value, list | tuple) else value

@@ -1,4 +1,4 @@
-"""`Problem`: what a study, an evaluation and a report need to know of a plant, and nothing else of it."""
+"""`Problem`: the interface between a plant and studies, evaluations and reports."""
 
 from __future__ import annotations
 
@@ -17,34 +17,34 @@ from tuning.problems.parameter import Parameter
 
 
 class Problem(ABC):
-    """A plant that makes data, and a family of models that filters may assume of it.
+    """A plant that makes data, and a family of models that filters may assume for it.
 
-    Scenarios of the thruster are problems, and so are a `ModelProblem` and an `EnvProblem`. What is listed first
-    each problem has to say; the rest has a default.
+    Scenarios of the thruster are problems, and so are a `ModelProblem`, an `EnvProblem` and a `LogProblem`. A
+    problem has to define the attributes and the abstract members; the others have a default.
 
     Attributes:
-        name: by which it is found: of a built-in one, FILE.toml, or "module:object".
+        name: by which it is found: that of a built-in one, FILE.toml, or "module:object".
         about: one line for tables and help.
-        scale: what the score measures the error of each state in, (n,): positive, infinite for states that do not
-            count; None where the data have no truth. It depends on no filter and on no assumed model.
+        scale: by which the score divides the error of each state, (n,): positive, infinite for states that do not
+            count; None where the data have no truth. It depends neither on a filter nor on the assumed model.
     """
 
     name: str
     about: str
     scale: Sequence[float] | None
-    seed_word: ClassVar[str] = "seeds"  # what its seeds are called
+    seed_word: ClassVar[str] = "seeds"  # name of its seeds in messages
 
     @property
     @abstractmethod
     def digest(self) -> str:
-        """A short hash of all that the problem is, but for its name and what it is about."""
+        """A short hash of the whole problem, without `name` and `about`."""
 
     @abstractmethod
     def model(self, **changes) -> StateSpaceModel:
-        """What a filter assumes: exactly what is believed of the plant, but for the changes.
+        """The model that a filter assumes, with some changes.
 
-        Every problem takes `process_noise_cov`, `measurement_noise_cov` and `prior_cov_factor`, a factor on P_0;
-        and the names of its `parameters`.
+        Covariances are per step and do not scale with dt. Every problem takes `process_noise_cov`,
+        `measurement_noise_cov` and `prior_cov_factor`, a factor on P_0; and the names of its `parameters`.
         """
 
     @abstractmethod
@@ -52,11 +52,11 @@ class Problem(ABC):
         """Inputs, measurements and, where it is known, truth for seeds: the same for the same seeds."""
 
     def training_seeds(self, seed: int, count: int) -> range:
-        """Seeds that a study with a given seed learns from: so many, or all that there are for it."""
+        """Training seeds of a study with a given seed: `count` of them, or all that the problem has."""
         return seeds.training_seeds(seed, count)
 
     def size_seeds(self, seed: int, count: int) -> range:
-        """Seeds that choose the ensemble size of a study with a given seed, and nothing else."""
+        """Seeds on which a study with a given seed chooses the ensemble size, and nothing else."""
         return seeds.size_seeds(seed, count)
 
     def held_out_seeds(self, seed: int, count: int) -> range:
@@ -70,11 +70,11 @@ class Problem(ABC):
 
     @property
     def true(self) -> Mapping | None:
-        """Arguments of the model of the filter that knows the plant's own Q and R; None if they are unknown."""
+        """Arguments of the oracle's model, with the plant's own Q and R; None if they are unknown."""
         return None
 
     def bound(self, data: Data) -> np.ndarray:
-        """Bound on the standard error of each state over scored steps, (n,); NaN where there is none."""
+        """Bound on the standard error of each state over scored steps, (n,); NaN where there is no bound."""
         return np.full(self.model().n if self.scale is None else len(self.scale), np.nan)
 
     @property
@@ -84,40 +84,40 @@ class Problem(ABC):
 
     @property
     def parameters(self) -> tuple[Parameter, ...] | None:
-        """What a study tunes of the model; None for the variances of Q and R."""
+        """Parameters of the model that a study tunes; None for the variances of Q and R."""
         return None
 
     @property
     def counts_start_up(self) -> bool:
-        """Whether the first steps count, in which P_0 is felt: a study then tunes its scale, too."""
+        """Whether the first steps are scored, on which P_0 has an effect: a study then tunes its scale, too."""
         return False
 
     @property
     def leads_in(self) -> bool:
-        """Whether the steps before the first scored one are a lead-in, which counts in no likelihood, either."""
+        """Whether the steps before the first scored one are a lead-in, which is left out of likelihoods, too."""
         return False
 
     @property
     def dt(self) -> float | None:
-        """Sample time [s]; None if it has none."""
+        """Sample time [s]; None if there is none. Covariances are per step and do not scale with dt."""
         return None
 
     @property
     def held(self) -> Mapping:
-        """Arguments by which `model` differs from the plant in every choice, for those who make it from an env."""
+        """Arguments by which `model` differs from the plant in every choice, for a model made from an env."""
         return {}
 
     @property
     def plant_data(self) -> Mapping | None:
-        """The plant as data, which tuned files keep for `check_tuned_for`, here and of envs; None without."""
+        """The plant as data, which tuned files store for `check_tuned_for`, here and of envs; None without."""
         return None
 
     def check_tuned_for(self, plant: Mapping | None, file: str | Path) -> None:
-        """Raise ValueError if what a tuned file holds as `plant_data` is another plant; None is not compared."""
+        """Raise ValueError if the `plant_data` of a tuned file is another plant; None is not compared."""
         return None
 
     def as_mapping(self) -> Mapping | None:
-        """All that makes the problem anew, as JSON can hold it; None if it is code, or known by its name."""
+        """The complete problem as data for JSON; None if it is code, or found by its name."""
         return None
 
 

@@ -1,4 +1,4 @@
-"""`BaseScenario`: a problem that is plain data, an immutable recipe which files hold whole."""
+"""`BaseScenario`: a problem that is plain data, an immutable recipe that files store completely."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import ClassVar, Self
 from numerics.checks import at_least, shown, vector
 from plants.env import as_json
 from tuning.problems.data import FIRST_SCORED_STEP, Data
-from tuning.problems.excitation import EXCITATIONS, Excitation, Steps
+from tuning.problems.excitation import Excitation, Steps, excitation_of
 from tuning.problems.plain import frozen, plain
 from tuning.problems.problem import Problem
 
@@ -21,23 +21,23 @@ MOST_STEPS = 1_000_000
 
 @dataclass(frozen=True, kw_only=True)
 class BaseScenario(Problem):
-    """What the scenarios of all plants have in common; a plant's own adds the fields of its plant.
+    """What the scenarios of all plants have in common; the subclass of a plant adds the fields of this plant.
 
-    A subclass is a frozen dataclass of plain data, says what else there is to check in `own_checks`, and makes its
-    data in `make`.
+    A subclass is a frozen dataclass of plain data; it checks its own fields in `own_checks`, and makes its data in
+    `make`.
 
     Attributes:
         plant_kind: key of its plant in `rooms.ROOMS`.
         name: its name; that of its file if it was read from one.
         about: one line for tables and help.
-        scale: what errors of each state are measured in, fixed numbers.
-        process_noise_cov: the plant's Q, a variance a state and step.
-        measurement_noise_cov: the plant's R, a variance a channel.
+        scale: by which the score divides the error of each state, fixed numbers.
+        process_noise_cov: the plant's Q, one variance per step for each state; covariances do not scale with dt.
+        measurement_noise_cov: the plant's R, one variance for each channel.
         parameter_factors: factors on the plant's parameters in the filter's model.
         excitation: makes the inputs; one of `excitation.EXCITATIONS`, or a mapping with its name.
         steps: length of a run.
-        first_scored_step: where errors begin to count. Below 50 the start-up counts, too, and a study then tunes
-            the scale of P_0.
+        first_scored_step: the first step whose error is scored. Below 50 the start-up is scored, too, and a study
+            then tunes the scale of P_0.
     """
 
     plant_kind: ClassVar[str]
@@ -45,16 +45,15 @@ class BaseScenario(Problem):
     about: str = ""
     scale: Sequence[float]
     process_noise_cov: Sequence[float]
-    measurement_noise_cov: float | Sequence[float]
+    measurement_noise_cov: float | Sequence[float] | None
     parameter_factors: Mapping[str, float] = field(default_factory=dict)
-    excitation: Excitation | Mapping = field(default_factory=Steps)
+    excitation: Excitation = field(default_factory=Steps)
     steps: int = 500
     first_scored_step: int = FIRST_SCORED_STEP
 
     def __post_init__(self):
-        """Check what the plant, which is made when it is needed, does not."""
-        if not isinstance(self.excitation, Excitation):
-            object.__setattr__(self, "excitation", EXCITATIONS.make([self.excitation])[0])
+        """Check the fields that are not checked when the plant is made."""
+        object.__setattr__(self, "excitation", excitation_of(self.excitation))
         for name, kind, called in (("about", str, "text"), ("parameter_factors", Mapping, "a mapping")):
             if not isinstance(getattr(self, name), kind):
                 raise ValueError(f"{name} must be {called}, but got {shown(getattr(self, name))}")
@@ -71,7 +70,7 @@ class BaseScenario(Problem):
             object.__setattr__(self, entry.name, frozen(checked.get(entry.name, getattr(self, entry.name))))
 
     def own_checks(self) -> dict:
-        """Fields of the plant and `scale` as they are to be kept; ValueError for wrong ones."""
+        """Fields of the plant and `scale` as they are to be stored; ValueError for wrong ones."""
         raise NotImplementedError
 
     def make(self, seeds: tuple[int, ...]) -> Data:
@@ -86,11 +85,11 @@ class BaseScenario(Problem):
         return scale.tolist()
 
     def __getstate__(self) -> dict:
-        """The fields as dictionaries and lists, for copies and pickles: a mapping that cannot change has none."""
+        """The fields as dictionaries and lists, for copies and pickles: immutable mappings cannot be pickled."""
         return {entry.name: plain(getattr(self, entry.name)) for entry in fields(self)}
 
     def __setstate__(self, state: dict) -> None:
-        """The fields, so that they cannot be changed again."""
+        """Set the fields, immutable again."""
         for name, value in state.items():
             object.__setattr__(self, name, frozen(value))
 
@@ -107,24 +106,24 @@ class BaseScenario(Problem):
 
     @property
     def held(self) -> dict:
-        """What the filter's model gets wrong of the plant's parameters."""
+        """Where the model differs from the plant in every choice: its wrong parameters."""
         return {"parameter_factors": dict(self.parameter_factors)}
 
     @property
     def counts_start_up(self) -> bool:
-        """Whether the first steps count, in which P_0 is felt."""
+        """Whether the first steps are scored, on which P_0 has an effect."""
         return self.first_scored_step < FIRST_SCORED_STEP
 
     @property
     def digest(self) -> str:
-        """The first part of a SHA-256 of all that the scenario says but for its name and what it is about."""
+        """The first part of a SHA-256 of all fields but `name` and `about`."""
         content = {entry.name: plain(getattr(self, entry.name)) for entry in fields(self)}
         content |= {"excitation": self.excitation.as_mapping(), "scale": [f"{part:.6g}" for part in self.scale]}
         del content["name"], content["about"]
         return hashlib.sha256(json.dumps(content, sort_keys=True, default=repr).encode()).hexdigest()[:12]
 
     def as_mapping(self) -> dict:
-        """All that it says but for its name, as JSON can hold it; `tuning.problems.files.scenario_of` reads it."""
+        """All fields but the name, for JSON; `tuning.problems.files.scenario_of` reads it."""
         content = {
             entry.name: as_json(getattr(self, entry.name)) for entry in fields(self) if entry.name != "name"
         }

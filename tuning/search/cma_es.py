@@ -1,4 +1,4 @@
-"""Optuna's CMA-ES, which keeps its state in the study, without trust in who wrote the study."""
+"""Optuna's CMA-ES, which stores its state in the study, made safe for studies of unknown origin."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pickle
 import optuna
 from optuna.trial import FrozenTrial
 
-# What the state of an optimizer of `cmaes` is made of. A pickle may name any function of any module, and call it.
+# The classes in the state of an optimizer of `cmaes`. Any pickle may name any function of any module, and call it.
 _OPTIMIZERS = ("CMA", "SepCMA", "CMAwM")
 _ARRAYS = {("numpy", "ndarray"), ("numpy", "dtype")} | {
     (f"numpy.{core}.{module}", name)
@@ -18,9 +18,9 @@ _ARRAYS = {("numpy", "ndarray"), ("numpy", "dtype")} | {
 
 
 class CmaEsSampler(optuna.samplers.CmaEsSampler):
-    """`optuna.samplers.CmaEsSampler` that takes from a journal or database its own state and nothing else.
+    """`optuna.samplers.CmaEsSampler` that reads from a journal or database its own state and nothing else.
 
-    Optuna unpickles the state that it finds in a study's trials, so that a study by somebody else could run code.
+    Optuna unpickles the state that it finds in a study's trials, so a study by somebody else could run code.
     """
 
     def _restore_optimizer(self, completed_trials: list[FrozenTrial]):
@@ -33,10 +33,10 @@ class CmaEsSampler(optuna.samplers.CmaEsSampler):
 
 
 def read_state(text: str):
-    """The optimizer of which a study holds the state, a pickle as hexadecimal digits.
+    """The optimizer whose state a study holds, a pickle as hexadecimal digits.
 
     Raises:
-        ValueError: if it is no such state, or names anything but an optimizer of `cmaes` and arrays of NumPy.
+        ValueError: if it is not such a state, or names anything but an optimizer of `cmaes` and arrays of NumPy.
     """
     try:
         return _Unpickler(io.BytesIO(bytes.fromhex(text))).load()

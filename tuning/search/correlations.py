@@ -1,4 +1,4 @@
-"""A full covariance by numbers that may be anything within their ranges: variances and correlations."""
+"""A full covariance matrix from variances and correlations, which may be chosen independently of one another."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ def full_covariance(variances: Sequence[float], correlations: Sequence[float]) -
     Source: Lewandowski, Kurowicka, Joe (2009), "Generating random correlation matrices based on vines and extended
     onion method", J. Multivariate Analysis 100(9).
     """
-    variances, count = np.asarray(variances, dtype=np.float64), len(variances) * (len(variances) - 1) // 2
-    if not (variances > 0).all():
-        raise ValueError(f"variances must be positive, but got {variances.tolist()}")
+    diagonal, count = np.asarray(variances, dtype=np.float64), len(variances) * (len(variances) - 1) // 2
+    if not (diagonal > 0).all():
+        raise ValueError(f"variances must be positive, but got {diagonal.tolist()}")
     if len(correlations) != count or not all(abs(r) < 1 for r in correlations):
         raise ValueError(f"correlations must be {count} numbers within -1 and 1, but got {list(correlations)}")
-    lower, given = np.zeros((len(variances),) * 2), iter(correlations)
+    lower, given = np.zeros((len(diagonal),) * 2), iter(correlations)
     for i, row in enumerate(lower):
         for j in range(i):
             row[j] = next(given) * np.sqrt(1.0 - row[:j] @ row[:j])
         row[i] = np.sqrt(1.0 - row[:i] @ row[:i])
-    factor = np.sqrt(variances)[:, None] * lower
+    factor = np.sqrt(diagonal)[:, None] * lower
     return factor @ factor.T
 
 

@@ -1,4 +1,4 @@
-"""What a study over several kinds of filters says of each kind."""
+"""What a study over several filter types reports of each."""
 
 from __future__ import annotations
 
@@ -9,46 +9,46 @@ from optuna.trial import FrozenTrial, TrialState
 
 from tuning.search.cost import COST
 from tuning.search.outcome import best_trial, is_consistent, is_over_budget
-from tuning.search.space import KIND
+from tuning.search.space import FILTER_TYPE
 
 
-class Kind(NamedTuple):
-    """How a kind of filter did in a study."""
+class FilterType(NamedTuple):
+    """How a filter type did in a study."""
 
     name: str
     trials: int  # finished ones
-    pruned: int  # that ended early for their errors ...
+    pruned: int  # for their errors ...
     over_budget: int  # ... and for their cost
     value: float | None  # first objective of its best trial; None if none is complete
-    consistent: bool  # whether that trial's mean NIS is in its band
-    microseconds: float | None  # what a step of that trial costs or, if none is complete, of the cheapest one
+    consistent: bool  # whether that trial's mean NIS (normalised innovation squared) is within its band
+    microseconds: float | None  # us/step of that trial or, if none is complete, of the cheapest one
 
 
-def kinds_tried(trials: Sequence[FrozenTrial]) -> list[Kind]:
-    """The kinds of filters that finished trials chose, the best first; empty for a study of one kind."""
-    by_kind: dict[str, list[FrozenTrial]] = {}
+def filter_types_tried(trials: Sequence[FrozenTrial]) -> list[FilterType]:
+    """The filter types that finished trials chose, the best first; empty for a study of one type."""
+    by_type: dict[str, list[FrozenTrial]] = {}
     for trial in trials:
-        if KIND in trial.params and trial.state in (TrialState.COMPLETE, TrialState.PRUNED):
-            by_kind.setdefault(trial.params[KIND], []).append(trial)
-    rows = [_kind(name, some) for name, some in by_kind.items()]
+        if FILTER_TYPE in trial.params and trial.state in (TrialState.COMPLETE, TrialState.PRUNED):
+            by_type.setdefault(trial.params[FILTER_TYPE], []).append(trial)
+    rows = [_row(name, some) for name, some in by_type.items()]
     return sorted(rows, key=lambda row: (row.value is None, not row.consistent, row.value or 0.0))
 
 
-def kinds_running(trials: Sequence[FrozenTrial]) -> list[str]:
-    """The kinds of filters that are under trial, in alphabetical order; empty in a study of one kind."""
+def filter_types_running(trials: Sequence[FrozenTrial]) -> list[str]:
+    """The filter types of the running trials, in alphabetical order; empty in a study of one type."""
     running = (trial for trial in trials if trial.state == TrialState.RUNNING)
-    return sorted({trial.params[KIND] for trial in running if KIND in trial.params})
+    return sorted({trial.params[FILTER_TYPE] for trial in running if FILTER_TYPE in trial.params})
 
 
-def trials_of_kind(trials: Sequence[FrozenTrial], name: str) -> list[FrozenTrial]:
-    """Trials that chose a kind; all of them in a study of one kind."""
-    return [trial for trial in trials if trial.params.get(KIND, name) == name]
+def trials_of_type(trials: Sequence[FrozenTrial], name: str) -> list[FrozenTrial]:
+    """Trials that chose a filter type; all of them in a study of one type."""
+    return [trial for trial in trials if trial.params.get(FILTER_TYPE, name) == name]
 
 
-def _kind(name: str, trials: list[FrozenTrial]) -> Kind:
+def _row(name: str, trials: list[FrozenTrial]) -> FilterType:
     best, over = best_trial(trials), sum(map(is_over_budget, trials))
     costs = [trial.user_attrs[COST] for trial in ([best] if best else trials) if COST in trial.user_attrs]
-    return Kind(
+    return FilterType(
         name,
         len(trials),
         sum(trial.state == TrialState.PRUNED for trial in trials) - over,
@@ -57,3 +57,12 @@ def _kind(name: str, trials: list[FrozenTrial]) -> Kind:
         best is not None and is_consistent(best),
         min(costs, default=None),
     )
+
+
+# Former names.
+Kind, kinds_tried, kinds_running, trials_of_kind = (
+    FilterType,
+    filter_types_tried,
+    filter_types_running,
+    trials_of_type,
+)

@@ -1,4 +1,4 @@
-"""Ctrl-C in the midst of long work: the first one asks for an end, the second one makes it."""
+"""Ctrl-C during long work: the first one asks for an end, the second one forces it."""
 
 from __future__ import annotations
 
@@ -7,15 +7,19 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from numerics.progress import tell
+
+STOPPING = "stopping after what runs now; Ctrl-C again stops at once"
+
 
 @contextmanager
 def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Within this context the first Ctrl-C only makes the yielded function return True.
+    """Within this context the first Ctrl-C only makes the yielded function return True, and tells who listens.
 
-    An exception in the midst of compiled code or a storage's lock could get lost or leave the lock behind.
-    Outside the main thread, where Python takes no signals, nothing changes.
+    An exception within compiled code or a storage's lock could get lost or leave the lock behind. Outside the main
+    thread, where Python delivers no signals, nothing changes.
     """
-    caught = []
+    caught: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
@@ -24,6 +28,7 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
     def note(number, frame):
         caught.append(number)
         signal.signal(signal.SIGINT, before)
+        tell(STOPPING)
 
     signal.signal(signal.SIGINT, note)
     try:
@@ -34,9 +39,9 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def without_interrupts() -> Iterator[None]:
-    """Within this context Ctrl-C waits, and processes are started that take none: their parent ends them.
+    """Within this context Ctrl-C waits, and processes are started that ignore it: their parent ends them.
 
-    They would otherwise get it, too, while they load packages, and each would tell so in its own way.
+    Otherwise they would get it, too, while they load packages, and each would print a traceback.
     """
     if not hasattr(signal, "pthread_sigmask"):
         yield

@@ -1,4 +1,4 @@
-"""A study's journal file, whose lines are whole: whatever is full, killed or interrupted."""
+"""A study's journal file, whose lines stay complete after a full disk, a killed process or an interrupt."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class JournalFile(JournalFileBackend):
     """Optuna's journal file, to which a line is added as a whole or not at all."""
 
     def __init__(self, path: Path, lock: JournalFileOpenLock):
-        """Take its path, and the lock of those who write to it."""
+        """Take its path, and the lock of its writers."""
         super().__init__(str(path), lock_obj=lock)
         self._path, self._writers = path, lock
 

@@ -1,4 +1,7 @@
-"""What a study minimises, and what it has to keep within bounds."""
+"""Objectives that a study minimises, and the constraint on the mean NIS.
+
+NEES is the normalised estimation error squared, NIS the normalised innovation squared.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +13,17 @@ from numerics.checks import one_of, shown
 from tuning.evaluation.evaluate import Evaluation
 from tuning.problems.problem import Problem
 
-NIS_BAND = (0.8, 1.25)  # of the mean NIS over what is right: what a constrained study calls consistent
-DIVERGENCE_PENALTY = 10.0  # added for each run that had to restart
-LARGEST = 1e6  # an error beyond this is this: studies want finite numbers
-OUTPUT = "output:"  # what objectives on derived outputs begin with
+NIS_BAND = (0.8, 1.25)  # of the mean NIS over its expected value: a constrained study calls this consistent
+DIVERGENCE_PENALTY = 10.0  # added for each filter reset
+LARGEST = 1e6  # larger errors are clipped to this: studies need finite numbers
+OUTPUT = "output:"  # prefix of objectives on derived outputs
 
 
 class Objective(NamedTuple):
     """One number to minimise."""
 
     about: str
-    value: Callable[[Evaluation, float], float]  # of an evaluation and its microseconds a step
+    value: Callable[[Evaluation, float], float]  # of an evaluation and its us/step
     needs_covariance: bool = False
     needs_truth: bool = False
     output: str = ""  # symbol of the derived output that it needs
@@ -28,7 +31,7 @@ class Objective(NamedTuple):
 
 
 def nis_ratio(evaluation: Evaluation) -> float:
-    """The mean NIS over the mean number of channels that were there: 1 is right, NaN without a covariance."""
+    """The mean NIS over the mean number of measured channels: expected value 1; NaN without a covariance."""
     return evaluation.nis.value / evaluation.expected_nis
 
 
@@ -38,7 +41,7 @@ def _nis_inconsistency(evaluation: Evaluation, _: float) -> float:
 
 
 def _inconsistency(evaluation: Evaluation, _: float) -> float:
-    """|log(NEES / n)| + |log(NIS / m)| of the means: zero for a filter as sure of itself as it may be."""
+    """|log(NEES / n)| + |log(NIS / m)| of the means: zero for a consistent filter."""
     of_errors = abs(math.log(evaluation.nees.value / len(evaluation.rmse)))
     return of_errors + _nis_inconsistency(evaluation, _)
 
@@ -83,7 +86,7 @@ def find_objective(name: str) -> Objective:
 
 
 def check_objectives(names: Iterable[str], problem: Problem) -> None:
-    """Raise ValueError if an objective needs the truth, or a derived output, and a problem has none such."""
+    """Raise ValueError if an objective needs the truth, or a derived output, that a problem does not have."""
     for name in names:
         objective = find_objective(name)
         if objective.needs_truth and problem.scale is None:
@@ -100,13 +103,13 @@ def check_objectives(names: Iterable[str], problem: Problem) -> None:
 
 
 def penalised(value: float, evaluation: Evaluation) -> float:
-    """A finite value for a study: that of a filter which diverged is large."""
+    """A finite value for a study; it is large for a filter that diverged."""
     value = min(value, LARGEST) if value == value else LARGEST
     return value + DIVERGENCE_PENALTY * evaluation.divergences
 
 
 def nis_violation(evaluation: Evaluation) -> float:
-    """How far the mean NIS is outside its band, in logarithms; at most zero inside, as Optuna wants it."""
+    """Logarithmic distance of the mean NIS from its band; at most zero inside, as Optuna expects it."""
     low, high = NIS_BAND
     ratio = nis_ratio(evaluation)
     if not ratio > 0.0 or not math.isfinite(ratio):

@@ -1,4 +1,7 @@
-"""How a trial ended: whether it keeps to its constraints, and which one is best."""
+"""The outcome of trials: constraints, and the best trial.
+
+NIS is the normalised innovation squared.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,10 @@ from tuning.search.trials import CONSISTENCY
 
 
 def best_trial(trials: Sequence[FrozenTrial]) -> FrozenTrial | None:
-    """The complete trial with the least first objective, of consistent ones wherever there are any.
+    """The complete trial with the lowest first objective, among the consistent ones if there are any.
 
-    A trial over the budget is never complete. Where none is consistent, a mean NIS nearer to its band would be
-    no better a reason to choose: an estimate that is many times worse can have it.
+    A trial over the budget is never complete. Where no trial is consistent, the distance of the mean NIS from its
+    band does not matter: an estimate that is many times worse can be closer to it.
     """
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     return min(complete, key=lambda trial: (not is_consistent(trial), trial.values[0]), default=None)
@@ -26,10 +29,10 @@ def is_consistent(trial: FrozenTrial) -> bool:
 
 
 def violation(trial: FrozenTrial) -> float:
-    """How far a trial's mean NIS is outside its band, in logarithms; at most zero inside, or without a band."""
+    """Logarithmic distance of a trial's mean NIS from its band; at most zero inside, or without a band."""
     return trial.constraints.get(CONSISTENCY, 0.0)
 
 
 def is_over_budget(trial: FrozenTrial) -> bool:
-    """Whether a trial ended because its filter costs too much."""
+    """Whether a trial ended because its filter is over the budget."""
     return trial.constraints.get(BUDGET, 0.0) > 0

@@ -1,4 +1,4 @@
-"""The list of what a study may choose: each number's name, range, unit and place in a choice."""
+"""The list of parameters that a study may choose: each one's name, range, unit and place in a choice."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from tuning.search.correlations import correlations_of, full_covariance
 
 Q, R = NOISE  # arguments of the model
 Q_FACTORS = (1e-5, 1e2)  # range of each process noise variance, as factors on the untuned one
-R_FACTORS = (1e-2, 1e3)  # range of each measurement noise variance, as factors on the sensor sheet's
+R_FACTORS = (1e-2, 1e3)  # range of each measurement noise variance, as factors on that of the data sheet
 CORRELATIONS = (-0.99, 0.99)  # range of each correlation in a full Q
 PRIOR_FACTORS = (1e-4, 1e2)  # range of P_0, as a factor on the covariance of the plant's initial state
 
 
 @dataclass(frozen=True)
 class ProcessVariance:
-    """Variance of one state in Q, which keeps its correlations."""
+    """Variance of one state in Q; the correlations stay."""
 
     index: int
     is_variance: ClassVar[bool] = True
 
     def get(self, choice) -> float | None:
         """The variance in a choice."""
-        variances = _diagonal(choice.model.get(Q))
-        return None if variances is None else float(variances[self.index])
+        q = choice.model.get(Q)
+        return None if q is None else float(_diagonal(q)[self.index])
 
     def set(self, choice, value):
         """The choice with another variance."""
@@ -43,7 +43,7 @@ class ProcessVariance:
 
 @dataclass(frozen=True)
 class ProcessCorrelation:
-    """One of the numbers of `correlations.full_covariance` that make a full Q."""
+    """One of the correlations from which `correlations.full_covariance` makes a full Q."""
 
     index: int
     is_variance: ClassVar[bool] = False
@@ -80,18 +80,18 @@ class MeasurementVariance:
 
 
 @dataclass(frozen=True)
-class FilterNumber:
-    """One of the filter's own numbers."""
+class FilterParameter:
+    """One of the filter's parameters."""
 
     name: str
     is_variance: ClassVar[bool] = False
 
     def get(self, choice) -> float | int | None:
-        """The number in a choice."""
+        """The parameter in a choice."""
         return choice.numbers.get(self.name)
 
     def set(self, choice, value):
-        """The choice with another number."""
+        """The choice with another value of the parameter."""
         return choice._replace(numbers={**choice.numbers, self.name: value})
 
 
@@ -99,11 +99,11 @@ PRIOR = Argument(PRIOR_FACTOR, is_variance=True)
 
 
 def _own(name: str, low: float, high: float, **options) -> Parameter:
-    return Parameter(name, low, high, **{"log": False, **options}, place=FilterNumber(name))
+    return Parameter(name, low, high, **{"log": False, **options}, place=FilterParameter(name))
 
 
-# Ranges of numbers that filters have beside Q, R and N; they hold the defaults of all filters.
-OWN_NUMBERS = {
+# Ranges of the parameters that filters have beside Q, R and N; the defaults of all filters lie within them.
+FILTER_PARAMETERS = {
     one.name: one
     for one in (
         _own("inflation", 1.0, 1.3),
@@ -119,36 +119,36 @@ OWN_NUMBERS = {
 }
 
 
-# Without process noise nothing but this parts the copies of a particle; with it a study has Q for that.
+# Without process noise only this separates the copies of a particle; with process noise Q does.
 WITHOUT_NOISE = {one.name: one for one in (_own("regularisation", 0.0, 3.0),)}
 
 
 def has_process_noise(problem: Problem) -> bool:
-    """Whether filters of a problem are untuned with some process noise, or its parameters say how much."""
+    """Whether a problem has process noise in the untuned filter, or parameters from which it follows."""
     return problem.parameters is not None or bool(np.any(problem.untuned.get(Q, True)))
 
 
 def filter_parameters(name: str, sizes: tuple[int, int] | None, process_noise: bool) -> list[Parameter]:
-    """What a study may choose of a filter itself: N from `sizes`, if it has an ensemble, and its own numbers.
+    """Parameters of a filter that a study may choose: N from `sizes`, if it has an ensemble, and the others.
 
-    Of an estimator that is what it says it is tuned by. Some numbers are chosen only without process noise.
+    An estimator declares its own parameters. Some parameters are chosen only without process noise.
     """
     if is_foreign(name):
-        return [replace(one, place=FilterNumber(one.name)) for one in parameters_of(name)]
-    size = [] if sizes is None else [Parameter("N", *sizes, integer=True, place=FilterNumber("ensemble_size"))]
+        return [replace(one, place=FilterParameter(one.name)) for one in parameters_of(name)]
+    size = [] if sizes is None else [Parameter("N", *sizes, integer=True, place=FilterParameter("ensemble_size"))]
     known = tunable_numbers(name)
-    numbers = OWN_NUMBERS if process_noise else OWN_NUMBERS | WITHOUT_NOISE
+    numbers = FILTER_PARAMETERS if process_noise else FILTER_PARAMETERS | WITHOUT_NOISE
     return size + [one for number, one in numbers.items() if number in known]
 
 
 def model_parameters(
     problem: Problem, *, hold_r: bool = False, full_q: bool = False, prior: bool = False
 ) -> list[Parameter]:
-    """What a study may choose of a problem's model: its own `parameters`, or the variances of Q and R.
+    """Parameters of a problem's model that a study may choose: its `parameters`, or the variances of Q and R.
 
     Args:
-        problem: the ranges are made of its untuned values.
-        hold_r: leave R at the sensor's sheet.
+        problem: the ranges follow from its untuned values.
+        hold_r: leave R as on the sensor's data sheet.
         full_q: choose the correlations of Q, too (`correlations.full_covariance`).
         prior: choose the scale of P_0, too.
     """
@@ -158,7 +158,7 @@ def model_parameters(
     variances, count = _diagonal(untuned[Q]), len(quantities.states)
     scales = [*(() if problem.scale is None else problem.scale), *[0.0] * count]
     for i, (variance, state) in enumerate(zip(variances, quantities.states, strict=True)):
-        if variance > 0:  # else the state has no noise, and no range of it
+        if variance > 0:  # otherwise the state has no noise, and no range
             # Where the input hardly moves a state, noise may move it more.
             scale = scales[i] if np.isfinite(scales[i]) else 0.0
             low, high = Q_FACTORS[0] * variance, Q_FACTORS[1] * max(variance, scale**2)
@@ -180,7 +180,7 @@ def model_parameters(
 
 
 def places_in(choice) -> dict[str, Place]:
-    """Where the numbers of a choice's model stand, by the names of their parameters.
+    """Places of the parameters of a choice's model, by name.
 
     Correlations and P0 are among them where the choice has a full Q and a factor on P_0.
     """
@@ -202,26 +202,27 @@ def places_in(choice) -> dict[str, Place]:
 
 
 def correlation_names(states: int) -> list[str]:
-    """Trial parameters that are correlations of Q, in the order of `correlations.full_covariance`."""
+    """Names of the correlations of Q as trial parameters, in the order of `correlations.full_covariance`."""
     between = "" if states < 10 else "_"
     return [f"correlation_{j}{between}{i}" for i in range(2, states + 1) for j in range(1, i)]
 
 
 def r_name(index: int, channels: int) -> str:
-    """The trial parameter that is a channel's variance in R: "R" of a single channel, else "R11", "R22", ..."""
+    """Name of a channel's variance in R as a trial parameter: "R" of a single channel, else "R11", "R22", ..."""
     return "R" if channels == 1 else f"R{index + 1}{index + 1}"
 
 
-def _diagonal(cov) -> tuple | None:
-    """Variances of a covariance as a choice has it: one variance, some, or the rows of a matrix."""
-    if cov is None or np.ndim(cov) == 1:
-        return cov if cov is None else tuple(cov)
+def _diagonal(cov) -> tuple[float, ...]:
+    """Variances of a covariance as a choice stores it: one variance, several, or the rows of a matrix."""
+    if np.ndim(cov) == 1:
+        return tuple(cov)
     return (cov,) if np.ndim(cov) == 0 else tuple(np.diag(covariance("a covariance", cov, len(cov))).tolist())
 
 
 def _with_variance(choice, argument: str, index: int, value: float):
     """A choice with another variance in Q or R, whose correlations stay."""
     before = choice.model[argument]
+    after: float | tuple
     if np.ndim(before) == 0:
         after = value
     elif np.ndim(before) == 1:

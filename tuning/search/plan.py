@@ -1,4 +1,7 @@
-"""What a study is for: two studies of the same plan are one study."""
+"""`Plan`: what a study is for. Two studies with the same plan are the same study.
+
+NIS is the normalised innovation squared.
+"""
 
 from __future__ import annotations
 
@@ -13,33 +16,33 @@ from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.search.objectives import Objective, check_objectives, find_objective
-from tuning.search.space import AUTO, AUTO_KINDS, has_search_space, joint_distributions, joint_parameters
+from tuning.search.space import AUTO, AUTO_FILTER_TYPES, has_search_space, joint_distributions, joint_parameters
 
 TRAINING_SEEDS = 32
 HELD_OUT_SEEDS = 200
-SIZE_SEEDS = 100  # an ensemble that is 1 % worse than the best is told from it, one of 30 from 50
+SIZE_SEEDS = 100  # enough to distinguish an ensemble that is 1 % worse than the best, as N = 30 from N = 50
 
 
 class Plan(NamedTuple):
-    """A filter, what to tune it on, what to make small and how to search."""
+    """A filter, what to tune it on, what to minimise and how to search."""
 
-    filter: str  # a name, or "auto" for the best of many kinds
+    filter: str  # a name, or "auto" for the best of many filter types
     scenarios: tuple[Problem, ...]
     seed: int = 0
     objectives: tuple[str, ...] = ("score",)
     consistent: bool = True  # whether the mean NIS has to be within its band
     sampler: str = "tpe"
-    hold_r: bool = False  # whether R stays that of the sensor's sheet
-    prune: bool = True  # whether a trial ends early that is worse than the best one on the same seeds
-    budget: float | None = None  # microseconds that a step may cost, as `cost.microseconds_a_step` measures them
+    hold_r: bool = False  # whether R stays that of the sensor's data sheet
+    prune: bool = True  # whether a trial is pruned that is worse than the best one on the same seeds
+    budget: float | None = None  # us/step that the filter may take, as `cost.microseconds_a_step` measures them
     full_q: bool = False  # whether Q has correlations
 
     @property
     def identity(self) -> dict:
-        """What has to be the same for a study to go on."""
+        """What has to be the same for a study to be continued."""
         return {
             "filter": self.filter,
-            "kinds": list(self.kinds),
+            "kinds": list(self.filter_types),
             "budget": self.budget,
             "full_q": self.full_q,
             "scenarios": [scenario.name for scenario in self.scenarios],
@@ -53,14 +56,23 @@ class Plan(NamedTuple):
         }
 
     @property
-    def kinds(self) -> tuple[str, ...]:
+    def filter_types(self) -> tuple[str, ...]:
         """Names of the filters among which a trial chooses."""
-        return AUTO_KINDS if self.filter == AUTO else (self.filter,)
+        return AUTO_FILTER_TYPES if self.filter == AUTO else (self.filter,)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The former name of `filter_types`."""
+        return self.filter_types
 
     @property
     def is_constrained(self) -> bool:
-        """Whether the mean NIS is held in its band: a filter without a covariance has none."""
-        return self.consistent and all(filter_class(kind).has_covariance for kind in self.kinds)
+        """Whether the mean NIS has to be within its band: a filter without a covariance has no NIS."""
+        return self.consistent and self._has_covariance
+
+    @property
+    def _has_covariance(self) -> bool:
+        return all(filter_class(name).has_covariance for name in self.filter_types)
 
     @property
     def asks_for_cost(self) -> bool:
@@ -68,8 +80,8 @@ class Plan(NamedTuple):
         return self.budget is not None or "cost" in self.objectives
 
     def checked(self) -> Plan:
-        """The same plan; ValueError where it cannot work."""
-        if not all(map(has_search_space, self.kinds)):
+        """The same plan; ValueError for one that cannot work."""
+        if not all(map(has_search_space, self.filter_types)):
             raise ValueError(f"filter must be one that has something to tune, but got {self.filter!r}")
         if not self.scenarios:
             raise ValueError("a study must have at least one scenario, but got none")
@@ -77,19 +89,20 @@ class Plan(NamedTuple):
         if not 1 <= len(self.objectives) <= 2 or len(set(self.objectives)) < len(self.objectives):
             raise ValueError(f"objectives must be one, or two different ones, but got {list(self.objectives)}")
         for name, objective in zip(self.objectives, self.found_objectives(), strict=True):
-            if objective.needs_covariance and not all(filter_class(k).has_covariance for k in self.kinds):
+            if objective.needs_covariance and not self._has_covariance:
                 raise ValueError(
                     f"the objective {name!r} needs a filter with a covariance, but got {self.filter!r}"
                 )
         for problem in self.scenarios:
             check_objectives(self.objectives, problem)
-        if not self.tunes_noise and (self.full_q or self.hold_r):
-            names = ", ".join(one.name for one in self.scenarios[0].parameters)
+        parameters = self.scenarios[0].parameters
+        if parameters is not None and (self.full_q or self.hold_r):
+            names = ", ".join(one.name for one in parameters)
             raise ValueError(
                 f"a full Q or an R that is held must be asked of a problem that tunes Q and R, but "
                 f"{self.scenarios[0].name} tunes {names}"
             )
-        if self.full_q and not all(filter_class(kind).has_covariance for kind in self.kinds):
+        if self.full_q and not self._has_covariance:
             raise ValueError(f"a full Q needs a filter with a covariance, but got {self.filter!r}")
         if self.budget is not None:
             positive("budget", self.budget)
@@ -101,7 +114,7 @@ class Plan(NamedTuple):
         return self
 
     def _check_problems(self) -> None:
-        """Raise ValueError unless all problems are such, and one choice of numbers has a meaning for each."""
+        """Raise ValueError unless all scenarios are problems, and the same parameters have a meaning for each."""
         shapes = []
         for one in self.scenarios:
             if not isinstance(one, Problem):
@@ -119,15 +132,15 @@ class Plan(NamedTuple):
         return [find_objective(name) for name in self.objectives]
 
     def space(self) -> dict[str, BaseDistribution]:
-        """What a trial may choose, by name; ranges are those of the first scenario.
+        """The distributions of a trial's parameters by name; ranges are those of the first scenario.
 
-        The scale of P_0 is among it where a scenario counts the start-up.
+        The scale of P_0 is one of them where a scenario scores the start-up.
         """
-        return joint_distributions(self.kinds, self.scenarios[0], **self._options)
+        return joint_distributions(self.filter_types, self.scenarios[0], **self._options)
 
     def parameters(self) -> dict[str, Parameter]:
-        """What a trial may choose beside the kind of filter, by the names that trials have for it."""
-        return joint_parameters(self.kinds, self.scenarios[0], **self._options)
+        """A trial's parameters by name, without the filter type."""
+        return joint_parameters(self.filter_types, self.scenarios[0], **self._options)
 
     @property
     def tunes_noise(self) -> bool:
@@ -140,7 +153,7 @@ class Plan(NamedTuple):
         return {"hold_r": self.hold_r, "full_q": self.full_q, "prior": prior}
 
     def training_data(self) -> list[Data]:
-        """Data that every trial shares, one for each scenario."""
+        """Data that all trials share, one for each scenario."""
         return [scenario.data(scenario.training_seeds(self.seed, TRAINING_SEEDS)) for scenario in self.scenarios]
 
     def size_data(self) -> list[Data]:

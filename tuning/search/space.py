@@ -1,12 +1,12 @@
-"""Search spaces: which numbers of a filter a study may choose, and how a choice becomes a filter."""
+"""Search spaces: the parameters of a filter that a study may choose, and the filter of a choice."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import optuna
-from optuna.distributions import BaseDistribution, CategoricalDistribution, IntDistribution
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 
 from filters.estimators.find import is_foreign
 from filters.filter import Filter
@@ -15,41 +15,41 @@ from filters.registry import FILTERS, filter_class, make_filter, tunable_numbers
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.search.parameters import (
-    FilterNumber,
+    FilterParameter,
     filter_parameters,
     has_process_noise,
     model_parameters,
     places_in,
 )
 
-AUTO = "auto"  # stands for a filter that a study is to choose
-# Among these: all that know how sure they are. The first one is the first trial.
-AUTO_KINDS = ("ekf", *(name for name, kind in FILTERS.items() if kind.has_covariance and name != "ekf"))
-KIND = "filter"  # the trial parameter that is the kind
+AUTO = "auto"  # in place of a filter: a study chooses among the following, all filters with a covariance.
+# The first one is the first trial.
+AUTO_FILTER_TYPES = ("ekf", *(name for name, kind in FILTERS.items() if kind.has_covariance and name != "ekf"))
+FILTER_TYPE = KIND = "filter"  # the trial parameter that is the filter type; KIND is its former name
 SIZE_LADDER = (5, 7, 10, 14, 20, 30, 50, 70, 100, 140, 200, 300, 500, 700, 1000, 1400, 2000, 3000, 5000)
 
 
 class Sizes(NamedTuple):
-    """Ensemble sizes of a kind of filter."""
+    """Ensemble sizes of a filter type."""
 
     untuned: int
     low: int  # of the search
     high: int
 
 
-# The members of a Kalman ensemble make a mean and a covariance, those of a particle filter a whole distribution.
+# The members of a Kalman ensemble represent a mean and a covariance, those of a particle filter a distribution.
 KALMAN_SIZES, PARTICLE_SIZES = Sizes(30, 5, 200), Sizes(1000, 200, 5000)
 
 
 class Choice(NamedTuple):
-    """One choice of a filter's free numbers."""
+    """One choice of a filter's free parameters."""
 
-    name: str  # of the filter
-    model: dict  # arguments of the problem's model, such as `process_noise_cov` and `measurement_noise_cov`
-    numbers: dict  # the filter's own, such as `ensemble_size`
+    name: str  # name of the filter
+    model: dict[str, Any]  # arguments of the problem's model, such as `process_noise_cov`
+    numbers: dict[str, Any]  # the filter's parameters, such as `ensemble_size`
 
     def filter(self, problem: Problem) -> Filter:
-        """The filter of this choice, with what the problem lets it assume of the plant."""
+        """The filter of this choice, with the model that the problem lets it assume."""
         return make_filter(self.name, problem.model(**self.model), **self.numbers)
 
     def with_size(self, ensemble_size: int) -> Choice:
@@ -58,13 +58,16 @@ class Choice(NamedTuple):
 
 
 def untuned_choice(name: str, problem: Problem) -> Choice:
-    """The untuned filter: R from the sensor's sheet, Q from the ranges of the states, N = 30 (particles: 1000)."""
+    """The untuned filter: R from the data sheet, Q from the ranges of the states, N = 30 (particles: 1000)."""
     return Choice(name, dict(problem.untuned), _default_numbers(name, problem))
 
 
-def true_choice(name: str, problem: Problem) -> Choice | None:
-    """The filter that is told the plant's own Q and R, with the untuned ensemble size; None if unknown."""
+def oracle_choice(name: str, problem: Problem) -> Choice | None:
+    """The filter that knows the plant's own Q and R, with the untuned ensemble size; None if they are unknown."""
     return None if problem.true is None else Choice(name, dict(problem.true), _default_numbers(name, problem))
+
+
+true_choice = oracle_choice  # its former name
 
 
 def has_ensemble(name: str) -> bool:
@@ -87,7 +90,7 @@ def _default_numbers(name: str, problem: Problem) -> dict:
     own = _of_filter(name, has_process_noise(problem))
     if is_foreign(name):
         return {one.name: one.start for one in own}
-    numbers = {"ensemble_size": ensemble_sizes_of(name).untuned} if has_ensemble(name) else {}
+    numbers: dict[str, Any] = {"ensemble_size": ensemble_sizes_of(name).untuned} if has_ensemble(name) else {}
     others = [one.name for one in own if one.name != "N"]
     return numbers | {number: getattr(filter_class(name), number) for number in others}
 
@@ -100,15 +103,16 @@ def _of_filter(name: str, process_noise: bool = False) -> list[Parameter]:
 def parameters(
     name: str, problem: Problem, *, hold_r: bool = False, full_q: bool = False, prior: bool = False
 ) -> list[Parameter]:
-    """What a study may choose for a filter.
+    """The parameters that a study may choose for a filter.
 
-    Of the model that is what the problem says: by default Q for each state, R for each channel and, where asked
-    for, the factor on P_0, all on logarithmic scales. Baselines, which know neither, keep the untuned ones.
+    Those of the model are defined by the problem: by default a variance in Q for each state, a variance in R for
+    each channel and, where requested, the factor on P_0, all on logarithmic scales. Filters without a covariance
+    have no parameters of the model.
 
     Args:
-        name: of the filter.
-        problem: the ranges are made of its untuned values.
-        hold_r: leave R at the sensor's sheet.
+        name: name of the filter.
+        problem: the ranges follow from its untuned values.
+        hold_r: leave R as on the sensor's data sheet.
         full_q: choose the correlations of Q, too.
         prior: choose the scale of P_0, too.
     """
@@ -123,52 +127,67 @@ def distributions(name: str, problem: Problem, **options) -> dict[str, BaseDistr
     return {one.name: one.distribution for one in parameters(name, problem, **options)}
 
 
-def joint_parameters(kinds: Sequence[str], problem: Problem, **options) -> dict[str, Parameter]:
-    """What a study may choose among several kinds of filters, by the names that trials have for it.
+def joint_parameters(filter_types: Sequence[str], problem: Problem, **options) -> dict[str, Parameter]:
+    """What a study may choose among several filter types, by the names of the trials' parameters.
 
-    What is of the model (Q, R, P_0) is shared by all kinds. Each kind's own numbers, such as "enkf N", are chosen
-    only where that kind is. Of one kind these are its `parameters`.
+    Parameters of the model (Q, R, P_0) are shared by all filter types. The parameters of one type, such as
+    "enkf N", are chosen only in trials of that type. Of a single type these are its `parameters`.
     """
     found = {}
-    for kind in kinds:
-        for one in parameters(kind, problem, **options):
-            own = isinstance(one.place, FilterNumber) and len(kinds) > 1
-            found[f"{kind} {one.name}" if own else one.name] = one
+    for name in filter_types:
+        for one in parameters(name, problem, **options):
+            of_filter = isinstance(one.place, FilterParameter) and len(filter_types) > 1
+            found[f"{name} {one.name}" if of_filter else one.name] = one
     return found
 
 
-def joint_distributions(kinds: Sequence[str], problem: Problem, **options) -> dict[str, BaseDistribution]:
-    """The ranges of `joint_parameters`, as Optuna takes them; of several kinds, "filter" comes first."""
-    found: dict[str, BaseDistribution] = {KIND: CategoricalDistribution(kinds)} if len(kinds) > 1 else {}
-    return found | {key: one.distribution for key, one in joint_parameters(kinds, problem, **options).items()}
+def joint_distributions(filter_types: Sequence[str], problem: Problem, **options) -> dict[str, BaseDistribution]:
+    """The ranges of `joint_parameters`, as Optuna takes them; of several filter types, "filter" comes first."""
+    found: dict[str, BaseDistribution] = {}
+    if len(filter_types) > 1:
+        found[FILTER_TYPE] = CategoricalDistribution(filter_types)
+    return found | {
+        key: one.distribution for key, one in joint_parameters(filter_types, problem, **options).items()
+    }
 
 
-def _is_of(kind: str | None, key: str) -> bool:
-    """Whether a parameter of `joint_distributions` is chosen for a kind."""
-    return " " not in key or key.startswith(f"{kind} ")
+def _is_of(filter_type: str | None, key: str) -> bool:
+    """Whether a parameter of `joint_distributions` is chosen for a filter type."""
+    return " " not in key or key.startswith(f"{filter_type} ")
 
 
 def suggest(
     trial: optuna.trial.BaseTrial, name: str, problem: Problem, space: Mapping[str, BaseDistribution]
 ) -> Choice:
-    """Let a trial choose all that a space of `joint_distributions` lists for the kind that it chooses."""
-    chosen = {}
+    """Let a trial choose its filter type, and the parameters of a `joint_distributions` space for that type."""
+    chosen: dict[str, float | int | str] = {}
+    filter_type = None
     for key, distribution in space.items():
         if isinstance(distribution, CategoricalDistribution):
-            chosen[key] = trial.suggest_categorical(key, distribution.choices)
-        elif _is_of(chosen.get(KIND), key):
-            draw = trial.suggest_int if isinstance(distribution, IntDistribution) else trial.suggest_float
-            chosen[key] = draw(key, distribution.low, distribution.high, log=distribution.log)
+            filter_type = str(trial.suggest_categorical(key, distribution.choices))
+            chosen[key] = filter_type
+        elif _is_of(filter_type, key):
+            if isinstance(distribution, IntDistribution):
+                chosen[key] = trial.suggest_int(key, distribution.low, distribution.high, log=distribution.log)
+            elif isinstance(distribution, FloatDistribution):
+                chosen[key] = trial.suggest_float(key, distribution.low, distribution.high, log=distribution.log)
     return choice_of(name, chosen, problem)
 
 
-def choice_of(name: str, values: Mapping[str, float | int | str], problem: Problem) -> Choice:
-    """The choice that trial parameters stand for; what is not among them is that of the untuned filter.
+def ends_of(distribution: BaseDistribution) -> tuple[float, float]:
+    """The smallest and the largest value of a parameter; TypeError for a choice among names."""
+    if not isinstance(distribution, FloatDistribution | IntDistribution):
+        raise TypeError(f"only a range of numbers has ends, but got {distribution}")
+    return distribution.low, distribution.high
 
-    A filter named "auto" is the one that the parameter "filter" names.
+
+def choice_of(name: str, values: Mapping[str, float | int | str], problem: Problem) -> Choice:
+    """The choice of a trial's parameters; parameters that it lacks are those of the untuned filter.
+
+    For the name "auto" the parameter "filter" names the filter.
     """
     if name == AUTO:
-        name = values[KIND]
+        name = str(values[FILTER_TYPE])
         values = {key.removeprefix(f"{name} "): value for key, value in values.items()}
     choice = untuned_choice(name, problem)
     if "N" not in values:
@@ -181,12 +200,12 @@ def choice_of(name: str, values: Mapping[str, float | int | str], problem: Probl
 
 
 def has_search_space(name: str) -> bool:
-    """Whether there is anything to choose for a filter."""
+    """Whether a filter has any parameter to choose."""
     return filter_class(name).has_covariance or bool(_of_filter(name))
 
 
 def parameters_of(choice: Choice) -> dict[str, float | int]:
-    """The trial parameters that stand for a choice of one kind: the inverse of `choice_of`.
+    """The trial parameters of a choice of one filter type: the inverse of `choice_of`.
 
     Correlations and P0 are among them where the choice has a full Q and a factor on P_0.
     """
@@ -196,17 +215,21 @@ def parameters_of(choice: Choice) -> dict[str, float | int]:
 
 
 def neutral(parameter: str) -> float | None:
-    """What a trial parameter is where a choice lacks it: no correlation, P_0 as it is; None for all others."""
+    """The value of a trial parameter that a choice lacks: no correlation, P_0 unchanged; None for all others."""
     return 1.0 if parameter == "P0" else 0.0 if parameter.startswith("correlation") else None
 
 
 def trial_parameters(choice: Choice, space: Mapping[str, BaseDistribution]) -> dict[str, float | int | str]:
-    """What a trial in a space of `joint_distributions` has to be given to make a choice."""
-    own, found = parameters_of(choice), {}
+    """The parameters of a trial in a `joint_distributions` space that make a choice."""
+    own = parameters_of(choice)
+    found: dict[str, float | int | str] = {}
     for key in space:
-        if key == KIND:
+        if key == FILTER_TYPE:
             found[key] = choice.name
         elif _is_of(choice.name, key):
             short = key.removeprefix(f"{choice.name} ")
-            found[key] = own.get(short, neutral(short))
+            value = own.get(short, neutral(short))
+            if value is None:
+                raise ValueError(f"a trial must have a value of {key}, but the choice has none")
+            found[key] = value
     return found

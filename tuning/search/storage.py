@@ -33,14 +33,17 @@ CONNECT_SECONDS = 10  # for which to try to reach one, where its driver can be t
 WITH_TIMEOUT = re.compile(r"(postgresql(\+psycopg2?)?|(mysql|mariadb)(\+(pymysql|mysqldb))?)://")
 HEARTBEAT_SECONDS = 10  # between two signs of life of a running trial in a database
 GRACE_SECONDS = 180  # without one, after which it counts as lost; an outage is shorter
-PROXY_PORT, PROXY_SECONDS = 13000, 10  # where a proxy listens by default, and how soon it has to answer
-PROCESS, RETRY_OF = "process", "retry_of"  # trial attributes: who runs it, and what it repeats
+PROXY_PORT, PROXY_SECONDS = 13000, 10  # the default port of a proxy, and the time in which it has to answer
+PROCESS, RETRY_OF = (
+    "process",
+    "retry_of",
+)  # trial attributes: who runs it, and which one it repeats
 
 
 def open_storage(storage: str) -> BaseStorage:
     """Open a storage: a URL such as "postgresql+psycopg2://..." or "grpc://host:port", else a journal file.
 
-    A database may go away for a minute; a trial that it hears no more of is lost, and queued once more.
+    A database may be unreachable for a minute; a trial without signs of life is lost, and enqueued once more.
 
     A last line that a killed process left unfinished in a journal is cut off, with a warning.
 
@@ -104,12 +107,18 @@ def _connected(url: str) -> RDBStorage:
             engine_kwargs={"connect_args": {"connect_timeout": CONNECT_SECONDS}}
             if WITH_TIMEOUT.match(url)
             else None,
-            heartbeat_stale_trial_callback=retry_once,
+            heartbeat_stale_trial_callback=_retry,
         )
+
+
+def _retry(study: optuna.Study, trial: FrozenTrial) -> None:
+    retry_once(study, trial)
 
 
 def _proxy(url: str) -> BaseStorage:
     parts = urlsplit(url)
+    if parts.hostname is None:
+        raise ValueError("it names no host")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         proxy = GrpcStorageProxy(host=parts.hostname, port=parts.port or PROXY_PORT)
@@ -118,7 +127,7 @@ def _proxy(url: str) -> BaseStorage:
 
 
 class Outage:
-    """A database that does not answer, as all threads of this process see it: one deadline for all their calls."""
+    """A database that does not answer, for all threads of this process: one deadline for all their calls."""
 
     def __init__(self):
         """Begin with a database that answers."""
@@ -191,7 +200,7 @@ def _all_patient(storage: type) -> type:
 
 @_all_patient
 class _PatientStorage(_CachedStorage):
-    """What Optuna makes of a database, in no hurry."""
+    """Optuna's cached storage of a database, whose calls are repeated until the database answers."""
 
     def __init__(self, database: RDBStorage):
         super().__init__(database)
@@ -203,7 +212,7 @@ class _PatientStorage(_CachedStorage):
             super().record_heartbeat(trial_id)
             self.outage.answered("record_heartbeat")
         except StorageInternalError as error:
-            with contextlib.suppress(ValueError):  # it is for the thread that runs the trial to end
+            with contextlib.suppress(ValueError):  # the thread that runs the trial has to end it
                 self.outage.noticed("record_heartbeat", str(error))
 
 
@@ -213,7 +222,7 @@ def this_process() -> str:
 
 
 def retry_orphans(study: optuna.Study) -> int:
-    """Fail running trials whose process on this host is gone, and queue each once more; return how many."""
+    """Fail running trials whose process on this host is gone, and enqueue each once more; return how many."""
     retried = 0
     for trial in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
         signed = _wait_for_signature(study, trial)
@@ -228,7 +237,7 @@ def retry_orphans(study: optuna.Study) -> int:
 
 
 def retry_once(study: optuna.Study, trial: FrozenTrial) -> bool:
-    """Queue a lost trial once more, unless it is a second try or had no numbers yet; return whether it is."""
+    """Enqueue a lost trial once more, unless it is a second try or has no parameters yet; return whether so."""
     if RETRY_OF in trial.user_attrs or not trial.params:
         return False
     study.enqueue_trial(trial.params, user_attrs={RETRY_OF: trial.number})

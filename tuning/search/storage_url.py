@@ -1,4 +1,4 @@
-"""What may be shown of a storage's URL: scheme, host and database, never who logs in, with what, or an option."""
+"""What may be shown of a storage's URL: scheme, host and database, never the user, the password or an option."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ def shown_storage(storage: str) -> str:
     """
     scheme, separator, rest = storage.partition("://")
     if not separator:
-        return f"{_MISSPELT.match(storage)[0]}{HIDDEN}" if is_misspelt(storage) else storage
+        misspelt = _MISSPELT.match(storage)
+        return storage if misspelt is None else f"{misspelt[0]}{HIDDEN}"
     if not _SCHEME.fullmatch(scheme):
         return HIDDEN
     place = _place(rest)
@@ -34,7 +35,7 @@ def is_misspelt(storage: str) -> bool:
 
 def _place(rest: str) -> str | None:
     """Host, port and database of what follows a scheme, None where it is not sure which part they are."""
-    if rest.startswith("/"):  # no host, and so nobody who logs in
+    if rest.startswith("/"):  # no host, and so no user
         return re.split(r"[?#]", rest, maxsplit=1)[0]
     before, at, after = rest.rpartition("@")
     if at and re.search(r"[?#]", before):

@@ -1,4 +1,4 @@
-"""Optuna studies of a filter's numbers: common random numbers in, a choice out."""
+"""Optuna studies of a filter's parameters, with common random numbers for all trials."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tuning.evaluation.kept import kept_sizes, sizes_as_data
 from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
 from tuning.problems.data import Data
 from tuning.search.cost import COST
-from tuning.search.enqueued import enqueue_followers, enqueue_what_is_left
+from tuning.search.enqueued import enqueue_after, enqueue_what_is_left
 from tuning.search.interruption import stop_on_interrupt
 from tuning.search.objectives import nis_ratio
 from tuning.search.outcome import best_trial, is_consistent
@@ -25,18 +25,18 @@ from tuning.search.storage import PROCESS, retry_orphans, this_process
 from tuning.search.trials import cost_of, make_pruner, measure, run_trial
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
-BEST = "best trial under the constraints"  # attribute of a study, for programs that know no constraints
-SIZES = "ensemble sizes"  # attribute of a study: their table, and what it is of
+BEST = "best trial under the constraints"  # attribute of a study, for programs that ignore constraints
+SIZES = "ensemble sizes"  # attribute of a study: their table, with its digest
 OnTrial = Callable[[optuna.Study, int], None]
 
 
 def quiet_optuna() -> None:
-    """Let Optuna report errors only, for programs that show progress of their own."""
+    """Let Optuna report errors only, for programs that show their own progress."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
 
 
 class StudyResult(NamedTuple):
-    """What a study found, before it is proved on held-out data."""
+    """The result of a study, before held-out evaluation."""
 
     choice: Choice  # with the smallest sufficient ensemble
     best_value: float  # first objective of the best trial, on the training seeds
@@ -44,27 +44,36 @@ class StudyResult(NamedTuple):
     sizes: list[SizeRow]  # score against ensemble size, empty without an ensemble
     seconds: float
     interrupted: bool
-    free_value: float | None = None  # first objective of the best trial, consistent or not; None where all count
-    front: tuple[FrozenTrial, ...] = ()  # trials that no other beats in both of two objectives
-    microseconds: float | None = None  # that a step of the choice takes, where the plan asks for it
-    consistent: bool | None = None  # whether any trial's mean NIS is in its band; None where all count
-    nis: tuple[float, ...] = ()  # the choice's, over the number of channels, on each scenario's training seeds
+    free_value: float | None = (
+        None  # first objective of the best trial, consistent or not; None without a constraint
+    )
+    front: tuple[FrozenTrial, ...] = ()  # Pareto front: trials that no other trial dominates in two objectives
+    microseconds: float | None = None  # us/step of the choice, where the plan asks for it
+    consistent: bool | None = None  # whether any trial's mean NIS is within its band; None without a constraint
+    nis: tuple[float, ...] = ()  # NIS of the choice over the number of channels, on each scenario's training seeds
 
     @property
     def finished(self) -> int:
-        """Trials that count: complete ones and those that ended early."""
+        """Number of finished trials: complete and pruned ones."""
         return sum(trial.state in FINISHED for trial in self.trials)
 
     @property
     def pruned(self) -> int:
-        """Trials that ended early."""
+        """Number of pruned trials."""
         return sum(trial.state == TrialState.PRUNED for trial in self.trials)
 
     def or_interrupted(self) -> StudyResult:
-        """This result; KeyboardInterrupt instead if Ctrl-C ended the study, for work of which it is a part."""
+        """This result; KeyboardInterrupt if Ctrl-C ended the study, for a caller whose work has to end, too."""
         if self.interrupted:
             raise KeyboardInterrupt
         return self
+
+
+def checked(plan: Plan) -> Plan:
+    """A plan that can work, whose sampler is there; ValueError otherwise, before anything is stored."""
+    plan = plan.checked()
+    make_sampler(plan.sampler, plan.seed, 0, plan.space())
+    return plan
 
 
 def open_study(
@@ -74,24 +83,22 @@ def open_study(
     start: Choice | None = None,
     worker: int = 0,
 ) -> optuna.Study:
-    """Create a study or load it to go on; its first trial is `start`, by default the untuned filter.
+    """Create a study, or load it to continue it; its first trial is `start`, by default the untuned filter.
 
-    A study over several kinds tries the untuned filter of every kind, one after the other.
+    A study over several filter types tries the untuned filter of each type, one after the other.
 
     Args:
-        name: of the study.
+        name: name of the study.
         plan: what the study is for.
-        storage: from `open_storage`; None for one that ends with the process.
+        storage: from `open_storage`; None for a study in memory.
         start: the first trial, in place of untuned ones.
-        worker: place of this process among those that share the study; 0 if it may be the only one.
+        worker: index of this process among those that share the study; 0 if it may be the only one.
 
     Raises:
         ValueError: if the plan cannot work, or a study of this name was made for something else or by another
             version of Optuna.
     """
-    plan = plan.checked()
-    space = plan.space()
-    make_sampler(plan.sampler, plan.seed, 0, space)  # a clear error before anything is stored
+    plan, space = checked(plan), plan.space()
     study = optuna.create_study(
         study_name=name,
         storage=storage,
@@ -115,7 +122,7 @@ def open_study(
 
 
 def _check_identity(name: str, wanted: dict, found: dict) -> None:
-    """Raise ValueError, with what differs, unless a study is for what is wanted."""
+    """Raise ValueError, with the differences, unless a study has the wanted identity."""
     if found != wanted:
         differing = [key for key in {**wanted, **found} if wanted.get(key) != found.get(key)]
         wanted, found = ({key: part.get(key) for key in differing} for part in (wanted, found))
@@ -126,7 +133,7 @@ def _check_identity(name: str, wanted: dict, found: dict) -> None:
 
 
 def finished_trials(study: optuna.Study) -> int:
-    """Number of trials that count: complete and pruned ones."""
+    """Number of finished trials: complete and pruned ones."""
     return len(study.get_trials(deepcopy=False, states=FINISHED))
 
 
@@ -139,7 +146,7 @@ def run_study(
 ) -> StudyResult:
     """Run a study until it has `trials` finished trials, all on the same training seeds.
 
-    Ctrl-C ends it after the running trial and keeps what is finished; a second one ends it at once.
+    Ctrl-C ends it after the running trial and keeps all finished trials; a second one ends it at once.
 
     Args:
         study: from `open_study`.
@@ -165,15 +172,18 @@ def run_study(
             f"budget must be at least what the cheapest trial takes, {min(costs):.3g} microseconds a step, "
             f"but got {plan.budget:g}"
         )
-    if study.user_attrs.get(BEST) != best.number:  # another worker's last word may have been an older one
+    if study.user_attrs.get(BEST) != best.number:  # another worker may have written an older one last
         study.set_user_attr(BEST, best.number)
     choice = choice_of(plan.filter, best.params, plan.scenarios[0])
-    sizes, consistent = [], plan.is_constrained and is_consistent(best)
+    sizes: list[SizeRow] = []
+    consistent = plan.is_constrained and is_consistent(best)
     if has_ensemble(choice.name) and len(plan.objectives) == 1:
-        sizes = kept_sizes(study.user_attrs.get(SIZES), choice, plan)
-        if sizes is None:
+        kept = kept_sizes(study.user_attrs.get(SIZES), choice, plan)
+        if kept is None:
             sizes = ensemble_sizes(choice, plan, data, consistent)
             study.set_user_attr(SIZES, sizes_as_data(sizes, choice, plan))
+        else:
+            sizes = kept
         if sizes:
             choice = choice.with_size(sufficient_size(sizes, consistent))
         elif all(scenario.leads_in for scenario in plan.scenarios):
@@ -196,7 +206,7 @@ def run_study(
 
 
 def _note_best(study: optuna.Study, last: FrozenTrial) -> None:
-    """Write down the last trial's number if it is the best one."""
+    """Store the last trial's number if it is the best one."""
     best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
     if best is not None and best.number == last.number:
         study.set_user_attr(BEST, last.number)
@@ -220,7 +230,7 @@ def run_trials(
         trials: finished trials that the study shall have in total.
         on_trial: called after each trial with the study and the number of finished trials.
         stop: asked before the first and after each trial whether to end.
-        on_choice: called with what each trial tries.
+        on_choice: called with the choice of each trial.
     """
     if stop() or finished_trials(study) >= trials:
         return False
@@ -233,7 +243,7 @@ def run_trials(
         _note_best(study, trial)
         finished = finished_trials(study)
         if finished < trials:
-            enqueue_followers(study, plan, trial)
+            enqueue_after(study, plan, trial)
         on_trial(study, finished)
         if finished >= trials or interrupted() or stop():
             study.stop()
@@ -249,7 +259,7 @@ def run_trials(
 
 
 def _first_cause(error: BaseException) -> BaseException:
-    """What a storage said before Optuna's own assertions hid it."""
+    """The error of a storage that Optuna's own assertions have hidden."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, (OSError, ValueError)):
         cause = cause.__context__

@@ -1,4 +1,7 @@
-"""One trial of a study: the same seeds for all, in blocks, and an early end for what cannot win."""
+"""One trial of a study: the same seeds for all trials, in blocks, and pruning.
+
+NEES is the normalised estimation error squared, NIS the normalised innovation squared.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +21,14 @@ from tuning.search.objectives import LARGEST, nis_ratio, nis_violation, penalise
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, suggest
 
-BLOCK = 8  # seeds between two decisions whether to go on
+BLOCK = 8  # seeds between two decisions whether to prune
 CONSISTENCY = "mean NIS outside its band"  # name of the constraint; at most zero is inside
 NIS = "mean NIS over the number of channels"
-P_THRESHOLD = 0.1  # of Wilcoxon's signed-rank test, below which a trial ends
+P_THRESHOLD = 0.1  # p-value of Wilcoxon's signed-rank test below which a trial is pruned
 
 
 def make_pruner(plan: Plan) -> optuna.pruners.BasePruner:
-    """Wilcoxon's signed-rank test over seeds, paired with the best trial's; or none."""
+    """Wilcoxon's signed-rank test over seeds, paired with the best trial; or no pruning."""
     if not plan.prune or len(plan.objectives) > 1:
         return optuna.pruners.NopPruner()
     with warnings.catch_warnings():
@@ -39,7 +42,7 @@ def run_trial(
     data: Sequence[Data],
     on_choice: Callable[[Choice], None] = lambda choice: None,
 ) -> list[float]:
-    """Values of a trial, one for each objective; `on_choice` is told what it tries.
+    """Values of a trial, one for each objective; `on_choice` is called with its choice.
 
     Raises:
         optuna.TrialPruned: if it is over the plan's budget, or significantly worse than the best one on the seeds
@@ -60,7 +63,7 @@ def run_trial(
     if plan.is_constrained:
         outside = max(map(nis_violation, evaluations))
         trial.set_constraint(CONSISTENCY, outside)
-        if outside < LARGEST:  # else there is no finite NIS to speak of
+        if outside < LARGEST:  # otherwise there is no finite NIS
             trial.set_user_attr(NIS, geometric_mean(map(nis_ratio, evaluations)))
     return [
         float(np.mean([penalised(objective.value(e, microseconds), e) for e in evaluations]))
@@ -69,7 +72,7 @@ def run_trial(
 
 
 def cost_of(choice: Choice, plan: Plan, data: Sequence[Data]) -> float:
-    """Microseconds that a step of a choice takes, on the scenario where that is most."""
+    """Cost of a choice [us/step], on the scenario where it is largest."""
     pairs = zip(plan.scenarios, data, strict=True)
     return max(microseconds_a_step(choice.filter(scenario), one) for scenario, one in pairs)
 
@@ -77,9 +80,9 @@ def cost_of(choice: Choice, plan: Plan, data: Sequence[Data]) -> float:
 def measure(
     choice: Choice, plan: Plan, data: Sequence[Data], trial: optuna.Trial | None = None
 ) -> list[Evaluation]:
-    """Run a choice on all data; with a trial, tell it each seed's score and end where it should be pruned.
+    """Run a choice on all data; with a trial, report each seed's score to it and stop if it should be pruned.
 
-    The NEES is worked out where an objective is made of it.
+    The NEES is computed where an objective needs it.
     """
     nees = any(objective.needs_nees for objective in plan.found_objectives())
     filters = [choice.filter(scenario) for scenario in plan.scenarios]

@@ -1,8 +1,8 @@
 """Several processes on one host that run trials of one study.
 
 Each is `python -m tuning.search.workers`, in a session of its own, so that Ctrl-C reaches the parent alone. It
-reads what to do as a line of JSON from its standard input, and ends after its running trial when that is closed:
-by its parent, or because its parent is gone.
+reads its task as a line of JSON from its standard input, and ends after its running trial when that is closed: by
+its parent, or because its parent has ended.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import warnings
 import zlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from typing import Any
 
 import optuna
 
@@ -46,8 +47,8 @@ def run_in_workers(
 ) -> bool:
     """Run trials in several processes until the study has `trials` finished ones; return whether Ctrl-C ended it.
 
-    Ctrl-C ends each worker after its running trial, a second one ends them at once. A worker that dies loses its
-    running trial, which another one repeats; should all die, this process goes on alone.
+    Ctrl-C ends each worker after its running trial, a second one ends them at once. If a worker dies,
+    another one repeats its running trial; if all die, this process continues alone.
 
     Args:
         study: from `open_study`, in `storage`.
@@ -59,11 +60,16 @@ def run_in_workers(
         workers: number of processes.
     """
     names = [scenario.name for scenario in plan.scenarios]
-    orders = {"study": study.study_name, "storage": storage, "trials": trials, "workers": workers}
-    orders["plan"] = plan._replace(scenarios=names)._asdict()
+    orders: dict[str, Any] = {
+        "study": study.study_name,
+        "storage": storage,
+        "trials": trials,
+        "workers": workers,
+    }
+    orders["plan"] = {**plan._asdict(), "scenarios": names}
     orders["digests"] = [scenario.digest for scenario in plan.scenarios]
     orders["logs"] = {one.name: _packed(one) for one in plan.scenarios if isinstance(one, LogProblem)}
-    # Places that no other host has, whichever starts first, so that no two workers propose the same.
+    # Indices that no other host has, so that no two workers propose the same trials.
     first = zlib.crc32(this_process().encode())
     processes: dict[int, subprocess.Popen] = {}
     try:
@@ -78,13 +84,12 @@ def run_in_workers(
         for process in processes.values():
             process.kill()
             process.wait()
-            with suppress(BrokenPipeError):
-                process.stdin.close()
+            _close_input(process)
         retry_orphans(study)
 
 
 def _packed(problem: LogProblem) -> str:
-    """A problem of logs as text: no name tells how these are read. Only the parent of a worker sends such."""
+    """A problem of logs as text, since it cannot be found by a name. Only the parent of a worker sends it."""
     try:
         return base64.b64encode(pickle.dumps(problem)).decode()
     except Exception as error:  # functions within functions, say
@@ -101,10 +106,18 @@ def _start(orders: dict) -> subprocess.Popen:
     command = [sys.executable, "-m", "tuning.search.workers"]
     with without_interrupts():
         process = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True)
-    with suppress(BrokenPipeError):  # it has died already, which its exit code tells
+    assert process.stdin is not None  # a pipe
+    with suppress(BrokenPipeError):  # it has died already, which its exit code shows
         process.stdin.write(json.dumps(orders) + "\n")
         process.stdin.flush()
     return process
+
+
+def _close_input(process: subprocess.Popen) -> None:
+    """Close a worker's standard input, which asks it to end."""
+    if process.stdin is not None:
+        with suppress(BrokenPipeError):
+            process.stdin.close()
 
 
 def _watch(
@@ -115,8 +128,7 @@ def _watch(
         time.sleep(POLL_SECONDS)
         if interrupted():
             for process in living.values():
-                with suppress(BrokenPipeError):
-                    process.stdin.close()
+                _close_input(process)
         for worker, process in list(living.items()):
             if process.poll() is not None:
                 del living[worker]
@@ -137,26 +149,25 @@ def _cause(process: subprocess.Popen) -> str:
 
 
 def take_share(workers: int) -> None:
-    """Let this process count its share of the cores as all there are, whichever it then runs on."""
+    """Let this process use the number of threads that is its share of the cores; it may run on any core."""
     if hasattr(os, "sched_setaffinity"):
         allowed = os.sched_getaffinity(0)
         os.sched_setaffinity(0, sorted(allowed)[: max(1, len(allowed) // workers)])
-        cores()  # is remembered
+        cores()  # is cached
         os.sched_setaffinity(0, allowed)
 
 
 def main() -> None:
-    """Run trials as standard input says, until the study is finished or standard input is closed."""
+    """Run the trials that standard input describes, until the study is finished or standard input is closed."""
     orders = json.loads(sys.stdin.readline())
     take_share(orders["workers"])
     quiet_optuna()
-    plan = Plan(**orders["plan"])
+    given = orders["plan"]
     try:
         logs = {name: _unpacked(text) for name, text in orders.get("logs", {}).items()}
-        pairs = zip(plan.scenarios, orders["digests"], strict=True)
+        pairs = zip(given["scenarios"], orders["digests"], strict=True)
         scenarios = tuple(logs.get(name) or find_same(name, digest) for name, digest in pairs)
-        objectives = tuple(plan.objectives)
-        plan = plan._replace(scenarios=scenarios, objectives=objectives)
+        plan = Plan(**{**given, "scenarios": scenarios, "objectives": tuple(given["objectives"])})
         study = open_study(orders["study"], plan, open_storage(orders["storage"]), worker=orders["place"])
         run_trials(study, plan, plan.training_data(), orders["trials"], stop=_parent_says_stop)
     except (ValueError, OSError) as error:

@@ -1,1 +1,1 @@
-"""The thruster's scenarios, the only room of tuning that knows a plant."""
+"""The thruster's scenarios, and its parameters for identification."""

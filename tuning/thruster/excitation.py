@@ -19,7 +19,7 @@ from tuning.problems.excitation import EXCITATIONS, Excitation
 
 
 def voltages_of(excitation: Excitation, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
-    """Voltages (B, steps) [V] for keys (B, 2); those beyond the plant's range are to be cut off."""
+    """Voltages (B, steps) [V] for keys (B, 2), not yet clipped to the plant's range."""
     if isinstance(excitation, ClosedLoop):
         return excitation.voltages(plant, keys, steps)
     return excitation.inputs(keys, steps, plant.dt, 1)[..., 0]
@@ -31,12 +31,12 @@ class ClosedLoop(Excitation):
     """The voltage of a PI controller that makes the measured thrust follow a reference.
 
     The loop is that of `BowThrusterTracking-v0` with the same seed and reference under `PIController.for_env`. It
-    is closed through the sensor and all that spoils it, not through a filter: all filters meet the same voltages.
+    is closed through the sensor with all its effects, not through a filter: all filters get the same voltages.
 
     Args:
         low: lowest level of the reference, as a fraction of the steady thrust at max_voltage.
         high: highest level.
-        hold_time: for which a level is held [s].
+        hold_time: time for which a level is held [s].
     """
 
     low: float = -0.5
@@ -56,7 +56,7 @@ class ClosedLoop(Excitation):
         return REFERENCE_SIGNALS.make({"name": "steps", **levels})
 
     def inputs(self, keys: np.ndarray, steps: int, dt: float, count: int) -> np.ndarray:
-        """There are none without a thruster: ValueError."""
+        """Raise ValueError: the voltages depend on the thruster, see `voltages`."""
         raise ValueError("the excitation 'pi' must be a thruster's, for it is a loop closed through its sensor")
 
     def voltages(self, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
@@ -70,7 +70,7 @@ class ClosedLoop(Excitation):
         out, state, report = np.empty((len(keys), steps)), None, copies.begin(keys)
         measured = slice(READINGS, READINGS + len(plant.channels))
         for k in range(steps):
-            # An env's observation, and so in float32.
+            # float32, as an env's observation.
             observation = np.concatenate([report[measured], report[[NEXT_REFERENCE]]]).T.astype(np.float32)
             action, state = controller.predict(observation, state)
             out[:, k] = action[:, 0]

@@ -1,4 +1,4 @@
-"""The thruster's scenarios by name or file, as `tuning.problems.find` is told of them."""
+"""The thruster's scenarios by name or file, for `tuning.problems.find`."""
 
 from __future__ import annotations
 

@@ -1,10 +1,11 @@
-"""What of a thruster may be free in `thruster identify`, and the model for its values."""
+"""The parameters of a thruster that may be free in `thruster identify`, and the model for their values."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -34,34 +35,35 @@ UNITS = {
     "blade_angle": "rad",
     "thrust_asymmetry": "",
 }  # of the thruster's own parameters
-FACTOR = 10.0  # of the start, to either side, that a positive parameter may be
-NOISE_FACTOR = 1e4  # the same of variances
+FACTOR = 10.0  # range of a positive parameter about its start
+NOISE_FACTOR = 1e4  # range of a variance about its start
 LINEAR = {"blade_angle": (0.05, 1.5), "thrust_asymmetry": (-0.5, 0.5)}
 FASTEST_FLOW = 2.0  # [m/s], ambient
-DEAD_PART = 0.25  # of the largest voltage, that a dead band may reach to
+DEAD_PART = 0.25  # largest dead band, as a fraction of the largest voltage
 DEAD_START = 0.02
-BIAS_PART = 0.25  # of the channel's largest magnitude
+BIAS_PART = 0.25  # largest bias, as a fraction of the channel's largest magnitude
 LAGS = 0.1, 100.0  # time constants in sample times
 LAG_START = 3.0
-OFFSETS = 10.0  # sample times that a clock may be off, and at least
+OFFSETS = 10.0  # largest clock offset, in sample times, but at least
 LEAST_OFFSET = 0.1  # [s]
 
 
 class ThrusterFamily:
     """A thruster's models and logs as functions of its free parameters.
 
-    Known are the fields of `ThrusterParameters` but angles; ambient_velocity; dead_band, or dead_band_low and
-    dead_band_high; bias_CHANNEL, lag_CHANNEL and clock_offset_CHANNEL; Q11, Q22 and R, or R11, R22, ...
+    The parameters are the fields of `ThrusterParameters` except angles; ambient_velocity; dead_band, or
+    dead_band_low and dead_band_high; bias_CHANNEL, lag_CHANNEL and clock_offset_CHANNEL; Q11, Q22 and R, or R11,
+    R22, ...
 
     Args:
-        logs: of the plant's inputs and channels.
-        plant: where everything starts, and what is held.
-        seen: what logs show beside, where it starts.
+        logs: logs with the plant's inputs and channels.
+        plant: the start of all parameters, and the values of the held ones.
+        seen: start of the recorder's parameters: dead band, bias and lag.
         free: names of free parameters.
         noise: whether Q and R are free, too.
 
     Raises:
-        ValueError: for an unknown name, with those that are known.
+        ValueError: for an unknown name; the message has the known ones.
     """
 
     def __init__(self, logs: Sequence[Log], plant: Plant, seen: Shown, free: Sequence[str], *, noise: bool = True):
@@ -89,7 +91,7 @@ class ThrusterFamily:
 
     @cached_property
     def known(self) -> dict[str, Parameter]:
-        """Every parameter that may be free, with its range about where it starts."""
+        """Every parameter that may be free, with its range about its start."""
         plant, seen, found = self.plant, self.seen, {}
         for name, unit in UNITS.items():
             found[name] = _about(name, getattr(plant.parameters, name), unit)
@@ -125,20 +127,21 @@ class ThrusterFamily:
 
     @property
     def data(self):
-        """The logs, or a function of the clock offsets that are free."""
+        """The logs, or a function of the free clock offsets."""
         return self.shifted(self.logs)
 
     def shifted(self, logs: Sequence[Log]):
-        """Some logs as this family takes them: as they are, or a function of the clock offsets that are free."""
+        """Some logs for this family: unchanged, or a function of the free clock offsets."""
         offsets = tuple(one.name for one in self.free if one.name.startswith("clock_offset_"))
         return ShiftedLogs(logs, offsets) if offsets else tuple(logs)
 
     def parameters(self, values: Mapping[str, float]) -> ThrusterParameters:
         """The thruster's own parameters."""
-        return checked(self.plant.parameters._replace(**{k: v for k, v in values.items() if k in UNITS}))
+        changes: dict[str, Any] = {name: value for name, value in values.items() if name in UNITS}
+        return checked(self.plant.parameters._replace(**changes))
 
     def plant_at(self, values: Mapping[str, float]) -> Plant:
-        """The plant for values; others are held."""
+        """The plant for some values; the others are held."""
         q, r = self._noise(values)
         return self.plant._replace(
             parameters=self.parameters(values),
@@ -148,11 +151,11 @@ class ThrusterFamily:
         )
 
     def shown_at(self, values: Mapping[str, float]) -> Shown:
-        """What logs show beside, for values."""
+        """The recorder's parameters (dead band, bias and lag) for some values."""
         return self._shown(values)
 
     def model(self, **values: float) -> StateSpaceModel:
-        """The model for values of the free parameters, but for clock offsets; quickly: its ranges stay."""
+        """The model for values of the free parameters without clock offsets; its ranges stay, which is fast."""
         plant, seen = self.plant_at(values), self._shown(values)
         constants = plant.constants
         step, biases, lags = constants.substep, dict(seen.bias), dict(seen.lag)
@@ -162,8 +165,9 @@ class ThrusterFamily:
             further[f"kept_{place}"], further[f"after_{place}"] = lag_weights(lags.get(channel, 0.0), step)
         q = self._base.process_noise_cov.copy()
         q[:2, :2] = plant.process_noise_cov
+        before: Any = self._base.constants  # a NamedTuple
         return self._base.replace(
-            constants=self._base.constants._replace(**constants._asdict(), **further),
+            constants=before._replace(**constants._asdict(), **further),
             process_noise_cov=q,
             measurement_noise_cov=plant.measurement_noise_cov,
         )
@@ -198,24 +202,24 @@ class ThrusterFamily:
 class ShiftedLogs:
     """Logs as a function of clock offsets of their channels [s].
 
-    Of a channel that is shifted every other row counts. Between two samples it is interpolated, and so the noise
-    of rows one after the other is correlated; a likelihood of white noise would then take a wrong offset for a
-    good one. Every other row shares no sample with the next.
+    Of a shifted channel only every other row is used. It is interpolated between two samples, so that the noise of
+    consecutive rows is correlated, and a likelihood of white noise would prefer a wrong offset. Every other row
+    shares no sample with the next one.
     """
 
     def __init__(self, logs: Sequence[Log], names: Sequence[str]):
-        """Take logs, and the names clock_offset_CHANNEL."""
+        """Take logs, and names such as clock_offset_CHANNEL."""
         self.logs, self.parameters = tuple(logs), tuple(names)
 
     def __call__(self, **offsets: float) -> list[Log]:
-        """The logs with the channels' clocks set."""
+        """The logs with shifted clocks of the channels."""
         return [self._shifted(log, offsets) for log in self.logs]
 
     def noise_factors(self, **offsets: float) -> dict[str, float]:
-        """What is left of the variance of white noise in each shifted channel, by symbol.
+        """Factors on the variance of white noise in each shifted channel, by symbol.
 
-        A sample between two others is w and 1 - w of these, and its noise has w^2 + (1 - w)^2 of their variance. A
-        likelihood that does not know this would take offsets of half a sample for good models.
+        An interpolated sample has weights w and 1 - w of its neighbours, and its noise w^2 + (1 - w)^2 of their
+        variance. A likelihood without this factor would prefer offsets of half a sample.
         """
         found = {}
         for name, seconds in offsets.items():
@@ -237,7 +241,7 @@ class ShiftedLogs:
 
 
 def _left(log: Log, channel: str, seconds: float) -> np.ndarray:
-    """w^2 + (1 - w)^2 of each row of a shifted channel that lies between two samples near one another."""
+    """w^2 + (1 - w)^2 of each row of a shifted channel that lies between two close samples."""
     samples = log.series(channel).times
     times = log.times + seconds
     after = np.clip(np.searchsorted(samples, times), 1, len(samples) - 1)

@@ -1,4 +1,4 @@
-"""What a scenario measures errors in: its bound or, where there is none, the error of the open loop."""
+"""The scale of a thruster's scenario: its bound or, where there is none, the error of the open loop."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from thruster_env.model import model_of_plant
 from thruster_env.plant import Plant
 from tuning.thruster.scenario import Scenario
 
-SEQUENCES = 1200  # voltage sequences that a stored scale is the bound of
-ROUNDING = 1e-6  # of the untuned noise: what is below is no error but rounding
-PARTS = (0.5, 1.0)  # of the largest voltage, where stability is looked at: at rest the quadratic drag vanishes
+SEQUENCES = 1200  # voltage sequences for a stored scale
+ROUNDING = 1e-6  # of the untuned noise: anything below is rounding
+PARTS = (0.5, 1.0)  # of the largest voltage, where stability is checked: at rest the quadratic drag vanishes
 
 
 def computed_scale(scenario: Scenario, sequences: int = SEQUENCES, truths: int = 100) -> np.ndarray:
     """The scale (2,) of a scenario, over voltage sequences of the seeds 0, 1, 2, ...
 
-    It is `Scenario.bound`, and a score is then RMSE over the bound. Where there is none, because Q is singular, it
-    is the RMSE of the open loop: a score below 1 is then skill, what the measurements win.
+    It is `Scenario.bound`, and a score is then RMSE over the bound. Where there is no bound, because Q is
+    singular, it is the RMSE of the open loop: a score below 1 then shows what the measurements contribute.
 
     Args:
-        scenario: whose own scale does not matter.
+        scenario: its own scale is not used.
         sequences: number of seeds.
-        truths: drawn for each of them, for the bound.
+        truths: number of true paths drawn for each seed, for the bound.
 
     Raises:
         ValueError: if there is neither a bound nor a stable open loop, or the scale is zero or not finite.
@@ -51,7 +51,7 @@ def computed_scale(scenario: Scenario, sequences: int = SEQUENCES, truths: int =
 
 
 def is_stable(plant: Plant) -> bool:
-    """Whether the plant without feedback forgets its past: all modes decay, ahead and astern."""
+    """Whether the plant without feedback is stable: all modes decay, ahead and astern."""
     if plant.linear is not None:
         matrices = [plant.linear.a]
     else:

@@ -27,25 +27,25 @@ from tuning.problems.plain import plain
 from tuning.problems.scenario import BaseScenario
 from tuning.thruster.excitation import voltages_of
 
-UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as part of each state's range
+UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as a fraction of each state's range
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario(BaseScenario):
     """A plant, an excitation and what a filter assumes of the plant.
 
-    A filter's model is the plant's, but for `parameter_factors`; it knows the distribution of the initial state
-    and a constant `ambient_velocity`. Of sensor effects, `flow`, `amplifier` and `uncertainty` it knows nothing.
+    A filter's model is the plant's, except for `parameter_factors`; it knows the distribution of the initial state
+    and a constant `ambient_velocity`. It does not know sensor effects, `flow`, `amplifier` and `uncertainty`.
 
     Attributes, beside those of `BaseScenario`:
-        measurement_noise_cov: the plant's R, the variance of the sensor's sheet [N^2, or the channel's unit^2]; of
-            several channels one each.
-        process_noise_cov: the plant's Q, two variances a step [(rad/s)^2, (m/s)^2].
+        measurement_noise_cov: the plant's R, the variance on the sensor's data sheet [N^2, or the channel's
+            unit^2]; one for each of several channels.
+        process_noise_cov: the plant's Q, two variances per step [(rad/s)^2, (m/s)^2]; they do not scale with `dt`.
         scale: bound on the standard error of each state, (omega_m [rad/s], U_a [m/s]), of the scenario's Gaussian
-            core: fixed numbers that errors are measured in, made by `scale.computed_scale`.
+            core: fixed numbers, by which errors are divided, computed by `scale.computed_scale`.
         system: a published linear system that is the plant, "tunnel" or "open_bladed"; None for the equations.
-        preset: the thruster, as for `thruster_env.plant.make_plant`; so are all that follow. What a file says of
-            it is kept in place of the path.
+        preset: the thruster, as for `thruster_env.plant.make_plant`; so are all that follow. The content of a file
+            is stored in place of its path.
         dt: sample time [s].
         max_voltage: voltages are clipped to plus and minus this [V].
         ambient_velocity: constant flow U_0 [m/s].
@@ -79,8 +79,9 @@ class Scenario(BaseScenario):
             raise ValueError(
                 f"sensors of a scenario must be one channel or several, but got {shown(self.sensors)}"
             )
+        preset = self.preset
         return {
-            "preset": preset_mapping(self.preset) if is_file(self.preset) else self.preset,
+            "preset": preset if isinstance(preset, Mapping) or not is_file(preset) else preset_mapping(preset),
             "scale": self.checked_scale(2),
             "process_noise_cov": vector("process_noise_cov", self.process_noise_cov, 2).tolist(),
             "measurement_noise_cov": _variances(self.measurement_noise_cov, len(self.sensors)),
@@ -105,7 +106,7 @@ class Scenario(BaseScenario):
 
     @property
     def untuned(self) -> dict:
-        """Model arguments of the untuned filter: R from the sheet, Q from 1 % of each state's range."""
+        """Model arguments of the untuned filter: R from the data sheet, Q from 1 % of each state's range."""
         deviation = UNTUNED_RANGE_FRACTION * _range(self.plant)
         return {
             "process_noise_cov": tuple(float(v) for v in deviation**2),
@@ -145,7 +146,7 @@ class Scenario(BaseScenario):
         voltages = voltages_of(self.excitation, plant, keys, self.steps)
         voltages = np.clip(voltages, -plant.max_voltage, plant.max_voltage)  # as the env does
         simulation = simulate(plant, keys, voltages).checked(f"the plant of scenario {self.name}")
-        measurements = np.where(simulation.valid, simulation.measurements, np.nan)  # as filters take missing ones
+        measurements = np.where(simulation.valid, simulation.measurements, np.nan)  # NaN: missing
         return Data(
             seeds,
             voltages[..., None],
@@ -158,7 +159,7 @@ class Scenario(BaseScenario):
 
 
 def _variances(given, channels: int) -> float | tuple[float, ...]:
-    """R as a scenario holds it: one variance of one channel, or a variance for each of several."""
+    """R as a scenario stores it: the variance of one channel, or one variance for each of several."""
     if channels == 1 and not isinstance(given, list | tuple | np.ndarray):
         return positive("measurement_noise_cov", given)
     each = tuple(positive("measurement_noise_cov", v) for v in vector("measurement_noise_cov", given, channels))

@@ -8,6 +8,7 @@ computes their scales anew and prints them.
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 from numerics.checks import one_of
 from tuning.problems.excitation import BinarySequence, Dwells, MultiSine
@@ -15,9 +16,9 @@ from tuning.thruster.excitation import ClosedLoop
 from tuning.thruster.scale import computed_scale
 from tuning.thruster.scenario import Scenario
 
-# Bounds from 1200 voltage sequences and 100 truths each, good to half a per cent; a test computes them anew.
+# Bounds from 1200 voltage sequences and 100 truths each, accurate to half a per cent; a test recomputes them.
 NOMINAL_SCALE = (1.0753, 0.0464)
-LINEAR_NOISE = {"process_noise_cov": (0.5, 0.5), "measurement_noise_cov": 0.5, "steps": 100}
+LINEAR_NOISE: dict[str, Any] = {"process_noise_cov": (0.5, 0.5), "measurement_noise_cov": 0.5, "steps": 100}
 
 SCENARIOS: dict[str, Scenario] = {
     scenario.name: scenario
@@ -36,31 +37,31 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         Scenario(
             name="mismatch",
-            about="the filter believes in 15 % more lift and 5 % less voltage gain K2 than there is",
+            about="the filter assumes 15 % more lift and 5 % less voltage gain K2 than the plant has",
             parameter_factors={"lift_coefficient": 1.15, "voltage_gain": 0.95},
             scale=NOMINAL_SCALE,
         ),
         Scenario(
             name="ambient",
-            about="an ambient flow of about 0.5 m/s, slow to change, that the filter does not know",
+            about="a slowly changing ambient flow of about 0.5 m/s, unknown to the filter",
             flow=[{"name": "gauss-markov", "std": 0.5, "time_constant": 10.0}],
             scale=NOMINAL_SCALE,
         ),
         Scenario(
             name="outliers",
-            about="one thrust in twenty is off by some 10 N",
+            about="one measured thrust in twenty has an error of about 10 N",
             sensors={"thrust": [{"name": "outliers", "std": 10.0, "probability": 0.05}]},
             scale=NOMINAL_SCALE,
         ),
         Scenario(
             name="dropout",
-            about="half of the measurements are missing, 0.2 s in a row",
+            about="half of the measurements are missing, in gaps of 0.2 s on average",
             sensors={"thrust": [{"name": "dropout", "probability": 0.5, "mean_length": 20}]},
             scale=NOMINAL_SCALE,
         ),
         Scenario(
             name="bias",
-            about="the sensor is off by some 1.5 N and drifts, while the voltage jumps between two levels",
+            about="the sensor has a bias of about 1.5 N that drifts, while the voltage jumps between two levels",
             sensors={"thrust": [{"name": "bias", "std": 1.5, "drift": 0.03}]},
             excitation=BinarySequence(amplitude=8.0, hold=40),
             scale=(1.0424, 0.0384),
@@ -74,14 +75,14 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         Scenario(
             name="deadband",
-            about="the amplifier swallows 1 V, which the filter does not know, under a sum of sines",
+            about="the amplifier has a dead band of 1 V, unknown to the filter, under a sum of sines",
             amplifier=[{"name": "dead-band", "width": 1.0}],
             excitation=MultiSine(),
             scale=(1.1042, 0.0512),
         ),
         Scenario(
             name="reversal",
-            about="slow crossings of 0 V and dwells there, where thrust tells nothing of the flow",
+            about="slow crossings of 0 V and dwells there, where the flow is not observable from thrust",
             excitation=Dwells(amplitude=4.0),
             scale=(1.1452, 0.0806),
         ),
@@ -95,7 +96,7 @@ SCENARIOS: dict[str, Scenario] = {
         ),
         Scenario(
             name="startup",
-            about="the thruster may already turn, either way, as the run begins, and every step counts",
+            about="the thruster may already turn, in either direction, when a run starts; every step counts",
             first_scored_step=0,
             initial_state={"mean": [0.0, 0.0], "cov": [[100.0**2, 0.0], [0.0, 2.0**2]]},
             scale=(1.0917, 0.0456),

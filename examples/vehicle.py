@@ -1,0 +1,69 @@
+"""
+The underwater vehicle
+======================
+
+The same filters and wrappers on a plant of six degrees of freedom: an autonomous underwater vehicle with a
+Doppler log, gyros, a depth sensor and a compass.
+"""
+
+# %%
+# A filter of twelve states
+# -------------------------
+#
+# Nothing but the name of the env has changed. The filter's model comes from the env, with names and units.
+
+import gymnasium as gym
+import matplotlib.pyplot as plt
+import numpy as np
+
+import auv_env
+from auv_env.control.depth_and_course import DepthAndCourse
+from filters import EstimateState
+
+STEPS = 600
+
+env = EstimateState(gym.make("SegorogeniAUVPath-v0", path="IV"), filter="ekf")
+observation, info = env.reset(seed=3)
+states = env.filter.model.states
+print(", ".join(f"{quantity.name} [{quantity.unit}]" for quantity in states))
+
+# %%
+# Along a path, on the estimate
+# -----------------------------
+#
+# ``DepthAndCourse`` steers along a line of sight with PD on pitch and course. It sees what the filter estimates.
+# The sensors have rates of their own, so some measurements are missing in most steps; the filter knows.
+
+controller, memory = DepthAndCourse.for_env(env, seen="navigation"), None
+truth, estimate, deviation, distances = [], [], [], []
+for _ in range(STEPS):
+    action, memory = controller.predict(observation, memory)
+    observation, reward, terminated, truncated, info = env.step(action)
+    truth.append(info["state"])
+    estimate.append(info["estimate"])
+    deviation.append(np.sqrt(info["estimate_cov"].diagonal()))
+    distances.append(info["path_errors"])
+    if terminated or truncated:
+        break
+truth, estimate, deviation = np.array(truth), np.array(estimate), np.array(deviation)
+across, below = np.sqrt(np.mean(np.square(distances), axis=0))
+print(f"{len(truth)} steps; distance from the path {across:.2f} m across, {below:.2f} m in depth (RMS)")
+
+# %%
+# What it does not know
+# ---------------------
+#
+# Depth is measured, the horizontal position is not: its error is a random walk, and the band grows as it should.
+
+time = 0.05 * np.arange(1, len(truth) + 1)
+figure, axes = plt.subplots(1, 3, figsize=(10, 3), layout="constrained")
+for axis, place in zip(axes, (6, 9, 11), strict=True):
+    band = 1.96 * deviation[:, place]
+    axis.fill_between(time, -band, band, color="tab:blue", alpha=0.25, linewidth=0, label="95 % band")
+    axis.plot(time, estimate[:, place] - truth[:, place], color="tab:red", linewidth=0.8, label="error")
+    axis.set(title=f"{states[place].name} [{states[place].unit}]", xlabel="time [s]")
+axes[0].legend()
+
+# %%
+# Equations, instruments, scenarios, the published comparisons: :doc:`/auv`. ``thruster compare --scenario
+# auv:navigation`` ranks filters on it, and ``thruster train --task depth`` learns a policy.

@@ -1,0 +1,73 @@
+"""`thruster demo`: its own result first, in thirty lines, with the pictures and the page that it speaks of."""
+
+import json
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+import thruster_env  # noqa: F401 - registers the env
+from filters import EstimateState
+from thruster_cli import demo
+from thruster_cli.main import main
+from thruster_cli.output import console
+from tuning.reporting.report import Report
+
+
+@pytest.fixture
+def run_demo(tmp_path, monkeypatch, capsys):
+    """Run it with three trials in an empty folder; returns exit code and lines of standard output."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(console, "width", 80)
+    monkeypatch.setattr(sys, "argv", ["thruster", "demo", "--trials", "3", "--json", "demo.json"])
+
+    def run():
+        with pytest.raises(SystemExit) as stop:
+            main()
+        return stop.value.code or 0, capsys.readouterr().out.splitlines()
+
+    return run
+
+
+def test_demo_tells_its_result_in_thirty_lines_and_draws_what_it_tuned(run_demo, tmp_path):
+    code, lines = run_demo()
+    assert code == 0 and len(lines) <= 30 and max(map(len, lines)) <= 80
+    data = json.loads((tmp_path / "demo.json").read_text())
+    held_out = data["tuning"]["held_out"]["outliers"]
+    assert lines[0].startswith("An extended Kalman filter") and lines[2].split()[:3] == data["advice"].split()[:3]
+    (row,) = [line.split() for line in lines if line.startswith("tuned ")]
+    found = [rmse[0] for rmse in held_out["tuned"]["rmse"]]
+    assert [float(row[2]), float(row[5])] == pytest.approx(found, rel=0.006)
+    told = [tmp_path / line.split()[0] for line in lines if line.startswith("out/")]
+    assert told == [tmp_path / name for name in (*data["pictures"], data["report"], data["tuning"]["file"])]
+    assert [path.read_bytes()[:4] == b"\x89PNG" for path in told] == [True, True, True, False, False]
+    assert "<html" in told[3].read_text()
+    sensors = {"thrust": [{"name": "outliers", "std": 10.0, "probability": 0.05}]}
+    assert EstimateState(gym.make("BowThruster-v0", sensors=sensors), tuned=str(told[4]))
+
+
+def test_a_demo_whose_search_was_interrupted_says_so_and_exits_with_130(run_demo, monkeypatch):
+    tune, page = demo.tune, Path("out/page.html")
+
+    def interrupted(*arguments, **options):
+        tuning = tune(*arguments, **options)
+        return tuning._replace(result=tuning.result._replace(interrupted=True))
+
+    monkeypatch.setattr(demo, "tune", interrupted)
+    monkeypatch.setattr(demo, "draw", lambda *_: {})
+    monkeypatch.setattr(demo, "write_report", lambda *_: Report(page, page, "Tuning lowers the score."))
+    code, lines = run_demo()
+    assert code == 130 and lines[1].startswith("interrupted, on the trials that were finished: 3 trials")
+
+
+def test_a_demo_that_is_interrupted_later_exits_with_130(run_demo, monkeypatch):
+    monkeypatch.setattr(demo, "tune", failing(KeyboardInterrupt))
+    assert run_demo() == (130, [])
+
+
+def failing(error):
+    def function(*arguments, **options):
+        raise error
+
+    return function

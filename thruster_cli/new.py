@@ -1,0 +1,71 @@
+"""`thruster new`: a file to start from, for a problem, a model, an env or a thruster of one's own."""
+
+from __future__ import annotations
+
+import keyword
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from numerics.checks import one_of
+from numerics.files import write_whole
+from thruster_cli.options import JsonOption, spelt
+from thruster_cli.output import check_targets, emit
+
+TEMPLATES = Path(__file__).parent / "templates"
+FILES = {"problem": "problem.py", "model": "model.py", "env": "env.py", "preset": "preset.toml"}
+NAMED = "template"  # what a template calls itself
+NEXT = {
+    "problem": "thruster tune --problem {name}:problem --filter ekf --trials 50",
+    "model": "python {file}; thruster estimate {name}.csv --model {name}:model --plot estimate.png",
+    "env": "python {file}; thruster tune --problem {name}:problem --filter ekf --trials 50",
+    "preset": "thruster inspect --preset {file} --voltage 12",
+}
+
+
+def command(
+    kind: Annotated[
+        str, typer.Argument(metavar="KIND", help=f"{', '.join(FILES)}.", callback=spelt(FILES), show_default=False)
+    ],
+    name: Annotated[
+        Path, typer.Argument(metavar="NAME", help="Of the file, .py or, of a preset, .toml; it must not exist.")
+    ],
+    json: JsonOption = None,
+) -> None:
+    """Write a commented file to change into a problem, model, env or thruster of yours; it works as it stands.
+
+    problem: a plant that makes data and what filters assume of it, for tune, evaluate and compare. model: a
+    state-space model, for estimate, tune --log and identify. env: a Gymnasium env with a filter around it. preset:
+    a thruster's numbers, for --preset of every command.
+
+    Example: thruster new problem pendulum
+    """
+    file = target(kind, name)
+    check_targets((file,), json)
+    text = (TEMPLATES / FILES[kind]).read_text(encoding="utf-8").replace(f"{NAMED}.toml", str(file))
+    write_whole(file, text.replace(NAMED, file.stem))
+    following = NEXT[kind].format(name=file.stem, file=file if kind == "preset" else file.name)
+    where = "" if kind == "preset" or file.parent == Path() else f", in {file.parent}"
+    emit([f"wrote {file}", f"Try it{where}: {following}"], {"file": str(file), "next": following}, json)
+
+
+def target(kind: str, name: Path) -> Path:
+    """The file that a template goes to.
+
+    Raises:
+        ValueError: for an unknown kind, a file that is there, or a name by which Python could not import it.
+    """
+    suffix = Path(FILES[one_of("what is new", kind, FILES)]).suffix
+    if name.suffix not in ("", suffix):
+        raise ValueError(f"a new {kind} must end in {suffix}, but got {str(name)!r}")
+    file = name.with_suffix(suffix)
+    if file.exists():
+        raise ValueError(f"a new {kind} must not replace a file, but {file} is there")
+    if suffix == ".py":
+        if not file.stem.isidentifier() or keyword.iskeyword(file.stem):
+            raise ValueError(f"a module must have a name of letters, digits and _, but got {file.stem!r}")
+        if find_spec(file.stem) is not None:
+            raise ValueError(f"a new module must not hide one that is installed, but got {file.stem!r}")
+    return file

@@ -1,0 +1,186 @@
+"""`tuning.compare`: filters side by side on problems, on seeds that no study saw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from filters.augmented import Unknown
+from filters.estimators.find import is_foreign
+from filters.registry import filter_class
+from filters.tuned_file import read_tuned_file
+from numerics.checks import at_least, shown
+from tuning.api.comparison import FilterComparison
+from tuning.api.evaluate import NOMINAL
+from tuning.api.problems import given_for, is_filter, problems_of
+from tuning.api.progress import console_for, row_bar
+from tuning.api.study import Study
+from tuning.api.tune import tune
+from tuning.evaluation.compare import Contender, contender, sized
+from tuning.evaluation.compare import compare as compare_all
+from tuning.evaluation.tuned import read_choice, read_tuned
+from tuning.problems.problem import Problem
+from tuning.search.plan import HELD_OUT_SEEDS
+from tuning.search.space import Choice, has_ensemble
+
+DEFAULT_FILTERS = ("ekf", "enkf", "pf")
+Beliefs = Mapping[str, Unknown | None]
+
+
+def compare(
+    filters: Any = DEFAULT_FILTERS,
+    problem: Any = None,
+    *,
+    seeds: int = HELD_OUT_SEEDS,
+    seed: int = 0,
+    trials: int | None = None,
+    knows: str | None = None,
+    augment: Sequence[str] | Mapping[str, Any] | None = None,
+    ensemble_size: int | Mapping[str, int] | None = None,
+    preset: str | Path | None = None,
+    progress: bool | None = None,
+) -> FilterComparison:
+    """Rank filters on problems: errors, consistency, cost, and which beat the first one on the same seeds.
+
+    All filters meet the same truth, inputs and measurements. A filter is better or worse than the first one if the
+    paired 95 % interval of the ratio of their scores leaves out 1; where there is no truth, if that of the
+    difference of their log-likelihoods leaves out 0. Ctrl-C keeps the rows that are done.
+
+        comparison = tuning.compare(["kf", "ekf", "enkf"], "mismatch", seeds=50)
+        comparison.to_frame()
+        comparison.plot_scores()
+
+    Args:
+        filters: names of filters, tuned files, `Study`s, or somebody's estimators, in a list; the first is what
+            the others are compared with.
+        problem: on what, as `tuning.tune` takes it; several in a list. By default that of the first tuned file or
+            study, or "nominal".
+        seeds: number of held-out seeds.
+        seed: of the study to which they belong.
+        trials: tune each filter that is named with so many trials first; all filters on the same training seeds.
+        knows: what a filter that is named, and not tuned, knows of the plant's noise: "true" (oracle), "scaled"
+            (scaled default) or "untuned" (rule of thumb); the first that there is on every problem if None.
+        augment: constants of the model, such as "ambient_velocity", that each filter also estimates in a further
+            row; by name with an `Unknown`, or (std, walk), for what is believed of it.
+        ensemble_size: of all filters, or by name.
+        preset: the problems of another thruster, by name or file.
+        progress: whether to show it; None in terminals and notebooks only.
+
+    Returns:
+        `FilterComparison`: `to_frame()`, `plot_scores()`, `sentences()`.
+
+    Raises:
+        ValueError: states the rule and the value.
+        KeyboardInterrupt: after Ctrl-C before any row is done.
+    """
+    some = list(filters) if isinstance(filters, list | tuple) else [filters]
+    problems = problems_of(_default(some) if problem is None else problem, preset)
+    each = ensemble_size if isinstance(ensemble_size, Mapping) else {None: ensemble_size}
+    sizes = {name: size for name, size in each.items() if size is not None}
+    if trials is not None:
+        if knows is not None:
+            raise ValueError(f"knows must be left out where filters are tuned, but got {shown(knows)} and trials")
+        some = [
+            tune(list(problems), one, trials=trials, seed=seed, progress=progress) if _is_named(one) else one
+            for one in some
+        ]
+    knows = _knowledge(problems) if knows is None else knows
+    beliefs = beliefs_of(augment or {})
+    return compared(contenders_of(some, knows, beliefs, sizes, seed), problems, seed, seeds, console_for(progress))
+
+
+def compared(
+    contenders: Sequence[Contender], problems: Sequence[Problem], seed: int, seeds: int, console: Any
+) -> FilterComparison:
+    """Run contenders over problems with a progress bar; what `tuning.compare` and `thruster compare` both do."""
+
+    def held_out(problem: Problem) -> range:
+        return problem.held_out_seeds(seed, seeds)
+
+    for problem in problems:
+        held_out(problem)  # a clear error before any filter runs
+    with row_bar(len(contenders) * len(problems), console) as on_row:
+        boards, interrupted = compare_all(contenders, problems, held_out, on_row)
+    return FilterComparison(tuple(boards), seed, interrupted)
+
+
+def contenders_of(
+    filters: Sequence[Any], knows: str, unknown: Beliefs, sizes: Mapping[Any, int], seed: int
+) -> list[Contender]:
+    """The filters that take part: tuned files and studies first as they are, then those that are named.
+
+    Args:
+        filters: names, paths of tuned files, `Study`s or estimators.
+        knows: what a filter that is named knows of the plant's noise.
+        unknown: constants that each of these also estimates in a second row.
+        sizes: ensemble size by name; under None that of all others.
+        seed: of the study whose training runs scale the scaled default.
+    """
+    for name, size in sizes.items():
+        if name is not None and not has_ensemble(name):
+            raise ValueError(f"ensemble_size must be for a filter with an ensemble, but got {name}: {size}")
+        at_least("ensemble_size", size, 2)
+    others, out = sizes.get(None), list[Contender]()
+    for one in filters:
+        if isinstance(one, Study):
+            choice = sized(one.choice, sizes.get(one.choice.name, others))
+            out.append(Contender(_new(f"{choice.name} tuned", out), partial(_same, choice)))
+        elif not is_filter(one):
+            size = sizes.get(read_tuned_file(one)["filter"]["name"], others)
+            out.append(Contender(_new(Path(one).stem, out), partial(_from_file, Path(one), size)))
+        else:
+            size = sizes.get(one, others) if not is_foreign(one) and has_ensemble(one) else None
+            out.append(contender(one, knows, seed=seed, ensemble_size=size))
+            if unknown and filter_class(one).has_covariance:
+                out.append(contender(one, knows, unknown, seed, ensemble_size=size))
+    return out
+
+
+def beliefs_of(augment: Sequence[str] | Mapping[str, Any]) -> dict[str, Unknown | None]:
+    """What is believed of constants at first; None for what is usual."""
+    if not isinstance(augment, Mapping):
+        return dict.fromkeys([augment] if isinstance(augment, str) else augment)
+    found: dict[str, Unknown | None] = {}
+    for name, given in augment.items():
+        if given is None or isinstance(given, Unknown):
+            found[name] = given
+        else:
+            found[name] = Unknown(*map(float, given if isinstance(given, list | tuple) else (given,)))
+    return found
+
+
+def _is_named(given: Any) -> bool:
+    return not isinstance(given, Study) and is_filter(given)
+
+
+def _default(filters: Sequence[Any]) -> Any:
+    """The problem where none is named: that of the first tuned file or study, or nominal."""
+    for one in filters:
+        if isinstance(one, Study):
+            return list(one.problems)
+        if not is_filter(one):
+            return read_tuned(one, given_for(one))[1]
+    return NOMINAL
+
+
+def _knowledge(problems: Sequence[Problem]) -> str:
+    """What filters know of the noise unless it is said: all of it, or the scaled default where nobody does."""
+    return "scaled" if any(one.true is None for one in problems) else "true"
+
+
+def _from_file(file: Path, size: int | None, problem: Problem) -> Choice:
+    return sized(read_choice(file, problem), size)
+
+
+def _same(choice: Choice, problem: Problem) -> Choice:
+    return choice
+
+
+def _new(label: str, before: Sequence[Contender]) -> str:
+    """A label that none has before."""
+    labels = [one.label for one in before]
+    if label not in labels:
+        return label
+    return next(text for text in (f"{label} {place}" for place in range(2, len(labels) + 3)) if text not in labels)

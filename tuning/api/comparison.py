@@ -1,0 +1,140 @@
+"""`FilterComparison`: filters on the same held-out seeds, as a value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from filters.consistency.intervals import Interval
+from numerics.plots import BLUE, DARK, panels
+from tuning.api.held_out import cells_of
+from tuning.api.showing import about, drawn, frame, html, number
+from tuning.evaluation.compare import Leaderboard, Row, winners
+from tuning.problems.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+GREY = "#9aa5ad"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FilterComparison:
+    """Filters on one problem or several, in the order in which they were given.
+
+    Attributes:
+        boards: a `Leaderboard` a problem: seeds, bound and rows.
+        seed: of the study to which the held-out seeds belong.
+        interrupted: whether Ctrl-C ended it; the rows are those that were done.
+    """
+
+    boards: tuple[Leaderboard, ...]
+    seed: int = 0
+    interrupted: bool = False
+
+    @property
+    def problems(self) -> tuple[Problem, ...]:
+        """The problems."""
+        return tuple(board.scenario for board in self.boards)
+
+    @property
+    def filters(self) -> tuple[str, ...]:
+        """Labels of the filters; the first is what the others are compared with."""
+        return tuple(row.label for row in self.boards[0].rows)
+
+    def ranked(self, problem: int = 0) -> list[str]:
+        """Labels of the filters on a problem, by its place, the best score first; the likeliest without truth."""
+        return [row.label for row in sorted(self.boards[problem].rows, key=_rank)]
+
+    def sentences(self) -> list[str]:
+        """On each problem, who is significantly better or worse than the first filter."""
+        return [winners(board) for board in self.boards]
+
+    def to_frame(self) -> pandas.DataFrame:
+        """A row a filter and problem: errors, score and its ratio to the first filter's, consistency, cost.
+
+        Raises:
+            ValueError: if pandas is not installed.
+        """
+        pairs = [(board, row) for board in self.boards for row in board.rows]
+        columns: dict[str, list] = {"problem": [board.scenario.name for board, _ in pairs]}
+        columns["filter"] = [row.label for _, row in pairs]
+        cells: list[dict[str, Any]] = []
+        for _, row in pairs:
+            ratio, gain = row.score_ratio, row.likelihood_gain
+            cells.append(cells_of(row.evaluation))
+            cells[-1] |= {"score over first": ratio.value, "score over first low": ratio.low}
+            cells[-1] |= {"score over first high": ratio.high, "log-likelihood less first": gain.value}
+            cells[-1] |= {"median NEES": row.evaluation.median_nees, "us/step": row.microseconds}
+            cells[-1] |= {"verdict": row.verdict}
+        for name in dict.fromkeys(name for one in cells for name in one):
+            columns[name] = [one.get(name, np.nan) for one in cells]
+        return frame(columns)
+
+    def plot_scores(self) -> Figure:
+        """Score of each filter with its 95 % interval, a panel a problem; without truth the log-likelihood gained.
+
+        Hollow are filters that do not differ significantly from the first.
+        """
+        count = max(len(board.rows) for board in self.boards)
+        figure, axes = panels(len(self.boards), 3, (5.2, 0.9 + 0.38 * count), extra=0.3)
+        for axis, board in zip(axes, self.boards, strict=True):
+            _draw(axis, board)
+        return drawn(figure)
+
+    def __repr__(self) -> str:
+        said = []
+        for board in self.boards:
+            found = [f"{row.label} {_figure(row)}" for row in sorted(board.rows, key=_rank)]
+            said.append(f"{board.scenario.name}: {', '.join(found)}")
+        ended = ", interrupted" if self.interrupted else ""
+        return f"FilterComparison({'; '.join(said)}{ended})"
+
+    def _repr_html_(self) -> str:
+        parts = []
+        for board in self.boards:
+            truth = board.rows[0].evaluation.has_truth
+            heads = ["filter", "score", "over the first"] if truth else ["filter", "log L", "less the first's"]
+            rows = []
+            for row in board.rows:
+                one = row.evaluation
+                found = [about(one.score), about(row.score_ratio)]
+                if not truth:
+                    found = [number(one.log_likelihood, ".2f"), about(row.likelihood_gain, 2)]
+                last = [number(one.nees.value, ".3g"), number(one.nis.value, ".3g"), f"{row.microseconds:.3g}"]
+                rows.append([row.label, *found, *last, row.verdict])
+            heads += ["NEES", "NIS", "us/step", "verdict"]
+            title = f"{len(board.seeds)} held-out {board.scenario.seed_word} of {board.scenario.name}"
+            parts.append(html(title, heads, rows, winners(board)))
+        return "".join(parts)
+
+
+def _rank(row: Row) -> float:
+    value = row.evaluation.score.value if row.evaluation.has_truth else -row.evaluation.log_likelihood
+    return np.inf if np.isnan(value) else value
+
+
+def _figure(row: Row) -> str:
+    one = row.evaluation
+    return number(one.score.value if one.has_truth else one.log_likelihood)
+
+
+def _draw(axis: Any, board: Leaderboard) -> None:
+    truth = board.rows[0].evaluation.has_truth
+    for place, row in enumerate(board.rows):
+        value: Interval = row.evaluation.score if truth else row.likelihood_gain
+        if np.isnan(value.value):
+            continue
+        colour = DARK if place == 0 else BLUE if row.verdict == "better" else GREY
+        face = "white" if row.verdict == "tie" and place else colour
+        axis.plot([value.low, value.high], [-place, -place], "|-", color=colour, linewidth=1.4)
+        axis.plot(value.value, -place, "o", color=colour, markerfacecolor=face, markersize=6)
+    axis.set_yticks([-place for place in range(len(board.rows))], [row.label for row in board.rows])
+    axis.set_ylim(0.6 - len(board.rows), 0.6)
+    axis.grid(axis="y", visible=False)
+    gained = f"log L of a run less that of {board.rows[0].label}"
+    axis.set_xlabel("score: mean RMSE over scale [-]" if truth else gained)
+    axis.set_title(board.scenario.name, fontsize=11)

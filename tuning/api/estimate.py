@@ -1,0 +1,93 @@
+"""`tuning.estimate`: a filter or a smoother over a recorded run."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from filters.logs.estimate import estimate as estimate_log
+from filters.logs.findings import findings
+from numerics.checks import shown
+from numerics.modules import is_code
+from tuning.api.estimates import LogEstimates
+from tuning.logs.problem import name_of
+from tuning.logs.read import read_named
+
+if TYPE_CHECKING:
+    from tuning.api.study import Study
+
+
+def estimate(
+    log: Any,
+    tuned: str | Path | Study | None = None,
+    *,
+    filter: Any = None,
+    model: Any = None,
+    preset: str | Path | None = None,
+    sensors: Sequence[str] | None = None,
+    columns: Any = None,
+    clock_offset: Any = None,
+    dt: float | None = None,
+    smoother: bool = False,
+    lag: int | None = None,
+    skip: int | None = None,
+    seed: int = 0,
+    **numbers: Any,
+) -> LogEstimates:
+    """Estimate the state of a recorded run, and say what the innovations tell of filter and model.
+
+    What the log has of the model's states and outputs beside inputs and measurements, such as the thrust of a load
+    cell where the filter sees the tachometer, is held against the estimate.
+
+        estimates = tuning.estimate("run.csv", tuned="tuned.json")
+        estimates.to_frame()
+        estimates.plot_states()
+
+    Args:
+        log: the path of a .csv, .parquet or .npz file; a table, as a pandas.DataFrame or a mapping from headers to
+            arrays; or a `Log`.
+        tuned: a tuned file or a `Study`: filter, Q, R and the like.
+        filter: without these, the name of a filter, or somebody's estimator; "ekf" if None.
+        model: whose log it is, in place of a thruster: a `StateSpaceModel`, what makes or offers one,
+            "module:object", or a thruster's preset.
+        preset: the thruster that it is of, by name or file.
+        sensors: what the filter sees of a thruster.
+        columns: headers by quantity: {"speed": "motor_rpm", "thrust": "loadcell[kgf]"}.
+        clock_offset: seconds by quantity that a channel's clock is ahead.
+        dt: sample time [s], of a log without times, or to put it on.
+        smoother: correct estimates by later measurements.
+        lag: how many later ones; all by default.
+        skip: first rows that do not count in the findings; 50, or a quarter of a short log, by default.
+        seed: of the filter's random numbers.
+        **numbers: the filter's own, such as `ensemble_size`.
+
+    Returns:
+        `LogEstimates`: `means`, `stds`, `findings`, `to_frame()`, `plot_states()`, `plot_innovations()`, `save()`.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
+    if tuned is not None and filter is not None:
+        raise ValueError(f"give either a tuned file or a filter, but got both, {shown(tuned)} and {shown(filter)}")
+    if isinstance(model, str | Path) and not is_code(str(model)):
+        preset, model = (model, None) if preset is None else (preset, model)
+    named = {"preset": preset, "model": model, "sensors": sensors, "columns": columns}
+    read, offer = read_named(log, **named, clock_offset=clock_offset, dt=dt, name=name_of(log, 0))
+    with _as_file(tuned) as file:
+        found = estimate_log(read, filter, offer, tuned=file, smoother=smoother, lag=lag, seed=seed, **numbers)
+    return LogEstimates(found, findings(found, skip))
+
+
+@contextmanager
+def _as_file(tuned: Any) -> Iterator[str | Path | None]:
+    """A tuned file, of a study one that is gone afterwards."""
+    if tuned is None or isinstance(tuned, str | Path):
+        yield tuned
+        return
+    if not hasattr(tuned, "save"):
+        raise ValueError(f"what is tuned must be a tuned file or a Study, but got {shown(tuned)}")
+    with tempfile.TemporaryDirectory() as folder:
+        yield tuned.save(Path(folder) / "tuned.json")

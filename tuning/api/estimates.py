@@ -1,0 +1,115 @@
+"""`LogEstimates`: what a filter or a smoother makes of a recorded run, as a value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import isnan
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from filters.filter import Filter
+from filters.logs.columns import columns_of
+from filters.logs.estimate import LogEstimate
+from filters.logs.findings import LogFindings
+from plants.logs.log import Log
+from plants.logs.write import write_columns
+from tuning.api.showing import drawn, frame, html, number
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LogEstimates:
+    """Estimates and innovations of every row of a log, and what they tell of filter and model.
+
+    Attributes:
+        found: the estimate itself.
+        findings: mean NIS with its 95 % band, whiteness, RMSE of predictions, errors against references.
+    """
+
+    found: LogEstimate
+    findings: LogFindings
+
+    @property
+    def log(self) -> Log:
+        """The log."""
+        return self.found.log
+
+    @property
+    def filter(self) -> Filter:
+        """The filter."""
+        return self.found.filter
+
+    @property
+    def means(self) -> np.ndarray:
+        """Estimates of the states, (K + 1, n); a smoother's where it was asked for."""
+        return self.found.means
+
+    @property
+    def stds(self) -> np.ndarray:
+        """Their standard deviations, (K + 1, n)."""
+        return self.found.stds
+
+    @property
+    def innovations(self) -> np.ndarray:
+        """Measurement less prediction, (K + 1, m), NaN where nothing was measured."""
+        return self.found.innovations
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of the rows that count; NaN for a filter without a covariance."""
+        return self.findings.log_likelihood
+
+    def output(self, symbol: str) -> tuple[np.ndarray, np.ndarray]:
+        """An output of the model, such as "T", at the estimates, (K + 1,), and its standard deviation."""
+        return self.found.output(symbol)
+
+    def to_frame(self) -> pandas.DataFrame:
+        """A row a time: inputs, measurements, references, estimates, standard deviations and innovations.
+
+        Raises:
+            ValueError: if pandas is not installed.
+        """
+        return frame(dict(columns_of(self.found)), "time_s")
+
+    def save(self, path: str | Path) -> Path:
+        """Write the same columns to a .csv, .parquet or .npz file; return the path.
+
+        Raises:
+            ValueError: for another ending, or if the file cannot be written.
+        """
+        write_columns(path, columns_of(self.found))
+        return Path(path)
+
+    def plot_states(self) -> Figure:
+        """Estimates of states and outputs over time beside the references, and the innovations below."""
+        from filters.logs.figure import draw_log
+
+        smoothed = ", smoothed," if self.found.smoothed else ""
+        return drawn(draw_log(self.found, f"{self.filter.name}{smoothed} on {Path(self.log.name).name}"))
+
+    def plot_innovations(self) -> Figure:
+        """Innovations of each channel over time, in the 95 % band that the filter expects."""
+        from filters.logs.figure import draw_log
+
+        return drawn(draw_log(self.found, f"{self.filter.name} on {Path(self.log.name).name}", states=False))
+
+    def __repr__(self) -> str:
+        what = f"{self.filter.name}{', smoothed,' if self.found.smoothed else ''} on {self.log.name}"
+        rows, told = self.log.steps + 1, self.findings
+        if isnan(told.mean_nis):
+            return f"LogEstimates({what}: {rows} rows)"
+        low, high = told.nis_band
+        nis = f"mean NIS over channels {told.mean_nis:.3g}, {low:.3g} to {high:.3g} if consistent"
+        return f"LogEstimates({what}: {rows} rows; {nis}; log-likelihood {number(told.log_likelihood)})"
+
+    def _repr_html_(self) -> str:
+        told, rows = self.findings, []
+        for what, some in (("prediction less measurement", told.predictions), ("less reference", told.references)):
+            for one in some:
+                rows.append([what, one.quantity.short_label, f"{one.rmse:.4g}", f"{one.bias:+.4g}", one.rows])
+        return html(repr(self), ["", "quantity", "RMSE", "bias", "rows"], rows)

@@ -1,0 +1,82 @@
+"""`tuning.evaluate`: a filter, tuned or not, beside its baselines on seeds that no study saw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tuning.api.held_out import HeldOut, on_held_out
+from tuning.api.problems import given_for, is_filter, problem_of
+from tuning.api.progress import console_for
+from tuning.api.study import Study
+from tuning.evaluation.baselines import rule_of_thumb
+from tuning.evaluation.tuned import read_choice, read_tuned
+from tuning.problems.problem import Problem
+from tuning.search.plan import HELD_OUT_SEEDS
+from tuning.search.space import Choice
+
+if TYPE_CHECKING:
+    from plants.state_space import StateSpaceModel
+
+NOMINAL = "nominal"  # the problem of a filter that is not tuned, where none is named
+
+
+def evaluate(
+    tuned: str | Path | Study,
+    problem: Any = None,
+    *,
+    seeds: int = HELD_OUT_SEEDS,
+    seed: int = 0,
+    preset: str | Path | None = None,
+    model: str | StateSpaceModel | None = None,
+    progress: bool | None = None,
+) -> HeldOut:
+    """Run a filter on held-out seeds of a problem, beside its baselines: scaled default, rule of thumb, oracle.
+
+    The rule of thumb takes R from the sensor's data sheet and Q from 1 % of each state's range. The scaled default
+    is the same with one factor on Q that brings the mean NIS to 1. The oracle has the plant's own Q and R.
+
+        evaluation = tuning.evaluate("tuned.json", seeds=50)
+        evaluation.to_frame()
+
+    Args:
+        tuned: a tuned file, a `Study`, or the name of a filter: then it is the rule of thumb of that filter.
+        problem: on what: a name, a `Problem`, "module:object" or a pair (model, data); by default that of the
+            tuned file, or "nominal" for the name of a filter.
+        seeds: number of held-out seeds, of problems that can make as many as are asked for.
+        seed: of the study to which they belong.
+        preset: the problem of another thruster, by name or file.
+        model: "module:object" of the logs that a tuned file names, where their model is code.
+        progress: whether to show it; None in terminals and notebooks only.
+
+    Returns:
+        `HeldOut`: `evaluations` by name, `ratios`, `bound`, `to_frame()`, `plot_errors()`.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
+    choice, found, is_tuned = subject_of(tuned, problem, preset, model)
+    return on_held_out(choice, found, seed, seeds, is_tuned=is_tuned, console=console_for(progress))
+
+
+def subject_of(
+    tuned: Any,
+    problem: Any = None,
+    preset: str | Path | None = None,
+    model: Any = None,
+) -> tuple[Choice, Problem, bool]:
+    """The choice, the problem, and whether it was tuned; the arguments are those of `evaluate`."""
+    if isinstance(tuned, Study):
+        return tuned.choice, problem_of(tuned.problem if problem is None else problem, preset), True
+    if is_filter(tuned):
+        found = problem_of(NOMINAL if problem is None else problem, preset)
+        return rule_of_thumb(tuned, found), found, False
+    if problem is None:
+        if preset is not None:
+            raise ValueError(
+                "--preset must come with --scenario, for a tuned file names its own, but got it alone"
+            )
+        choice, found, _ = read_tuned(tuned, given_for(tuned, model=model))
+        return choice, found, True
+    found = problem_of(problem, preset)
+    return read_choice(tuned, found), found, True

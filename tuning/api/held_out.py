@@ -1,0 +1,199 @@
+"""`HeldOut`: what a filter and its baselines achieve on seeds that no study saw, as a value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+
+from filters.consistency.intervals import Interval
+from filters.consistency.report import ConsistencyReport
+from filters.filter import Filter
+from numerics.checks import at_least
+from tuning.api.progress import working
+from tuning.api.showing import about, drawn, frame, html, number
+from tuning.evaluation.baselines import RULE, SCALED, TUNED, baselines
+from tuning.evaluation.evaluate import Evaluation, check_consistency
+from tuning.evaluation.held_out import Comparison, prove
+from tuning.evaluation.tuned import metrics
+from tuning.problems.problem import Problem
+from tuning.search.plan import HELD_OUT_SEEDS
+from tuning.search.space import Choice
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class HeldOut:
+    """A filter and its baselines on the same held-out seeds of a problem.
+
+    Attributes:
+        choice: the filter's numbers.
+        problem: on what.
+        proof: evaluations, bound and seeds.
+        is_tuned: whether the choice is that of a study; else it is the rule of thumb.
+        seed: of the study to which the seeds belong.
+    """
+
+    choice: Choice
+    problem: Problem
+    proof: Comparison
+    is_tuned: bool = True
+    seed: int = 0
+
+    @property
+    def filter(self) -> Filter:
+        """The filter, with `init`, `predict` and `update`."""
+        return self.choice.filter(self.problem)
+
+    @property
+    def evaluations(self) -> dict[str, Evaluation]:
+        """What each filter achieved: "rule of thumb", "scaled default", "tuned", "oracle", where there is one."""
+        found = self.proof.evaluations
+        return {name: one for name, one in found.items() if self.is_tuned or name != TUNED}
+
+    @property
+    def evaluation(self) -> Evaluation:
+        """What the filter itself achieved."""
+        return self.proof.tuned
+
+    @property
+    def choices(self) -> dict[str, Choice]:
+        """The numbers of each filter."""
+        found = {TUNED: self.choice, **baselines(self.choice.name, self.problem, self.seed, self.proof.default)}
+        return {name: found[name] for name in self.evaluations}
+
+    @property
+    def bound(self) -> np.ndarray:
+        """Bound on the standard error of each state, (n,); NaN where there is none."""
+        return self.proof.bound
+
+    @property
+    def seeds(self) -> range:
+        """The held-out seeds; of logs the numbers of the held-out blocks."""
+        return self.proof.seeds
+
+    @property
+    def score(self) -> Interval:
+        """Mean over states of RMSE over scale, with its 95 % interval; NaN without truth."""
+        return self.evaluation.score
+
+    @property
+    def ratios(self) -> dict[str, Interval]:
+        """Score over that of each baseline, paired, with 95 % intervals; below 1 is better."""
+        return self.proof.ratios
+
+    @property
+    def likelihood_gains(self) -> dict[str, Interval]:
+        """Log-likelihood of a run less that of each baseline, paired; it needs no truth."""
+        return self.proof.likelihood_gains
+
+    def to_dict(self) -> dict[str, Any]:
+        """All figures as plain numbers: what `thruster evaluate --json` has of them."""
+        said = metrics(self.proof)
+        if not self.is_tuned:
+            del said["tuned"]
+        return {"filter": self.choice._asdict(), "scenario": self.problem.name, **said}
+
+    def to_frame(self) -> pandas.DataFrame:
+        """A row a filter: RMSE of each state with its 95 % interval, score, NEES, NIS, log-likelihood, restarts.
+
+        Raises:
+            ValueError: if pandas is not installed.
+        """
+        columns: dict[str, list] = {"filter": list(self.evaluations)}
+        for one in self.evaluations.values():
+            for name, value in cells_of(one).items():
+                columns.setdefault(name, []).append(value)
+        return frame(columns, "filter")
+
+    def check_consistency(self) -> ConsistencyReport:
+        """Hold the filter's errors and innovations against its own covariances: NEES, NIS, whiteness, coverage."""
+        return check_consistency(self.filter, self.problem.data(self.seeds))
+
+    def plot_errors(self) -> Figure:
+        """RMSE of each state, of all filters, with 95 % intervals and the bound.
+
+        Raises:
+            ValueError: if there is no truth, and so no RMSE.
+        """
+        from tuning.reporting.figures import draw_comparison
+
+        return drawn(draw_comparison(self.proof, f"{self.choice.name} on {self.problem.name}"))
+
+    def plot_run(self, place: int = 0) -> Figure:
+        """One held-out run over time, of the first baseline and the filter: truth, estimate and 95 % band.
+
+        Args:
+            place: of the run among the held-out seeds.
+        """
+        from tuning.reporting.time_figures import draw_estimates
+
+        place = at_least("place", place, 0, len(self.seeds) - 1)
+        pair = {RULE: self.choice}
+        if self.is_tuned:
+            others = {name: one for name, one in self.choices.items() if name != TUNED}
+            first = SCALED if SCALED in others else RULE
+            pair = {first: others[first], TUNED: self.choice}
+        filters = {name: one.filter(self.problem) for name, one in pair.items()}
+        data, scored = self.problem.data(self.seeds), self.evaluation.scored or None
+        return drawn(draw_estimates(filters, data, place, self.problem.dt, scored, sharey="row"))
+
+    def plot_consistency(self) -> Figure:
+        """The checks of `check_consistency`, a panel each.
+
+        Raises:
+            ValueError: for a filter without a covariance.
+        """
+        from tuning.reporting.consistency_figures import draw_consistency
+
+        title = f"{self.choice.name} on {len(self.seeds)} seeds of {self.problem.name}"
+        scored = self.evaluation.scored or None
+        return drawn(draw_consistency(self.check_consistency(), title, scored=scored))
+
+    def __repr__(self) -> str:
+        what = f"{self.choice.name} on {self.problem.name}, {len(self.seeds)} held-out {self.problem.seed_word}"
+        if not self.evaluation.has_truth:
+            return f"HeldOut({what}: log-likelihood of a run {number(self.evaluation.log_likelihood)})"
+        ratios = [f"{about(one)} x {name}" for name, one in self.ratios.items()][: int(self.is_tuned)]
+        return f"HeldOut({', '.join([f'{what}: score {about(self.score)}', *ratios])})"
+
+    def _repr_html_(self) -> str:
+        rows, heads = [], ["filter", *(state.short_label for state in self.evaluation.states)]
+        for name, one in self.evaluations.items():
+            errors = [about(rmse) for rmse in one.rmse]
+            last = [about(one.score), number(one.nees.value, ".3g"), number(one.nis.value, ".3g")]
+            rows.append([name, *errors, *last])
+        title = f"RMSE on {len(self.seeds)} held-out {self.problem.seed_word} of {self.problem.name}"
+        note = "In brackets 95 % intervals. Score: mean over states of RMSE over scale."
+        return html(title, [*heads, "score", "NEES", "NIS"], rows, note)
+
+
+def on_held_out(
+    choice: Choice,
+    problem: Problem,
+    seed: int = 0,
+    seeds: int = HELD_OUT_SEEDS,
+    *,
+    is_tuned: bool,
+    console: Console,
+) -> HeldOut:
+    """Run a choice and its baselines on held-out seeds; the arguments are those of `HeldOut` and `prove`."""
+    with working(f"{choice.name} on {seeds} seeds of {problem.name}", console):
+        return HeldOut(choice, problem, prove(choice, problem, seed, seeds), is_tuned, seed)
+
+
+def cells_of(one: Evaluation) -> dict[str, float]:
+    """The figures of an evaluation by the names that columns of a table have."""
+    cells: dict[str, float] = {}
+    errors = [(state.short_label, rmse) for state, rmse in zip(one.states, one.rmse, strict=True)]
+    errors += [(one.outputs[symbol].short_label, rmse) for symbol, rmse in one.output_rmse.items()]
+    for label, rmse in errors:
+        cells |= {f"RMSE {label}": rmse.value, f"RMSE {label} low": rmse.low, f"RMSE {label} high": rmse.high}
+    for name, value in (("score", one.score), ("NEES", one.nees), ("NIS", one.nis)):
+        cells |= {name: value.value, f"{name} low": value.low, f"{name} high": value.high}
+    return cells | {"log-likelihood": one.log_likelihood, "restarts": one.divergences}

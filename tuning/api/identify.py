@@ -1,0 +1,146 @@
+"""`tuning.identify`: a thruster's parameters, or any model's, from recorded runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from numerics.checks import shown
+from numerics.modules import is_code
+from plants.logs.log import Log
+from tuning.api.identified import Identified
+from tuning.api.progress import console_for
+from tuning.identification.coordinates import Coordinates
+from tuning.identification.excitation import check_excitation
+from tuning.identification.family import with_ranges
+from tuning.identification.identify import STARTS
+from tuning.identification.identify import identify as identify_runs
+from tuning.identification.objective import Objective
+from tuning.identification.validation import validate
+from tuning.logs.identify import check_offsets, family_of, split_runs
+from tuning.problems.parameter import Parameter
+
+
+def identify(
+    logs: Any,
+    free: str | Sequence[str] = (),
+    *,
+    model: Any = None,
+    preset: str | Path | None = None,
+    sensors: Sequence[str] | None = None,
+    columns: Any = None,
+    clock_offset: Any = None,
+    dt: float | None = None,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    start: Mapping[str, float] | None = None,
+    noise: bool = True,
+    held_out: Any = None,
+    use_all: bool = False,
+    filter: str = "ekf",
+    predicted: Sequence[str] = (),
+    degrees: float = math.inf,
+    gate: float = math.inf,
+    starts: int = STARTS,
+    seed: int = 0,
+    progress: bool | None = None,
+) -> Identified:
+    """Find the parameters under which recorded runs are most likely, and say which of them the runs determine.
+
+    Of a thruster may be free: its parameters (motor_damping, voltage_gain, ...), dead_band, thrust_asymmetry,
+    ambient_velocity, bias_CHANNEL, lag_CHANNEL, clock_offset_CHANNEL, and the variances of Q and R. Of another
+    model, the arguments that have numbers for defaults, and its named constants. Ctrl-C keeps the best so far.
+
+        found = tuning.identify(["run1.csv", "run2.csv"], ["motor_damping", "voltage_gain"], preset="tunnel")
+        found.to_frame()
+        found.save("mine.toml")
+
+    Args:
+        logs: one recorded run or several: paths of .csv, .parquet or .npz files, tables, or `Log`s.
+        free: names of what is to be found; of a thruster its damping, gain and lift by default.
+        model: in place of a thruster: a function that makes a `StateSpaceModel` (of dt, if it takes it), a model,
+            "module:object" for either, or a thruster's preset.
+        preset: the thruster where the search starts, by name or file.
+        sensors: what the filter sees of a thruster.
+        columns: headers by quantity.
+        clock_offset: seconds by quantity that a channel's clock is ahead.
+        dt: sample time [s], of logs without times, or to put them on.
+        ranges: (low, high) by name, within which a parameter is looked for.
+        start: values by name where the search begins.
+        noise: whether the variances of Q and R are found, too.
+        held_out: runs that only validate, themselves or by path; by default every third of three or more.
+        use_all: hold no run out.
+        filter: "ekf", or "kf" for affine models.
+        predicted: channels that the filter predicts but never sees, such as a load cell's thrust.
+        degrees: of freedom of Student-t errors, such as 20, of predicted channels, if there are any.
+        gate: leave out samples beyond so many standard deviations, such as 5, as outliers.
+        starts: searches from so many starts.
+        seed: of the draws of the starts.
+        progress: whether to show it; None in terminals and notebooks only.
+
+    Returns:
+        `Identified`: `values`, `standard_errors`, `validation`, `to_frame()`, `save()`, `plot_profiles()`.
+
+    Raises:
+        ValueError: states the rule and the value.
+        KeyboardInterrupt: after Ctrl-C before there is a best so far.
+    """
+    if isinstance(model, str | Path) and not is_code(str(model)):
+        if preset is not None:
+            raise ValueError(f"give either a model or a preset, but got both, {shown(model)} and {shown(preset)}")
+        preset, model = model, None
+    whose: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensors}
+    read: dict[str, Any] = {**whose, "columns": columns, "clock_offset": clock_offset, "dt": dt}
+    runs, proving = split_runs(logs, held_out, use_all=use_all, **read)
+    names = [free] if isinstance(free, str) else list(free)
+    family = family_of(runs, names, **whose, noise=noise, filter=filter)
+    search: dict[str, Any] = {"predicted": tuple(predicted), "degrees": degrees, "gate": gate, "starts": starts}
+    return identified(
+        family, runs, proving, ranges, start, console_for(progress), filter=filter, seed=seed, **search
+    )
+
+
+def identified(
+    family: Any,
+    runs: Sequence[Log],
+    proving: Sequence[Log],
+    ranges: Mapping[str, tuple[float, float]] | None,
+    start: Mapping[str, float] | None,
+    console: Console,
+    *,
+    filter: str,
+    predicted: Sequence[str] = (),
+    starts: int = STARTS,
+    **search: Any,
+) -> Identified:
+    """Check what is asked for, search with progress, and validate: what `thruster identify` does, too.
+
+    Args:
+        family: from `tuning.logs.identify.family_of`.
+        runs: to learn from.
+        proving: that only validate; if there are none, the runs themselves do.
+        ranges: of some free parameters.
+        start: of some.
+        console: where progress is shown.
+        filter: whose innovations count.
+        predicted: channels that it never sees.
+        starts: how many.
+        **search: further options of `tuning.identification.identify.identify`.
+    """
+    parameters: tuple[Parameter, ...] = with_ranges(family.free, ranges or {}, start or {})
+    check_offsets(parameters, runs)
+    coordinates = Coordinates(parameters)
+    objective = Objective(family.data, family.model, coordinates, filter=filter, predicted=predicted)
+    check_excitation(objective, runs, coordinates.start())
+    with console.status("identifying ...") as status:
+
+        def tell(number: int, value: float, values: dict[str, float]) -> None:
+            status.update(f"start {number + 1} of {starts}: log-likelihood {value:.2f}")
+
+        options: dict[str, Any] = {"filter": filter, "predicted": predicted, "starts": starts, **search}
+        found = identify_runs(family.data, family.model, parameters, **options, progress=tell)
+    checked = validate(found, family.shifted(proving)) if proving else validate(found)
+    return Identified(found, checked, family, tuple(runs), tuple(proving))

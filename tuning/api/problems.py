@@ -1,0 +1,108 @@
+"""What a user gives for a problem, as a `Problem`: a name, a problem itself, or a model and recorded runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from filters.estimators.find import is_foreign
+from filters.registry import FILTERS, filter_class
+from filters.tuned_file import read_tuned_file
+from numerics.checks import shown
+from numerics.modules import is_code
+from tuning.logs.problem import log_problem, problems_in
+from tuning.problems.find import find_problem, named
+from tuning.problems.problem import Problem
+from tuning.problems.rooms import built_in, room_of_logs
+
+RULE = (
+    "a problem must be a name, a file that ends in .toml, 'module:object', a Problem, or a pair (model, data) of "
+    "a model and recorded runs"
+)
+
+
+def problem_of(given: Any, preset: str | Path | None = None, **of_logs: Any) -> Problem:
+    """The problem that a user gives.
+
+    Args:
+        given: a name, such as "mismatch" or "auv:motion", a file that ends in .toml, or "module:object"; a
+            `Problem`; or a pair (model, data) for `log_problem`, where the model is a `StateSpaceModel`, what
+            makes or offers one, "module:object", or a preset of a thruster, and data are recorded runs.
+        preset: the problem of another thruster, by name or file.
+        **of_logs: options of `log_problem`, for a pair; None for those not given.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
+    told = {name: value for name, value in of_logs.items() if value is not None}
+    if isinstance(given, tuple) and len(given) == 2:
+        return _of_logs(*given, preset, told)
+    if told:
+        raise ValueError(f"{next(iter(told))} must come with a pair (model, data), but got {shown(given)}")
+    if isinstance(given, str | Path):
+        found = find_problem(str(given))
+    elif isinstance(given, Problem):
+        found = _told_apart(given)
+    else:
+        raise ValueError(f"{RULE}, but got {shown(given)}")
+    return room_of_logs().of_preset(found, preset)
+
+
+def problems_of(given: Any, preset: str | Path | None = None, **of_logs: Any) -> tuple[Problem, ...]:
+    """One problem, or several of a list; the arguments are those of `problem_of`."""
+    some = given if isinstance(given, list) else [given]
+    if not some:
+        raise ValueError(f"{RULE}, or a list of some, but got an empty list")
+    return tuple(problem_of(one, preset, **of_logs) for one in some)
+
+
+def given_for(file: str | Path, problem: Any = None, model: str | None = None, **of_logs: Any) -> list[Problem]:
+    """The problems by which a tuned file's are found again: those the user gives, and logs that the file names.
+
+    Nothing is imported that a file names: a problem or a model that is code has to be given.
+    """
+    given = [] if problem is None else list(problems_of(problem, **of_logs))
+    kept = read_tuned_file(file)["problems"]
+    if any(one.name in kept for one in given):
+        return given
+    return [*given, *problems_in(Path(file), model)]
+
+
+def is_filter(given: Any) -> bool:
+    """Whether something is a filter or an estimator, and no tuned file: a `Path`, or what ends in .json.
+
+    Raises:
+        ValueError: for an unknown name, or what is neither.
+    """
+    if isinstance(given, Path) or (isinstance(given, str) and given not in FILTERS and _is_tuned_file(given)):
+        return False
+    if isinstance(given, str) or is_foreign(given):
+        filter_class(given)  # a clear error for an unknown name
+        return True
+    raise ValueError(f"a filter must be a name, a tuned file, a Study or an estimator, but got {shown(given)}")
+
+
+def _is_tuned_file(text: str) -> bool:
+    return text.endswith(".json") or Path(text).is_file()
+
+
+def _of_logs(model: Any, data: Any, preset: str | Path | None, options: dict[str, Any]) -> Problem:
+    if isinstance(model, str | Path) and not is_code(str(model)):
+        if preset is not None:
+            raise ValueError(
+                f"a pair (model, data) of a preset must come without another, but got {shown(preset)}"
+            )
+        preset, model = model, None
+    return log_problem(data, **_without_nothing({"preset": preset, "model": model}), **options)
+
+
+def _without_nothing(options: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _told_apart(problem: Problem) -> Problem:
+    """A problem that a user changed, under another name than that of the package's: files know these by name."""
+    known = built_in()
+    if problem.name in known and known[problem.name].find_scenario(problem.name).digest != problem.digest:
+        return named(problem, f"{problem.name} (changed)")
+    return problem

@@ -1,0 +1,124 @@
+"""Progress of long work, in a terminal and in a notebook, on standard error."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from numerics.checks import shown
+from numerics.progress import listening
+from tuning.search.interruption import STOPPING
+
+if TYPE_CHECKING:
+    from tuning.problems.problem import Problem
+    from tuning.search.plan import Plan
+    from tuning.search.study import OnTrial
+
+ShowKinds = Callable[[Sequence[str]], None]
+
+
+def console_for(progress: bool | None) -> Console:
+    """Where progress is shown.
+
+    Args:
+        progress: False for nowhere, True for standard error whatever it is, None for terminals and notebooks.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if progress not in (True, False, None):
+        raise ValueError(f"progress must be True, False or None, but got {shown(progress)}")
+    console = Console(stderr=True, markup=False, highlight=False)
+    if console.is_jupyter and importlib.util.find_spec("ipywidgets") is None:  # by which rich shows live displays
+        console = Console(stderr=True, markup=False, highlight=False, force_jupyter=False)
+        return console if progress else Console(quiet=True)
+    console.quiet = progress is False or (progress is None and not (console.is_terminal or console.is_jupyter))
+    return console
+
+
+@contextmanager
+def working(text: str, console: Console) -> Iterator[None]:
+    """Say what goes on, with how far it is where that is told."""
+    with console.status(f"{text} ...") as status, listening(lambda far: status.update(f"{text}: {far}")):
+        yield
+
+
+@contextmanager
+def trial_bar(
+    plan: Plan, names: str, total: int, done: int, console: Console
+) -> Iterator[tuple[OnTrial, ShowKinds]]:
+    """What is called after each trial of a study, and with the kinds of filters that are under trial.
+
+    Args:
+        plan: of the study.
+        names: of its scenarios.
+        total: trials that it shall have.
+        done: trials that it has.
+        console: where it is shown.
+    """
+    from tuning.search.filter_types import kinds_running
+    from tuning.search.outcome import best_trial
+
+    title = f"tuning {{}} on {names}"
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("best {task.fields[best]}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task(title.format(plan.filter), total=total, completed=min(done, total), best="-")
+
+        def show_kinds(kinds: Sequence[str]) -> None:
+            if len(plan.kinds) > 1:
+                progress.update(task, description=title.format(f"{plan.filter} ({', '.join(kinds)})"))
+
+        def advance(study, finished: int) -> None:
+            trials = study.get_trials(deepcopy=False)
+            best = best_trial(trials)
+            progress.update(task, completed=finished, best="-" if best is None else f"{best.values[0]:.3f}")
+            if running := kinds_running(trials):
+                show_kinds(running)
+
+        def show_rest(far: str) -> None:
+            if far == STOPPING:
+                progress.update(task, description=far, refresh=True)
+            elif progress.tasks[task].finished:  # what comes after the last trial
+                progress.update(task, description=f"ensemble sizes, {far}" if far.startswith("N: ") else far)
+
+        with listening(show_rest):
+            yield advance, show_kinds
+
+
+@contextmanager
+def row_bar(total: int, console: Console) -> Iterator[Callable[[Problem, str], None]]:
+    """What is called before each filter of a comparison is run, with the problem and the filter's label."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("comparing ...", total=total)
+        begun: list[str] = []
+
+        def on_row(problem: Problem, label: str) -> None:
+            progress.update(task, description=f"{label} on {problem.name}", completed=len(begun))
+            begun.append(label)
+
+        def show(far: str) -> None:
+            if far == STOPPING:
+                progress.update(task, description=far, refresh=True)
+
+        with listening(show):
+            yield on_row
+        progress.update(task, completed=len(begun))

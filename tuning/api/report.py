@@ -1,0 +1,98 @@
+"""`tuning.report`: a page on a tuned filter that any browser shows without a network."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import optuna
+from optuna.study import StudyDirection
+
+from numerics.checks import shown
+from numerics.files import check_target, write_whole
+from tuning.api.problems import given_for, problems_of
+from tuning.api.progress import console_for, working
+from tuning.api.run import quiet_optuna
+from tuning.api.study import Study
+from tuning.evaluation.kept import sizes_as_data
+from tuning.problems.problem import Problem
+from tuning.reporting.report import write_report
+from tuning.reporting.subject import is_file
+from tuning.search.storage import open_storage
+from tuning.search.study import SIZES
+
+STUDIES = "out/studies.journal"  # where studies are unless it is told
+
+
+def report(
+    source: str | Path | Study,
+    out: str | Path | None = None,
+    *,
+    storage: str | Path = STUDIES,
+    problem: Any = None,
+    model: str | None = None,
+    progress: bool | None = None,
+) -> Path:
+    """Write a page on a tuned filter, its study and its evaluation on held-out seeds; return the page's path.
+
+    Beside the page its tables are written as Markdown. The page needs nothing else, no network either.
+
+        tuning.report("tuned.json", out="report.html")
+
+    Args:
+        source: a `Study`, a tuned file, or the name of a study in the storage.
+        out: the page, a file that ends in .html, or a folder for it; by default it is beside the tuned file, or in
+            the folder out.
+        storage: where the study is, of a file or a name; without it the page on a file leaves the search out.
+        problem: what it was tuned on, where that is code or was changed: a file only names it.
+        model: "module:object" of the logs that a tuned file names, where their model is code.
+        progress: whether to show it; None in terminals and notebooks only.
+
+    Raises:
+        ValueError: if the source is refused, or the page cannot be written.
+    """
+    console = console_for(progress)
+    page = None if out is None or Path(out).suffix != ".html" else Path(out)
+    if page is not None:
+        check_target(page)
+    with quiet_optuna(), working("reporting", console), tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch) / "page" if page is not None else None if out is None else Path(out)
+        if isinstance(source, Study):
+            folder = Path("out") if folder is None else folder
+            with _as_files(source, Path(scratch)) as (file, journal):
+                made = write_report(file, journal, folder, source.problems)
+        else:
+            made = write_report(source, str(storage), folder, _given(source, problem, model))
+        if page is None:
+            return made.page
+        write_whole(page, made.page.read_bytes())
+        write_whole(page.with_suffix(".md"), made.tables.read_bytes())
+        return page
+
+
+def _given(source: str | Path, problem: Any, model: str | None) -> Sequence[Problem]:
+    """What the user gives of the problems that a file or a study names."""
+    if not isinstance(source, str | Path):
+        raise ValueError(
+            f"a report must be of a Study, a tuned file or the name of a study, but got {shown(source)}"
+        )
+    if is_file(source) and Path(source).is_file():
+        return given_for(source, problem, model)
+    return [] if problem is None else problems_of(problem)
+
+
+@contextmanager
+def _as_files(study: Study, folder: Path) -> Iterator[tuple[Path, str]]:
+    """A study's tuned file, and a journal that holds its trials."""
+    journal, tuning = str(folder / "study.journal"), study.tuning
+    plan, sizes = tuning.plan, tuning.result.sizes
+    directions = [StudyDirection.MINIMIZE] * len(plan.objectives)
+    kept = optuna.create_study(study_name=study.name, storage=open_storage(journal), directions=directions)
+    kept.set_user_attr("identity", plan.identity)
+    if sizes:
+        kept.set_user_attr(SIZES, sizes_as_data(sizes, study.choice, plan))
+    kept.add_trials(study.trials)
+    yield study.save(folder / f"{study.name}.json"), journal

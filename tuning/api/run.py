@@ -1,0 +1,172 @@
+"""A study from its plan to its proof: what `tuning.tune` and `thruster tune` both do."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import optuna
+from rich.console import Console
+
+from numerics.checks import at_least, one_of, shown
+from numerics.files import check_target
+from tuning.api.progress import trial_bar, working
+from tuning.evaluation.held_out import Comparison, prove
+from tuning.evaluation.tuned import write_tuned
+from tuning.likelihood.gradient import DIFFERENTIABLE, GradientResult, maximise_likelihood
+from tuning.likelihood.identifiability import Identifiability, identify
+from tuning.problems.problem import Problem
+from tuning.search.plan import Plan
+from tuning.search.storage import open_storage
+from tuning.search.study import StudyResult, checked, finished_trials, open_study, run_study, run_trials
+from tuning.search.workers import run_in_workers
+
+MOST_TRIALS = 1_000_000
+MOST_WORKERS = 1000
+METHODS = ("optuna", "gradient")
+
+
+class Tuning(NamedTuple):
+    """All that a tuning made."""
+
+    study: str
+    plan: Plan
+    result: StudyResult
+    proofs: tuple[Comparison, ...]  # one for each scenario
+    file: Path | None  # the tuned file, where one was written
+    gradient: GradientResult | None = None  # where the choice is the maximum of the likelihood ...
+    rival: Comparison | None = None  # ... and what an Optuna study in its stead would have chosen
+    known: Identifiability | None = None  # what the innovations determine; None without a covariance
+
+    @property
+    def scenario(self) -> Problem:
+        """The first scenario."""
+        return self.plan.scenarios[0]
+
+    @property
+    def proof(self) -> Comparison:
+        """The proof on the first scenario."""
+        return self.proofs[0]
+
+    def write(self, file: str | Path) -> None:
+        """Write the tuned file."""
+        method = METHODS[self.gradient is not None]
+        write_tuned(file, self.plan, self.result, self.proofs, self.study, method)
+
+
+def run_tuning(
+    plan: Plan,
+    trials: int,
+    console: Console,
+    storage: str | None = None,
+    name: str | None = None,
+    out: Path | None = None,
+    *,
+    by_gradient: bool = False,
+    workers: int = 1,
+) -> Tuning:
+    """Run or resume a study with a progress bar, prove its choice and, where asked, write the tuned file.
+
+    Args:
+        plan: what the study is for.
+        trials: finished trials that it shall have in total.
+        console: where progress is shown.
+        storage: journal file or URL; None for a study that ends with the process.
+        name: of the study; from the plan if None.
+        out: the tuned file; none is written if None.
+        by_gradient: whether the choice is the maximum of the likelihood, beside a study.
+        workers: processes that share the study.
+
+    Raises:
+        ValueError: states the rule and the value.
+        KeyboardInterrupt: after Ctrl-C before any trial is complete, or in the midst of the proof.
+    """
+    trials, workers = at_least("trials", trials, 1, MOST_TRIALS), at_least("workers", workers, 1, MOST_WORKERS)
+    _check_method(plan, by_gradient)
+    if workers > 1 and storage is None:
+        raise ValueError(f"workers must be 1 without a storage that they share, but got {workers}")
+    name = name or name_of(plan, by_gradient)
+    if not isinstance(name, str) or "/" in name:
+        raise ValueError(f"study must be a name without slashes, but got {shown(name)}")
+    if out is not None:
+        check_target(out)
+    with quiet_optuna():
+        plan = checked(plan)  # before there is a journal
+        study = open_study(name, plan, None if storage is None else open_storage(storage))
+        already = finished_trials(study)
+        if already:
+            console.print(f"study {name!r} goes on after {already} finished trials")
+        with trial_bar(plan, names_of(plan), trials, already, console) as (advance, show_kinds):
+            run = partial(run_trials, on_choice=lambda choice: show_kinds([choice.name]))
+            if storage is not None and workers > 1:
+                run = partial(run_in_workers, storage=storage, workers=workers)
+            result = run_study(study, plan, trials, advance, run)
+    gradient = rival = None
+    if by_gradient:
+        with working("maximising the likelihood", console):
+            gradient = maximise_likelihood(plan.filter, plan.scenarios[0], plan.training_data()[0])
+        rival = prove(result.choice, plan.scenarios[0], plan.seed)
+        result = result._replace(choice=gradient.choice, consistent=None, nis=())
+    try:
+        with working("proving the choice on held-out seeds", console):
+            proofs = tuple(prove(result.choice, scenario, plan.seed) for scenario in plan.scenarios)
+    except KeyboardInterrupt:
+        if storage is not None:
+            console.print(f"study {name!r} keeps its trials: the same command goes on with the proof")
+        raise
+    tuning = Tuning(name, plan, result, proofs, out, gradient, rival)
+    if out is not None:
+        tuning.write(out)
+    if by_gradient:
+        return tuning
+    return tuning._replace(known=identify(result.choice, plan.scenarios, plan.training_data(), plan.space()))
+
+
+def _check_method(plan: Plan, by_gradient: bool) -> None:
+    """Raise ValueError for a plan that the gradient method cannot serve."""
+    if not by_gradient:
+        return
+    one_of("a filter whose likelihood has a gradient", plan.filter, DIFFERENTIABLE)
+    if plan.hold_r:
+        raise ValueError("R must be free for --method gradient, but got --hold-r")
+    if plan.full_q:
+        raise ValueError("Q must be diagonal for --method gradient, but got --full-q")
+    if plan.budget is not None:
+        raise ValueError("--method gradient must come without a budget, but got --budget")
+
+
+def name_of(plan: Plan, by_gradient: bool = False) -> str:
+    """A name for a study of a plan: what differs from the default is in it."""
+    parts = [plan.filter, names_of(plan).replace(", ", "+"), f"seed{plan.seed}"]
+    parts += ["+".join(plan.objectives)] * (plan.objectives != ("score",))
+    parts += ["hold-r"] * plan.hold_r + ["full-q"] * plan.full_q
+    parts += [] if plan.budget is None else [f"budget{plan.budget:g}"]
+    parts += ["any-nis"] * (not plan.consistent) + [plan.sampler] * (plan.sampler != "tpe")
+    return "-".join(parts + ["gradient"] * by_gradient)
+
+
+def names_of(plan: Plan) -> str:
+    """Names of a plan's scenarios as those of a study and of a file have them."""
+    return ", ".join(map(short_name, plan.scenarios))
+
+
+def short_name(problem: Problem) -> str:
+    """A problem's name as that of a study and of a file has it: without folders and what shells read."""
+    name = Path(problem.name)
+    text = name.stem if name.suffix == ".toml" else name.name
+    return re.sub(r"[^\w.+-]+", "-", text.replace(".toml)", ")")).strip("-")
+
+
+@contextmanager
+def quiet_optuna() -> Iterator[None]:
+    """Within this context Optuna reports errors only: there is progress of our own."""
+    before = optuna.logging.get_verbosity()
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    try:
+        yield
+    finally:
+        optuna.logging.set_verbosity(before)

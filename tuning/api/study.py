@@ -1,0 +1,188 @@
+"""`Study`: what a tuning found, as a value that can be shown, saved and put to use."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from optuna.trial import FrozenTrial, TrialState
+
+from filters.filter import Filter
+from tuning.api.held_out import HeldOut
+from tuning.api.run import Tuning
+from tuning.api.showing import about, drawn, frame, html, number
+from tuning.evaluation.tuned import check_keepable
+from tuning.evaluation.worth import worth
+from tuning.problems.problem import Problem
+from tuning.search.outcome import is_consistent
+from tuning.search.space import Choice
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Study:
+    """A tuned filter, the trials that led to it, and what it is worth on held-out seeds.
+
+    Attributes:
+        tuning: all that was made, as the command line has it: plan, result and proofs.
+    """
+
+    tuning: Tuning
+
+    @property
+    def name(self) -> str:
+        """What the study is called in its storage."""
+        return self.tuning.study
+
+    @property
+    def choice(self) -> Choice:
+        """The tuned numbers: those of the model, such as Q and R, and the filter's own."""
+        return self.tuning.result.choice
+
+    @property
+    def problem(self) -> Problem:
+        """What it was tuned on; of several problems the first."""
+        return self.tuning.scenario
+
+    @property
+    def problems(self) -> tuple[Problem, ...]:
+        """All problems that it was tuned on."""
+        return self.tuning.plan.scenarios
+
+    @property
+    def filter(self) -> Filter:
+        """The tuned filter, ready to use: `init`, `predict`, `update`."""
+        return self.choice.filter(self.problem)
+
+    @property
+    def held_out(self) -> HeldOut:
+        """Tuned filter and baselines on seeds that the study never saw; of several problems on the first."""
+        return self.evaluations[0]
+
+    @property
+    def evaluations(self) -> tuple[HeldOut, ...]:
+        """The same on each problem."""
+        pairs = zip(self.problems, self.tuning.proofs, strict=True)
+        return tuple(HeldOut(self.choice, one, proof, True, self.tuning.plan.seed) for one, proof in pairs)
+
+    @property
+    def trials(self) -> list[FrozenTrial]:
+        """The trials as Optuna has them."""
+        return self.tuning.result.trials
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C ended it before it had all its trials."""
+        return self.tuning.result.interrupted
+
+    @property
+    def consistent(self) -> bool | None:
+        """Whether any trial's mean NIS was in its band; None where all count."""
+        return self.tuning.result.consistent
+
+    def save(self, path: str | Path) -> Path:
+        """Write the tuned file, which `EstimateState(env, tuned=path)` and all commands take; return the path.
+
+        Raises:
+            ValueError: if the file cannot be written, or the filter is an estimator that is code.
+        """
+        check_keepable(self.choice.name)
+        self.tuning.write(path)
+        return Path(path)
+
+    def to_frame(self) -> pandas.DataFrame:
+        """A row a trial: its number, state, objectives, whether it is consistent, seconds, and what it tried.
+
+        Raises:
+            ValueError: if pandas is not installed.
+        """
+        objectives = self.tuning.plan.objectives
+        names = list(dict.fromkeys(name for trial in self.trials for name in trial.params))
+        columns: dict[str, list] = {"trial": [trial.number + 1 for trial in self.trials]}
+        columns["state"] = [trial.state.name.lower() for trial in self.trials]
+        for place, objective in enumerate(objectives):
+            columns[objective] = [_value(trial, place) for trial in self.trials]
+        columns["consistent"] = [is_consistent(trial) for trial in self.trials]
+        columns["seconds"] = [_seconds(trial) for trial in self.trials]
+        for name in names:
+            columns[name] = [trial.params.get(name) for trial in self.trials]
+        return frame(columns, "trial")
+
+    def plot_history(self) -> Figure:
+        """First objective of every trial, and the best so far."""
+        from tuning.reporting.figures import SCORE, draw_history
+
+        objective = self.tuning.plan.objectives[0]
+        label = SCORE if objective == "score" else objective
+        return drawn(draw_history(self.trials, f"Study {self.name}", label))
+
+    def plot_errors(self) -> Figure:
+        """RMSE before and after on held-out seeds, with 95 % intervals and the bound.
+
+        Raises:
+            ValueError: if there is no truth, and so no RMSE.
+        """
+        return self.held_out.plot_errors()
+
+    def plot_run(self, place: int = 0) -> Figure:
+        """One held-out run over time, before and after."""
+        return self.held_out.plot_run(place)
+
+    def plot_consistency(self) -> Figure:
+        """Whether the tuned filter's covariance is consistent on the held-out seeds, a panel a check."""
+        return self.held_out.plot_consistency()
+
+    def plot_sizes(self) -> Figure:
+        """RMSE against ensemble size on seeds that chose neither Q nor R.
+
+        Raises:
+            ValueError: for a filter without an ensemble, or a problem without truth.
+        """
+        from tuning.reporting.search_figures import draw_sizes
+
+        rows = self.tuning.result.sizes
+        if not rows:
+            raise ValueError(f"a figure of ensemble sizes needs an ensemble and truth, but {self!r} has not both")
+        return drawn(draw_sizes(rows, self.choice.numbers["ensemble_size"]))
+
+    def report(self, out: str | Path | None = None) -> Path:
+        """Write a page on it that any browser shows; see `tuning.report`."""
+        from tuning.api.report import report
+
+        return report(self, out)
+
+    def __repr__(self) -> str:
+        result, names = self.tuning.result, ", ".join(one.name for one in self.problems)
+        said = f"Study({self.choice.name} on {names}, {result.finished} trials"
+        ended = ", interrupted" if self.interrupted else ""
+        if not self.tuning.proof.tuned.has_truth:
+            return f"{said}{ended}: tuning {worth(self.tuning.proof)})"
+        return f"{said}{ended}: score {about(self.held_out.score)}; tuning {worth(self.tuning.proof)})"
+
+    def _repr_html_(self) -> str:
+        from tuning.reporting.units import number_rows
+
+        found = self.held_out
+        rows = number_rows(list(found.choices.values()), self.choice.name, self.problem, _text)
+        numbers = html(f"Numbers of the {self.choice.name} filter", ["", *found.choices], rows)
+        return numbers + found._repr_html_() + f"<p>Tuning {worth(self.tuning.proof)}.</p>"
+
+
+def _text(value: Any) -> str:
+    return "default" if value is None else number(value) if isinstance(value, float) else str(value)
+
+
+def _value(trial: FrozenTrial, place: int) -> float | None:
+    """An objective of a complete trial; of a pruned one the mean of the seeds that it came to."""
+    if trial.state == TrialState.COMPLETE:
+        return trial.values[place]
+    seen = list(trial.intermediate_values.values())
+    return sum(seen) / len(seen) if seen and place == 0 else None
+
+
+def _seconds(trial: FrozenTrial) -> float | None:
+    return None if trial.duration is None else trial.duration.total_seconds()

@@ -1,0 +1,115 @@
+"""`tuning.tune`: find the Q, R and other numbers that make a filter good, and prove them on held-out seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from numerics.checks import one_of
+from tuning.api.problems import problems_of
+from tuning.api.progress import console_for
+from tuning.api.run import METHODS, run_tuning
+from tuning.api.study import Study
+from tuning.search.plan import Plan
+
+
+def tune(
+    problem: Any,
+    filter: Any = "ekf",
+    *,
+    trials: int = 50,
+    seed: int = 0,
+    objective: str | Sequence[str] | None = None,
+    consistent: bool = True,
+    hold_r: bool = False,
+    full_q: bool = False,
+    budget: float | None = None,
+    sampler: str = "tpe",
+    prune: bool = True,
+    method: str = "optuna",
+    workers: int = 1,
+    storage: str | Path | None = None,
+    name: str | None = None,
+    progress: bool | None = None,
+    preset: str | Path | None = None,
+    sensors: Sequence[str] | None = None,
+    columns: Any = None,
+    clock_offset: Any = None,
+    dt: float | None = None,
+    held_out: Any = None,
+    blocks: int | None = None,
+    lead: int | None = None,
+) -> Study:
+    """Find the Q, R and ensemble size that make a filter's estimate best, and prove it on held-out seeds.
+
+    The score is the mean over states of RMSE over its bound, on 32 training seeds that every trial shares; of
+    recorded runs without true states it is the negative log-likelihood of the innovations. The first trial is the
+    rule of thumb. The mean NIS is held in a band, for RMSE alone hardly tells Q and R: only their ratio matters to
+    the estimate. Ctrl-C keeps all finished trials: the study is that of these, and says that it was `interrupted`.
+
+        study = tuning.tune("mismatch", filter="enkf", trials=50)
+        study.save("tuned.json")
+        study.plot_errors()
+
+        study = tuning.tune((model, ["run1.csv", "run2.csv"]), trials=100)
+
+    Args:
+        problem: a name, such as "mismatch" or "auv:motion", a file that ends in .toml, or "module:object"; a
+            `Problem`; a pair (model, data) of a model, or a thruster's preset, and recorded runs; or a list of
+            several problems, whose objectives are averaged. Recorded runs are paths, tables of pandas, mappings
+            from headers to arrays, or `Log`s.
+        filter: name of a filter; "auto" for the best of all within the budget; or somebody's estimator.
+        trials: finished trials that the study shall have in total.
+        seed: of all randomness; the same seed repeats all.
+        objective: what is minimised, or two for a Pareto front, as `thruster tune --objective` lists them; the
+            score, or without truth the negative log-likelihood.
+        consistent: whether the mean NIS is held between 0.8 and 1.25 of what is right.
+        hold_r: leave R as the data sheet has it, tune Q alone.
+        full_q: tune the correlations of Q, too.
+        budget: what a step of the filter may cost [microseconds of one core].
+        sampler: of Optuna: "tpe", "random", "cma-es", ...
+        prune: end a trial that is significantly worse than the best on the same seeds.
+        method: "optuna", or "gradient": maximum likelihood, for kf and ekf.
+        workers: processes on this host that share the study; several need a storage.
+        storage: journal file or URL of a database that keeps the study, so that the same call goes on with it; by
+            default it ends with the process.
+        name: of the study; by default from the above.
+        progress: whether to show it; None in terminals and notebooks only.
+        preset: the problem of another thruster, by name or file.
+        sensors: of recorded runs of a thruster, what the filter sees.
+        columns: of recorded runs, headers by quantity.
+        clock_offset: of recorded runs, seconds by quantity that a channel's clock is ahead.
+        dt: of recorded runs, the sample time [s].
+        held_out: recorded runs that only prove the choice; by default every third.
+        blocks: how many blocks a recorded run is cut into.
+        lead: rows at the beginning of a block that do not count.
+
+    Returns:
+        `Study`: `filter`, `choice`, `held_out`, `save(path)`, `to_frame()`, `plot_history()`, `plot_errors()`.
+
+    Raises:
+        ValueError: states the rule and the value.
+        KeyboardInterrupt: after Ctrl-C before any trial is complete, or in the midst of the proof.
+    """
+    one_of("method", method, METHODS)
+    of_logs = {"sensors": sensors, "columns": columns, "clock_offset": clock_offset, "dt": dt}
+    problems = problems_of(problem, preset, **of_logs, held_out=held_out, blocks=blocks, lead=lead)
+    if objective is None:
+        objective = "score" if problems[0].scale is not None else "likelihood"
+    plan = Plan(
+        filter,
+        problems,
+        seed,
+        (objective,) if isinstance(objective, str) else tuple(objective),
+        consistent=consistent,
+        sampler=sampler,
+        hold_r=hold_r,
+        prune=prune,
+        budget=budget,
+        full_q=full_q,
+    )
+    where = None if storage is None else str(storage)
+    by_gradient = method == "gradient"
+    console = console_for(progress)
+    return Study(run_tuning(plan, trials, console, where, name, by_gradient=by_gradient, workers=workers))

@@ -1,0 +1,141 @@
+"""Recorded logs as the problem of a study: from what a user says of them, or as a tuned file names them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from filters.tuned_file import read_tuned_file
+from numerics.checks import shown
+from plants.logs.log import Log
+from plants.replay import read_for
+from tuning.logs.read import read_named, texts
+from tuning.problems.log_problem import LogProblem
+from tuning.problems.problem import Problem
+
+OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt")  # of `read_named`
+CUTS = ("held_out", "blocks", "lead")
+
+
+def log_problem(
+    logs: Any,
+    held_out: Any = None,
+    blocks: int | None = None,
+    lead: int | None = None,
+    **options: Any,
+) -> LogProblem:
+    """The problem of some logs.
+
+    Args:
+        logs: a recorded run or several: paths, tables or `Log`s, as `read_named` takes them. Tables are called
+            run1, run2, ...
+        held_out: runs that a study never sees, by path or name, or themselves; those that are not among the logs
+            are added to them.
+        blocks: of each run.
+        lead: rows of a block's lead-in.
+        **options: of `read_named`.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
+    runs, proving = runs_by_name(logs, held_out)
+    if not runs:
+        raise ValueError("a problem of logs must have at least one, but got none: say --log FILE")
+    pairs = [read_named(log, **options, name=name) for name, log in runs.items()]
+    recorded = [log for log, _ in pairs]
+    model = read_for(recorded[0], pairs[0][1])[1]()
+    cuts: dict[str, Any] = {"held_out": proving, "blocks": blocks, "lead": lead}
+    cuts = {key: value for key, value in cuts.items() if value is not None and value != []}
+    return LogProblem(recorded, model, **cuts, content=_content(runs, options, cuts))
+
+
+def runs_by_name(logs: Any, held_out: Any = None) -> tuple[dict[str, Any], list[str]]:
+    """All runs by name, those held out behind the others unless they are among them, and the names of these."""
+    runs: dict[str, Any] = {}
+    for log in listed(logs):
+        _add(runs, name_of(log, len(runs)), log)
+    proving = []
+    for log in listed(held_out):
+        name = name_of(log, len(runs))
+        if not (isinstance(log, str) and name in runs):
+            _add(runs, name, log)
+        proving.append(name)
+    return runs, list(dict.fromkeys(proving))
+
+
+def listed(logs: Any) -> list:
+    """Several recorded runs as a list, which one may be given without; nothing for None."""
+    if logs is None:
+        return []
+    return list(logs) if isinstance(logs, list | tuple) else [logs]
+
+
+def _add(runs: dict[str, Any], name: str, log: Any) -> None:
+    if name in runs and not isinstance(log, str | PathLike) and runs[name] is not log:
+        raise ValueError(f"logs must have different names, but got two called {name}")
+    runs.setdefault(name, log)
+
+
+def name_of(log: Any, place: int) -> str:
+    """What a log is called: by its path, its own name, or a table by its place among the others."""
+    if isinstance(log, Log):
+        return log.name
+    return str(log) if isinstance(log, str | PathLike) else f"run{place + 1}"
+
+
+def _content(runs: Mapping[str, Any], options: Mapping[str, Any], cuts: Mapping[str, Any]) -> dict | None:
+    """What makes the problem anew, as JSON can hold it; None where logs are no files, or the model an object."""
+    model, told = options.get("model"), dict(options)
+    if not all(isinstance(log, str | PathLike) for log in runs.values()) or not isinstance(model, str | None):
+        return None
+    for name in ("columns", "clock_offset"):
+        told[name] = texts(told.get(name))
+    told["preset"] = None if told.get("preset") is None else str(told["preset"])
+    told["sensors"] = None if told.get("sensors") is None else list(told["sensors"])
+    kept = {name: told[name] for name in options if told[name] is not None}
+    return {"options": {**kept, **cuts}}
+
+
+def problems_in(file: Path, model: str | None = None) -> list[Problem]:
+    """The problems of logs that a tuned file names, read anew; none if it names none.
+
+    A model that is code is not imported because a file names it: the caller says it once more.
+
+    Raises:
+        ValueError: if a log cannot be read, the options in the file are none, or the model is code and not given.
+    """
+    if not file.is_file():
+        return []
+    found: list[Problem] = []
+    for name, entry in read_tuned_file(file)["problems"].items():
+        content = entry.get("content") if isinstance(entry, dict) else None
+        if not isinstance(content, dict) or "logs" not in content:
+            continue
+        try:
+            paths = [one["file"] for one in content["logs"]]
+            options = dict(content["options"])
+            if not all(isinstance(path, str) for path in paths) or set(options) - {*OPTIONS, *CUTS}:
+                raise TypeError
+        except (KeyError, TypeError):
+            raise ValueError(
+                f"logs in a tuned file must have paths and options, but {file} has {shown(content)}"
+            ) from None
+        _check_model(options.get("model"), model, file)
+        found.append(log_problem(paths, **options))
+        if found[-1].name != name:
+            said = f"logs in a tuned file must be those of {shown(name)}"
+            raise ValueError(f"{said}, but {file} has {found[-1].name}")
+    return found
+
+
+def _check_model(named, given: str | None, file: Path) -> None:
+    """Raise ValueError unless the caller gives the code that a file names, or none where it names none."""
+    if named is None and given is not None:
+        raise ValueError(f"--model must be left out for logs of a thruster, as in {file}, but got {shown(given)}")
+    if named != given:
+        raise ValueError(
+            f"the model of logs must be given where it is code, but {file} only names {shown(named)}: say --model "
+            f"{named}, if you trust it"
+        )

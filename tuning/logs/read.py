@@ -1,0 +1,103 @@
+"""One recorded run and what offers its model: a file or a table, whose it is, and which column is which."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from numerics.checks import finite, shown
+from numerics.modules import object_named
+from plants.logs.log import Log
+from plants.replay import ANY_DT, read_for
+from tuning.problems.rooms import room_of_logs
+
+Told = Mapping[str, Any] | Sequence[str] | None  # by name, or texts NAME=VALUE as command lines have them
+
+
+def read_named(
+    path: Any,
+    preset: str | Path | None = None,
+    model: Any = None,
+    sensors: Sequence[str] | None = None,
+    columns: Told = None,
+    clock_offset: Told = None,
+    dt: float | None = None,
+    name: str | None = None,
+) -> tuple[Log, Any]:
+    """A log, and what offers its model at its sample time.
+
+    Args:
+        path: of a file; a table, as a pandas.DataFrame or a mapping from headers to arrays; or a `Log`.
+        preset: the thruster that it is of, by name or file, whose clock offsets are taken off; of a model a
+            FILE.toml with its numbers.
+        model: in place of a thruster: a `StateSpaceModel`, what makes or offers one, or "module:object".
+        sensors: what a filter sees of a thruster.
+        columns: headers by quantity, a mapping or texts NAME=HEADER[UNIT].
+        clock_offset: seconds by quantity, a mapping or texts NAME=SECONDS.
+        dt: sample time [s].
+        name: of a log that is no file.
+
+    Raises:
+        ValueError: states the rule and the value.
+    """
+    if model is not None and (sensors or (preset is not None and not str(preset).endswith(".toml"))):
+        raise ValueError("a log must be of --model or of a thruster (--preset, --sensor), but got both")
+    offsets = pairs("--clock-offset", clock_offset)
+    options: dict[str, Any] = {
+        "columns": pairs("--column", columns),
+        "clock_offset": {key: _seconds(key, value) for key, value in offsets.items()},
+        "dt": dt,
+    }
+    if isinstance(path, Log):
+        given = next((key for key, value in options.items() if value not in (None, {})), None)
+        if given is not None:
+            raise ValueError(f"{given} must come with a file or a table, but {path.name} is a Log already")
+    elif name is not None:
+        options["name"] = name
+    if model is not None:
+        offer = object_named(model, "model") if isinstance(model, str) else model
+        if preset is not None:
+            from tuning.identification.values import with_values  # which imports Optuna
+
+            offer = with_values(offer, preset)
+        return read_for(path, offer, **options)[0], offer
+    room = room_of_logs()
+    whose = room.DEFAULT_PRESET if preset is None else str(preset)
+    thruster = room.Preset(whose, sensors, ANY_DT)
+    log, _ = read_for(path, thruster.state_space_model(), **options)
+    known = {key: value for key, value in thruster.clock_offset.items() if f"measurement:{key}" not in log.offsets}
+    if known and not isinstance(path, Log):  # what the user or the log itself says goes first
+        options["clock_offset"] |= known
+        log, _ = read_for(path, thruster.state_space_model(), **options)
+    return log, room.Preset(whose, sensors, log.dt)
+
+
+def pairs(option: str, given: Told) -> dict[str, Any]:
+    """A mapping from itself, or from texts NAME=VALUE; ValueError for another form, or a name that comes twice."""
+    if isinstance(given, Mapping):
+        return dict(given)
+    if isinstance(given, str) or not isinstance(given, Sequence | None):
+        raise ValueError(f"{option} must be a mapping by name, or texts NAME=VALUE, but got {shown(given)}")
+    found: dict[str, str] = {}
+    for text in given or []:
+        name, equals, value = text.partition("=")
+        if not (name and equals and value) or name in found:
+            rule = "be given once for each name" if name in found else "have the form NAME=VALUE"
+            raise ValueError(f"{option} must {rule}, but got {shown(text)}")
+        found[name.strip()] = value.strip()
+    return found
+
+
+def texts(given: Told) -> list[str] | None:
+    """The same as texts NAME=VALUE, as files keep them; None for nothing."""
+    if given is None:
+        return None
+    return [f"{name}={value}" for name, value in given.items()] if isinstance(given, Mapping) else list(given)
+
+
+def _seconds(name: str, value: Any) -> float:
+    try:
+        return finite(f"the clock offset of {name}", value)
+    except ValueError:
+        raise ValueError(f"--clock-offset {name} must be seconds, but got {shown(value)}") from None

@@ -1,0 +1,146 @@
+"""Logs of a thruster: whose model they are of, and scenarios of another thruster than the one by default."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from plants.logs.log import Log
+from plants.state_space import StateSpaceModel
+from thruster_env.logged import NO_BAND, logged_plant, with_shown
+from thruster_env.model import model_of_plant
+from thruster_env.modelled import ModelledThruster
+from thruster_env.preset_file import is_file, read_preset
+from tuning.problems.files import FILE_SEQUENCES
+from tuning.problems.problem import Problem
+
+DEFAULT_PRESET = "tunnel"
+FREE = ("motor_damping", "voltage_gain", "lift_coefficient")  # to be identified, where nothing is said
+
+
+class Preset(ModelledThruster):
+    """A thruster of a preset, of which logs are: it offers the model, and checks tuned files.
+
+    Of a preset file the model has the recorder, too: biases, lags, ambient flow, Q and R; `clock_offset` [s], by
+    measured channel, is for who reads the logs.
+    """
+
+    def __init__(self, preset: str, sensors: Sequence[str] | None, dt: float):
+        """Make the plant."""
+        self.plant, self._seen = logged_plant(
+            preset=preset, dt=dt, **({"sensors": tuple(sensors)} if sensors else {})
+        )
+        offsets = read_preset(preset).recorder.get("clock_offset", {}) if is_file(preset) else {}
+        self.clock_offset = {name: value for name, value in offsets.items() if name in self.plant.channels}
+
+    def state_space_model(self, **changes) -> StateSpaceModel:
+        """The model, with what logs show beside the equations."""
+        bare = self.plant._replace(dead_band=NO_BAND)
+        return with_shown(model_of_plant(bare, **changes), bare, self._seen)
+
+
+def of_preset(problem: Problem, preset: str | Path | None, sequences: int = FILE_SEQUENCES) -> Problem:
+    """A scenario of another thruster, whose scale is computed anew; the problem itself where no preset is given.
+
+    Args:
+        problem: a scenario.
+        preset: a preset's name or file.
+        sequences: of inputs, that the scale is made of.
+
+    Raises:
+        ValueError: for a problem that is no scenario of a thruster that moves by its equations.
+    """
+    if preset is None:
+        return problem
+    from tuning.thruster.scale import computed_scale
+    from tuning.thruster.scenario import Scenario
+
+    preset = str(preset)
+    if not isinstance(problem, Scenario) or problem.system is not None:
+        raise ValueError(f"--preset must come with scenarios of the thruster's equations, but got {problem.name}")
+    name = f"{problem.name} ({preset})"
+    made = problem.replace(preset=preset, name=name, scale=problem.scale)
+    return made.replace(scale=tuple(float(one) for one in computed_scale(made, sequences)))
+
+
+def family_of_preset(
+    logs: Sequence[Log],
+    preset: str | None,
+    sensors: Sequence[str] | None,
+    free: Sequence[str],
+    *,
+    noise: bool,
+):
+    """The thruster of a preset whose parameters are free, `tuning.thruster.identification.ThrusterFamily`.
+
+    Args:
+        logs: to learn from.
+        preset: where the search starts; the one by default if None.
+        sensors: what the filter sees.
+        free: names of the parameters; motor damping, voltage gain and lift if there are none.
+        noise: whether Q and R are free, too.
+    """
+    from tuning.thruster.identification import ThrusterFamily  # which imports Optuna
+
+    largest = max(np.abs(log.inputs).max() for log in logs)
+    arguments: dict[str, Any] = {"preset": preset or DEFAULT_PRESET, "dt": logs[0].dt}
+    arguments["max_voltage"] = float(max(largest, 1.0))
+    if sensors:
+        arguments["sensors"] = tuple(sensors)
+    plant, seen = logged_plant(**arguments)
+    return ThrusterFamily(logs, plant, seen, list(free) or list(FREE), noise=noise)
+
+
+def preset_of(found: Any, family: Any, logs: Sequence[str]):
+    """The identified thruster as a preset file holds it, `thruster_env.preset_file.PresetFile`.
+
+    Args:
+        found: from `tuning.identification.identify`.
+        family: the `ThrusterFamily` it is of.
+        logs: names of the runs.
+    """
+    from thruster_env.preset_file import PresetFile
+
+    plant, seen = family.plant_at(found.values), family.shown_at(found.values)
+    offsets = {channel: _taken_off(family.logs, channel) for channel in plant.channels}
+    offsets |= {
+        name.removeprefix("clock_offset_"): value + offsets[name.removeprefix("clock_offset_")]
+        for name, value in found.values.items()
+        if name.startswith("clock_offset_")
+    }
+    offsets = {channel: value for channel, value in offsets.items() if value}
+    variances = plant.measurement_noise_cov.diagonal().tolist()
+    recorder: Mapping[str, Any] = {
+        "dt": plant.dt,
+        "sensors": list(plant.channels),
+        "ambient_velocity": plant.ambient_velocity,
+        "process_noise_cov": plant.process_noise_cov.diagonal().tolist(),
+        "measurement_noise_cov": dict(zip(plant.channels, variances, strict=True)),
+        "bias": dict(seen.bias),
+        "lag": dict(seen.lag),
+        "clock_offset": offsets,
+    }
+    identified = {
+        "logs": [Path(log).name for log in logs],
+        "log_likelihood": found.log_likelihood,
+        "standard_errors": found.standard_errors,
+        "determined": found.determined,
+    }
+    kept = {name: value for name, value in recorder.items() if value not in ({}, 0.0)}
+    return PresetFile(plant.parameters, (seen.dead_band_low, seen.dead_band_high), kept, identified)
+
+
+def _taken_off(logs: Sequence[Log], channel: str) -> float:
+    """The clock offset with which all logs were read; 0 if they differ, and so belong to the logs."""
+    found = {log.offsets.get(f"measurement:{channel}", 0.0) for log in logs}
+    return found.pop() if len(found) == 1 else 0.0
+
+
+def write_identified(path: str | Path, found: Any, family: Any, logs: Sequence[str]) -> None:
+    """Write the identified thruster as a preset file; arguments are those of `preset_of`."""
+    from thruster_env.preset_file import write_preset
+
+    write_preset(path, preset_of(found, family, logs), "A thruster as `thruster identify` found it.")
