@@ -14,6 +14,7 @@ from tuning.reporting.svg import palette
 INTERVAL = re.compile(r"(\S+) (\[\S+, \S+\])")
 WIDE = 480.0  # [pt] pictures beyond this are scrolled on a phone
 MANY = 9  # columns of a table that is set small on paper
+NARROW = 5  # columns of a table that fits beside another
 
 
 class Table(NamedTuple):
@@ -101,12 +102,17 @@ class Pair(NamedTuple):
     parts: Sequence[Table | Picture | Words | Code | None]
 
     def html(self) -> str:
-        """A grid of the parts."""
+        """A grid of the parts; one that is the same in both stands once."""
+        first, second = self.parts
+        if first is not None and second is not None and first == second:
+            return first.html()
         cells = "".join(
             f'<div><p class="whose">{escape(name)}</p>{part.html() if part else ""}</div>'
             for name, part in zip(self.names, self.parts, strict=True)
         )
-        kind = "pair" if any(isinstance(one, Table) for one in self.parts) else "pair close"
+        tables = [one for one in self.parts if isinstance(one, Table)]
+        kind = "pair close" if not tables else "pair"
+        kind += " deep" if any(len(one.columns) > NARROW for one in tables) else ""
         return f'<div class="{kind}">{cells}</div>'
 
 

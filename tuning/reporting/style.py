@@ -51,6 +51,7 @@ details {{ margin: .5rem 0; }}
 summary {{ cursor: pointer; font-weight: 600; }}
 .pair {{ display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 30rem), 1fr)); gap: 0 2rem; }}
 .pair > * {{ min-width: 0; }}
+.pair.deep {{ display: block; }}
 .whose {{ font-weight: 600; color: var(--mark); margin: .75rem 0 0; }}
 body.beside {{ max-width: 84rem; }}
 @media (max-width: 40rem) {{
