@@ -67,10 +67,10 @@ def command(
 def result(tuning: Tuning, report: Report, seconds: float) -> list[str | Table]:
     """What was tuned on what, the errors before and after, and one sentence on what it was worth."""
     found, seeds = tuning.result, len(tuning.proof.seeds)
-    stopped = "interrupted, on the trials that were finished: " if found.interrupted else ""
+    stopped = ", interrupted," if found.interrupted else ""
     return [
-        f"An extended Kalman filter (EKF) where {tuning.scenario.about}:",
-        f"{stopped}{found.finished} trials on {TRAINING_SEEDS} runs, proved on {seeds} others; {seconds:.0f} s.",
+        f"An extended Kalman filter (EKF) where {tuning.scenario.about}: {found.finished} trials{stopped} on "
+        f"{TRAINING_SEEDS} runs, proved on {seeds} others, in {seconds:.0f} s.",
         report.advice,
         "",
         error_table(tuning),
@@ -142,7 +142,7 @@ def next_steps() -> list[str]:
     """What to do next, for each thing that a user may have come for."""
     steps = {
         "others": f"thruster compare --filter ekf --filter ekf-robust --scenario {SCENARIO}",
-        "my plant": "thruster tune --problem my_module:problem     (docs/problems.md)",
+        "my plant": "thruster new problem NAME                     (docs/problems.md)",
         "my log": "thruster tune --filter ekf --log run.csv      (docs/logs.md)",
         "policies": "thruster train --observe ekf                  (docs/policies.md)",
     }

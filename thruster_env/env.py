@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -85,7 +86,7 @@ class BowThrusterEnv(ModelledThruster, RenderedThruster, PlantEnv):
         self.task = make_task(**{**of_task, "reference": self._reference_signals(of_task["reference"])})
         m, top = len(plant.channels), plant.max_voltage
         measurement = slice(READINGS, READINGS + m)
-        info = {
+        info: dict[str, int | slice] = {
             "state": slice(OMEGA, FLOW + 1),
             "thrust": THRUST,
             "measurement": measurement,
@@ -114,4 +115,5 @@ class BowThrusterEnv(ModelledThruster, RenderedThruster, PlantEnv):
         """The parameters of this episode, which differ from the plant's where these are uncertain."""
         keys = self._memory[:1, KEY_0 : KEY_1 + 1, 0]
         drawn = drawn_parameters(self.plant.parameters, self.plant.uncertainty, keys)
-        return drawn._replace(**{name: float(getattr(drawn, name)[0]) for name in self.plant.uncertainty})
+        values: dict[str, Any] = {name: float(getattr(drawn, name)[0]) for name in self.plant.uncertainty}
+        return drawn._replace(**values)

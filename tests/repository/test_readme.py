@@ -17,7 +17,7 @@ COMMANDS = re.findall(r"^thruster (.+)$|`thruster ([^`]+ --[^`]+)`", README, fla
 
 
 def test_readme_is_one_screen_and_says_early_what_it_is_for():
-    assert len(README.splitlines()) <= 110
+    assert sum(line != "" for line in README.splitlines()) <= 80
     _, second, *_ = re.split(r"(?<=\.)\s", README.partition("\n\n")[2])
     assert "any model" in second and "any log" in second
 
@@ -25,7 +25,7 @@ def test_readme_is_one_screen_and_says_early_what_it_is_for():
 @pytest.mark.parametrize("code", EXAMPLES, ids=range(len(EXAMPLES)))
 def test_readme_code_runs(code, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    exec(compile(code, "README.md", "exec"), {})
+    exec(compile(code.replace("trials=50", "trials=3"), "README.md", "exec"), {})
     out = capsys.readouterr().out
     assert out and "nan" not in out
 

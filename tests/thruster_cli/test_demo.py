@@ -35,7 +35,9 @@ def test_demo_tells_its_result_in_thirty_lines_and_draws_what_it_tuned(run_demo,
     assert code == 0 and len(lines) <= 30 and max(map(len, lines)) <= 80
     data = json.loads((tmp_path / "demo.json").read_text())
     held_out = data["tuning"]["held_out"]["outliers"]
-    assert lines[0].startswith("An extended Kalman filter") and lines[2].split()[:3] == data["advice"].split()[:3]
+    words = " ".join(" ".join(lines).split())
+    assert words.startswith("An extended Kalman filter")
+    assert 0 < words.index(data["advice"]) < words.index("rule of thumb 0.25")
     (row,) = [line.split() for line in lines if line.startswith("tuned ")]
     found = [rmse[0] for rmse in held_out["tuned"]["rmse"]]
     assert [float(row[2]), float(row[5])] == pytest.approx(found, rel=0.006)
@@ -58,7 +60,7 @@ def test_a_demo_whose_search_was_interrupted_says_so_and_exits_with_130(run_demo
     monkeypatch.setattr(demo, "draw", lambda *_: {})
     monkeypatch.setattr(demo, "write_report", lambda *_: Report(page, page, "Tuning lowers the score."))
     code, lines = run_demo()
-    assert code == 130 and lines[1].startswith("interrupted, on the trials that were finished: 3 trials")
+    assert code == 130 and "3 trials, interrupted, on 32 runs" in " ".join(lines)
 
 
 def test_a_demo_that_is_interrupted_later_exits_with_130(run_demo, monkeypatch):
