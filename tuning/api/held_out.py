@@ -123,7 +123,7 @@ class HeldOut:
         """
         from tuning.reporting.figures import draw_comparison
 
-        return drawn(draw_comparison(self.proof, f"{self.choice.name} on {self.problem.name}"))
+        return drawn(draw_comparison(self.proof, f"{self.choice.name} on {self.problem.name}", self.choice.name))
 
     def plot_run(self, place: int = 0) -> Figure:
         """One held-out run over time, of the first baseline and the filter: truth, estimate and 95 % band.
@@ -153,7 +153,8 @@ class HeldOut:
 
         title = f"{self.choice.name} on {len(self.seeds)} seeds of {self.problem.name}"
         scored = self.evaluation.scored or None
-        return drawn(draw_consistency(self.check_consistency(), title, scored=scored))
+        report, name = self.check_consistency(), self.choice.name
+        return drawn(draw_consistency(report, title, scored=scored, filter_name=name))
 
     def __repr__(self) -> str:
         what = f"{self.choice.name} on {self.problem.name}, {len(self.seeds)} held-out {self.problem.seed_word}"

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import zip_longest
 from math import isfinite
 from pathlib import Path
+from typing import Any
 
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import rounded
@@ -62,7 +63,7 @@ def _paired(names: Sequence[str], found: Sequence[Pages]) -> list[Section]:
     first, second = ({section.title: section.parts for section in one.sections} for one in found)
     sections = []
     for title in [*first, *(title for title in second if title not in first)]:
-        rows = zip_longest(first.get(title, []), second.get(title, []))
+        rows: Iterable[Any] = zip_longest(first.get(title, []), second.get(title, []))
         sections.append(Section(title, [Pair(names, row) for row in rows]))
     return sections
 

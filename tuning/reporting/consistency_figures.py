@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -79,7 +79,7 @@ def _panels(
         found.append(partial(_correlations, report=report, colour=colour))
     found += [partial(_distribution, check=check, colour=colour) for check in squares]
     if not np.isnan(report.coverage_by_level).all():
-        shares = {"found": report.coverage, "by_level": report.coverage_by_level}
+        shares: dict[str, Any] = {"found": report.coverage, "by_level": report.coverage_by_level}
         found.append(partial(_coverage, what="truth", colours=_of_states(places), **shares))
         found.append(partial(_crps, report=report, places=places))
     elif not (report.has_truth or np.isnan(report.innovation_coverage_by_level).all()):
@@ -203,6 +203,7 @@ def _crps(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
 
 
 def _ranks(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
+    assert report.ensemble is not None  # this panel is drawn of ensembles alone
     size = report.ensemble.size
     for i, colour in _of_states(places).items():
         found = report.ensemble.ranks[i]

@@ -130,11 +130,14 @@ def _functions(model: StateSpaceModel) -> tuple[str, list[str]]:
     """Functions f and h, empty if they cannot be written out, and more fields of the struct."""
     if isinstance(model, AffineModel):
         a, b, offset, c, shift = model.matrices()
-        f = f"y = {_matrix(a)} * x + {_matrix(offset[:, None])}"
-        f += f" + {_matrix(b)} * u(:);" if model.inputs else ";"
-        h = f"z = {_matrix(c)} * x + {_matrix(shift[:, None])};"
+        moved = f"y = {_matrix(a)} * x + {_matrix(offset[:, None])}"
+        moved += f" + {_matrix(b)} * u(:);" if model.inputs else ";"
+        read = f"z = {_matrix(c)} * x + {_matrix(shift[:, None])};"
         fields = [f"m.A = {_matrix(a)};", f"m.B = {_matrix(b)};", f"m.C = {_matrix(c)};"]
-        return f"\nfunction y = transition(x, u)\n{f}\nend\n\nfunction z = measurement(x)\n{h}\nend\n", fields
+        return (
+            f"\nfunction y = transition(x, u)\n{moved}\nend\n\nfunction z = measurement(x)\n{read}\nend\n",
+            fields,
+        )
     x, u = [f"x({i + 1})" for i in range(model.n)], [f"u({i + 1})" for i in range(model.inputs)]
     f = traced(model.transition, (x, u), model.given_constants)
     h = traced(model.observe, (x,), model.given_constants)

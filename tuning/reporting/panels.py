@@ -10,7 +10,9 @@ MOST_PANELS = 6  # of states in one figure
 COLUMNS = 3  # of panels side by side
 
 
-def shown_states(states: Sequence[Quantity], scored: Collection[int] | None = None) -> tuple[list[int], str]:
+def shown_states(
+    states: Sequence[Quantity] | Sequence[str], scored: Collection[int] | None = None
+) -> tuple[list[int], str]:
     """Places of the states that a figure shows, in their order, and a line that says how many it leaves out.
 
     Args:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from numerics.files import check_target, write_whole
 from tuning.evaluation.held_out import Comparison, prove
 from tuning.evaluation.kept import kept_comparison, kept_sizes
-from tuning.evaluation.sizes import ensemble_sizes, sufficient_size
+from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
 from tuning.likelihood.identifiability import identify, sentences, too_many
 from tuning.problems.problem import Problem
 from tuning.reporting.facts_parts import facts_section, model_section, score_section
@@ -83,10 +83,10 @@ def pages_of(source: str | Path, subject: Subject, prefix: str = "p") -> Pages:
     """Everything that a page holds of a study, whose pictures' names begin with a prefix."""
     plan, choice = subject.plan, subject.choice
     data = plan.training_data()
-    sizes = []
+    sizes: Sequence[SizeRow] = []
     if has_ensemble(choice.name):
-        sizes = kept_sizes(subject.sizes, choice, plan)
-        sizes = ensemble_sizes(choice, plan, data, subject.consistent) if sizes is None else sizes
+        kept_rows = kept_sizes(subject.sizes, choice, plan)
+        sizes = ensemble_sizes(choice, plan, data, subject.consistent) if kept_rows is None else kept_rows
     if sizes and not subject.chosen:
         choice = choice.with_size(sufficient_size(sizes, subject.consistent))
         subject = subject._replace(choice=choice)

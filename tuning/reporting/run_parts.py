@@ -33,12 +33,9 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
     what = "Estimate and innovation, each with its" if data.states is None else "Truth, estimate and"
     caption = f"{what} 95 % band on {where}, before and after. The panels of a row share their axis. {READ}"
     alt = of_estimates(pair, data, 0, dt)
-    said = [] if data.states is not None else [Words([f"{scenario.name} has no truth, so there are no errors."])]
-    sections = [
-        Section(
-            "One run over time", [book.picture(draw_estimates(pair, data, 0, dt, scored), caption, alt), *said]
-        )
-    ]
+    remark = [] if data.states is not None else [Words([f"{scenario.name} has no truth, so there are no errors."])]
+    picture = book.picture(draw_estimates(pair, data, 0, dt, scored), caption, alt)
+    sections = [Section("One run over time", [picture, *remark])]
     model = tuned.model
     named = [one.name for one in model.measurements], [one.unit for one in model.measurements]
     alt = f"Measured: {of_series(named[0], data.measurements[0], named[1])}"
@@ -58,11 +55,11 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
     report = check_consistency(tuned, data)
     said = sentences(report)
     runs = f"{report.runs} held-out {scenario.seed_word} of {scenario.name}"
-    picture = draw_consistency(report, f"{choice.name}, tuned, on {runs}", scored=scored, filter_name=choice.name)
+    drawn = draw_consistency(report, f"{choice.name}, tuned, on {runs}", scored=scored, filter_name=choice.name)
     parts: list[Part] = [
         Words([NEES_NIS]),
         Words(said),
-        book.picture(picture, f"Checks of the tuned filter's covariance on {runs}.", " ".join(said)),
+        book.picture(drawn, f"Checks of the tuned filter's covariance on {runs}.", " ".join(said)),
     ]
     return [*sections, Section("Is the covariance consistent?", parts)]
 

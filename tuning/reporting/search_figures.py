@@ -57,8 +57,8 @@ def _with_pruned(study: optuna.Study) -> optuna.Study:
     copied = optuna.create_study(direction=study.direction)
     copied.add_trials(trials)
     for trial, value in early_trials(study.get_trials(deepcopy=False)):
-        made = {"params": trial.params, "distributions": trial.distributions, "value": value}
-        copied.add_trial(optuna.trial.create_trial(**made))
+        made = optuna.trial.create_trial(params=trial.params, distributions=trial.distributions, value=value)
+        copied.add_trial(made)
     return copied
 
 
@@ -86,6 +86,7 @@ def draw_slices(trials: Sequence[FrozenTrial], label: str) -> Figure:
     early, names = early_trials(trials), [name for name in done[0].params if name != KIND]
     figure, axes = panels(len(names), COLUMNS, (3.2, 2.7), extra=0.4, sharey=True)
     best, values = best_trial(done), [trial.values[0] for trial in done]
+    assert best is not None  # a report is of a study with a complete trial
     faces = [BLUE if is_consistent(trial) else "white" for trial in done]
     for axis, name in zip(axes, names, strict=True):
         places = [trial.params[name] for trial in done]

@@ -20,7 +20,7 @@ LEGIBLE = 0.22  # luminance of a colour on dark paper, at least
 GREYISH = 0.15  # saturation below which a colour is a grey
 LARGE = 400_000  # bytes of a picture whose coordinates are rounded to a tenth of a point
 READ_FROM = 30  # points of a line whose values can be read off
-OPTIONS = {"svg.fonttype": "none", "svg.hashsalt": "report", "path.simplify": True}
+OPTIONS: Any = {"svg.fonttype": "none", "svg.hashsalt": "report", "path.simplify": True}
 NO_METADATA = {"Date": None, "Creator": None, "Format": None, "Type": None}
 PLACES = re.compile(r'\b(d|x|y|x1|x2|y1|y2|points|transform)="([^"]*)"')
 FONTS = re.compile(r"'DejaVu Sans',[^;\"]*sans-serif")
@@ -114,7 +114,7 @@ def _axes(axis: Axes, place: int, name: str, width: float, height: float) -> dic
     lines = [
         [f"{name}-line{place}-{row}", plain(label if not label.startswith("_") else axis.get_ylabel())]
         for row, (line, label) in enumerate((line, str(line.get_label())) for line in axis.lines)
-        if len(line.get_xdata()) >= READ_FROM and line.get_linestyle() != "None"
+        if len(line.get_path()) >= READ_FROM and line.get_linestyle() != "None"
     ]
     return {
         "id": f"{name}-axes{place}",

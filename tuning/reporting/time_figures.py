@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -90,7 +90,7 @@ def draw_estimates(
     for axis, row in zip(axes[:, 0], rows, strict=True):
         axis.set_ylabel(row.label)
     figure.align_ylabels(axes[:, 0])
-    named = {}
+    named: dict[str, Any] = {}
     for axis in axes[:, 0]:
         handles, labels = axis.get_legend_handles_labels()
         named |= dict(zip(labels, handles, strict=True))
@@ -135,6 +135,7 @@ def _values(axis, found: Run, i: int, colour: str) -> None:
 
 
 def _error(axis, found: Run, i: int, colour: str) -> None:
+    assert found.errors is not None  # rows of errors are made where there is a truth
     band = TWO_SIDED * np.sqrt(found.estimates.covs[0, :, i, i])
     draw_in_band(axis, found.time, found.errors[:, i], band, "error of the estimate", colour)
 
