@@ -3,10 +3,12 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq -c constraints.txt
+# The versions to install: make CONSTRAINTS=constraints-oldest.txt test, or none, make CONSTRAINTS= test, for the newest.
+CONSTRAINTS := constraints.txt
+PIP := $(BIN)/python -m pip --disable-pip-version-check install -qq $(addprefix -c ,$(CONSTRAINTS))
 TEST_EXTRAS := rl,render,peers,db,samplers,parquet,units,frames,dev
 BENCH_EXTRAS := rl,peers,bench
-DOCS_EXTRAS := docs,rl
+DOCS_EXTRAS := docs,rl,frames
 ARGS :=
 
 # Stamps: present only after a complete install, so a second run needs no network and an interrupted one starts over.
@@ -54,7 +56,7 @@ $(MADE):
 
 # The build tool comes first, pinned like the rest, so that pip does not fetch an unpinned one behind our back. The extras
 # are pinned by the same file, so neither install changes a version that the other one put there.
-$(BASE): pyproject.toml constraints.txt | $(MADE)
+$(BASE): pyproject.toml $(CONSTRAINTS) | $(MADE)
 	@echo "installing the base into $(VENV) (once, about a minute) ..."
 	@rm -f $(BASE) $(TEST) $(BENCH) $(DOCS)
 	@$(PIP) setuptools
@@ -64,7 +66,7 @@ $(BASE): pyproject.toml constraints.txt | $(MADE)
 $(TEST): EXTRAS := $(TEST_EXTRAS)
 $(BENCH): EXTRAS := $(BENCH_EXTRAS)
 $(DOCS): EXTRAS := $(DOCS_EXTRAS)
-$(TEST) $(BENCH) $(DOCS): pyproject.toml constraints.txt | $(MADE)
+$(TEST) $(BENCH) $(DOCS): pyproject.toml $(CONSTRAINTS) | $(MADE)
 	@echo "installing what tests, benchmarks or the site need into $(VENV) (once, some minutes) ..."
 	@rm -f $(BASE) $@
 	@$(PIP) setuptools

@@ -1,4 +1,4 @@
-"""What sensors measure of a vehicle: channels, instruments with their noise and rate, and suites of instruments.
+"""Sensors of a vehicle: channels, instruments with their noise and rate, and suites of instruments.
 
 Each channel is one of the states; x and y have two, for a position by sound and by satellites.
 """
@@ -16,12 +16,12 @@ from plants.quantities import Quantity
 
 
 class Instrument(NamedTuple):
-    """A sensor, its noise and how often it speaks.
+    """A sensor, its noise and its rate.
 
     Attributes:
         channels: what it measures.
         deviation: standard deviation of its noise, in the channels' unit.
-        rate: measurements a second [Hz]; None for one a step.
+        rate: measurements per second [Hz]; None for one per step.
         source: where the numbers are from.
         at_surface: whether it measures at the surface only.
     """

@@ -1,4 +1,4 @@
-"""The motion of an underwater vehicle, as six, eight or twelve states, and how each steps and what its slopes are.
+"""The motion of an underwater vehicle with six, eight or twelve states, its integration and its Jacobians.
 
 Six velocities nu = (u, v, w, p, q, r) are moved by `forces`. With roll and pitch, of which weight and buoyancy
 depend, they are the smallest closed system; with yaw and position, to the north, to the east and down, everything.

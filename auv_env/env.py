@@ -95,7 +95,7 @@ class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
         self.plant, self.task, self.inputs = plant, task, plant.inputs
         m = len(plant.channels)
         measurement = slice(at.READINGS, at.READINGS + m)
-        info = {
+        info: dict[str, int | slice] = {
             "state": slice(at.STATE, at.STATE + at.N),
             "measurement": measurement,
             "inputs": slice(at.INPUTS, at.INPUTS + 4),
@@ -116,7 +116,8 @@ class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
 
 def action_space(plant: Plant) -> gym.spaces.Box:
     """Thrust from zero, planes, and between them the torque where it is an action, each to its limit."""
-    return gym.spaces.Box(*(limit.astype(np.float32) for limit in plant.input_limits), dtype=np.float32)
+    low, high = (limit.astype(np.float32) for limit in plant.input_limits)
+    return gym.spaces.Box(low, high, dtype=np.float32)
 
 
 def at_depth(plant: Plant, depth: float) -> Plant:

@@ -1,11 +1,12 @@
-"""Roll and pitch as an AHRS measures them, inputs of the model of six velocities.
+"""Roll and pitch, measured by an AHRS, as inputs of the model of six velocities.
 
-They act for one step, as the action does; what is measured so is no measurement of the model. Its noise moves the
-model's states, so that
+They act for one step, as the action does, and are not measurements of the model. Their noise drives the model's
+states, so that
 
     Q = Q_plant + B R_a B',   B = df/d(phi, theta) straight ahead,
 
-with R_a of these two channels, unless somebody gives Q. Righting moments make roll rates out of it above all.
+with the covariance R_a of these two channels, unless Q is given. By the righting moments it affects roll rates
+most.
 """
 
 from __future__ import annotations

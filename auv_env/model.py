@@ -1,10 +1,10 @@
-"""The vehicle as a `StateSpaceModel`: what a filter assumes of it, with six to fourteen states."""
+"""The vehicle as a `StateSpaceModel` that a filter assumes, with six to fourteen states."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -26,7 +26,8 @@ from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
 
 
-class Steps(NamedTuple):
+@dataclass(frozen=True)
+class Steps:
     """How many states move, by which functions of the equations of motion."""
 
     count: int
@@ -138,7 +139,12 @@ def auv_model(
     prior_cov_factor: float = 1.0,
     **plant_arguments,
 ) -> StateSpaceModel:
-    """What a filter assumes of a vehicle, from plain arguments that JSON can hold.
+    """The model of a vehicle that a filter assumes, from plain arguments that JSON can hold.
+
+        x_{k+1} = F(x_k, u_k) + w,  w ~ N(0, Q);   z_k = h(x_k) + v,  v ~ N(0, R)
+
+    F integrates the equations of `auv_env.dynamics` over one sample time. Covariances are per step and do not
+    scale with dt: another dt needs another Q.
 
     Args:
         states: "velocities" for (u, v, w, p, q, r), "motion" for these with (phi, theta), "navigation" for those
@@ -150,13 +156,13 @@ def auv_model(
         attitude: of "velocities" alone: "input" for phi and theta as two further inputs, "measured" for these as
             the sensors measure them, see `auv_env.measured_attitude`, "level" for zeros.
         parameter_factors: factors on fields of `VehicleParameters`, by which the assumed vehicle differs.
-        operating_speed: where a Kalman filter approximates the model, straight ahead [m/s].
+        operating_speed: speed straight ahead about which a Kalman filter linearises the model [m/s].
         current_std: of "current" alone: standard deviation of each component of the current at the start [m/s].
-        current_time: of "current" alone: it wanders at random, by a variance of 2 current_std^2 t / current_time
-            in a time t, as one does at first that changes within a time constant of so many seconds.
+        current_time: of "current" alone: time constant of the current [s]. It is a random walk whose variance
+            grows by 2 current_std^2 t/current_time in a time t, as that of a Gauss-Markov process does at first.
         process_noise_cov: Q of the model's n states, (n, n) or n variances; the plant's if None.
         measurement_noise_cov: R, (m, m) or m variances; the plant's if None.
-        prior_cov_factor: P_0, the covariance of the filter's prior, over that of the plant's initial state.
+        prior_cov_factor: P_0, the covariance of the filter's prior, divided by that of the plant's initial state.
         **plant_arguments: others of `auv_env.plant.make_plant`.
 
     Raises:
@@ -195,7 +201,7 @@ def model_of_plant(
     measurement_noise_cov=None,
     prior_cov_factor: float = 1.0,
 ) -> StateSpaceModel:
-    """The model of a plant, exact unless told otherwise; see `auv_model` for the arguments."""
+    """The model of a plant, exact unless changed; see `auv_model` for the arguments."""
     states = _smallest(plant.channels) if states is None else one_of("states", states, tuple(MODELS))
     method = one_of("integration", integration, METHODS)
     attitude = one_of("attitude", attitude, ATTITUDES)

@@ -1,4 +1,4 @@
-"""What every env of the vehicle, single or in number, offers to filters."""
+"""What every env and vector env of the vehicle offers to filters."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class ModelledVehicle(ModelledEnv):
-    """An env with a `plant`, of which it offers the model; changes are those of `model.model_of_plant`.
+    """An env with a `plant` that offers its model to filters; changes are those of `model.model_of_plant`.
 
     Unless `states` says otherwise, that is the smaller of "motion" (8 states) and "navigation" (12) that predicts
     all channels: of the default sensors, which have compass and depth, "navigation".

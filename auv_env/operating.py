@@ -1,4 +1,4 @@
-"""Where a vehicle operates: the thrust of a speed, the range of its states, the step that follows its motion."""
+"""Operating range of a vehicle: the thrust of a speed, the range of its states, the integration step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The noisy vehicle as plain arguments: its parameters, noise, sensors, limits and start."""
+"""The noisy vehicle from plain arguments: its parameters, noise, sensors, limits and initial state."""
 
 from __future__ import annotations
 
@@ -107,11 +107,11 @@ def make_plant(
 
     Args:
         preset: a preset's name, a mapping of the fields of `VehicleParameters`, or one of these.
-        dt: sample time [s].
+        dt: sample time [s]. Covariances are per step and do not scale with dt.
         max_thrust: thrusts are clipped to 0 and this [N].
         max_plane: angles of both planes are clipped to plus and minus this [rad].
         propeller_torque: the propeller's torque over its thrust [m]; None makes the torque an input.
-        process_noise_cov: Q, covariance (12, 12) or twelve variances a step; zero allowed.
+        process_noise_cov: Q, covariance (12, 12) or twelve variances per step; zero allowed.
         measurement_noise_cov: R, covariance (m, m) or m variances; zero allowed. None for those of the sensors.
         initial_state: None for about a cruise at 1 m/s, a fixed state (12,), or a mapping: {"speed": U} for a
             fixed speed straight ahead from the origin, 0 for rest, or {"mean": [..], "cov": [..]}.
@@ -122,8 +122,8 @@ def make_plant(
         current: three velocities (north, east, down) [m/s], or signals by direction; see `effects.current`.
         propeller_lag: time constant with which the thrust follows the command [s]; 0 for at once. (A small
             propeller's is some 1 s.)
-        plane_lag: that of both planes [s]. (Servos have some 0.1 s.) Filters do not know of either.
-        substeps: Runge-Kutta steps a sample time; None for the fewest that hold `operating.ONE_STEP_ACCURACY`.
+        plane_lag: that of both planes [s]. (Servos have some 0.1 s.) Filters model neither lag.
+        substeps: Runge-Kutta steps per sample time; None for the fewest that reach `operating.ONE_STEP_ACCURACY`.
 
     Raises:
         ValueError: states the rule and the value.

@@ -1,4 +1,4 @@
-"""What Ngatini and Nurhadi (2019) print of their vehicle, kept to be looked at and never simulated with."""
+"""The parameters that Ngatini and Nurhadi (2019) print for their vehicle, for reference and not for simulation."""
 
 from __future__ import annotations
 

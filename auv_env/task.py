@@ -65,10 +65,11 @@ def make_task(
         "speed": speed_weight,
         "plane": plane_weight,
     }
-    checked = tuple(
+    cross_track, vertical, speed_error, planes = (
         within(f"{name}_weight", positive(f"{name}_weight", value, zero_allowed=True), LARGEST_WEIGHT)
         for name, value in weights.items()
     )
+    checked = cross_track, vertical, speed_error, planes
     depth = within("depth", depth, LARGEST_DEPTH)
     return Task(make_path(path, depth), positive("speed", speed, zero_allowed=True), weights=checked)
 

@@ -1,6 +1,8 @@
-"""The envs in number: all copies advanced by one compiled call, noise included."""
+"""The vector envs: all copies advanced by one compiled call, noise included."""
 
 from __future__ import annotations
+
+from typing import ClassVar
 
 from auv_env.env import SegorogeniAUVEnv
 from auv_env.modelled import ModelledVehicle
@@ -9,22 +11,22 @@ from plants.vector_env import PlantVectorEnv
 
 
 class SegorogeniAUVVectorEnv(ModelledVehicle, PlantVectorEnv):
-    """`SegorogeniAUV-v0` in number; see `PlantVectorEnv`.
+    """Vector env of `SegorogeniAUV-v0`; see `PlantVectorEnv`.
 
     `num_envs`, `max_episode_steps` and `autoreset_mode` are those of `PlantVectorEnv`, the others those of the
     single env.
     """
 
-    single_env: type[SegorogeniAUVEnv] = SegorogeniAUVEnv
+    single_env: ClassVar[type[SegorogeniAUVEnv]] = SegorogeniAUVEnv
 
 
 class SegorogeniAUVPathVectorEnv(SegorogeniAUVVectorEnv):
-    """`SegorogeniAUVPath-v0` in number."""
+    """Vector env of `SegorogeniAUVPath-v0`."""
 
     single_env = SegorogeniAUVPathEnv
 
 
 class SegorogeniAUVDepthVectorEnv(SegorogeniAUVVectorEnv):
-    """`SegorogeniAUVDepth-v0` in number."""
+    """Vector env of `SegorogeniAUVDepth-v0`."""
 
     single_env = SegorogeniAUVDepthEnv

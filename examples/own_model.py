@@ -88,9 +88,7 @@ print("upper and lower level", belief.mean.round(3), "+-", np.sqrt(belief.cov.di
 # A :term:`problem` is a pair: the model that makes the data, and the model that filters assume. Here they
 # differ, as they always do: the filter believes in an outflow that is a tenth too small.
 
-problem = ModelProblem(
-    tanks(0.055), tanks(0.05), inputs=Steps(amplitude=0.01, hold=40), steps=300, name="tanks", scale=(0.02, 0.01)
-)
+problem = ModelProblem(tanks(0.055), tanks(0.05), inputs=Steps(amplitude=0.01, hold=40), steps=300, name="tanks")
 study = tuning.tune(problem, filter="ekf", trials=TRIALS)
 study
 
@@ -99,8 +97,11 @@ study
 figure = study.plot_run()
 
 # %%
-# The rule of thumb trusts the model too much; the tuned filter follows the sensor more. The best answer to a
-# wrong constant is not noise, though: ``augmented_model`` makes it a state, and the filter finds it.
+# The study puts the model's error where it is: in the upper level, which nobody measures. Errors are a third
+# smaller than with the :term:`scaled default`, on the same held-out seeds.
+#
+# The best answer to a wrong constant is not noise, though. ``augmented_model`` makes it a state, and the filter
+# finds it.
 
 from filters import Unknown, augmented_model
 
@@ -110,9 +111,8 @@ more = ModelProblem(
     inputs=Steps(amplitude=0.01, hold=40),
     steps=300,
     name="tanks with outflow",
-    scale=(0.02, 0.01),
 )
-print(tuning.evaluate("ekf", more, seeds=SEEDS))
+tuning.evaluate("ekf", more, seeds=SEEDS)
 
 # %%
 # In a module of its own, the same problem serves the command line: ``thruster tune --problem my_tanks:problem``.

@@ -21,30 +21,38 @@ from plants.state_space import StateSpaceModel
 
 
 class Unknown(NamedTuple):
-    """What is believed of a constant that is not known; all in the constant's own unit."""
+    """Prior of an unknown constant of a model; all in the constant's own unit.
 
-    std: float  # standard deviation of the prior
-    walk_std: float = 0.0  # standard deviation of its change in a step; 0 for a constant
-    mean: float | None = None  # of the prior; the model's value if None
+    Attributes:
+        std: standard deviation of the prior.
+        walk_std: standard deviation of its change per step (random walk); 0 for a constant. It does not scale with
+            dt.
+        mean: of the prior; the model's value if None.
+    """
+
+    std: float
+    walk_std: float = 0.0
+    mean: float | None = None
 
 
 def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unknown]) -> StateSpaceModel:
-    """A model with some constants of another as further states, for any filter to estimate with the rest.
+    """Make a model in which some constants of another one are further states, which any filter can estimate.
 
         (x, theta)' = (f(x, u, c with theta), theta) + (w, walk),  z = h(x, c with theta) + v
 
-    Jacobians are the model's own for its states, where it has them, and central differences for the new ones.
+    theta are the unknown constants, with a random walk of standard deviation `walk_std` per step. Jacobians are
+    the model's own for its states, where it has them, and central differences for the new ones.
 
     Args:
         model: n states; its constants are a NamedTuple, or a tuple.
-        parameters: what is believed of each unknown constant, by its name in the NamedTuple, or its number in
-            the tuple; the new states follow in this order.
+        parameters: the prior of each unknown constant, by its name in the NamedTuple, or its index in the tuple;
+            the new states have this order.
 
     Returns:
         A model of n + len(parameters) states with the same inputs and measurements.
 
     Raises:
-        ValueError: if a name is not one of the model's constants, or a number is off.
+        ValueError: if a name is not one of the model's constants, or a standard deviation is not positive.
     """
     fields = getattr(model.constants, "_fields", range(len(model.constants)))
     places, means, variances, walks = [], [], [], []

@@ -1,4 +1,4 @@
-"""How good an estimate can be: Riccati covariances, steady and along a path; `filters.posterior` has the bound."""
+"""Attainable accuracy: Riccati covariances, steady-state and along a path; `filters.posterior` has the bound."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray |
 
         P = F P F' + Q,  K = P H' (H P H' + R)^-1,  P = (I - K H) P
 
-    It is what an extended Kalman filter on the path has, and for a linear model the optimum. It is no bound where
-    noise moves the state so far that F or H differ; but it holds where `posterior_bound` does not: for a singular
-    Q, and where a state has hardly any process noise, for then E[F' Q^-1 F] takes the smallest differences of F
-    between truths for information.
+    It is the covariance of an extended Kalman filter on the path, and optimal for a linear model. It is not a
+    bound where noise moves the state so far that F or H differ. But it can be used where `posterior_bound` cannot:
+    for a singular Q, and for a state with hardly any process noise, for which E[F' Q^-1 F] mistakes the smallest
+    differences of F between simulated states for information.
 
     Args:
         model: the model that draws the truth.

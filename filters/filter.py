@@ -1,6 +1,6 @@
-"""The contract of a filter: `init`, `predict(belief, u)`, `update(belief, z)`, all pure.
+"""The interface of a filter: `init`, `predict(belief, u)`, `update(belief, z)`, all pure functions.
 
-A filter is a frozen value that holds a model and its own tunable numbers. Each kind supplies three plain
+A filter is a frozen value that holds a model and its own tunable parameters. Each filter type supplies three plain
 functions that work in place on one row of floats and one table of members (`Kernels`); everything else,
 single steps and whole batches, compiled or not, is made from these in `filters.engine.compile`.
 """
@@ -19,7 +19,7 @@ from plants.state_space import StateSpaceModel
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Filter:
-    """Base of all filters; subclasses add their tunable numbers and the method `kernels`.
+    """Base of all filters; subclasses add their tunable parameters and the method `kernels`.
 
     Attributes:
         model: the `StateSpaceModel` that the filter assumes.
@@ -32,7 +32,7 @@ class Filter:
     model: StateSpaceModel
 
     def kernels(self) -> Kernels:
-        """The functions of this kind of filter for the shape of its model."""
+        """The plain functions of this filter type for the shape of its model."""
         raise TypeError(f"{type(self).__name__} has no kernels: use one of its subclasses")
 
     @property
@@ -42,12 +42,12 @@ class Filter:
 
     @property
     def own_numbers(self) -> tuple[float, ...]:
-        """Numbers of the filter itself that its kernels read, behind the model's: from `layout.own_place` on."""
+        """The filter's own parameters, packed behind the model's: from `layout.own_place` on."""
         return ()
 
     @property
     def numbers(self) -> np.ndarray:
-        """All that the kernels read, one float64 row: the model's numbers, then the filter's own."""
+        """Packed parameters that the kernels read, one float64 row: the model's, then the filter's own."""
         return np.append(self.kernel_model.numbers, self.own_numbers)
 
     @property
@@ -56,20 +56,23 @@ class Filter:
         return 0
 
     def init(self, key: tuple[int, int] = (0, 0)) -> Belief:
-        """The prior as a belief; key is two integers from 0 to 2^32 - 1, else it raises ValueError."""
+        """The prior as a belief; key, two integers from 0 to 2^32 - 1, determines its random draws.
+
+        Raises ValueError for another key.
+        """
         session = Session(self)
         session.set_key(key)
         session.run("start")
         return session.belief()
 
     def predict(self, belief: Belief, u, *, process_noise_cov=None) -> Belief:
-        """The belief one step later under input u (p,).
+        """Predict the belief one step ahead under input u (p,), in the units of the model's inputs.
 
-        If it is not finite it is a `LostBelief`, and the next update restarts from the prior and counts that. A
-        `process_noise_cov`, (n, n) or n variances, stands in for the model's Q in this step.
+        A `process_noise_cov`, (n, n) or n variances per step, replaces the model's Q in this step. A result that
+        is not finite is a `LostBelief`: the next update restarts from the prior and counts that.
 
-        Raises ValueError for an input that is not p finite numbers, and for a belief that is none: of another kind
-        of filter, not finite, or with a covariance that is not positive semidefinite.
+        Raises ValueError for an input that is not p finite numbers, and for a belief of another filter type, not
+        finite, or with a covariance that is not positive semidefinite.
         """
         session = Session(self)
         session.load(belief)
@@ -79,9 +82,9 @@ class Filter:
         return session.belief()
 
     def update(self, belief: Belief, z, *, measurement_noise_cov=None) -> tuple[Belief, Innovation]:
-        """The belief after measurement z (m,), and the innovation; a NaN in z leaves that channel out.
+        """Update the belief with measurement z (m,); return it and the innovation. NaN marks a missing channel.
 
-        A `measurement_noise_cov`, (m, m) or m variances, stands in for the model's R in this update.
+        A `measurement_noise_cov`, (m, m) or m variances, replaces the model's R in this update.
 
         Raises ValueError for a measurement that is not m numbers, finite or NaN, and as `predict` for a belief.
         """
@@ -100,5 +103,5 @@ class Filter:
             )
 
     def session(self) -> Running:
-        """This filter at work in place on one belief, which is quicker than values."""
+        """A session: this filter running in place on one belief, which is faster than `predict` and `update`."""
         return Session(self)

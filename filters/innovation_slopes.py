@@ -1,4 +1,4 @@
-"""Slopes of an innovation's log-likelihood, and what it tells of parameters."""
+"""Derivatives of an innovation's log-likelihood along parameters, and the information in it."""
 
 from __future__ import annotations
 

@@ -161,7 +161,7 @@ def no_terms(row, dy, ds):
 
 @cache
 def information_sum(size: int):
-    """`add(out, terms, s_inverse)`: what a measurement tells of the parameters, (p, p), is added to out.
+    """`add(out, terms, s_inverse)`: add the information of a measurement on the parameters, (p, p), to out.
 
     It is dy_i' S^-1 dy_j + 1/2 tr(S^-1 dS_i S^-1 dS_j) with the terms (p, size + size^2) of `terms_writer`.
     """

@@ -1,4 +1,4 @@
-"""The posterior Cramer-Rao bound: how good any estimate can be, from truths drawn under each input."""
+"""The posterior Cramer-Rao bound on any estimate, from simulated true trajectories under each input."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ MOST_BYTES, MATRICES = 2**28, 8  # of so many matrices (n, n) a sequence and ste
 def posterior_bound(model: StateSpaceModel, inputs: np.ndarray, *, truths: int = 100, seed: int = 0) -> np.ndarray:
     """Posterior Cramer-Rao bound on the covariance of any estimate, conditional on each input sequence.
 
-    With F = df/dx and H = dh/dx at truths drawn under the very input sequence, and P = J^-1,
+    With F = df/dx and H = dh/dx at states simulated under this input sequence ("truths"), and P = J^-1,
 
         J_0 = P_0^-1 + E[H' R^-1 H],  D11 = E[F' Q^-1 F],  D12 = -E[F'] Q^-1,
         J_{k+1} = Q^-1 + E[H' R^-1 H] - D12' (J_k + D11)^-1 D12
 
-    written with P in place of J, so that P_0 may be singular. Expectations are over truths of one sequence;
-    Jacobians pooled over different inputs would give a bound that nothing attains and nothing obeys.
+    written with P in place of J, so that P_0 may be singular. Expectations are over truths of one sequence: with
+    Jacobians pooled over different inputs, the result would not be a bound.
 
     Args:
         model: the model that draws the truth; Q must be positive definite.

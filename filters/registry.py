@@ -1,4 +1,4 @@
-"""Filters by name, with the numbers that each has beside its model."""
+"""Filters by name, with the parameters that each has beside its model."""
 
 from __future__ import annotations
 
@@ -58,23 +58,30 @@ FILTERS: dict[str, type[Filter]] = {
 
 
 def filter_class(name: str) -> type[Filter]:
-    """The class of a filter by name, of an estimator that of all; ValueError for an unknown name."""
+    """The class of a filter by name, `ForeignFilter` for estimators; ValueError for an unknown name."""
     if is_foreign(name):
         return ForeignFilter
     return FILTERS[one_of("filter", name, tuple(FILTERS))]
 
 
 def tunable_numbers(name: str) -> tuple[str, ...]:
-    """Names of the numbers that a filter has beside its model, or that an estimator says it is tuned by."""
+    """Names of a filter's parameters beside its model, or of those that an estimator declares as tunable."""
     if is_foreign(name):
         return tuple(one.name for one in parameters_of(name))
     return tuple(field.name for field in dataclasses.fields(filter_class(name)) if field.name != "model")
 
 
 def make_filter(name: str, model: StateSpaceModel, **numbers) -> Filter:
-    """A filter by name, for a model, with its own numbers; ValueError for an unknown name or number.
+    """Make a filter by name, for a model, with its own parameters.
 
-    In place of a name it takes what `filters.estimators.find.foreign_filter` does.
+    Args:
+        name: of a filter in `FILTERS`, such as "ekf"; or an estimator, as `filters.estimators.find.foreign_filter`
+            takes it.
+        model: the model that the filter assumes, with Q, R and the prior.
+        **numbers: parameters of the filter beside its model, such as `ensemble_size`; defaults where not given.
+
+    Raises:
+        ValueError: for an unknown name or parameter, or a value that the filter does not accept.
     """
     if is_foreign(name):
         return foreign_filter(name, model, **numbers)

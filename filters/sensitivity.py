@@ -23,7 +23,7 @@ from plants.state_space import StateSpaceModel
 
 
 class ModelSlopes(NamedTuple):
-    """How a model changes along p parameters, a unit of each of which is a sensible amount of it."""
+    """Derivatives of a model with respect to p parameters, each scaled so that 1 is a sensible change of it."""
 
     constants: np.ndarray  # (p, c)
     process_noise_cov: np.ndarray  # (p, n, n), symmetric
@@ -64,11 +64,11 @@ def sensitivity(
         slopes: how the model changes along each parameter.
         degrees: degrees of freedom of a Student-t density with the covariance S in place of the normal one, which
             outliers move less; above 2. The filter stays as it is.
-        blocks: equal parts of each trajectory, whose gradients are told apart.
-        predicted: (m,) which channels the filter predicts after it has seen the others, but never sees: those of
-            a load cell that is there for the identification alone. Their prediction errors enter as innovations
-            do; as nothing corrects them, errors of steps one after the other are alike, and the information is
-            more than there is.
+        blocks: number of equal parts of each trajectory, whose gradients are returned separately.
+        predicted: (m,) which channels the filter only predicts, after it has seen the others, and is never updated
+            with: such as a load cell that is there for the identification only. Their prediction errors enter as
+            innovations do. As nothing corrects them, they are correlated in time, and the information is
+            overestimated.
 
     Raises:
         ValueError: if shapes do not fit, or degrees are not above 2.

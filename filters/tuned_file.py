@@ -32,7 +32,7 @@ MODEL_KEYS = (*NOISE, PRIOR, FACTORS, STATES)  # what every plant with data of i
 def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
     """The content of a tuned file with its hash, the SHA-256 of everything else as JSON with sorted keys.
 
-    The hash tells damage and edits by hand; it does not tell who wrote the file.
+    The hash detects damage and edits by hand; it does not show who wrote the file.
     """
     rest = {key: value for key, value in content.items() if key != "hash"}
     return {**rest, "hash": hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()}
@@ -73,7 +73,7 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
 
 
 def _of_this_version(content: dict) -> dict:
-    """Content of any version with the entries of this one that it tells, checked."""
+    """Content of any version, checked, with the entries of this version that follow from it."""
     if content["version"] < FILE_VERSION:
         if content["version"] > 2:
             for part in ("plant", "scenarios"):

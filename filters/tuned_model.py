@@ -63,7 +63,7 @@ def check_model_data(given) -> None:
     if not sound or not all(
         isinstance(given[key], list) and all(map(_is_quantity, given[key])) for key in VECTORS
     ):
-        raise ValueError(f"the model of a tuned file must be told by {', '.join(KEYS)}, but got {shown(given)}")
+        raise ValueError(f"the model of a tuned file must have {', '.join(KEYS)}, but got {shown(given)}")
 
 
 def _is_quantity(given) -> bool:

@@ -1,4 +1,4 @@
-"""What every room stands on: compilation, small algebra, random streams, threads, checks, files and plots."""
+"""What all other packages use: compilation, matrix algebra, random streams, threads, checks, files, plots."""
 
 from numerics.compiled import may_be_inlined
 

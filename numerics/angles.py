@@ -1,12 +1,12 @@
-"""Angles: numbers of which those a turn apart are the same, and so differences go the short way round.
+"""Angles: values that differ by whole turns are equal, so differences between angles are wrapped.
 
-A belief's mean of an angle lies in (-pi, pi]. A sample of one, whether an ensemble, weighted particles or the
-parts of a mixture, is first put on one branch: each member is moved by whole turns to within half a turn of the
-sample's circular mean. From then on means, distances from them and covariances are those of plain numbers. So
-distances from the mean sum up to zero, as the algebra of ensembles has it, which those from the circular mean
-itself would not; and a sample far from the cut at pi has the moments that it has without all this.
+The mean of an angle in a belief lies in (-pi, pi]. A sample of an angle (an ensemble, weighted particles or the
+parts of a mixture) is first moved to one branch: whole turns are added to each member until it lies within half a
+turn of the sample's circular mean. Means, deviations and covariances are then computed as for ordinary numbers.
+Deviations from this mean sum up to zero, which the algebra of ensembles needs; deviations from the circular mean
+itself would not. A sample far from the cut at pi keeps its ordinary moments.
 
-Nothing here leaves a trace in the code of a model without angles.
+The compiled code of a model without angles does not change.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TURN = 2.0 * math.pi
 
 @inlined
 def whole_turns(x):
-    """What an angle x [rad] has beyond (-pi, pi], a multiple of a turn; of a number or an array."""
+    """Whole turns [rad] to subtract from an angle x [rad], a number or an array, so that it lies in (-pi, pi]."""
     return TURN * np.ceil((x - math.pi) / TURN)
 
 
@@ -52,12 +52,12 @@ def is_angle(index: int, angles: Sequence[bool]) -> bool:
 
 
 def places_of(angles: Sequence[bool], first: int = 0) -> tuple[int, ...]:
-    """Numbers of the components that are angles, counted from `first`."""
+    """Indices of the components that are angles, counted from `first`."""
     return tuple(first + i for i, angle in enumerate(angles) if angle)
 
 
 def at_angle(index: int | Index, angles: Sequence[bool], there: str, elsewhere: str) -> str:
-    """Source of `there` in components that are angles and of `elsewhere` in others; in loops it asks which."""
+    """Source of `there` for components that are angles, else of `elsewhere`; in loops decided at run time."""
     if not isinstance(index, Index):
         return there if is_angle(index, angles) else elsewhere
     if all(angles):
@@ -66,7 +66,7 @@ def at_angle(index: int | Index, angles: Sequence[bool], there: str, elsewhere: 
 
 
 def short_way(expression: str, index: int | Index, angles: Sequence[bool]) -> str:
-    """Source of a difference in component `index`, wrapped where that is an angle; for functions with `NAMES`."""
+    """Source of a difference in component `index`, wrapped if that is an angle; for functions with `NAMES`."""
     return at_angle(index, angles, f"wrapped({expression})", expression)
 
 
@@ -76,7 +76,7 @@ def wrapped_where(x: np.ndarray, angles: Sequence[bool]) -> np.ndarray:
 
 
 def difference(a: np.ndarray, b: np.ndarray, angles: Sequence[bool]) -> np.ndarray:
-    """Errors a - b of vectors (..., d), the short way round in components that are angles (d,)."""
+    """Differences a - b of vectors (..., d), wrapped to (-pi, pi] in components that are angles (d,)."""
     return wrapped_where(np.subtract(a, b), angles)
 
 
@@ -102,7 +102,7 @@ def angle_writer(start: int, angles: tuple[bool, ...]) -> Callable:
 
 @cache
 def row_brancher(count: int, angles: tuple[bool, ...]) -> Callable:
-    """Return `align(y)`: rows y (count, d), each angle on the branch of its circular mean; there must be some."""
+    """Return `align(y)`: rows y (count, d), each angle on the branch of its circular mean; some must be angles."""
     size = len(angles)
     source = Source("align", "y", result=(count, size), y=(count, size))
     middle = source.local("middle", size)

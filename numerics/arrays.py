@@ -1,7 +1,7 @@
 """Products and quotients of large matrices, as loops over arrays of float64 that run along contiguous memory.
 
-They are compiled once for all sizes. Loops, and no calls of BLAS: its threads would compete with those that share
-out trajectories, and its sums depend on the machine.
+They are compiled once for all sizes. They are loops rather than calls of BLAS, because the threads of BLAS would
+compete with those that work on different trajectories, and because its sums depend on the machine.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ def called(function):
 
 @kept_apart
 def _products_of_rows(a, b, lower):
-    """A b', or its part on and below the diagonal: two rows and four share what is read, the last ones again.
+    """A b', or its part on and below the diagonal, in blocks of two rows of a and four of b that share reads.
 
-    So there is one loop, and no further ones for what is left over at the ends.
+    Blocks at the ends repeat the last row, so that no further loops are needed for the remainder.
     """
     rows, columns, inner = a.shape[0], b.shape[0], a.shape[1]
     out = np.empty((rows, columns))
@@ -81,7 +81,7 @@ def product(a, b):
 
 @kept_apart
 def deviations(table, first, rows, means, size):
-    """Distances from means (rows,) in so many rows of a table from the first on, and `size` columns."""
+    """Deviations from means (rows,) of `rows` rows of a table, starting at row `first`, and `size` columns."""
     out = np.empty((rows, size))
     for i in range(rows):
         for j in range(size):
@@ -116,7 +116,7 @@ def square_of_rows(a):
 
 @kept_apart
 def solve_rows(b, factor):
-    """B (l l')^-1 for a lower triangular l, of all rows of b at a time: forwards, then backwards."""
+    """B (l l')^-1 for a lower triangular l: forward, then backward substitution for all rows of b at a time."""
     rows, size = b.shape
     turned = b.T.copy()
     for i in range(size):

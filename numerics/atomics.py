@@ -1,8 +1,8 @@
-"""Atomic flags by which compiled code in several threads tells one another how far it is.
+"""Atomic flags with which compiled code synchronises several threads.
 
-One number, for all calls, says which call is on. Each call has for each part that a helper may do a number that
-says whether anybody has taken it, and whether it is done. Every number has a cache line of its own, so that
-writing one does not slow the reading of another.
+One integer holds the number of the current call. For each part of a call that a worker thread may do, another one
+says whether the part is open, taken or done. Every flag has a cache line of its own, so that writing one does not
+slow down the reading of another.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ def new_flags(places: int) -> np.ndarray:
 
 @overloaded
 def read(flags, place):
-    """Read one flag, and with it all that its writer wrote before."""
+    """Read one flag (acquire): whatever its writer wrote before is then visible."""
     return flags[place]
 
 
 @overloaded
 def post(flags, place, value):
-    """Write one flag; who reads it sees all that was written before."""
+    """Write one flag (release): whoever reads it sees all that was written before."""
     flags[place] = value
 
 
 @overloaded
 def take(marks, place, mark):
-    """Put a mark on a part that is open; return whether it was."""
+    """Mark a part if it is open (compare and swap); return whether it was open."""
     was_open = marks[place] == OPEN
     if was_open:
         marks[place] = mark
@@ -64,7 +64,7 @@ def wait_for(marks, place):
 
 @inlined
 def spin_for_call(flags, call):
-    """Wait for a call after this one for a while, spinning."""
+    """Wait for the next call for a limited time (spin-wait)."""
     for _ in range(SPIN_ROUNDS):
         for _ in range(SPINS):
             if read(flags, CALL) > call:

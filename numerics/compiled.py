@@ -41,9 +41,9 @@ _interpreting = False
 def inlined(function: Callable, *, into_callers: bool = True) -> Callable:
     """Mark a plain function so that compiled functions may call it; it is inlined into all of them.
 
-    So are functions that it calls by name. Inside a loop over members or copies this makes vector code, which
-    no call may interrupt. With into_callers=False a function is called instead, and so are those that call it:
-    what loops over large arrays gains nothing by being inlined, and would be optimised anew in each caller.
+    So are functions that it calls by name. A loop over members or copies is vectorised only if it contains no
+    call. With into_callers=False the function is called instead of inlined, and so are the functions that call it:
+    loops over large arrays gain nothing from inlining, and would be optimised again in each caller.
     """
     if function not in _marked:
         _marked.add(function)
@@ -57,10 +57,9 @@ def inlined(function: Callable, *, into_callers: bool = True) -> Callable:
 
 
 def kept_apart(function: Callable) -> Callable:
-    """Mark a plain function that is called, of which there is one copy, however many functions call it.
+    """Mark a plain function that is never inlined: there is one copy of it, however many functions call it.
 
-    For long loops, to which a call is nothing. Other functions that are called may still become part of callers,
-    where LLVM finds that worth while.
+    It is meant for long loops, where the cost of a call does not matter. LLVM may still inline other functions.
     """
     _apart.add(function)
     return inlined(function, into_callers=False)
@@ -88,7 +87,7 @@ def overloaded(function: Callable) -> Callable:
 
 
 def when_compiling(teach: Callable[[], None]) -> Callable[[], None]:
-    """Mark what numba has to be taught before it compiles anything, which is when it is imported."""
+    """Mark a function that registers something with numba; it is called once, before the first compilation."""
     _lessons.append(teach)
     return teach
 
@@ -155,10 +154,10 @@ def tell_when_compiling(tell: Callable[[], None]) -> None:
 
 
 def may_be_inlined(package: str, *below: str) -> None:
-    """Say, from a package's `__init__`, that its functions inline one another, and those of packages below it.
+    """Declare, in a package's `__init__`, that its functions inline one another and those of packages below it.
 
-    Machine code made of one of them is then found again only as long as no source of these packages changed. Of
-    packages that do not say so the files of the functions that are called by name are looked at.
+    Cached machine code of such a function is valid as long as no source file of these packages changes. For other
+    packages, only the files of the functions that are called by name are compared.
     """
     _packages[package] = below
 
@@ -181,10 +180,10 @@ def _package_hash(package: str) -> str:
 
 
 def function_fingerprint(*functions: Callable | None, within: str) -> str:
-    """Hash of what a compiled function inlines; numba's cache looks at the source of the outermost only.
+    """Hash of what a compiled function inlines; numba's cache itself looks at the outermost function only.
 
-    It is made of the byte code of `functions` and of all they call by name, and of the sources of their packages,
-    of this one, and of the package of the module `within` which the compiled function is written.
+    It covers the byte code of `functions` and of all that they call by name, and the source files of their
+    packages, of this package, and of the package of the module `within` which the compiled function is written.
     """
     digest = hashlib.sha256()
     packages = {_package(__name__), _package(within)}
@@ -245,7 +244,7 @@ class CompiledOrPython:
 
     @property
     def direct(self) -> Callable:
-        """What a call comes to: machine code, once it has run, without the detour through this object."""
+        """What a call runs: machine code, once it has run, without the detour through this object."""
         return self._run if self._proven and self._run is not self._python else self
 
     def _call_first(self, *arguments):

@@ -15,7 +15,7 @@ from numerics.pickling import makes_functions
 from numerics.sources import Index, is_array, matrix_of, tuple_of, written_out
 
 RELATIVE_STEP = 6e-6  # cube root of the float64 resolution balances truncation and rounding
-COMPLEX_STEP = 1e-100  # nothing is subtracted, so it may be as small as one likes
+COMPLEX_STEP = 1e-100  # no subtraction, hence no cancellation: it may be this small
 
 _EXACT: WeakSet[Callable] = WeakSet()  # what `complex_step` has returned
 
@@ -29,12 +29,12 @@ def _stores(rows: int, entry: Callable) -> list[str]:
 
 @makes_functions
 def complex_step(function: Callable, rows: int, columns: int, arguments: str) -> Callable:
-    """Return `jacobian(x, <arguments>)`: df/dx_j = Im f(x + i h e_j) / h, to the last digit.
+    """Return `jacobian(x, <arguments>)`: df/dx_j = Im f(x + i h e_j) / h, exact to rounding.
 
     Args:
         function: an analytic function of a tuple of `columns` components and the arguments, made of arithmetic and
             numpy functions that take complex numbers. (`abs`, comparisons and `math` are not among them: `abs`
-            would give a wrong derivative without a word.)
+            would silently give a wrong derivative.)
         rows: number of components of its result.
         columns: number of components of x.
         arguments: names of the other arguments, comma separated.
@@ -117,7 +117,7 @@ def jacobian(
         rows: number of components of the result.
         columns: number of components of x.
         arguments: names of the other arguments, comma separated.
-        angles: which components of the result are angles, so that differences of them go the short way round.
+        angles: which components of the result are angles, whose differences are wrapped to (-pi, pi].
 
     The steps of central differences are relative to |x| + scales, both tuples of `columns` components.
     """

@@ -1,4 +1,4 @@
-"""Files that are whole or not there: write aside, then rename; links are followed, devices written to."""
+"""Files that are written completely or not at all: a temporary file is renamed; links are followed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Episode keys of many copies at once, the ones that as many single envs would draw."""
+"""Episode keys of a vector env: copy i gets the keys that a single env with its seed would draw."""
 
 from __future__ import annotations
 

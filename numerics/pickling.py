@@ -1,4 +1,4 @@
-"""Functions that are written out for a model's size know what made them, so that models can be pickled."""
+"""Generated functions remember what made them, so that models that hold them can be pickled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far long work is: who does it tells, and whoever shows progress listens."""
+"""Progress of long computations: they report it, and whoever shows it listens."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def tell(text: str) -> None:
 
 
 def told(what: str, parts: Sequence[Part], sizes: Sequence[int] | None = None) -> Iterator[Part]:
-    """The parts of some work one after the other; before each it is told how much is done.
+    """Go through the parts of a computation, and report before each how much is done.
 
-    What is told while a part is worked on stands behind it: "N = 40: 3 of 12, runs: 20 of 100".
+    Progress inside a part is appended to that of the part: "N = 40: 3 of 12, runs: 20 of 100".
 
     Args:
-        what: is being worked out.
-        parts: to go through; a single one is not worth telling.
-        sizes: what each part counts for, 1 if None.
+        what: name of what is computed.
+        parts: what to go through; a single part is not reported.
+        sizes: weight of each part in the count; 1 if None.
     """
     if _listener.get() is None or len(parts) < 2:
         yield from parts

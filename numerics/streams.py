@@ -131,7 +131,7 @@ def draw_key(generator: np.random.Generator) -> np.ndarray:
 
 
 def draw_keys(generator: np.random.Generator, count: int) -> np.ndarray:
-    """Draw the keys (count, 2) that so many calls of `draw_key` would give."""
+    """Draw keys (count, 2): those that `count` calls of `draw_key` would give."""
     return generator.integers(0, 2**32, size=(count, 2)).astype(np.float64)
 
 

@@ -79,9 +79,9 @@ if hasattr(os, "register_at_fork"):  # a forked child has none of the threads
 class WorkerThreads:
     """Threads that share the work of a call with the thread that makes it.
 
-    A call owns nothing of the workers: its parts, and who has taken them, are its own. Whoever makes it does what
-    no helper has begun, so that it never waits for a helper that is late, busy with another call, or not told. And
-    an exception at any moment, such as Ctrl-C brings, leaves the workers as they were.
+    The state of a call, its parts and who has taken them, belongs to the call and not to the workers. The calling
+    thread does every part that no worker has begun, so that it never waits for a worker that is late or busy with
+    another call. An exception at any moment, such as Ctrl-C, leaves the workers unchanged.
     """
 
     def __init__(self, helpers: int):

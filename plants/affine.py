@@ -20,7 +20,7 @@ from plants.state_space import StateSpaceModel
 
 @makes_functions
 def affine_functions(n: int, m: int, p: int) -> dict[str, Callable]:
-    """Functions of an affine model whose constants c are, by rows and in this order, A, B, a, C, d."""
+    """Functions of an affine model whose constants c are A, B, a, C, d in this order, matrices by rows."""
     starts = starts_of(n * n, n * p, n, m * n)  # of A, B, a, C, d
     sizes = {"x": (n,), "u": (p,), "c": (starts[-1] + m,)}
     if constants_are_array(starts[-1] + m):
@@ -82,7 +82,11 @@ def affine_model(
     input_quantities=None,
     measurements=None,
 ) -> AffineModel:
-    """The model x' = A x + B u + state_offset + w, z = C x + measurement_offset + v.
+    """Make a model that is linear in state and input, with constant offsets.
+
+        x' = A x + B u + state_offset + w,  w ~ N(0, Q);   z = C x + measurement_offset + v,  v ~ N(0, R)
+
+    Covariances are per step and do not scale with dt.
 
     Args:
         a: A, (n, n).
@@ -90,13 +94,13 @@ def affine_model(
         c: C, (m, n).
         process_noise_cov: Q, (n, n) or n variances.
         measurement_noise_cov: R, (m, m) or m variances.
-        prior_mean: (n,).
-        prior_cov: (n, n) or n variances.
+        prior_mean: mean of the initial state, (n,).
+        prior_cov: covariance of the initial state, (n, n) or n variances.
         state_offset: (n,), zero if None.
         measurement_offset: (m,), zero if None.
-        states: names of the states, as `StateSpaceModel` takes them; so ...
-        input_quantities: ... those of inputs ...
-        measurements: ... and measurements.
+        states: names and units of the states, as `StateSpaceModel` takes them.
+        input_quantities: those of the inputs.
+        measurements: those of the measurements.
 
     Raises:
         ValueError: if shapes do not fit.
@@ -131,9 +135,19 @@ def _input_first(transition: Callable) -> Callable:
 
 
 def linearize(model: StateSpaceModel, state: Any, control: Any) -> AffineModel:
-    """Affine approximation of a model about a state x* (n,) and an input u* (p,), offsets kept.
+    """Linearise a model about a state x* (n,) and an input u* (p,); the offsets are kept.
 
-    x' = f(x*, u*) + A (x - x*) + B (u - u*),  z = h(x*) + C (x - x*). An affine model comes back as it is.
+        x' = f(x*, u*) + A (x - x*) + B (u - u*),   z = h(x*) + C (x - x*)
+
+    with the Jacobians A = df/dx, B = df/du (over all substeps) and C = dh/dx at x*, u*.
+
+    Args:
+        model: the model; an affine one is returned as it is.
+        state: x*, (n,), in the units of the states.
+        control: u*, (p,), in the units of the inputs.
+
+    Returns:
+        The affine model, with the same noise, prior, names and units.
     """
     if isinstance(model, AffineModel):
         return model

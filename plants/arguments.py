@@ -1,4 +1,4 @@
-"""Arguments that stand in one place: what a function says it takes, others take by its definition."""
+"""Arguments that are defined once: a function takes the arguments of other functions, names and defaults."""
 
 from __future__ import annotations
 

@@ -14,17 +14,17 @@ from plants.quantities import Quantity
 class Channel(NamedTuple):
     """A measured quantity h(x, y, u, c): of the state x, the plant's outputs y at x, its input u and constants c.
 
-    The functions work on tuples of components, floats or arrays, and compile. What needs no u has slopes; the
-    state alone then predicts it, and a model of the state can have it.
+    The functions work on tuples of components (floats or arrays) and can be compiled. A channel that does not
+    depend on u has slopes: the state alone predicts it, so that a state-space model may contain it.
 
     Attributes:
         quantity: what is measured, with its unit.
         variance: default variance of the channel's Gaussian noise [unit^2].
-        code: a number of its own among the plant's channels, by which compiled code knows it; it never changes,
-            so the order in which channels are listed means nothing.
+        code: unique integer that identifies the channel in compiled code; it never changes, so that the order in
+            which channels are listed has no meaning.
         read: h(x, y, u, c).
-        slopes: `slopes(x, dy, c)`, the n derivatives of h by x, where dy are those of each output by rows; None
-            for what depends on the input.
+        slopes: `slopes(x, dy, c)`, the n derivatives dh/dx, where row i of dy is the gradient of output i; None if
+            the channel depends on the input.
         affine: whether h is affine in x and y, so that a linear plant's model can have it.
     """
 

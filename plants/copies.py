@@ -1,4 +1,4 @@
-"""Many copies of a plant at work in place, a step of all of them being one call of compiled code."""
+"""Many copies of a plant that are stepped in place, all of them in one call of compiled code."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ THREADED_BLOCKS = 8  # fewer blocks are done before a second thread has woken up
 class PlantCopies:
     """N copies of a plant, each with its own key; a report of them is an array (reported, N).
 
-    A plant's class says where commands and reports lie, makes its numbers and finds its compiled step,
+    A plant's class defines the rows of commands and reports, packs its parameters and finds its compiled step,
     `advance(first, last, memory, numbers, out, begin)` on blocks first ... last - 1: with `begin` it starts an
     episode of every copy from the keys in its memory and takes the first measurement; else it applies the
     commands for one sample time. It writes the rows that it reports to out (reported, blocks, width).
@@ -28,16 +28,16 @@ class PlantCopies:
         reported: the row behind the last one that a step reports.
     """
 
-    commands: ClassVar[tuple[int, ...]]
+    commands: tuple[int, ...]
     reported: ClassVar[int]
     advance: Callable
 
     def __init__(self, count: int, numbers: np.ndarray, rows: int):
-        """Allocate the memory of `count` copies, of so many rows each; `begin` comes next.
+        """Allocate the memory of `count` copies, each of `rows` rows; call `begin` next.
 
         Args:
             count: number of copies.
-            numbers: what the compiled step knows of the plant.
+            numbers: packed parameters of the plant, which the compiled step reads.
             rows: of the memory, those in front (`plants.memory.FRONT`) included.
         """
         self.count, self.numbers = count, numbers

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -23,7 +23,7 @@ VIEWS = ("_memory", "_command", "_numbers", "_advance", "_report", "_views", "_i
 
 
 class PlantEnv(RenderedEnv):
-    """An env of one copy of a plant, whose compiled step does all that moves.
+    """An env of one copy of a plant, whose compiled step does all the computation.
 
     A plant's env has `inputs`, makes `copies_of` the plant, and calls `_set_up` from its `__init__`. Rendering is
     that of `RenderedEnv`; what it offers to filters is in `plants.modelled`. The vector env is then a class of two
@@ -32,15 +32,15 @@ class PlantEnv(RenderedEnv):
     Attributes:
         inputs: what the p entries of an action are.
         plant: the plant; it has `dt`, its sample time [s].
-        task: what the env asks of it, if that is a value.
+        task: what the env rewards and how episodes end, if that is a value.
     """
 
-    inputs: ClassVar[tuple[Quantity, ...]]
+    inputs: tuple[Quantity, ...]
     plant: Any
     task: Any = None
 
     def copies_of(self, count: int) -> PlantCopies:
-        """So many copies of the plant, with what the env asks of it."""
+        """Return `count` copies of the plant, with the env's task."""
         raise NotImplementedError
 
     def _set_up(self, action_space: gym.spaces.Box, rows: ReportRows, render_mode: str | None = None) -> None:
@@ -127,7 +127,7 @@ class PlantEnv(RenderedEnv):
     def step(self, action):
         """Apply an action for one sample time.
 
-        Raises ValueError for an action that is not the plant's number of numbers, or has NaN.
+        Raises ValueError for an action that does not have one number for each input, or contains NaN.
         """
         if self._one_input:
             self._command[0] = one_number(action, self.inputs[0])

@@ -1,4 +1,4 @@
-"""A plant whose parameters are so many times another one's, as a filter may assume it."""
+"""Parameters multiplied by factors: a plant that differs from the true one, as a filter may assume it."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """The memory of many copies of a plant: one float64 array (blocks, rows, width), block by block.
 
-So a block's rows fit the fastest cache and every loop over copies is vector code. A single env is one block of
-width one. The first rows of every plant hold what random draws depend on, and what is reported of a step; the
-plant's own follow. A measured channel has a row, and so many rows behind it (the plant's `Context.valid_offset`,
-the same for all its channels) one that says whether the measurement is valid.
+The rows of a block fit the fastest cache, and every loop over copies is vectorised. A single env is one block of
+width one. The first rows of every plant hold what random draws depend on and what a step reports; the plant's own
+rows follow. Each measured channel has a row, and another one, `Context.valid_offset` rows further on (the same
+distance for all channels of a plant), that says whether the measurement is valid.
 """
 
 from __future__ import annotations

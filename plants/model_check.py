@@ -1,4 +1,4 @@
-"""Whether a model's functions take and return what its numbers say, tried once, as Python, at the prior mean."""
+"""Check that a model's functions take and return the declared shapes: one call, as Python, at the prior mean."""
 
 from __future__ import annotations
 

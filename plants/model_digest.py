@@ -1,4 +1,4 @@
-"""A short name of what a model is: of its quantities, and of what its functions compute at fixed points."""
+"""A short hash that identifies a model: its quantities, and what its functions compute at fixed points."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ SMALL = 1e-2  # of the largest number at a point: of less, less digits are sure,
 def digest_of(model: StateSpaceModel) -> str:
     """A hash of names, units, sizes and substeps, and of the values of f and h at fixed points.
 
-    Noise and prior, which are what tuning changes, have no part in it, and neither have Jacobians, which follow
-    from the functions, nor what a filter is only helped by: operating points and ranges. Points are the same for
-    all models of a size, for those about a prior would change with it. Values are rounded to ten digits, so that
-    another machine or version of Python finds the same.
+    The hash leaves out noise and prior, which tuning changes, Jacobians, which follow from the functions, and
+    operating points and ranges, which only help a filter. The points are the same for all models of a size: points
+    about the prior would change with it. Values are rounded to ten digits, so that other machines and versions of
+    Python find the same hash.
     """
     constants = getattr(model.constants, "_fields", len(model.constants))
     parts = {

@@ -1,4 +1,4 @@
-"""`ModelEnv`: a Gymnasium env whose plant is a state-space model itself."""
+"""`ModelEnv`: a Gymnasium env whose plant is a state-space model."""
 
 from __future__ import annotations
 
@@ -21,17 +21,21 @@ from plants.state_space import StateSpaceModel
 class ModelEnv(gym.Env):
     """A state-space model as an env: the action is its input, the observation its measurement.
 
+        x_{k+1} = f(x_k, u_k) + w,  w ~ N(0, Q);   z_k = h(x_k) + v,  v ~ N(0, R)
+
     The first episode after `reset(seed=s)` is the trajectory that `plants.simulate.simulate` draws for the key of
-    s, under the same inputs; a problem of the same model has it as the data of seed s. `info` holds "state" (n,)
-    and "measurement" (m,) in float64. There is no reward and no end; `gymnasium.wrappers.TimeLimit` sets one.
+    seed s under the same inputs; a tuning problem of the same model has it as the data of seed s. `info` holds
+    "state" (n,) and "measurement" (m,) in float64. The reward is 0 and episodes do not end; use
+    `gymnasium.wrappers.TimeLimit` to end them.
 
     Args:
-        truth: the model that moves and measures.
-        assumed: what `state_space_model` offers to filters: a model, or a function of changes by name that makes
-            it; the truth if None.
-        low: smallest input, one number or p.
-        high: largest input.
-        dt: sample time [s], with which tuned files are compared; None if it has none.
+        truth: the model that generates states and measurements.
+        assumed: the model that filters assume, returned by `state_space_model`: a model, or a function that makes
+            one from changes by name; the truth if None.
+        low: smallest input, one number or p, in the units of the inputs.
+        high: largest input, likewise.
+        dt: sample time [s], which tuned files are checked against; None if unknown. It changes nothing else:
+            covariances are per step and do not scale with dt.
 
     Raises:
         ValueError: if the truth is no model, or bounds or dt are off.
@@ -87,7 +91,7 @@ def with_noise(
     measurement_noise_cov=None,
     prior_cov_factor: float | None = None,
 ) -> StateSpaceModel:
-    """A model with another Q or R, where given, and its P_0 times a factor."""
+    """A model with another Q or R, where given, and with P_0 multiplied by a factor, where given."""
     changes = {"process_noise_cov": process_noise_cov, "measurement_noise_cov": measurement_noise_cov}
     if prior_cov_factor is not None:
         changes["prior_cov"] = positive("prior_cov_factor", prior_cov_factor) * model.prior_cov

@@ -1,4 +1,4 @@
-"""What an env of a plant, single or in number, offers to filters: its model, and checks of tuned files."""
+"""What an env or vector env of a plant offers to filters: its model, and checks of tuned files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from plants.state_space import StateSpaceModel
 
 
 class ModelledEnv:
-    """An env with a `plant`, of which it offers the model.
+    """An env with a `plant`, which offers the plant's model to filters.
 
     Attributes:
         plant_name: what messages call the plant.
@@ -32,7 +32,7 @@ class ModelledEnv:
         return []
 
     def state_space_model(self, **changes) -> StateSpaceModel:
-        """The model of the env's plant, exact unless changed; changes are those of its `model_maker`.
+        """The model of the env's plant, exact unless changed; changes are arguments of its `model_maker`.
 
         Raises ValueError that states the rule and the value.
         """

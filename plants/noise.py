@@ -42,8 +42,8 @@ def noise_adder(size: int, first: int, root: int, stream: int) -> Callable:
 def add_noise(memory, b, numbers, size, first, root, stream, scratch):
     """Add w ~ N(0, L L') to rows of every copy, as `noise_adder` does, for a number of rows known at run time.
 
-    What is zero in L costs nothing. The draws go into rows from `scratch` on, `size` rounded up to a multiple of
-    BLOCK.
+    Zeros in L cost nothing. The draws are written into the rows from `scratch` on, `size` rounded up to a multiple
+    of BLOCK.
     """
     for block in range((size + BLOCK - 1) // BLOCK):
         at = scratch + BLOCK * block

@@ -1,4 +1,4 @@
-"""The true state in the observation, for policies that are to be compared with those that must estimate it."""
+"""The true state as observation: the reference for policies that must work with estimates."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 class ObserveState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     """Observe the true state of a plant in place of the measurement.
 
-    What the env appends to its measurement (validity flags, a reference) stays at the end.
+    What the env appends to its measurement (validity flags, a reference signal) stays at the end.
 
     Args:
         env: an env of a plant.
@@ -38,7 +38,7 @@ class ObserveState(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
 
 class ObserveStateVector(gym.vector.VectorWrapper):
-    """`ObserveState` for envs in number, in all three autoreset modes.
+    """`ObserveState` for vector envs, in all three autoreset modes.
 
     Args:
         env: a vector env of a plant.

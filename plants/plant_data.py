@@ -1,4 +1,4 @@
-"""A plant as data that JSON can hold, for files that have to say what plant they are for, and what differs."""
+"""A plant as JSON data, for files that record which plant they belong to, and differences between two plants."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def check_same(entries: Entries, tuned_for: Mapping, data: Mapping, file: str | 
 
 
 def differences(entries: Entries, then: Mapping, now: Mapping) -> tuple[list[str], list[str]]:
-    """What two plants' data differ in, each with both values: what makes them other plants, and what does not.
+    """Differences between the data of two plants, with both values: essential ones, and others.
 
     Raises:
         ValueError: if one of them lacks an entry.

@@ -1,4 +1,4 @@
-"""What the numbers of a model are: names, symbols and units of states, inputs, measurements and outputs."""
+"""Quantities of a model: names, symbols and units of states, inputs, measurements and outputs."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ class Quantity(NamedTuple):
 
     Attributes:
         name: in words, such as "motor speed".
-        symbol: as equations have it and files name it, such as "omega_m"; letters, digits, "_" and "-".
-        unit: of SI, such as "rad/s"; empty for a pure number.
-        angle: whether it wraps at 2 pi [rad]: filters and scores take differences of it the short way round.
+        symbol: as in equations and file headers, such as "omega_m"; letters, digits, "_" and "-".
+        unit: SI unit, such as "rad/s"; empty for a pure number.
+        angle: whether it is an angle that wraps at 2 pi [rad]: filters and scores wrap its differences to (-pi,
+            pi].
     """
 
     name: str
@@ -48,9 +49,9 @@ class Quantity(NamedTuple):
 
 
 class Output(NamedTuple):
-    """What follows from a state: a quantity y = function(x, c) of components x and the model's constants c.
+    """An output of a model: a quantity y = function(x, c) of the state x and the model's constants c.
 
-    The function is made of operators on components, so that it takes arrays of them as well as floats.
+    The function uses operators on the components of x only, so that it takes arrays as well as floats.
     """
 
     quantity: Quantity
@@ -66,16 +67,16 @@ class Quantities(NamedTuple):
 
 
 def quantities(kind: str, given: Any, count: int, letter: str) -> tuple[Quantity, ...]:
-    """Quantities from such, from tuples of their fields or from names; letter_1, letter_2, ... if None.
+    """Make quantities from `Quantity` values, tuples of their fields, or names; letter_1, letter_2, ... if None.
 
     Args:
         kind: what they are, for messages: "states".
         given: a sequence with `count` entries, or None.
-        count: how many components there are.
-        letter: what those without names are called.
+        count: number of components.
+        letter: default symbol of components without names.
 
     Raises:
-        ValueError: states the rule and the value.
+        ValueError: if there are not `count` of them, symbols are equal, or a name, symbol, unit or angle is wrong.
     """
     if given is None:
         return tuple(Quantity(f"{letter}_{i}", f"{letter}_{i}") for i in range(1, count + 1))

@@ -1,4 +1,4 @@
-"""Whole trajectories of many copies of a plant: the reports of a batch that is stepped through given inputs."""
+"""Trajectories of many copies of a plant: the reports of a batch that is stepped through given inputs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def record(
     """Reports (B, K + 1, reported) of a batch of B copies from their start on.
 
     Args:
-        copies_of: makes so many copies.
+        copies_of: `copies_of(count)` makes that many copies.
         keys: of their episodes, (B, 2).
         inputs: (B, K, p), or (B, K) where p is 1.
         name: what the inputs are called, for messages.

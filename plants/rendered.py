@@ -1,4 +1,4 @@
-"""What every env of a plant does about pictures."""
+"""Rendering that is common to all envs of plants."""
 
 from __future__ import annotations
 

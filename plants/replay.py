@@ -1,4 +1,4 @@
-"""`ReplayEnv`: a recorded run as a Gymnasium env, on which wrappers run as on any other."""
+"""`ReplayEnv`: a recorded run as a Gymnasium env, on which filter wrappers work as on any other env."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ ANY_DT = 0.01  # [s], of a model that is asked for its quantities before the sam
 
 
 class ReplayEnv(gym.Env):
-    """A log as an env: step k gives the measurement of row k, whatever the action; the episode ends with the log.
+    """A log as an env: step k returns the measurement of row k, whatever the action; an episode is the whole log.
 
-    The actions are the log's, too: `info["recorded_input"]` (p,) is what acted in the step, and filter wrappers
-    predict with it in place of the action that they are given. Where nothing was measured the observation repeats
-    the last number, 0 at first, and `info["measurement_valid"]` says so. `info["references"]` holds what reference
-    channels have in the row. There is no reward.
+    The inputs come from the log, too: `info["recorded_input"]` (p,) is the input of the step, and filter wrappers
+    predict with it instead of the action. Where a measurement is missing, the observation repeats the last value
+    (0 at first), and `info["measurement_valid"]` is false there. `info["references"]` holds the values of the
+    reference channels in the row. The reward is 0.
 
     Args:
         log: a `Log`, or the path of a file that `plants.logs.read.read_log` reads.
@@ -38,11 +38,11 @@ class ReplayEnv(gym.Env):
             function that makes one, of the log's sample time where it takes `dt`; an object that offers
             `state_space_model`, such as an env; or "module:object" for any of these.
         columns: headers by quantity, as `read_log` takes them.
-        clock_offset: seconds by quantity, likewise.
-        dt: sample time [s], likewise.
+        clock_offset: clock offsets [s] by quantity, as `read_log` takes them.
+        dt: sample time [s], as `read_log` takes it.
 
     Raises:
-        ValueError: if the file or the model is off.
+        ValueError: if the file cannot be used, or the model is not one or does not fit the log.
     """
 
     metadata = {"render_modes": []}

@@ -66,8 +66,8 @@ def views_of(report: np.ndarray, rows: ReportRows) -> tuple[np.ndarray, ...]:
 def info_maker(rows: ReportRows) -> Callable[[np.ndarray, tuple[np.ndarray, ...]], dict]:
     """Return `info(report, views)`: the info of one copy, in arrays of its own.
 
-    It is written out for the plant's entries, as a step has to be quick. Numbers are those of NumPy: clients ask
-    every value for its dtype.
+    It is generated for the plant's entries, because a step has to be quick. Numbers are NumPy scalars, as clients
+    ask every value for its dtype.
     """
     places = tuple((name, None if isinstance(place, slice) else place) for name, place in rows.info.items())
     return _info_maker(places, bool(rows.dropping))

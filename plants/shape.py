@@ -1,4 +1,4 @@
-"""What compiled code is made for: the shape of a model, and its functions."""
+"""Shape and functions of a model, for which code is compiled."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MOST_CONSTANTS = 96  # in a tuple that compiled functions pass on
 
 
 class Shape(NamedTuple):
-    """Sizes of a model, and what else compiled code has to know of it beforehand."""
+    """Sizes of a model, and what else must be known when its code is compiled."""
 
     n: int  # states
     m: int  # measurements
@@ -38,7 +38,7 @@ class Functions(NamedTuple):
 
 
 def innovation_of(shape: Shape, first: int = 0) -> Callable:
-    """Return `subtract(z, y)`: z - y[first:], angles the short way round, zero in channels that are NaN in z."""
+    """Return `subtract(z, y)`: z - y[first:], angles wrapped, zero in channels that are NaN in z."""
     return kept(matrices.innovation(shape.m, first), "z, y", shape.measurement_angles)
 
 

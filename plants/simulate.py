@@ -1,4 +1,4 @@
-"""Truth drawn from a model: states and measurements of many trajectories with the model's own noise."""
+"""Simulation of a model: states and measurements of many trajectories with the model's own noise."""
 
 from __future__ import annotations
 
@@ -16,10 +16,15 @@ from plants.state_space import StateSpaceModel
 
 
 class Truth(NamedTuple):
-    """Trajectories of B truths over K steps."""
+    """True states and measurements of B trajectories over K steps.
 
-    states: np.ndarray  # (B, K + 1, n)
-    measurements: np.ndarray  # (B, K + 1, m)
+    Attributes:
+        states: (B, K + 1, n), in the units of the states.
+        measurements: (B, K + 1, m), in the units of the measurements.
+    """
+
+    states: np.ndarray
+    measurements: np.ndarray
 
 
 @inlined
@@ -98,10 +103,20 @@ def _simulation(begin, advance, measure, n: int, m: int, interpreting: bool):
 
 
 def simulate(model: StateSpaceModel, keys: np.ndarray, inputs: np.ndarray) -> Truth:
-    """Draw truths from a model, one for every key (B, 2), under inputs (B, K, p).
+    """Simulate a model with its own noise, one trajectory for every key.
 
-    The numbers are those of the plant with the same key, where the model is exact. States and measurements that
-    are angles are as f and h give them, of any turn: filters and errors (`numerics.angles.difference`) wrap them.
+        x_{k+1} = f(x_k, u_k) + w_k,  w_k ~ N(0, Q);   z_k = h(x_k) + v_k,  v_k ~ N(0, R);   x_0 ~ N(mean, cov)
+
+    The same keys give the same noise as in the plant, so that an exact model gives the plant's trajectories.
+    Angles are not wrapped: filters and errors (`numerics.angles.difference`) wrap them.
+
+    Args:
+        model: the model, with Q, R and the prior.
+        keys: random keys, one a trajectory, (B, 2).
+        inputs: u, (B, K, p), in the units of the inputs.
+
+    Returns:
+        `Truth`: states (B, K + 1, n) and measurements (B, K + 1, m).
 
     Raises:
         ValueError: if shapes do not fit.

@@ -1,4 +1,4 @@
-"""What an env measures, by what it is to a model: an input, such as an attitude from an AHRS, or a measurement."""
+"""Channels of an env that a model takes as inputs, such as an attitude from an AHRS, and as measurements."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from plants.state_space import StateSpaceModel
 
 
 class Split(NamedTuple):
-    """Places of an env's channels by what they are to a model.
+    """Indices of an env's channels that are inputs of a model, and of those that are measurements.
 
     Attributes:
         inputs: those of the model's last inputs, in their order.

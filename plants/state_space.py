@@ -1,4 +1,4 @@
-"""`StateSpaceModel`: what a filter believes of a plant."""
+"""`StateSpaceModel`: the model of a plant that a filter assumes."""
 
 from __future__ import annotations
 
@@ -28,24 +28,26 @@ class StateSpaceModel:
 
         x_{k+1} = f(x_k, u_k) + w,  w ~ N(0, Q);   z_k = h(x_k) + v,  v ~ N(0, R);   x_0 ~ N(mean, cov)
 
-    The functions take and return tuples of components and may use `constants` c, the model's numbers:
-    `transition(x, u, c)`, `observe(x, c)` and, if known, their Jacobians as tuples of rows
-    (n rows of n, m rows of n). Written with arithmetic and `math` or `numpy` scalar functions they compile;
-    others run as Python, slower, with the same results.
+    Covariances are per step and do not scale with dt: a model of another sample time needs its own Q (and R).
 
-    More than 36 states or inputs, or 96 constants in a plain tuple, are no tuple of numbers: then x, u or c is an
-    array of float64, or of complex numbers where a Jacobian is found by complex steps (`np.empty_like(x)` makes
-    another such). It is indexed alike, and functions may return arrays or tuples whatever the size; a Jacobian of
-    more than a thousand entries should be an array, or a tuple of rows that hold floats only.
+    The functions are `transition(x, u, c)`, `observe(x, c)` and, if known, their Jacobians. They take and return
+    tuples of components, Jacobians as tuples of rows (n rows of n, m rows of n), and may use the parameters of the
+    model, `constants` c. Functions made of arithmetic and `math` or `numpy` scalar functions are compiled; others
+    run as Python, slower, with the same results.
 
-    Models, and filters and wrapped envs with them, can be copied and pickled. Pickle holds functions by name, so
-    those of a user must stand in a module; functions within functions, and lambdas, need cloudpickle.
+    Above 36 states or inputs, or 96 constants in a plain tuple, x, u or c is an array of float64 and not a tuple;
+    it is complex where a Jacobian is found by complex steps (`np.empty_like(x)` makes another such array). It is
+    indexed in the same way, and functions may return arrays or tuples of any size. A Jacobian of more than a
+    thousand entries should be an array, or a tuple of rows that hold floats only.
+
+    Models can be copied and pickled, and so can filters and wrapped envs that hold them. Pickle stores functions
+    by name: define yours in a module. Nested functions and lambdas need cloudpickle.
 
     Attributes:
-        transition: f, or one of its `substeps` equal parts: the function is applied `substeps` times a step.
-        observe: h.
+        transition: f, or one of its `substeps` equal parts: the function is applied `substeps` times in a step.
+        observe: h, without noise.
         process_noise_cov: Q, (n, n) or n variances, per step.
-        measurement_noise_cov: R, (m, m) or m variances; positive definite.
+        measurement_noise_cov: R, (m, m) or m variances, of each measurement; positive definite.
         prior_mean: mean of the initial state, (n,).
         prior_cov: covariance of the initial state, (n, n) or n variances; zero allowed.
         inputs: number p of inputs.
@@ -57,14 +59,14 @@ class StateSpaceModel:
         substeps: how often `transition` is applied in one step.
         operating_state: x* (n,) about which a Kalman filter approximates the model; None for affine models.
         operating_input: u* (p,), the input that goes with it.
-        operating_points: `operating_points(count)` gives so many pairs (x*, u*) over the range of the one input,
-            in its order, between which a Kalman filter may be scheduled; None if unknown.
-        state_low: the smallest state of normal operation, by components (n,); None if unknown.
-        state_high: the largest one (n,).
-        states: the states' `Quantity` each, or their names; x_1, x_2, ... if None.
-        input_quantities: those of the inputs, u_1, ...
-        measurements: those of the measurements, z_1, ...
-        outputs: what follows from a state, by symbol: an `Output` each, a quantity and a function of (x, c).
+        operating_points: `operating_points(count)` returns that many pairs (x*, u*) over the range of a single
+            input, in increasing order of u*, for gain scheduling of a Kalman filter; None if unknown.
+        state_low: smallest value of each state in normal operation, (n,); None if unknown.
+        state_high: largest value of each state, (n,); None if unknown.
+        states: a `Quantity` or a name for each state; x_1, x_2, ... if None.
+        input_quantities: the same for the inputs; u_1, ... if None.
+        measurements: the same for the measurements; z_1, ... if None.
+        outputs: outputs of the model by symbol: an `Output` each, a quantity and a function of (x, c).
     """
 
     transition: Callable
@@ -164,7 +166,7 @@ class StateSpaceModel:
         return np.array(self.constants) if constants_are_array(self.shape.form) else self.constants
 
     def replace(self, **changes) -> Self:
-        """The same model with some fields changed."""
+        """A copy of the model with some fields changed; ValueError as for a new model."""
         return dataclasses.replace(self, **changes)
 
     @property
@@ -174,11 +176,11 @@ class StateSpaceModel:
 
     @cached_property
     def digest(self) -> str:
-        """A short hash of names, units, sizes and what f and h compute; Q, R and the prior are no part of it."""
+        """A short hash of names, units, sizes and values of f and h; Q, R and the prior do not enter."""
         return digest_of(self)
 
     def output(self, symbol: str, states: np.ndarray) -> np.ndarray:
-        """The output of a symbol at states (..., n), (...); ValueError if there is none."""
+        """The output `symbol`, shape (...), at states (..., n); ValueError if the model has no such output."""
         one_of("output", symbol, tuple(self.outputs))
         components = np.moveaxis(states, -1, 0)
         x = components if is_array(self.n) else tuple(components)
@@ -203,9 +205,9 @@ class StateSpaceModel:
 
     @property
     def scales(self) -> np.ndarray:
-        """What central differences measure a small step of each state in, (n,): its spread.
+        """Scale of each state for the steps of central differences, (n,): its standard deviation in prior and Q.
 
-        A change of units then changes nothing.
+        Results then do not depend on the units.
         """
         spread = np.sqrt(np.diag(self.prior_cov) + np.diag(self.process_noise_cov))
         return np.where(spread > 0, spread, 1.0)

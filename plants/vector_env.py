@@ -22,11 +22,11 @@ MOST_ENVS = 1_000_000  # of some kilobytes each
 
 
 class PlantVectorEnv(gym.vector.VectorEnv):
-    """N copies of an env, native: copy i of `reset(seed=s)` equals a single env with `reset(seed=s + i)`.
+    """N copies of an env in one compiled step: copy i after `reset(seed=s)` equals a single env with seed s + i.
 
-    Its j-th later episode equals that env's j-th unseeded reset, in all three autoreset modes. What is drawn for
-    an episode is drawn for each copy. Info holds arrays with one row a copy, and a mask `_key` for each key, as
-    Gymnasium's own vector envs do. Actions of copies that are about to be reset are ignored.
+    Its j-th later episode equals that env's j-th unseeded reset, in all three autoreset modes. Random parameters
+    of an episode are drawn for each copy. Info holds arrays with one row a copy, and a mask `_key` for each key,
+    as Gymnasium's own vector envs do. Actions of copies that are about to be reset are ignored.
 
     Args:
         num_envs: number of copies.
@@ -51,7 +51,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
         self.num_envs = at_least("num_envs", num_envs, 1, MOST_ENVS)
         self.autoreset_mode = _autoreset_mode(autoreset_mode)
         if arguments.get("render_mode") is not None:
-            raise ValueError(f"render_mode must be None in number, but got {arguments['render_mode']!r}")
+            raise ValueError(f"render_mode must be None in a vector env, but got {arguments['render_mode']!r}")
         env = self.single_env(**arguments)
         self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
         self.plant, self.task, self._rows = env.plant, env.task, env.report_rows

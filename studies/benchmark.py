@@ -1,8 +1,8 @@
-"""Standard problems that others have solved, with what they have found beside what our filters give.
+"""Standard problems with published scores, beside those of our filters.
 
-The score of data assimilation is "rmse.a": after each analysis the root of the mean square error over the states,
-then the mean of these over time, without the burn-in. The RMSE of our tables is pooled instead: the root of the
-mean square over runs, steps and states, so that moments in which a filter is lost weigh more. Both are told.
+The score of data assimilation is "rmse.a": after each analysis the root mean square error over the states, then
+the mean of these over time, without the burn-in. The RMSE of our tables is pooled instead: the root mean square
+over runs, steps and states, in which times when a filter has diverged have more weight. Both are reported.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from studies import BENCHMARKS
 from tuning.evaluation.runs import state_errors
 from tuning.problems.model_problem import ModelProblem
 
-RUNS = 16  # of 1000 analyses each; what is published rests on one such run, as far as is told
+RUNS = 16  # of 1000 analyses each; published scores seem to be of one such run
 MOST_RUNS = 10_000
-CLOSE = 0.05  # relative difference within which two scores count as the same
+CLOSE = 0.05  # relative difference up to which two scores are called the same
 WHY = "why different"
 NUMBERS = {  # in words
     "ensemble_size": "N = {0}",
@@ -34,16 +34,14 @@ NUMBERS = {  # in words
 
 
 class Row(NamedTuple):
-    """What one filter achieved, beside what somebody else's did."""
+    """The score of a filter beside a published one."""
 
     label: str
     theirs: float
     ours: Interval
     pooled: float  # root of the mean square error over runs, scored steps and states
-    divergences: int  # restarts from the prior
-    run_median: (
-        float  # of our score in a single run, which few runs that lose the truth for a time do not move ...
-    )
+    divergences: int  # filter resets: restarts from the prior
+    run_median: float  # median of our score over single runs, robust against few runs that diverge for a time ...
     run_std: float  # ... and its standard deviation
     known: str  # the reason for a difference, if one is known
 
@@ -75,22 +73,22 @@ OnRow = Callable[[Row], None]
 
 
 class Benchmark(NamedTuple):
-    """A standard problem, and how it is solved.
+    """A standard problem with its filters.
 
-    `rows(seeds, on_row)` gives the rows for some seeds, one after the other to `on_row`, too.
+    `rows(seeds, on_row)` returns the rows for some seeds, and calls `on_row` with each of them.
     """
 
     name: str
     about: str
-    theirs: str  # what `Row.theirs` is
-    score: str  # what is compared
+    theirs: str  # heading of `Row.theirs`
+    score: str  # the score that is compared
     source: str
     remarks: tuple[str, ...]
     rows: Callable[[Sequence[int], OnRow], list[Row]]
 
     @property
     def header(self) -> list[str]:
-        """What the columns of a table of rows are."""
+        """Headings of a table of rows."""
         return ["filter", self.theirs, f"ours, {self.score}", "ratio", "median run", "pooled", WHY]
 
     def reproduce(self, runs: int = RUNS, seed: int = 0, on_row: OnRow = lambda row: None) -> list[Row]:
@@ -100,17 +98,17 @@ class Benchmark(NamedTuple):
 
 
 class Published(NamedTuple):
-    """A published score, and the filter of ours that stands beside it."""
+    """A published score, and our filter that is compared with it."""
 
     filter: str
-    numbers: Mapping[str, float]  # of the filter
+    numbers: Mapping[str, float]  # parameters of the filter
     value: float
     model: Mapping[str, float] = {}  # arguments of the model that the filter assumes
     why: str = ""  # reason for a difference
 
     @property
     def label(self) -> str:
-        """Filter and numbers in words."""
+        """Filter and parameters in words."""
         given = {**self.numbers, **self.model}.items()
         return ", ".join([self.filter, *(NUMBERS.get(name, f"{name} {{0:g}}").format(one) for name, one in given)])
 
@@ -121,14 +119,14 @@ def find_benchmark(name: str) -> Benchmark:
 
 
 def noise_free_problem(truth: StateSpaceModel, **arguments) -> ModelProblem:
-    """A problem whose filters assume the truth, with a Q of zero: a study tunes what a filter has of its own."""
+    """A problem whose filters assume the truth, with a Q of zero: a study tunes the filter's own parameters."""
     r = tuple(np.diag(truth.measurement_noise_cov).tolist())
     untuned = {"process_noise_cov": (0.0,) * truth.n, "measurement_noise_cov": r}
     return ModelProblem(truth, untuned=untuned, **arguments)
 
 
 def mean_of_roots(errors: np.ndarray) -> np.ndarray:
-    """rmse.a of each run, (B,), from its errors at the analyses that count (B, K, n)."""
+    """rmse.a of each run, (B,), from its errors at the scored analyses (B, K, n)."""
     return np.sqrt(np.square(errors).mean(axis=2)).mean(axis=1)
 
 
@@ -139,8 +137,8 @@ def against_published(
 
     Args:
         problem: makes the data.
-        model: gives what filters assume, from the arguments `Published.model`.
-        published: one a row.
+        model: makes the filters' model from the arguments `Published.model`.
+        published: one for each row.
     """
 
     def rows(seeds: Sequence[int], on_row: OnRow) -> list[Row]:

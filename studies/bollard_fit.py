@@ -1,6 +1,6 @@
-"""A thruster and its speed controller from a bollard table: what a static table can tell.
+"""A thruster and its speed controller from a bollard table: what a static table determines.
 
-A table of steady states at zero flow knows ratios only. With thrust T and propeller torque Q proportional to
+A table of steady states at zero flow determines ratios only. With thrust T and propeller torque Q proportional to
 omega_m^2 there, it fixes
 
     T/omega_m^2 ahead and astern       C_Lmax and the thrust asymmetry e, once blade angle and K4 are given
@@ -9,13 +9,13 @@ omega_m^2 there, it fixes
 
 It fixes neither K_h and K3, on which all time constants depend, nor blade angle and K4. Those are inferred.
 
-Current is measured at the supply. The motor's is taken to be that over the throttle.
+Current is measured at the supply. The motor's current is assumed to be that divided by the throttle.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,8 +25,10 @@ from thruster_env.linear.steady_state import steady_state
 from thruster_env.parameters import ThrusterParameters, derive_constants
 
 FITTED = ("lift_coefficient", "drag_coefficient", "thrust_asymmetry", "motor_damping", "voltage_gain")
-SMALL_ERROR = 0.02  # relative; larger ones are the model's own and count by their size, not by its square
-DEAD_BAND = 28.0  # the propeller rests within [us]: read off the T200's table, where it is 24 to 40
+SMALL_ERROR = (
+    0.02  # relative; larger errors are errors of the model, and are weighted linearly, not by their square
+)
+DEAD_BAND = 28.0  # half of the dead band [us]; 24 to 40 in the table of the T200
 
 
 class PulseWidthMap(NamedTuple):
@@ -34,9 +36,9 @@ class PulseWidthMap(NamedTuple):
 
         throttle = (pulse width - 1500 us)/400 us,  V_s = throttle V (1 - droop V), times astern_gain astern
 
-    The droop stands for all that is lost before the motor: a higher supply raises the speed by less than a motor
-    alone would explain, and at part throttle above 16 V not at all. The gain makes up for what the model's torque
-    astern is off by; for the T200 it is 1.01.
+    The droop represents all losses before the motor: a higher supply raises the speed by less than the motor alone
+    would explain, and at part throttle above 16 V not at all. The gain compensates the error of the model's torque
+    astern; for the T200 it is 1.01.
 
     Fitted for supplies of 10 to 20 V, V_s of 8 to 13 V at full throttle.
     """
@@ -60,7 +62,7 @@ class Identified(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """What a thruster would have shown in the rows of a table, arrays (n,)."""
+    """Predictions of a thruster for the rows of a table, arrays (n,)."""
 
     thrust_from_speed: np.ndarray  # from the measured speed [N]
     current_from_speed: np.ndarray  # from the measured speed and the throttle [A]
@@ -96,11 +98,11 @@ def identify(table: BollardTable, held_out: Sequence[float], inferred: ThrusterP
 
     Args:
         table: rows that `read_table` gives.
-        held_out: supply voltages [V] that are not fitted.
-        inferred: where the other parameters are taken from; its gear ratio is 1, as the motor's speed is measured.
+        held_out: supply voltages [V] that are held out.
+        inferred: the thruster with the other parameters; its gear ratio is 1, as the motor's speed is measured.
 
     Returns:
-        What was identified, `Identified`.
+        `Identified`.
 
     Raises:
         ValueError: if a voltage to hold out is not in the table, or too few would be left to fit.
@@ -111,7 +113,8 @@ def identify(table: BollardTable, held_out: Sequence[float], inferred: ThrusterP
 
     def found(numbers) -> Identified:
         values = [float(number) for number in numbers]
-        thruster = inferred._replace(**dict(zip(FITTED, values[:5], strict=True)))
+        changes: dict[str, Any] = dict(zip(FITTED, values[:5], strict=True))
+        thruster = inferred._replace(**changes)
         return Identified(thruster, PulseWidthMap(*values[5:]))
 
     def errors(numbers):
@@ -142,7 +145,7 @@ def identify(table: BollardTable, held_out: Sequence[float], inferred: ThrusterP
 
 
 def is_held_out(table: BollardTable, held_out: Sequence[float]) -> np.ndarray:
-    """Which rows (n,) are of the voltages to hold out; ValueError if those are not in the table."""
+    """Which rows (n,) are of held-out voltages; ValueError if those are not in the table."""
     supplies = np.unique(table.supply)
     if not held_out or not set(held_out) <= set(supplies) or len(supplies) - len(set(held_out)) < 2:
         raise ValueError(

@@ -13,7 +13,7 @@ from numerics.checks import shown
 
 COLUMNS = ("pwm_us", "rpm", "current_A", "voltage_V", "force_kgf")
 CENTRE, SPAN = 1500.0, 400.0  # pulse width at rest, and from there to full throttle [us]
-SLOWEST = 0.25  # of full speed; rows below are not used
+SLOWEST = 0.25  # fraction of full speed; slower rows are not used
 STANDARD_GRAVITY = 9.80665  # m/s^2, N in a kgf
 
 
@@ -36,12 +36,12 @@ class BollardTable(NamedTuple):
 
 
 def read_table(path) -> BollardTable:
-    """Read a table with the columns of COLUMNS, in any order, others beside them allowed.
+    """Read a table with the columns of COLUMNS, in any order; other columns are ignored.
 
     Pulse widths above 1500 us are ahead, below astern, where the force is negative. Of each supply voltage and
     direction the rows above a quarter of its full speed are kept.
 
-    Raises ValueError that names the file, and the line where one is to blame, if this is no such table.
+    Raises ValueError with the file, and with the line if possible, if this is not such a table.
     """
     path = Path(path)
     try:

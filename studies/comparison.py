@@ -1,7 +1,7 @@
-"""The published experiment done with many runs: Kalman filter, ensemble Kalman filter and the optimum.
+"""The published experiment repeated with many runs: Kalman filter, ensemble Kalman filter and the optimum.
 
-Truth and filter share the model x' = A_d x + w, z = H x + v with Q = R = q I and zero input. The input
-changes nothing: truth and filters know it alike, and the errors of a linear filter do not depend on it.
+Truth and filter share the model x' = A_d x + w, z = H x + v with Q = R = q I and zero input. The input has no
+effect: it is known to truth and filters, and the errors of a linear filter do not depend on it.
 
 The start. The papers print neither x_0 nor P_0. Here x_0 and the filter's prior are N(0, P_inf), P_inf being
 the steady-state covariance of the *predicted* state. Our filters are updated with z_0 before they first
@@ -37,7 +37,7 @@ RESAMPLES = 2000
 
 
 class Score(NamedTuple):
-    """RMSE of an estimator, one entry a state: (omega_m [rad/s], U_a [m/s])."""
+    """RMSE of an estimator, one entry for each state: (omega_m [rad/s], U_a [m/s])."""
 
     rmse: np.ndarray  # (2,), pooled over runs and over steps 1 ... 100
     low: np.ndarray  # (2,), 95 % interval of rmse, by bootstrap over runs ...
@@ -102,7 +102,7 @@ def compare(case: str, q: float, *, runs: int = RUNS, members: int = MEMBERS, se
         q: noise variance, Q = R = q I.
         runs: independent runs of 100 steps, at least 2: the intervals come from their scatter.
         members: ensemble size N, at least 2.
-        seed: of all randomness; every case and noise level has draws of its own.
+        seed: seed of all random numbers; cases and noise levels have independent draws.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -125,7 +125,7 @@ def compare(case: str, q: float, *, runs: int = RUNS, members: int = MEMBERS, se
 
 
 def keys_of(case: str, q: float, runs: int, seed: int) -> tuple[np.ndarray, np.random.Generator]:
-    """The keys (runs, 2) of so many runs of one case at one noise level, and the generator for what is left."""
+    """The keys (runs, 2) of the runs of one case at one noise level, and the generator of all other draws."""
     generator = np.random.default_rng([seed, tuple(SYSTEMS).index(case), round(1000 * q)])
     return generator.integers(0, 2**32, size=(runs, 2)).astype(np.float64), generator
 

@@ -1,4 +1,4 @@
-"""Published values against ours: how far apart they are, in the scatter of one run, and why."""
+"""Published values against ours: their distance in standard deviations of one run, and its reason."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from studies.comparison import Comparison, Score
 from studies.published import STEPS, H, PublishedRMSE, PublishedTable
 
-CLOSE = 2.0  # standard deviations of a single run within which a published run counts as explained
-EQUAL = 0.06  # relative difference up to which the errors of the two states count as equal numbers
-UNSEEN_RATIO = H[0][1] / H[0][0]  # omega_m over U_a [rad/m] of the errors that H does not see
+CLOSE = 2.0  # standard deviations of a single run within which a published value is explained
+EQUAL = 0.06  # relative difference up to which the errors of the two states are called equal
+UNSEEN_RATIO = H[0][1] / H[0][0]  # omega_m over U_a [rad/m] of errors that are not observable by H
 
 
 class Finding(NamedTuple):
@@ -71,7 +71,7 @@ def _why(over_optimum: np.ndarray, from_optimum: np.ndarray, from_unupdated: np.
 
 
 def general_statements(comparisons: list[Comparison]) -> list[str]:
-    """What our runs say, whatever a paper prints."""
+    """Statements on our runs that do not depend on a paper."""
     ratios = np.array([c.enkf_over_kf for c in comparisons])
     scatter = 100 * np.array([c.kf.run_std / c.kf.rmse for c in comparisons])
     covered = np.array([(c.kf.low <= c.optimum) & (c.optimum <= c.kf.high) for c in comparisons])
@@ -95,7 +95,7 @@ def general_statements(comparisons: list[Comparison]) -> list[str]:
 
 
 def study_statements(table: PublishedTable, found: list[Finding]) -> list[str]:
-    """What one paper's columns say beside ours, and the remarks on the paper."""
+    """Statements that compare a paper's columns with ours, and the remarks on the paper."""
     tunnel, open_bladed = (
         [f for f in found if f.filter == "enkf" and f.case == case] for case in ("tunnel", "open-bladed")
     )
@@ -131,7 +131,7 @@ def study_statements(table: PublishedTable, found: list[Finding]) -> list[str]:
 
 
 def _farthest(found: list[Finding], distance: str) -> float:
-    # A cell with a note is no value of its row: a copied one would be measured against the wrong q.
+    # A cell with a note is not a value of its row: a copied one belongs to another q.
     return max(float(np.abs(getattr(f, distance)).max()) for f in found if not f.published.note)
 
 

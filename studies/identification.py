@@ -3,8 +3,8 @@
     python -m studies.identification --repetitions 20
 
 A thruster with a dead band, asymmetric thrust and ambient flow is recorded by a thrust sensor with a bias and a
-tachometer that lags. Each repetition draws other inputs, process noise and measurement noise, identifies from the
-preset, which is another thruster, and asks whether each value is within two of its standard errors of the truth.
+tachometer with a lag. Each repetition draws other inputs, process noise and measurement noise, starts from a
+preset of another thruster, and checks whether each value is within two standard errors of the truth.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,12 +47,12 @@ TRUTH = {
 }
 OWN = ("motor_damping", "voltage_gain", "load_gain", "lift_coefficient", "thrust_asymmetry")
 AMPLITUDE, HOLD = 12.0, 25  # of the inputs [V], in steps
-FINE = 8  # Runge-Kutta steps of the truth: more than the identified model's
+FINE = 8  # Runge-Kutta steps of the truth: more than in the identified model
 WITHIN = 2.0  # standard errors
 
 
 class Coverage(NamedTuple):
-    """How the estimates of one parameter lie about the truth, over all repetitions."""
+    """The estimates of one parameter compared with the truth, over all repetitions."""
 
     name: str
     truth: float
@@ -65,8 +65,9 @@ class Coverage(NamedTuple):
 def record(seed: int, runs: int = 6, steps: int = 500) -> list[Log]:
     """Logs of the known thruster."""
     plant = make_plant(PRESET)
+    own: dict[str, Any] = {name: TRUTH[name] for name in OWN}
     model = logged_model(
-        preset=plant.parameters._replace(**{name: TRUTH[name] for name in OWN}),
+        preset=plant.parameters._replace(**own),
         sensors=SENSORS,
         substeps=FINE,
         ambient_velocity=TRUTH["ambient_velocity"],
@@ -93,7 +94,7 @@ def repetition(seed: int, *, starts: int = 2, runs: int = 6, steps: int = 500) -
 
 
 def coverage(found: Sequence[Identification]) -> list[Coverage]:
-    """How the estimates of each parameter lie about the truth."""
+    """The estimates of each parameter compared with the truth."""
     rows = []
     for name, truth in TRUTH.items():
         values = np.array([one.values[name] for one in found])

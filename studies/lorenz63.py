@@ -20,7 +20,7 @@ Research", J. Open Source Software 9(94), 5150.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -94,7 +94,12 @@ def model(inflation: float = 1.0, jitter: float = 0.0) -> StateSpaceModel:
     )
 
 
-SETTINGS = {"steps": STEPS, "first_scored_step": BURN_IN + 1, "scale": [1.0] * 3, "dt": SUBSTEP * SUBSTEPS}
+SETTINGS: dict[str, Any] = {
+    "steps": STEPS,
+    "first_scored_step": BURN_IN + 1,
+    "scale": [1.0] * 3,
+    "dt": SUBSTEP * SUBSTEPS,
+}
 problem = noise_free_problem(model(), **SETTINGS)
 faded = ModelProblem(model(), model, parameters=[Parameter("inflation", 1.0, 10_000.0)], **SETTINGS)
 jittered = ModelProblem(model(), model, parameters=[Parameter("jitter", 1e-4, 10.0)], **SETTINGS)

@@ -1,4 +1,4 @@
-"""What the bow thruster papers say of their runs: the systems, the settings, and the form of a table.
+"""The runs of the bow thruster papers: systems, settings, and the form of a table.
 
 Source: M. Kiki (2020) and H. Nurhadi, M. Kiki, D. Adzkiya, T. Herlambang (2022), cited in full in `kiki2020`
 and `nurhadi2022`; the model goes back to A. J. Healey et al. (1995), "Toward an improved understanding of
@@ -24,12 +24,12 @@ class PublishedRMSE(NamedTuple):
 
     omega_m: float  # [rad/s]
     U_a: float  # [m/s]
-    note: str = ""  # what is wrong with the print, if anything
-    in_text: tuple[float, float] | None = None  # the pair as the paper's text has it, if that is another
+    note: str = ""  # misprint, if there is one
+    in_text: tuple[float, float] | None = None  # the pair in the paper's text, if it differs
 
     @property
     def meant(self) -> tuple[float, float]:
-        """The pair that was most likely found: that of the text, where it differs from the table's."""
+        """The most probable pair: that of the text, where it differs from the table."""
         return self.in_text or (self.omega_m, self.U_a)
 
 

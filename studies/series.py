@@ -62,7 +62,7 @@ def all_series(*, members: int = MEMBERS, seed: int = 0) -> list[Series]:
 
 
 def series_figure(path: str | Path, runs: list[Series], members: int) -> Path:
-    """Truth, KF and EnKF over time as PNG: a column a noise level, a row a case and state."""
+    """Truth, KF and EnKF over time as PNG: a column for each noise level, a row for each case and state."""
     cases, levels = list(dict.fromkeys(one.case for one in runs)), list(dict.fromkeys(one.q for one in runs))
     figure = new_figure((3.3 * len(levels) + 0.6, 2.15 * 2 * len(cases) + 0.6))
     axes = figure.subplots(2 * len(cases), len(levels), sharex=True, sharey="row", squeeze=False)

@@ -25,7 +25,7 @@ def stone_soup_means(
 
     Args:
         name: "ekf" or "ukf".
-        measurements: the first one is at the time of the prior.
+        measurements: the first one has the time of the prior.
         sigma_a: root of the acceleration's spectral density [m/s^1.5].
         dt: sample time [s].
         deviations: of bearing [rad] and range [m].

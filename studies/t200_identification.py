@@ -45,9 +45,9 @@ AGREEMENT = 1e-3  # relative; the preset has four digits
 T200_PULSE_WIDTHS = PulseWidthMap(droop=0.01687, astern_gain=1.0085)
 """The speed controller of the table, identified together with the preset: `source_voltage` gives V_s.
 
-The gain makes up for the model's torque, which is larger astern than the thruster's: see `T200`. It is nearly one,
-but fixed at one it costs a goal, by a hair: the fit then makes up for the torque with more thrust astern, whose
-median error at measured speed is 3.03 % at the voltages held out. With the gain it is 2.93 %.
+The gain compensates the model's torque, which is larger astern than the thruster's: see `T200`. It is nearly one,
+but with a gain of exactly one a goal is narrowly missed: the fit then compensates the torque with more thrust
+astern, whose median error at measured speed is 3.03 % at the held-out voltages. With the gain it is 2.93 %.
 """
 
 PRESET = Identified(T200, T200_PULSE_WIDTHS)
@@ -108,7 +108,7 @@ def study(path, held_out: Sequence[float] = HELD_OUT) -> dict:
 
 
 def report(result: dict) -> str:
-    """What `study` found, as text."""
+    """The result of `study` as text."""
     lines = [
         f"fitted: {_volts(result['fitted_voltages'])}; held out: {_volts(result['held_out_voltages'])}",
         "",
@@ -128,8 +128,8 @@ def report(result: dict) -> str:
         f"{'':36}" + f"{'ahead':>16}{'astern':>16}" * 2,
     ]
     for quantity, groups in result["errors"].items():
-        cells = [f"{e['median']:.1%} ({e['90 %']:.1%})" for group in groups.values() for e in group.values()]
-        lines.append(f"{quantity:36}" + "".join(f"{cell:>16}" for cell in cells))
+        errors = [f"{e['median']:.1%} ({e['90 %']:.1%})" for group in groups.values() for e in group.values()]
+        lines.append(f"{quantity:36}" + "".join(f"{cell:>16}" for cell in errors))
     for quantity, goal in result["goals"].items():
         lines.append(f"Median {quantity} below {goal:.0%}: {'yes' if result['goals_met'][quantity] else 'no'}")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Inflation found by a study like any other number, on problems whose published scores rest on it."""
+"""Inflation tuned by a study like any other parameter, on problems whose published scores depend on it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tuning.search.study import open_study, quiet_optuna, run_study
 
 
 class Tuned(NamedTuple):
-    """What a study found, and what it is worth on seeds that it never saw."""
+    """The choice of a study, and its score on held-out seeds."""
 
     choice: Choice
     score: Interval  # rmse.a
@@ -27,10 +27,10 @@ def tune_inflation(filter_name: str, problem: ModelProblem, trials: int, runs: i
 
     Args:
         filter_name: "enkf", "etkf", "ensrf" or "denkf".
-        problem: without process noise, so that Q is not tuned either.
-        trials: of the study.
-        runs: held-out seeds.
-        seed: of the study.
+        problem: a problem without process noise, so that Q is not tuned either.
+        trials: number of trials of the study.
+        runs: number of held-out seeds.
+        seed: seed of the study.
     """
     quiet_optuna()
     plan = Plan(filter_name, (problem,), seed, hold_r=True)

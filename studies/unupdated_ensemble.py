@@ -7,7 +7,7 @@ import numpy as np
 from numerics.checks import covariance_root
 from plants.affine import AffineModel
 
-_BLOCK = 128  # runs at a time: their members stay in the processor's cache
+_BLOCK = 128  # runs at a time, whose members fit the processor's cache
 
 
 def unupdated_ensemble_means(
@@ -19,10 +19,10 @@ def unupdated_ensemble_means(
         gain:     K = P H' (H P H' + R)^-1,  P the members' sample covariance
         mean:     m = A m,  then  m += K (H x - H m),  x the true state
 
-    A right filter replaces x_j by x_j + K (z + v_j - H x_j), which keeps P bounded. Here P follows the open
-    loop. On an unstable system it grows for ever along the unstable direction e, and K tends to e / (H e):
-    the gain trusts every measurement and knows nothing of the noise across e. It is no filter to use, so it
-    stands here and not in `filters`. Starting the truth at the known x_0 = 0 instead lowers the RMSE of the
+    A correct filter replaces x_j by x_j + K (z + v_j - H x_j), which keeps P bounded. Here P follows the open
+    loop. On an unstable system it grows without bound along the unstable direction e, and K tends to
+    e / (H e): the gain assumes exact measurements and ignores the noise across e. It should not be used, so it is
+    here and not in `filters`. Starting the truth at the known x_0 = 0 instead lowers the RMSE of the
     open-bladed case by about 1 %.
 
     Args:

@@ -7,8 +7,8 @@ import pytest
 
 from training.environments import make_environments
 from training.learn import train
-from training.saved import load, read_setup
-from training.setup import make_setup
+from training.saved import load, read_configuration
+from training.setup import make_configuration
 from tuning.thruster.find import find_scenario
 
 COPIES, LIMIT = 4, 30
@@ -33,7 +33,7 @@ def short_episodes(monkeypatch):
 def setup_of(observe="ekf", algo="ppo", steps=256, **arguments):
     scenario = find_scenario("medium_noise")
     given = {"num_envs": COPIES, "hyperparameters": SMALL[algo], **arguments}
-    return make_setup("tracking", scenario, observe, algo, steps, **given)
+    return make_configuration("tracking", scenario, observe, algo, steps, **given)
 
 
 def learn(setup, folder, **arguments):
@@ -45,7 +45,7 @@ def contents(folder):
 
 
 def steps_of(folder):
-    return load(folder, make_environments(read_setup(folder), [0])).model.num_timesteps
+    return load(folder, make_environments(read_configuration(folder), [0])).model.num_timesteps
 
 
 @pytest.fixture(scope="module")

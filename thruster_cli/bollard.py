@@ -38,7 +38,7 @@ def identify_bollard(
 ) -> None:
     """Identify a thruster from a bollard table, write its preset file, and say how well it fits.
 
-    The table tells thrust, torque and speed in steady state; a step response, where there is one, how fast motor
+    The table has thrust, torque and speed in steady state; a step response, where there is one, how fast motor
     and flow follow. All else is that of a preset.
 
     Args:
@@ -144,7 +144,7 @@ def _report(found: Identified, errors: dict, held_out, timed: Identification | N
         part += [table("From the step response", ["", "value", "standard error"], rows), *timed.sentences()]
     else:
         part.append(
-            "A static table tells no time constants: those of the preset stay. --step LOG finds them, of a log of "
-            "voltage and motor speed."
+            "A static table does not determine time constants: those of the preset stay. --step LOG finds them, "
+            "of a log of voltage and motor speed."
         )
     return [*part, f"wrote {out}"]

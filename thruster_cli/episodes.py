@@ -17,6 +17,7 @@ from numerics.checks import at_least, one_of, within
 from numerics.streams import episode_keys
 from plants.logs.log import Log
 from plants.rendering.film import OnStep, Played, steps_a_frame, write_film
+from thruster_cli.output import warn_beyond
 from thruster_env.control.controllers import PIController
 from thruster_env.rendering.env import renderer_of
 from thruster_env.rendering.history import Moment, Overlay
@@ -54,6 +55,8 @@ def play_voltages(
     film: Path | None, seed: int, on_step: OnStep, given: float | str, steps: int, **arguments
 ) -> Played:
     """A thruster under a constant voltage [V], or a sequence by the name of an excitation."""
+    if not isinstance(given, str):
+        warn_beyond(arguments.get("preset", "tunnel"), given)
     with estimated_env(film, steps=steps, **arguments) as env:
         plant = env.unwrapped.plant
         if isinstance(given, str):

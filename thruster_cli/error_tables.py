@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import inf, isfinite, isnan, log10
 
 import numpy as np
@@ -34,7 +34,16 @@ def comparison_table(evaluations: Mapping[str, Evaluation], bound: np.ndarray, w
     layout = _across if 2 * len(first.states) + len(outputs) <= MOST_COLUMNS else _below
     columns, rows = layout(evaluations, bound, outputs)
     caption = f"above: the bound. ±: half of the 95 % interval. Ideal: NEES {len(bound)}, NIS {right_nis(first)}."
-    return table(f"RMSE on {where}", columns, rows, caption=caption)
+    lines = 1 if layout is _across else len(first.states) + len(outputs)
+    place = lowest([found.score.value for found in evaluations.values()])
+    best = range(place * lines, (place + 1) * lines) if place is not None else ()
+    return table(f"RMSE on {where}", columns, rows, caption=caption, best=best)
+
+
+def lowest(values: Sequence[float]) -> int | None:
+    """Place of the lowest of several values, NaN left out; None if there are none to compare."""
+    known = [value for value in values if not isnan(value)]
+    return list(values).index(min(known)) if len(known) > 1 else None
 
 
 def _across(evaluations: Mapping[str, Evaluation], bound: np.ndarray, outputs: Mapping[str, Quantity]) -> tuple:
@@ -90,7 +99,7 @@ def above_bound(found: Evaluation, bound: np.ndarray) -> list[float]:
 
 def decimals(found: Evaluation) -> list[int]:
     """Decimals of each state's RMSE: three where its scale, or without one its RMSE, is about one, four at 0.1."""
-    sizes = [s if isfinite(s) else rmse.value for s, rmse in zip(found.scale, found.rmse, strict=True)]
+    sizes = [min(s if isfinite(s) else inf, rmse.value) for s, rmse in zip(found.scale, found.rmse, strict=True)]
     return [max(0, 3 - round(log10(size))) if 0 < size < inf else 3 for size in sizes]
 
 

@@ -49,7 +49,8 @@ def command(
     clock_offset: ClockOption = None,
     dt: DtOption = None,
     ensemble_size: Annotated[
-        int | None, typer.Option(help="Of a filter with an ensemble.", rich_help_panel=FILTER)
+        int | None,
+        typer.Option(help="Of a filter with an ensemble; 100 by default, particles 1000.", rich_help_panel=FILTER),
     ] = None,
     smoother: Annotated[
         bool, typer.Option("--smoother", help="Correct estimates by later measurements.", rich_help_panel=FILTER)
@@ -77,7 +78,7 @@ def command(
 
     The log has the model's inputs and measurements, found by the headers of its columns or told by --column. What
     it has of the model's states and outputs beside these, such as the thrust of a load cell where the filter sees
-    the tachometer, is held against the estimate. docs/logs.md tells the rules.
+    the tachometer, is held against the estimate. docs/logs.md has the rules.
 
     Example: thruster estimate run.csv --tuned out/ekf-run-seed0.json --out est.csv --plot est.png
 

@@ -63,11 +63,12 @@ def command(
 ) -> None:
     """Run a filter on held-out seeds of a scenario, beside its baselines: scaled default, rule of thumb, oracle.
 
-    The rule of thumb takes R from the sensor's sheet and Q from 1 % of each state's range. The scaled default is
-    the same with one factor on Q that brings the mean NIS to 1. The oracle has the plant's own Q and R.
+    The rule of thumb takes R from the sensor's data sheet and Q from 1 % of each state's range. The scaled default
+    is the same with one factor on Q that brings the mean NIS (normalised innovation squared) to 1. The oracle has
+    the plant's own Q and R.
 
-    With --consistency its errors and innovations are held against its own covariances: NEES, NIS, whiteness,
-    coverage, CRPS and, for ensembles, ranks; a sentence each, and a picture of all.
+    With --consistency a filter's errors and innovations are held against its own covariances: NEES, NIS,
+    whiteness, coverage, CRPS and, for ensembles, ranks; a sentence each, and a picture of all.
 
     Example: thruster evaluate --filter enkf --scenario mismatch --consistency calibrated.png
     """

@@ -12,6 +12,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 from rich.text import Text
 
+from filters.ensembles.ensemble import EnsembleKalmanFilter
 from filters.filter import Filter
 from filters.registry import FILTERS, filter_class, tunable_numbers
 from thruster_cli.fitting import fit_table, fits_of
@@ -19,8 +20,9 @@ from thruster_cli.options import INPUT, JsonOption, spelt
 from thruster_cli.output import console, emit, table
 from thruster_cli.problems import PROBLEMS
 from tuning.problems.find import find_problem
-from tuning.search.space import has_ensemble
+from tuning.search.space import KALMAN_SIZES, PARTICLE_SIZES, has_ensemble
 
+MADE = EnsembleKalmanFilter.ensemble_size  # by default
 ATTRIBUTES, ERRORS = "Attributes:", "Raises:"  # what these sections of a docstring begin with
 OWNERS_WIDTH = 27  # of the longest number, so that the names of filters take no room from what it means
 
@@ -100,6 +102,9 @@ def overview(entries: list[Entry]) -> list:
         table("Filters", ["filter", "what it is", "cov.", "ens."], filters, words=True),
         table("Their own numbers, beside the model's", ["of; number", "default", "meaning"], numbers, words=True),
         "cov.: it has a covariance, which says how far the estimate may be off. ens.: it has an ensemble.",
+        f"ensemble_size: {MADE} members where you make a filter or estimate from a log; the rule of thumb, from "
+        f"which tune, evaluate and compare start, has {KALMAN_SIZES.untuned} (particles: "
+        f"{PARTICLE_SIZES.untuned} in both); a tuned file has its own.",
         "thruster filters NAME shows one in full, with its equations and sources.",
     ]
 

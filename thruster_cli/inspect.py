@@ -9,8 +9,8 @@ import numpy as np
 import typer
 
 from numerics.checks import within
-from thruster_cli.options import INPUT, OUTPUT, JsonOption, PresetOption, SeedOption
-from thruster_cli.output import emit, table
+from thruster_cli.options import INPUT, OUTPUT, JsonOption, PresetOption
+from thruster_cli.output import emit, table, warn_beyond
 from thruster_env.linear.analysis import (
     GAIN_UNITS,
     INPUTS,
@@ -26,6 +26,7 @@ from thruster_env.linear.figures import response_figure
 from thruster_env.linear.published import NO_LINEARISATION, SAMPLE_TIME, PublishedLinearModel, published_for
 from thruster_env.linear.steady_state import SteadyState, state_range, steady_state
 from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, Plant, make_plant
+from thruster_env.preset_file import is_file
 
 OUTPUTS = ("omega_m [rad/s]", "U_a [m/s]", "T [N]")
 
@@ -49,12 +50,9 @@ def command(
             rich_help_panel=OUTPUT,
         ),
     ] = None,
-    seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
     """Print and draw a thruster's linear model at a voltage: steady state, stiffness, control, responses.
-
-    Nothing here is random; --seed is accepted, as by every command, and changes nothing.
 
     Example: thruster inspect --preset tunnel --voltage 12 --out tunnel.png
     """
@@ -62,6 +60,7 @@ def command(
         raise ValueError(f"--out must end in .png, but got {str(out)!r}")
     plant = make_plant(preset, dt, max_voltage, ambient_velocity)
     voltage = within("voltage", voltage, max_voltage)
+    warn_beyond(preset, voltage)
     point = steady_state(plant.parameters, voltage, ambient_velocity)
     spread = state_range(plant.parameters, max_voltage)
     ours = analyse(linear_model(plant.parameters, point[:2], voltage, ambient_velocity), dt, spread)
@@ -74,7 +73,7 @@ def command(
         words = ["", f"{NO_LINEARISATION} {model.remark} Source: {model.source}."]
         published = _plain_published(name, model, theirs)
     if out is None and ours.model.c.any():  # at rest there is no Bode plot
-        out = Path("out") / f"inspect-{preset}-{voltage:g}V.png"
+        out = Path("out") / f"inspect-{Path(preset).stem if is_file(preset) else preset}-{voltage:g}V.png"
     if out is not None:
         response_figure(out, ours.model, dt, title.replace("U_0", "$U_0$"))
         words += ["", f"Bode plot and step response: {out}"]

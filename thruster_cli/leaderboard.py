@@ -12,6 +12,7 @@ from thruster_cli.error_tables import (
     consistency_cells,
     decimals,
     limit_cell,
+    lowest,
     right_nis,
     two_lines,
     unless_blank,
@@ -26,7 +27,7 @@ def report(board: Leaderboard) -> list:
     """Two tables of a scenario, one without truth, and a sentence on who wins."""
     scenario, evaluation = board.scenario, board.rows[0].evaluation
     title = f"{scenario.name}: {scenario.about}" if scenario.about else scenario.name
-    seeds = f"held-out seeds {board.seeds[0]} to {board.seeds[-1]}"
+    seeds = f"held-out {scenario.seed_word} {board.seeds[0]} to {board.seeds[-1]}"
     if not evaluation.has_truth:
         shown = [_predictions(board, f"{title}\nInnovations on {seeds}")]
         said = [without_truth(scenario.name), f"{winners(board)}\n"]
@@ -36,12 +37,10 @@ def report(board: Leaderboard) -> list:
     return [*shown, *said]
 
 
-def winner(board: Leaderboard) -> int:
-    """Place of the row with the lowest score or, without truth, the highest log-likelihood; -1 if none has it."""
+def winner(board: Leaderboard) -> int | None:
+    """Place of the row with the lowest score, without truth the highest log-likelihood; None if none has it."""
     found = [row.evaluation for row in board.rows]
-    values = [one.score.value if one.has_truth else -one.log_likelihood for one in found]
-    known = [value for value in values if not isnan(value)]
-    return values.index(min(known)) if len(known) > 1 else -1
+    return lowest([one.score.value if one.has_truth else -one.log_likelihood for one in found])
 
 
 def _errors_across(board: Leaderboard, title: str) -> Table:
@@ -80,8 +79,8 @@ def _errors_below(board: Leaderboard, title: str) -> Table:
     if any(cells[1] for cells in bounds):
         rows += [["bound" if i == 0 else "", *cells] for i, cells in enumerate(bounds)]
     heads = ["filter", "state", "RMSE", "above\n[%]", "start-up", f"over\n{board.rows[0].label}"]
-    first = winner(board) * len(states)
-    best = range(first, first + len(states)) if first >= 0 else ()
+    place, lines = winner(board), len(states)
+    best = () if place is None else range(place * lines, (place + 1) * lines)
     return table(title, heads, rows, caption=_CAPTION, best=best)
 
 

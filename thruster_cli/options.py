@@ -109,7 +109,11 @@ ClockOption = Annotated[
 ]
 DtOption = Annotated[
     float | None,
-    typer.Option("--dt", help="Sample time [s]: of a log without times, or to put it on.", rich_help_panel=INPUT),
+    typer.Option(
+        "--dt",
+        help="Sample time [s]: of a log without times, or to put it on. Variances are per step of it.",
+        rich_help_panel=INPUT,
+    ),
 ]
 LogOption = Annotated[
     list[Path] | None,
@@ -123,7 +127,7 @@ HeldOutOption = Annotated[
     list[Path] | None,
     typer.Option(
         "--held-out",
-        help="Recorded run that only proves the choice; by default every third one.",
+        help="Recorded run that the study never sees; by default every third one.",
         rich_help_panel=INPUT,
     ),
 ]

@@ -22,6 +22,7 @@ from numerics.files import check_not_read, check_target, write_whole
 from numerics.progress import listening
 from thruster_cli.characters import showable
 from thruster_cli.options import JsonOption, SeedOption  # noqa: F401 - for `demo`
+from thruster_env.plant import largest_known_voltage
 
 BEST = "bold green"  # style of rows that win
 
@@ -112,6 +113,14 @@ def check_targets(targets: Iterable[str | Path | None], json_target: str | None,
         check_not_read(target, given)
     for target in named:
         check_target(target)
+
+
+def warn_beyond(preset: str, voltage: float) -> None:
+    """Say on standard error that a preset is driven by a larger voltage [V] than is known of it."""
+    known = largest_known_voltage(preset)
+    if abs(voltage) > known:
+        said = f"{preset} is known up to {known:g} V, but is driven by {abs(voltage):g} V: this is extrapolated"
+        progress_console.print(f"thruster: warning: {said}")
 
 
 @cache

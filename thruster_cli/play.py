@@ -1,4 +1,4 @@
-"""`thruster play`: watch a policy, a sequence of voltages or a log, as a film or in a window."""
+"""`thruster play`: watch a policy, a sequence of voltages or a log, as a video or in a window."""
 
 from __future__ import annotations
 
@@ -111,9 +111,9 @@ def command(
         played, shown = _without_policy(
             what, chosen[what], film, seed or 0, preset, steps, sensor, column, options
         )
-    data = {**played._asdict(), "film": None if film is None else str(film)}
+    data = {**played._asdict(), "video": None if film is None else str(film)}
     if film is not None:
-        shown.append(f"Film: {film}")
+        shown.append(f"Video: {film}")
     emit(shown, data, json)
 
 

@@ -43,7 +43,7 @@ def command(
 
     The filter sees command and tachometer. Without --identify its numbers are those that the project has from six
     runs; with it, each run is estimated with numbers that were found without that run. The recordings are those of
-    J. A. Boehm (University of Maryland, 2019), which are no part of this project: docs/real_data.md tells more.
+    J. A. Boehm (University of Maryland, 2019), which are no part of this project: docs/real_data.md says more.
 
     Example: thruster study recordings --data rov_thruster
     """

@@ -12,7 +12,7 @@ from numerics.checks import at_least, positive, within
 from numerics.streams import episode_keys
 from plants.logs.write import check_suffix, header_of, write_columns
 from thruster_cli.options import INPUT, OUTPUT, RUNS, JsonOption, PresetOption, SeedOption
-from thruster_cli.output import announce_compilation, emit
+from thruster_cli.output import announce_compilation, emit, warn_beyond
 from thruster_env.channels import CHANNELS
 from thruster_env.plant import (
     DEFAULT_DT,
@@ -28,15 +28,15 @@ TRUTH = ("time_s", "voltage_V", "omega_m_rad_per_s", "U_a_m_per_s", "thrust_N")
 
 
 def command(
-    out: Annotated[
-        Path,
-        typer.Option(
-            help="File to write: .csv with units in the header, .parquet or .npz.", rich_help_panel=OUTPUT
-        ),
-    ],
+    *,
     preset: PresetOption = "tunnel",
     steps: Annotated[int, typer.Option(help="Number of steps.", rich_help_panel=RUNS)] = 500,
-    dt: Annotated[float, typer.Option(help="Sample time [s].", rich_help_panel=INPUT)] = DEFAULT_DT,
+    dt: Annotated[
+        float,
+        typer.Option(
+            help="Sample time [s]; covariances are per step of it and do not scale with it.", rich_help_panel=INPUT
+        ),
+    ] = DEFAULT_DT,
     voltage: Annotated[
         float | None, typer.Option(help="Constant voltage [V]; else random levels.", rich_help_panel=RUNS)
     ] = None,
@@ -55,6 +55,12 @@ def command(
         typer.Option(help=f"What is measured, thrust by default: {', '.join(CHANNELS)}.", rich_help_panel=INPUT),
     ] = None,
     seed: SeedOption = 0,
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="File to write: .csv with units in the header, .parquet or .npz.", rich_help_panel=OUTPUT
+        ),
+    ],
     json: JsonOption = None,
 ) -> None:
     """Simulate a thruster and write time, voltage, true state, true thrust and measurements to a log.
@@ -82,6 +88,7 @@ def command(
         voltages = held_levels(
             keys, min(amplitude, plant.max_voltage), at_least("hold", hold, 1, MOST_STEPS), steps
         )
+    warn_beyond(preset, np.abs(voltages).max())
     announce_compilation()
     run = simulate(plant, keys, voltages).checked()
     values = [

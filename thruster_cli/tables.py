@@ -41,7 +41,12 @@ def front_table(plan: Plan, front: Sequence) -> Table:
         for trial in sorted(front, key=lambda trial: trial.values)
     ]
     caption = "No trial is better in both. The first one is the tuned filter."
-    return table("Pareto front on the training seeds", ["trial", *plan.objectives, *names], rows, caption=caption)
+    return table(
+        f"Pareto front on the training {plan.scenarios[0].seed_word}",
+        ["trial", *plan.objectives, *names],
+        rows,
+        caption=caption,
+    )
 
 
 def kinds_table(kinds: Sequence[Kind], plan: Plan) -> Table:
@@ -54,14 +59,15 @@ def kinds_table(kinds: Sequence[Kind], plan: Plan) -> Table:
     columns = ["filter", "trials", "pruned", "over\nbudget", f"best\n{plan.objectives[0]}", "us/step"]
     caption = "us/step: of the best trial; of the cheapest where none is complete. *: mean NIS outside its band."
     best = [0] if len(rows) > 1 else []
-    return table("Filters that were tried, on the training seeds", columns, rows, caption=caption, best=best)
+    title = f"Filters that were tried, on the training {plan.scenarios[0].seed_word}"
+    return table(title, columns, rows, caption=caption, best=best)
 
 
 def _best(kind: Kind) -> str:
     return "" if kind.value is None else f"{kind.value:.4g}{'' if kind.consistent else '*'}"
 
 
-def gradient_table(found: GradientResult) -> Table:
+def gradient_table(found: GradientResult, seed_word: str = "seeds") -> Table:
     """Where each start led, and how well the data determine the maximum."""
     rows = [
         ["x ".join(f"{factor:g}" for factor in optimum.start)]
@@ -74,4 +80,4 @@ def gradient_table(found: GradientResult) -> Table:
     ]
     rows.append(["standard error", *errors, "", ""])
     columns = ["start, factors on the rule of thumb", *found.names, "log L", "evaluations"]
-    return table("Maximum of the innovations' likelihood on the training seeds", columns, rows)
+    return table(f"Maximum of the innovations' likelihood on the training {seed_word}", columns, rows)

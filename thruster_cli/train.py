@@ -76,7 +76,7 @@ def command(
         bool,
         typer.Option(
             "--untuned",
-            help="Give the filter R by the sensor's sheet and Q by a rule of thumb.",
+            help="Give the filter R by the sensor's data sheet and Q by a rule of thumb.",
             rich_help_panel=FILTER,
         ),
     ] = False,

@@ -66,12 +66,13 @@ def command(
         bool,
         typer.Option(
             "--no-consistency",
-            help="Do not hold the mean NIS between 0.8 and 1.25 of what is right.",
+            help="Do not hold the mean NIS between 0.8 and 1.25 of its expected value.",
             rich_help_panel=SEARCH,
         ),
     ] = False,
     hold_r: Annotated[
-        bool, typer.Option("--hold-r", help="Leave R at the sensor's sheet, tune Q alone.", rich_help_panel=SEARCH)
+        bool,
+        typer.Option("--hold-r", help="Keep R of the sensor's data sheet, tune Q alone.", rich_help_panel=SEARCH),
     ] = False,
     full_q: Annotated[
         bool, typer.Option("--full-q", help="Tune the correlations of Q, too.", rich_help_panel=SEARCH)
@@ -133,18 +134,18 @@ def command(
 ) -> None:
     """Find the Q, R and ensemble size that make a filter's estimate best, and prove it on held-out seeds.
 
-    The score is the mean over states of RMSE over its bound, on 32 training seeds that every trial shares.
-    The first trial is the rule of thumb: R from the sensor's sheet, Q from 1 % of each state's range. Ctrl-C
+    The score is the mean over states of RMSE over its bound, on 32 training seeds that every trial shares. The
+    first trial is the rule of thumb: R from the sensor's data sheet, Q from 1 % of each state's range. Ctrl-C
     keeps all finished trials: the same command goes on with the study. The report is on 200 seeds that no trial
-    saw, against the scaled default first: the rule of thumb with one factor on its Q that makes the mean NIS on
-    the training runs right.
+    saw, against the scaled default first: the rule of thumb with one factor on its Q that brings the mean NIS
+    (normalised innovation squared) on the training runs to 1.
 
-    RMSE alone hardly tells Q and R: only their ratio matters to the estimate. So the mean NIS is held in a band
-    unless --no-consistency is given, and the report says what that costs. Where no trial is in the band, the one
-    with the least error is written, the report and the file say so, and the exit code is 3.
+    RMSE alone hardly determines Q and R: only their ratio matters to the estimate. So the mean NIS is held in a
+    band unless --no-consistency is given, and the report says what that costs. Where no trial is in the band, the
+    one with the least error is written, the report and the file say so, and the exit code is 3.
 
-    With --log it learns from recorded runs instead, cut into blocks of which every third proves the choice. What
-    is made small is the negative log-likelihood of the innovations, unless the logs hold the true states.
+    With --log it learns from recorded runs instead, cut into blocks of which every third is held out. What is
+    minimised is the negative log-likelihood of the innovations, unless the logs hold the true states.
 
     Example: thruster tune --filter ekf --scenario mismatch --scenario outliers --trials 100
 

@@ -57,9 +57,9 @@ def report(tuning: Tuning) -> list:
 
 def _search_sentences(tuning: Tuning) -> list:
     """What the search itself has to say: sizes, the price of consistency, optimism, a front, a maximum."""
-    result, plan, shown = tuning.result, tuning.plan, []
+    result, plan, word, shown = tuning.result, tuning.plan, tuning.scenario.seed_word, []
     if tuning.gradient is not None:
-        return [gradient_table(tuning.gradient), *_gradient_sentences(tuning)]
+        return [gradient_table(tuning.gradient, tuning.scenario.seed_word), *_gradient_sentences(tuning)]
     kinds = kinds_tried(result.trials)
     if kinds:
         shown.append(kinds_table(kinds, plan))
@@ -74,21 +74,21 @@ def _search_sentences(tuning: Tuning) -> list:
             f"{r.size}: {r.ratio.value:.3f} [{r.ratio.high:.3f}]" for r in result.sizes if r.size in ladder
         )
         shown.append(
-            "Score over the best by ensemble size, on seeds that chose neither Q nor R, with the upper end of its "
-            f"95 % interval: {ratios}. {_size_sentence(kept, result)}{_seeds_sentence(result)}"
+            f"Score over the best by ensemble size, on {word} that chose neither Q nor R, with the upper end of "
+            f"its 95 % interval: {ratios}. {_size_sentence(kept, result)}{_seeds_sentence(result, word)}"
         )
     if result.consistent is False:
         shown.append(_none_consistent(result, plan))
     elif result.free_value is not None:
         price = 100 * (result.best_value / result.free_value - 1)
         shown.append(
-            f"Consistency costs {price:.1f} % of the score on the training seeds: the best trial has "
+            f"Consistency costs {price:.1f} % of the score on the training {word}: the best trial has "
             f"{result.free_value:.3f} whatever its NIS, {result.best_value:.3f} with it in its band."
         )
     if plan.objectives == ("score",):  # which needs truth
         found = sum(proof.tuned.score.value for proof in tuning.proofs) / len(tuning.proofs)
         shown.append(
-            f"Optimism: the best trial scores {result.best_value:.3f} on the training seeds, the tuned filter "
+            f"Optimism: the best trial scores {result.best_value:.3f} on the training {word}, the tuned filter "
             f"{found:.3f} on the held-out ones."
         )
     if result.front:
@@ -97,11 +97,12 @@ def _search_sentences(tuning: Tuning) -> list:
 
 
 def _none_consistent(result: StudyResult, plan: Plan) -> str:
+    word = plan.scenarios[0].seed_word
     ratios = [f"{ratio:.3g}" if isfinite(ratio) else "beyond all numbers" for ratio in result.nis]
     return (
-        f"No trial was consistent: a mean NIS must lie between {NIS_BAND[0]:g} and {NIS_BAND[1]:g} of what is "
-        f"right, but the tuned filter's is {' and '.join(ratios)} on the training seeds. It is the trial with the "
-        f"least {plan.objectives[0]}; do not rely on its covariance."
+        f"No trial was consistent: a mean NIS must lie between {NIS_BAND[0]:g} and {NIS_BAND[1]:g} of its "
+        f"expected value, but the tuned filter's is {' and '.join(ratios)} on the training {word}. It is the "
+        f"trial with the least {plan.objectives[0]}; do not rely on its covariance."
     )
 
 
@@ -119,7 +120,9 @@ def _gradient_sentences(tuning: Tuning) -> list[str]:
         if gradient.agree
         else "Starts lead to different maxima: the best is kept."
     )
-    over = f"Score over Optuna's on the held-out seeds: {span(score_ratio(ours, theirs), 3)}."
+    over = (
+        f"Score over Optuna's on the held-out {tuning.scenario.seed_word}: {span(score_ratio(ours, theirs), 3)}."
+    )
     if not ours.has_truth:
         over = f"Log-likelihood of a held-out run above Optuna's: {span(likelihood_gain(ours, theirs), 2)}."
     words.append(
@@ -221,13 +224,13 @@ def _size_sentence(kept: int, result: StudyResult) -> str:
     return f"No N has its upper end below {1 + SIZE_TOLERANCE:g} on all scenarios; N = {kept} is a compromise."
 
 
-def _seeds_sentence(result: StudyResult) -> str:
-    """Which sizes few seeds left out; empty where all were run on all of them."""
+def _seeds_sentence(result: StudyResult, word: str) -> str:
+    """Which sizes few runs left out; empty where all were run on all of them."""
     counts = {row.seeds for row in result.sizes}
     if len(counts) < 2:
         return ""
     whole = ", ".join(str(row.size) for row in result.sizes if row.seeds == max(counts))
-    return f" The first {min(counts)} seeds left out the others before N = {whole} were run on {max(counts)}."
+    return f" The first {min(counts)} {word} left out the others before N = {whole} were run on {max(counts)}."
 
 
 def _consistency_sentence(evaluation: Evaluation) -> str:

@@ -1,4 +1,4 @@
-"""What can be measured of a thruster.
+"""Channels: quantities of a thruster that can be measured.
 
 The functions are of the state x = (omega_m, U_a), the outputs y = (T,), the input u = (V_s,) and the constants c
 of the equations of motion; the derivatives of T by the state are dy[0].

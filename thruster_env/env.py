@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 
@@ -82,7 +84,7 @@ class BowThrusterEnv(ModelledThruster, RenderedThruster, PlantEnv):
         self.task = make_task(**{**of_task, "reference": self._reference_signals(of_task["reference"])})
         m, top = len(plant.channels), plant.max_voltage
         measurement = slice(READINGS, READINGS + m)
-        info = {
+        info: dict[str, int | slice] = {
             "state": slice(OMEGA, FLOW + 1),
             "thrust": THRUST,
             "measurement": measurement,
@@ -111,4 +113,5 @@ class BowThrusterEnv(ModelledThruster, RenderedThruster, PlantEnv):
         """The parameters of this episode, which differ from the plant's where these are uncertain."""
         keys = self._memory[:1, KEY_0 : KEY_1 + 1, 0]
         drawn = drawn_parameters(self.plant.parameters, self.plant.uncertainty, keys)
-        return drawn._replace(**{name: float(getattr(drawn, name)[0]) for name in self.plant.uncertainty})
+        values: dict[str, Any] = {name: float(getattr(drawn, name)[0]) for name in self.plant.uncertainty}
+        return drawn._replace(**values)

@@ -1,17 +1,17 @@
-"""The thruster as logs show it: with a dead band, and sensors that have a bias and lag behind.
+"""The thruster of recorded logs: with a dead band, and with sensors that have a bias and a lag.
 
-    V = V_s less what of it is within the dead band,  low <= 0 <= high
-    z_i = h_i(x) + bias_i + v_i,  or with y' = (h_i(x) - y)/tau, of a sensor that lags,  z_i = y + bias_i + v_i
+    V = V_s behind the dead band (low, high),  low <= 0 <= high
+    z_i = h_i(x) + bias_i + v_i,  or, for a sensor with lag tau,  z_i = y + bias_i + v_i with y' = (h_i(x) - y)/tau
 
-Thrust that differs ahead and astern is `thrust_asymmetry` of the parameters. Without any of it the model is
-that of `thruster_env.model`.
+A thrust that differs ahead and astern is the parameter `thrust_asymmetry`. Without all of these the model is that
+of `thruster_env.model`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,7 +37,8 @@ _FURTHER = (
     *(f"kept_{place}" for place in range(MAX_CHANNELS)),  # what a lagging sensor keeps over a substep,
     *(f"after_{place}" for place in range(MAX_CHANNELS)),  # and what it takes of the value behind it
 )
-LoggedConstants = NamedTuple("LoggedConstants", [(name, float) for name in (*Constants._fields, *_FURTHER)])
+_named_tuple: Any = NamedTuple  # type checkers know fields only where they are written out
+LoggedConstants = _named_tuple("LoggedConstants", [(name, float) for name in (*Constants._fields, *_FURTHER)])
 """`dynamics.Constants`, and what logs show beside."""
 
 
@@ -45,7 +46,7 @@ NO_BAND = 0.0, 0.0
 
 
 class Shown(NamedTuple):
-    """What logs show beside the equations of motion."""
+    """What logs contain beside the equations of motion: dead band, bias and lag."""
 
     dead_band_low: float = 0.0  # [V]
     dead_band_high: float = 0.0  # [V]
@@ -88,11 +89,12 @@ def logged_model(
 ) -> StateSpaceModel:
     """`thruster_model` with a dead band, biases and lags.
 
-    A sensor that lags has a state behind the two of the thruster: what it would show without bias and noise. Of a
-    preset file the recorder is taken, too: bias, lag, ambient flow, Q and R, as far as no arguments say otherwise.
+    Each sensor with a lag adds a state behind the two of the thruster: its reading without bias and noise. From a
+    preset file the recorder is taken, too: bias, lag, ambient flow, Q and R, unless arguments say otherwise.
+    Covariances are per step and do not scale with dt.
 
     Args:
-        dead_band: voltages (low, high) within which the motor has none [V], or half of a symmetric band.
+        dead_band: ends (low, high) of the dead band [V], or half the width of a symmetric one.
         bias: of channels, in their units.
         lag: time constants of channels [s].
         operating_voltage: as for `thruster_model`.
@@ -112,7 +114,7 @@ def logged_model(
 def logged_plant(*, dead_band=None, bias=None, lag=None, **plant_arguments) -> tuple[Plant, Shown]:
     """A plant, and what logs show beside, as `logged_model` takes both."""
     preset = plant_arguments.get("preset")
-    recorder = read_preset(preset).recorder if is_file(preset) else {}
+    recorder = read_preset(preset).recorder if preset is not None and is_file(preset) else {}
     own = {name: value for name, value in recorder.items() if name not in BY_CHANNEL}
     if plant_arguments.get("dt", own.get("dt")) != own.get("dt"):  # of which Q is
         own.pop("process_noise_cov", None)
@@ -135,9 +137,10 @@ def with_shown(base: StateSpaceModel, plant: Plant, seen: Shown, *, always: bool
         return base
     channels, lags, biases = plant.channels, dict(seen.lag), dict(seen.bias)
     lagging = tuple(channel in lags for channel in channels)
-    step = base.constants.substep
+    of_plant = Constants(*base.constants)
+    step = of_plant.substep
     constants = LoggedConstants(
-        *base.constants,
+        *of_plant,
         seen.dead_band_low,
         seen.dead_band_high,
         *_by_place(biases.get(channel, 0.0) for channel in channels),
@@ -218,7 +221,7 @@ def _functions(channels: tuple[str, ...], lagging: tuple[bool, ...]) -> tuple[Ca
     places = [i for i, lags_behind in enumerate(lagging) if lags_behind]
     n = 2 + len(places)
     state_of = {channel: 2 + number for number, channel in enumerate(places)}
-    names = {
+    names: dict[str, Any] = {
         "substep": substep,
         "substep_jacobian": substep_jacobian,
         "outside": outside,
@@ -227,12 +230,12 @@ def _functions(channels: tuple[str, ...], lagging: tuple[bool, ...]) -> tuple[Ca
     }
     drive = "v = outside(u[0], c.dead_band_low, c.dead_band_high), c.ambient_velocity"
     move = drive, "s = substep((x[0], x[1]), v, c)"
-    look = ("y = read((x[0], x[1]), c)", "z = read(s, c)") if places else ()
+    reads = ("y = read((x[0], x[1]), c)", "z = read(s, c)") if places else ()
     lags = [
         f"c.kept_{i} * x[{state_of[i]}] + (1.0 - c.kept_{i} - c.after_{i}) * y[{i}] + c.after_{i} * z[{i}]"
         for i in places
     ]
-    transition = written_out("transition", "x, u, c", *move, *look, tuple_of(["s[0]", "s[1]", *lags]), **names)
+    transition = written_out("transition", "x, u, c", *move, *reads, tuple_of(["s[0]", "s[1]", *lags]), **names)
     lines = [*move, "a = substep_jacobian((x[0], x[1]), v, c)"]
     lines += ["b = read_slopes((x[0], x[1]), c)", "d = read_slopes(s, c)"] if places else []
 

@@ -1,10 +1,11 @@
-"""The thruster as a `StateSpaceModel`: what a filter assumes of it."""
+"""The thruster as a `StateSpaceModel`: the model that a filter assumes."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from thruster_env.dynamics import (
     thrust_and_torque,
     thrust_and_torque_tangent,
 )
+from thruster_env.linear.analysis import LinearModel
 from thruster_env.linear.steady_state import steady_state
 from thruster_env.parameters import ThrusterParameters, checked
 from thruster_env.plant import Plant, make_plant
@@ -81,12 +83,18 @@ def thruster_model(
     prior_cov_factor: float = 1.0,
     **plant_arguments,
 ) -> StateSpaceModel:
-    """What a filter assumes of a thruster, from plain arguments that JSON can hold.
+    """The model of a thruster that a filter assumes, from plain arguments that JSON can hold.
+
+        x_{k+1} = F(x_k, V_s) + w,  w ~ N(0, Q);   z_k = h(x_k) + v,  v ~ N(0, R);   x = (omega_m, U_a)
+
+    F integrates the equations of `thruster_env.dynamics` over one sample time. Covariances are per step and do not
+    scale with dt: another dt needs another Q.
 
     Args:
         parameter_factors: factors on fields of `ThrusterParameters`, by which the assumed thruster differs.
-        operating_voltage: where a Kalman filter approximates the model [V]; half of max_voltage if None.
-        prior_cov_factor: P_0, the covariance of the filter's prior, over that of the plant's initial state.
+        operating_voltage: voltage about which a Kalman filter linearises the model [V]; half of max_voltage if
+            None.
+        prior_cov_factor: P_0, the covariance of the filter's prior, divided by that of the plant's initial state.
         **plant_arguments: those of `thruster_env.plant.make_plant`; the noise covariances are the filter's.
 
     Raises:
@@ -109,7 +117,7 @@ def model_of_plant(
     measurement_noise_cov=None,
     prior_cov_factor: float = 1.0,
 ) -> StateSpaceModel:
-    """The model of a plant, exact unless told otherwise; see `thruster_model` for the arguments."""
+    """The model of a plant, exact unless changed; see `thruster_model` for the arguments."""
     if plant.linear is not None and parameter_factors:
         raise ValueError(f"parameter_factors must be none for a linear plant, but got {parameter_factors}")
     if parameter_factors is not None:
@@ -125,7 +133,7 @@ def model_of_plant(
         operating_voltage = plant.max_voltage / 2
     operating_voltage = finite("operating_voltage", operating_voltage)
     if plant.linear is not None:
-        return _linear_model(plant)
+        return _linear_model(plant, plant.linear)
     of_channels, of_channels_jacobian = channel_functions(plant.channels)
     model = StateSpaceModel(
         transition=transition,
@@ -161,7 +169,7 @@ MODEL_ARGUMENTS = tuple(inspect.signature(model_of_plant).parameters)[1:]
 
 
 def overlay_of(label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
-    """What a rendered thruster shows of a belief: the state and its thrust, each with a standard deviation."""
+    """Overlay of a belief on a rendered thruster: the state and its thrust, each with a standard deviation."""
     # A model may have more states, such as parameters, behind these two.
     (omega, flow), (omega_std, flow_std) = mean[:2].tolist(), np.sqrt(np.diag(cov))[:2].tolist()
     if not isinstance(model.constants, Constants):  # a linear plant's model
@@ -172,17 +180,17 @@ def overlay_of(label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.nda
     return Overlay(label, thrust, thrust_std, omega, omega_std, flow, flow_std)
 
 
-def _linear_model(plant: Plant) -> StateSpaceModel:
+def _linear_model(plant: Plant, linear: LinearModel) -> StateSpaceModel:
     """The exact model of a plant that moves by a published linear system."""
-    a, b = zero_order_hold(plant.linear.a, plant.linear.b, plant.dt)
+    a, b = zero_order_hold(linear.a, linear.b, plant.dt)
     _check_channels(
         "of a linear model", plant.channels, lambda channel: channel.slopes is not None and channel.affine
     )
-    rest = np.zeros(2)
+    rest, slopes = np.zeros(2), [CHANNELS[name].slopes for name in plant.channels]
     return affine_model(
         a=a,
         b=b[:, :1],
-        c=[CHANNELS[name].slopes(rest, plant.linear.c, None) for name in plant.channels],
+        c=[slope(rest, linear.c, None) for slope in slopes if slope is not None],
         state_offset=b[:, 1] * plant.ambient_velocity,
         process_noise_cov=plant.process_noise_cov,
         measurement_noise_cov=plant.measurement_noise_cov,
@@ -203,7 +211,7 @@ def _operating_points(plant: Plant, count: int) -> list[tuple[tuple[float, float
     return [(steady_state(plant.parameters, v, plant.ambient_velocity)[:2], (v,)) for v in voltages]
 
 
-def _operating_range(plant: Plant) -> dict[str, np.ndarray]:
+def _operating_range(plant: Plant) -> dict[str, Any]:
     """Smallest and largest state that the voltages settle to, ambient flow added."""
     ends = [steady_state(plant.parameters, sign * plant.max_voltage)[:2] for sign in (1.0, -1.0)]
     flow = np.array([0.0, plant.ambient_velocity])

@@ -1,4 +1,4 @@
-"""What every bow thruster env, single or in number, offers to filters."""
+"""What every bow thruster env and vector env offers to filters."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class ModelledThruster(ModelledEnv):
-    """An env with a `plant`, of which it offers the model; changes are those of `model.model_of_plant`."""
+    """An env with a `plant` that offers its model to filters; changes are those of `model.model_of_plant`."""
 
     plant_name = "a bow thruster"
     plant: Plant

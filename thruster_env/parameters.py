@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -48,7 +48,7 @@ class ThrusterParameters(NamedTuple):
 
 def checked(parameters: ThrusterParameters) -> ThrusterParameters:
     """Return the parameters as floats; raise ValueError that names the rule and the value if one is off."""
-    values = {}
+    values: dict[str, Any] = {}
     for name, value in parameters._asdict().items():
         if name == "angles":
             values[name] = one_of("angles", value, ANGLES)
@@ -175,6 +175,11 @@ PRESETS: dict[str, ThrusterParameters] = {
     "open_bladed_corrected": OPEN_BLADED_CORRECTED,
     "t200": T200,
 }
+
+
+LARGEST_VOLTAGE = {
+    "t200": 13.3
+}  # [V], that the data behind a preset reach; of the others plant.DEFAULT_MAX_VOLTAGE
 
 
 def preset_parameters(preset: str | Mapping | ThrusterParameters) -> ThrusterParameters:

@@ -1,4 +1,4 @@
-"""The noisy plant as plain arguments: a thruster, its noise and sensors, and what disturbs it."""
+"""The noisy plant from plain arguments: a thruster, its noise, sensors and disturbances."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from thruster_env.effects.flow import FLOW_SIGNALS
 from thruster_env.effects.uncertainty import LogNormal, Uniform, extreme_parameters, make_uncertainty
 from thruster_env.linear.analysis import LinearModel
 from thruster_env.linear.steady_state import required_substeps, steady_state
-from thruster_env.parameters import ThrusterParameters, derive_constants, preset_and_dead_band
+from thruster_env.parameters import LARGEST_VOLTAGE, ThrusterParameters, derive_constants, preset_and_dead_band
+from thruster_env.preset_file import is_file, read_preset
 
 DEFAULT_DT = 0.01  # [s], the sample time of the published experiments
 DEFAULT_MAX_VOLTAGE = 24.0  # [V]
-# Tunnel, signal to noise: w stirs motor and flow by 0.5 % of their values at 12 V each step (in stationarity
+# Tunnel, signal to noise: w drives motor and flow by 0.5 % of their values at 12 V each step (in stationarity
 # 1.15 rad/s and 0.035 m/s at 12 V); v is 0.5 N, 4 % of the thrust at 12 V, 16 % at 6 V and 65 % at 3 V.
 DEFAULT_PROCESS_NOISE = (1.0, 4e-4)  # variances a step, [(rad/s)^2, (m/s)^2]
 DEFAULT_MEASUREMENT_NOISE = CHANNELS["thrust"].variance  # [N^2]
@@ -68,6 +69,13 @@ class Plant(NamedTuple):
         return dropping_channels(self.sensors)
 
 
+def largest_known_voltage(preset) -> float:
+    """The voltage up to which a preset is known [V]: what the logs of an identified one reached, or its data."""
+    if is_file(preset):
+        return float(read_preset(preset).identified.get("largest_voltage", DEFAULT_MAX_VOLTAGE))
+    return LARGEST_VOLTAGE.get(preset, DEFAULT_MAX_VOLTAGE) if isinstance(preset, str) else DEFAULT_MAX_VOLTAGE
+
+
 def make_plant(
     preset: str | Mapping | ThrusterParameters = "tunnel",
     dt: float = DEFAULT_DT,
@@ -87,19 +95,19 @@ def make_plant(
     Args:
         preset: a preset's name, a preset FILE.toml, a mapping of all fields of `ThrusterParameters`, or one of
             these; a file or a mapping may have a dead band, too.
-        dt: sample time [s].
+        dt: sample time [s]. Covariances are per step and do not scale with dt.
         max_voltage: voltages are clipped to plus and minus this [V].
         ambient_velocity: flow U_0 along the thruster's axis [m/s].
-        process_noise_cov: Q, covariance (2, 2) or two variances a step; zero allowed.
-        measurement_noise_cov: R, covariance (m, m) or m variances; zero allowed. None for the defaults of
-            `channels.CHANNELS`.
+        process_noise_cov: Q, covariance (2, 2) or two variances per step [(rad/s)^2, (m/s)^2]; zero allowed.
+        measurement_noise_cov: R, covariance (m, m) or m variances, in the channels' units squared; zero allowed.
+            None for the defaults of `channels.CHANNELS`.
         initial_state: None for N(0, diag(1, 0.01)), a fixed state [omega_m, U_a], or a mapping:
             {"voltage": V} for the steady state of V volts, {"mean": [..], "cov": [..]} for a distribution.
         sensors: None for the thrust alone, a list of channels of `channels.CHANNELS`, or a mapping from
             channels to lists of effects, {"thrust": [{"name": "dropout", "probability": 0.1}]}.
         flow: signals of `flow.FLOW_SIGNALS` that add to ambient_velocity.
         amplifier: effects of `amplifier.AMPLIFIER_EFFECTS` between the commanded voltage and the motor.
-        substeps: Runge-Kutta steps a sample time; None for the fewest that hold `linear.ONE_STEP_ACCURACY`.
+        substeps: Runge-Kutta steps per sample time; None for the fewest that reach `linear.ONE_STEP_ACCURACY`.
         uncertainty: distributions of factors on parameters, {"load_gain": {"name": "log-normal", "std": 0.1}}.
 
     Raises:

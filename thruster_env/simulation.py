@@ -1,4 +1,4 @@
-"""Whole trajectories of a plant, without an env around it."""
+"""Trajectories of a plant, without an env around it."""
 
 from __future__ import annotations
 

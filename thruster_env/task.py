@@ -1,4 +1,4 @@
-"""What an env asks for: a reference thrust, and the weights of the reward's terms."""
+"""The task of an env: a reference thrust, and the weights of the reward's terms."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ def make_task(
         ValueError: states the rule and the value.
     """
     weights = {"tracking": tracking_weight, "energy": energy_weight, "voltage_rate": voltage_rate_weight}
-    checked = (positive(f"{name}_weight", value, zero_allowed=True) for name, value in weights.items())
-    checked = [
-        within(f"{name}_weight", value, LARGEST_WEIGHT) for name, value in zip(weights, checked, strict=True)
-    ]
-    return Task(REFERENCE_SIGNALS.make(reference), tuple(checked))
+    tracking, energy, voltage_rate = (
+        within(f"{name}_weight", positive(f"{name}_weight", value, zero_allowed=True), LARGEST_WEIGHT)
+        for name, value in weights.items()
+    )
+    return Task(REFERENCE_SIGNALS.make(reference), (tracking, energy, voltage_rate))
 
 
 def thrust_scale(plant: Plant) -> float:
@@ -80,8 +80,8 @@ def state_limits(plant: Plant) -> np.ndarray:
     if plant.linear is not None:
         speed, flow, _ = equilibrium(plant.linear, (plant.max_voltage, plant.ambient_velocity))
         # The open-bladed system hardly answers to the voltage: its noise is larger than its range.
-        stirred = np.sqrt(np.diag(plant.initial_cov)) + np.sqrt(np.diag(plant.process_noise_cov))
-        return ABSURD * (2 * np.abs([speed, flow]) + np.abs(plant.initial_mean) + stirred)
+        spread = np.sqrt(np.diag(plant.initial_cov)) + np.sqrt(np.diag(plant.process_noise_cov))
+        return ABSURD * (2 * np.abs([speed, flow]) + np.abs(plant.initial_mean) + spread)
     flow = abs(plant.ambient_velocity)
     turned_by_flow = np.array([flow / plant.constants.blade_speed, flow])
     return ABSURD * (state_range(plant.parameters, plant.max_voltage) + turned_by_flow)

@@ -40,7 +40,8 @@ class BowThrusterReversalEnv(BowThrusterTrackingEnv):
     """A ship's bow thruster: follow a reference thrust that crosses zero, ahead and astern.
 
     As `BowThrusterTrackingEnv`; by default the reference runs in straight lines of 1 s between levels drawn from
-    -0.6 to 0.6 of the steady thrust at max_voltage. Near zero the thrust tells hardly anything of the state.
+    -0.6 to 0.6 of the steady thrust at max_voltage. Near zero the thrust contains hardly any information on the
+    state.
     """
 
     default_reference = ({"name": "ramps", "low": -0.6, "high": 0.6, "hold_time": 1.0},)

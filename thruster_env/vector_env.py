@@ -1,6 +1,8 @@
-"""The envs in number: all copies advanced by one compiled call, noise included."""
+"""The vector envs: all copies advanced by one compiled call, noise included."""
 
 from __future__ import annotations
+
+from typing import ClassVar
 
 from plants.vector_env import PlantVectorEnv
 from thruster_env.env import BowThrusterEnv
@@ -9,28 +11,28 @@ from thruster_env.tasks import BowThrusterLinearEnv, BowThrusterReversalEnv, Bow
 
 
 class BowThrusterVectorEnv(ModelledThruster, PlantVectorEnv):
-    """`BowThruster-v0` in number; see `PlantVectorEnv`. Uncertain parameters are drawn for each copy and episode.
+    """Vector env of `BowThruster-v0`; see `PlantVectorEnv`. Uncertain parameters are drawn per copy and episode.
 
     `num_envs`, `max_episode_steps` and `autoreset_mode` are those of `PlantVectorEnv`, the others those of the
     single env.
     """
 
-    single_env: type[BowThrusterEnv] = BowThrusterEnv
+    single_env: ClassVar[type[BowThrusterEnv]] = BowThrusterEnv
 
 
 class BowThrusterTrackingVectorEnv(BowThrusterVectorEnv):
-    """`BowThrusterTracking-v0` in number."""
+    """Vector env of `BowThrusterTracking-v0`."""
 
     single_env = BowThrusterTrackingEnv
 
 
 class BowThrusterReversalVectorEnv(BowThrusterVectorEnv):
-    """`BowThrusterReversal-v0` in number."""
+    """Vector env of `BowThrusterReversal-v0`."""
 
     single_env = BowThrusterReversalEnv
 
 
 class BowThrusterLinearVectorEnv(BowThrusterVectorEnv):
-    """`BowThrusterLinear-v0` in number."""
+    """Vector env of `BowThrusterLinear-v0`."""
 
     single_env = BowThrusterLinearEnv

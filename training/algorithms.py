@@ -1,8 +1,8 @@
 """Algorithms of Stable-Baselines3 by name, with hyperparameters that suit the thruster.
 
-The voltage sets the thrust of the very next step, and a controller that looks one step ahead does as well as one
-that looks ahead further (docs/policies.md), so a short horizon (gamma 0.5) suffices, and what is to be learnt from
-is less noisy. `hyperparams/` has the same numbers for rl_zoo3.
+The voltage sets the thrust of the next step, and a controller with a horizon of one step is as good as one with a
+longer horizon (docs/policies.md). So a short horizon (gamma 0.5) suffices, and returns are less noisy.
+`hyperparams/` has the same hyperparameters for rl_zoo3.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 from numerics.checks import one_of
 from training.extras import check_installed
 
-PPO_STEPS = 98 * 64 * 64  # whole rollouts of 64 steps of 64 copies: the learning rate ends at zero
+PPO_STEPS = 98 * 64 * 64  # complete rollouts of 64 steps of 64 copies: the learning rate ends at zero
 LAYERS = {"net_arch": [64, 64, 64]}
 ON_POLICY = {"gamma": 0.5, "gae_lambda": 0.9, "n_epochs": 5, "policy_kwargs": {**LAYERS, "log_std_init": -1.0}}
 OFF_POLICY = {
@@ -28,7 +28,7 @@ OFF_POLICY = {
     "policy_kwargs": LAYERS,
 }
 
-# What else may be said of an algorithm, all of it numbers; not where it writes, nor classes and functions.
+# Hyperparameters that may be given, all plain data: neither output paths nor classes or functions.
 HYPERPARAMETERS = (
     *("learning_rate", "gamma", "gae_lambda", "n_steps", "n_epochs", "batch_size", "policy_kwargs", "noise_std"),
     *("clip_range", "clip_range_vf", "normalize_advantage", "ent_coef", "vf_coef", "max_grad_norm", "target_kl"),
@@ -51,14 +51,14 @@ POLICY_ARGUMENTS = (
 
 
 class Algorithm(NamedTuple):
-    """An algorithm and what it is given by default."""
+    """An algorithm and its defaults."""
 
     about: str
     module: str
     policy: str
     steps: int
     num_envs: int
-    hyperparameters: Mapping  # learning_rate: at the start; it falls linearly to zero
+    hyperparameters: Mapping  # learning_rate: the initial one; it falls linearly to zero
 
     @property
     def name(self) -> str:
@@ -74,7 +74,7 @@ class Algorithm(NamedTuple):
 
 ALGORITHMS: dict[str, Algorithm] = {
     "ppo": Algorithm(
-        "proximal policy optimisation, on-policy; the fastest by the clock",
+        "proximal policy optimisation, on-policy; the shortest training time",
         "stable_baselines3:PPO",
         "MlpPolicy",
         PPO_STEPS,
@@ -82,7 +82,7 @@ ALGORITHMS: dict[str, Algorithm] = {
         {**ON_POLICY, "n_steps": 64, "batch_size": 256, "learning_rate": 1e-3},
     ),
     "sac": Algorithm(
-        "soft actor-critic, off-policy; few steps, each of them slow",
+        "soft actor-critic, off-policy; few steps, but each one is slow",
         "stable_baselines3:SAC",
         "MlpPolicy",
         40_000,
@@ -95,10 +95,10 @@ ALGORITHMS: dict[str, Algorithm] = {
         "MlpPolicy",
         40_000,
         16,
-        {**OFF_POLICY, "noise_std": 0.1},  # of actions, for its policy explores by nothing else
+        {**OFF_POLICY, "noise_std": 0.1},  # of actions: its only exploration
     ),
     "recurrent-ppo": Algorithm(
-        "PPO with an LSTM, which may learn a filter of its own; very slow",
+        "PPO with an LSTM, which may learn its own filter; very slow",
         "sb3_contrib:RecurrentPPO",
         "MlpLstmPolicy",
         PPO_STEPS,

@@ -1,7 +1,7 @@
-"""What a setup may hold: names that are known, and arguments that env, filter and algorithm have, all data.
+"""Checks of a training configuration: known names, and known arguments of env, filter and algorithm, all data.
 
-A setup is read from a policy's folder, where somebody else may have written it. So no entry of it reaches
-Gymnasium, a filter or Stable-Baselines3 that has not been looked at here, before any other file is opened.
+It is read from a policy's folder, which somebody else may have written. So every entry is checked here before it
+reaches Gymnasium, a filter or Stable-Baselines3, and before any other file is opened.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING
 from filters.registry import tunable_numbers
 from numerics.checks import at_least, one_of, positive, shown
 from training.algorithms import HYPERPARAMETERS, POLICY_ARGUMENTS, find_algorithm
-from training.observations import find_arm
+from training.observations import find_observation_set
 from training.plants.find import plant_of
 
 if TYPE_CHECKING:
-    from training.setup import Setup
+    from training.setup import TrainingConfiguration
 
 
-def check_setup(setup: Setup) -> None:
-    """Raise ValueError, with rule and value, if a setup holds anything that is no data or that nobody knows."""
+def check_configuration(setup: TrainingConfiguration) -> None:
+    """Raise ValueError, with rule and value, for an entry of a configuration that is unknown or not data."""
     plant = plant_of(setup.task)
     one_of("env_id", setup.env_id, (plant.tasks[setup.task].env_id,))
-    arm, algorithm = find_arm(setup.observe), find_algorithm(setup.algo)
+    observed, algorithm = find_observation_set(setup.observe), find_algorithm(setup.algo)
     if not isinstance(setup.scenario, str):
         raise ValueError(f"scenario must be a name, but got {shown(setup.scenario)}")
     for name, least in (("steps", 1), ("seed", 0), ("num_envs", 1)):
@@ -33,7 +33,7 @@ def check_setup(setup: Setup) -> None:
         one_of("controller", setup.controller, plant.correctable)
         plant.check_observes(setup.controller, setup.observe)
     positive("share", setup.share)
-    own = () if arm.filter is None else (*tunable_numbers(arm.filter), *plant.model_arguments)
+    own = () if observed.filter is None else (*tunable_numbers(observed.filter), *plant.model_arguments)
     _check_known("env_arguments", setup.env_arguments, plant.env_arguments)
     _check_known(f"filter_arguments of observe={setup.observe!r}", setup.filter_arguments, own)
     if setup.assumed_plant is not None:
@@ -57,6 +57,7 @@ def _check_known(name: str, given, known: Iterable[str]) -> None:
 
 def _check_data(name: str, value) -> None:
     """Raise ValueError unless a value is made of text, finite numbers, lists and mappings, as JSON has them."""
+    parts: list | tuple
     if isinstance(value, Mapping):
         parts = [*value.keys(), *value.values()]
     else:

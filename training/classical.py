@@ -1,21 +1,18 @@
-"""Classical policies for the same tables: each observes what an arm of `training.observations` does.
-
-So it stands beside the policy that learnt on that arm.
-"""
+"""Classical policies on the observation sets of `training.observations`, for comparison with learnt policies."""
 
 from __future__ import annotations
 
 from numerics.checks import one_of
 from training.controllers import ClassicalPolicy
 from training.plants.find import plant_of
-from training.setup import Setup
+from training.setup import TrainingConfiguration
 
 
-def classical_policy(name: str, setup: Setup) -> ClassicalPolicy:
-    """A classical policy by the name of its controller, on what a setup observes.
+def classical_policy(name: str, setup: TrainingConfiguration) -> ClassicalPolicy:
+    """A classical policy by the name of its controller, on the observation set of a training configuration.
 
     Raises:
-        ValueError: for an unknown name, or where a controller of states observes none.
+        ValueError: for an unknown name, or a controller of states on an observation set without states.
     """
     plant = plant_of(setup.task)
     one_of("controller", name, plant.controllers)

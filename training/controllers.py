@@ -9,12 +9,14 @@ import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
+from training.spaces import size_of
+
 
 class Controller(Protocol):
-    """What acts on observations (n, d) as the env gives them, in the units of its inputs."""
+    """A controller that acts on observations (n, d) of the env, in the units of its inputs."""
 
     def predict(self, observation, state=None, episode_start=None):
-        """Inputs (n, p), and what the controller remembers."""
+        """Inputs (n, p), and the controller's state."""
 
 
 @dataclass(frozen=True)
@@ -22,19 +24,19 @@ class ClassicalPolicy:
     """A controller of a plant with the observations and actions of learnt policies."""
 
     controller: Controller
-    skipped: int  # entries in front of what the controller reads
+    skipped: int  # entries before those that the controller reads
     half: float | np.ndarray  # half of the range of each input, in its unit: the voltage's is max_voltage ...
     middle: float | np.ndarray = 0.0  # ... about this
-    keeps_input: bool = False  # whether what it remembers begins with its last input
+    keeps_input: bool = False  # whether its state begins with its last input
 
     def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
-        """Actions (n, p) in [-1, 1] for observations (n, d), and what the controller remembers."""
+        """Actions (n, p) in [-1, 1] for observations (n, d), and the controller's state."""
         seen = np.asarray(observation)[..., self.skipped :]
         inputs, state = self.controller.predict(seen, state, episode_start)
         return (inputs - self.middle) / self.half, state
 
     def tell(self, state: np.ndarray, actions: np.ndarray) -> None:
-        """Put the actions (n, p) that were really applied in place of the last ones that a state remembers."""
+        """Replace the last actions in a state by those that were applied, (n, p)."""
         if self.keeps_input:
             state[:, 0] = self.middle + self.half * actions[:, 0]
 
@@ -42,19 +44,20 @@ class ClassicalPolicy:
 class CorrectController(VecEnvWrapper):
     """Let a policy correct a controller: a = clip(a_c + share a_p) of the two actions, each in [-1, 1].
 
-    What the controller would do is shown behind the observation. A policy that does nothing is the controller.
+    The controller's action is appended to the observation. With a policy of zero action the result is the
+    controller.
     Source: T. Johannink et al. (2019), "Residual reinforcement learning for robot control", ICRA, 6023-6029.
 
     Args:
-        venv: envs that observe what the controller needs, with actions in [-1, 1].
-        controller: what is corrected.
-        share: the largest correction, as a part of half of each input's range.
+        venv: envs whose observations the controller takes, with actions in [-1, 1].
+        controller: the controller that is corrected.
+        share: the largest correction, as a fraction of half of each input's range.
     """
 
     def __init__(self, venv: VecEnv, controller: ClassicalPolicy, share: float):
         """Wrap the envs; see the class."""
         self._controller, self._share = controller, share
-        size = venv.observation_space.shape[0] + venv.action_space.shape[0]
+        size = size_of(venv.observation_space) + size_of(venv.action_space)
         super().__init__(venv, gym.spaces.Box(-np.inf, np.inf, (size,), np.float32))
 
     def reset(self) -> np.ndarray:
@@ -64,7 +67,7 @@ class CorrectController(VecEnvWrapper):
         return np.concatenate([observations, self._actions], axis=1)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Correct what the controller does."""
+        """Correct the controller's actions."""
         applied = np.clip(self._actions + self._share * np.clip(actions, -1.0, 1.0), -1.0, 1.0)
         self._controller.tell(self._state, applied)
         self.venv.step_async(applied.astype(np.float32))

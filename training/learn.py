@@ -1,4 +1,4 @@
-"""Train a policy: evaluation, checkpoints, TensorBoard, and going on where a run was interrupted."""
+"""Train a policy, with evaluations, checkpoints and TensorBoard; an interrupted training can be continued."""
 
 from __future__ import annotations
 
@@ -30,34 +30,34 @@ from training.saved import (
     latest_checkpoint,
     load,
     mend,
-    read_setup,
+    read_configuration,
     remove,
     reopen,
     save,
     whole,
 )
-from training.setup import Setup
+from training.setup import TrainingConfiguration
 from tuning.problems.seeds import SEEDS_APART, training_seeds
 from tuning.search.interruption import stop_on_interrupt
 
-VALIDATION_EPISODES = 32  # of an evaluation in the course of training; always the same ones
+VALIDATION_EPISODES = 32  # of an evaluation during training; always the same ones
 KEPT = 2  # checkpoints
 OnProgress = Callable[[int, float], None]  # steps, and the mean return of the last evaluation (NaN before it)
 
 
 class Trained(NamedTuple):
-    """How a training went."""
+    """The result of a training."""
 
     folder: Path
-    steps: int  # in all
-    learnt: int  # of them in this call
+    steps: int  # total number
+    learnt: int  # number in this call
     seconds: float  # of this call
     curve: list[tuple[int, float]]  # steps and mean return of each evaluation
     interrupted: bool
 
 
 def train(
-    setup: Setup,
+    setup: TrainingConfiguration,
     folder: str | Path,
     *,
     evaluations: int = 20,
@@ -69,16 +69,16 @@ def train(
     """Train a policy until it has learnt from `setup.steps` steps, and save it.
 
     The folder gets `final/`, `best/` (by evaluation), `checkpoints/`, the evaluations and TensorBoard's files. If
-    it holds a training of the same setup, this one goes on from its latest checkpoint, with other episodes.
-    Ctrl-C ends it after the running step and saves a checkpoint.
+    it holds a training with the same configuration, this one continues from its latest checkpoint, with other
+    episodes. Ctrl-C ends it after the running step and saves a checkpoint.
 
     Args:
-        setup: what is learnt.
-        folder: where everything goes.
-        evaluations: how often the policy is evaluated, on the same episodes each time; none of them is held out.
-        checkpoints: how often it is saved meanwhile; the last two are kept.
+        setup: the training configuration.
+        folder: folder of all results.
+        evaluations: number of evaluations of the policy, always on the same episodes; none of them is held out.
+        checkpoints: number of checkpoints; the last two are kept.
         native: whether all copies are stepped in one call.
-        tensorboard: whether to write what TensorBoard shows.
+        tensorboard: whether to write logs for TensorBoard.
         on_progress: called after each step of the envs.
 
     Raises:
@@ -90,7 +90,7 @@ def train(
     envs = make_environments(setup, seeds[VALIDATION_EPISODES:], native=native)
     validation = make_environments(setup, seeds[:VALIDATION_EPISODES])
     model = _model(setup, envs, start, folder / "tensorboard" if tensorboard else None)
-    # A model seeds its envs anew, all by its own seed; and one that goes on has seen the first episodes.
+    # A model seeds its envs again, by its own seed; and a continued training has had the first episodes.
     seed_episodes(envs, _episodes_after(setup, model.num_timesteps))
     evaluation = _Evaluation(
         setup, folder, validation, seeds[:VALIDATION_EPISODES], evaluations, model.num_timesteps
@@ -120,7 +120,7 @@ def train(
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Within this context torch works on one thread, which is quickest for networks this small."""
+    """Within this context torch uses one thread, which is fastest for such small networks."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -129,28 +129,30 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _start(folder: Path, setup: Setup) -> Path | None:
-    """The saved policy to go on from, if any."""
+def _start(folder: Path, setup: TrainingConfiguration) -> Path | None:
+    """The saved policy to continue from, if any."""
     mend(folder)
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return None
     if not (folder / SETUP).is_file():
         raise ValueError(f"the folder must be new, empty or that of a training, but {folder} holds other things")
-    differences = read_setup(folder).differences(setup)
+    differences = read_configuration(folder).differences(setup)
     if differences:
-        rule = f"{folder} must hold a training of the same setup to go on with, but differs in"
+        rule = f"{folder} must hold a training of the same configuration to go on with, but differs in"
         raise ValueError(f"{rule} {', '.join(differences)}: give another folder")
     latest = latest_checkpoint(folder)
     return folder / FINAL if (folder / FINAL / POLICY).is_file() else latest
 
 
-def _episodes_after(setup: Setup, steps: int) -> list[int]:
-    """Seeds of the first episodes of every copy of a training that begins, or goes on, after some steps."""
-    first = VALIDATION_EPISODES + steps % (SEEDS_APART // 4)  # far from seeds that are held out
+def _episodes_after(setup: TrainingConfiguration, steps: int) -> list[int]:
+    """Seeds of the first episodes of every copy of a training that starts, or continues, after some steps."""
+    first = VALIDATION_EPISODES + steps % (SEEDS_APART // 4)  # far from held-out seeds
     return list(training_seeds(setup.seed, first + setup.num_envs)[first:])
 
 
-def _model(setup: Setup, envs: VecEnv, start: Path | None, tensorboard: Path | None) -> BaseAlgorithm:
+def _model(
+    setup: TrainingConfiguration, envs: VecEnv, start: Path | None, tensorboard: Path | None
+) -> BaseAlgorithm:
     algorithm = find_algorithm(setup.algo)
     kind = algorithm.load_class()
     if start is not None:
@@ -159,7 +161,7 @@ def _model(setup: Setup, envs: VecEnv, start: Path | None, tensorboard: Path | N
         return model
     numbers = deepcopy(dict(setup.hyperparameters))  # off-policy algorithms write into policy_kwargs
     rate = numbers["learning_rate"]
-    # The last rollout may reach beyond the steps that were asked for: what remains is then negative.
+    # The last rollout may exceed the requested steps: `remaining` is then negative.
     numbers["learning_rate"] = lambda remaining: rate * max(remaining, 0.0)
     if "noise_std" in numbers:
         deviation = numbers.pop("noise_std")
@@ -175,16 +177,18 @@ def _evaluations_in(path: Path) -> dict[str, np.ndarray]:
 
 
 class _Evaluation(EvalCallback):
-    """Evaluate on the same episodes each time, keep the best policy, go on with the evaluations of before."""
+    """Evaluate on the same episodes each time, keep the best policy, continue earlier evaluations."""
 
-    def __init__(self, setup: Setup, folder: Path, envs: VecEnv, seeds, count: int, steps: int):
+    def __init__(self, setup: TrainingConfiguration, folder: Path, envs: VecEnv, seeds, count: int, steps: int):
         self._seeds, self._setup, self._best = seeds, setup, folder / BEST
         self.returns: list[float] = []
         normalised = VecNormalize(envs, training=False, norm_reward=False)
         every = max(1, setup.steps // (count * setup.num_envs))
         super().__init__(normalised, n_eval_episodes=len(seeds), eval_freq=every, log_path=str(folder), verbose=0)
         path = self._path = folder / f"{EVALUATIONS}.npz"
-        self.log_path = str(path.with_name(f".{EVALUATIONS}"))  # written aside: a full disk costs no earlier ones
+        self.log_path = str(
+            path.with_name(f".{EVALUATIONS}")
+        )  # under another name: a full disk then destroys no earlier ones
         if steps and path.is_file():
             before = whole(path, _evaluations_in)
             kept = before["timesteps"] <= steps
@@ -208,9 +212,17 @@ class _Evaluation(EvalCallback):
 
 
 class _Watch(BaseCallback):
-    """Tell how far it is, save checkpoints, and end on Ctrl-C."""
+    """Report progress, save checkpoints, and end on Ctrl-C."""
 
-    def __init__(self, setup: Setup, folder: Path, count: int, evaluation: _Evaluation, interrupted, on_progress):
+    def __init__(
+        self,
+        setup: TrainingConfiguration,
+        folder: Path,
+        count: int,
+        evaluation: _Evaluation,
+        interrupted,
+        on_progress,
+    ):
         super().__init__()
         self._setup, self._folder = setup, folder / CHECKPOINTS
         self._every = max(1, setup.steps // (count * setup.num_envs))

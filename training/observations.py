@@ -1,8 +1,8 @@
-"""What a policy may observe: the arms that are compared.
+"""Observation sets: what a policy may observe.
 
 Every observation ends with the reference thrust of the next step. What comes before it is, in float32,
 
-| arm | entries |
+| observation set | entries |
 |---|---|
 | raw | measured thrust |
 | raw+action | measured thrust, the last voltage |
@@ -11,8 +11,8 @@ Every observation ends with the reference thrust of the next step. What comes be
 | belief | the same of the enkf, then two standard deviations |
 | true | true thrust, omega_m and U_a |
 
-Thrust is a nonlinear function of the state, and the reward compares it with the reference. Raw observations hold
-it; beside an estimate it stands so that no arm has to learn the equation of the propeller.
+Thrust is a nonlinear function of the state, and the reward compares it with the reference. Raw observations
+contain thrust; it is added to estimates so that no policy has to learn the equation of the propeller.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from numerics.checks import one_of
 STACKED = 8
 
 
-class Arm(NamedTuple):
-    """What one kind of policy observes."""
+class ObservationSet(NamedTuple):
+    """What a policy observes."""
 
     about: str
     filter: str | None = None  # name in `filters.FILTERS`
-    numbers: Mapping = MappingProxyType({})  # of the filter, unless told otherwise
+    numbers: Mapping = MappingProxyType({})  # default parameters of the filter
     form: str = "estimate"  # as of `filters.EstimateState`
     is_true: bool = False  # whether it is the true state
-    pairs: int = 0  # last measurements, each with the voltage before it
+    pairs: int = 0  # number of last measurements, each with the voltage before it
 
     @property
     def shows_state(self) -> bool:
@@ -43,20 +43,26 @@ class Arm(NamedTuple):
 
 
 MEMBERS = MappingProxyType({"ensemble_size": 50})
-ARMS: dict[str, Arm] = {
-    "raw": Arm("the measured thrust"),
-    "raw+action": Arm("the measured thrust and the last voltage", pairs=1),
-    "stack": Arm(f"the last {STACKED} measured thrusts and voltages", pairs=STACKED),
-    "lowpass": Arm("the low-passed thrust, and the state that belongs to it", "low-pass"),
-    "kf": Arm("the estimate of a Kalman filter", "kf"),
-    "ekf": Arm("the estimate of an extended Kalman filter", "ekf"),
-    "ukf": Arm("the estimate of an unscented Kalman filter", "ukf"),
-    "enkf": Arm("the estimate of an ensemble Kalman filter", "enkf", MEMBERS),
-    "belief": Arm("the enkf's estimate with its standard deviations", "enkf", MEMBERS, form="belief"),
-    "true": Arm("the true state", is_true=True),
+OBSERVATION_SETS: dict[str, ObservationSet] = {
+    "raw": ObservationSet("the measured thrust"),
+    "raw+action": ObservationSet("the measured thrust and the last voltage", pairs=1),
+    "stack": ObservationSet(f"the last {STACKED} measured thrusts and voltages", pairs=STACKED),
+    "lowpass": ObservationSet("the low-passed thrust, and the state that belongs to it", "low-pass"),
+    "kf": ObservationSet("the estimate of a Kalman filter", "kf"),
+    "ekf": ObservationSet("the estimate of an extended Kalman filter", "ekf"),
+    "ukf": ObservationSet("the estimate of an unscented Kalman filter", "ukf"),
+    "enkf": ObservationSet("the estimate of an ensemble Kalman filter", "enkf", MEMBERS),
+    "belief": ObservationSet("the enkf's estimate with its standard deviations", "enkf", MEMBERS, form="belief"),
+    "true": ObservationSet("the true state", is_true=True),
 }
 
 
-def find_arm(name: str) -> Arm:
-    """The arm of a name; raises ValueError for an unknown one."""
-    return ARMS[one_of("observe", name, tuple(ARMS))]
+def find_observation_set(name: str) -> ObservationSet:
+    """The observation set of a name; raises ValueError for an unknown one."""
+    return OBSERVATION_SETS[one_of("observe", name, tuple(OBSERVATION_SETS))]
+
+
+# Former names.
+Arm = ObservationSet
+ARMS = OBSERVATION_SETS
+find_arm = find_observation_set

@@ -1,36 +1,37 @@
-"""Show what a saved policy does: one episode as a film, or in a window."""
+"""One episode of a saved policy as a video, or in a window."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from plants.rendering.film import OnStep, Played, check_drawing, steps_a_frame, write_film
-from training.environments import make_environments
-from training.saved import load, read_setup
+from training.environments import episode_steps, make_environments
+from training.saved import load, read_configuration
 
 
-def play(folder: Path, film: Path | None, seed: int, on_step: OnStep = lambda steps, count: None) -> Played:
-    """Run one episode of a saved policy and show it; without a film, in a window, at true speed.
+def play(folder: Path, video: Path | None, seed: int, on_step: OnStep = lambda steps, count: None) -> Played:
+    """Run one episode of a saved policy and record it; without a video, show it in a window in real time.
 
     Args:
-        folder: of the policy, from `saved.find_saved`.
-        film: an .mp4 or .gif file, which is written whole or not at all.
-        seed: of the episode.
+        folder: folder of the policy, from `saved.find_saved`.
+        video: an .mp4 or .gif file, which is written completely or not at all.
+        seed: seed of the episode.
         on_step: called after each step.
 
     Raises:
         ValueError: as `check_drawing` and `saved.load`.
     """
-    check_drawing(film)
-    setup = read_setup(folder)
-    # A window draws itself at each step, an array when it is asked for.
-    venv = make_environments(setup, [seed], native=False, render_mode="human" if film is None else "rgb_array")
-    env = venv.unwrapped.envs[0]
-    dt, count = env.unwrapped.plant.dt, gym.spec(setup.env_id).max_episode_steps
-    every = steps_a_frame(film, dt)
+    check_drawing(video)
+    setup = read_configuration(folder)
+    # A window is drawn at each step, an array on request.
+    venv = make_environments(setup, [seed], native=False, render_mode="human" if video is None else "rgb_array")
+    base: Any = venv.unwrapped  # single envs side by side
+    env = base.envs[0]
+    dt, count = env.unwrapped.plant.dt, episode_steps(setup.env_id)
+    every = steps_a_frame(video, dt)
     try:
         policy = load(folder, venv)
         observation, state, ended = venv.reset(), None, np.ones(1, dtype=bool)
@@ -43,8 +44,8 @@ def play(folder: Path, film: Path | None, seed: int, on_step: OnStep = lambda st
             if every and steps % every == 0 and not ended[0]:  # at its end the env has been reset
                 frames.append(env.render())
             on_step(steps, count)
-        if film is not None:
-            write_film(film, frames, 1 / (dt * every))
+        if video is not None:
+            write_film(video, frames, 1 / (dt * every))
     finally:
         venv.close()
     return Played(steps, total, steps * dt)

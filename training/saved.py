@@ -1,10 +1,10 @@
-"""Saved policies: a folder with the network, the normalisation of its observations, and the whole setup.
+"""Saved policies: a folder with the network, the normalisation of its observations, and the configuration.
 
     setup.json  policy.zip  normalisation.pkl  [replay.pkl]
 
-Such a folder is written aside and renamed, so a reader finds all of one moment or none. What a killed process
-leaves aside has a name that begins with a dot, and `mend` clears it away. Files that are not one's own should not
-be loaded: Stable-Baselines3 and this module use pickle.
+Such a folder is written under another name and then renamed, so that a reader never finds a part of it. What a
+killed process leaves has a name that begins with a dot; `mend` removes it. Do not load files of unknown origin:
+Stable-Baselines3 and this module use pickle.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from training.algorithms import find_algorithm
-from training.setup import Setup, setup_from_json
+from training.setup import TrainingConfiguration, configuration_from_json
+from training.spaces import box_of
 
 SETUP, POLICY, NORMALISATION, REPLAY = "setup.json", "policy.zip", "normalisation.pkl", "replay.pkl"
 FINAL, BEST, CHECKPOINTS = "final", "best", "checkpoints"
@@ -34,27 +35,30 @@ REPLACED, REMOVED = "old", "gone"  # how they end where something is replaced or
 
 
 class SavedPolicy(NamedTuple):
-    """A policy that predicts from observations as the env gives them."""
+    """A saved policy, which acts on observations of the env."""
 
-    setup: Setup
+    setup: TrainingConfiguration
     model: BaseAlgorithm
     normalisation: VecNormalize
 
     def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
-        """Actions (n, 1) in [-1, 1] for observations (n, d), and what the policy remembers."""
+        """Actions (n, 1) in [-1, 1] for observations (n, d), and the policy's state."""
         seen = self.normalisation.normalize_obs(np.asarray(observation))
         return self.model.predict(seen, state, episode_start, deterministic)
 
 
-def save(folder: Path, setup: Setup, model: BaseAlgorithm, replay: bool = False) -> None:
-    """Save a model with its normalisation and setup; `replay` keeps the replay buffer, if there is one."""
+def save(folder: Path, setup: TrainingConfiguration, model: BaseAlgorithm, replay: bool = False) -> None:
+    """Save a model with normalisation and training configuration; with `replay` the replay buffer, too."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     aside = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
     try:
         aside.chmod(0o755)
         (aside / SETUP).write_text(setup.as_json(), encoding="utf-8")
         model.save(aside / POLICY)
-        model.get_vec_normalize_env().save(str(aside / NORMALISATION))
+        normalisation = model.get_vec_normalize_env()
+        if normalisation is None:
+            raise ValueError("a policy must be saved with the normalisation of its envs, but its model has none")
+        normalisation.save(str(aside / NORMALISATION))
         if replay and hasattr(model, "save_replay_buffer"):
             model.save_replay_buffer(aside / REPLAY)
         if folder.exists():
@@ -70,7 +74,7 @@ def save(folder: Path, setup: Setup, model: BaseAlgorithm, replay: bool = False)
 
 
 def remove(folder: Path) -> None:
-    """Remove a saved policy, at once for whoever looks for it."""
+    """Remove a saved policy; it disappears in one step."""
     gone = folder.with_name(f".{folder.name}.{REMOVED}")
     shutil.rmtree(gone, ignore_errors=True)
     os.replace(folder, gone)
@@ -78,9 +82,9 @@ def remove(folder: Path) -> None:
 
 
 def mend(folder: Path) -> None:
-    """Clear away what a killed process left half done in a training's folder; anything else stays as it is.
+    """Remove the incomplete files of a killed process from a training's folder; anything else stays as it is.
 
-    A policy that was about to be replaced is put back if its successor did not come into its place.
+    A policy that was about to be replaced is restored if its successor is not there.
     """
     if not folder.is_dir():
         return
@@ -118,7 +122,7 @@ def latest_checkpoint(folder: Path) -> Path | None:
 
 
 def reopen(folder: Path, steps: int) -> None:
-    """Make the final policy of a training, which learnt from some steps, its latest checkpoint, to go on from."""
+    """Make the final policy of a training its latest checkpoint, at its number of steps, to continue from it."""
     checkpoint = folder / CHECKPOINTS / f"{steps:09d}"
     checkpoint.parent.mkdir(exist_ok=True)
     if checkpoint.exists():  # the same policy, perhaps with its replay buffer
@@ -127,13 +131,15 @@ def reopen(folder: Path, steps: int) -> None:
         os.replace(folder / FINAL, checkpoint)
 
 
-def read_setup(folder: Path) -> Setup:
-    """The setup in a folder; raises ValueError if there is none, or it is damaged."""
+def read_configuration(folder: Path) -> TrainingConfiguration:
+    """The training configuration in a folder; raises ValueError if there is none, or it is damaged."""
     path = folder / SETUP
     try:
-        return setup_from_json(path.read_text(encoding="utf-8"), str(path))
+        return configuration_from_json(path.read_text(encoding="utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"a policy must come with its setup, but {path} is not readable: {error}") from None
+        raise ValueError(
+            f"a policy must come with its training configuration, but {path} is not readable: {error}"
+        ) from None
 
 
 def load(folder: Path, venv: VecEnv, training: bool = False) -> SavedPolicy:
@@ -142,18 +148,18 @@ def load(folder: Path, venv: VecEnv, training: bool = False) -> SavedPolicy:
     Args:
         folder: from `find_saved`.
         venv: the envs.
-        training: whether it is to learn on; then the envs are the model's, and normalised.
+        training: whether training continues; the model then gets the envs, normalised.
 
     Raises:
         ValueError: if a file is damaged, or was made with other observations or actions.
     """
-    setup = read_setup(folder)
+    setup = read_configuration(folder)
     kind = find_algorithm(setup.algo).load_class()
     normalisation: VecNormalize = whole(folder / NORMALISATION, _normalisation)
-    shape = normalisation.observation_space.shape
-    if shape != venv.observation_space.shape:
+    shape, given = box_of(normalisation.observation_space).shape, box_of(venv.observation_space).shape
+    if shape != given:
         rule = f"a policy trained on observe={setup.observe!r} must see {shape[0]} numbers"
-        raise ValueError(f"{rule}, but the env shows {venv.observation_space.shape[0]}")
+        raise ValueError(f"{rule}, but the env shows {given[0]}")
     normalisation.set_venv(venv)
     normalisation.training, normalisation.norm_reward = training, training
     model = whole(
@@ -167,7 +173,7 @@ def load(folder: Path, venv: VecEnv, training: bool = False) -> SavedPolicy:
 
 
 def _normalisation(path: Path) -> VecNormalize:
-    """As `VecNormalize.load` does, but for the envs, whose observations may turn out to be others."""
+    """As `VecNormalize.load`, but without envs, since their observations may differ."""
     found = pickle.loads(path.read_bytes())
     if not isinstance(found, VecNormalize):
         raise ValueError(f"it holds {type(found).__name__}")
@@ -175,7 +181,7 @@ def _normalisation(path: Path) -> VecNormalize:
 
 
 def whole(path: Path, read: Callable[[Path], Any]) -> Any:
-    """What `read` makes of a file's path; ValueError whatever goes wrong in a damaged one."""
+    """The result of `read` for a file; ValueError for any error of a damaged one."""
     try:
         return read(path)
     except FileNotFoundError:
@@ -183,3 +189,6 @@ def whole(path: Path, read: Callable[[Path], Any]) -> Any:
     except (pickle.UnpicklingError, Exception) as error:  # a damaged zip or pickle raises nearly anything
         said = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"{path} must be a whole file as it was saved, but cannot be read: {said}") from None
+
+
+read_setup = read_configuration  # its former name

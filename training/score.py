@@ -1,4 +1,4 @@
-"""How well policies do on held-out episodes: return, and errors of what is to be followed.
+"""Scores of policies on held-out episodes: return, and tracking errors.
 
 Learnt and classical policies run in the same loop, on the same seeds, in native envs.
 """
@@ -6,54 +6,54 @@ Learnt and classical policies run in the same loop, on the same seeds, in native
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
-import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from training.environments import make_environments
+from training.environments import episode_steps, make_environments, native_of
 from training.plants.find import plant_of
 from training.plants.plant import Part, TrainingPlant
-from training.setup import Setup
+from training.setup import TrainingConfiguration
 
 
 class Policy(Protocol):
-    """What acts on observations (n, d), as Stable-Baselines3's models do."""
+    """A policy that acts on observations (n, d), as Stable-Baselines3's models do."""
 
     def predict(self, observation, state=None, episode_start=None, deterministic: bool = True):
-        """Actions (n, p) in [-1, 1], and what the policy remembers."""
+        """Actions (n, p) in [-1, 1], and the policy's state."""
 
 
 class Scores(NamedTuple):
-    """How a policy did in B episodes."""
+    """Return and errors of a policy in B episodes."""
 
     returns: np.ndarray  # (B,)
     parts: Mapping[str, Part]  # errors by name, see `TrainingPlant.parts_of`
 
 
-def score(policy: Policy, setup: Setup, seeds: Sequence[int]) -> Scores:
+def score(policy: Policy, setup: TrainingConfiguration, seeds: Sequence[int]) -> Scores:
     """Run a policy, deterministic, for one episode of each seed in the envs of a setup.
 
     Args:
         policy: learnt or classical.
-        setup: of the envs; what is observed has to be what the policy needs.
-        seeds: held-out ones.
+        setup: the training configuration of the envs, with the observations that the policy needs.
+        seeds: held-out seeds.
     """
-    steps = gym.spec(setup.env_id).max_episode_steps
+    steps = episode_steps(setup.env_id)
     venv, kind = make_environments(setup, seeds, endless=True), plant_of(setup.task)
     returns, recorded, alive = run_episodes(policy, venv, steps, kind)
-    return Scores(returns, kind.parts_of(recorded, alive, venv.unwrapped.env.unwrapped.plant))
+    base: Any = native_of(venv).env.unwrapped
+    return Scores(returns, kind.parts_of(recorded, alive, base.plant))
 
 
 def run_episodes(
     policy: Policy, venv: VecEnv, steps: int, kind: TrainingPlant
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns (B,), what the plant has recorded (q, B, K), and in which steps each first episode went on (B, K).
+    """Returns (B,), what the plant records (q, B, K), and the steps in which each first episode continues (B, K).
 
-    A step that ends an episode counts in its return; what is recorded there is already the next one's start.
+    A step that ends an episode is part of its return; its record is already the start of the next episode.
     """
-    observations, state = venv.reset(), None
+    observations, state, native = venv.reset(), None, native_of(venv)
     starts, going = np.ones(venv.num_envs, dtype=bool), np.ones(venv.num_envs, dtype=bool)
     returns, rows, alive = np.zeros(venv.num_envs), [], []
     for _ in range(steps):
@@ -61,6 +61,6 @@ def run_episodes(
         observations, rewards, starts, _ = venv.step(actions)
         returns += np.where(going, rewards, 0.0)
         going &= ~starts
-        rows.append(kind.recorded(venv.unwrapped.arrays, observations))
+        rows.append(kind.recorded(native.arrays, np.asarray(observations)))
         alive.append(going.copy())
     return returns, np.array(rows).transpose(1, 2, 0), np.array(alive).T

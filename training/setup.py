@@ -1,4 +1,4 @@
-"""`Setup`: all that a policy was trained with, as one value that JSON can hold."""
+"""`TrainingConfiguration`: everything that a policy is trained with, as plain data."""
 
 from __future__ import annotations
 
@@ -10,41 +10,41 @@ from pathlib import Path
 from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least, one_of, shown
 from training.algorithms import find_algorithm
-from training.checks import check_setup
-from training.observations import find_arm
+from training.checks import check_configuration
+from training.observations import find_observation_set
 from training.plants.find import plant_of
 from tuning.problems.plain import plain
 from tuning.problems.scenario import BaseScenario
 
 VERSION = 1
-MOST_ENVS = 100_000  # whose experience, of 100 steps each, takes a gigabyte
+MOST_ENVS = 100_000  # 100 steps of each take a gigabyte
 MOST_STEPS = 10**12
-SHARE = 0.2  # of the maximum voltage, by which a policy may correct a controller
+SHARE = 0.2  # largest correction of a controller, as a fraction of the range of its action
 
 
 @dataclass(frozen=True, kw_only=True)
-class Setup:
-    """What is learnt, from what, by what.
+class TrainingConfiguration:
+    """Observations, algorithm, task, plant and numbers of a training.
 
     Attributes:
-        observe: name of an arm, see `training.observations`.
+        observe: name of an observation set, see `training.observations`.
         algo: name of an algorithm, see `training.algorithms`.
         task: name of the task.
-        scenario: name of the scenario, which says what the plant and its noise are.
-        env_id: the env.
-        env_arguments: its arguments.
-        filter_arguments: of the filter beside it: its own numbers, and what it assumes of the plant.
-        steps: steps of the env that are learnt from.
-        seed: of training, and of the held-out data that belong to it.
-        num_envs: copies of the env.
-        hyperparameters: of the algorithm.
+        scenario: name of the scenario, with the plant and its noise.
+        env_id: id of the env.
+        env_arguments: arguments of the env.
+        filter_arguments: arguments of the filter: its parameters, and those of its model.
+        steps: number of training steps of the env.
+        seed: seed of the training, and of the held-out data that belong to it.
+        num_envs: number of copies of the env.
+        hyperparameters: hyperparameters of the algorithm.
         controller: name of the predictive controller that the policy corrects, if any.
-        share: the largest correction, as a part of each action's range.
-        assumed_plant: arguments of the plant that the filter assumes; None for the env's own. No file has one.
+        share: the largest correction, as a fraction of each action's range.
+        assumed_plant: arguments of the plant that the filter assumes; None for the env's plant. It is in no file.
 
     Raises:
-        ValueError: if a name is unknown, or an argument is none that env, filter or algorithm have: whatever comes
-            from a file is data, and can name no code.
+        ValueError: for an unknown name, or an argument that env, filter or algorithm do not have: a file has data
+            only, and cannot name code.
     """
 
     observe: str
@@ -64,21 +64,21 @@ class Setup:
 
     def __post_init__(self):
         """Check names, and that all arguments are known."""
-        check_setup(self)
+        check_configuration(self)
 
     def as_json(self) -> str:
-        """The setup as text."""
+        """The training configuration as text."""
         content = asdict(self)
         del content["assumed_plant"]
         return json.dumps({"version": VERSION, **content}, indent=2) + "\n"
 
-    def differences(self, other: Setup) -> list[str]:
-        """Names of what differs, apart from the steps: a longer run goes on where a shorter one ended."""
+    def differences(self, other: TrainingConfiguration) -> list[str]:
+        """Names of what differs, apart from the steps: a longer training continues a shorter one."""
         names = [entry.name for entry in fields(self) if entry.name != "steps"]
         return [name for name in names if getattr(self, name) != getattr(other, name)]
 
 
-def make_setup(
+def make_configuration(
     task: str,
     scenario: BaseScenario,
     observe: str,
@@ -92,32 +92,34 @@ def make_setup(
     hyperparameters: Mapping | None = None,
     controller: str | None = None,
     share: float = SHARE,
-) -> Setup:
-    """A setup from names; what is None is the algorithm's default.
+) -> TrainingConfiguration:
+    """A training configuration from names; arguments that are None have the algorithm's default.
 
-    The plant is the scenario's, and the filter's model too: the parameters that the scenario assumes, with the
-    plant's Q and R, unless `filter_arguments` or a tuned file say otherwise.
+    The plant is the scenario's, and so is the filter's model: with the scenario's assumed parameters and the
+    plant's Q and R, unless `filter_arguments` or a tuned file change them.
 
     Raises:
-        ValueError: for unknown names, a scenario of a linear plant, a tuned file of another filter than the arm's,
-            or numbers out of range.
+        ValueError: for unknown names, a scenario of a linear plant, a tuned file of another filter than the
+            observation set's, or numbers out of range.
     """
     kind = plant_of(task)
     chosen = kind.tasks[task]
-    arm, algorithm = find_arm(observe), find_algorithm(algo)
+    observed, algorithm = find_observation_set(observe), find_algorithm(algo)
     kind.check_scenario(scenario)
-    if arm.filter is None and (filter_arguments or tuned):
-        raise ValueError(f"filter arguments must come with an arm that has a filter, but got {observe!r}")
+    if observed.filter is None and (filter_arguments or tuned):
+        raise ValueError(
+            f"filter arguments must come with an observation set that has a filter, but got {observe!r}"
+        )
     assumed = {name: value for name, value in plain(scenario.held).items() if value}
-    given = {**arm.numbers, **assumed} if arm.filter is not None else {}
+    given = {**observed.numbers, **assumed} if observed.filter is not None else {}
     if tuned is not None:
         content = read_tuned_file(tuned)
         found = content["filter"]
-        one_of("filter of the tuned file", found["name"], (arm.filter,))
+        one_of("filter of the tuned file", found["name"], () if observed.filter is None else (observed.filter,))
         scenario.check_tuned_for(content.get("plant"), tuned)
         given |= {**found["numbers"], **found["model"]}
     given |= filter_arguments or {}
-    return Setup(
+    return TrainingConfiguration(
         observe=observe,
         algo=algo,
         task=task,
@@ -138,13 +140,13 @@ def make_setup(
     )
 
 
-def in_scenario(setup: Setup, scenario: BaseScenario) -> Setup:
-    """The same observation on another scenario's plant, of which a filter is not told.
+def in_scenario(setup: TrainingConfiguration, scenario: BaseScenario) -> TrainingConfiguration:
+    """The same observations on another scenario's plant, which is unknown to the filter.
 
-    The filter goes on assuming the plant of the setup, whatever the scenario says of its errors.
+    The filter still assumes the plant of the training configuration.
 
     Raises:
-        ValueError: for a scenario of another plant than the setup's, or a linear one.
+        ValueError: for a scenario of another plant than the training configuration's, or a linear one.
     """
     kind = plant_of(setup.task)
     kind.check_scenario(scenario)
@@ -159,11 +161,11 @@ def in_scenario(setup: Setup, scenario: BaseScenario) -> Setup:
     )
 
 
-def setup_from_json(text: str, name: str) -> Setup:
-    """The inverse of `Setup.as_json`; `name` is that of the file, for errors.
+def configuration_from_json(text: str, name: str) -> TrainingConfiguration:
+    """The inverse of `TrainingConfiguration.as_json`; `name` is that of the file, for errors.
 
     Raises:
-        ValueError: if it is not the text of a setup, or one of a later version.
+        ValueError: if it is not the text of a training configuration, or one of a later version.
     """
     try:
         entries = json.loads(text)
@@ -173,10 +175,16 @@ def setup_from_json(text: str, name: str) -> Setup:
         if "assumed_plant" in entries:
             raise KeyError("assumed_plant")
     except (json.JSONDecodeError, RecursionError, TypeError, KeyError, AttributeError):
-        raise ValueError(f"{name} must hold the setup of a policy, but got {shown(text)}") from None
+        raise ValueError(f"{name} must hold the configuration of a policy, but got {shown(text)}") from None
     try:
-        return Setup(**entries)
+        return TrainingConfiguration(**entries)
     except TypeError:  # an entry too many or too few
-        raise ValueError(f"{name} must hold the setup of a policy, but got {shown(text)}") from None
+        raise ValueError(f"{name} must hold the configuration of a policy, but got {shown(text)}") from None
     except ValueError as error:
         raise ValueError(f"{error} (in {name})") from None
+
+
+# Former names.
+Setup = TrainingConfiguration
+make_setup = make_configuration
+setup_from_json = configuration_from_json

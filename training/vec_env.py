@@ -10,16 +10,17 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
 from numerics.checks import one_of
+from training.spaces import box_of
 
 
 class NativeVecEnv(VecEnv):
     """Step a Gymnasium vector env, all copies in one call, under the contract of Stable-Baselines3.
 
     A copy whose episode ends is reset within the step; its info then holds `terminal_observation` and
-    `TimeLimit.truncated`. All other infos are empty, for a dictionary a copy and step costs more than the plant;
-    the arrays that they would be made of are in `arrays`, one row a copy.
+    `TimeLimit.truncated`. All other infos are empty, because a dictionary for each copy and step takes more time
+    than the plant; the arrays are in `arrays` instead, with one row for each copy.
 
-    Actions in [-1, 1] stand for the range of the env's, as Stable-Baselines3 prefers them.
+    Actions are scaled to [-1, 1], as Stable-Baselines3 recommends.
 
     Args:
         env: a vector env that resets within the step (autoreset mode "SameStep"), with Box spaces.
@@ -33,14 +34,14 @@ class NativeVecEnv(VecEnv):
         one_of("autoreset mode", AutoresetMode(env.metadata["autoreset_mode"]).value, ("SameStep",))
         self.env = env
         self.arrays: dict[str, Any] = {}
-        space = env.single_action_space
+        space = box_of(env.single_action_space)
         self._low, self._half = space.low, (space.high - space.low) / 2
         actions = gym.spaces.Box(-1.0, 1.0, space.shape, np.float32)
         super().__init__(env.num_envs, env.single_observation_space, actions)
 
     def reset(self) -> np.ndarray:
-        """Start an episode of every copy; those that were seeded start with their seeds."""
-        seeds = self._seeds if self._seeds[0] is not None else None
+        """Start an episode of every copy; those with a seed use it."""
+        seeds: Any = self._seeds if self._seeds[0] is not None else None  # vector envs take a list, too
         observations, self.arrays = self.env.reset(seed=seeds, options=self._options[0] or None)
         self.reset_infos = [{} for _ in range(self.num_envs)]
         self._reset_seeds()
@@ -66,11 +67,11 @@ class NativeVecEnv(VecEnv):
         self.env.close()
 
     def get_attr(self, attr_name: str, indices=None) -> list:
-        """An attribute of the vector env, once for each copy: the copies are no objects of their own."""
+        """An attribute of the vector env, once for each copy: the copies are not separate objects."""
         return [self._find(attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices=None) -> None:
-        """Set an attribute of the vector env, which is that of all copies."""
+        """Set an attribute of the vector env, which all copies share."""
         self._refuse_some(indices)
         setattr(self.env.unwrapped, attr_name, value)
 

@@ -1,4 +1,4 @@
-"""What a policy sees of an env, in number: an output of a state, or the last measurements and actions."""
+"""Vectorised observations of a policy: an output of a state, or the last measurements and actions."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from plants.state_space import StateSpaceModel
+from training.spaces import box_of, size_of
 
 
 class ShowOutput(VecEnvWrapper):
@@ -14,25 +15,25 @@ class ShowOutput(VecEnvWrapper):
 
     Args:
         venv: envs whose observations begin with the model's states.
-        model: of the plant, as the one who observes it believes it to be.
+        model: the model of the plant that the observer assumes.
         symbol: of the output, such as the thruster's T.
     """
 
     def __init__(self, venv: VecEnv, model: StateSpaceModel, symbol: str):
         """Wrap the envs; see the class."""
         self._model, self._symbol = model, symbol
-        super().__init__(venv, _space(venv.observation_space.shape[0] + 1))
+        super().__init__(venv, _space(size_of(venv.observation_space) + 1))
 
     def reset(self) -> np.ndarray:
         """Reset the envs."""
-        return self._with_output(self.venv.reset())
+        return self._with_output(np.asarray(self.venv.reset()))
 
     def step_wait(self):
         """Step the envs."""
         observations, rewards, dones, infos = self.venv.step_wait()
         for i in np.flatnonzero(dones):
             infos[i]["terminal_observation"] = self._with_output(infos[i]["terminal_observation"])
-        return self._with_output(observations), rewards, dones, infos
+        return self._with_output(np.asarray(observations)), rewards, dones, infos
 
     def _with_output(self, observations: np.ndarray) -> np.ndarray:
         states = observations[..., : self._model.n].astype(np.float64)
@@ -43,7 +44,7 @@ class ShowOutput(VecEnvWrapper):
 class ShowHistory(VecEnvWrapper):
     """Show the last measurements, each with the action before it, latest first; what the env appends stays last.
 
-    At the start of an episode there is one measurement; what came before counts as zero.
+    At the start of an episode there is one measurement; earlier entries are zero.
 
     Args:
         venv: envs whose observations are a measurement, then `appended` entries.
@@ -53,24 +54,26 @@ class ShowHistory(VecEnvWrapper):
 
     def __init__(self, venv: VecEnv, pairs: int, appended: int):
         """Wrap the envs; see the class."""
-        self._measured = venv.observation_space.shape[0] - appended
-        width = self._measured + venv.action_space.shape[0]
+        self._measured = size_of(venv.observation_space) - appended
+        width = self._measured + size_of(venv.action_space)
+        self._box = box_of(venv.action_space)
         self._past = np.zeros((venv.num_envs, pairs, width), dtype=np.float32)
         super().__init__(venv, _space(pairs * width + appended))
 
     def reset(self) -> np.ndarray:
-        """Reset the envs; nothing has been seen or done before."""
-        observations = self.venv.reset()
+        """Reset the envs; earlier measurements and actions are zero."""
+        observations = np.asarray(self.venv.reset())
         return self._begin(np.ones(self.num_envs, dtype=bool), observations)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions as the env takes them, clipped."""
-        self._actions = np.clip(actions, self.action_space.low, self.action_space.high)
+        self._actions = np.clip(actions, self._box.low, self._box.high)
         self.venv.step_async(actions)
 
     def step_wait(self):
         """Step the envs."""
-        observations, rewards, dones, infos = self.venv.step_wait()
+        found, rewards, dones, infos = self.venv.step_wait()
+        observations = np.asarray(found)
         last = observations.copy()
         for i in np.flatnonzero(dones):
             last[i] = infos[i]["terminal_observation"]

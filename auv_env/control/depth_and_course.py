@@ -56,7 +56,7 @@ class DepthAndCourse:
 
     @classmethod
     def for_env(cls, env, seen: str = "measurement", **gains: float) -> DepthAndCourse:
-        """A controller for an env of a task, single or in number.
+        """A controller for an env or vector env of a task.
 
         Args:
             env: `SegorogeniAUVPath-v0` or `SegorogeniAUVDepth-v0`, wrapped or not.

@@ -14,10 +14,12 @@ from plants.rendered import RenderedEnv
 class RenderedVehicle(RenderedEnv):
     """An env with a vehicle as `plant` and a path in its `task`."""
 
+    task: Any
     metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 20}
 
     def make_renderer(self) -> Renderer:
         """What draws the vehicle on its way."""
+        assert self.render_mode is not None  # a renderer is made for a mode only
         return Renderer(
             self.render_mode,
             path=self.task.path.points,

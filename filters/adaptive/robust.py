@@ -1,4 +1,4 @@
-"""A robust extended Kalman filter: noise with Student's t distribution, so that outliers weigh little."""
+"""A robust extended Kalman filter: Student-t measurement noise, so that outliers have little weight."""
 
 from __future__ import annotations
 
@@ -73,16 +73,16 @@ def robust_kernels(functions: Functions, shape: Shape) -> Kernels:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RobustExtendedKalmanFilter(Filter):
-    """Extended Kalman filter for measurement noise with Student's t distribution: an outlier weighs little.
+    """Extended Kalman filter for Student-t measurement noise: outliers have little weight.
 
         predict: the extended filter's
         update:  from weight = 1 repeat  weight = (d + m)/(d + trace(R^-1 E[v v' | z])), each moment with R/weight
                  in place of R; then the extended filter's update, too, with R/weight in place of R
 
     The noise v has d degrees of freedom and scale matrix R: it is N(0, R/weight) for a weight that is gamma
-    distributed about 1. What is repeated is the fixed point of the variational approximation in which state and
-    weight are independent; m counts the channels that are there, which share one weight. Innovation, S and
-    log-likelihood are those under R itself, so that the NIS tells an outlier.
+    distributed about 1. The repetition is the fixed-point iteration of the variational approximation in which
+    state and weight are independent; m counts the measured channels, which share one weight. Innovation, S and
+    log-likelihood are those under R itself, so that outliers show in the NIS (normalised innovation squared).
 
     `Belief.extras` holds the last weight, near 0 for an outlier; 1 where nothing was measured.
 

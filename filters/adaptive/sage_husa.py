@@ -123,11 +123,10 @@ class SageHusaFilter(Filter):
                          Q = Q + (1 - b) K (i i' - S) K' = b Q + (1 - b)(K i i' K' + P_new - F P_old F')
 
     with P before the update in the first line, P_new after it and P_old before the prediction in the second. On
-    average nothing changes where S is the innovation's covariance. As it stands, i i' - H P H' may be indefinite;
-    here a step R + d (i i' - S) is never longer than d = 1/(2 trace(R^-1 S)), and that of Q likewise, which leaves
-    at least half of R: both stay positive definite by construction. A missing channel changes nothing in its row
-    and column of R. One channel rarely tells Q from R: with b = 1 Q stays the model's, as a singular Q always
-    does.
+    average nothing changes if S is the covariance of the innovation. Since i i' - H P H' may be indefinite, a step
+    R + d (i i' - S) is limited to d = 1/(2 trace(R^-1 S)), and that of Q likewise, which leaves at least half of
+    R: both stay positive definite by construction. A missing channel changes nothing in its row and column of R.
+    One channel can rarely distinguish Q from R: with b = 1 Q stays the model's, and a singular Q always does.
 
     `Belief.extras` holds R (m m numbers), Q (n n), and 1 between a prediction and its update, else 0.
 

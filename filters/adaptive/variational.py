@@ -77,24 +77,24 @@ def variational_kernels(functions: Functions, shape: Shape) -> Kernels:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VariationalBayesFilter(Filter):
-    """Extended Kalman filter that believes of R what an inverse Wishart distribution says, beside mean and P.
+    """Extended Kalman filter with an inverse Wishart distribution of R beside mean and P.
 
         predict: the extended filter's
         update:  repeat R = (rho V + E[v v' | z])/(rho nu + 1), each moment under the R before, then
                  V = rho V + E[v v' | z],  nu = rho nu + 1, and mean and P as in the extended filter with this R
 
     V (m, m) and nu make the distribution of R; the estimate of R is 1/E[1/R] = V/nu. For one channel this is the
-    inverse gamma distribution with alpha = nu/2, beta = V/2. What is repeated is the fixed point of the
-    variational approximation, in which state and R are independent. Innovation, S and log-likelihood are those
-    under the R that was estimated before the measurement. In a missing channel E[v v' | z] is what R makes of the
-    others.
+    inverse gamma distribution with alpha = nu/2, beta = V/2. The repetition is the fixed-point iteration of the
+    variational approximation in which state and R are independent. Innovation, S and log-likelihood are those
+    under the R that was estimated before the measurement. In a missing channel E[v v' | z] follows from the others
+    by their correlation in R.
 
     `Belief.extras` holds V (m m numbers), then nu.
 
     Attributes:
         forgetting_factor: rho, above 0 and at most 1; R is that of the last 1/(1 - rho) measurements or so.
-        prior_weight: nu at first, how many measurements the model's R counts for; as it grows, with rho = 1,
-            the filter becomes the extended one.
+        prior_weight: initial nu: the model's R counts as much as this many measurements; with rho = 1,
+            as it grows, the filter becomes the extended one.
         iterations: of the fixed point, at least 1.
 
     Source: Sarkka, Nummenmaa (2009), "Recursive noise adaptive Kalman filtering by variational Bayesian

@@ -1,1 +1,1 @@
-"""What a filter has to beat: open loop, low-pass and inversion."""
+"""Baselines for filters: open loop, low-pass and inversion."""

@@ -1,4 +1,4 @@
-"""Baselines that any filter should beat: the open loop, the raw inversion of the measurement, and a low-pass."""
+"""Baselines that any filter should beat: open loop, inversion of the measurement, low-pass with inversion."""
 
 from __future__ import annotations
 
@@ -130,21 +130,22 @@ class OpenLoop(Filter):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Inversion(OpenLoop):
-    """The measurement inverted: one component x_i of the state, as it must be for the model to give it.
+    """Inversion of the measurement: the value of one state component x_i for which the model gives z.
 
         x = f(x, u), the open loop;  the estimate is x with x_i replaced by the root v of
         h(x with x_i = v) = z nearest to x_i, else by the v at which h comes nearest to z, an extremum
 
-    One channel of z is used, with the component that it tells of: for the thruster the flow velocity U_a from the
-    thrust, with the open loop's motor speed. While no measurement comes, the last one is inverted; before the
-    first, the estimate is the open loop. There is no covariance (zeros) and no likelihood; the innovation is z
-    less what the estimate before gives.
+    One channel of z and one component are used: for the thruster the flow velocity U_a follows from the thrust,
+    with the open loop's motor speed. While a measurement is missing, the last one is inverted; before the first,
+    the estimate is the open loop. There is no covariance (zeros) and no likelihood; the innovation is z minus its
+    prediction from the estimate before.
 
     Attributes:
-        inverted: number i of the component that is solved for; -1 is the last.
-        channel: number of the channel of z.
-        reach: how far from the open loop's x_i a root is looked for; if None, as far as the range of x_i is wide
-            in the model (`state_high` less `state_low`), or else 20 times its spread in prior and process noise.
+        inverted: index i of the component that is solved for; -1 is the last.
+        channel: index of the channel of z.
+        reach: largest distance from the open loop's x_i at which a root is looked for, in the unit of x_i; if
+            None, the width of the range of x_i in the model (`state_high` minus `state_low`), or, without a range,
+            20 times its spread in prior and process noise.
     """
 
     name: ClassVar[str] = "inversion"
@@ -183,7 +184,7 @@ class Inversion(OpenLoop):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LowPass(Inversion):
-    """The measurement behind an exponential low-pass filter, then inverted as in `Inversion`.
+    """Exponential low-pass filter of the measurement, followed by an inversion as in `Inversion`.
 
         y = a y + (1 - a) z,  a = exp(-1/time_constant), from the first measurement on;  h(x with x_i = v) = y
 
@@ -191,9 +192,9 @@ class LowPass(Inversion):
 
     Attributes:
         time_constant: of the low-pass filter, in steps; positive.
-        inverted: number i of the component that is solved for; -1 is the last.
-        channel: number of the channel of z.
-        reach: how far from the open loop's x_i a root is looked for; see `Inversion`.
+        inverted: index i of the component that is solved for; -1 is the last.
+        channel: index of the channel of z.
+        reach: largest distance from the open loop's x_i at which a root is looked for; see `Inversion`.
     """
 
     name: ClassVar[str] = "low-pass"

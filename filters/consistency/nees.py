@@ -1,4 +1,7 @@
-"""Is a filter's covariance consistent? NEES and NIS of many runs against their chi-square distributions."""
+"""Is a filter's covariance consistent? NEES and NIS of many runs against their chi-square distributions.
+
+NEES is the normalised estimation error squared, e' P^-1 e; NIS is the normalised innovation squared, v' S^-1 v.
+"""
 
 from __future__ import annotations
 
@@ -107,7 +110,7 @@ def check_squares(
 
 
 def check_whitened(name: str, errors: np.ndarray, present: np.ndarray | None = None) -> SquaresCheck:
-    """Hold normalised squares against chi-square, as numbers of B independent runs.
+    """Compare normalised squares of B independent runs with the chi-square distribution.
 
     The sum over runs of one step is chi-squared with as many degrees of freedom as there are components, so its
     band is exact even where measurements are missing. Intervals and the test of the distribution resample whole

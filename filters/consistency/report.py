@@ -1,4 +1,8 @@
-"""All checks of a filter's consistency in one typed report, from estimates and, where it is known, the truth."""
+"""All checks of a filter's consistency in one report, from estimates and, where it is known, the truth.
+
+NEES is the normalised estimation error squared, NIS the normalised innovation squared, CRPS the continuous ranked
+probability score.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +29,7 @@ from numerics.angles import difference, is_angle, wrapped
 
 
 class EnsembleCheck(NamedTuple):
-    """What the members of an ensemble say, by state."""
+    """Ranks and CRPS of the members of an ensemble, by state."""
 
     size: int  # number of members
     ranks: tuple[Uniformity, ...]  # of the truth among the members
@@ -79,7 +83,7 @@ def findings(
     first_step: int = 0,
     angles: Sequence[bool] = (),
 ) -> Findings:
-    """What a filter's estimates of some runs are to be judged by; arguments are those of `consistency_report`."""
+    """Errors and innovations of a filter's estimates; arguments are those of `consistency_report`."""
     late = slice(first_step, None)
     truth = np.full(estimates.means.shape, np.nan) if states is None else states
     errors = difference(estimates.means, truth, angles)[:, late]
@@ -120,13 +124,13 @@ def consistency_report(
     angles: Sequence[bool] = (),
     **options,
 ) -> ConsistencyReport:
-    """Hold a filter's estimates against the truth, and its innovations against what it expected of them.
+    """Compare a filter's estimates with the truth, and its innovations with their expected covariance.
 
     Args:
         estimates: of B runs, from `filters.run`.
         states: the truth, (B, K + 1, n); None where it is not known.
         measurements: (B, K + 1, m); needed only where some are missing (NaN).
-        first_step: steps before it are start-up and do not count.
+        first_step: first step that counts; steps before it are start-up.
         angles: (n,), which states are angles, as the filter's `model.shape.state_angles`; none if empty.
         **options: members, names, channels and lags, as `report_of` takes them.
 
@@ -201,7 +205,7 @@ def report_of(
 
 
 def check_ensemble(members: Members, states: np.ndarray, angles: Sequence[bool] = ()) -> EnsembleCheck:
-    """Hold ensembles of the first runs against the truth of all, (B, K + 1, n); angles the short way round."""
+    """Compare ensembles of the first runs with the truth of all, (B, K + 1, n); angles are wrapped."""
     truth, size = states[: len(members.members), members.steps], members.members.shape[-1]
 
     def near(i):

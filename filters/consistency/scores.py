@@ -1,4 +1,4 @@
-"""Scores of forecasts that are distributions: coverage, CRPS of Gaussians and of ensembles, and ranks."""
+"""Scores of probabilistic estimates: coverage, CRPS (continuous ranked probability score) and ranks."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def gaussian_crps(errors: np.ndarray, deviations: np.ndarray) -> np.ndarray:
 
         s (z (2 Phi(z) - 1) + 2 phi(z) - 1/sqrt(pi)),  z = e/s;  |e| for s = 0
 
-    It has the unit of the state, is smallest on average for the right distribution, and is the absolute error for
-    a forecast without spread. If the forecast is right, its mean is s/sqrt(pi).
+    It has the unit of the state, is smallest on average for the true distribution, and equals the absolute error
+    if the standard deviation is zero. If the forecast distribution is correct, its mean is s/sqrt(pi).
 
     Source: Gneiting, Raftery (2007), "Strictly proper scoring rules, prediction, and estimation", section 4.2.
     """

@@ -1,4 +1,7 @@
-"""A consistency report in sentences, each a function of the numbers that it states."""
+"""A consistency report in sentences, each a function of the numbers that it states.
+
+NEES is the normalised estimation error squared, NIS the normalised innovation squared.
+"""
 
 from __future__ import annotations
 
@@ -233,7 +236,7 @@ def _test(found: Uniformity) -> str:
 
 
 def probability_text(p: float) -> str:
-    """A p-value as it is told."""
+    """A p-value as text."""
     return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
 
 

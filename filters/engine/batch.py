@@ -17,14 +17,23 @@ from plants.layout import LANES, with_root
 
 
 class Estimates(NamedTuple):
-    """A filter's output over a batch of B trajectories of K steps; index 0 is after the first measurement."""
+    """A filter's output over a batch of B trajectories of K steps; index 0 is after the first measurement.
 
-    means: np.ndarray  # (B, K + 1, n)
-    covs: np.ndarray  # (B, K + 1, n, n)
-    innovations: np.ndarray  # (B, K + 1, m)
-    innovation_covs: np.ndarray  # (B, K + 1, m, m)
-    log_likelihoods: np.ndarray  # (B, K + 1)
-    divergences: np.ndarray  # (B,), restarts after an estimate that was not finite
+    Attributes:
+        means: of the states, (B, K + 1, n), in the units of the model.
+        covs: covariances of the errors, (B, K + 1, n, n).
+        innovations: measurements minus their predictions, (B, K + 1, m); zero in missing channels.
+        innovation_covs: S, (B, K + 1, m, m).
+        log_likelihoods: of the innovations, (B, K + 1).
+        divergences: restarts from the prior after an estimate that was not finite, (B,).
+    """
+
+    means: np.ndarray
+    covs: np.ndarray
+    innovations: np.ndarray
+    innovation_covs: np.ndarray
+    log_likelihoods: np.ndarray
+    divergences: np.ndarray
 
 
 def run(
@@ -39,19 +48,22 @@ def run(
     """Filter many trajectories in one compiled call that uses all cores.
 
     Args:
-        filter_: any filter, or somebody else's estimator in the place of one.
-        keys: random keys, one a trajectory, (B, 2); those of seeds 0, 1, ..., B - 1 if None. Filters that draw
-            nothing do the same whatever the keys: run(filter_, inputs=u, measurements=z).
-        inputs: u, (B, K, p); None for a model without inputs; the filter predicts with u[:, k] ...
-        measurements: ... and updates with z[:, k + 1]; (B, K + 1, m), NaN where missing.
-        process_noise_covs: Q of every step, (K, n, n), in place of the model's.
+        filter_: any filter, or an estimator of another package in its place.
+        keys: random keys, one a trajectory, (B, 2): two whole numbers below 2^32 each; those of seeds 0, 1, ...,
+            B - 1 if None. Filters that draw nothing ignore them: run(filter_, inputs=u, measurements=z).
+        inputs: u, (B, K, p), in the units of the model's inputs; None for a model without inputs. The filter
+            predicts step k + 1 with u[:, k].
+        measurements: z, (B, K + 1, m), in the units of the model's measurements, NaN where missing; z[:, 0]
+            updates the prior, and z[:, k + 1] the prediction with u[:, k].
+        process_noise_covs: Q of every step, (K, n, n), in place of the model's. Covariances are per step and do
+            not scale with dt.
         measurement_noise_covs: R of every measurement, (K + 1, m, m), in place of the model's.
 
     Returns:
-        `Estimates`, the same whatever the number of cores.
+        `Estimates`, which do not depend on the number of cores.
 
     Raises:
-        ValueError: if shapes do not fit or an input is not finite; or as `ForeignFilter.fill`.
+        ValueError: if shapes do not fit or an input is not finite; errors of `ForeignFilter.fill` for estimators.
     """
     filter_.check_noise(process_noise_covs)
     filter_.check_noise(measurement_noise_covs)

@@ -1,4 +1,4 @@
-"""Many beliefs at work in place, one a copy of a vector env, advanced by one compiled call."""
+"""Batch session: one belief for each copy of a vector env, all advanced in place by one compiled call."""
 
 from __future__ import annotations
 

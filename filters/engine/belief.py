@@ -9,16 +9,26 @@ import numpy as np
 
 
 class Belief(NamedTuple):
-    """What a filter believes of the state at one time."""
+    """The estimate of a filter at one time.
 
-    mean: np.ndarray  # (n,)
-    cov: np.ndarray  # (n, n)
-    members: np.ndarray  # (n, N) ensemble, one row a state component; N = 0 for Gaussian filters. Particle
-    # filters add a row of log weights.
-    key: tuple[int, int]  # what all its randomness depends on, together with ...
-    step: int  # ... the number of steps predicted so far
-    divergences: int  # restarts from the prior after an estimate that was not finite
-    extras: np.ndarray = np.empty(0)  # whatever else a kind of filter remembers, such as an estimate of R
+    Attributes:
+        mean: of the state, (n,), in the units of the model.
+        cov: covariance of the error, (n, n).
+        members: of an ensemble, (n, N), one row for each state; N = 0 for Gaussian filters. Particle filters add a
+            row of log weights.
+        key: two integers on which all random draws depend, together with `step`.
+        step: number of steps predicted so far.
+        divergences: restarts from the prior after an estimate that was not finite.
+        extras: what else the filter keeps, such as an estimate of R.
+    """
+
+    mean: np.ndarray
+    cov: np.ndarray
+    members: np.ndarray
+    key: tuple[int, int]
+    step: int
+    divergences: int
+    extras: np.ndarray = np.empty(0)
 
 
 class LostBelief(Belief):
@@ -28,11 +38,17 @@ class LostBelief(Belief):
 
 
 class Innovation(NamedTuple):
-    """What a measurement said beyond the prediction."""
+    """Innovation of an update: measurement minus its prediction.
 
-    value: np.ndarray  # (m,), z - E[z]; zero in missing channels
-    cov: np.ndarray  # (m, m), S
-    log_likelihood: float  # log N(value; 0, S) of the channels that were there
+    Attributes:
+        value: z - E[z], (m,), in the units of the measurements; zero in missing channels.
+        cov: its covariance S, (m, m).
+        log_likelihood: log N(value; 0, S) of the channels that were measured.
+    """
+
+    value: np.ndarray
+    cov: np.ndarray
+    log_likelihood: float
 
 
 class Kernels(NamedTuple):

@@ -100,7 +100,8 @@ def _build_batch(kernels: Kernels) -> Callable:
 def operation(kernels: Kernels) -> CompiledOrPython:
     """`operate(*memory, size, given, numbers, task)` on one belief; it returns how often that diverged.
 
-    given = (u, z) in one array, for each costs some 80 ns a call; task is a sum of START, PREDICT and UPDATE.
+    given = (u, z) in one array, because each further array costs some 80 ns a call; task is a sum of START,
+    PREDICT and UPDATE.
     """
     return _runner(build_operation, kernels, is_interpreting())
 
@@ -115,7 +116,7 @@ def batch(kernels: Kernels) -> CompiledOrPython:
 
 
 def lanes(kernels: Kernels) -> CompiledOrPython:
-    """The same for filters without an ensemble, many trajectories at a time; see `engine.simd.build_lanes`."""
+    """The same for filters without an ensemble, in SIMD batches of trajectories; see `engine.simd.build_lanes`."""
     return _runner(build_lanes, kernels, is_interpreting())
 
 

@@ -1,4 +1,4 @@
-"""Where things stand in the memory of a filter.
+"""Layout of the memory of a filter.
 
 A filter's memory is a row of small parts (belief, innovation, scratch), a table with one column an ensemble
 member, and a vector of random draws. Rows are cheap to hand to compiled code, to copy and to stack. The row of a
@@ -65,5 +65,5 @@ def row_access(shape: Shape) -> tuple[tuple[Callable, Callable], ...]:
 
 
 def own_place(shape: Shape) -> int:
-    """First place of a filter's own numbers, behind those of its model."""
+    """Offset of the filter's own parameters in the packed row, behind those of its model."""
     return number_places(shape.n, shape.m).constants + shape.constants

@@ -1,4 +1,4 @@
-"""What happens to a belief that is lost, not finite or with a negative variance: the prior takes its place."""
+"""Restart of a belief that has diverged (not finite, or with a negative variance): it becomes the prior."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One belief at work in place: what a wrapper steps, and what a filter's pure functions borrow."""
+"""Sessions: a filter that runs in place on one belief, for wrappers and for the filter's pure functions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TASKS = {"start": START, "predict": PREDICT, "update": UPDATE}
 
 
 class Running(Protocol):
-    """A filter, or somebody else's estimator, at work in place on one trajectory.
+    """A filter, or an estimator of another package, that runs in place on one trajectory.
 
     Attributes:
         mean, cov, innovation, innovation_cov: of the last step, (n,), (n, n), (m,), (m, m).
@@ -43,7 +43,7 @@ class Running(Protocol):
 
 
 class Session:
-    """One filter at work in place on its own memory: what a wrapper steps and `Filter.predict` borrows.
+    """A filter that runs in place on its own memory: wrappers step it, and `Filter.predict` uses one.
 
     Attributes:
         mean, cov, innovation, innovation_cov: views on the memory, (n,), (n, n), (m,), (m, m).

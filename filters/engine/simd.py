@@ -1,4 +1,4 @@
-"""Trajectories side by side: batches of filters without an ensemble, as vector code.
+"""SIMD batches: trajectories of filters without an ensemble, side by side in vectorised code.
 
 Number i of all beliefs of a block lies in one line of memory. Each stage of a step is a loop over the block with
 no other loop in it, of which the compiler makes vector code: an extended Kalman step of the thruster takes a

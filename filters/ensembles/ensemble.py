@@ -127,7 +127,7 @@ def ensemble_kernels(analysis: Callable, functions: Functions, shape: Shape) -> 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EnsembleFilter(Filter):
-    """Base of the ensemble filters: kinds supply `analysis`, as `ensemble_kernels` takes it.
+    """Base of the ensemble filters: subclasses define `analysis`, as `ensemble_kernels` takes it.
 
     The belief's mean and covariance are those of the members.
 
@@ -135,7 +135,7 @@ class EnsembleFilter(Filter):
         ensemble_size: number N of members, at least 2.
         inflation: factor on the spread of the members about their mean in every step of the model's dt, after the
             process noise; 1 is none. For steps of another length dt' it is inflation^(dt'/dt).
-        relaxation: part, 0 to 1, by which each update gives each state's spread back what it took from it.
+        relaxation: fraction, 0 to 1, of each state's loss of spread in an update that is given back.
 
     Sources: Anderson, Anderson (1999), "A Monte Carlo implementation of the nonlinear filtering problem to produce
     ensemble assimilations and forecasts", for inflation; Whitaker, Hamill (2012), "Evaluating methods to account
@@ -247,15 +247,16 @@ class EnsembleKalmanFilter(EnsembleFilter):
         update:  y_j = h(x_j),  innovation = z - mean(y),  S = cov(y, y) + R,  K = cov(x, y) S^-1,
                  x_j += K (z - v_j - y_j),  v_j ~ N(0, R);  sample covariances with divisor N - 1
 
-    The perturbations of an update depend on the key and the step alone: of two updates within one step the second
-    repeats the first one's.
+    The perturbations of an update depend on the key and the step only: two updates within one step use the same
+    perturbations.
 
     Attributes:
         centred_perturbations: 1 for perturbations of the measurements whose sample mean is zero, 0 for independent
             ones. Centred, v_j is (N/(N - 1))^1/2 (v_j - mean(v)), whose covariance is R, and the mean moves as
-            the Kalman filter's; the mean of independent ones, of covariance R/N, enters the estimate. For small N.
+            in the Kalman filter; the mean of independent ones, of covariance R/N, enters the estimate. Use it for
+            small N.
 
-    Others are those of `EnsembleFilter`.
+    The other attributes are those of `EnsembleFilter`.
 
     Source: Evensen (1994); Burgers, van Leeuwen, Evensen (1998), "Analysis scheme in the EnKF"; centred: Evensen
     (2004), "Sampling strategies and square root analysis schemes for the EnKF".

@@ -129,14 +129,14 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
                  w = Y' S^-1 (z - mean(y) + Y w)/(N - 1),  T = (I + Y' R^-1 Y/(N - 1))^-1/2;
                  then x_j = mean + X w + X T e_j,  e_j the j-th unit vector
 
-    The slopes of h thus come from members that lie where the estimate is, as far apart as it is uncertain. One
+    The slopes of h are thus those at the estimate, averaged over its uncertainty. One
     iteration is the `EnsembleTransformFilter`; where h is linear, further ones change nothing. T and its inverse
     are symmetric and N x N, and never formed. The innovation and its covariance are those of the first iteration.
 
     What it does not do: the motion f is not run again, as where the last state is estimated anew together with
     this one (Sakov, Oliver and Bertino do so, without process noise). Steps are not damped: where the measurement
-    fits several states, iterations may jump between them. Where a measurement is far better than the forecast,
-    T^-1 magnifies any bend of h along the states that the measurement leaves open, and iterations gain little.
+    fits several states, iterations may jump between them. Where a measurement is far more accurate than the
+    forecast, T^-1 magnifies any nonlinearity of h along unobserved directions, and iterations gain little.
 
     Attributes:
         iterations: evaluations of h by all members in an update, at least 1. The others are those of

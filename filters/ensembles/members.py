@@ -112,7 +112,7 @@ class Motion(NamedTuple):
     """What all ensembles do alike, for one shape of model."""
 
     start: Callable  # start(memory, numbers, size): members drawn from the prior
-    predict: Callable  # predict(memory, u, numbers, size): members moved, then stirred by process noise
+    predict: Callable  # predict(memory, u, numbers, size): members moved, then process noise added
     summarise: Callable  # summarise(memory, size): the belief's mean and covariance from the members
 
 

@@ -91,8 +91,8 @@ class EnsembleTransformFilter(DeterministicUpdateFilter):
     of R S for one channel, T = I - Y' (S + R # S)^-1 Y/(N - 1) and X T = X - cov(x, y) (S + R # S)^-1 Y.
 
     The covariance after an update is exactly P - K S K', where the stochastic filter's is so on average only; the
-    mean moves as the Kalman filter's. The update draws nothing: the process noise that stirs the members is all
-    that is random, and what its sample lacks of mean zero and covariance Q enters the estimate. Attributes are
+    mean moves as the Kalman filter's. The update draws nothing: the process noise of the members is all that
+    is random, and the error of its sample mean and covariance enters the estimate. Attributes are
     those of `DeterministicUpdateFilter`.
 
     Source: Bishop, Etherton, Majumdar (2001), "Adaptive sampling with the ensemble transform Kalman filter", part

@@ -1,1 +1,1 @@
-"""Other people's estimators in the place of a filter."""
+"""Estimators of other packages in the place of a filter."""

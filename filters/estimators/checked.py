@@ -1,4 +1,4 @@
-"""What an estimator gives, checked: shapes, finite numbers, covariances that are some."""
+"""Checks of an estimator's output: shapes, finite numbers, valid covariances."""
 
 from __future__ import annotations
 
@@ -110,8 +110,8 @@ def log_likelihoods(
 ) -> np.ndarray:
     """Log-likelihood of measurements, log N(innovation; 0, S) over the channels that are there, (B, K + 1).
 
-    It is 0 where nothing was measured, and NaN where something was, but S is not told (all zero), not positive
-    definite, or no covariance of a Gaussian.
+    It is 0 where nothing was measured, and NaN where something was, but S is not given (all zero), not positive
+    definite, or not the covariance of a Gaussian.
 
     Args:
         innovations: (B, K + 1, m), of which those of missing channels do not matter.

@@ -1,4 +1,4 @@
-"""The contract of an estimator: whatever maps inputs and measurements to means, and covariances if it has them."""
+"""The interface of an estimator: it maps inputs and measurements to means, and to covariances if it has them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Output(NamedTuple):
 
 
 class Estimator:
-    """An estimator of one trajectory at a time; it keeps its belief, and what it draws follows from the key.
+    """An estimator of one trajectory at a time; it keeps its own state, and its random draws follow from the key.
 
     Runs and envs work on deep copies of it.
 
@@ -27,10 +27,10 @@ class Estimator:
     and steps, means (B, K + 1, n), covariances (B, K + 1, n, n) and so on.
 
     Attributes:
-        name: for tables; that under which it is found if None.
+        name: for tables; the name under which it is found if None.
         has_covariance: whether it gives covariances; NEES is left out where it does not.
         gaussian_likelihood: whether the likelihood of a measurement is N(innovation; 0, S); it is left out if not.
-        parameters: what it is tuned by: `Parameter`s, each an argument of the function that makes it.
+        parameters: its tunable parameters: `Parameter`s, each an argument of the function that makes it.
     """
 
     name: str | None = None

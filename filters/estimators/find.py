@@ -13,7 +13,7 @@ from plants.state_space import StateSpaceModel
 
 
 def is_foreign(given) -> bool:
-    """Whether something stands for somebody else's estimator, and is not meant as the name of a filter."""
+    """Whether something stands for an estimator of another package, and is not the name of a filter."""
     return is_code(given) or (not isinstance(given, str) and (is_estimator(given) or callable(given)))
 
 

@@ -1,4 +1,4 @@
-"""`ForeignFilter`: somebody else's estimator in the place of a filter."""
+"""`ForeignFilter`: an estimator of another package in the place of a filter."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ class ForeignFilter(Filter):
     """An estimator with the model that names its states, inputs and measurements, in the place of a `Filter`.
 
     It runs over batches and beside envs. It has no kernels: single calls of `predict` and `update`, smoothers and
-    gradients need a filter of ours.
+    gradients need a filter of this package.
 
     Attributes:
-        model: names, sizes and angles; whether the estimator assumes it is the estimator's own business.
+        model: names, sizes and angles; the estimator need not assume this model.
         estimator: an `Estimator`, or any object like one.
-        label: what it is called where it does not name itself.
+        label: its name in tables if it does not name itself.
 
     Raises:
         ValueError: if it is no estimator.

@@ -24,7 +24,8 @@ class StoneSoupEstimator(Estimator):
         updater: with a measurement model.
         prior: the state at the first measurement, with mean and covariance.
         dt: sample time [s].
-        set_input: `set_input(transition_model, u)` tells the predictor's of the next input (p,); None without any.
+        set_input: `set_input(transition_model, u)` passes the next input (p,) to the predictor's model; None
+            without.
         name: for tables; that of the updater's class if None.
 
     Source: Thomas et al. (2017), "An open source framework for tracking and state estimation (Stone Soup)".

@@ -34,7 +34,7 @@ class CubatureKalmanFilter(Filter):
     def own_numbers(self) -> PointSet:
         """Where the points lie, and their weights."""
         n = self.model.n
-        return PointSet(spread=n**0.5, weight=0.5 / n, bend=0.0)
+        return PointSet(spread=n**0.5, weight=0.5 / n, shift_weight=0.0)
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""

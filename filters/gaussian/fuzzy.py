@@ -185,8 +185,8 @@ class FuzzyKalmanFilter(Filter):
     output only. Innovation and S are blended as mean and P are. With equal rules, as an affine model has them, all
     three are the Kalman filter.
 
-    A blend of tangents at the corners follows a model only as well as the range is narrow: on the thruster the
-    extended filter, whose tangent moves with the estimate, is far better.
+    A blend of linearisations at the corners approximates a model only if the range is narrow: on the thruster the
+    extended filter, which linearises at the estimate, is far better.
 
     `Belief.extras` holds for each rule its mean, covariance, membership, innovation and the innovation's
     covariance; `rule_estimates` takes them apart.
@@ -195,8 +195,8 @@ class FuzzyKalmanFilter(Filter):
         low: the smallest states (n,); the model's `state_low` if None.
         high: the largest states (n,); the model's `state_high` if None.
         blending: "weights", "moments" or "output", see above.
-        premises: numbers of the states that rules ask for, at most 8; if None, all of at most 8 states, and the
-            first of more states of an affine model. Rules are linearised at the middle of the others' range.
+        premises: indices of the states that the rules depend on, at most 8; if None, all of up to 8 states, or the
+            first state of a larger affine model. Rules are linearised at the middle of the range of other states.
         offsets: whether rules have the offset a_r that makes them exact at their corners; the sources print none.
 
     Source: Ngatini, Apriliani, Nurhadi (2017), "Ensemble and fuzzy Kalman filter for position estimation of an

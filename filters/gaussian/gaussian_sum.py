@@ -112,7 +112,7 @@ def gaussian_sum_kernels(functions: Functions, shape: Shape, *, parts) -> Kernel
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GaussianSumFilter(Filter):
-    """Gaussian sum filter: the extended filter, whose belief is a sum of Gaussians within each update.
+    """Gaussian sum filter: an extended filter whose belief is a sum of Gaussians within each update.
 
         predict: the extended filter's
         split:   along g = P e_i/sqrt(P_ii), the way in which the state goes with its component i, into parts
@@ -122,17 +122,17 @@ class GaussianSumFilter(Filter):
                  its weight becomes a_k N(z; h(x_k), S_k)/L,  L = sum of a_k N(z; h(x_k), S_k)
         merge:   mean and P of the weighted parts: P within the parts and between them
 
-    So a measurement may have several roots in component i, where one tangent at the mean sees one. The
-    log-likelihood is log L; innovation and S are those of the mixture before the measurement. On an affine model
-    this is the Kalman filter to some thousandths of a standard deviation, for the sum has thinner tails than a
-    Gaussian.
+    So a measurement may have several solutions in component i, of which one linearisation at the mean sees one.
+    The log-likelihood is log L; innovation and S are those of the mixture before the measurement. On an affine
+    model this is the Kalman filter to some thousandths of a standard deviation, for the sum has thinner tails than
+    a Gaussian.
 
     `Belief.extras` holds what the last update made of each part: mean, covariance, weight, innovation, its
     covariance and its log-likelihood; `part_estimates` takes the first three apart.
 
     Attributes:
-        parts: their number, at least 7.
-        component: number i of the component along which the belief is split; -1 is the last.
+        parts: number of Gaussians, at least 7.
+        component: index i of the component along which the belief is split; -1 is the last.
 
     Source: Alspach, Sorenson (1972), "Nonlinear Bayesian estimation using Gaussian sum approximations"; splitting
     along one direction: Faubel, McDonough, Klakow (2009), "The split and merge unscented Gaussian mixture filter".

@@ -82,8 +82,8 @@ class IteratedExtendedKalmanFilter(Filter):
                  at last mean = x_i,  P = (I - K H) P (I - K H)' + K R K'  (Joseph) with the last H and K
 
     The first iteration is the extended filter's update. Innovation, its covariance and the likelihood are those of
-    the first: they judge the prediction. The number of iterations is fixed, without a line search: full steps may
-    overshoot where h bends much within the spread of the belief.
+    the first, so that they assess the prediction. The number of iterations is fixed, without a line search: full
+    steps may overshoot where h is strongly nonlinear within the spread of the belief.
 
     Attributes:
         iterations: how often the measurement is linearised, 1 to 20; 1 is the extended filter.

@@ -52,16 +52,16 @@ class KalmanFilter(AffineFilter):
         update:  innovation = z - C mean - d,  S = C P C' + R,  K = P C' S^-1,
                  mean += K innovation,  P = (I - K C) P (I - K C)' + K R K'  (Joseph)
 
-    On an affine model the extended filter does exactly this, so it does the work.
+    On an affine model the extended filter computes exactly this, so it is used.
 
     By default the operating point is the model's `operating_state` and `operating_input`; offsets are kept. With a
-    `schedule` of several points A, B, a, C, d follow the input: they are linear in u between the model's
-    `operating_points` and constant beyond them, where those of the first measurement belong to u = 0.
+    `schedule` of several points A, B, a, C, d depend on the input: they are linear in u between the model's
+    `operating_points` and constant beyond them; at the first measurement they are those of u = 0.
 
     Attributes:
-        form: what the arithmetic works on, "covariance" as above, "information" (`gaussian.information`) or
-            "square-root" (`gaussian.square_root`). The estimates are the same to rounding.
-        schedule: number of operating points, spread over the range of the input; 1 for the model's own one.
+        form: form of the recursion: "covariance" as above, "information" (`gaussian.information`) or "square-root"
+            (`gaussian.square_root`). The estimates are equal to rounding.
+        schedule: number of operating points, spread over the range of the input; 1 for the model's own point.
 
     Raises:
         ValueError: if a nonlinear model has no operating point, the form is unknown, the information form meets a

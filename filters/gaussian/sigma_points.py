@@ -27,7 +27,7 @@ class PointSet(NamedTuple):
 
     spread: float
     weight: float  # of each of the 2n points
-    bend: float  # weight of the outer product of the shift: of the mean of values less the value at the centre
+    shift_weight: float  # of the outer product of the shift, the mean of values minus the value at the centre
 
 
 @cache
@@ -197,25 +197,25 @@ def sigma_point_kernels(functions: Functions, shape: Shape, centre: bool) -> Ker
     @inlined
     def finish(memory, u, numbers, size):
         row, _, _ = memory
-        _, weight, bend = read_set(numbers)
+        _, weight, shift_weight = read_set(numbers)
         mean, shift, d = state_deviations(read_points(row), weight)
         store_mean(row, mean)
-        store_cov(row, add_n(state_scatter(d, shift, weight, bend), read_q(numbers)))
+        store_cov(row, add_n(state_scatter(d, shift, weight, shift_weight), read_q(numbers)))
         row[step_place] += 1.0
 
     @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
-        spread, weight, bend = read_set(numbers)
+        spread, weight, shift_weight = read_set(numbers)
         mean, root, z = read_mean(row), root_of(read_cov(row)), measured(z)
         y, shift, e = measured_deviations(seen(around(mean, root, spread), constants(numbers)), weight)
         e, shift = silence(e, z), silence_shift(shift, z)
         r, innovation = mask(read_r(numbers), z), present(z, y)
-        s = add_m(measured_scatter(e, shift, weight, bend), r)
+        s = add_m(measured_scatter(e, shift, weight, shift_weight), r)
         s_root = factor(s)
         k = solve(cross(root, e, weight * spread), s_root)
         store_mean(row, corrected(mean, 1.0, apply(k, innovation)))
-        left = state_scatter(rest(root, spread, k, e), apply(k, shift), weight, bend)
+        left = state_scatter(rest(root, spread, k, e), apply(k, shift), weight, shift_weight)
         store_cov(row, add_n(left, k_r_kt(k_r(k, r), k)))
         store_innovation(row, innovation)
         store_s(row, s)

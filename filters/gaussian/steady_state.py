@@ -55,7 +55,7 @@ def steady_kernels(functions: Functions, shape: Shape) -> Kernels:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SteadyStateKalmanFilter(AffineFilter):
-    """Kalman filter with the gain that the Kalman filter's own gain tends to.
+    """Kalman filter with a constant gain: the limit of the Kalman gain.
 
         K = P C' (C P C' + R)^-1,  P = A P A' - K C P A' + Q  (Riccati's equation for the predicted covariance)
         predict: mean = A mean + B u + a
@@ -65,16 +65,16 @@ class SteadyStateKalmanFilter(AffineFilter):
     equals "kf" where that starts from the solution P as its prior covariance.
 
     The covariance of a belief is that of the errors which this gain leaves: from the prior on A P A' + Q and
-    (I - K C) P (I - K C)' + K R K', Joseph's form, which holds for any gain. It tends to the solution of Riccati's
-    equation, stays honest where measurements are missing, and has no influence on the estimate. The gain belongs
-    to one Q and R: those of single steps are refused.
+    (I - K C) P (I - K C)' + K R K' (Joseph's form), which holds for any gain. It tends to the solution of
+    Riccati's equation, stays consistent where measurements are missing, and has no influence on the estimate. The
+    gain belongs to one Q and R: a Q or R of a single step is refused.
 
     Attributes:
         gain: K, (n, m).
 
     Raises:
         ValueError: if a nonlinear model has no operating point, or Riccati's equation has no stabilising solution:
-            what grows or lasts must be seen by the measurement, and what lasts must be stirred by Q.
+            unstable and marginally stable modes must be observable, and marginally stable ones driven by Q.
 
     Source: Anderson, Moore (1979), Optimal Filtering, section 4.4.
     """

@@ -30,10 +30,10 @@ class UnscentedKalmanFilter(Filter):
     alpha^2 kappa + beta n is not negative, which is checked.
 
     Attributes:
-        alpha: how far out the points lie; 1 puts them sqrt(n + kappa) standard deviations from the mean, where the
-            bend of f and h shows. With the often seen 0.001 the filter is hardly more than an extended one.
+        alpha: distance of the points; 1 puts them sqrt(n + kappa) standard deviations from the mean, where the
+            nonlinearity of f and h shows. With the common 0.001 the filter is hardly more than an extended one.
         beta: what is known of the distribution beyond its moments; 2 is best for Gaussian ones.
-        kappa: moves the points further out, with a larger weight in the centre; above -n.
+        kappa: moves the points further out and gives the centre a larger weight; above -n.
 
     Raises:
         ValueError: if alpha or n + kappa is not positive, or alpha^2 kappa + beta n is negative.
@@ -65,7 +65,7 @@ class UnscentedKalmanFilter(Filter):
     def own_numbers(self) -> PointSet:
         """Where the points lie, and their weights."""
         square = self.alpha**2 * (self.model.n + self.kappa)
-        return PointSet(spread=square**0.5, weight=0.5 / square, bend=self.beta - self.alpha**2)
+        return PointSet(spread=square**0.5, weight=0.5 / square, shift_weight=self.beta - self.alpha**2)
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""

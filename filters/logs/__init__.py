@@ -1,1 +1,1 @@
-"""Filters and smoothers over recorded runs, and what the innovations say of them."""
+"""Filters and smoothers over recorded runs, and what the innovations show of their consistency."""

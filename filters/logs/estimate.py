@@ -85,18 +85,18 @@ def estimate(
         filter: as `EstimateState` takes it; "ekf" if None and no tuned file.
         model: of the log, as `plants.replay.ReplayEnv` takes it: a model, what makes or offers one, or
             "module:object".
-        tuned: path of a tuned file; it gives filter, numbers and model arguments.
+        tuned: path of a tuned file, which gives filter, parameters and model arguments.
         smoother: whether estimates are corrected by later measurements.
-        lag: how many later ones; all if None.
+        lag: how many later measurements; all if None.
         columns: headers by quantity, as `plants.logs.read.read_log` takes them.
-        clock_offset: seconds by quantity, likewise.
-        dt: sample time [s], likewise.
+        clock_offset: clock offsets [s] by quantity, as `read_log` takes them.
+        dt: sample time [s], as `read_log` takes it. Covariances are per step and do not scale with dt.
         model_arguments: what the model's maker takes, such as `process_noise_cov`.
         seed: of the filter's random numbers.
-        **numbers: the filter's own numbers, such as `ensemble_size`.
+        **numbers: the filter's own parameters, such as `ensemble_size`.
 
     Raises:
-        ValueError: states the rule and the value.
+        ValueError: if an argument is wrong, or the file, the model and the filter do not fit.
     """
     env = ReplayEnv(log, model, columns=columns, clock_offset=clock_offset, dt=dt)
     filter_ = filter_for(env, filter, None, None if tuned is None else str(tuned), model_arguments, numbers)
@@ -106,7 +106,7 @@ def estimate(
 def estimate_with(
     filter_: Filter, log: Log, *, smoother: bool = False, lag: int | None = None, seed: int = 0
 ) -> LogEstimate:
-    """What a filter that is made already makes of a log; other arguments are those of `estimate`."""
+    """Run a given filter over a log; other arguments are those of `estimate`."""
     if lag is not None and not smoother:
         raise ValueError(f"a lag must be that of a smoother, but got lag {lag} without one")
     data = filter_keys([at_least("seed", seed, 0)]), log.inputs[None], log.measurements[None]

@@ -1,4 +1,7 @@
-"""What a filter's run over a log is worth: its innovations, and its errors against channels it did not see."""
+"""Assessment of a filter's run over a log: its innovations, and its errors against channels it did not see.
+
+NIS is the normalised innovation squared.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ class Residual(NamedTuple):
 
 
 class LogFindings(NamedTuple):
-    """Of the rows that count; NaN where a filter has no covariance, or nothing was measured."""
+    """Results over the rows that count; NaN where a filter has no covariance, or nothing was measured."""
 
     first: int  # the first row that counts
     rows: int  # that count, and in which something was measured

@@ -141,13 +141,13 @@ class AuxiliaryParticleFilter(WeightedFilter):
                  L = (sum of lambda_j) (mean of w_j before normalisation)
         belief:  mean = sum of w_j x_j,  cov = sum of w_j (x_j - mean)(x_j - mean)'/(1 - sum of w_j^2)
 
-    The look-ahead needs the measurement, which the update is the first to know. So the prediction keeps each
-    particle's noise; the update takes it away, draws parents by mu, and adds it again: the noise does not depend
-    on the draw, which is all that the method asks for. Before an update a belief is the bootstrap filter's. Right
-    after the prior or another update there is no noise to look through, and parents are drawn by exact weights.
+    The look-ahead needs the measurement, which is known in the update only. So the prediction keeps each
+    particle's noise; the update removes it, draws parents by mu, and adds it again: the noise does not depend on
+    the draw, which is all that the method requires. Before an update a belief equals the bootstrap filter's.
+    Directly after the prior or another update there is no noise, and parents are drawn by exact weights.
 
-    V, what the noise does to the measurement, keeps the weights w_j bounded where noise is large: with V = 0,
-    the textbook's choice, a few particles that mu had ruled out would take all the weight.
+    V, the covariance that the noise causes in the measurement, keeps the weights w_j bounded where the noise is
+    large: with V = 0, the textbook choice, a few particles that mu had ruled out would take all the weight.
 
     The log-likelihood is log L; innovation, S and restarts are the bootstrap filter's. `Belief.members` is
     (2 n + 1, N): particles, log weights, noise. `Belief.extras` holds the effective sample size.

@@ -87,16 +87,17 @@ class ParticleFilter(WeightedFilter):
     The log-likelihood is log L. The innovation is z less the weighted mean of h(x_j), and its covariance S the
     weighted covariance of h(x_j) plus R. Resampling waits for the next prediction, so that a belief has the
     moments of the weighted particles, without the noise of a draw. Where two or three particles have all the
-    weight, the covariance is nearly singular and the NEES far too large: a sign of too few particles. If none has
-    any, because the model holds the measurement for impossible, the belief restarts from the prior, counted in
-    `divergences`.
+    weight, the covariance is nearly singular and the NEES (normalised estimation error squared) far too large: a
+    sign of too few particles. If no particle has any weight, because the measurement is impossible under the
+    model, the belief restarts from the prior, which `divergences` counts.
 
     `Belief.members` is (n + 1, N), its last row the log weights; `Belief.extras` holds the ESS.
 
     Attributes:
-        resampling_threshold: the part of N below which the ESS calls for resampling, from 0 (never) to 1.
+        resampling_threshold: fraction of N; an effective sample size (ESS) below it triggers resampling; from 0
+            (never) to 1.
 
-    Others are those of `WeightedFilter`, c its regularisation.
+    The other attributes are those of `WeightedFilter`, c its regularisation.
 
     Source: Gordon, Salmond, Smith (1993), "Novel approach to nonlinear/non-Gaussian Bayesian state estimation";
     Kitagawa (1996) for the resampling; Kong, Liu, Wong (1994) for the ESS; Musso, Oudjane, Le Gland (2001),

@@ -1,4 +1,4 @@
-"""What one step's state tells of the next one's, by sigma points: for smoothing what such filters estimate."""
+"""Relation of the states of two successive steps, by sigma points: for smoothers of such filters."""
 
 from __future__ import annotations
 
@@ -58,14 +58,14 @@ def sigma_relation(transition: Callable, shape: Shape, centre: bool) -> Callable
     @inlined
     def relate(mean, p, u, numbers):
         v, c, q, root = control(u), constants(numbers), read_q(numbers), root_of(p)
-        spread, weight, bend = read_set(numbers)
+        spread, weight, shift_weight = read_set(numbers)
         points = around(mean, root, spread)
         for _ in range(int(numbers[substeps_place])):
             points = moved(points, v, c)
         predicted_mean, shift, d = deviate(points, weight)
-        predicted = add(sum_of(d, shift, weight, bend), q)
+        predicted = add(sum_of(d, shift, weight, shift_weight), q)
         gain = solve(cross(root, d, weight * spread), factor(predicted))
-        left = sum_of(rest(root, spread, gain, d), apply(gain, shift), weight, bend)
+        left = sum_of(rest(root, spread, gain, d), apply(gain, shift), weight, shift_weight)
         return predicted_mean, gain, add(left, times_transposed(times(gain, q), gain))
 
     return relate

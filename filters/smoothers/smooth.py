@@ -26,10 +26,15 @@ WITH_POINTS: dict[type[Filter], bool] = {UnscentedKalmanFilter: True, CubatureKa
 
 
 class Smoothed(NamedTuple):
-    """Estimates of B trajectories of K steps; index k is given the measurements up to k + lag."""
+    """Estimates of B trajectories of K steps; that of step k uses the measurements up to k + lag.
 
-    means: np.ndarray  # (B, K + 1, n)
-    covs: np.ndarray  # (B, K + 1, n, n)
+    Attributes:
+        means: of the states, (B, K + 1, n), in the units of the model.
+        covs: covariances of the errors, (B, K + 1, n, n).
+    """
+
+    means: np.ndarray
+    covs: np.ndarray
 
 
 def smooth(
@@ -46,18 +51,23 @@ def smooth(
     - Ensemble Kalman filters of all kinds: the smoother of Evensen and van Leeuwen. Each update moves the members
       of earlier steps, too. Each adds its sampling error, so that a small ensemble gains by a short lag only.
 
+    The recursion backwards, with both covariances given the measurements up to k, is
+
+        G_k = cov(x_k, x_{k+1}) cov(x_{k+1})^-1,   mean_k += G_k (smoothed mean_{k+1} - predicted mean_{k+1}),
+        P_k += G_k (smoothed P_{k+1} - predicted P_{k+1}) G_k'
+
     With lag = 0 the result is the filter's own. The full smoother of an ensemble takes K/2 updates a step, so give
     it a lag of as many steps as the system remembers.
 
     Args:
-        filter_: a filter of these kinds.
+        filter_: a filter of one of these types.
         keys: random keys, one a trajectory, (B, 2); those of seeds 0, 1, ..., B - 1 if None.
-        inputs: u, (B, K, p).
-        measurements: z, (B, K + 1, m), NaN where missing.
-        lag: how many later measurements an estimate has seen, for use with a fixed delay; all of them if None.
+        inputs: u, (B, K, p), in the units of the model's inputs; None for a model without inputs.
+        measurements: z, (B, K + 1, m), in the units of the model's measurements, NaN where missing.
+        lag: number of later measurements that each estimate uses (fixed-lag smoothing); all of them if None.
 
     Returns:
-        `Smoothed`, the same whatever the number of cores.
+        `Smoothed`, which does not depend on the number of cores.
 
     Raises:
         ValueError: if shapes do not fit, an input is not finite, or there is no smoother for the filter.

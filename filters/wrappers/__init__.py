@@ -1,1 +1,1 @@
-"""Filters around Gymnasium envs, single and in number."""
+"""Filters around Gymnasium envs and vector envs."""

@@ -20,7 +20,7 @@ APPENDED = "appended_entries"  # attribute of an env: entries of its observation
 
 
 def filter_for(env, filter, model, tuned: str | None, model_arguments, numbers: dict) -> Filter:
-    """The filter that a wrapper of env is told to run; its class says what the arguments mean.
+    """The filter that a wrapper of env runs; the wrapper's class documents the arguments.
 
     A tuned file is data: nothing in it becomes a model or another argument of the wrapper.
 

@@ -1,7 +1,7 @@
-"""Registered envs with a filter around them: `gym.make("filters:BowThruster-EnKF-v0")`, single and in number.
+"""Registered envs with a filter around them: `gym.make("filters:BowThruster-EnKF-v0")`, also as vector envs.
 
-Packages with envs that offer a model name themselves in the group of entry points PLANTS; each of their ids has
-one here, "BowThruster-Filtered-v0", whose argument `filter` names the filter, and one for each filter of ALIASES.
+Packages whose envs offer a model are found by the entry point group PLANTS. For each of their ids there is one
+here, "BowThruster-Filtered-v0", whose argument `filter` names the filter, and one for each filter of ALIASES.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def make_env(
 ) -> EstimateState:
     """A single env of an id with a filter around it; see `EstimateState` for the arguments.
 
-    `filter_arguments` are the filter's own numbers; what is not named here are arguments of the env.
+    `filter_arguments` are the filter's own parameters; all arguments that are not named here go to the env.
     """
     env = _made(gym.spec(env_id).entry_point, env_arguments)
     numbers = _checked(filter_arguments)
@@ -79,7 +79,7 @@ def modelled_ids() -> list[str]:
 
 
 def register_filtered_envs() -> None:
-    """Register every env that offers a model with a filter around it, unless that has been done."""
+    """Register every env that offers a model with a filter around it; nothing happens the second time."""
     for env_id in modelled_ids():
         for word, filter in [("Filtered", None), *((word, name) for name, word in ALIASES.items())]:
             if filtered_id(env_id, word) not in registry:

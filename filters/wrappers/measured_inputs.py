@@ -1,9 +1,9 @@
-"""Inputs of a model that an env measures, such as an attitude from an AHRS: they come with the action.
+"""Measured inputs of a model, such as an attitude from an AHRS: they are appended to the action.
 
     x_{k+1} = f(x_k, (u_k, a_k)) + w,   z_k
 
-An env says by `measured_inputs(model)` which of its channels are such inputs a, and which the model's measurements
-z. A filter predicts with what was measured last, and updates with the others.
+The method `measured_inputs(model)` of an env says which of its channels are such inputs a, and which are the
+model's measurements z. A filter predicts with the last measured a, and updates with z.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ HOOK = "measured_inputs"  # method of an env; what it returns is a `Split`, or N
 
 
 def split_of(env, model: StateSpaceModel) -> Split:
-    """What an env says of a model; without a word all channels are its measurements."""
+    """The split of an env's channels for a model; without the hook all channels are measurements."""
     found = getattr(env.unwrapped, HOOK, lambda model: None)(model)
     return Split((), tuple(range(model.m)), model.m) if found is None else found
 
 
 class WithMeasuredInputs:
-    """A session, or the beliefs of all copies, that takes whole measurements and makes inputs of some.
+    """A session, or the beliefs of all copies, that takes all measurements and uses some of them as inputs.
 
-    Where such a measurement is missing, the last one stands in, and zero before the first.
+    If such a measurement is missing, the last one is used, and zero before the first.
     """
 
     def __init__(self, runs, split: Split):

@@ -36,35 +36,35 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     - "measurement+estimate": the measurement, then the mean, (m + n,);
     - "belief": the mean, then the standard deviations, (2 n,).
 
-    What the env appends to its measurement (validity flags, a reference) stays at the end of the observation.
-    Of what an env measures some may be inputs of the model (`filters.wrappers.measured_inputs`): m counts them in
-    the observation, and not in the innovation.
+    What the env appends to its measurement (validity flags, a reference signal) stays at the end of the
+    observation. Some channels of an env may be inputs of the model (`filters.wrappers.measured_inputs`): m counts
+    them in the observation, but not in the innovation.
 
-    Info gains `estimate` (n,), `estimate_cov` (n, n), `innovation` (m,), `innovation_cov` (m, m) and
-    `estimate_divergences`, the restarts from the prior after an estimate that was not finite. The measurement
-    is `info["measurement"]` where the env reports it (NaN where `measurement_valid` is false), else the
-    observation. The action is clipped to the action space before the filter sees it; where an env replays a log
-    and reports `info["recorded_input"]`, that is what the filter sees. The filter's
-    randomness comes from the reset seed by a stream of its own; the env's generator is never touched. Where a
-    measurement is missing, the observation repeats the last one that was there (0 at first).
+    The info dictionary gains `estimate` (n,), `estimate_cov` (n, n), `innovation` (m,), `innovation_cov` (m, m)
+    and `estimate_divergences`, the number of restarts from the prior after an estimate that was not finite. All
+    are in the units of the model. The measurement is `info["measurement"]` if the env reports it (missing where
+    `measurement_valid` is false), else the observation. Where a measurement is missing, the observation repeats
+    the last one (0 at first). The filter predicts with the action clipped to the action space or, if an env
+    replays a log, with `info["recorded_input"]`. The filter's random numbers come from the reset seed by a stream
+    of their own; the env's generator is never used.
 
     Args:
         env: any env with Box actions and observations.
-        filter: name of a filter in `filters.FILTERS`, which `thruster filters` lists; "ekf" if None. Or somebody
-            else's `filters.estimators.estimator.Estimator`, a function that makes one of a model, or
-            "module:object" for either; what it does not give, covariances or innovations, is zero.
+        filter: name of a filter in `filters.FILTERS`, which `thruster filters` lists; "ekf" if None. Or an
+            estimator of another package, as `filters.estimators.estimator.Estimator`, a function that makes one
+            from a model, or "module:object" for either; covariances or innovations that it does not give are zero.
         observation: one of the three forms above.
         model: None for the model that the env itself offers by `env.unwrapped.state_space_model(**arguments)`,
             as a bow thruster does; "module:factory" of a function that returns a `StateSpaceModel`; or a
-            `StateSpaceModel` (which JSON cannot hold).
-        tuned: path of a tuned file; it gives filter, numbers and model arguments.
-        model_arguments: what the env's own model or the factory takes, a mapping: for a bow thruster
+            `StateSpaceModel` (which the env's spec cannot hold as JSON).
+        tuned: path of a tuned file, which gives filter, parameters and model arguments.
+        model_arguments: mapping of arguments of the env's own model or of the factory: for a bow thruster
             `process_noise_cov`, `measurement_noise_cov`, `prior_cov_factor`, `parameter_factors`,
             `operating_voltage`.
-        **numbers: the filter's own numbers, such as `ensemble_size`, or what a function takes beside the model.
+        **numbers: the filter's own parameters, such as `ensemble_size`, or further arguments of the function.
 
     Raises:
-        ValueError: if an argument is unknown or off, or spaces and model do not fit.
+        ValueError: if an argument is unknown or wrong, or spaces and model do not fit.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The filter of a tuned file, with the model of the env, or of the caller, that it is put on."""
+"""The filter of a tuned file, with the model of the env or of the caller."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from plants.state_space import StateSpaceModel
 
 
 def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:
-    """The filter of a tuned file, whose numbers a model has taken on.
+    """Make the filter of a tuned file, for a model that takes the tuned Q, R and parameters.
 
     Nothing is imported that the file names: the model is the env's own, or what the caller gives. It has to be the
     one that the file is for. A file that holds its plant as data is compared with the env's plant, if no model is
@@ -62,7 +62,7 @@ def _with_numbers(
 ) -> StateSpaceModel:
     """A model with the numbers of a tuned file: Q and R, the factor on P_0, and what else the maker takes by name.
 
-    Other numbers are left out only where the model's digest then tells whether that makes another model.
+    Other parameters are left out only where the model's digest then shows whether that makes another model.
     """
     if isinstance(make, StateSpaceModel):
         fits(make)

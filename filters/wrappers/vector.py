@@ -24,22 +24,22 @@ from plants.state_space import StateSpaceModel
 
 
 class EstimateStates(gym.vector.VectorWrapper):
-    """Run a filter beside every copy of a vector env; what `EstimateState` is to a single env.
+    """Run a filter beside every copy of a vector env, as `EstimateState` does beside a single env.
 
     Copy i of `reset(seed=s)` equals an `EstimateState` around a single env with `reset(seed=s + i)`, later
     episodes too. A copy whose episode begins starts from the prior, updated with the first measurement: in the
     mode NEXT_STEP at the step after the end, whose action is ignored; in SAME_STEP within the step, and then
     `final_obs` and `final_info` hold the last estimate; in DISABLED where `options["reset_mask"]` is true.
 
-    Info gains, with one row a copy, `estimate` (N, n), `estimate_cov` (N, n, n), `innovation` (N, m),
-    `innovation_cov` (N, m, m) and `estimate_divergences` (N,).
+    The info dictionary gains, with one row for each copy, `estimate` (N, n), `estimate_cov` (N, n, n),
+    `innovation` (N, m), `innovation_cov` (N, m, m) and `estimate_divergences` (N,).
 
     Args:
         env: any vector env with Box actions and observations.
         filter, observation, model, tuned, model_arguments, **numbers: those of `EstimateState`.
 
     Raises:
-        ValueError: if an argument is unknown or off, or spaces and model do not fit.
+        ValueError: if an argument is unknown or wrong, or spaces and model do not fit.
     """
 
     def __init__(

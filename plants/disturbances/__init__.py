@@ -1,1 +1,1 @@
-"""What disturbs any plant: effects as frozen values, sensors and recorded series."""
+"""Disturbances of any plant: effects as frozen values, sensor effects and recorded series."""

@@ -1,4 +1,4 @@
-"""Chains of effects in compiled code: programs of numbers that are run one effect after the other."""
+"""Chains of effects in compiled code: packed parameters of effects that act one after the other."""
 
 from __future__ import annotations
 

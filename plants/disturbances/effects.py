@@ -1,13 +1,13 @@
-"""What disturbs a plant: immutable descriptions, registered by name, that JSON can hold.
+"""Effects that disturb a plant: immutable values, registered by name, that JSON can hold.
 
 An effect is a frozen dataclass of plain numbers with the function that acts on a block of copies,
 
     act(memory, b, target, rows, number, numbers, at, begin)
 
-where `memory[b, target, j]` is what it changes for copy j, `memory[b, rows + i, j]` are its own states,
-`numbers[at + i]` its parameters, `number` tells its random draws from those of other effects, and `begin` is true
-at the start of an episode. The same function serves a single env, a batch and a vector env. Anyone may register
-further effects before the first env is made.
+where `memory[b, target, j]` is the value that it changes for copy j, `memory[b, rows + i, j]` are its own states,
+`numbers[at + i]` its parameters, `number` distinguishes its random draws from those of other effects, and `begin`
+is true at the start of an episode. The same function serves a single env, a batch and a vector env. Anyone may
+register further effects before the first env is made.
 """
 
 from __future__ import annotations
@@ -31,25 +31,28 @@ LONGEST = 1e9  # [s], and in steps: what an effect may hold
 
 @dataclasses.dataclass(frozen=True)
 class Context:
-    """What an effect may need to turn its arguments into numbers; a plant may add to it, in a class of its own."""
+    """What an effect may need to compute its parameters; a plant may add to it, in a class of its own."""
 
     dt: float  # sample time [s]
     valid_offset: int  # from the row of a measured channel to the one that says whether it is valid
 
 
 class Effect:
-    """Base of all effects; fields of the dataclass are the arguments."""
+    """Base of all effects; fields of the dataclass are the arguments.
+
+    The `context` of its methods is the plant's: a `Context`, or a class of the plant's own that adds to it.
+    """
 
     __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]  # every effect is a dataclass
     act: ClassVar[Callable]  # the function above, a staticmethod
     name: ClassVar[str]
     loses: ClassVar[bool] = False  # whether measurements may be missing: then their validity is observed
 
-    def parameters(self, context: Context) -> list[float]:
-        """Numbers that `act` finds from `numbers[at]` on: the fields in order, unless overridden."""
+    def parameters(self, context: Any) -> list[float]:
+        """Parameters that `act` reads from `numbers[at]` on: the fields in order, unless overridden."""
         return [float(value) for value in dataclasses.astuple(self)]
 
-    def rows(self, context: Context) -> int:
+    def rows(self, context: Any) -> int:
         """Number of states that a copy keeps for this effect."""
         return 0
 
@@ -175,6 +178,6 @@ def _numbers(values: tuple) -> list:
     return [value for value in values if isinstance(value, (int, float, tuple)) and value]
 
 
-def set_field(effect: Effect, name: str, value) -> None:
+def set_field(effect: object, name: str, value) -> None:
     """Set a checked value on a frozen effect, from its __post_init__."""
     object.__setattr__(effect, name, value)

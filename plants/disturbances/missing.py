@@ -55,11 +55,11 @@ def sample_every(memory, b, target, rows, number, numbers, at, begin):
 class Dropout(Effect):
     """Missing measurements, in runs of random length.
 
-    The observation then repeats the last valid value (0 at first), a validity flag of the channel is appended
-    to it, and `info["measurement_valid"]` tells the same.
+    The observation then repeats the last valid value (0 at first), a validity flag of the channel is appended to
+    it, and `info["measurement_valid"]` holds the same flag.
 
     Args:
-        probability: share of the measurements that are missing in the long run.
+        probability: fraction of the measurements that are missing in the long run.
         mean_length: mean number of missing measurements in a row; 1/(1 - probability) is independent dropout.
     """
 

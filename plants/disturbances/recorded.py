@@ -1,4 +1,4 @@
-"""A recorded series as a signal that somebody measured."""
+"""A recorded series, such as a measured wind, as a signal."""
 
 from __future__ import annotations
 

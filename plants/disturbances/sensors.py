@@ -1,7 +1,7 @@
-"""Sensors: what is measured, and what spoils it beside Gaussian noise.
+"""Sensor effects: errors of a measurement beside Gaussian noise.
 
 A channel measures a quantity plus Gaussian noise of covariance R (`measurement_noise_cov`). A list of effects may
-follow it; each acts on what the one before it made. All amounts are in the channel's unit.
+follow; each acts on the result of the one before. All amounts are in the channel's unit.
 """
 
 from __future__ import annotations

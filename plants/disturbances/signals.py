@@ -1,7 +1,7 @@
-"""Signals that add to what disturbs a plant, such as a flow or a wind, in the unit of that quantity.
+"""Signals that add to a disturbance of a plant, such as a flow or a wind, in the unit of that quantity.
 
-A signal is held over a sample time; those of time take their value in the middle. A plant registers those that it
-has (`Registry.register`).
+A signal is held over a sample time; a function of time is evaluated in its middle. A plant registers the signals
+that it has (`Registry.register`).
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class Gusts(Effect):
 
     Args:
         std: standard deviation of a gust's height.
-        rate: gusts a second that begin while it is calm [1/s].
+        rate: gusts that begin per second of calm [1/s].
         duration: of a gust [s].
     """
 

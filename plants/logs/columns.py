@@ -1,4 +1,4 @@
-"""Which column of a file is which quantity of a model: by its header, or as it is told."""
+"""Which column of a file is which quantity of a model: by its header, or as the caller says."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Wanted(NamedTuple):
 
 
 class Column(NamedTuple):
-    """A column of a file, and its unit; None where it tells none."""
+    """A column of a file, and its unit; None where the header gives none."""
 
     header: str
     unit: str | None
@@ -74,34 +74,34 @@ def find_columns(
     units: Mapping[str, str],
     file: str,
 ) -> dict[str, Column]:
-    """The column of each quantity that the file has, and of "time", by key.
+    """Find the column of each quantity that the file has, and of "time", by key.
 
-    What is not told goes by headers: without its unit, that of a column is the quantity's name or its symbol.
-    Names come first, and of quantities inputs, measurements, states and outputs in this order; a column is used
+    Quantities that are not given are found by headers: a header without its unit is the quantity's name or symbol.
+    Names are tried before symbols, and inputs, measurements, states and outputs in this order; a column is used
     once.
 
     Args:
         wanted: from `quantities_of`.
         headers: of the file's columns.
         given: columns by quantity: "thrust" or "output:T", and "time", to "loadcell_N" or "loadcell[N]".
-        units: by header, where the header tells none or another.
+        units: by header, where the header gives none or another one.
         file: for messages.
 
     Raises:
-        ValueError: for a quantity that the model has not, a column that the file has not, or one told twice.
+        ValueError: for a quantity that the model has not, a column that the file has not, or one given twice.
     """
     found: dict[str, Column] = {}
     for name, text in given.items():
         one = None if name == TIME else find_wanted(name, wanted)
         if one is None and name != TIME:
             known = ", ".join([*(known.quantity.symbol for known in wanted), TIME])
-            raise ValueError(f"columns must be told for some of {known}, but got {shown(name)}={text} ({file})")
+            raise ValueError(f"columns must be given for some of {known}, but got {shown(name)}={text} ({file})")
         if not isinstance(text, str):
             raise ValueError(f"the column for {name} must be a header, but got {shown(text)} ({file})")
         key = TIME if one is None else one.key
         if key in found:
             raise ValueError(
-                f"a column must be told once for {name}, but got {found[key].header} and {text} ({file})"
+                f"a column must be given once for {name}, but got {found[key].header} and {text} ({file})"
             )
         found[key] = column_of(text, headers, units, name, file)
     for header in units:

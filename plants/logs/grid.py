@@ -1,17 +1,18 @@
 """Times of samples and the regular grid on which a log lies: the rules, all in one place.
 
-Grid. Stamps that keep to multiples of one sample time within a tenth of it are those multiples: a missing row
-leaves a gap. Else the log is irregular, and the sample time is the one asked for, or the median between stamps.
+Grid. Time stamps that lie within a tenth of a sample time of its multiples are put on these multiples: a missing
+row leaves a gap. Otherwise the log is irregular, and the sample time is the one given, or the median interval.
 
-Measurements. A sample goes to the nearest grid time within half a step, and of several to one time the nearest
-counts; a grid time without one has NaN. A channel with a clock offset is interpolated linearly between samples
-that are at most 1.5 steps apart, so that what is estimated moves continuously with the offset, as a search for it
-needs; that averages some of the noise away. Samples farther apart go to the nearest grid time.
+Measurements. A sample is moved to the nearest grid time, at most half a step away; if several belong to one time,
+the nearest is used; a grid time without a sample has NaN. A channel with a clock offset is interpolated linearly
+between samples that are at most 1.5 steps apart, so that estimates depend continuously on the offset, as a search
+for it needs; this averages some of the noise. Samples further apart are moved to the nearest grid time.
 
-Inputs. They are held from sample to sample, before the first one at its value; the input of a step is the mean of
-what is held over the step.
+Inputs. They are held from sample to sample (before the first sample at its value); the input of a step is the mean
+of the held value over the step.
 
-Clock offsets. A channel's stamp less its offset is the time on the log's clock: it is how far that clock is ahead.
+Clock offsets. The offset says how far a channel's clock is ahead: its time stamp minus the offset is the log's
+time.
 """
 
 from __future__ import annotations

@@ -22,24 +22,24 @@ FEWEST_STEPS = 2
 class Log:
     """One recorded run. Row k holds what was measured at time k dt, and the input that acts from then on.
 
-    That is how `thruster simulate --out` writes, and how a recorder does that reads its sensors right after it has
-    sent a command. Channels are named by `input:V_s`, `measurement:thrust`, `state:omega_m` and `output:T`.
+    `thruster simulate --out` writes rows like this, and so does a recorder that reads its sensors right after it
+    has sent a command. Channels are named as in `input:V_s`, `measurement:thrust`, `state:omega_m` and `output:T`.
 
     Attributes:
         name: of the run, its file if it has one.
         dt: sample time [s].
         inputs: (K, p), finite.
         measurements: (K + 1, m), NaN where there is no sample.
-        references: what filters do not see, (K + 1,) by channel: true states, and outputs of the model such as
+        references: channels that filters do not see, (K + 1,) each: true states, and outputs of the model such as
             the thrust of a load cell; NaN where there is no sample.
-        input_quantities: what the inputs are, p.
-        measured: what the measurements are, m.
-        referred: what the references are, by channel.
-        start: the file's stamp of row 0 [s].
-        source: samples of channels by their own times, before they are put on the grid; where there is none, the
+        input_quantities: names and units of the p inputs.
+        measured: names and units of the m measurements.
+        referred: name and unit of each reference, by channel.
+        start: time stamp of row 0 in the file [s].
+        source: samples of channels at their own times, before they are put on the grid; for other channels the
             rows themselves.
-        offsets: how far the clock of a channel is ahead [s], by channel; it is taken off its times.
-        irregular: whether the file's stamps were on no grid.
+        offsets: how far the clock of a channel is ahead [s], by channel; it is subtracted from its times.
+        irregular: whether the time stamps of the file lay on no grid.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Logs from files: CSV, Parquet or npz, and what a small TOML file beside one says of its columns."""
+"""Logs from files: CSV, Parquet or npz, and an optional TOML file beside it that describes the columns."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ def read_log(
     dt: float | None = None,
     name: str = "a table",
 ) -> Log:
-    """A log of a model's inputs and measurements from a file; columns of its states and outputs are references.
+    """Read a log of a model's inputs and measurements from a file; columns of states and outputs are references.
 
     Columns are found by their headers (`plants.logs.columns.find_columns`), converted to the model's units
-    (`plants.logs.units`) and put on a grid (`plants.logs.grid`). A file beside, run.toml for run.csv, may say
+    (`plants.logs.units`) and put on a grid (`plants.logs.grid`). A file beside it, run.toml for run.csv, may say
 
         dt = 0.01
         [columns]
@@ -62,19 +62,19 @@ def read_log(
         [clock_offset]
         thrust = -0.06
 
-    and the arguments say what they name in its place.
+    and the arguments take precedence over it.
 
     Args:
         path: a file that ends in .csv, .parquet or .npz; or a table itself: a mapping from headers to arrays
             (rows,), or a pandas.DataFrame.
-        model: whose inputs and measurements it has to have.
+        model: its inputs and measurements must be in the file.
         columns: headers by the symbol or name of a quantity, or "kind:symbol"; "HEADER[UNIT]" with another unit.
         clock_offset: how far a channel's clock is ahead [s].
-        dt: sample time [s], of rows without a time column, or of the grid where stamps are on none.
-        name: of a log that is no file.
+        dt: sample time [s], for files without a time column, or whose time stamps lie on no grid.
+        name: of a log that is not a file.
 
     Raises:
-        ValueError: states the rule and the value, with file, line and column.
+        ValueError: if a column is missing, or a value is wrong; it names file, line and column.
     """
     is_file = isinstance(path, (str, PathLike))
     table = read_table(path) if is_file else table_of(path, name)

@@ -18,7 +18,7 @@ _BRACKETS = re.compile(r"^(?P<base>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
 
 
 def parted(header: str) -> tuple[str, str | None]:
-    """The header of a column without its unit, and the unit, None where it tells none.
+    """The header of a column without its unit, and the unit, None where it gives none.
 
     Units stand in brackets ("speed [rad/s]"), or at the end as `thruster simulate` writes them
     ("omega_m_rad_per_s", also "omega_m_rad_s"); these are of WORDS.
@@ -41,11 +41,11 @@ def suffix(unit: str) -> str:
 
 
 def converted(values: np.ndarray, unit: str | None, wanted: str, where: str) -> np.ndarray:
-    """Values in another unit; the same where a column tells no unit, or that which is wanted.
+    """Convert values to another unit; unchanged where a column gives no unit, or the wanted one.
 
     Args:
         values: of a column.
-        unit: its unit, None where it tells none.
+        unit: its unit, None where it gives none.
         wanted: that of the model's quantity, empty for a pure number.
         where: the column, for messages.
 

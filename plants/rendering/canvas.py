@@ -1,4 +1,4 @@
-"""What the picture is drawn on: coordinates in pixels, smooth edges, text, and the colours.
+"""Canvas of the pictures: coordinates in pixels, smooth edges, text, and the colours.
 
 Imports pygame, as most modules of this folder do: `renderer` imports them only when a picture is wanted.
 """

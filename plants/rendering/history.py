@@ -1,4 +1,4 @@
-"""The last moments of an episode, and what a filter believes of them."""
+"""The last time steps of an episode, with the estimates of a filter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What draws an episode of a plant: it remembers the last moments, and shows them as arrays or in a window."""
+"""Renderer of an episode of a plant: it keeps the last steps, and shows them as arrays or in a window."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class PlantRenderer:
         """Start an episode: nothing is remembered."""
         self._history.clear()
 
-    def add(self, moment: tuple, overlay: tuple | None = None) -> None:
+    def add(self, moment: Any, overlay: Any = None) -> None:
         """Note a moment, a sample time after the one before; the first of an episode is that of the reset."""
         self._history.add(moment)
         self.amend(overlay)

@@ -1,11 +1,11 @@
-"""How far one recorder's clock is ahead of another's, where both recorded the same quantity."""
+"""The offset between the clocks of two recorders of the same quantity."""
 
 from __future__ import annotations
 
 import numpy as np
 
-REACH, STEP = 0.15, 0.001  # offsets that are tried, to either side of zero [s]
-EDGES = 0.2  # of both ends that are left out, as the shifted series has to reach over them [s]
+REACH, STEP = 0.15, 0.001  # range of offsets to either side of zero, and its step [s]
+EDGES = 0.2  # left out at both ends, so that the shifted series covers all samples [s]
 
 
 def clock_offset(times: np.ndarray, here: np.ndarray, there: np.ndarray) -> float:
@@ -13,7 +13,7 @@ def clock_offset(times: np.ndarray, here: np.ndarray, there: np.ndarray) -> floa
 
     Args:
         times: stamps (K,) [s], the same for both series, each by its own clock.
-        here: samples by the clock that counts.
+        here: samples by the reference clock.
         there: samples by the other clock, which are interpolated linearly.
     """
     counted = (times >= times[0] + EDGES) & (times <= times[-1] - EDGES) & np.isfinite(here)
@@ -24,7 +24,7 @@ def clock_offset(times: np.ndarray, here: np.ndarray, there: np.ndarray) -> floa
 
 
 def offset_by_halves(times: np.ndarray, here: np.ndarray, there: np.ndarray) -> tuple[float, float]:
-    """The offset that each half of a run has by itself: how far they are apart tells how well it is known."""
+    """The offset of each half of a run: their difference shows the accuracy."""
     middle = len(times) // 2
     halves = slice(None, middle), slice(middle, None)
     first, last = (clock_offset(times[half], here[half], there[half]) for half in halves)

@@ -1,4 +1,4 @@
-"""Structures of the model, each identified from recordings: what every effect is worth."""
+"""Structures of the model, each identified from recordings, to compare the effects."""
 
 from __future__ import annotations
 
@@ -56,11 +56,11 @@ NOISE = (
 )
 
 
-DEGREES = 20.0  # of freedom of the load cell's errors: it rings after each start and reversal
+DEGREES = 20.0  # degrees of freedom of the load cell's errors: it rings after each start and reversal
 
 
 class Structure(NamedTuple):
-    """Effects of the model that are there, and the numbers that are found."""
+    """Effects in the model, and the free parameters."""
 
     about: str
     free: tuple[Parameter, ...]
@@ -68,7 +68,7 @@ class Structure(NamedTuple):
     ambient: bool = False  # whether the measured ambient flow is an input
 
     def model(self, **values: float) -> StateSpaceModel:
-        """The model, with the load cell, for values of the free numbers."""
+        """The model with the load cell for values of the free parameters."""
         mount = MOUNT[0] in self.free
         return valued(to_identify(self.ambient, mount), {**self.fixed, **values})
 
@@ -102,9 +102,9 @@ STRUCTURES = {
 def identified(
     structure: Structure, runs: Sequence[Recording], starts: int = 1, progress: Callable | None = None
 ) -> Identification:
-    """The numbers of a structure under which the filter predicts tachometer and load cell best.
+    """The parameters of a structure with the best prediction of tachometer and load cell.
 
-    The filter sees the tachometer alone; the load cell's channel is predicted (`identify`).
+    The filter uses the tachometer only; the load cell's channel is predicted (`identify`).
     """
     return identify(
         [one.log(structure.ambient) for one in runs],
@@ -113,13 +113,13 @@ def identified(
         predicted=[LOAD_CELL.symbol],
         degrees=DEGREES,
         starts=starts,
-        simulation_first=False,  # which would follow the sign of the speed wrongly for a while
+        simulation_first=False,  # a simulation would have the wrong sign of the speed for a while
         progress=progress,
     )
 
 
 def thrusts(model: StateSpaceModel, runs: Sequence[Recording], ambient: bool = False) -> list[np.ndarray]:
-    """Estimated thrust (K + 1,) on each run, of an EKF that sees command and tachometer, on the recorder's clock.
+    """Estimated thrust (K + 1,) on each run, of an EKF with command and tachometer, on the recorder's clock.
 
     Args:
         model: identified, with or without the load cell.

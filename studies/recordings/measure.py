@@ -1,4 +1,4 @@
-"""How far an estimate of thrust is from the load cell, and over the recorder's own."""
+"""Errors of thrust estimates against the load cell, and their ratios to the recorder's own."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from studies.recordings.runs import Recording
 
 WINDOW = 5  # rows, 0.2 s, over which estimate and load cell are averaged: the mount swings at 14 Hz
-SHIFTS = np.arange(-0.12, 0.1201, 0.01)  # of the clock, of which each estimate may take its best one [s]
+SHIFTS = np.arange(-0.12, 0.1201, 0.01)  # of the clock [s]; each estimate may have its best one
 SETTLED = 1.2  # after the start, and after every change of the command's sign [s]
 
 
@@ -22,13 +22,13 @@ class Ratios(NamedTuple):
 
 
 def averaged(values: np.ndarray, window: int = WINDOW) -> np.ndarray:
-    """Centred means over so many rows, at the ends over those that there are."""
+    """Centred means over `window` rows, fewer at the ends."""
     ones = np.ones(window)
     return np.convolve(values, ones, "same") / np.convolve(np.ones(len(values)), ones, "same")
 
 
 def error(estimate: np.ndarray, run: Recording, offset: float, window: int = WINDOW) -> np.ndarray:
-    """Estimate less load cell [N], on the rows of the load cell.
+    """Estimate minus load cell [N], on the rows of the load cell.
 
     Args:
         estimate: (K + 1,), on the recorder's clock.
@@ -41,7 +41,7 @@ def error(estimate: np.ndarray, run: Recording, offset: float, window: int = WIN
 
 
 def rmse(estimate: np.ndarray, run: Recording, offset: float | None = None, window: int = WINDOW) -> float:
-    """Root mean square of `error`, at the run's clock offset unless told another."""
+    """Root mean square of `error`, at the run's clock offset unless another one is given."""
     found = error(estimate, run, run.offset if offset is None else offset, window)
     return float(np.sqrt((found**2).mean()))
 

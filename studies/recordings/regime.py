@@ -1,4 +1,7 @@
-"""Whether process noise that is larger for a while after each reversal of the command pays on the recordings."""
+"""The effect of a larger process noise after each reversal of the command on the recordings.
+
+NIS is the normalised innovation squared.
+"""
 
 from __future__ import annotations
 
@@ -18,19 +21,19 @@ FACTORS = (1.0, 4.0, 16.0, 64.0, 256.0)  # on Q in that time
 
 
 class Regime(NamedTuple):
-    """What a factor on Q after reversals achieves."""
+    """Results with a factor on Q after reversals."""
 
     factor: float
     log_likelihood: float  # of the tachometer, all runs
-    nis: float  # mean over all steps; 1 is right
+    nis: float  # mean over all steps; expected value 1
     ratio: float  # mean over the runs of the thrust's error over that of the recorder's own
 
 
 def regimes(model: StateSpaceModel, runs: Sequence[Recording], factors: Sequence[float] = FACTORS) -> list[Regime]:
     """An extended Kalman filter with each factor on Q after reversals.
 
-    No filter of the project changes Q by the regime: this is one in plain NumPy; where the factor is 1 it is the
-    project's, as a test sees.
+    No filter of the project changes Q during a run: this one is plain NumPy. With a factor of 1 it is equal to the
+    project's filter, which a test checks.
     """
     seen, found = on_line(model), []
     for factor in factors:

@@ -1,4 +1,4 @@
-"""Results of all identifications, kept in a file as they come, so that an interrupted study goes on."""
+"""Results of all identifications, stored in a file one by one, so that an interrupted study can be continued."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ class Task(NamedTuple):
     """One identification."""
 
     structure: str
-    held_out: str = NONE_HELD_OUT  # the run that it does not see
+    held_out: str = NONE_HELD_OUT  # the held-out run
 
     @property
     def name(self) -> str:
-        """What messages and files call it."""
+        """Its name in messages and files."""
         return f"{self.structure}, without {self.held_out}" if self.held_out else self.structure
 
 
 def tasks_of(runs: Sequence[Recording]) -> list[Task]:
-    """The structure that is taken, with all runs and without each; then the others, without each."""
+    """The chosen structure, with all runs and without each one; then the other structures in the same way."""
     names = [NONE_HELD_OUT, *(run.name for run in runs)]
     order = [CHOSEN, *(name for name in STRUCTURES if name != CHOSEN)]
     return [Task(structure, held_out) for structure in order for held_out in names]
@@ -37,13 +37,13 @@ def tasks_of(runs: Sequence[Recording]) -> list[Task]:
 def identify_all(
     runs: Sequence[Recording], file: Path, starts: int = 4, progress: Callable[[str, int, int], None] | None = None
 ) -> dict[str, dict[str, Any]]:
-    """Values, standard errors and log-likelihoods of every task, by its name; what the file has is not done anew.
+    """Values, standard errors and log-likelihoods of every task, by its name; tasks in the file are not repeated.
 
     Args:
-        runs: recorded.
-        file: JSON, written after every task; one of other runs or structures is begun anew.
-        starts: of the identification whose numbers are taken; the others begin at round numbers alone.
-        progress: told a task's name, how many are done, and of how many.
+        runs: the recordings.
+        file: JSON, written after every task; a file of other runs or structures is replaced.
+        starts: number of starts of the identification with all runs; the others have one start, at round numbers.
+        progress: called with a task's name, the number of finished tasks, and the number of all tasks.
     """
     digest = digest_of(
         tuple(run.log(True).digest for run in runs), [(*one,) for one in STRUCTURES.values()], starts

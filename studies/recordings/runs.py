@@ -14,8 +14,8 @@ from studies.recordings.clock import clock_offset, offset_by_halves
 from studies.recordings.model import AMBIENT, COMMAND, DT, LOAD_CELL, TACHOMETER
 
 FOLDER = "closed_loop_25Hz"
-GATE = 0.12  # beyond which the flow sensor is taken to be wrong [m/s]
-FLOW_RATE = 0.1  # share of a new sample in the smoothed flow
+GATE = 0.12  # larger values of the flow sensor are taken to be wrong [m/s]
+FLOW_RATE = 0.1  # weight of a new sample in the smoothed flow
 # The recorder's thrust T = c_n n|n| - c_nv v|n| - c_v v|v|, for its two kinds of model (Boehm 2019).
 OWN = (1.466934e-3, 0.4146275, 0.0)
 OWN_NONLINEAR = (1.4657e-3, 0.375535, 37.7137)  # of runs named NLO2
@@ -27,14 +27,14 @@ class Recording(NamedTuple):
     name: str
     times: np.ndarray  # (K + 1,) stamps [s], of the recorder's rows and, by its own clock, of the load cell's
     command: np.ndarray  # (K + 1,) [V]
-    flow: np.ndarray  # (K + 1,) [m/s], smoothed, zero where there is none
-    tachometer: np.ndarray  # (K + 1,) [rad/s], without its sign; NaN in row 0, which holds no sample
+    flow: np.ndarray  # (K + 1,) [m/s], smoothed; zero without samples
+    tachometer: np.ndarray  # (K + 1,) [rad/s], absolute value; NaN in row 0, which has no sample
     load: np.ndarray  # (K + 1,) [N], by the load cell's clock
-    own: np.ndarray  # (K + 1,) [N], the recorder's on-line estimate, or the desired thrust where it made none
+    own: np.ndarray  # (K + 1,) [N], the recorder's on-line estimate, or the desired thrust where there is none
     own_is_desired: bool
     desired: np.ndarray  # (K + 1,) [N]
-    offset: float  # how far the load cell's clock is ahead, by the two tachometers [s]
-    halves: tuple[float, float]  # the same by either half of the run
+    offset: float  # of the load cell's clock, by the two tachometers [s]; positive if it is ahead
+    halves: tuple[float, float]  # the same for each half of the run
 
     def log(self, ambient: bool = False) -> Log:
         """The run as a log on the recorder's clock, with the load cell as a channel, and the flow as an input."""
@@ -54,7 +54,7 @@ def read_recordings(folder: str | Path) -> list[Recording]:
     """All closed-loop runs of a folder, or of its folder "closed_loop_25Hz", by name.
 
     Raises:
-        ValueError: if there are none, or a file lacks a column.
+        ValueError: if there is no recording, or a file lacks a column.
     """
     folder = Path(folder)
     files = sorted((folder / FOLDER).glob("*.csv")) or sorted(folder.glob("*.csv"))

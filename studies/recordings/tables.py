@@ -32,7 +32,7 @@ class Table(NamedTuple):
 def tables_of(
     runs: Sequence[Recording], estimates: Estimates, tasks: Mapping[str, Mapping] | None = None
 ) -> dict[str, Table]:
-    """All tables by name, in their order; those of structures and numbers where these were identified anew."""
+    """All tables by name, in their order; those of structures and parameters where these were identified again."""
     made = {
         "ratios": Table(RATIO_HEADER, ratio_rows(runs, estimates)),
         "estimators": Table(["run", *estimates], baseline_rows(runs, estimates)),
@@ -65,12 +65,12 @@ def baseline_rows(runs: Sequence[Recording], estimates: Estimates) -> list[list[
 
 
 def clock_rows(runs: Sequence[Recording]) -> list[list[str]]:
-    """How far the load cell's clock is ahead on each run."""
+    """The offset of the load cell's clock on each run."""
     return [[run.name, *(f"{value + 0.0:+.3f}" for value in (run.offset, *run.halves))] for run in runs]
 
 
 def ladder_rows(runs: Sequence[Recording], tasks: Mapping[str, Mapping]) -> list[list[str]]:
-    """What each effect of the model is worth, on runs left out of the identification."""
+    """The errors of each structure, on runs left out of the identification."""
     rows = []
     for name, structure in STRUCTURES.items():
         found = np.array(structure_ratios(name, runs, tasks))
@@ -81,7 +81,7 @@ def ladder_rows(runs: Sequence[Recording], tasks: Mapping[str, Mapping]) -> list
 
 
 def number_rows(runs: Sequence[Recording], tasks: Mapping[str, Mapping]) -> list[list[str]]:
-    """The numbers that are taken, how sure they are, and within what they lie if one run is left out."""
+    """The chosen parameters, their standard errors, and their range when one run is left out."""
     whole, rows = tasks[Task(CHOSEN).name], []
     for one in STRUCTURES[CHOSEN].free:
         value, error = whole["values"][one.name], whole["standard_errors"][one.name]
@@ -92,7 +92,7 @@ def number_rows(runs: Sequence[Recording], tasks: Mapping[str, Mapping]) -> list
 
 
 def sentences(estimates: Estimates, runs: Sequence[Recording]) -> list[str]:
-    """What the table of ratios says in short."""
+    """The table of ratios in one sentence."""
     found = np.array([ratios(one, run) for one, run in zip(estimates[OURS], runs, strict=True)])
     averaged, best, raw = found.T
     return [

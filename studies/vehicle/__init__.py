@@ -1,7 +1,7 @@
-"""Two papers on the estimation of an underwater vehicle's path, done again with many runs.
+"""Two papers on the estimation of an underwater vehicle's path, repeated with many runs.
 
-`printed` is the form of what the papers print, `paths` what the vehicle does, `models` what it is, `pose` how a
-path follows from velocities. `mean_propagation` and `own_attitude` are filters that serve these studies alone,
-`estimators` and `tasks` say which filters run where. `experiment` runs them all on the same runs, `scores` is what
-is kept, `findings` sets printed values beside it, `statements` says what it means, `figure` draws the paths.
+`printed` is the form of the papers' tables, `paths` has the inputs, `models` the vehicle, `pose` the path from
+velocities. `mean_propagation` and `own_attitude` are filters of these studies only, `estimators` and `tasks` the
+filters of each study. `experiment` runs all of them on the same runs, `scores` has the results, `findings` the
+printed values beside them, `statements` the conclusions, `figure` the pictures of the paths.
 """

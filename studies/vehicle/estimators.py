@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,10 +16,10 @@ from studies.vehicle.own_attitude import OwnAttitudeKalmanFilter
 from studies.vehicle.printed import FUZZY_HIGH, FUZZY_LOW
 
 MEMBERS = (50, 100, 200, 300)
-NARROW_LOW = (0.5, -0.1, -0.1, -0.1, -0.3, -0.3)  # [m/s], [rad/s]: about what the paths come to once under way
+NARROW_LOW = (0.5, -0.1, -0.1, -0.1, -0.3, -0.3)  # [m/s], [rad/s]: approximate range on the paths after the start
 NARROW_HIGH = (1.1, 0.1, 0.1, 0.1, 0.3, 0.3)
 MEASUREMENTS = "measurements, no filter"
-EULER = {"integration": "euler"}  # what the papers print; the truth and our other filters have Runge and Kutta's
+EULER = {"integration": "euler"}  # as in the papers; the truth and our other filters use Runge-Kutta
 
 
 class Estimator(NamedTuple):
@@ -30,7 +30,7 @@ class Estimator(NamedTuple):
 
     @property
     def has_attitude(self) -> bool:
-        """Whether roll and pitch are among what is estimated."""
+        """Whether roll and pitch are estimated."""
         return self.filter is not None and self.filter.model.n > 6
 
 
@@ -70,12 +70,12 @@ def ensembles(states: int, world: str = "vehicle", members: Sequence[int] = MEMB
 def fuzzy(world: str = "vehicle") -> list[Estimator]:
     """The fuzzy filter of 64 rules in four readings.
 
-    All linearise Euler's method, I + A dt. The printed bounds without and with offsets; the same with rules that
-    go on from an estimate of their own each, blended for output only; a range about the manoeuvre.
+    All linearise Euler's method, I + A dt. The printed bounds without and with offsets; the same with a separate
+    estimate for each rule, blended for output only; and a range about the manoeuvre.
     """
     model = level_model(world)
-    bounds = {"low": np.array(FUZZY_LOW), "high": np.array(FUZZY_HIGH)}
-    narrow = {"low": np.array(NARROW_LOW), "high": np.array(NARROW_HIGH)}
+    bounds: dict[str, Any] = {"low": np.array(FUZZY_LOW), "high": np.array(FUZZY_HIGH)}
+    narrow: dict[str, Any] = {"low": np.array(NARROW_LOW), "high": np.array(NARROW_HIGH)}
     return [
         Estimator("fuzzy 0..1", FuzzyKalmanFilter(model=model, offsets=False, **bounds)),
         Estimator("fuzzy 0..1 offsets", FuzzyKalmanFilter(model=model, **bounds)),

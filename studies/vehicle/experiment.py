@@ -1,4 +1,7 @@
-"""All filters on the same runs of a path: truth, estimates, and what is kept of both."""
+"""All filters on the same runs of a path: truth, estimates and scores.
+
+NEES is the normalised estimation error squared.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ import numpy as np
 from filters import run
 from filters.bounds import path_bound
 from filters.consistency.nees import normalized_squares
+from filters.filter import Filter
 from numerics.checks import at_least
 from plants.simulate import Truth, simulate
 from studies.vehicle.estimators import Estimator
@@ -44,9 +48,9 @@ class PathResult(NamedTuple):
     steps: int
     end: np.ndarray  # (4,), x, y, z [m] and psi [rad] at the end without noise
     planar_gap: np.ndarray  # (4,), RMSE of the transformation by yaw alone, of the velocities without noise
-    outside: np.ndarray  # (7,), share of time that each velocity is outside 0..1, then that any is
+    outside: np.ndarray  # (7,), fraction of time in which each velocity is outside 0..1, then in which any is
     bound: Bound
-    scores: dict[str, Scores]  # by the filter's label
+    scores: dict[str, Scores]  # by label of the filter
 
 
 class Task(NamedTuple):
@@ -61,12 +65,12 @@ OnPart = Callable[[int, int, str], None]  # (done, total, what was done)
 
 
 def settled(steps: int) -> slice:
-    """The steps that count for velocities: from 2 s on, or the second half of what is shorter."""
+    """The scored steps of velocities: from 2 s on, or the second half of a shorter run."""
     return slice(min(SETTLED, steps // 2) + 1, None)
 
 
 def keys_of(path: str, runs: int, seed: int) -> np.ndarray:
-    """Keys of the runs of one path, (runs, 2): of truth and filters alike, for their streams differ."""
+    """Keys of the runs of one path, (runs, 2), for both truth and filters, whose random streams differ."""
     generator = np.random.default_rng([seed, tuple(PATHS).index(path)])
     return generator.integers(0, 2**32, size=(runs, 2)).astype(np.float64)
 
@@ -82,11 +86,11 @@ def run_tasks(
     """Run every task's filters on the same runs.
 
     Args:
-        tasks: what to run.
-        runs: independent runs of each path, at least 2.
-        seed: of all randomness.
-        steps: first steps of each path that are run; all if None.
-        on_part: is told how many parts of the work are done, of how many, and which is next.
+        tasks: the tasks.
+        runs: number of independent runs of each path, at least 2.
+        seed: seed of all random numbers.
+        steps: number of first steps of each path; all if None.
+        on_part: called with the number of finished parts, the number of all parts, and the next one.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -98,7 +102,7 @@ def run_tasks(
     total, done, results = sum(len(task.estimators) for task in tasks) * len(parts), 0, []
     for task in tasks:
         inputs, keys = find_path(task.path).inputs(steps), keys_of(task.path, runs, seed)
-        found = {one.label: [] for one in task.estimators}
+        found: dict[str, list[Scores]] = {one.label: [] for one in task.estimators}
         for part in parts:
             truth = true_runs(task.world, keys[part], inputs)
             for one in task.estimators:
@@ -121,15 +125,17 @@ def for_all(inputs: np.ndarray, runs: int) -> np.ndarray:
     return np.ascontiguousarray(np.broadcast_to(inputs, (runs, *inputs.shape)))
 
 
-def for_filter(one: Estimator, inputs: np.ndarray, runs: int) -> np.ndarray:
-    """Inputs as an estimator's model takes them: level, where it is told roll and pitch."""
-    level = np.zeros((len(inputs), one.filter.model.inputs - inputs.shape[1]))
+def for_filter(filter_: Filter, inputs: np.ndarray, runs: int) -> np.ndarray:
+    """Inputs of a filter's model; where roll and pitch are inputs, they are zero."""
+    level = np.zeros((len(inputs), filter_.model.inputs - inputs.shape[1]))
     return for_all(np.concatenate([inputs, level], axis=1), runs)
 
 
 def estimate(one: Estimator, truth: Truth, keys: np.ndarray, inputs: np.ndarray):
-    """What a filter makes of some runs, and how many seconds of one core it took; the code is compiled before."""
-    given = for_filter(one, inputs, len(keys))
+    """Estimates of a filter on some runs, and its seconds of one core without compilation."""
+    if one.filter is None:
+        raise ValueError(f"an estimate must be by a filter, but {one.label} has none")
+    given = for_filter(one.filter, inputs, len(keys))
     run(one.filter, keys[:1], given[:1, :1], truth.measurements[:1, :2])
     began = time.process_time()
     estimates = run(one.filter, keys, given, truth.measurements)
@@ -137,7 +143,7 @@ def estimate(one: Estimator, truth: Truth, keys: np.ndarray, inputs: np.ndarray)
 
 
 def scores_of(one: Estimator, truth: Truth, keys: np.ndarray, inputs: np.ndarray) -> Scores:
-    """What is kept of an estimator on some runs."""
+    """The scores of an estimator on some runs."""
     count, steps, true_pose = len(keys), settled(len(inputs)), truth.states[..., [9, 10, 11, 8]]
     nothing = np.full((count, 4), np.nan)
     if one.filter is None:
@@ -187,11 +193,11 @@ def noise_free(world: str, inputs: np.ndarray) -> np.ndarray:
     return simulate(still, np.zeros((1, 2)), inputs[None]).states[0]
 
 
-def along_path(world: str, inputs: np.ndarray) -> tuple:
+def along_path(world: str, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, Bound]:
     """End, gap of the transformation by yaw alone, share outside the bounds, and the bound, all without noise.
 
-    The bound is `filters.bounds.path_bound`: the posterior one is useless with a noise of 1e-6 rad a step on the
-    angles.
+    The bound is `filters.bounds.path_bound`: the posterior bound is useless with a noise of 1e-6 rad per step on
+    the angles.
     """
     states, steps = noise_free(world, inputs), settled(len(inputs))
     pose = states[:, [9, 10, 11, 8]]

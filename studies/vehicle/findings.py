@@ -11,17 +11,17 @@ from studies.vehicle.experiment import PathResult
 from studies.vehicle.printed import POSE, PrintedRow
 from studies.vehicle.scores import Scores
 
-FACTOR = 3.0  # up to which two errors count as of one size: path and duration are not printed
+FACTOR = 3.0  # up to which two errors are of the same size: path and duration are not printed
 FIELDS = {
     "full": "of the size of ours by the full transformation",
     "planar_both": "of the size of ours with path and estimate both by yaw alone",
     "planar": "of the size of ours by yaw alone, which no filter can mend",
 }
-ENKF, FKF = "EnKF8 N=50", "fuzzy 0..1"  # those that stand beside the printed filters
+ENKF, FKF = "EnKF8 N=50", "fuzzy 0..1"  # our counterparts of the printed filters
 
 
 class Finding(NamedTuple):
-    """One filter on one path: what is printed, if anything, and what we have."""
+    """One filter on one path: the printed values, if there are any, and ours."""
 
     path: str
     label: str
@@ -43,7 +43,7 @@ def findings(paper: str, results: list[PathResult]) -> list[Finding]:
 
 
 def printed_row(paper: str, path: str, label: str) -> PrintedRow | None:
-    """The printed row that a filter of ours stands beside."""
+    """The printed row of one of our filters."""
     if paper == ngatini2019.PAPER.name:
         rows = {f"EnKF8 N={count}": row for count, row in ngatini2019.TABLE_III.items()}
         return rows.get(label) if path == "IV" else None
@@ -51,7 +51,7 @@ def printed_row(paper: str, path: str, label: str) -> PrintedRow | None:
 
 
 def why_different(printed: PrintedRow, scores: Scores, result: PathResult) -> str:
-    """Which of our errors the printed ones are like, and which are less than these measurements allow."""
+    """Which of our errors the printed ones resemble, and which are smaller than these measurements allow."""
     said = []
     for field, words in FIELDS.items():
         ratios = [value / one for value, one in _pairs(printed, scores.rmse(field))]

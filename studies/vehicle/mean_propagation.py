@@ -1,4 +1,4 @@
-"""The ensemble Kalman filter as one paper prints it: every member is moved from the mean, and none from itself."""
+"""The ensemble Kalman filter as printed in one paper: every member is predicted from the mean, not from itself."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numerics.sources import Source
 
 @lru_cache(maxsize=64)
 def from_the_mean(kernels: Kernels) -> Kernels:
-    """An ensemble's kernels with all members put on their mean before they are moved."""
+    """An ensemble's kernels in which all members are set to their mean before the prediction."""
     n, predict_members, means_of = kernels.n, kernels.predict, row_means(kernels.n)
     source = Source("gather", "table, means", means=(n,))
     for a in source.rows_of_members(n):
@@ -38,10 +38,10 @@ class MeanPropagatingEnKF(EnsembleKalmanFilter):
         predict: x_j = f(mean, u) + w_j,  w_j ~ N(0, Q)
         update:  that of `EnsembleKalmanFilter`
 
-    The members' covariance before an update is Q whatever came before, so the gain is Q H' (H Q H' + R)^-1: what
-    the model carries from step to step, such as what heave says of pitch, is not used, and states that H does not
-    see are those of the model alone. With Q = R a state that is measured directly is estimated with the variance
-    2/3 R, where a right filter has 0.618 R. It is no filter to use, so it stands here and not in `filters`.
+    The members' covariance before an update is always Q, so the gain is Q H' (H Q H' + R)^-1: correlations that
+    the model builds up over steps, such as of heave and pitch, are not used, and states that H does not contain
+    are those of the model alone. With Q = R a state that is measured directly is estimated with the variance 2/3
+    R; a correct filter has 0.618 R. It should not be used, so it is here and not in `filters`.
 
     Source: Ngatini, Nurhadi (2019), Jurnal Inovtek Polbeng Seri Informatika 4(1), equation (24), which has no
     index on the state that is moved; probably a misprint, for the authors' slides of 2017 have one.

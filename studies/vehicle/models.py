@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from auv_env.model import auv_model
 from auv_env.presets import SEGOROGENI
 from numerics.checks import one_of
 from plants.state_space import StateSpaceModel
 from studies.vehicle.printed import DT, MEASURED, NOISE
 
-ANGLE_NOISE = 1e-6  # of roll and pitch, standard deviation a step [rad]: Q of eight states is not singular
+ANGLE_NOISE = 1e-6  # of roll and pitch, standard deviation per step [rad]: so Q of eight states is not singular
 START = (1e-3,) * 6 + (1e-4,) * 2 + (0.0,) * 4  # standard deviations about rest at the origin; P_0 is not printed
 WORLDS = {"vehicle": SEGOROGENI, "no restoring moments": SEGOROGENI._replace(zG=0.0)}
-"""Segorogeni by our recipe, and the same with the centre of gravity in that of buoyancy.
+"""Segorogeni with our parameters, and the same with the centre of gravity at the centre of buoyancy.
 
-There nothing depends on roll and pitch, so that the papers' six velocities are a closed system.
+Then nothing depends on roll and pitch, so that the papers' six velocities are a closed system.
 """
 COUNTS = {"velocities": 6, "motion": 8, "navigation": 12}
 
@@ -21,8 +23,8 @@ COUNTS = {"velocities": 6, "motion": 8, "navigation": 12}
 def papers_model(states: str, world: str = "vehicle", **arguments) -> StateSpaceModel:
     """The model of so many states at the papers' noise and sensors, u, v, w and r measured at every step of 1 ms.
 
-    Process noise is on velocities, as the papers have it, and a trace of it on roll and pitch; yaw and position
-    have none. The inputs are X_prop, K_prop, delta_s and delta_r, for "velocities" roll and pitch as well.
+    Process noise is on velocities, as in the papers, and very small on roll and pitch; yaw and position have none.
+    The inputs are X_prop, K_prop, delta_s and delta_r, and for "velocities" also roll and pitch.
 
     Args:
         states: "velocities", "motion" or "navigation".
@@ -33,7 +35,7 @@ def papers_model(states: str, world: str = "vehicle", **arguments) -> StateSpace
         ValueError: for an unknown world, and as `auv_model` does.
     """
     noise = (NOISE,) * 6 + (ANGLE_NOISE**2,) * 2 + (0.0,) * 4
-    settings = {
+    settings: dict[str, Any] = {
         "preset": WORLDS[one_of("world", world, tuple(WORLDS))],
         "dt": DT,
         "propeller_torque": None,

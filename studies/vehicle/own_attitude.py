@@ -57,11 +57,11 @@ def own_attitude_kernels(functions: Functions, shape: Shape) -> Kernels:
 class OwnAttitudeKalmanFilter(ExtendedKalmanFilter):
     """The extended Kalman filter of u, v, w, p, q, r with its own attitude.
 
-        predict: with roll and pitch as inputs, those that its estimates of p, q, r have led to
+        predict: with roll and pitch as inputs, integrated from its estimates of p, q, r
         update:  that of `ExtendedKalmanFilter`, then roll and pitch a step further by Heun's rule
 
-    It takes the attitude as known, so its covariance is too small. Whatever is given as roll and pitch, the last
-    two inputs of the model `auv_model(states="velocities")`, is overwritten. The vehicle starts level.
+    It treats the attitude as known, so its covariance is too small. The given roll and pitch, the last two inputs
+    of the model `auv_model(states="velocities")`, are overwritten. The vehicle starts level.
     """
 
     name: ClassVar[str] = "own attitude"

@@ -1,7 +1,7 @@
-"""What the vehicle does on each of the papers' five paths, as inputs over time.
+"""The vehicle's inputs over time on each of the papers' five paths.
 
-The papers do not define their paths. These are ours, named alike: each starts at rest at the origin, and on IV the
-planes are such that the end is the printed one, (10, 18, 6) m.
+The papers do not define their paths. These are ours with the same names: each starts at rest at the origin,
+and on IV the planes are chosen so that the path ends at the printed point, (10, 18, 6) m.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ class Manoeuvre(NamedTuple):
     stern: float  # angle of the stern plane [deg]
     rudder: float  # [deg]
     duration: float  # [s]
-    stern_period: float = math.inf  # of a change of sign and back [s]
+    stern_period: float = math.inf  # of a full cycle of the sign [s]
     rudder_period: float = math.inf
     thrust_period: float = math.inf
-    thrust_swing: float = 0.0  # part of the thrust
+    thrust_swing: float = 0.0  # as a fraction of the thrust
 
     @property
     def steps(self) -> int:

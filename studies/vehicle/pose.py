@@ -1,6 +1,6 @@
 """Position and yaw that follow from velocities over time, by the full transformation or by yaw alone.
 
-All integrals are trapezoids. Yaw counts turns; its errors do not, they are the short way round.
+Integrals are by the trapezoidal rule. Yaw counts full turns; its errors are the short way round.
 
 Source of the transformation by yaw alone: Ngatini, Nurhadi (2019), equations 1 to 4.
 """
@@ -48,7 +48,7 @@ def _attitude_reckoner(interpreting: bool) -> CompiledOrPython:
 
 
 def reckoned_attitude(velocities: np.ndarray, dt: float) -> np.ndarray:
-    """Roll and pitch (B, K + 1, 2) [rad] that p, q, r of velocities (B, K + 1, 6) lead to, level at first."""
+    """Roll and pitch (B, K + 1, 2) [rad] from p, q, r of velocities (B, K + 1, 6), level at the start."""
     attitudes = np.zeros((*velocities.shape[:2], 2))
     _attitude_reckoner(is_interpreting())(np.ascontiguousarray(velocities[..., 3:]), dt, attitudes)
     return attitudes

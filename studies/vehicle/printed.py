@@ -1,4 +1,4 @@
-"""What the papers on the vehicle print of their runs: the form of a table, and the settings that both share."""
+"""The runs of the papers on the vehicle: the form of a table, and the settings of both papers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ DT = 0.001  # [s]
 NOISE = 1e-6  # Q = R = 1e-6 I, in the units of the velocities squared
 MEASURED = ("u", "v", "w", "r")  # H picks these
 POSE = ("x", "y", "z", "psi")  # [m], [m], [m], [rad]
-FUZZY_LOW, FUZZY_HIGH = (0.0,) * 6, (1.0,) * 6  # bounds of the velocities, of which the rules are the corners
+FUZZY_LOW, FUZZY_HIGH = (0.0,) * 6, (1.0,) * 6  # bounds of the velocities; the rules are the corners
 RUNS = 10  # "mean of 10 runs"
 NOT_PRINTED = (
     "number of steps",
@@ -35,11 +35,11 @@ class PrintedPath(NamedTuple):
 
     enkf: PrintedRow
     fkf: PrintedRow
-    remark: str = ""  # what is wrong with the print, or how it was read
+    remark: str = ""  # misprint, or how it was interpreted
 
 
 class Paper(NamedTuple):
-    """A source, and what a reader of it should know."""
+    """A source with remarks for its readers."""
 
     name: str
     source: str

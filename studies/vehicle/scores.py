@@ -1,4 +1,7 @@
-"""What is kept of a filter's runs: mean squares by run, which intervals and ratios follow from."""
+"""Scores of a filter: mean squares by run, from which intervals and ratios follow.
+
+NEES is the normalised estimation error squared.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from filters.consistency.intervals import Interval, interval, mean_interval, res
 
 
 class Scores(NamedTuple):
-    """A filter's errors in B runs; NaN where it says nothing.
+    """A filter's errors in B runs; NaN where it has no estimate.
 
     Velocities are u, v, w [m/s] and p, q, r [rad/s], attitude is roll and pitch [rad]; both are scored from 2 s
     on, as the NEES is. A pose is x, y, z [m] and psi [rad], scored over the whole run as the papers do, it seems.
@@ -25,7 +28,7 @@ class Scores(NamedTuple):
     full_end: np.ndarray  # (B, 4), absolute errors at the end
     planar_end: np.ndarray  # (B, 4)
     nees: np.ndarray  # (B,), mean
-    divergences: np.ndarray  # (B,), restarts from the prior
+    divergences: np.ndarray  # (B,), filter resets: restarts from the prior
     seconds: np.ndarray  # (B,), of one core
 
     def rmse(self, field: str) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What the runs say of the two papers on the vehicle, in sentences with the numbers in them."""
+"""Sentences with numbers on the two papers on the vehicle, from our runs."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def unstable_corners(low=FUZZY_LOW, high=FUZZY_HIGH, world: str = "vehicle") -> 
 
 
 def statements(paper: str, results: list[PathResult]) -> list[str]:
-    """What one paper's tables say beside ours."""
+    """Statements that compare a paper's tables with ours."""
     by_path = {result.path: result for result in results if result.world == "vehicle"}
     if paper == ngatini2019.PAPER.name:
         return [

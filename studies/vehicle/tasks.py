@@ -1,4 +1,4 @@
-"""Which filters each paper's study runs, on which paths and in which worlds."""
+"""The filters of each paper's study, with their paths and worlds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers in the words of tables and statements."""
+"""Formats of numbers in tables and statements."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from training.setup import Setup, make_setup, setup_from_json
+from training.setup import Setup, configuration_from_json, make_configuration
 from tuning.thruster.find import find_scenario
 
 KILLS = 20
@@ -43,7 +43,7 @@ def kill_training(rng: np.random.Generator, kills: int, seconds: float) -> str:
             in the end.
     """
     scenario, deadline = find_scenario("medium_noise"), time.monotonic() + LAST_KILL * seconds
-    setup = make_setup("tracking", scenario, "ekf", steps=STEPS, num_envs=COPIES, hyperparameters=SMALL)
+    setup = make_configuration("tracking", scenario, "ekf", steps=STEPS, num_envs=COPIES, hyperparameters=SMALL)
     with tempfile.TemporaryDirectory() as scratch:
         folder, lost, done, steps = Path(scratch) / "policy", [], 0, 0
         while done < kills and time.monotonic() < deadline:
@@ -171,16 +171,16 @@ def _saved_steps(folder: Path) -> int:
 
 def _learnt(saved: Path) -> int:
     from training.environments import make_environments
-    from training.saved import load, read_setup
+    from training.saved import load, read_configuration
 
-    return load(saved, make_environments(read_setup(saved), [0])).model.num_timesteps
+    return load(saved, make_environments(read_configuration(saved), [0])).model.num_timesteps
 
 
 def _check_training(folder: Path, setup: Setup | None = None) -> None:
     """What is in the folder of a training that has ended is whole, and nothing is left aside."""
-    from training.saved import BEST, FINAL, read_setup
+    from training.saved import BEST, FINAL, read_configuration
 
-    setup = setup or read_setup(folder)
+    setup = setup or read_configuration(folder)
     assert _learnt(folder / FINAL) >= setup.steps and _learnt(folder / BEST) > 0
     with np.load(folder / "evaluations.npz") as file:
         steps = file["timesteps"].tolist()
@@ -196,7 +196,7 @@ def _learn(folder: str) -> None:
     def tell(steps: int, mean_return: float) -> None:
         print(steps, flush=True)
 
-    setup = setup_from_json(sys.stdin.read(), "standard input")
+    setup = configuration_from_json(sys.stdin.read(), "standard input")
     train(setup, folder, evaluations=EVALUATIONS, checkpoints=CHECKPOINTS, tensorboard=False, on_progress=tell)
 
 

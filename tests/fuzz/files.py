@@ -21,7 +21,7 @@ from filters import EstimateState
 from filters.tuned_file import sealed
 from tests.tuned_files import write_untuned
 from training.environments import make_environments
-from training.setup import make_setup, setup_from_json
+from training.setup import configuration_from_json, make_configuration
 from tuning.evaluation.tuned import read_tuned
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage
@@ -72,7 +72,7 @@ def tuned_files(rng: np.random.Generator, seconds: float) -> str:
         assert np.isfinite(info["estimate"]).all() and np.isfinite(info["estimate_cov"]).all()
 
     def train(path: Path) -> None:
-        setup = make_setup("manoeuvre", find_scenario("nominal"), "ekf", tuned=path)
+        setup = make_configuration("manoeuvre", find_scenario("nominal"), "ekf", tuned=path)
         assert TRAP not in setup.as_json()
 
     def write(path: Path) -> None:
@@ -87,10 +87,10 @@ def tuned_files(rng: np.random.Generator, seconds: float) -> str:
 
 def setups(rng: np.random.Generator, seconds: float) -> str:
     """Setups of policies, changed: read as data, or refused."""
-    right = json.loads(make_setup("manoeuvre", find_scenario("mismatch"), "ekf").as_json())
+    right = json.loads(make_configuration("manoeuvre", find_scenario("mismatch"), "ekf").as_json())
 
     def use(path: Path) -> None:
-        setup = setup_from_json(path.read_text(errors="replace"), path.name)
+        setup = configuration_from_json(path.read_text(errors="replace"), path.name)
         make_environments(setup, [0], native=bool(rng.integers(2))).reset()
 
     def write(path: Path) -> None:

@@ -157,8 +157,8 @@ def test_a_file_of_another_kind_is_refused_in_one_line(tmp_path):
 def test_columns_that_are_told_have_to_be_there(tmp_path):
     refused = {
         "the column for tach must be one of time_s, voltage_V, tach, but got 'rpm'": {"tach": "rpm"},
-        "columns must be told for some of V_s, tach, n, time, but got 'flow'=tach": {"flow": "tach"},
-        "a column must be told once for voltage, but got tach and voltage_V": {
+        "columns must be given for some of V_s, tach, n, time, but got 'flow'=tach": {"flow": "tach"},
+        "a column must be given once for voltage, but got tach and voltage_V": {
             "V_s": "tach",
             "voltage": "voltage_V",
         },

@@ -6,11 +6,14 @@ import subprocess
 import sys
 import tarfile
 import tomllib
+import zipfile
 from importlib.metadata import requires
 from pathlib import Path
 
 import pytest
 
+from tests.repository.test_house import ROOMS
+from thruster_env import __version__
 from tuning.search.samplers import NEEDS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -20,7 +23,6 @@ EXTRAS = {
     for extra, lines in PROJECT["optional-dependencies"].items()
 }
 PINNED = {line.partition("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line}
-ROOMS = ("thruster_env", "auv_env", "filters", "tuning", "training", "studies", "thruster_cli")
 NOT_PACKED = {".gitignore", ".ci/run"}
 
 
@@ -50,17 +52,35 @@ def test_whatever_of_rl_zoo3_imports_requests_is_brought_by_the_extra():
     assert "requests" in EXTRAS["peers"] or "requests" in theirs
 
 
-def test_a_source_distribution_holds_the_whole_repository(tmp_path):
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory):
+    """A folder with what git knows, and in dist/ a source distribution and a wheel built from it."""
     if not (ROOT / ".git").exists():
         pytest.skip("only where git knows what there is")
+    folder = tmp_path_factory.mktemp("packed")
     listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True)
     files = {name for name in listed.stdout.splitlines() if (ROOT / name).is_file()}
     for name in files:
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(ROOT / name, tmp_path / name)
-    program = "import setuptools.build_meta as build; build.build_sdist('dist')"
-    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, check=True)
-    (archive,) = (tmp_path / "dist").iterdir()
-    with tarfile.open(archive) as packed:
-        found = {name.partition("/")[2] for name in packed.getnames()}
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(ROOT / name, folder / name)
+    program = "import setuptools.build_meta as b; b.build_sdist('dist'); b.build_wheel('dist')"
+    subprocess.run([sys.executable, "-c", program], cwd=folder, capture_output=True, check=True)
+    return folder / "dist", files
+
+
+def test_a_source_distribution_holds_the_whole_repository(packed):
+    dist, files = packed
+    with tarfile.open(next(dist.glob("*.tar.gz"))) as archive:
+        found = {name.partition("/")[2] for name in archive.getnames()}
     assert sorted(files - found) == sorted(NOT_PACKED)
+
+
+def test_a_wheel_holds_every_file_of_every_package_and_nothing_else(packed):
+    dist, files = packed
+    (wheel,) = dist.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        found = {name for name in archive.namelist() if ".dist-info/" not in name}
+    of_rooms = {name for name in files if name.partition("/")[0] in ROOMS}
+    assert {f"{room}/py.typed" for room in ROOMS} <= found
+    assert sorted(found ^ of_rooms) == []
+    assert wheel.name.split("-")[:2] == ["thruster_env", __version__]

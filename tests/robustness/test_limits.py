@@ -14,7 +14,7 @@ from numerics.checks import as_floats, shown, vector
 from studies.comparison import compare
 from thruster_cli.simulate import command
 from thruster_env.parameters import TUNNEL
-from training.setup import setup_from_json
+from training.setup import configuration_from_json
 from tuning.problems.files import read_scenario
 from tuning.problems.seeds import held_out_seeds, training_seeds
 from tuning.thruster.scenarios import SCENARIOS
@@ -133,6 +133,8 @@ def test_files_that_are_nested_without_end_are_refused(tmp_path):
         json.loads(text)
     (tmp_path / "deep.json").write_text(text)
     refused(lambda: read_tuned_file(tmp_path / "deep.json"), "a tuned file must be whole JSON")
-    refused(lambda: setup_from_json(text, "policy.json"), "policy.json must hold the setup of a policy")
+    refused(
+        lambda: configuration_from_json(text, "policy.json"), "policy.json must hold the configuration of a policy"
+    )
     (tmp_path / "deep.toml").write_text(f"steps = {text}")
     refused(lambda: read_scenario(tmp_path / "deep.toml"), "a scenario file must be TOML")

@@ -106,7 +106,7 @@ def test_a_filter_tuned_on_logs_is_verified_reported_and_used(simulated, as_json
     assert wrapped.filter.name == "ekf"
     (tmp_path / "c.csv").write_text((tmp_path / "a.csv").read_text())
     changed = thruster("verify", "tuned.json")
-    assert changed.returncode == 2 and "must be what it was tuned on, a.csv+2 of digest" in changed.stderr
+    assert changed.returncode == 2 and "must be what it was tuned on, a.csv and 2 more of digest" in changed.stderr
     done = thruster("estimate", "b.csv", "--tuned", "tuned.json", "--dt", "0.02", "--out", "est.csv")
     assert done.returncode == 2 and "was tuned for dt 0.01 (here 0.02)" in done.stderr
     assert not (tmp_path / "est.csv").exists()
@@ -141,7 +141,7 @@ def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  
             ("estimate", "run.csv", "--column", "thrust"),
             "--column must have the form NAME=VALUE, but got 'thrust'",
         ),
-        (("estimate", "run.csv", "--column", "flow=x"), "columns must be told for some of V_s, thrust, omega_m"),
+        (("estimate", "run.csv", "--column", "flow=x"), "columns must be given for some of V_s, thrust, omega_m"),
         (
             ("estimate", "run.csv", "--column", "thrust=x"),
             "the column for thrust must be one of time_s, voltage_V",

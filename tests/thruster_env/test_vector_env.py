@@ -290,5 +290,5 @@ def test_make_vec_takes_json(name):
 def test_wrong_arguments_of_the_vector_env_are_refused(given):
     with pytest.raises(ValueError, match=f"{next(iter(given))} must be"):
         BowThrusterVectorEnv(**given)
-    with pytest.raises(ValueError, match="render_mode must be None in number, but got 'rgb_array'"):
+    with pytest.raises(ValueError, match="render_mode must be None in a vector env, but got 'rgb_array'"):
         BowThrusterVectorEnv(render_mode="rgb_array")

@@ -21,7 +21,7 @@ from training.environments import make_environments
 from training.plants.plant import Part
 from training.plants.thruster import FIRST_SCORED_STEP, THRUSTER
 from training.score import Scores, run_episodes, score
-from training.setup import make_setup
+from training.setup import make_configuration
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario
 
@@ -30,7 +30,7 @@ SEEDS = held_out_seeds(0, 3)
 
 
 def setup(observe, seed=0, steps=2048):
-    return make_setup("manoeuvre", MEDIUM, observe, steps=steps, seed=seed)
+    return make_configuration("manoeuvre", MEDIUM, observe, steps=steps, seed=seed)
 
 
 def result(observe, returns, kind="ppo", errors=1.0, seed=0):
@@ -186,7 +186,7 @@ def test_predictive_control_beats_lqr_and_a_horizon_changes_little():
 
 def test_a_predictive_controller_believes_in_what_its_filter_does():
     assumed = find_scenario("mismatch").parameter_factors
-    wrong = make_setup("manoeuvre", MEDIUM.replace(parameter_factors=assumed), "ekf")
+    wrong = make_configuration("manoeuvre", MEDIUM.replace(parameter_factors=assumed), "ekf")
     told, right = (
         classical_policy("mpc", chosen).controller.problem.constants for chosen in (wrong, setup("ekf"))
     )
@@ -212,7 +212,7 @@ def test_the_plan_has_every_arm_at_every_noise_with_equal_networks_and_steps():
 
 @pytest.mark.slow
 def test_variants_change_what_the_filter_assumes_and_nothing_else():
-    runs_there = runs_of(Comparison(noises=("medium",), arms=("ekf",), seeds=1))
+    runs_there = runs_of(Comparison(noises=("medium",), observation_sets=("ekf",), seeds=1))
     planned = {run.label: run.setup for run in runs_there if run.kind == "ppo"}
     best = {run.label: run.setup for run in runs_there if run.kind == BEST}
     for arm, variant in VARIANTS:
@@ -265,7 +265,7 @@ def test_the_quick_form_compares_every_arm_and_writes_a_page(thruster, tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "found.json").read_text())
     named = {row[HEADER[0]] for row in found["policies"]["medium"]}
-    assert {f"PPO: {arm}" for arm in QUICK.arms} < named
+    assert {f"PPO: {arm}" for arm in QUICK.observation_sets} < named
     assert {
         "PI: raw",
         "LQG: kf",

@@ -13,7 +13,7 @@ from training.classical import classical_policy
 from training.environments import make_environments
 from training.saved import find_saved, load
 from training.score import score
-from training.setup import setup_from_json
+from training.setup import configuration_from_json
 from tuning.problems.seeds import held_out_seeds
 
 SEEDS = list(range(10, 10 + COPIES))
@@ -85,7 +85,7 @@ def test_native_and_single_envs_and_the_end_of_an_episode_are_alike():
 def test_a_correction_is_learnt_saved_and_scored(algo, tmp_path):
     setup = setup_of("ekf", algo, controller="one-step")
     run = learn(setup, tmp_path / "policy")
-    assert setup_from_json(setup.as_json(), "setup.json") == setup and setup.controller == "one-step"
+    assert configuration_from_json(setup.as_json(), "setup.json") == setup and setup.controller == "one-step"
     seeds = held_out_seeds(0, 2)
     policy = load(find_saved(run.folder), make_environments(setup, seeds))
     assert (score(policy, setup, seeds).returns < 0).all()

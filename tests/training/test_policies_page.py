@@ -12,10 +12,10 @@ from training.classical import classical_policy
 from training.comparison.answers import GOAL
 from training.comparison.plan import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
 from training.comparison.tables import HEADER, name_of
-from training.observations import ARMS
+from training.observations import OBSERVATION_SETS
 from training.plants.find import TASKS
 from training.score import score
-from training.setup import make_setup
+from training.setup import make_configuration
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario
 
@@ -54,7 +54,7 @@ def test_the_table_of_medium_noise_has_every_variant_too():
 
 
 def test_the_page_tells_every_arm_and_the_task():
-    assert all(f"`{arm}`" in PAGE for arm in ARMS)
+    assert all(f"`{arm}`" in PAGE for arm in OBSERVATION_SETS)
     (reference,) = TASKS[TASK].arguments["reference"]
     assert f"between {reference['low']} and {reference['high']}" in PAGE and reference["hold_time"] == 0.5
     assert all(f"`{name}`" in PAGE for name in NOISES.values())
@@ -114,7 +114,7 @@ def test_where_the_model_is_wrong_a_policy_that_corrects_it_beats_the_controller
     ],
 )
 def test_classical_rows_are_those_of_the_code(name, kind, arm):
-    setup = make_setup(TASK, find_scenario("medium_noise"), arm)
+    setup = make_configuration(TASK, find_scenario("medium_noise"), arm)
     found = score(classical_policy(kind, setup), setup, held_out_seeds(0, 200))
     row = rows_at("medium")[name]
     assert returned(row) == pytest.approx(found.returns.mean(), abs=6e-4)

@@ -14,14 +14,14 @@ from tests.learners import COPIES, LIMIT, contents, copied, learn, setup_of, sho
 from training.algorithms import ALGORITHMS
 from training.environments import make_environments
 from training.learn import VALIDATION_EPISODES, _episodes_after
-from training.observations import ARMS
-from training.saved import CHECKPOINTS, FINAL, find_saved, load, read_setup
+from training.observations import OBSERVATION_SETS
+from training.saved import CHECKPOINTS, FINAL, find_saved, load, read_configuration
 from training.score import score
-from training.setup import setup_from_json
+from training.setup import configuration_from_json
 from tuning.problems.seeds import held_out_seeds
 
 
-@pytest.mark.parametrize("observe", ARMS)
+@pytest.mark.parametrize("observe", OBSERVATION_SETS)
 def test_a_policy_learns_on_every_arm_and_is_scored(observe, tmp_path):
     setup, told = setup_of(observe), []
     run = learn(setup, tmp_path / "policy", on_progress=lambda steps, value: told.append((steps, value)))
@@ -49,7 +49,7 @@ def test_a_policy_learns_by_every_algorithm_goes_on_and_acts_the_same_when_loade
     run = learn(longer, folder)
     assert (run.steps, run.learnt) == (256, 128)
     assert [steps for steps, _ in run.curve] == [64, 128, 256]
-    assert steps_of(find_saved(folder)) == 256 and read_setup(find_saved(folder)).steps == 256
+    assert steps_of(find_saved(folder)) == 256 and read_configuration(find_saved(folder)).steps == 256
     seen = np.random.default_rng(0).normal(0, 20, (5, 4)).astype(np.float32)
     policies = [load(find_saved(folder), make_environments(setup, [0, 1])) for _ in range(2)]
     first, second = (policy.predict(seen)[0] for policy in policies)
@@ -152,9 +152,9 @@ def test_a_training_goes_on_after_any_number_of_steps_with_episodes_of_its_own(s
 
 
 def test_a_setup_survives_its_text():
-    for observe in ARMS:
+    for observe in OBSERVATION_SETS:
         setup = setup_of(observe)
-        again = setup_from_json(setup.as_json(), "setup.json")
+        again = configuration_from_json(setup.as_json(), "setup.json")
         assert again == setup and not setup.differences(again)
 
 

@@ -16,7 +16,7 @@ from thruster_cli.train import name_of
 from training.algorithms import ALGORITHMS
 from training.environments import make_environments
 from training.play import play
-from training.saved import FINAL, load, read_setup
+from training.saved import FINAL, load, read_configuration
 from training.score import score
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario
@@ -74,7 +74,7 @@ def test_the_commands_train_score_and_play(thruster, monkeypatch, tmp_path):
     assert contents(tmp_path / "out") == before
     if importlib.util.find_spec("pygame") and importlib.util.find_spec("moviepy"):
         played = thruster("play", folder, "--out", "film.gif")
-        assert played.returncode == 0 and "Film: film.gif" in played.stdout
+        assert played.returncode == 0 and "Video: film.gif" in played.stdout
 
 
 def small_algorithm(name):
@@ -89,7 +89,9 @@ def test_a_filter_is_trained_beside_as_it_is_told(thruster, monkeypatch, tmp_pat
     options = ("train", "--steps", 128, "--envs", COPIES, "--no-tensorboard", "--out")
     assert thruster(*options, "tuned", "--tuned", "mine.json").returncode == 0
     assert thruster(*options, "untuned", "--untuned").returncode == 0
-    tuned, untuned = (read_setup(tmp_path / name / FINAL).filter_arguments for name in ("tuned", "untuned"))
+    tuned, untuned = (
+        read_configuration(tmp_path / name / FINAL).filter_arguments for name in ("tuned", "untuned")
+    )
     assert tuned["process_noise_cov"] == numbers["process_noise_cov"]
     assert untuned["measurement_noise_cov"] == find_scenario("medium_noise").measurement_noise_cov
     line = "filter of the tuned file must be one of ukf, but got 'ekf'"

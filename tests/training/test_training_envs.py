@@ -14,14 +14,14 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormal
 import thruster_env  # noqa: F401 - registers the envs
 from thruster_env.vector_env import BowThrusterTrackingVectorEnv
 from training.environments import make_environments, make_single
-from training.observations import ARMS, STACKED
-from training.setup import in_scenario, make_setup
+from training.observations import OBSERVATION_SETS, STACKED
+from training.setup import in_scenario, make_configuration
 from training.vec_env import NativeVecEnv
 from tuning.thruster.find import find_scenario
 
 COPIES, LIMIT, STEPS = 3, 12, 30
 SEEDS = [7, 107, 5]
-every_arm = pytest.mark.parametrize("observe", ARMS)
+every_arm = pytest.mark.parametrize("observe", OBSERVATION_SETS)
 
 
 @pytest.fixture(autouse=True)
@@ -30,7 +30,7 @@ def short_episodes(monkeypatch):
 
 
 def setup_of(observe, scenario="medium_noise", **arguments):
-    return make_setup("manoeuvre", find_scenario(scenario), observe, **arguments)
+    return make_configuration("manoeuvre", find_scenario(scenario), observe, **arguments)
 
 
 def actions_of(steps=STEPS, copies=COPIES):
@@ -202,7 +202,7 @@ def test_nothing_of_the_truth_is_observed_but_by_the_arm_that_says_so(observe, r
     def falsify(env):
         return FalseTruth(env, remove)
 
-    if ARMS[observe].is_true:
+    if OBSERVATION_SETS[observe].is_true:
         if not remove:
             assert not np.array_equal(observations_of(monkeypatch, observe, falsify), honest)
         return
@@ -211,7 +211,7 @@ def test_nothing_of_the_truth_is_observed_but_by_the_arm_that_says_so(observe, r
 
 @every_arm
 def test_the_entries_of_an_observation_are_those_of_the_table(observe):
-    venv, arm = make_environments(setup_of(observe), SEEDS), ARMS[observe]
+    venv, arm = make_environments(setup_of(observe), SEEDS), OBSERVATION_SETS[observe]
     seen, measured = venv.reset(), [venv.unwrapped.arrays["measurement"][:, 0]]
     voltages = [np.zeros(COPIES)]
     env = make_single(setup_of(observe)).env

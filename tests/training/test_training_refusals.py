@@ -16,7 +16,7 @@ from training.environments import make_environments
 from training.extras import check_installed
 from training.play import play
 from training.saved import FINAL, find_saved, load
-from training.setup import make_setup, setup_from_json
+from training.setup import configuration_from_json, make_configuration
 from tuning.thruster.find import find_scenario
 
 
@@ -105,21 +105,21 @@ def test_unknown_names_and_wrong_numbers_are_refused():
         ({"steps": 0}, "steps must be"),
         (
             {"observe": "raw", "filter_arguments": {"process_noise_cov": 1}},
-            "with an arm that has a filter, but got",
+            "with an observation set that has a filter, but got",
         ),
     ]:
         with pytest.raises(ValueError, match=line):
-            make_setup("tracking", find_scenario("nominal"), **{"observe": "ekf", **arguments})
+            make_configuration("tracking", find_scenario("nominal"), **{"observe": "ekf", **arguments})
     with pytest.raises(ValueError, match="task must be one of"):
-        make_setup("parking", find_scenario("nominal"), "ekf")
+        make_configuration("parking", find_scenario("nominal"), "ekf")
     with pytest.raises(ValueError, match="but 'published_tunnel' is linear"):
-        make_setup("tracking", find_scenario("published_tunnel"), "ekf")
+        make_configuration("tracking", find_scenario("published_tunnel"), "ekf")
 
 
 @pytest.mark.parametrize("text", ["", "[1]", '{"version": 1}', '{"version": 99}', '{"version": "x"}', "{}"])
 def test_the_setup_of_a_policy_must_be_one(text):
-    with pytest.raises(ValueError, match="setup.json must (hold the setup of a policy|be of version 1)"):
-        setup_from_json(text, "setup.json")
+    with pytest.raises(ValueError, match="setup.json must (hold the configuration of a policy|be of version 1)"):
+        configuration_from_json(text, "setup.json")
 
 
 def without(package, monkeypatch):
@@ -161,7 +161,10 @@ BAD = [
     (("train", "--steps", "0"), "steps must be"),
     (("train", "--untuned", "--tuned", "x.json"), "give either --tuned FILE or --untuned, but got both"),
     (("train", "--tuned", "no.json"), "a tuned file must be readable, but no.json is not"),
-    (("train", "--observe", "raw", "--untuned"), "must come with an arm that has a filter, but got 'raw'"),
+    (
+        ("train", "--observe", "raw", "--untuned"),
+        "must come with an observation set that has a filter, but got 'raw'",
+    ),
     (("train", "--out", "full"), "must be new, empty or that of a training, but full holds other things"),
     (("play", "full"), "a policy must be a folder that `thruster train` made, but full holds none"),
     (("play", "ekf", "--out", "x.avi"), "--out must end in .mp4 or .gif, but got 'x.avi'"),

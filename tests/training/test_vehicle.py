@@ -16,7 +16,7 @@ from training.plants.find import PLANTS, TASKS, plant_of
 from training.plants.plant import Part
 from training.saved import find_saved, load
 from training.score import run_episodes, score
-from training.setup import in_scenario, make_setup, setup_from_json
+from training.setup import configuration_from_json, in_scenario, make_configuration
 from tuning.problems.find import find_problem
 from tuning.problems.seeds import held_out_seeds
 
@@ -32,7 +32,7 @@ def short_episodes(monkeypatch):
 
 def setup_of(task="path", observe="ekf", algo="ppo", scenario="auv:navigation", **arguments):
     given = {"num_envs": COPIES, "hyperparameters": SMALL[algo], **arguments}
-    return make_setup(task, find_problem(scenario), observe, algo, 256, **given)
+    return make_configuration(task, find_problem(scenario), observe, algo, 256, **given)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_a_policy_learns_and_is_scored(task, observe, tmp_path):
     assert run.steps == 256 and found.returns.shape == (3,) and (found.returns < 0).all()
     assert list(found.parts) == list(plant_of(task).parts)
     assert all(part.steps.tolist() == [LIMIT] * 3 for part in found.parts.values())
-    assert setup_from_json(setup.as_json(), "setup.json").as_json() == setup.as_json()
+    assert configuration_from_json(setup.as_json(), "setup.json").as_json() == setup.as_json()
 
 
 def test_sac_learns_too(tmp_path):

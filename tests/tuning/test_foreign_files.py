@@ -125,8 +125,8 @@ DOCTORED = {
     "no number": ({"hyperparameters": {"gamma": float("nan")}}, "hyperparameters, gamma must be data: .* got nan"),
     "no mapping": ({"env_arguments": ["dt"]}, r"env_arguments must be a mapping, but got \['dt'\]"),
     "no steps": ({"steps": "many"}, "steps must be a finite number, but got 'many'"),
-    "an assumed plant": ({"assumed_plant": {"dt": 0.01}}, "must hold the setup of a policy"),
-    "an entry": ({"module": TRAP}, "must hold the setup of a policy"),
+    "an assumed plant": ({"assumed_plant": {"dt": 0.01}}, "must hold the configuration of a policy"),
+    "an entry": ({"module": TRAP}, "must hold the configuration of a policy"),
 }
 
 

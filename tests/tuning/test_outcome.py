@@ -57,7 +57,7 @@ def test_the_best_trial_has_the_least_error_of_the_consistent_ones_else_of_all(t
 def test_a_study_without_a_consistent_trial_says_so_everywhere(thruster, tmp_path):
     code, said = thruster("tune", "--filter", "ekf", "--trials", 1, "--json", "one.json")
     assert code == 3 and "in its band" not in said
-    assert "No trial was consistent: a mean NIS must lie between 0.8 and 1.25 of what is right, but" in said
+    assert "No trial was consistent: a mean NIS must lie between 0.8 and 1.25 of its expected value, but" in said
     data = json.loads((tmp_path / "one.json").read_text())
     study = json.loads((tmp_path / "out" / "ekf-mismatch-seed0.json").read_text())["study"]
     for found in (data, study):

@@ -54,7 +54,7 @@ class PIController:
         operating_voltage: float | None = None,
         time_constant: float | None = None,
     ) -> PIController:
-        """A controller for a bow thruster env, single or in number, that shows its measurement and takes volts.
+        """A controller for a bow thruster env or vector env that shows its measurement and takes volts.
 
         Args:
             env: the env, wrapped or not.

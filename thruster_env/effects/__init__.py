@@ -1,1 +1,1 @@
-"""What disturbs a thruster: amplifier, ambient flow, reference signals and uncertain parameters."""
+"""Disturbances of a thruster: amplifier, ambient flow, reference signals and uncertain parameters."""

@@ -1,4 +1,4 @@
-"""The amplifier between the commanded voltage and the motor: effects that a filter is not told of."""
+"""The amplifier between the commanded voltage and the motor: effects that are not in a filter's model."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ AMPLIFIER_EFFECTS = Registry("amplifier")
 
 @inlined
 def outside(voltage, low, high):
-    """A voltage less what of it is within low ... high, a dead band: zero there."""
+    """A voltage behind a dead band low ... high: zero within the band, the distance to its end beyond."""
     return voltage - min(max(voltage, low), high)
 
 
 @inlined
 def dead_band(memory, b, target, rows, number, numbers, at, begin):
-    """Take off the voltage what of it is within the band."""
+    """Apply the dead band to the voltage."""
     low, high = numbers[at], numbers[at + 1]
     for j in range(memory.shape[2]):
         memory[b, target, j] = outside(memory[b, target, j], low, high)
@@ -29,7 +29,7 @@ def dead_band(memory, b, target, rows, number, numbers, at, begin):
 
 @inlined
 def slew_limit(memory, b, target, rows, number, numbers, at, begin):
-    """Let the voltage change by so much a step at most; it starts from zero."""
+    """Limit the change of the voltage per step; it starts from zero."""
     change = numbers[at]
     for j in range(memory.shape[2]):
         before = 0.0 if begin else memory[b, rows, j]
@@ -58,9 +58,9 @@ def sag(memory, b, target, rows, number, numbers, at, begin):
 @AMPLIFIER_EFFECTS.register("dead-band")
 @dataclass(frozen=True)
 class DeadBand(Effect):
-    """No voltage within plus and minus `width` [V]; beyond, the voltage less the width.
+    """Dead band: no voltage within plus and minus `width` [V]; beyond, the voltage minus the width.
 
-    Where the band is another one astern, that is `astern` [V], and `width` is that ahead.
+    If the band astern differs, it is `astern` [V], and `width` is that ahead.
     """
 
     width: float
@@ -125,7 +125,7 @@ class AmplifierSaturation(Effect):
 @AMPLIFIER_EFFECTS.register("sag")
 @dataclass(frozen=True)
 class Sag(Effect):
-    """A supply that gives way under load: `fraction` of V_s - k_e omega_m is lost in its resistance.
+    """A supply whose voltage drops under load: `fraction` of V_s - k_e omega_m is lost in its resistance.
 
     With the resistance r of the supply and R_a of the armature, the fraction is r/(r + R_a). The motor's constant
     is k_e = K1/K2 of the nominal parameters (a brushed motor without friction), the speed that before the step.

@@ -1,4 +1,4 @@
-"""Reference thrust: signals that tasks ask the thruster to follow; those of a list are added.
+"""Reference thrust: signals that the thruster has to follow; those of a list are added.
 
 Levels are fractions of T_max, the steady thrust at max_voltage, so that one reference fits every preset. What is
 random is drawn anew each episode. Observation k holds r_{k+1}, so each signal works one step ahead.
@@ -121,7 +121,10 @@ class Constant(Effect):
 
     def parameters(self, context: ThrusterContext) -> list[float]:
         """The thrust [N]."""
-        return [self.level * context.thrust_scale if self.thrust is None else self.thrust]
+        if self.level is not None:
+            return [self.level * context.thrust_scale]
+        assert self.thrust is not None  # one of the two is given
+        return [self.thrust]
 
 
 def held_time(name: str, value) -> float:

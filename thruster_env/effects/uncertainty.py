@@ -1,12 +1,12 @@
-"""Parameters that nobody knows exactly: factors on a preset's values, drawn once an episode from its key."""
+"""Uncertain parameters: factors on a preset's values, drawn once per episode from its key."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import ClassVar
+from dataclasses import Field, asdict, dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -19,6 +19,7 @@ UNCERTAIN = tuple(name for name in ThrusterParameters._fields if name not in ("a
 
 
 class _Distribution:
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]  # every distribution is a dataclass
     name: ClassVar[str]
 
     def as_mapping(self) -> dict:
@@ -49,7 +50,7 @@ class Uniform(_Distribution):
 
     @property
     def extremes(self) -> tuple[float, float]:
-        """Smallest and largest factor that the integration has to follow."""
+        """Smallest and largest factor for which the integration must be accurate."""
         return self.low, self.high
 
 
@@ -76,7 +77,7 @@ class LogNormal(_Distribution):
 
     @property
     def extremes(self) -> tuple[float, float]:
-        """Smallest and largest factor that the integration has to follow: three standard deviations."""
+        """Smallest and largest factor for which the integration must be accurate: three standard deviations."""
         return math.exp(-3 * self.std), math.exp(3 * self.std)
 
 

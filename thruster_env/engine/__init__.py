@@ -1,1 +1,1 @@
-"""One compiled step for one thruster and for thousands, and where its numbers lie."""
+"""One compiled step for one thruster and for thousands, and the layout of its packed parameters."""

@@ -1,4 +1,4 @@
-"""Many copies of a thruster at work in place: what envs step and what `simulate` records."""
+"""Many copies of a thruster, stepped in place by envs and by `simulate`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plant and task as one row of numbers, the form that compiled steps read; places are in `memory`."""
+"""Plant and task as one packed row, the form that compiled steps read; offsets are in `memory`."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from thruster_env.effects.context import ThrusterContext
 from thruster_env.effects.flow import FLOW_SIGNALS
 from thruster_env.effects.reference import REFERENCE_SIGNALS, Constant
 from thruster_env.engine import memory as at
+from thruster_env.linear.analysis import LinearModel
 from thruster_env.plant import Plant
 from thruster_env.task import Task, state_limits, thrust_scale
 
@@ -60,7 +61,7 @@ def encode(plant: Plant, task: Task) -> tuple[np.ndarray, int]:
     numbers[at.R_ROOT : at.R_ROOT + r_root.size] = r_root.ravel()
     if plant.linear is not None:
         numbers[at.LINEAR] = 1.0
-        numbers[at.LINEAR_MODEL : at.LINEAR_MODEL + 10] = _held(plant)
+        numbers[at.LINEAR_MODEL : at.LINEAR_MODEL + 10] = _held(plant.linear, plant.dt)
     numbers[at.REWARD_WEIGHTS : at.REWARD_WEIGHTS + 3] = task.weights
     numbers[at.THRUST_SCALE] = scale
     numbers[at.LIMITS : at.LIMITS + 2] = state_limits(plant)
@@ -69,9 +70,9 @@ def encode(plant: Plant, task: Task) -> tuple[np.ndarray, int]:
     return np.concatenate([numbers, program]), rows + (at.CONSTANT_COUNT if plant.uncertainty else 0)
 
 
-def _held(plant: Plant) -> np.ndarray:
-    a_d, b_d = zero_order_hold(plant.linear.a, plant.linear.b, plant.dt)
-    return np.concatenate([a_d.ravel(), b_d.ravel(), plant.linear.c.ravel()])
+def _held(linear: LinearModel, dt: float) -> np.ndarray:
+    a_d, b_d = zero_order_hold(linear.a, linear.b, dt)
+    return np.concatenate([a_d.ravel(), b_d.ravel(), linear.c.ravel()])
 
 
 def _program(plant: Plant, task: Task, context: ThrusterContext, numbers: np.ndarray) -> tuple[list[float], int]:

@@ -1,4 +1,4 @@
-"""Where things lie: rows of the memory of many thrusters, and places in the row of numbers of compiled code."""
+"""Layout: rows of the memory of many thrusters, and offsets in the packed parameters of compiled code."""
 
 from __future__ import annotations
 

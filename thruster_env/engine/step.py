@@ -11,8 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from typing import Any
 
-from numerics.compiled import compiled, function_fingerprint, inlined, is_interpreting
+from numerics.compiled import CompiledOrPython, compiled, function_fingerprint, inlined, is_interpreting
 from numerics.streams import MEASUREMENT, normal_block
 from numerics.threads import in_parts
 from plants.channels import Channel, reader_of
@@ -142,7 +143,7 @@ def advance(known_effects, plain: bool) -> Callable:
     return _build(compiled, known_effects, _known_channels(plain), plain, is_interpreting())
 
 
-def advance_in_parts(known_effects, plain: bool) -> Callable:
+def advance_in_parts(known_effects, plain: bool) -> CompiledOrPython:
     """The same for `threads.WorkerThreads.run`."""
     return _build(in_parts, known_effects, _known_channels(plain), plain, is_interpreting())
 
@@ -153,7 +154,7 @@ def _known_channels(plain: bool) -> tuple[Channel, ...]:
 
 
 @cache
-def _build(maker: Callable, known_effects, channels, plain: bool, interpreting: bool) -> Callable:
+def _build(maker: Callable, known_effects, channels, plain: bool, interpreting: bool) -> Any:
     amplify, stream, sense, refer = (
         chain_of(effects, SECTIONS + section) for section, effects in enumerate(known_effects)
     )

@@ -1,4 +1,4 @@
-"""The thruster near an operating point as a linear system: poles, what moves it, what is seen, responses.
+"""The thruster near an operating point as a linear system: poles, controllability, observability, responses.
 
     dx/dt = A x + B u,  T = C x
 
@@ -42,7 +42,7 @@ def linear_model(p: ThrusterParameters, x, voltage: float = 0.0, ambient_velocit
 
 
 def equilibrium(model: LinearModel, u) -> np.ndarray:
-    """Where a linear system stays under u = (V_s, U_0): (omega_m, U_a, T); an unstable one never comes to it."""
+    """Equilibrium (omega_m, U_a, T) of a linear system under u = (V_s, U_0); not reached if it is unstable."""
     x = -np.linalg.solve(model.a, model.b @ np.asarray(u, dtype=np.float64))
     return np.append(x, model.c @ x)
 
@@ -53,9 +53,9 @@ def controllability(a: np.ndarray, b: np.ndarray) -> tuple[int, float]:
 
 
 def dc_gain(model: LinearModel) -> np.ndarray:
-    """What a constant unit input settles to: rows omega_m, U_a and T, columns the inputs, (3, 2).
+    """Steady-state gains: rows omega_m, U_a and T, columns the inputs, (3, 2).
 
-    The states are x = -A^-1 B u and the thrust is C x. NaN unless the model is stable: it does not settle then.
+    The states are x = -A^-1 B u and the thrust is C x. NaN unless the model is stable.
     """
     if np.linalg.eigvals(model.a).real.max() >= 0:
         return np.full((3, len(INPUTS)), np.nan)
@@ -120,7 +120,7 @@ def response_grids(model: LinearModel, points: int = 200) -> tuple[np.ndarray, n
 
 
 class Analysis(NamedTuple):
-    """What can be said of a linear thruster that is sampled every dt seconds."""
+    """Results of the analysis of a linear thruster that is sampled every dt seconds."""
 
     model: LinearModel
     eigenvalues: np.ndarray  # (2,) complex [1/s], the fastest first
@@ -140,7 +140,7 @@ def analyse(model: LinearModel, dt: float, scale) -> Analysis:
         model: the linear thruster.
         dt: sample time [s].
         scale: ranges (2,) of omega_m [rad/s] and U_a [m/s], positive. Condition numbers depend on units; each
-            state is counted in its range, so that a large number tells of the thruster and not of rad/s.
+            state is scaled by its range, so that a large number is a property of the thruster and not of rad/s.
     """
     a_d, b_d = zero_order_hold(model.a, model.b, dt)
     scale = np.asarray(scale, dtype=np.float64)

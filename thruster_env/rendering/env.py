@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from plants.memory import TIME
 from plants.rendered import RenderedEnv
 from thruster_env.engine.memory import AMBIENT, COMMAND, FLOW, OMEGA, READINGS, REFERENCE, THRUST
@@ -35,10 +37,12 @@ def renderer_of(plant: Plant, mode: str, frames_per_second: float) -> Renderer:
 class RenderedThruster(RenderedEnv):
     """An env with a thruster as `plant`, and a `_memory` of one copy."""
 
+    _memory: np.ndarray
     metadata: dict[str, Any] = {"render_modes": list(MODES), "render_fps": 100}
 
     def make_renderer(self) -> Renderer:
         """What draws the thruster in its water."""
+        assert self.render_mode is not None  # a renderer is made for a mode only
         return renderer_of(self.plant, self.render_mode, self.metadata["render_fps"])
 
     def moment_of(self, report: list[float]) -> Moment:

@@ -21,7 +21,7 @@ from training.comparison.tables import (
 )
 
 GOAL = 0.7  # of the gap between raw and true, at medium noise
-NEAR = 0.02  # of the best controller's cost, within which a learnt policy reaches it
+NEAR = 0.02  # of the best controller's cost: tolerance within which a learnt policy reaches it
 LEARNT = ("ppo", "sac", "ppo+mpc", "sac+mpc")
 
 
@@ -34,7 +34,7 @@ def answers(results: Sequence[Result]) -> list[str]:
 
 def _goal(groups: Groups) -> Iterator[str]:
     gap = ends_of_gap(groups, VARIANT_NOISE)
-    found = [figure_of(groups, VARIANT_NOISE, "ppo", arm) for arm in FILTERED]
+    found = [figure_of(groups, VARIANT_NOISE, "ppo", observed) for observed in FILTERED]
     parts = [as_interval(closed(figure, *gap)) for figure in found if gap is not None and figure is not None]
     if parts:
         least = min(parts, key=lambda value: value.low)
@@ -46,7 +46,7 @@ def _goal(groups: Groups) -> Iterator[str]:
 
 
 def _estimates(groups: Groups) -> Iterator[str]:
-    """What a better estimate is worth to the same controller, with no training between."""
+    """The effect of a better estimate on the same controller, without training."""
     for one, other, said in (
         ("true", "ekf", "knowing the true state"),
         ("ekf, tuned", "ekf, untuned", "tuning the EKF's Q and R, against the rule of thumb,"),
@@ -57,20 +57,20 @@ def _estimates(groups: Groups) -> Iterator[str]:
         ),
         ("ekf", "ekf, wrong model", "a right model"),
     ):
-        figures = [figure_of(groups, VARIANT_NOISE, BEST, label) for label in (one, other)]
-        if None not in figures:
-            value = as_interval(figures[0] - figures[1])
+        known, usual = (figure_of(groups, VARIANT_NOISE, BEST, label) for label in (one, other))
+        if known is not None and usual is not None:
+            value = as_interval(known - usual)
             yield f"With the same controller (MPC), {said} is worth {shown(value, '+.4f')}: {_verdict(value)}."
 
 
 def _learnt(groups: Groups) -> Iterator[str]:
-    for arm in ("true", "ekf"):
-        best = figure_of(groups, VARIANT_NOISE, BEST, arm)
+    for observed in ("true", "ekf"):
+        best = figure_of(groups, VARIANT_NOISE, BEST, observed)
         for kind in LEARNT:
-            figure = figure_of(groups, VARIANT_NOISE, kind, arm)
+            figure = figure_of(groups, VARIANT_NOISE, kind, observed)
             if best is not None and figure is not None:
                 value = as_interval(figure / best)
-                yield f"{name_of(kind, arm)} costs {shown(value, '.3f')} times what MPC does: {_near(value)}."
+                yield f"{name_of(kind, observed)} costs {shown(value, '.3f')} times what MPC does: {_near(value)}."
 
 
 def _wrong(groups: Groups) -> Iterator[str]:
@@ -89,9 +89,9 @@ def _tuned(groups: Groups) -> Iterator[str]:
         ("the exact model", "ekf, tuned", "ekf, untuned", "the untuned one"),
         ("a wrong model", "ekf, wrong model tuned", "ekf, wrong model", "the one with the plant's Q and R"),
     ):
-        figures = [figure_of(groups, VARIANT_NOISE, "ppo", label) for label in (one, other)]
-        if None not in figures:
-            value = as_interval(figures[0] - figures[1])
+        tuned, reference = (figure_of(groups, VARIANT_NOISE, "ppo", label) for label in (one, other))
+        if tuned is not None and reference is not None:
+            value = as_interval(tuned - reference)
             yield (
                 f"With {about}, PPO on the tuned EKF returns {shown(value, '+.3f')} more than on {called}: "
                 f"{_verdict(value)}."
@@ -99,12 +99,13 @@ def _tuned(groups: Groups) -> Iterator[str]:
 
 
 def _wrong_model(groups: Groups) -> Iterator[str]:
-    for arm in ("ekf", "enkf"):
+    for observed in ("ekf", "enkf"):
         for kind in ("ppo", BEST):
-            figures = [figure_of(groups, VARIANT_NOISE, kind, label) for label in (f"{arm}, wrong model", arm)]
-            if None not in figures:
-                value = shown(as_interval(figures[0] / figures[1]), ".3f")
-                yield f"A wrong model multiplies the cost of {name_of(kind, arm)} by {value}."
+            wrong = figure_of(groups, VARIANT_NOISE, kind, f"{observed}, wrong model")
+            right = figure_of(groups, VARIANT_NOISE, kind, observed)
+            if wrong is not None and right is not None:
+                value = shown(as_interval(wrong / right), ".3f")
+                yield f"A wrong model multiplies the cost of {name_of(kind, observed)} by {value}."
 
 
 def _near(value: Interval) -> str:

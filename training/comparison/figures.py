@@ -1,4 +1,4 @@
-"""The two pictures of a comparison: learning curves by arm, and return against the error of what is observed."""
+"""The two pictures of a comparison: learning curves by observation set, and cost against observation error."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COST = "cost of an episode: minus the return [-]"
 
 
 def learning_curves(results: Sequence[Result], path: str | Path) -> Path:
-    """Cost over training steps, one panel a noise: mean over seeds, and the range of all of them."""
+    """Cost over training steps, one panel for each noise level: mean and range over seeds."""
     groups = by_policy(results)
     noises = noises_of(groups)
     figure = new_figure((3.2 * len(noises) + 0.8, 4.2))
@@ -49,8 +49,8 @@ def learning_curves(results: Sequence[Result], path: str | Path) -> Path:
             (BEST, "ekf", "--"),
             (BEST, "true", "--"),
         ):
-            if group := groups.get((noise, kind, label)):
-                cost, colour = -typical_return(group).value, COLOURS["ekf"] if label == "ekf" else DARK
+            if reference := groups.get((noise, kind, label)):
+                cost, colour = -typical_return(reference).value, COLOURS["ekf"] if label == "ekf" else DARK
                 axis.axhline(cost, color=colour, linestyle=dashes, lw=1, label=name_of(kind, label))
         axis.set(xlabel="steps [thousand]", title=f"{noise} noise")
         _make_logarithmic(axis)
@@ -62,26 +62,26 @@ def learning_curves(results: Sequence[Result], path: str | Path) -> Path:
 
 
 def cost_against_error(results: Sequence[Result], path: str | Path) -> Path:
-    """Cost against the RMSE of the thrust that a policy is shown: all arms and noises, learnt and classical."""
+    """Cost against the RMSE of the observed thrust, for all observation sets, noise levels and policies."""
     groups = by_policy(results)
     figure = new_figure((8.4, 5.0))
     axis = figure.subplots()
     lines: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for (noise, kind, _), group in groups.items():
         run = group[0].run
-        arm = run.setup.observe
-        if kind not in ("ppo", BEST, "pi", "lqr") or arm not in COLOURS:
+        observed = run.setup.observe
+        if kind not in ("ppo", BEST, "pi", "lqr") or observed not in COLOURS:
             continue
         point = typical_error(group, "observed").value, -typical_return(group).value
-        face = COLOURS[arm] if kind == "ppo" else "none"
+        face = COLOURS[observed] if kind == "ppo" else "none"
         faint = 0.4 if run.variant or kind in ("pi", "lqr") else 1.0
-        axis.plot(*point, MARKERS[noise], color=COLOURS[arm], markerfacecolor=face, alpha=faint, zorder=3)
+        axis.plot(*point, MARKERS[noise], color=COLOURS[observed], markerfacecolor=face, alpha=faint, zorder=3)
         if not run.variant:
-            lines.setdefault((kind, arm), []).append(point)
-    for (_, arm), points in lines.items():
-        axis.plot(*zip(*points, strict=True), color=COLOURS[arm], linewidth=0.8, alpha=0.6)
-    for arm, colour in COLOURS.items():
-        axis.plot([], [], "-", color=colour, linewidth=4, label=arm)
+            lines.setdefault((kind, observed), []).append(point)
+    for (_, observed), points in lines.items():
+        axis.plot(*zip(*points, strict=True), color=COLOURS[observed], linewidth=0.8, alpha=0.6)
+    for observed, colour in COLOURS.items():
+        axis.plot([], [], "-", color=colour, linewidth=4, label=observed)
     for noise, marker in MARKERS.items():
         axis.plot([], [], marker, color=GREY, label=f"{noise} noise")
     axis.plot([], [], "o", color=GREY, label="PPO")

@@ -1,7 +1,8 @@
-"""Which policies are compared, at which noise: a list of runs, each one training or one classical policy.
+"""The policies of a comparison and their noise levels: a list of runs, each a training or a classical policy.
 
-Beside the three noises, all at medium noise: filters with other Q and R (`untuned`, `tuned`), and three situations
-in which filter and controller believe in a model that is wrong (`WRONG`). A policy learns in the situation itself.
+Beside the three noise levels, at medium noise: filters with other Q and R (`untuned`, `tuned`), and three
+situations in which filter and controller assume a wrong model (`WRONG`). A policy is trained in the situation
+itself.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from training.setup import Setup, make_setup
+from training.setup import TrainingConfiguration, make_configuration
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, quiet_optuna, run_study
 from tuning.thruster.find import find_scenario
@@ -24,10 +25,8 @@ LEARNT = ("raw", "raw+action", "stack", "ekf", "enkf", "belief", "true")
 FOR_PI = ("raw", "lowpass", "ekf", "enkf", "true")
 FOR_STATES = ("lowpass", "kf", "ekf", "ukf", "enkf", "true")
 CLASSICAL = {"pi": FOR_PI, "lqr": FOR_STATES, "one-step": FOR_STATES, "mpc": FOR_STATES}
-BEST = (
-    "mpc"  # the best controller known: on the true state what "gap closed" is measured to, and what is corrected
-)
-CORRECTING = {"ppo+mpc": "ppo", "sac+mpc": "sac"}  # kinds that correct it, and the algorithm
+BEST = "mpc"  # the best known controller: on the true state the end of "gap closed", and the one that is corrected
+CORRECTING = {"ppo+mpc": "ppo", "sac+mpc": "sac"}  # policies that correct it, and their algorithm
 OF_MEDIUM = {"sac": ("ekf", "true"), "ppo+mpc": ("true",), "sac+mpc": ("ekf", "true")}  # at medium noise only
 VARIANT_NOISE = "medium"
 WRONG = {
@@ -48,15 +47,15 @@ TUNING_TRIALS = 60
 
 
 class Comparison(NamedTuple):
-    """How much is compared. The defaults are those of docs/policies.md."""
+    """The size of a comparison; the defaults are those of docs/policies.md."""
 
     noises: tuple[str, ...] = tuple(NOISES)
-    arms: tuple[str, ...] = LEARNT
-    seeds: int = 5  # of each learnt policy
-    steps: int | None = None  # that it learns from; None for what its algorithm takes
-    episodes: int = 200  # held out, the same for all
+    observation_sets: tuple[str, ...] = LEARNT
+    seeds: int = 5  # training seeds of each learnt policy
+    steps: int | None = None  # training steps; None for the algorithm's default
+    episodes: int = 200  # held-out episodes, the same for all
     variants: bool = True  # filters with other Q and R, and wrong models
-    recurrent: bool = False  # PPO with memory of its own on raw measurements, which is slow
+    recurrent: bool = False  # PPO with an LSTM on raw measurements, which is slow
 
 
 QUICK = Comparison(noises=("medium",), seeds=2, steps=8_192, episodes=16, variants=False)
@@ -67,12 +66,12 @@ class Run(NamedTuple):
 
     noise: str
     kind: str  # an algorithm, one of `CORRECTING`, or a controller of `CLASSICAL`
-    variant: str  # what is special about the filter, or nothing
-    setup: Setup
+    variant: str  # variant of the filter or of the situation; may be empty
+    setup: TrainingConfiguration
 
     @property
     def label(self) -> str:
-        """What it observes, and what is special about it."""
+        """Observation set and variant."""
         return f"{self.setup.observe}, {self.variant}" if self.variant else self.setup.observe
 
     @property
@@ -83,12 +82,15 @@ class Run(NamedTuple):
 
 
 def runs_of(comparison: Comparison) -> list[Run]:
-    """All runs of a comparison; seed by seed, so that an early look has something of each arm."""
+    """All runs of a comparison; seed by seed, so that early results include each observation set."""
     variants = VARIANTS if comparison.variants else ()
     cases = [
-        (noise, kind, arm, "") for noise in comparison.noises for kind in CLASSICAL for arm in CLASSICAL[kind]
+        (noise, kind, observed, "")
+        for noise in comparison.noises
+        for kind in CLASSICAL
+        for observed in CLASSICAL[kind]
     ]
-    cases += [(VARIANT_NOISE, BEST, arm, variant) for arm, variant in variants]
+    cases += [(VARIANT_NOISE, BEST, observed, variant) for observed, variant in variants]
     cases += [(VARIANT_NOISE, BEST, "true", variant) for variant in WRONG if variants and variant != "wrong model"]
     classical = [_run(comparison, *case) for case in cases]
     return classical + [
@@ -97,33 +99,37 @@ def runs_of(comparison: Comparison) -> list[Run]:
 
 
 def _learnt(comparison: Comparison) -> list[tuple[str, str, str, str]]:
-    """Noise, kind, arm and variant of what is learnt."""
+    """Noise, kind, observation set and variant of the learnt policies."""
     cases = []
     for noise in comparison.noises:
-        cases += [(noise, "ppo", arm, "") for arm in comparison.arms]
+        cases += [(noise, "ppo", observed, "") for observed in comparison.observation_sets]
         cases.append((noise, "ppo+mpc", "ekf", ""))
         if noise == VARIANT_NOISE:
-            cases += [(noise, kind, arm, "") for kind, arms in OF_MEDIUM.items() for arm in arms]
+            cases += [
+                (noise, kind, observed, "")
+                for kind, observation_sets in OF_MEDIUM.items()
+                for observed in observation_sets
+            ]
         if comparison.recurrent:
             cases.append((noise, "recurrent-ppo", "raw", ""))
     if comparison.variants:
-        cases += [(VARIANT_NOISE, "ppo", arm, variant) for arm, variant in VARIANTS]
+        cases += [(VARIANT_NOISE, "ppo", observed, variant) for observed, variant in VARIANTS]
         cases += [(VARIANT_NOISE, "ppo+mpc", "ekf", variant) for variant in WRONG]
     return cases
 
 
-def _run(comparison: Comparison, noise: str, kind: str, arm: str, variant: str = "", seed: int = 0) -> Run:
+def _run(comparison: Comparison, noise: str, kind: str, observed: str, variant: str = "", seed: int = 0) -> Run:
     scenario = _scenario(noise, variant)
     arguments: Mapping = {}
     if variant.endswith("untuned"):
         arguments = scenario.untuned
     elif variant.endswith("tuned"):
-        arguments = _tuned(arm, noise, variant)
+        arguments = _tuned(observed, noise, variant)
     algo = "ppo" if kind in CLASSICAL else CORRECTING.get(kind, kind)
-    setup = make_setup(
+    setup = make_configuration(
         TASK,
         scenario,
-        arm,
+        observed,
         algo,
         steps=comparison.steps,
         seed=seed,
@@ -134,7 +140,7 @@ def _run(comparison: Comparison, noise: str, kind: str, arm: str, variant: str =
 
 
 def _scenario(noise: str, variant: str) -> Scenario:
-    """The scenario of a noise, with what a variant takes from another one."""
+    """The scenario of a noise level, with the fields that a variant takes from another one."""
     scenario = find_scenario(NOISES[noise])
     if (name := variant.removesuffix(" tuned")) in WRONG:
         other = find_scenario(WRONG[name])
@@ -145,7 +151,7 @@ def _scenario(noise: str, variant: str) -> Scenario:
 
 @cache
 def _tuned(filter_name: str, noise: str, variant: str) -> Mapping:
-    """Q and R that a study finds on the noise's scenario, where voltages are held at random levels."""
+    """Q and R of a study on the scenario, in which voltages are held at random levels."""
     quiet_optuna()
     scenario = _scenario(noise, variant)
     plan = Plan(filter_name, (scenario,))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from numerics.files import check_target, write_whole
@@ -31,13 +32,12 @@ def check_page(page: Path) -> None:
 
 
 def write_report(results: Sequence[Result], comparison: Comparison, page: Path) -> list[Path]:
-    """Write the tables of a page anew, and the pictures beside it; return the files.
+    """Write the tables of a page again, and the pictures beside it; return the files.
 
-    A page that is not there yet is made. Tables stand between `<!-- table NAME -->` and `<!-- end -->`.
+    A missing page is created. Tables stand between `<!-- table NAME -->` and `<!-- end -->`.
     """
     tables: dict[str, Callable[[], str]] = {
-        f"policies_{noise}": lambda noise=noise: table(HEADER, rows_of(results, noise))
-        for noise in comparison.noises
+        f"policies_{noise}": partial(_noise_table, results, noise) for noise in comparison.noises
     }
     tables["summary"] = lambda: table(["", *comparison.noises], summary_rows(results))
     tables["answers"] = lambda: "\n".join(f"- {sentence}" for sentence in answers(results))
@@ -46,6 +46,10 @@ def write_report(results: Sequence[Result], comparison: Comparison, page: Path) 
     errors = cost_against_error(results, page.with_name(ERRORS))
     write_whole(page, with_tables(text, tables))
     return [page, curves, errors]
+
+
+def _noise_table(results: Sequence[Result], noise: str) -> str:
+    return table(HEADER, rows_of(results, noise))
 
 
 def _new_page(comparison: Comparison, names: Sequence[str]) -> str:

@@ -1,4 +1,4 @@
-"""Do the runs of a comparison, side by side on the cores; what is done is kept, and done once."""
+"""Run a comparison, in parallel on the cores; finished runs are stored, and never repeated."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from training.environments import make_environments
 from training.learn import one_thread, train
 from training.plants.plant import Part
 from training.saved import FINAL, load
-from training.score import Scores, score
+from training.score import Policy, Scores, score
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.interruption import without_interrupts
 
 RUNS = "runs"
-STEPS_APART = 40_000  # points of a learning curve: an evaluation has 16 000 steps
-OnRun = Callable[[Run, int, int], None]  # a run that is done, how many are, of how many
+STEPS_APART = 40_000  # training steps between points of a learning curve: an evaluation has 16 000 steps
+OnRun = Callable[[Run, int, int], None]  # a finished run, number of finished runs, number of all runs
 
 
 class Result(NamedTuple):
-    """What a run came to."""
+    """The result of a run."""
 
     run: Run
     scores: Scores
-    curve: list[tuple[int, float]]  # steps and mean return of evaluations in the course of training
+    curve: list[tuple[int, float]]  # steps and mean return of evaluations during training
     seconds: float
 
 
@@ -47,18 +47,18 @@ def run_comparison(
     jobs: int | None = None,
     on_run: OnRun = lambda run, done, count: None,
 ) -> list[Result]:
-    """Do all runs that the folder does not hold yet, and return all results.
+    """Do all runs that the folder does not contain yet, and return all results.
 
-    Ctrl-C ends it; a later call goes on, trainings from their last checkpoints.
+    Ctrl-C ends it; a later call continues, trainings from their last checkpoints.
 
     Args:
-        comparison: what is compared.
-        folder: where each run gets a file of results and a folder of its training.
-        jobs: processes; as many as cores if None.
+        comparison: the comparison.
+        folder: folder for a file of results and a folder of the training of each run.
+        jobs: number of processes; that of the cores if None.
         on_run: called after each run.
 
     Raises:
-        ValueError: if a file of results is damaged, or a process ended without a word.
+        ValueError: if a file of results is damaged, or a process was killed.
         KeyboardInterrupt: on Ctrl-C.
     """
     folder, runs = Path(folder), runs_of(comparison)
@@ -88,13 +88,14 @@ def run_comparison(
         raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-    return [results[run.name] for run in runs]
+    found = (results[run.name] for run in runs)
+    return [result for result in found if result is not None]  # all are there now
 
 
 def _prepare(counter) -> None:
-    """Give a process one core, leave Ctrl-C to its parent, and end where that is no more.
+    """Give a process one core, leave Ctrl-C to its parent, and end it when the parent has ended.
 
-    Else it would go on with its run, and the same command once more would start a second one in the same folder.
+    Otherwise it would continue its run, and the next call would start the same run in the same folder.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -106,13 +107,17 @@ def _prepare(counter) -> None:
 
 
 def _end_with_parent() -> None:
-    multiprocessing.parent_process().join()
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
     os._exit(1)
 
 
 def _do(run: Run, folder: Path, episodes: int) -> None:
     """Train and score one policy; write its results."""
-    curve, seconds = [], 0.0
+    policy: Policy
+    curve: list[tuple[int, float]] = []
+    seconds = 0.0
     with one_thread():
         if run.kind in CLASSICAL:
             policy = classical_policy(run.kind, run.setup)
@@ -135,7 +140,7 @@ def _do(run: Run, folder: Path, episodes: int) -> None:
 
 
 def _read(folder: Path, run: Run, episodes: int) -> Result | None:
-    """The result of a run, or None where there is none of this very setup."""
+    """The result of a run; None unless there is one with exactly this training configuration."""
     path = _file(folder, run)
     if not path.is_file():
         return None

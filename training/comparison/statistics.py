@@ -1,15 +1,16 @@
-"""Means over training seeds, with intervals that count both how policies and how episodes vary.
+"""Means over training seeds, with intervals for the variation of both policies and episodes.
 
-A figure is a number with what it becomes when one training seed, or one episode, is left out. So differences and
-ratios of figures are figures, and their intervals are the jackknife's: each source of chance k has a variance
+A figure is a number with its values when one training seed, or one episode, is left out. So differences and ratios
+of figures are figures, and their intervals follow from the jackknife: each source of variation k has a variance
 
     v_k = (n_k - 1)/n_k sum_i (f_(i) - mean f_(i))^2,    f_(i) the figure without its i-th seed or episode
 
 and the interval is f -+ t sqrt(sum_k v_k), with Student's t of (sum v_k)^2/sum (v_k^2/(n_k - 1)) degrees of
-freedom. For one mean it is Student's interval, for a difference Welch's. Episodes are one source, for they are the
-same for all policies; the training seeds of each policy are a source of their own, for two policies have no chance
-in common. (What only one policy does in only one episode is in both sources, which is on the safe side.) With five
-seeds it covers 95 %, where the middle 95 % of bootstrap resamples cover less than 90 %; a test simulates both.
+freedom. For one mean it is Student's interval, for a difference Welch's. Episodes are one source, because they are
+the same for all policies; the training seeds of each policy are a separate source, because two policies are
+trained independently. (The variation of one policy in one episode is in both sources, which is conservative.) With
+five seeds it covers 95 %, where the middle 95 % of bootstrap resamples cover less than 90 %; a test simulates
+both.
 
 Sources: B. Efron, C. Stein (1981), "The jackknife estimate of variance", Annals of Statistics 9(3), 586-596;
 B. L. Welch (1947), "The generalization of Student's problem when several different population variances are
@@ -27,12 +28,12 @@ from scipy.stats import t as student
 from filters.consistency.intervals import Interval
 from training.comparison.runs import Result
 
-EPISODES = "episodes"  # the source of chance that all figures share
+EPISODES = "episodes"  # the source of variation that all figures share
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A number, and by source of chance its values (n_k,) with one seed or episode left out each."""
+    """A number, and by source of variation its values (n_k,) with one seed or episode left out each."""
 
     value: float
     without: Mapping[Hashable, np.ndarray] = field(default_factory=dict)
@@ -47,7 +48,7 @@ class Figure:
 
 
 def combined(function: Callable, *figures: Figure) -> Figure:
-    """A function of some figures, as a figure; what is left out is left out of all that know it."""
+    """A function of figures as a figure; a seed or episode is left out of all of them at the same time."""
     sources = dict.fromkeys(source for figure in figures for source in figure.without)
     return Figure(
         function(*(figure.value for figure in figures)),
@@ -61,10 +62,10 @@ def mean_figure(of_seeds: np.ndarray, without_episode: np.ndarray, source: Hasha
     Args:
         of_seeds: its values (S,), one a seed.
         without_episode: the same (E, S) with each of E episodes left out.
-        source: what stands for the chance in these seeds; one seed tells nothing of it.
+        source: name of the variation of these seeds; it cannot be estimated from one seed.
     """
     count, total = len(of_seeds), of_seeds.sum()
-    without = {EPISODES: without_episode.mean(axis=1)}
+    without: dict[Hashable, np.ndarray] = {EPISODES: without_episode.mean(axis=1)}
     if count > 1:
         without[source] = (total - of_seeds) / (count - 1)
     return Figure(float(total / count), without)
@@ -82,7 +83,7 @@ def typical_error(results: Sequence[Result], part: str) -> Figure:
     squares, steps = (np.stack(columns, axis=1) for columns in zip(*parts, strict=True))
     with np.errstate(invalid="ignore"):
         of_seeds = np.sqrt(squares.sum(axis=0) / steps.sum(axis=0))
-        # Rounding may leave a sum of squares of which nothing is left below zero.
+        # By rounding a sum of squares that should be zero may be negative.
         return mean_figure(
             of_seeds, np.sqrt(np.maximum(_left_out(squares), 0) / _left_out(steps)), _source(results)
         )

@@ -1,4 +1,4 @@
-"""What a comparison says: a table for each noise, and what matters, a row a question.
+"""Tables of a comparison: one for each noise level, and a summary with a row for each question.
 
 The sentences that answer each question are in `answers`.
 """
@@ -6,6 +6,7 @@ The sentences that answer each question are in `answers`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 from filters.consistency.intervals import Interval
 from training.comparison.plan import BEST
@@ -27,8 +28,12 @@ HEADER = ["policy: what it observes", "return", "gap closed", "transient", "stea
 FILTERED = ("ekf", "enkf", "belief")
 Key = tuple[str, str, str]  # noise, kind, label
 Groups = Mapping[Key, Sequence[Result]]
-# Rows of the summary: what stands first, and the kinds and labels whose figures are set against each other.
-GAPS = [("mpc", "ekf"), *(("ppo", arm) for arm in ("raw+action", "stack", *FILTERED)), ("ppo+mpc", "ekf")]
+# Rows of the summary: kinds and labels of the figures that are compared.
+GAPS = [
+    ("mpc", "ekf"),
+    *(("ppo", observed) for observed in ("raw+action", "stack", *FILTERED)),
+    ("ppo+mpc", "ekf"),
+]
 RATIOS = [
     (("mpc", "ekf"), ("mpc", "true")),
     (("mpc", "enkf"), ("mpc", "ekf")),
@@ -42,7 +47,7 @@ RATIOS = [
 
 
 def by_policy(results: Sequence[Result]) -> dict[Key, list[Result]]:
-    """Results grouped: those of one policy and noise, one for each training seed."""
+    """Results by policy and noise, one for each training seed."""
     groups: dict[Key, list[Result]] = {}
     for result in results:
         run = result.run
@@ -51,22 +56,22 @@ def by_policy(results: Sequence[Result]) -> dict[Key, list[Result]]:
 
 
 def noises_of(groups: Groups) -> list[str]:
-    """The noises of some results, in their order."""
+    """The noise levels of some results, in their order."""
     return list(dict.fromkeys(noise for noise, _, _ in groups))
 
 
 def name_of(kind: str, label: str) -> str:
-    """A policy and what it observes, as tables call it."""
+    """Name of a policy and its observations in tables."""
     return f"{'LQR' if (kind, label) == ('lqr', 'true') else KINDS[kind]}: {label}"
 
 
 def rows_of(results: Sequence[Result], noise: str) -> list[list[str]]:
     """Rows of the table for one noise, under `HEADER`.
 
-    Means over seeds: the return with half of its 95 % interval; the part of the gap that a policy closes between
-    PPO on raw measurements and the best controller on the true state; thrust errors, RMS [N], within 0.15 s of a
-    step of the reference, after that, and within 0.15 s of a change of its sign; and the error of the thrust that
-    is observed.
+    Means over seeds: the return with half of its 95 % interval; the part of the gap between PPO on raw
+    measurements and the best controller on the true state that a policy closes; thrust errors, RMS [N], within
+    0.15 s of a step of the reference, later, and within 0.15 s of a change of its sign; and the error of the
+    observed thrust.
     """
     groups, rows = by_policy(results), []
     gap = ends_of_gap(groups, noise)
@@ -82,19 +87,17 @@ def rows_of(results: Sequence[Result], noise: str) -> list[list[str]]:
 
 
 def summary_rows(results: Sequence[Result]) -> list[list[str]]:
-    """What matters, a row a question and a column a noise, with 95 % intervals; empty where a run is missing."""
+    """A row for each question, a column for each noise level, 95 % intervals; empty where a run is missing."""
     groups = by_policy(results)
     noises = noises_of(groups)
 
     def row(title: str, cell: Callable[[str], str]) -> list[str]:
         return [title, *(cell(noise) for noise in noises)]
 
-    rows = [
-        row(f"gap closed by {name_of(*one)}", lambda noise, one=one: _gap_cell(groups, noise, one)) for one in GAPS
-    ]
+    rows = [row(f"gap closed by {name_of(*one)}", partial(_gap_cell, groups, one=one)) for one in GAPS]
     for above, below in RATIOS:
         title = f"cost of {name_of(*above)} / of {name_of(*below)}"
-        rows.append(row(title, lambda noise, pair=(above, below): _ratio_cell(groups, noise, *pair)))
+        rows.append(row(title, partial(_ratio_cell, groups, above=above, below=below)))
     return rows
 
 
@@ -105,7 +108,7 @@ def figure_of(groups: Groups, noise: str, kind: str, label: str) -> Figure | Non
 
 
 def ends_of_gap(groups: Groups, noise: str) -> tuple[Figure, Figure] | None:
-    """Return of PPO on raw and of the best controller on true observations; None unless this is surely better."""
+    """Return of PPO on raw and of the best controller on true observations; None unless this is better."""
     raw, true = (figure_of(groups, noise, *of) for of in (("ppo", "raw"), (BEST, "true")))
     if raw is None or true is None or not as_interval(true - raw).low > 0:
         return None
@@ -135,5 +138,5 @@ def _gap_cell(groups: Groups, noise: str, one: tuple[str, str]) -> str:
 
 
 def _ratio_cell(groups: Groups, noise: str, above: tuple[str, str], below: tuple[str, str]) -> str:
-    figures = [figure_of(groups, noise, *of) for of in (above, below)]
-    return "" if None in figures else shown(as_interval(figures[0] / figures[1]), ".3f")
+    top, bottom = (figure_of(groups, noise, *of) for of in (above, below))
+    return "" if top is None or bottom is None else shown(as_interval(top / bottom), ".3f")

@@ -1,1 +1,1 @@
-"""The plants that policies learn on, and what training has to know of each."""
+"""The plants on which policies learn."""

@@ -1,4 +1,4 @@
-"""Policies on the underwater vehicle: they follow a path, or steps of the depth."""
+"""Policies on the underwater vehicle, which follows a path, or steps of the depth."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from auv_env.tasks import SegorogeniAUVDepthEnv, SegorogeniAUVPathEnv
 from plants.observe import ObserveState
 from plants.state_space import StateSpaceModel
 from training.algorithms import LAYERS
-from training.observations import find_arm
+from training.observations import find_observation_set
 from training.plants.plant import Part, Task, TrainingPlant, part_of
 from tuning.auv.find import find_scenario
 from tuning.auv.scenario import Scenario
 from tuning.auv.scenarios import SCENARIOS
+from tuning.problems.scenario import BaseScenario
 
-SHORTEST_STEP = 0.01  # [s]; with shorter ones an episode would have no time to go anywhere
+SHORTEST_STEP = 0.01  # [s]; with a shorter sample time the vehicle would hardly move in an episode
 PD = "pd"
 
 
@@ -51,7 +52,7 @@ class Vehicle(TrainingPlant):
     controllers = (PD,)
     of_states = ()
     correctable = (PD,)
-    # A turn takes seconds, so the horizon is 5 s; and a vehicle that is shaken tumbles and learns nothing.
+    # A turn takes seconds, so the horizon is 5 s; with large random actions the vehicle would tumble.
     hyperparameters = {
         "ppo": {"gamma": 0.99, "gae_lambda": 0.95, "policy_kwargs": {**LAYERS, "log_std_init": -2.0}},
         "sac": {"gamma": 0.98},
@@ -65,7 +66,7 @@ class Vehicle(TrainingPlant):
         """A scenario of the vehicle by its name or file."""
         return find_scenario(name)
 
-    def check_scenario(self, scenario: Scenario) -> None:
+    def check_scenario(self, scenario: BaseScenario) -> None:
         """Raise ValueError unless a scenario is one of the vehicle, with attitude in its model."""
         if not isinstance(scenario, Scenario) or not _may_learn(scenario):
             rule = f"scenario must be the vehicle's, with roll and pitch as states and dt from {SHORTEST_STEP} s"
@@ -77,12 +78,12 @@ class Vehicle(TrainingPlant):
 
     def check_observes(self, name: str, observe: str) -> None:
         """Raise ValueError for a history, or a belief with standard deviations."""
-        arm = find_arm(observe)
-        if arm.pairs or arm.form != "estimate":
+        observed = find_observation_set(observe)
+        if observed.pairs or observed.form != "estimate":
             raise ValueError(f"{name} must observe measurements or a state, but got observe={observe!r}")
 
     def classical(self, name: str, setup):
-        """PD on depth and course, from measurements, from an estimate or from the true state."""
+        """PD control of depth and course, from measurements, from an estimate or from the true state."""
         from training.environments import make_single
 
         return self.corrected(name, make_single(setup).env)

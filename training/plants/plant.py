@@ -1,4 +1,4 @@
-"""`TrainingPlant`: what training has to know of a plant, its tasks, envs, models and controllers."""
+"""`TrainingPlant`: a plant for training, with its tasks, envs, models and controllers."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 
 from plants.state_space import StateSpaceModel
-from training.observations import find_arm
+from training.observations import find_observation_set
 from tuning.problems.scenario import BaseScenario
 
 if TYPE_CHECKING:
     import gymnasium as gym
 
     from training.controllers import ClassicalPolicy
-    from training.setup import Setup
+    from training.setup import TrainingConfiguration
 
 
 class Task(NamedTuple):
-    """An env and what it is asked to follow."""
+    """An env with its reference or path."""
 
     about: str
     env_id: str
@@ -35,7 +35,7 @@ class Part(NamedTuple):
 
     @property
     def rms(self) -> float:
-        """Root of the mean square, pooled over episodes; NaN if no step counts."""
+        """Root mean square error, pooled over episodes; NaN without any step."""
         steps = self.steps.sum()
         return float(np.sqrt(self.squares.sum() / steps)) if steps else float("nan")
 
@@ -46,22 +46,22 @@ def part_of(errors: np.ndarray, chosen: np.ndarray) -> Part:
 
 
 class TrainingPlant(ABC):
-    """A plant on which policies learn; what they observe is that of `training.observations` for all plants.
+    """A plant on which policies learn; the observation sets of `training.observations` are for all plants.
 
     Attributes:
-        tasks: by name, which no other plant has.
-        scenario: name of the one that is the default.
-        scenarios: names of those that policies may learn in.
-        env_arguments: names of those of its envs, `render_mode` left out.
-        plant_arguments: names of those that say what the plant is, and not what is asked of it.
-        model_arguments: names of what a filter may assume otherwise.
-        output: symbol of the output that stands in front of a state that is observed; None for none.
+        tasks: tasks by name; no two plants share a name.
+        scenario: name of the default scenario.
+        scenarios: names of the scenarios in which policies may learn.
+        env_arguments: names of the envs' arguments, without `render_mode`.
+        plant_arguments: names of the arguments of the plant, without those of the task.
+        model_arguments: names of arguments in which a filter's model may differ from the plant.
+        output: symbol of the output that precedes an observed state; None for none.
         controllers: names of the classical policies.
-        of_states: those of them that must observe a state.
-        correctable: those that a policy may correct.
-        hyperparameters: of algorithms by name, where they differ from those of `training.algorithms`.
-        parts: what `parts_of` gives, with units.
-        errors: what these are errors of, in words.
+        of_states: names of those that must observe a state.
+        correctable: names of those that a policy may correct.
+        hyperparameters: hyperparameters by algorithm, where they differ from those of `training.algorithms`.
+        parts: names and units of the errors of `parts_of`.
+        errors: description of these errors.
     """
 
     tasks: ClassVar[Mapping[str, Task]]
@@ -88,16 +88,16 @@ class TrainingPlant(ABC):
 
     @abstractmethod
     def model(self, **arguments) -> StateSpaceModel:
-        """What a filter assumes, of arguments of the plant and of the model."""
+        """The model that a filter assumes, from arguments of the plant and of the model."""
 
     def check_observes(self, name: str, observe: str) -> None:
-        """Raise ValueError unless a classical policy can act on what an arm observes."""
-        if name in self.of_states and not find_arm(observe).shows_state:
+        """Raise ValueError unless a classical policy can act on an observation set."""
+        if name in self.of_states and not find_observation_set(observe).shows_state:
             raise ValueError(f"{name} must observe a state, but got observe={observe!r}")
 
     @abstractmethod
-    def classical(self, name: str, setup: Setup) -> ClassicalPolicy:
-        """A classical policy for what a setup observes."""
+    def classical(self, name: str, setup: TrainingConfiguration) -> ClassicalPolicy:
+        """A classical policy for the observation set of a training configuration."""
 
     def corrected(self, name: str, env: gym.Env) -> ClassicalPolicy:
         """The controller that a policy corrects, by one of the names `correctable`."""
@@ -105,8 +105,8 @@ class TrainingPlant(ABC):
 
     @abstractmethod
     def recorded(self, arrays: Mapping[str, np.ndarray], observations: np.ndarray) -> tuple[np.ndarray, ...]:
-        """What `parts_of` needs of a step: infos of B copies, one row each, and observations after it (B, d)."""
+        """The values of a step for `parts_of`, from infos of B copies and the observations after it (B, d)."""
 
     @abstractmethod
     def parts_of(self, recorded: np.ndarray, alive: np.ndarray, plant: Any) -> dict[str, Part]:
-        """Errors of episodes by name, from what was recorded (q, B, K) and whether an episode went on (B, K)."""
+        """Errors of episodes by name, from recorded values (q, B, K) and whether an episode continues (B, K)."""

@@ -1,4 +1,4 @@
-"""Policies on the thruster: they make its thrust follow a reference."""
+"""Policies on the thruster, whose thrust follows a reference."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from thruster_env.model import MODEL_ARGUMENTS, thruster_model
 from thruster_env.plant import Plant, make_plant
 from thruster_env.task import thrust_scale
 from training.plants.plant import Part, Task, TrainingPlant, part_of
+from tuning.problems.scenario import BaseScenario
 from tuning.thruster.find import find_scenario
 from tuning.thruster.scenario import Scenario
 from tuning.thruster.scenarios import SCENARIOS
 
-TRANSIENT = 0.15  # [s] after a step of the reference; what comes later is steady tracking
-STEP_OF_REFERENCE = 0.02  # a change within one sample time that counts as a step [T_max]
-FIRST_SCORED_STEP = 50  # of the observed thrust's RMSE, as of every estimate's
+TRANSIENT = 0.15  # [s] after a step of the reference; later steps are steady tracking
+STEP_OF_REFERENCE = 0.02  # least change within one sample time that is a step [T_max]
+FIRST_SCORED_STEP = 50  # of the RMSE of the observed thrust, as for all estimates
 
 
 class Thruster(TrainingPlant):
@@ -49,13 +50,13 @@ class Thruster(TrainingPlant):
     of_states = controllers[1:]
     correctable = tuple(HORIZONS)
     parts = dict.fromkeys(("all", "transient", "steady", "reversal", "observed"), "N")
-    errors = "of thrust; seen: of the thrust that the policy is shown"
+    errors = "of thrust; seen: of the thrust that the policy observes"
 
     def find_scenario(self, name: str) -> Scenario:
         """A scenario of the thruster by its name or file."""
         return find_scenario(name)
 
-    def check_scenario(self, scenario: Scenario) -> None:
+    def check_scenario(self, scenario: BaseScenario) -> None:
         """Raise ValueError unless a scenario is one of the thruster's equations."""
         if not isinstance(scenario, Scenario) or scenario.system is not None:
             kind = "linear" if isinstance(scenario, Scenario) else "of another plant"
@@ -78,13 +79,13 @@ class Thruster(TrainingPlant):
         return predictive(name, env)
 
     def recorded(self, arrays: Mapping[str, np.ndarray], observations: np.ndarray) -> tuple[np.ndarray, ...]:
-        """The true thrust, the reference, and the thrust that the policy is shown [N]."""
+        """The true thrust, the reference, and the thrust that the policy observes [N]."""
         return arrays["thrust"].copy(), arrays["reference"].copy(), observations[:, 0].astype(np.float64)
 
     def parts_of(self, recorded: np.ndarray, alive: np.ndarray, plant: Plant) -> dict[str, Part]:
         """Errors of thrust [N]: over all steps, soon after steps of the reference, elsewhere, at reversals.
 
-        "observed" is that of the thrust that the policy is shown, against the true one.
+        "observed" is the error of the thrust that the policy observes.
         """
         thrusts, references, shown = recorded
         transient, reversal = _windows(

@@ -1,12 +1,13 @@
 """The thruster's classical policies: PI, LQR (LQG with an estimator), and the predictive controllers.
 
-Each observes what an arm of `training.observations` does, so it stands beside the policy that learnt on that arm.
+They use the observation sets of `training.observations`, so that they can be compared with learnt policies.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 from itertools import product
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -18,15 +19,22 @@ from thruster_env.dynamics import Constants
 from training.controllers import ClassicalPolicy
 from training.environments import make_single
 from training.score import score
-from training.setup import Setup
+from training.setup import TrainingConfiguration
 from tuning.problems.seeds import training_seeds
 
-GAINS = (0.5, 1.0, 2.0, 3.0, 4.0, 6.0)  # factors on the gains of `gains.lambda_gains`, tried for each arm
+GAINS = (
+    0.5,
+    1.0,
+    2.0,
+    3.0,
+    4.0,
+    6.0,
+)  # factors on the gains of `gains.lambda_gains`, tried for each observation set
 GAIN_SEEDS = 16
 
 
 def predictive(name: str, env: gym.Env) -> ClassicalPolicy:
-    """A predictive controller by name, that believes in the thruster that the filter of an env does.
+    """A predictive controller by name, with the model that the filter of an env assumes.
 
     Args:
         name: one of `HORIZONS`.
@@ -39,24 +47,24 @@ def predictive(name: str, env: gym.Env) -> ClassicalPolicy:
     believed = getattr(getattr(env, "filter", None), "model", None)
     constants = believed.constants if believed is not None and isinstance(believed.constants, Constants) else None
     controller = PredictiveController.for_env(env, horizon, constants)
-    return ClassicalPolicy(controller, 1, env.unwrapped.plant.max_voltage, keeps_input=True)
+    return ClassicalPolicy(controller, 1, _max_voltage(env), keeps_input=True)
 
 
-def lqr(setup: Setup) -> ClassicalPolicy:
+def lqr(setup: TrainingConfiguration) -> ClassicalPolicy:
     """LQR on the true state, or on an estimate: certainty equivalence, so LQG."""
     env = make_single(setup)
-    return ClassicalPolicy(LQRController.for_env(env), 1, env.unwrapped.plant.max_voltage)
+    return ClassicalPolicy(LQRController.for_env(env), 1, _max_voltage(env))
 
 
-def pi(setup: Setup) -> ClassicalPolicy:
-    """PI with feed-forward on the thrust that an arm shows, with the gains that suit the arm best.
+def pi(setup: TrainingConfiguration) -> ClassicalPolicy:
+    """PI with feed-forward on the thrust of an observation set, with the best gains for it.
 
     Factors `GAINS` on both gains of `lambda_gains` are tried on training seeds; the highest mean return wins.
     """
     env = make_single(setup)
-    usual, top = PIController.for_env(env), env.unwrapped.plant.max_voltage
+    usual, top = PIController.for_env(env), _max_voltage(env)
     tried = np.array(list(product(GAINS, GAINS))) * [usual.proportional_gain, usual.integral_gain]
-    # All pairs of gains at once, each on copies of its own: the controller takes arrays as it takes numbers.
+    # All pairs of gains at once, each on its own copies: gains may be arrays.
     each = np.repeat(tried, GAIN_SEEDS, axis=0).T
     seeds = list(training_seeds(setup.seed, GAIN_SEEDS)) * len(tried)
     returns = score(ClassicalPolicy(_with_gains(usual, *each), 0, top), setup, seeds).returns
@@ -64,11 +72,16 @@ def pi(setup: Setup) -> ClassicalPolicy:
     return ClassicalPolicy(_with_gains(usual, *best.tolist()), 0, top)
 
 
+def _max_voltage(env: gym.Env) -> float:
+    base: Any = env.unwrapped
+    return base.plant.max_voltage
+
+
 def _with_gains(controller: PIController, proportional, integral) -> PIController:
     return replace(controller, proportional_gain=proportional, integral_gain=integral)
 
 
-def controller_of(name: str, setup: Setup) -> ClassicalPolicy:
+def controller_of(name: str, setup: TrainingConfiguration) -> ClassicalPolicy:
     """A classical policy of the thruster by the name of its controller."""
     if name in HORIZONS:
         return predictive(name, make_single(setup).env)

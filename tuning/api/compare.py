@@ -122,16 +122,20 @@ def contenders_of(
         if name is not None and not has_ensemble(name):
             raise ValueError(f"ensemble_size must be for a filter with an ensemble, but got {name}: {size}")
         at_least("ensemble_size", size, 2)
-    others, out = sizes.get(None), list[Contender]()
+
+    def size_of(name: Any) -> int | None:
+        return sizes[name] if name in sizes else sizes.get(None)
+
+    out: list[Contender] = []
     for one in filters:
         if isinstance(one, Study):
-            choice = sized(one.choice, sizes.get(one.choice.name, others))
+            choice = sized(one.choice, size_of(one.choice.name))
             out.append(Contender(_new(f"{choice.name} tuned", out), partial(_same, choice)))
         elif not is_filter(one):
-            size = sizes.get(read_tuned_file(one)["filter"]["name"], others)
+            size = size_of(read_tuned_file(one)["filter"]["name"])
             out.append(Contender(_new(Path(one).stem, out), partial(_from_file, Path(one), size)))
         else:
-            size = sizes.get(one, others) if not is_foreign(one) and has_ensemble(one) else None
+            size = size_of(one) if not is_foreign(one) and has_ensemble(one) else None
             out.append(contender(one, knows, seed=seed, ensemble_size=size))
             if unknown and filter_class(one).has_covariance:
                 out.append(contender(one, knows, unknown, seed, ensemble_size=size))

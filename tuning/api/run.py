@@ -112,7 +112,7 @@ def run_tuning(
         rival = prove(result.choice, plan.scenarios[0], plan.seed)
         result = result._replace(choice=gradient.choice, consistent=None, nis=())
     try:
-        with working("proving the choice on held-out seeds", console):
+        with working(f"proving the choice on held-out {plan.scenarios[0].seed_word}", console):
             proofs = tuple(prove(result.choice, scenario, plan.seed) for scenario in plan.scenarios)
     except KeyboardInterrupt:
         if storage is not None:

@@ -90,6 +90,11 @@ class Scenario(BaseScenario):
         return MODELS[self.states].count
 
     @property
+    def env_id(self) -> str:
+        """`SegorogeniAUV-v0`."""
+        return "auv_env:SegorogeniAUV-v0"
+
+    @property
     def plant_arguments(self) -> dict:
         """Arguments of the env of the same vehicle, `SegorogeniAUV-v0`."""
         own = {"name", "about", "scale", "parameter_factors", "excitation", "steps", "first_scored_step", "states"}

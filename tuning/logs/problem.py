@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -12,6 +13,7 @@ from numerics.checks import shown
 from plants.logs.log import Log
 from plants.replay import read_for
 from tuning.logs.read import read_named, texts
+from tuning.problems.find import named
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Problem
 
@@ -123,10 +125,11 @@ def problems_in(file: Path, model: str | None = None) -> list[Problem]:
                 f"logs in a tuned file must have paths and options, but {file} has {shown(content)}"
             ) from None
         _check_model(options.get("model"), model, file)
-        found.append(log_problem(paths, **options))
-        if found[-1].name != name:
+        problem = log_problem(paths, **options)
+        if name not in (problem.name, re.sub(r" and (\d+) more$", r"+\1", problem.name)):  # as it was until 0.1
             said = f"logs in a tuned file must be those of {shown(name)}"
-            raise ValueError(f"{said}, but {file} has {found[-1].name}")
+            raise ValueError(f"{said}, but {file} has {problem.name}")
+        found.append(named(problem, name))
     return found
 
 

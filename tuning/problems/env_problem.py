@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -143,6 +144,19 @@ class EnvProblem(AssumedProblem):
         outputs = None if states is None else self._outputs(states)
         return Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, states, outputs)
 
+    def make_env(self, **arguments: Any) -> gym.Env:
+        """The env itself, where that was given; else a new one.
+
+        Args:
+            **arguments: of the id or the function, in place of `env_arguments` of the same name.
+
+        Raises:
+            ValueError: if it cannot be made.
+        """
+        if arguments and isinstance(self.env, gym.Env):
+            raise ValueError(f"the env of problem {self.name} is made already, but got {', '.join(arguments)}")
+        return self._make_env(self.name, arguments)
+
     def found_scale(self) -> np.ndarray:
         """The standard deviation of each true state over the scored steps of 16 seeds."""
         data = self.data(SCALE_SEEDS)
@@ -198,12 +212,12 @@ class EnvProblem(AssumedProblem):
         state = info["state"] if self.state_of is None else self.state_of(env.unwrapped)
         return np.ravel(np.asarray(state, dtype=np.float64)).copy()
 
-    def _make_env(self, name: str) -> gym.Env:
+    def _make_env(self, name: str, arguments: Mapping | None = None) -> gym.Env:
         if isinstance(self.env, gym.Env):
             return self.env
         try:
             make = partial(gym.make, self.env) if isinstance(self.env, str) else self.env
-            made = make(**self.env_arguments)
+            made = make(**{**self.env_arguments, **(arguments or {})})
         except (gym.error.Error, TypeError, ImportError) as error:
             raise ValueError(
                 f"the env of problem {name} must be one that can be made, but {said(error)}"

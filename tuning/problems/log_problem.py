@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from numerics.checks import shown
+from numerics.checks import at_least, shown
 from numerics.streams import filter_keys
 from plants.logs.log import Log
+from plants.replay import ReplayEnv
 from plants.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, rows_of
 from tuning.problems.check import check_quantities
@@ -158,6 +160,17 @@ class LogProblem(AssumedProblem):
         outputs = {symbol: model.output(symbol, states) for symbol in model.outputs}
         return data._replace(states=states, outputs=outputs)
 
+    def make_env(self, *, run: int = 0, **arguments: Any) -> ReplayEnv:
+        """A recorded run as an env that replays it, whatever the action, and offers filters the assumed model.
+
+        Args:
+            run: place of the run among the logs.
+            **arguments: none.
+        """
+        if arguments:
+            raise ValueError(f"an env of recorded runs must come with run alone, but got {', '.join(arguments)}")
+        return ReplayEnv(self.logs[at_least("run", run, 0, len(self.logs) - 1)], self.model)
+
     def found_scale(self) -> np.ndarray:
         """The standard deviation of each true state over the scored steps of the training blocks."""
         data = self.data(self.parts.training)
@@ -193,6 +206,6 @@ def _checked_logs(given) -> tuple[Log, ...]:
 
 
 def _name(logs: Sequence[Log]) -> str:
-    """The name of several logs: that of the first one, and the number of others."""
-    more = f"+{len(logs) - 1}" if len(logs) > 1 else ""
+    """What logs are called together: the first one's name, and how many there are more."""
+    more = f" and {len(logs) - 1} more" if len(logs) > 1 else ""
     return f"{logs[0].name}{more}"

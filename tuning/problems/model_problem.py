@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from inspect import Parameter as SignatureParameter
 from inspect import Signature
+from typing import Any
 
 import numpy as np
 
@@ -155,13 +156,15 @@ class ModelProblem(AssumedProblem):
         variances = posterior_variances(self.truth, data.inputs, truths=truths)
         return np.sqrt(variances[:, data.scored, self._shared].mean(axis=(0, 1)))
 
-    def env(self, **bounds) -> ModelEnv:
+    def make_env(self, **arguments: Any) -> ModelEnv:
         """The truth as a Gymnasium env, which offers filters the assumed model; the data of a seed is its episode.
 
         Args:
-            **bounds: `low` and `high` of the inputs, as `ModelEnv` takes them.
+            **arguments: `low` and `high` of the inputs, as `ModelEnv` takes them.
         """
-        return ModelEnv(self.truth, NamedArguments(self), dt=self._dt, **bounds)
+        return ModelEnv(self.truth, NamedArguments(self), dt=self._dt, **arguments)
+
+    env = make_env  # its name before there was one for all problems
 
     def _inputs_of(self, seeds: tuple[int, ...]) -> np.ndarray:
         shape = len(seeds), self.steps, self.truth.inputs

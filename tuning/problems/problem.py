@@ -5,8 +5,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import gymnasium as gym
 import numpy as np
 
 from plants.quantities import Quantities
@@ -76,6 +77,20 @@ class Problem(ABC):
     def bound(self, data: Data) -> np.ndarray:
         """Bound on the standard error of each state over scored steps, (n,); NaN where there is no bound."""
         return np.full(self.model().n if self.scale is None else len(self.scale), np.nan)
+
+    def make_env(self, **arguments: Any) -> gym.Env:
+        """A Gymnasium env of the plant, for wrappers and policies; an episode of a seed is the data of that seed.
+
+        Filters around it that are told nothing assume what the env offers: `EstimateState(problem.make_env(),
+        tuned=...)`, or "ekf".
+
+        Args:
+            **arguments: of the env, such as `render_mode`.
+
+        Raises:
+            ValueError: if the problem has none, or an argument is off.
+        """
+        raise ValueError(f"make_env must be of a problem that has an env, but {self.name} has none")
 
     @property
     def quantities(self) -> Quantities:

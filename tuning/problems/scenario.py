@@ -7,7 +7,9 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
+
+import gymnasium as gym
 
 from numerics.checks import at_least, shown, vector
 from plants.env import as_json
@@ -74,7 +76,7 @@ class BaseScenario(Problem):
         raise NotImplementedError
 
     def make(self, seeds: tuple[int, ...]) -> Data:
-        """The data of some seeds; `data` keeps the last ones."""
+        """The data of some seeds; `data` caches the last ones."""
         raise NotImplementedError
 
     def checked_scale(self, states: int) -> list[float]:
@@ -95,6 +97,16 @@ class BaseScenario(Problem):
 
     def __hash__(self) -> int:
         return hash((self.name, self.process_noise_cov, self.measurement_noise_cov, self.excitation, self.steps))
+
+    @property
+    def env_id(self) -> str:
+        """The env of the same plant."""
+        raise NotImplementedError
+
+    @property
+    def plant_arguments(self) -> dict:
+        """Arguments of this env that make the same plant."""
+        raise NotImplementedError
 
     @property
     def true(self) -> dict:
@@ -128,6 +140,18 @@ class BaseScenario(Problem):
             entry.name: as_json(getattr(self, entry.name)) for entry in fields(self) if entry.name != "name"
         }
         return {"plant": self.plant_kind, **content, "excitation": self.excitation.as_mapping()}
+
+    def make_env(self, **arguments: Any) -> gym.Env:
+        """An env of the scenario's plant, as `gym.make` makes it, with the scenario's length.
+
+        Filters around it assume the plant itself: what the scenario lets them assume is in a tuned file, or
+
+            EstimateState(scenario.make_env(), "ekf", model_arguments=dict(scenario.held))
+
+        Args:
+            **arguments: of the env, in place of those of the plant; or of `gym.make`.
+        """
+        return gym.make(self.env_id, **{"max_episode_steps": self.steps, **self.plant_arguments, **arguments})
 
     def replace(self, **changes) -> Self:
         """The same scenario with some fields changed."""

@@ -60,9 +60,7 @@ def _row(name: str, trials: list[FrozenTrial]) -> FilterType:
 
 
 # Former names.
-Kind, kinds_tried, kinds_running, trials_of_kind = (
-    FilterType,
-    filter_types_tried,
-    filter_types_running,
-    trials_of_type,
-)
+Kind = FilterType
+kinds_tried = filter_types_tried
+kinds_running = filter_types_running
+trials_of_kind = trials_of_type

@@ -128,6 +128,7 @@ def preset_of(found: Any, family: Any, logs: Sequence[str]):
         "log_likelihood": found.log_likelihood,
         "standard_errors": found.standard_errors,
         "determined": found.determined,
+        "largest_voltage": float(max(np.abs(log.inputs).max() for log in family.logs)),
     }
     kept = {name: value for name, value in recorder.items() if value not in ({}, 0.0)}
     return PresetFile(plant.parameters, (seen.dead_band_low, seen.dead_band_high), kept, identified)

@@ -88,6 +88,11 @@ class Scenario(BaseScenario):
         }
 
     @property
+    def env_id(self) -> str:
+        """`BowThruster-v0`, or `BowThrusterLinear-v0` of a linear plant."""
+        return "thruster_env:BowThruster-v0" if self.system is None else "thruster_env:BowThrusterLinear-v0"
+
+    @property
     def plant_arguments(self) -> dict:
         """Arguments of the env of the same plant, `BowThruster-v0`, or `BowThrusterLinear-v0` of a linear one."""
         own = {"name", "about", "scale", "parameter_factors", "excitation", "steps", "first_scored_step"}

@@ -1,0 +1,120 @@
+"""
+PPO in a script of one's own
+============================
+
+A policy that makes the thruster's thrust follow a reference, from the estimate of a Kalman filter, learnt with
+Stable-Baselines3 (``pip install 'thruster-env[rl]'``) and hyperparameters that suit this plant. In a third of the
+steps that ``thruster train`` takes; with all of them::
+
+    python examples/ppo.py --steps 401408 --out ppo_thruster
+"""
+
+import argparse
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.wrappers import RescaleAction
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+import thruster_env  # noqa: F401 - registers the envs
+from filters import EstimateState, EstimateStates
+from training import NativeVecEnv
+
+ENV, FILTER = "BowThrusterTracking-v0", "ekf"
+COPIES = 64  # stepped side by side, in one compiled call
+ROLLOUT = 64  # steps of each between two updates: batches of 4096 steps
+DISCOUNT = 0.5  # the voltage sets the thrust of the very next step, so a short horizon suffices
+PPO_NUMBERS = {
+    "n_steps": ROLLOUT,
+    "batch_size": 256,
+    "n_epochs": 5,
+    "gamma": DISCOUNT,
+    "gae_lambda": 0.9,
+    "policy_kwargs": {"net_arch": [64, 64, 64], "log_std_init": -1.0},
+}
+
+# %%
+# The envs
+# --------
+#
+# To learn, all copies of the thruster and their filters are stepped together. ``NativeVecEnv`` hands them to
+# Stable-Baselines3, and takes actions in [-1, 1] for the range of the voltage, as PPO's Gaussian policy likes
+# them. Observations and rewards are normalised, which matters: states are of very different size.
+
+
+def make_training(copies=COPIES, seed=0):
+    """Copies of the env with a filter each, as PPO takes them."""
+    envs = gym.make_vec(ENV, num_envs=copies, autoreset_mode="SameStep")
+    venv = VecNormalize(VecMonitor(NativeVecEnv(EstimateStates(envs, FILTER))), gamma=DISCOUNT)
+    venv.seed(seed)
+    return venv
+
+
+# %%
+# To use what was learnt there is one thruster. ``RescaleAction`` gives it the same actions in [-1, 1].
+
+
+def make_single():
+    """One env with its filter, for the policy at work."""
+    return RescaleAction(EstimateState(gym.make(ENV), FILTER), np.float32(-1.0), np.float32(1.0))
+
+
+# %%
+# Learn
+# -----
+
+
+def learn(steps, copies=COPIES, seed=0):
+    """The policy after so many steps, and the normalisation that belongs to it."""
+    torch.set_num_threads(1)  # quickest for networks as small as these
+    venv = make_training(copies, seed)
+    rate = 1e-3
+
+    def falling(remaining):  # to zero, as the share of the steps that is left does
+        return rate * max(remaining, 0.0)
+
+    model = PPO("MlpPolicy", venv, learning_rate=falling, seed=seed, device="cpu", **PPO_NUMBERS)
+    model.learn(steps)
+    return model, venv
+
+
+# %%
+# Use it
+# ------
+#
+# The policy saw normalised observations, and has to see them here, too.
+
+
+def episode_return(model, venv, seed):
+    """Sum of the rewards of one episode."""
+    env, total, done = make_single(), 0.0, False
+    observation, _ = env.reset(seed=seed)
+    while not done:
+        action, _ = model.predict(venv.normalize_obs(observation), deterministic=True)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        total, done = total + reward, terminated or truncated
+    return total
+
+
+def main(arguments=None):
+    """Learn, say what it is worth on held-out episodes, and save it."""
+    parser = argparse.ArgumentParser(description="PPO on the estimate of a filter.")
+    parser.add_argument("--steps", type=int, default=131_072, help="steps to learn from; 401408 is what is best")
+    parser.add_argument("--copies", type=int, default=COPIES, help="of the env")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--episodes", type=int, default=5, help="held-out ones")
+    parser.add_argument("--out", help="where to save: OUT.zip, and OUT.pkl with the normalisation")
+    given = parser.parse_args(arguments)
+    model, venv = learn(given.steps, given.copies, given.seed)
+    returns = [episode_return(model, venv, 1_000_000 + seed) for seed in range(given.episodes)]
+    print(f"mean return of {given.episodes} held-out episodes: {np.mean(returns):.3f}")
+    if given.out:
+        model.save(given.out)
+        venv.save(f"{given.out}.pkl")
+    return returns
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,134 @@
+"""How the command line presents itself: version, panels, names, tables at any width, colour, progress."""
+
+import importlib.metadata
+import io
+import os
+import signal
+import sys
+
+import pytest
+from rich.console import Console
+
+from numerics.checks import any_case, meant, one_of
+from numerics.progress import listening
+from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from thruster_cli import output
+from thruster_cli.app import COMMANDS, PANELS, listed
+from thruster_cli.benchmark import fitted
+from tuning.search.interruption import STOPPING, stop_on_interrupt
+
+
+def test_the_version_is_that_of_the_package(thruster):  # noqa: F811
+    assert thruster("--version").stdout == f"thruster-env {importlib.metadata.version('thruster-env')}\n"
+
+
+def test_commands_are_listed_in_panels_without_being_imported(thruster, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(importlib, "import_module", lambda name: pytest.fail(f"{name} was imported"))
+    said = thruster("--help").stdout
+    places = [said.index(f" {panel} ") for panel in PANELS]
+    assert places == sorted(places)
+    for name in COMMANDS:
+        assert f"\n│ {name} " in said and listed(name).help[0].isupper()
+
+
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("demo", "study")])
+def test_every_option_is_in_a_panel(thruster, name):  # noqa: F811
+    said = thruster(name, "--help").stdout
+    rest = said[said.index("─ Options ─") :]
+    options = rest[: rest.index("╰")]
+    assert options.count("--") == 1 and "--help" in options
+    assert "--json" in said[said.index("─ Output ─") :]
+
+
+def test_names_are_taken_in_any_case(as_json):  # noqa: F811
+    found = as_json("inspect", "--preset", "T200", "--out", "x.png")
+    assert found["preset"] == "t200"
+    assert as_json("filters", "EnKF")["filters"][0]["name"] == "enkf"
+    assert as_json("filters", "ekf", "--problem", "MisMatch")["problem"] == "mismatch"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "end"),
+    [
+        (("evaluate", "--filter", "EFK"), "but got 'EFK'; did you mean 'ekf'?"),
+        (("compare", "--scenario", "mismach"), "but got 'mismach'; did you mean 'mismatch'?"),
+        (("inspect", "--preset", "tunel"), "but got 'tunel'; did you mean 'tunnel'?"),
+        (("reproduce", "lorenz36"), "but got 'lorenz36'; did you mean 'lorenz96'?"),
+        (("train", "--scenario", "ambiant"), "but got 'ambiant'; did you mean 'ambient'?"),
+        (("tunne",), "Did you mean 'tune'?"),
+        (("tune", "--trails", "3"), "--trials"),
+        (("evaluate", "--filter", "zzz"), "but got 'zzz'\n"),
+        (("evaluate",), "but got none"),
+    ],
+)
+def test_a_misspelt_name_comes_with_the_nearest_one(thruster, arguments, end):  # noqa: F811
+    done = thruster(*arguments)
+    assert done.returncode == 2 and end in done.stderr and done.stderr.count("\n") == 1
+
+
+def test_names_in_python_are_told_apart_by_case():
+    with pytest.raises(ValueError, match="filter must be one of kf, ekf, but got 'EKF'; did you mean 'ekf'?"):
+        one_of("filter", "EKF", iter(["kf", "ekf"]))
+    assert meant(3, ["ekf"]) == meant("", ["ekf"]) == ""
+    assert any_case("EKF", ["kf", "ekf"]) == "ekf" and any_case("module:EKF", ["ekf"]) == "module:EKF"
+
+
+ROWS = [["rule of thumb", "5.887 ±0.069", "0.1229 ±0.0018", "7.0", "0.21"]] * 2
+HEADS = ["filter", "omega_m\n[rad/s]", "U_a\n[m/s]", "NEES", "NIS"]
+
+
+def drawn(made, width, terminal=False, **environment):
+    stream = io.StringIO()
+    environment = {"TERM": "xterm-256color", **environment}
+    Console(file=stream, width=width, force_terminal=terminal or None, _environ=environment).print(made)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 140])
+@pytest.mark.parametrize("framed", [False, True])
+def test_a_table_has_the_same_columns_at_any_width(monkeypatch, width, framed):
+    monkeypatch.setattr(output.console, "width", width)
+    made = output.table("a title that is longer than the table", HEADS, ROWS, caption="of nothing")
+    said = drawn(fitted(made, ROWS) if framed else made, width)
+    assert max(map(len, said.splitlines())) <= width and "…" not in said
+    lines = said.splitlines()
+    below = lines[next(i for i, line in enumerate(lines) if "──" in line) + 1]
+    assert len(below.split()) >= 5 and below.rstrip().endswith("0.21")
+    for word in "rule thumb 5.887 ±0.069 0.1229 7.0 omega_m NEES NIS".split():
+        assert word in said
+
+
+def test_a_winner_stands_out_on_terminals_only():
+    made = output.table("", HEADS, ROWS, best=[1])
+    assert drawn(made, 80, terminal=True).count("\x1b[1;32m") > 3
+    assert "\x1b" not in drawn(made, 80)
+    assert "\x1b[1;32m" not in drawn(made, 80, terminal=True, NO_COLOR="1")
+
+
+def test_the_first_ctrl_c_is_acknowledged_at_once():
+    told = []
+    with listening(told.append), stop_on_interrupt() as stopped:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stopped() and told == [STOPPING]
+
+
+def test_a_word_stands_there_while_a_command_is_imported(monkeypatch, capsys):
+    from thruster_cli.app import LOADING, imported
+
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    assert imported("thruster_cli.verify").__name__ == "thruster_cli.verify"
+    assert capsys.readouterr().err.startswith(LOADING)
+
+
+def test_a_refused_study_leaves_no_journal(thruster, tmp_path):  # noqa: F811
+    for arguments in (("--sampler", "none"), ("--objective", "none"), ("--filter", "none")):
+        assert thruster("tune", "--filter", "ekf", *arguments).returncode == 2
+    assert not list(tmp_path.rglob("*.journal"))
+
+
+def test_a_preset_beyond_its_range_is_warned_about(thruster):  # noqa: F811
+    done = thruster("inspect", "--preset", "t200", "--voltage", 20, "--out", "x.png")
+    assert done.returncode == 0 and "t200 is known up to 13.3 V, but is driven by 20 V" in done.stderr
+    assert "warning" not in thruster("inspect", "--preset", "t200", "--voltage", 13, "--out", "x.png").stderr
+    done = thruster("inspect", "--voltage", 60, "--max-voltage", 60, "--out", "x.png")
+    assert "tunnel is known up to 24 V, but is driven by 60 V" in done.stderr
