@@ -163,7 +163,7 @@ def test_workers_share_a_study_in_mysql():
 
 def test_the_page_names_options_that_there_are():
     page = (Path(__file__).parents[2] / "docs" / "workers.md").read_text()
-    (tune,) = [one for one in typer.main.get_command(app).commands.values() if one.name == "tune"]
+    tune = typer.main.get_command(app).get_command(None, "tune")
     known = {option for parameter in tune.params for option in parameter.opts}
     named = set(re.findall(r"(?<=\s)--[a-z]+", " ".join(re.findall(r"^ *thruster tune.*", page, re.MULTILINE))))
     assert {"--workers", "--storage", "--trials"} <= named <= known
