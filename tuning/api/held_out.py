@@ -124,7 +124,8 @@ class HeldOut:
         """
         from tuning.reporting.figures import draw_comparison
 
-        return drawn(draw_comparison(self.proof, f"{label_of(self.choice.name)} on {self.problem.name}"))
+        name = self.choice.name
+        return drawn(draw_comparison(self.proof, f"{label_of(name)} on {self.problem.name}", name))
 
     def plot_run(self, place: int = 0) -> Figure:
         """One held-out run over time, of the first baseline and the filter: truth, estimate and 95 % band.
@@ -154,7 +155,8 @@ class HeldOut:
 
         title = f"{label_of(self.choice.name)} on {len(self.seeds)} seeds of {self.problem.name}"
         scored = self.evaluation.scored or None
-        return drawn(draw_consistency(self.check_consistency(), title, scored=scored))
+        report, name = self.check_consistency(), self.choice.name
+        return drawn(draw_consistency(report, title, scored=scored, filter_name=name))
 
     def __repr__(self) -> str:
         seeds = f"{len(self.seeds)} held-out {self.problem.seed_word}"

@@ -160,10 +160,15 @@ def names_of(plan: Plan) -> str:
 
 
 def short_name(problem: Problem) -> str:
-    """A problem's name as that of a study and of a file has it: without folders and what shells read."""
-    name = Path(problem.name)
-    text = name.stem if name.suffix == ".toml" else name.name
-    return re.sub(r"[^\w.+-]+", "-", text.replace(".toml)", ")")).strip("-")
+    """A problem's name as that of a study and of a file has it."""
+    return file_name(problem.name)
+
+
+def file_name(name: str) -> str:
+    """A problem's name without folders and what shells read: "nominal-mine" of "nominal (presets/mine.toml)"."""
+    paths = [Path(part.removesuffix(")")) for part in name.split(" (")]
+    text = "-".join(path.stem if path.suffix == ".toml" else path.name for path in paths)
+    return re.sub(r"[^\w.+-]+", "-", text).strip("-")
 
 
 @contextmanager

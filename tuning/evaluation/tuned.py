@@ -1,4 +1,7 @@
-"""The tuned file: one JSON file with a filter's parameters, their origin and their held-out metrics."""
+"""The tuned file: one JSON file with a filter's parameters, their origin and their held-out metrics.
+
+NIS is the normalised innovation squared.
+"""
 
 from __future__ import annotations
 
