@@ -171,10 +171,7 @@ WRONG = [
     (lambda: tuning.tune("mismatch", name="a/b"), "study must be a name without slashes, but got 'a/b'"),
     (lambda: tuning.evaluate("none.json"), "none.json"),
     (lambda: tuning.evaluate(3), "a filter must be a name, a tuned file, a Study or an estimator, but got 3"),
-    (
-        lambda: tuning.tune("mismatch", len),
-        "filter must be a name or 'module:object', by which trials keep it, but",
-    ),
+    (lambda: tuning.tune("mismatch", len), "filter must be a name or 'module:object', by which trials keep it"),
     (lambda: tuning.report(3), "a report must be of a Study, a tuned file or the name of a study, but got 3"),
     (lambda: tuning.report("no such study"), "a report must be of a tuned file or of a study in"),
     (

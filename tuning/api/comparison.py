@@ -104,7 +104,8 @@ class FilterComparison:
                 if not truth:
                     found = [number(one.log_likelihood, ".2f"), about(row.likelihood_gain, 2)]
                 last = [number(one.nees.value, ".3g"), number(one.nis.value, ".3g"), f"{row.microseconds:.3g}"]
-                rows.append([row.label, *found, *last, row.verdict])
+                first = row is board.rows[0]  # which is compared with itself
+                rows.append([row.label, found[0], "" if first else found[1], *last, "" if first else row.verdict])
             heads += ["NEES", "NIS", "us/step", "verdict"]
             title = f"{len(board.seeds)} held-out {board.scenario.seed_word} of {board.scenario.name}"
             parts.append(html(title, heads, rows, winners(board)))
