@@ -33,6 +33,7 @@ myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]
 myst_heading_anchors = 4
 # Equations and terminal output stand in blocks without a language.
 highlight_language = "none"
+smartquotes = False  # an option such as --out has two hyphens
 default_role = "py:obj"
 nitpicky = False
 html_theme = "furo"
