@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import gymnasium as gym
 import numpy as np
 
@@ -76,18 +78,19 @@ class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
 
     ## Arguments
     The list, with units and defaults, is that of `auv_env.plant.make_plant` (the vehicle, its noise, sensors and
-    current; without `substeps`) and of `auv_env.task.make_task` (the path and the weights above); `render_mode`
-    comes on top. All but the first go by name. A wrong value raises a ValueError.
+    current; without `substeps`) and of `auv_env.task.make_task` (the path and the weights above); `render_mode`,
+    and `render_size`, (width, height) of pictures in pixels, come on top. All but the first go by name. A wrong
+    value raises a ValueError.
     """
 
     observes_errors = False
 
     @takes_arguments_of(make_plant, make_task, leaving_out=["substeps"])
-    def __init__(self, *, render_mode: str | None = None, **arguments):
+    def __init__(self, *, render_mode: str | None = None, render_size: Sequence[int] | None = None, **arguments):
         """Build the plant; see the class for the arguments."""
-        self._build(arguments, make_task(**arguments_of(make_task, arguments)), render_mode)
+        self._build(arguments, make_task(**arguments_of(make_task, arguments)), (render_mode, render_size))
 
-    def _build(self, arguments: dict, task, render_mode: str | None) -> None:
+    def _build(self, arguments: dict, task, rendering: tuple) -> None:
         plant: Plant = make_plant(**arguments_of(make_plant, arguments))
         start = arguments["initial_state"]
         if start is None or set(start) == {"speed"}:  # the others say how deep it begins
@@ -107,10 +110,10 @@ class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
         }
         appended = (at.PATH_DEPTH, *range(at.ERRORS, at.ERRORS + 5)) if self.observes_errors else ()
         rows = ReportRows(measurement, slice(at.VALID, at.VALID + m), plant.dropping_channels, appended, info)
-        self._set_up(action_space(plant), rows, render_mode)
+        self._set_up(action_space(plant), rows, *rendering)
 
     def copies_of(self, count: int) -> Copies:
-        """So many vehicles with the env's task."""
+        """Return `count` vehicles with the env's task."""
         return Copies(self.plant, self.task, count)
 
 

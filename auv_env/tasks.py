@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from auv_env.env import SegorogeniAUVEnv
 from auv_env.plant import make_plant
 from auv_env.task import make_depth_task, make_task
@@ -43,9 +45,9 @@ class SegorogeniAUVPathEnv(SegorogeniAUVEnv):
     observes_errors = True
 
     @takes_arguments_of(make_plant, make_task, leaving_out=["substeps"], defaults={"path": "IV"})
-    def __init__(self, *, render_mode: str | None = None, **arguments):
+    def __init__(self, *, render_mode: str | None = None, render_size: Sequence[int] | None = None, **arguments):
         """Build the plant; see the class for the arguments."""
-        self._build(arguments, make_task(**arguments_of(make_task, arguments)), render_mode)
+        self._build(arguments, make_task(**arguments_of(make_task, arguments)), (render_mode, render_size))
 
 
 class SegorogeniAUVDepthEnv(SegorogeniAUVEnv):
@@ -57,13 +59,15 @@ class SegorogeniAUVDepthEnv(SegorogeniAUVEnv):
     Episodes are truncated after 1200 steps (60 s).
 
     ## Arguments
-    The list is that of `auv_env.plant.make_plant` and of `auv_env.task.make_depth_task`; `render_mode` comes on
-    top.
+    The list is that of `auv_env.plant.make_plant` and of `auv_env.task.make_depth_task`; `render_mode` and
+    `render_size` come on top.
     """
 
     observes_errors = True
 
     @takes_arguments_of(make_plant, make_depth_task, leaving_out=["substeps"])
-    def __init__(self, *, render_mode: str | None = None, **arguments):
+    def __init__(self, *, render_mode: str | None = None, render_size: Sequence[int] | None = None, **arguments):
         """Build the plant; see the class for the arguments."""
-        self._build(arguments, make_depth_task(**arguments_of(make_depth_task, arguments)), render_mode)
+        self._build(
+            arguments, make_depth_task(**arguments_of(make_depth_task, arguments)), (render_mode, render_size)
+        )

@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
+
 from numerics.files import write_whole
 
 DARK, BLUE, RUST = "#222222", "#0b6fa4", "#b5541c"
+SKY, MUSTARD, GREEN, PLUM, WINE = "#56b4e9", "#c99700", "#009e73", "#b065a0", "#882255"
+GREY, PALE, TRUE = "#9aa5ad", "#c5ccd1", "#7d848a"
+MOST_POINTS = 600  # of a line, some four in a millimetre
 
 
 def new_figure(size: tuple[float, float]):
@@ -25,7 +30,7 @@ def tidy(axes: Iterable) -> None:
 
 
 def grid_of(count: int, columns: int) -> tuple[int, int]:
-    """Rows and columns of so many panels, at most `columns` side by side, and none of the rows empty."""
+    """Rows and columns for `count` panels, at most `columns` side by side, and none of the rows empty."""
     columns = max(1, min(columns, count))
     return -(-count // columns), columns
 
@@ -35,7 +40,7 @@ def panels(count: int, columns: int, size: tuple[float, float], extra: float = 0
 
     Args:
         count: of panels.
-        columns: at most so many side by side.
+        columns: largest number side by side.
         size: of a panel [inch].
         extra: height for a title or a legend [inch].
         **options: of matplotlib's `subplots`.
@@ -47,6 +52,24 @@ def panels(count: int, columns: int, size: tuple[float, float], extra: float = 0
         axis.remove()
     tidy(axes[:count])
     return figure, axes[:count]
+
+
+def thinned(x: np.ndarray, y: np.ndarray, keep: np.ufunc | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Points of a line, (N,) each: of long ones the smallest and the largest value of each stretch.
+
+    Args:
+        x: ascending.
+        y: values, NaN where there are none.
+        keep: `np.fmin` or `np.fmax` for the smallest or the largest alone, as an edge of a band needs it.
+    """
+    if len(x) <= MOST_POINTS:
+        return x, y
+    parts = np.array_split(np.arange(len(x)), MOST_POINTS // 2)
+    if keep is not None:
+        return np.array([x[part].mean() for part in parts]), np.array([keep.reduce(y[part]) for part in parts])
+    low, high = np.where(np.isfinite(y), y, np.inf), np.where(np.isfinite(y), y, -np.inf)
+    places = np.unique([part[place] for part in parts for place in (low[part].argmin(), high[part].argmax())])
+    return x[places], y[places]
 
 
 def save_figure(figure, path: str | Path) -> Path:

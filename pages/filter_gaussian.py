@@ -133,7 +133,7 @@ def smoothers(path: Path) -> Path:
     kinds = {
         "ekf": ("ekf", {}, LOOKS["ekf"]),
         "enkf, N = 20": ("enkf", {"ensemble_size": 20}, LOOKS["enkf"]),
-        "enkf, N = 200": ("enkf", {"ensemble_size": 200}, LOOKS["etkf"]),
+        "enkf, N = 200": ("enkf", {"ensemble_size": 200}, LOOKS["enkf"] | {"linestyle": "--"}),
     }
     lags = (0, 1, 2, 3, 5, 7, 10, 15, 20, 30, 50)
     figure = new_figure((9.6, 3.6))

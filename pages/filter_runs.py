@@ -9,9 +9,10 @@ import numpy as np
 from filters import Estimates, run
 from filters.consistency.nees import normalized_squares
 from filters.filter import Filter
-from numerics.plots import BLUE, DARK, RUST
+from filters.looks import TRUTH, look
+from filters.registry import FILTERS
+from numerics.plots import MUSTARD
 from numerics.streams import episode_keys, filter_keys
-from pages.page import MUSTARD, SKY
 from thruster_env.plant import Plant, make_plant
 from thruster_env.simulation import simulate
 from tuning.problems.data import FIRST_SCORED_STEP
@@ -20,28 +21,10 @@ from tuning.problems.excitation import held_levels
 SEED, RUNS, STEPS, AMPLITUDE, HOLD, DT = 1, 60, 500, 12.0, 25, 0.01
 PUBLISHED_NOISE = {"process_noise_cov": (0.5, 0.5), "measurement_noise_cov": 0.5}
 
-# A filter keeps its colour and its dashes over the whole page.
-LOOKS = {
-    "truth": {"color": DARK, "linewidth": 1.1},
-    "ekf": {"color": BLUE},
-    "kf": {"color": RUST, "linestyle": "--"},
+# Those of the page alone beside those that filters have everywhere.
+LOOKS = {name: look(name) for name in FILTERS} | {
+    "truth": TRUTH,
     "scheduled": {"color": MUSTARD, "linestyle": "-."},
-    "iekf": {"color": MUSTARD, "linestyle": "--"},
-    "ukf": {"color": SKY, "linestyle": "-."},
-    "ckf": {"color": DARK, "linestyle": (0, (1, 1))},
-    "gsf": {"color": RUST},
-    "enkf": {"color": RUST},
-    "etkf": {"color": SKY, "linestyle": "-."},
-    "denkf": {"color": MUSTARD, "linestyle": "--"},
-    "ienkf": {"color": MUSTARD, "linestyle": "--"},
-    "pf": {"color": SKY},
-    "fuzzy": {"color": MUSTARD, "linestyle": "-."},
-    "vb": {"color": MUSTARD, "linestyle": "--"},
-    "sage-husa": {"color": SKY, "linestyle": "-."},
-    "ekf-robust": {"color": RUST},
-    "open-loop": {"color": MUSTARD, "linestyle": "--"},
-    "low-pass": {"color": SKY},
-    "inversion": {"color": RUST, "linewidth": 0.8},
 }
 
 

@@ -10,7 +10,7 @@ from filters import ParticleFilter, make_filter, run, thruster_model
 from filters.ensembles.recording import record_members
 from numerics.plots import DARK, RUST, new_figure, save_figure, tidy
 from pages.filter_runs import LOOKS, PUBLISHED_NOISE, Runs, held_runs, judged, runs_of, times
-from pages.page import MUSTARD, log_ticks
+from pages.page import log_ticks
 from thruster_env.plant import make_plant
 
 SIGNLESS = {"sensors": ["speed-magnitude"], "process_noise_cov": (4.0, 4e-4), "measurement_noise_cov": [0.25]}
@@ -77,7 +77,7 @@ def modes(path: Path) -> Path:
     left.pcolormesh(*cells, np.sqrt(density.T), cmap="Greys", rasterized=True)
     looks = {
         "ekf": LOOKS["ekf"],
-        "pf": {"color": MUSTARD},
+        "pf": LOOKS["pf"],
         "truth": {"color": RUST, "linestyle": "none", "marker": "o", "markersize": 3},
     }
     for name in looks:

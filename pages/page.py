@@ -11,7 +11,6 @@ from numerics.markdown import table as table  # for the scripts, beside what fol
 from numerics.markdown import with_tables
 
 DOCS = Path(__file__).parents[1] / "docs"  # where the pages and their pictures are
-SKY, MUSTARD = "#56b4e9", "#b8860b"  # beside those of thruster_env.linear.figures
 
 
 def digits(value: float, count: int = 3) -> str:

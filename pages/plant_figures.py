@@ -16,9 +16,9 @@ import gymnasium as gym
 import numpy as np
 
 from numerics.files import write_whole
-from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from numerics.plots import BLUE, DARK, RUST, SKY, new_figure, save_figure, tidy
 from numerics.streams import episode_keys
-from pages.page import SKY, label_grid, legend_below, make_page
+from pages.page import label_grid, legend_below, make_page
 from pages.plant_tables import FULL_VOLTAGE, TABLES, thrust_coefficient
 from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
 from thruster_env.effects.flow import FLOW_SIGNALS

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -43,18 +43,25 @@ class PlantEnv(RenderedEnv):
         """Return `count` copies of the plant, with the env's task."""
         raise NotImplementedError
 
-    def _set_up(self, action_space: gym.spaces.Box, rows: ReportRows, render_mode: str | None = None) -> None:
+    def _set_up(
+        self,
+        action_space: gym.spaces.Box,
+        rows: ReportRows,
+        render_mode: str | None = None,
+        render_size: Sequence[int] | None = None,
+    ) -> None:
         """Make spaces and memory; `plant`, and what `copies_of` needs, must be there.
 
         Args:
             action_space: of shape (p,).
             rows: what a report holds, and which of it is shown.
             render_mode: None, or one of the modes in `metadata`.
+            render_size: of pictures, (width, height) [px]; 640 x 400 if None.
 
         Raises:
-            ValueError: if there is no such mode.
+            ValueError: if there is no such mode, or the size is none.
         """
-        self._prepare_rendering(render_mode)
+        self._prepare_rendering(render_mode, render_size)
         self._rows, self._observed = rows, rows.observed
         self._readings = rows.observed[0]
         self._single = len(rows.observed) == 1  # the frequent case, which has to be quick

@@ -2,14 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 
+from numerics.checks import at_least, shown
+
 if TYPE_CHECKING:
     from plants.rendering.renderer import PlantRenderer
+
+
+SMALLEST, LARGEST = 64, 4096  # side of a picture [px]
+
+
+def checked_size(size: Sequence[int] | None) -> tuple[int, int] | None:
+    """A size of pictures, (width, height) [px], as a pair of integers, or None; ValueError for any other."""
+    if size is None:
+        return None
+    if not isinstance(size, (tuple, list)) or len(size) != 2:
+        raise ValueError(f"render_size must be None or (width, height) in pixels, but got {shown(size)}")
+    width, height = (
+        at_least(f"the {side} of render_size", value, SMALLEST, LARGEST)
+        for side, value in zip(("width", "height"), size, strict=True)
+    )
+    return width, height
 
 
 class RenderedEnv(gym.Env):
@@ -33,12 +51,12 @@ class RenderedEnv(gym.Env):
         """What the renderer adds of a report."""
         raise NotImplementedError
 
-    def _prepare_rendering(self, render_mode: str | None) -> None:
+    def _prepare_rendering(self, render_mode: str | None, render_size: Sequence[int] | None = None) -> None:
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
             rule = " or ".join(["None", *map(repr, modes)])
             raise ValueError(f"render_mode must be {rule}, but got {render_mode!r}")
-        self.render_mode = render_mode
+        self.render_mode, self.render_size = render_mode, checked_size(render_size)
         self._renderer = None
         self.metadata = {**self.metadata, "render_fps": max(1, round(1 / self.plant.dt))}  # true speed
 

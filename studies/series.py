@@ -9,8 +9,9 @@ import numpy as np
 
 from filters import EnsembleKalmanFilter, KalmanFilter, run
 from filters.ensembles.ensemble import LARGEST_ENSEMBLE
+from filters.looks import TRUTH, look
 from numerics.checks import at_least
-from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from numerics.plots import new_figure, save_figure, tidy
 from plants.simulate import simulate
 from studies.comparison import MEMBERS, discrete_model, keys_of
 from studies.published import NOISE_LEVELS, STEPS, SYSTEMS
@@ -18,9 +19,9 @@ from thruster_env.linear.figures import STATES
 from thruster_env.linear.published import SAMPLE_TIME
 
 LINES = {
-    "truth": {"color": DARK, "linewidth": 1.8},
-    "KF": {"color": BLUE, "linewidth": 1.2},
-    "EnKF": {"color": RUST, "linewidth": 1.2, "linestyle": (0, (3, 2))},
+    "truth": TRUTH,
+    "KF": look("kf") | {"linewidth": 1.2},
+    "EnKF": look("enkf") | {"linewidth": 1.2, "linestyle": (0, (3, 2))},  # in whose gaps the other is seen
 }
 
 
@@ -72,8 +73,8 @@ def series_figure(path: str | Path, runs: list[Series], members: int) -> Path:
         errors = one.rmse("kf"), one.rmse("enkf")
         for state, (label, unit) in enumerate(STATES):
             axis = axes[first + state, column]
-            for (name, look), values in zip(LINES.items(), (one.truth, one.kf, one.enkf), strict=True):
-                axis.plot(one.time, values[:, state], label=name, **look)
+            for (name, line), values in zip(LINES.items(), (one.truth, one.kf, one.enkf), strict=True):
+                axis.plot(one.time, values[:, state], label=name, **line)
             said = f"RMSE: KF {errors[0][state]:.3f}, EnKF {errors[1][state]:.3f} {unit}"
             axis.set_title(f"q = {one.q:g}\n{said}" if first + state == 0 else said, fontsize=9)
             if column == 0:

@@ -12,13 +12,17 @@ from thruster_cli.output import announce_compilation, emit, working
 from thruster_cli.tune import DEFAULT_STORAGE
 from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem
+from tuning.reporting.beside import write_beside
 from tuning.reporting.report import write_report
 from tuning.reporting.subject import is_file
 from tuning.search.study import quiet_optuna
 
 
 def command(
-    source: Annotated[str, typer.Argument(metavar="FILE_OR_STUDY", help="Tuned file, or name of a study.")],
+    sources: Annotated[
+        list[str],
+        typer.Argument(metavar="FILE_OR_STUDY...", help="Tuned file, or name of a study; of two: side by side."),
+    ],
     storage: Annotated[
         str,
         typer.Option(help="Where the study is: a journal file, or an Optuna storage URL.", rich_help_panel=INPUT),
@@ -38,12 +42,20 @@ def command(
     It has errors and consistency before and after on held-out seeds, the convergence of the study, which numbers
     matter, the error against ensemble size, one run over time with 95 % bands, and a sentence of advice.
 
+    Of two it has both side by side and, where they are of the same problem, the paired ratio of their scores.
+
     Example: thruster report out/enkf-mismatch-seed0.json
+
+    Example: thruster report out/ekf-outliers-seed0.json out/ekf-robust-outliers-seed0.json
     """
     quiet_optuna()
     announce_compilation()
-    given = [*map(find_problem, problem or []), *(problems_in(Path(source), model) if is_file(source) else [])]
-    with working(f"reporting on {source}"):
-        report = write_report(source, storage, out, given)
+    of_files = [one for source in sources if is_file(source) for one in problems_in(Path(source), model)]
+    given = [*map(find_problem, problem or []), *of_files]
+    with working(f"reporting on {' and '.join(sources)}"):
+        if len(sources) == 1:
+            report = write_report(sources[0], storage, out, given)
+        else:
+            report = write_beside(sources, storage, out, given)
     data = {"advice": report.advice, "page": str(report.page), "tables": str(report.tables)}
     emit([report.advice, f"Page: {report.page}", f"Tables: {report.tables}"], data, json)

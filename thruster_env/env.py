@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -66,19 +67,20 @@ class BowThrusterEnv(ModelledThruster, RenderedThruster, PlantEnv):
     ## Arguments
     The list, with units and defaults, is that of `thruster_env.plant.make_plant` (the thruster, its noise, sensors
     and disturbances; without `substeps`) and of `thruster_env.task.make_task` (`reference` [N] or signals, by
-    default the steady thrust at half of max_voltage, and the weights above); `render_mode` comes on top. All but
-    the first go by name. A wrong value raises a ValueError.
+    default the steady thrust at half of max_voltage, and the weights above); `render_mode`, and `render_size`,
+    (width, height) of pictures in pixels, come on top. All but the first go by name. A wrong value raises a
+    ValueError.
     """
 
     inputs = INPUTS
     observes_reference = False
 
     @takes_arguments_of(make_plant, make_task, leaving_out=["substeps"])
-    def __init__(self, *, render_mode: str | None = None, **arguments):
+    def __init__(self, *, render_mode: str | None = None, render_size: Sequence[int] | None = None, **arguments):
         """Build the plant; see the class for the arguments."""
-        self._build(make_plant(**arguments_of(make_plant, arguments)), render_mode, arguments)
+        self._build(make_plant(**arguments_of(make_plant, arguments)), (render_mode, render_size), arguments)
 
-    def _build(self, plant: Plant, render_mode: str | None, arguments: dict) -> None:
+    def _build(self, plant: Plant, rendering: tuple, arguments: dict) -> None:
         self.plant = plant
         of_task = arguments_of(make_task, arguments)
         self.task = make_task(**{**of_task, "reference": self._reference_signals(of_task["reference"])})
@@ -94,10 +96,10 @@ class BowThrusterEnv(ModelledThruster, RenderedThruster, PlantEnv):
         }
         appended = (NEXT_REFERENCE,) if self.observes_reference else ()
         rows = ReportRows(measurement, slice(VALID, VALID + m), plant.dropping_channels, appended, info)
-        self._set_up(gym.spaces.Box(-top, top, shape=(1,), dtype=np.float32), rows, render_mode)
+        self._set_up(gym.spaces.Box(-top, top, shape=(1,), dtype=np.float32), rows, *rendering)
 
     def copies_of(self, count: int) -> Copies:
-        """So many thrusters with the env's task."""
+        """Return `count` thrusters with the env's task."""
         return Copies(self.plant, self.task, count)
 
     def _reference_signals(self, reference):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from plants.arguments import arguments_of, takes_arguments_of
 from thruster_env.env import BowThrusterEnv
 from thruster_env.linear.linear_plant import PUBLISHED_NOISE, make_linear_plant
@@ -59,12 +61,13 @@ class BowThrusterLinearEnv(BowThrusterEnv):
     ## Arguments
     The list is that of `thruster_env.linear.linear_plant.make_linear_plant` (`system` is "tunnel" or
     "open_bladed"; `process_noise_cov` and `measurement_noise_cov` are the published 0.5 of each state and
-    measurement by default) and of `thruster_env.task.make_task`; `render_mode` comes on top.
+    measurement by default) and of `thruster_env.task.make_task`; `render_mode` and `render_size` come on top.
     """
 
     @takes_arguments_of(
         make_linear_plant, make_task, defaults={"process_noise_cov": (PUBLISHED_NOISE, PUBLISHED_NOISE)}
     )
-    def __init__(self, *, render_mode: str | None = None, **arguments):
+    def __init__(self, *, render_mode: str | None = None, render_size: Sequence[int] | None = None, **arguments):
         """Build the plant; see the class for the arguments."""
-        self._build(make_linear_plant(**arguments_of(make_linear_plant, arguments)), render_mode, arguments)
+        plant = make_linear_plant(**arguments_of(make_linear_plant, arguments))
+        self._build(plant, (render_mode, render_size), arguments)

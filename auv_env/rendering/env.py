@@ -27,6 +27,7 @@ class RenderedVehicle(RenderedEnv):
             max_plane=self.plant.max_plane,
             dt=self.plant.dt,
             frames_per_second=self.metadata["render_fps"],
+            size=self.render_size,
         )
 
     def moment_of(self, report: list[float]) -> Moment:

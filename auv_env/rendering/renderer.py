@@ -26,6 +26,7 @@ class Renderer(PlantRenderer):
         max_plane: float,
         dt: float,
         frames_per_second: float,
+        size: tuple[int, int] | None = None,
     ):
         """Load pygame and draw what never moves.
 
@@ -36,6 +37,7 @@ class Renderer(PlantRenderer):
             max_plane: full scale of the planes' gauges [rad].
             dt: sample time [s].
             frames_per_second: how many calls of `draw` a second a window keeps to [1/s].
+            size: of the picture [px]; 640 x 400 if None.
 
         Raises:
             ValueError: for a mode that is not one of the two, or a number that is not positive.
@@ -50,6 +52,7 @@ class Renderer(PlantRenderer):
             "max_plane": max_plane,
             "dt": dt,
             "frames_per_second": frames_per_second,
+            "size": size,
         }
         self._set_up(arguments, Moment._fields, Overlay._fields[1:])
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from filters.logs.estimate import SKIPPED, LogEstimate
 from filters.logs.findings import compared, estimated
-from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from filters.looks import TRUTH, colour_of
+from numerics.plots import new_figure, save_figure, tidy
 from plants.logs.columns import OUTPUT, STATE
 
 if TYPE_CHECKING:
@@ -33,11 +34,11 @@ def draw_log(found: LogEstimate, title: str, *, states: bool = True) -> Figure:
     References come first; of many states and outputs the first six are drawn. Bands of the first rows, in which a
     filter settles from its prior, do not widen the axes.
     """
-    model, references = found.model, compared(found)
+    model, references, colour = found.model, compared(found), colour_of(found.filter.name)
     values = [f"{STATE}:{one.symbol}" for one in model.states] + [f"{OUTPUT}:{symbol}" for symbol in model.outputs]
     shown = sorted(values, key=lambda key: key not in references)[:MOST_PANELS]
     shown = [key for key in values if key in shown] if states else []
-    heights = [TALL] * len(shown) + [LOW] * len(found.log.measured)
+    heights = [TALL] * len(shown) + [LOW if shown else TALL] * len(found.log.measured)
     figure = new_figure((WIDTH, sum(heights) + ROOM))
     axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
     tidy(axes)
@@ -46,17 +47,17 @@ def draw_log(found: LogEstimate, title: str, *, states: bool = True) -> Figure:
     labels |= {f"{OUTPUT}:{symbol}": one.quantity for symbol, one in model.outputs.items()}
     for axis, key in zip(axes, shown, strict=False):
         mean, std = estimated(found, key)
-        _band(axis, times, mean, std)
+        _band(axis, times, mean, std, colour)
         _limit(axis, mean, std, found.log.references[key] if key in references else mean)
         if key in references:
-            axis.plot(times, found.log.references[key], color=DARK, linewidth=1.2, label="reference, not seen")
-        axis.plot(times, mean, color=BLUE, linewidth=1.0, label="smoother" if found.smoothed else "estimate")
+            axis.plot(times, found.log.references[key], label="reference, not seen", **TRUTH)
+        axis.plot(times, mean, color=colour, linewidth=1.0, label="smoother" if found.smoothed else "estimate")
         axis.set_ylabel(labels[key].plot_label.replace(" $", "\n$"))
     for j, (axis, one) in enumerate(zip(axes[len(shown) :], found.log.measured, strict=True)):
         std = np.sqrt(np.maximum(found.innovation_covs[:, j, j], 0.0))
-        _band(axis, times, np.zeros_like(std), std)
+        _band(axis, times, np.zeros_like(std), std, colour)
         _limit(axis, np.zeros_like(std), std, found.innovations[:, j])
-        axis.plot(times, found.innovations[:, j], color=RUST, linewidth=0.8, label="innovation")
+        axis.plot(times, found.innovations[:, j], color=colour, linewidth=0.8, label="innovation")
         axis.set_ylabel(f"innovation of\n{one.symbol}" + (f"\n[{one.unit}]" if one.unit else ""))
     axes[0].set_title(title, fontsize=11)
     axes[-1].set_xlabel("time [s]")
@@ -69,9 +70,9 @@ def draw_log(found: LogEstimate, title: str, *, states: bool = True) -> Figure:
     return figure
 
 
-def _band(axis, times: np.ndarray, middle: np.ndarray, std: np.ndarray) -> None:
+def _band(axis, times: np.ndarray, middle: np.ndarray, std: np.ndarray, colour: str) -> None:
     low, high = middle - TWO_SIDED * std, middle + TWO_SIDED * std
-    axis.fill_between(times, low, high, color=BLUE, alpha=0.25, linewidth=0, label="95 % band")
+    axis.fill_between(times, low, high, color=colour, alpha=0.25, linewidth=0, label="95 % band")
 
 
 def _limit(axis, middle: np.ndarray, std: np.ndarray, line: np.ndarray) -> None:

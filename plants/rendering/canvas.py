@@ -25,12 +25,21 @@ SIGMAS = 2  # half the width of a band, in standard deviations
 
 
 class Canvas:
-    """A picture of 640 x 400 pixels; points are (x, y) in pixels, y downward, fractions allowed."""
+    """A picture laid out on 640 x 400 pixels; points are (x, y) in these, y downward, fractions allowed.
 
-    def __init__(self):
+    Of another size it is the same picture, enlarged or made smaller as far as it fits, in the middle.
+    """
+
+    def __init__(self, size: tuple[int, int] = SIZE):
+        """A picture of a size [px]."""
         width, height = SIZE
         self.large = pygame.Surface((width * SCALE, height * SCALE), depth=32)
-        self.small = pygame.Surface(SIZE, depth=32)
+        self._zoom = min(size[0] / width, size[1] / height)
+        inner = round(width * self._zoom), round(height * self._zoom)
+        self._whole = pygame.Surface(size, depth=32)
+        self._whole.fill(WHITE)
+        corner = (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2
+        self.small = self._whole.subsurface(pygame.Rect(corner, inner))
         self._fonts = {}
         self._words = {}
         self._on_top = []
@@ -93,15 +102,18 @@ class Canvas:
                 self._words.clear()
             self._words[key] = self._word(text, size, colour)
         word = self._words[key]
-        width, height = word.get_size()
-        self._on_top.append((word, (round(place[0] - align * width), round(place[1] - height / 2))))
-        return width
+        (width, height), zoom = word.get_size(), self._zoom
+        self._on_top.append((word, (round(zoom * place[0] - align * width), round(zoom * place[1] - height / 2))))
+        return width if zoom == 1.0 else round(width / zoom)
 
     def picture(self, array: np.ndarray, centre) -> None:
         """Put a picture around a centre, (height, width, 4) of uint8, its colours multiplied by their coverage."""
         height, width, _ = array.shape
         image = pygame.image.frombuffer(array.tobytes(), (width, height), "RGBA")
-        place = round(centre[0] - width / 2), round(centre[1] - height / 2)
+        if self._zoom != 1.0:
+            width, height = (max(1, round(side * self._zoom)) for side in (width, height))
+            image = pygame.transform.smoothscale(image, (width, height))
+        place = round(self._zoom * centre[0] - width / 2), round(self._zoom * centre[1] - height / 2)
         self._on_top.append((image, place, None, pygame.BLEND_PREMULTIPLIED))
 
     def keep(self) -> None:
@@ -110,11 +122,11 @@ class Canvas:
 
     def finish(self) -> pygame.Surface:
         """Average the drawing down to the picture's size, add what lies on top, and start anew."""
-        pygame.transform.smoothscale(self.large, SIZE, self.small)
+        pygame.transform.smoothscale(self.large, self.small.get_size(), self.small)
         self.small.blits(self._on_top, False)
         self._on_top.clear()
         self.large.blit(self._background, (0, 0))
-        return self.small
+        return self._whole
 
     @staticmethod
     def as_array(surface: pygame.Surface) -> np.ndarray:
@@ -133,7 +145,7 @@ class Canvas:
     def _font(self, size: int) -> pygame.font.Font:
         if size not in self._fonts:
             pygame.font.init()
-            self._fonts[size] = pygame.font.Font(_font_file(), size)
+            self._fonts[size] = pygame.font.Font(_font_file(), max(1, round(size * self._zoom)))
         return self._fonts[size]
 
 

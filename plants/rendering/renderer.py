@@ -33,7 +33,8 @@ class PlantRenderer:
 
         Args:
             made_with: arguments of `__init__` by name; `mode` is "human" (a window) or "rgb_array" (arrays),
-                `frames_per_second` how many calls of `draw` a second a window keeps to [1/s].
+                `frames_per_second` how many calls of `draw` a second a window keeps to [1/s], `size` that of the
+                picture [px], 640 x 400 if None.
             moment: names of a moment's entries.
             overlay: names of an overlay's, behind its label.
 
@@ -51,13 +52,14 @@ class PlantRenderer:
             raise DependencyNotInstalled(
                 "rendering needs pygame, which is not installed: run `pip install 'thruster-env[render]'`"
             ) from error
-        from plants.rendering.canvas import Canvas
+        from plants.rendering.canvas import SIZE, Canvas
         from plants.rendering.window import Window
 
-        self._canvas = Canvas()
+        size = made_with.get("size") or SIZE
+        self._canvas = Canvas(size)
         self._make_pictures()
         self._canvas.keep()
-        self._window = Window(frame_time, self.caption) if self.mode == "human" else None
+        self._window = Window(frame_time, self.caption, size) if self.mode == "human" else None
         self._history = History(moment, overlay)
         self.begin()
 
@@ -97,8 +99,8 @@ class PlantRenderer:
         """Draw the newest moment; drawn twice, it gives the same picture.
 
         Returns:
-            The picture, (400, 640, 3) of uint8, in the mode "rgb_array"; None in the mode "human", which shows it
-            in a window and waits for its time.
+            The picture, (height, width, 3) of uint8, in the mode "rgb_array"; None in the mode "human", which
+            shows it in a window and waits for its time.
 
         Raises:
             RuntimeError: if no moment has been added since the episode began.

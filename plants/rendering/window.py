@@ -16,8 +16,9 @@ LEAST_RATE = 20.0  # frames a second that are shown even if the steps come late 
 class Window:
     """A window that keeps real time: it waits when it is early and leaves frames out when it is late."""
 
-    def __init__(self, frame_time: float, caption: str):
-        """Keep calls of `show` frame_time [s] apart; the window opens with the first, under a caption."""
+    def __init__(self, frame_time: float, caption: str, size: tuple[int, int] = SIZE):
+        """Keep calls of `show` frame_time [s] apart; the window of a size [px] opens with the first."""
+        self._size = size
         self._caption = caption
         self._frame_time = frame_time
         self._screen: pygame.Surface | None = None
@@ -30,7 +31,7 @@ class Window:
         screen = self._screen
         if screen is None or not pygame.display.get_init():  # perhaps another env called pygame.quit()
             pygame.display.init()
-            screen = self._screen = pygame.display.set_mode(SIZE)
+            screen = self._screen = pygame.display.set_mode(self._size)
             pygame.display.set_caption(self._caption)
             self._due, self._shown = time.perf_counter(), -math.inf
         if pygame.event.get((pygame.QUIT, pygame.WINDOWCLOSE)):  # all other events are left to the caller

@@ -8,8 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from filters.looks import TRUTH as TRUTH_LOOK
+from filters.looks import look
 from numerics.checks import at_least
-from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure
+from numerics.plots import BLUE, GREEN, PLUM, SKY, new_figure, save_figure
 from studies import ngatini2017, ngatini2019
 from studies.vehicle.estimators import Estimator, ensembles, fuzzy
 from studies.vehicle.experiment import estimate, keys_of, true_runs
@@ -17,16 +19,15 @@ from studies.vehicle.paths import PATHS
 from studies.vehicle.pose import full_pose, planar_pose
 from studies.vehicle.printed import DT
 
-MUSTARD, GREEN = "#b8860b", "#2e7d4f"
 TRUTH = "truth"
 LOOKS = {
-    TRUTH: {"color": DARK, "linewidth": 2.2},
-    "EnKF8 N=50": {"color": BLUE, "linewidth": 1.4},
+    TRUTH: TRUTH_LOOK,
+    "EnKF8 N=50": look("enkf") | {"linewidth": 1.4},
     "EnKF8 N=100": {"color": GREEN, "linewidth": 1.2, "linestyle": (0, (6, 3))},
-    "EnKF8 N=200": {"color": MUSTARD, "linewidth": 1.2, "linestyle": (0, (3, 3))},
-    "EnKF8 N=300": {"color": "#7b4fa0", "linewidth": 1.2, "linestyle": (0, (1, 2))},
-    "EnKF8 N=50 by yaw alone": {"color": RUST, "linewidth": 1.4, "linestyle": (0, (4, 2))},
-    "fuzzy 0..1": {"color": MUSTARD, "linewidth": 1.2, "linestyle": (0, (1, 1))},
+    "EnKF8 N=200": {"color": SKY, "linewidth": 1.2, "linestyle": (0, (3, 3))},
+    "EnKF8 N=300": {"color": PLUM, "linewidth": 1.2, "linestyle": (0, (1, 2))},
+    "EnKF8 N=50 by yaw alone": {"color": BLUE, "linewidth": 1.4, "linestyle": (0, (4, 2))},
+    "fuzzy 0..1": look("fuzzy") | {"linewidth": 1.2, "linestyle": (0, (1, 1))},
 }
 LEAST_SPAN = 2.0  # of an axis [m]: millimetres of a straight path are no shape
 EVERY = 20  # steps between points of a line

@@ -1,6 +1,5 @@
 """The report of a tuning: one page that needs nothing else, and its tables."""
 
-import base64
 import json
 import sys
 from html.parser import HTMLParser
@@ -11,13 +10,14 @@ import pytest
 
 from filters.consistency.intervals import Interval
 from thruster_cli.main import main
+from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison, prove
-from tuning.evaluation.tuned import write_tuned
+from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.reporting.figures import early_trials
-from tuning.reporting.page import Picture, Section, Table, Words, html_page, markdown_page
+from tuning.reporting.page import Code, Picture, Section, Table, Words, html_page, markdown_page
 from tuning.reporting.parts import advice
 from tuning.reporting.report import write_report
-from tuning.reporting.search_figures import FEWEST_TRIALS, importances
+from tuning.reporting.search_figures import FEWEST_TRIALS, counted_trials, importances
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.storage import open_storage
@@ -34,7 +34,7 @@ class Page(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.open, self.words, self.attributes, self.headings = [], [], [], []
+        self.open, self.words, self.attributes, self.headings, self.styles = [], [], [], [], []
         self.feed(text)
         self.close()
         assert not self.open
@@ -48,13 +48,15 @@ class Page(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        if self.open and self.open[-1] not in ("style", "title"):
+        if self.open and self.open[-1] == "style":
+            self.styles.append(data)
+        if self.open and self.open[-1] not in ("style", "title", "script"):
             self.words.append(data)
             if self.open[-1] == "h2":
                 self.headings.append(data)
 
     def pictures(self):
-        return [found for tag, found in self.attributes if tag == "img"]
+        return [found for tag, found in self.attributes if tag == "svg"]
 
 
 def tuned(plan, trials, name="s", seeds=6):
@@ -80,19 +82,31 @@ def test_the_page_of_a_tuned_ensemble_has_all_parts_and_needs_no_network(folder)
     page = Page(text)
     assert page.headings == [
         "Before and after, on held-out seeds",
-        "The numbers",
+        "What the score is",
+        "The parameters",
+        "Model, Q and R",
         "The study",
         "Error against ensemble size",
         "One run over time",
+        "Measured signal",
+        "Innovations",
+        "Gain over time",
         "Is the covariance consistent?",
+        "Lines to copy",
         "What was done",
     ]
-    assert "http" not in text and not {"script", "link", "iframe"} & {tag for tag, _ in page.attributes}
-    assert len(page.pictures()) in (6, 7)  # importances where enough trials are complete
+    links = [found["href"] for tag, found in page.attributes if tag == "a"]
+    ids = [found["id"] for _, found in page.attributes if "id" in found]
+    assert len(links) == len(page.headings) and {link[1:] for link in links} <= set(ids)
+    assert len(ids) == len(set(ids))
+    assert "http" not in text and not {"img", "link", "iframe"} & {tag for tag, _ in page.attributes}
+    assert (
+        "src=" not in text and "@media print" in page.styles[0] and "prefers-color-scheme: dark" in page.styles[0]
+    )
+    assert len(page.pictures()) == 10 and len(text) < 2_000_000
     for picture in page.pictures():
-        head, _, data = picture["src"].partition(",")
-        assert head == "data:image/png;base64" and base64.b64decode(data).startswith(b"\x89PNG")
-        assert picture["alt"].endswith(".")
+        assert picture["aria-label"].endswith(".") and any(letter.isdigit() for letter in picture["aria-label"])
+    assert "var(--c-" in text and "--c-b5541c:#b5541c;" in page.styles[0]
     words = " ".join(page.words)
     assert report.advice in words and f"take N = {result.choice.numbers['ensemble_size']};" in report.advice
     assert report.advice.startswith("Tuning lowers the score by ") and "(mean NEES " in report.advice
@@ -126,7 +140,7 @@ def test_a_study_of_two_scenarios_and_objectives_has_a_front(monkeypatch):
     page = Page(report.page.read_text())
     words = " ".join(page.words)
     assert "Pareto front" in words and "mismatch, held-out seeds" in words and "outliers, held-out seeds" in words
-    assert " on mismatch and " in report.advice and len(page.pictures()) == 2 + 4 + 2
+    assert " on mismatch and " in report.advice and len(page.pictures()) == 2 + 4 + 5
 
 
 def test_a_baseline_has_no_covariance_to_speak_of():
@@ -146,6 +160,36 @@ def test_importances_need_enough_trials_and_sum_to_one():
     run_study(study, plan, FEWEST_TRIALS + 2)
     found = importances(study)
     assert set(found) == {"Q11", "Q22", "R"} and sum(found.values()) == pytest.approx(1.0)
+
+
+def test_importances_count_pruned_trials_where_few_are_complete():
+    plan = Plan("ekf", (MISMATCH,))
+    study = open_study("s", plan, optuna.storages.InMemoryStorage())
+    result = run_study(study, plan, 13)
+    complete = len(result.trials) - result.pruned
+    assert counted_trials(study) == (complete, result.pruned) and complete < FEWEST_TRIALS
+    assert sum(importances(study).values()) == pytest.approx(1.0)
+
+
+def test_two_studies_stand_beside_each_other(folder, monkeypatch, capsys):
+    tuned(Plan("ekf", (MISMATCH,)), 2)
+    tuned(Plan("kf", (MISMATCH,)), 2, "t")
+    arguments = ["thruster", "report", "s.json", "t.json", "--storage", STORAGE]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(SystemExit):
+        main()
+    assert "s-beside-t.html" in capsys.readouterr().out
+    page = Page((folder / "s-beside-t.html").read_text())
+    words, ids = " ".join(page.words), [found["id"] for _, found in page.attributes if "id" in found]
+    assert page.headings[0] == "Side by side" and len(ids) == len(set(ids)) and len(page.pictures()) == 2 * 8
+    a, b = (read_tuned(name)[0].filter(MISMATCH) for name in ("s.json", "t.json"))
+    data = MISMATCH.data(MISMATCH.held_out_seeds(0, 6))
+    ratio = score_ratio(*(evaluate(one, data, MISMATCH.scale) for one in (a, b)))
+    assert f"Score of s over that of t, paired by run: {ratio.value:.3g}" in words
+    monkeypatch.setattr(sys, "argv", [*arguments[:2], "a.json", "b.json", "c.json"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "a report side by side must be of two studies, but got 3" in capsys.readouterr().err
 
 
 def test_trials_that_ended_early_stand_at_the_mean_of_their_seeds():
@@ -176,10 +220,14 @@ def test_the_advice_says_when_tuning_is_worth_nothing_or_harms():
 
 def test_what_is_said_is_escaped():
     table = Table("a < b", ["<script>", "b"], [["x & y", 'say "1"']])
-    text = html_page("<t>", "a & b", [Section("<h>", [table, Words(["<i>"]), Picture(b"", '"><b>')])])
+    text = html_page(
+        "<t>",
+        "a & b",
+        [Section("<h>", [table, Words(["<i>"]), Code("<t>", "<u>"), Picture("<svg></svg>", "<s>", '"><b>')])],
+    )
     page = Page(text)
-    assert {tag for tag, _ in page.attributes} & {"script", "i", "b", "t", "h"} == set()
-    assert "x & y" in page.words and 'say "1"' in page.words and page.pictures()[0]["alt"] == '"><b>'
+    assert {tag for tag, _ in page.attributes} & {"i", "b", "t", "h", "s", "u"} == set()
+    assert "x & y" in page.words and 'say "1"' in page.words and page.pictures()[0]["aria-label"] == '"><b>'
     markdown = markdown_page("a_b", "1 < 2", [Table("c|d", ["", "e"], [["f|g", "h*"]])])
     assert markdown == "# a\\_b\n\n1 \\< 2\n\n**c\\|d**\n\n|  | e |\n| --- | ---: |\n| f\\|g | h\\* |\n"
 

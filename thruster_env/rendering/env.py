@@ -17,7 +17,9 @@ from thruster_env.rendering.renderer import MODES, Renderer
 from thruster_env.task import thrust_scale
 
 
-def renderer_of(plant: Plant, mode: str, frames_per_second: float) -> Renderer:
+def renderer_of(
+    plant: Plant, mode: str, frames_per_second: float, size: tuple[int, int] | None = None
+) -> Renderer:
     """What draws a plant, its scales those of the full voltage; arguments are those of `Renderer`."""
     p, top = plant.parameters, plant.max_voltage
     speed, flow = state_range(p, top) / 2
@@ -31,6 +33,7 @@ def renderer_of(plant: Plant, mode: str, frames_per_second: float) -> Renderer:
         flow_scale=flow,
         dt=plant.dt,
         frames_per_second=frames_per_second,
+        size=size,
     )
 
 
@@ -43,7 +46,7 @@ class RenderedThruster(RenderedEnv):
     def make_renderer(self) -> Renderer:
         """What draws the thruster in its water."""
         assert self.render_mode is not None  # a renderer is made for a mode only
-        return renderer_of(self.plant, self.render_mode, self.metadata["render_fps"])
+        return renderer_of(self.plant, self.render_mode, self.metadata["render_fps"], self.render_size)
 
     def moment_of(self, report: list[float]) -> Moment:
         """What the renderer adds of a report: truth, measured thrust, reference and voltage."""

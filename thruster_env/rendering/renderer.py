@@ -32,6 +32,7 @@ class Renderer(PlantRenderer):
         flow_scale: float,
         dt: float,
         frames_per_second: float,
+        size: tuple[int, int] | None = None,
     ):
         """Load pygame and draw what never moves.
 
@@ -45,6 +46,7 @@ class Renderer(PlantRenderer):
             flow_scale: flow velocity at full voltage [m/s]; the arrows' lengths are in proportion to it.
             dt: sample time [s].
             frames_per_second: how many calls of `draw` a second a window keeps to [1/s].
+            size: of the picture [px]; 640 x 400 if None.
 
         Raises:
             ValueError: for a mode that is not one of the two, or a number that is not positive.
@@ -60,9 +62,10 @@ class Renderer(PlantRenderer):
             "flow_scale": flow_scale,
             "dt": dt,
             "frames_per_second": frames_per_second,
+            "size": size,
         }
         for name, value in arguments.items():
-            if name != "mode":
+            if name not in ("mode", "size"):
                 positive(name, value)
         self._dt, self._gear_ratio = float(dt), float(gear_ratio)
         self._set_up(arguments, Moment._fields, Overlay._fields[1:])

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from filters.looks import colour_of
 from numerics.plots import DARK, new_figure, save_figure, tidy
 from training.comparison.plan import BEST
 from training.comparison.runs import Result
@@ -17,8 +18,8 @@ COLOURS = {
     "raw": "#999999",
     "raw+action": "#cc79a7",
     "stack": "#e69f00",
-    "ekf": "#0072b2",
-    "enkf": "#56b4e9",
+    "ekf": colour_of("ekf"),
+    "enkf": colour_of("enkf"),
     "belief": "#009e73",
     "true": DARK,
 }

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from numerics.plots import BLUE, DARK, panels
+from filters.looks import colour_of
+from numerics.plots import panels
 from tuning.api.held_out import cells_of
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.compare import Leaderboard, Row, winners
@@ -17,8 +18,6 @@ from tuning.problems.problem import Problem
 if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
-
-GREY = "#9aa5ad"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -128,7 +127,7 @@ def _draw(axis: Any, board: Leaderboard) -> None:
         value: Interval = row.evaluation.score if truth else row.likelihood_gain
         if np.isnan(value.value):
             continue
-        colour = DARK if place == 0 else BLUE if row.verdict == "better" else GREY
+        colour = colour_of(row.filter_name)
         face = "white" if row.verdict == "tie" and place else colour
         axis.plot([value.low, value.high], [-place, -place], "|-", color=colour, linewidth=1.4)
         axis.plot(value.value, -place, "o", color=colour, markerfacecolor=face, markersize=6)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,13 +14,13 @@ from filters.consistency.nees import SquaresCheck
 from filters.consistency.report import ConsistencyReport
 from filters.consistency.scores import LEVELS
 from filters.consistency.verdicts import probability_text, rounded
+from filters.looks import colour_of
 from numerics.plots import BLUE, DARK, RUST, panels, save_figure
 from tuning.reporting.panels import COLUMNS, shown_states
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FOUND = BLUE
 COLOURS = (BLUE, RUST, "#5a8f3c", "#7a5195", "#9aa5ad", "#c9a227")  # of states
 CHANNEL_COLOURS = ("#44aa99", "#cc6677", "#999933", "#882255", "#ddaa33", "#332288")
 PANEL = (4.0, 3.0)  # [inch]
@@ -39,6 +39,7 @@ def draw_consistency(
     title: str,
     comparison: Mapping[str, tuple[Interval, ...]] | None = None,
     scored: Collection[int] | None = None,
+    filter_name: str = "ekf",
 ) -> Figure:
     """Draw a consistency report; dashed lines show the expected value, grey bands what chance allows.
 
@@ -49,37 +50,41 @@ def draw_consistency(
         title: said above the picture.
         comparison: RMSE ratios by state, from `intervals.rmse_ratios`, under the names of the pairs.
         scored: places of the states that count in the score, which come first where not all are drawn.
+        filter_name: of the filter, whose colour is that of what was found.
 
     Raises:
         ValueError: if there is nothing to draw.
     """
     places, left_out = shown_states(report.states, scored)
-    checks = _panels(report, comparison, places)
+    colour = colour_of(filter_name)
+    checks = _panels(report, comparison, places, colour)
     if not checks:
         raise ValueError("a figure needs something to draw, but the filter gives no covariance")
     figure, axes = panels(len(checks), COLUMNS, PANEL, extra=0.4)
     for axis, draw in zip(axes, checks, strict=True):
         draw(axis)
         axis.title.set_fontsize(10)
-    _legend(figure, report, places, left_out)
+    _legend(figure, report, places, left_out, colour)
     figure.suptitle(title, fontsize=11)
     return figure
 
 
-def _panels(report: ConsistencyReport, comparison: Mapping | None, places: Sequence[int]) -> list[Callable]:
+def _panels(
+    report: ConsistencyReport, comparison: Mapping | None, places: Sequence[int], colour: str
+) -> list[Callable]:
     """A function on axes for each check of which there are numbers."""
     squares = [check for check in (report.nees, report.nis) if not np.isnan(check.mean.value)]
-    found: list[Callable] = [partial(_squares, check=check, report=report) for check in squares]
+    found: list[Callable] = [partial(_squares, check=check, report=report, colour=colour) for check in squares]
     if report.whiteness.statistic > 0:
-        found.append(partial(_correlations, report=report))
-    found += [partial(_distribution, check=check) for check in squares]
+        found.append(partial(_correlations, report=report, colour=colour))
+    found += [partial(_distribution, check=check, colour=colour) for check in squares]
     if not np.isnan(report.coverage_by_level).all():
-        shares = {"found": report.coverage, "by_level": report.coverage_by_level}
+        shares: dict[str, Any] = {"found": report.coverage, "by_level": report.coverage_by_level}
         found.append(partial(_coverage, what="truth", colours=_of_states(places), **shares))
         found.append(partial(_crps, report=report, places=places))
     elif not (report.has_truth or np.isnan(report.innovation_coverage_by_level).all()):
         shares = {"found": report.innovation_coverage, "by_level": report.innovation_coverage_by_level}
-        found.append(partial(_coverage, what="measurements", colours=_of_channels(report), **shares))
+        found.append(partial(_coverage, what="measurements", colours=_of_channels(report, colour), **shares))
     if report.ensemble is not None:
         found.append(partial(_ranks, report=report, places=places))
     if comparison:
@@ -92,24 +97,24 @@ def _of_states(places: Sequence[int]) -> dict[int, str]:
     return {i: COLOURS[row % len(COLOURS)] for row, i in enumerate(places)}
 
 
-def _of_channels(report: ConsistencyReport) -> dict[int, str]:
+def _of_channels(report: ConsistencyReport, colour: str) -> dict[int, str]:
     """Colours of the channels, others than those of states; a single one has that of all that was found."""
     count = len(report.channels)
-    return {j: FOUND if count == 1 else CHANNEL_COLOURS[j % len(CHANNEL_COLOURS)] for j in range(count)}
+    return {j: colour if count == 1 else CHANNEL_COLOURS[j % len(CHANNEL_COLOURS)] for j in range(count)}
 
 
-def _legend(figure, report: ConsistencyReport, places: Sequence[int], left_out: str) -> None:
+def _legend(figure, report: ConsistencyReport, places: Sequence[int], left_out: str, colour: str) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     handles = [
-        Line2D([], [], color=DARK, linestyle="--", linewidth=1, label="what is right"),
+        Line2D([], [], color=DARK, linestyle="--", linewidth=1, label="expected value"),
         Patch(color=DARK, alpha=0.15, linewidth=0, label="95 % of chance"),
-        Line2D([], [], color=FOUND, linewidth=1, label=f"found in {report.runs} runs"),
+        Line2D([], [], color=colour, linewidth=1, label=f"found in {report.runs} runs"),
     ]
     named = {report.states[i]: colour for i, colour in _of_states(places).items()} if report.has_truth else {}
     if len(report.channels) > 1:
-        named |= {report.channels[j]: colour for j, colour in _of_channels(report).items()}
+        named |= {report.channels[j]: one for j, one in _of_channels(report, colour).items()}
     handles += [Line2D([], [], color=colour, marker="o", label=name) for name, colour in named.items()]
     title = left_out if report.has_truth and left_out else None
     options = {"ncols": min(len(handles), MOST_HANDLES), "frameon": False, "title": title}
@@ -124,48 +129,48 @@ def _right(axis, value: float) -> None:
     axis.axhline(value, color=DARK, linestyle="--", linewidth=1, zorder=3)
 
 
-def _squares(axis, check: SquaresCheck, report: ConsistencyReport) -> None:
+def _squares(axis, check: SquaresCheck, report: ConsistencyReport, colour: str) -> None:
     steps = _steps(report)
     axis.fill_between(steps, *check.band.T, color=DARK, alpha=0.15, linewidth=0)
-    axis.plot(steps, check.step_means, color=FOUND, linewidth=0.8)
+    axis.plot(steps, check.step_means, color=colour, linewidth=0.8)
     _right(axis, check.dimension)
     if np.nanmax(check.step_means, initial=0.0) > LOGARITHMIC_FROM * check.dimension:
         axis.set_yscale("log", subs=(2, 5))
         axis.yaxis.set_major_formatter("{x:g}")
         axis.yaxis.set_minor_formatter("{x:g}")
     axis.set_title(f"{check.name}: mean {rounded(check.mean.value)} where {check.dimension:.3g} is right")
-    axis.set_xlabel("step")
-    axis.set_ylabel("mean over runs")
+    axis.set_xlabel("step [-]")
+    axis.set_ylabel(f"mean {check.name} over runs [-]")
     axis.margins(x=0.01)
 
 
-def _correlations(axis, report: ConsistencyReport) -> None:
+def _correlations(axis, report: ConsistencyReport, colour: str) -> None:
     found = report.whiteness
     lags, channels = np.arange(1, len(found.correlations) + 1), found.correlations.shape[1]
-    for i, colour in _of_channels(report).items():
+    for i, shade in _of_channels(report, colour).items():
         places, values = lags + (i - (channels - 1) / 2) * 0.6 / channels, found.correlations[:, i, i]
-        axis.vlines(places, 0, values, color=colour, linewidth=1.5)
-        axis.plot(places, values, "o", color=colour, markersize=3)
+        axis.vlines(places, 0, values, color=shade, linewidth=1.5)
+        axis.plot(places, values, "o", color=shade, markersize=3)
     half = found.half_widths[:, 0, 0]
     axis.fill_between(lags, -half, half, color=DARK, alpha=0.15, linewidth=0)
     _right(axis, 0)
     widest = 1.15 * max(np.abs(np.diagonal(found.correlations, axis1=1, axis2=2)).max(), 2 * half.max())
     axis.set_ylim(-widest, widest)
     axis.set_title(f"innovations: white? {probability_text(found.p_value)}")
-    axis.set_xlabel("steps apart")
-    axis.set_ylabel("correlation")
+    axis.set_xlabel("lag [steps]")
+    axis.set_ylabel("correlation [-]")
 
 
-def _distribution(axis, check: SquaresCheck) -> None:
+def _distribution(axis, check: SquaresCheck, colour: str) -> None:
     found = check.distribution
     errors = np.abs(found.frequency_band - found.frequencies[:, None]).T
     centres = (found.edges[:-1] + found.edges[1:]) / 2
-    axis.bar(centres, found.frequencies, 0.92 * np.diff(found.edges), color=FOUND, alpha=0.5)
-    axis.errorbar(centres, found.frequencies, errors, fmt="none", ecolor=FOUND, elinewidth=1)
+    axis.bar(centres, found.frequencies, 0.92 * np.diff(found.edges), color=colour, alpha=0.5)
+    axis.errorbar(centres, found.frequencies, errors, fmt="none", ecolor=colour, elinewidth=1)
     _right(axis, 1)
     axis.set_title(f"{check.name}: {100 * check.beyond.value:.1f} % beyond the 95 % point")
-    axis.set_xlabel("probability under chi-square")
-    axis.set_ylabel("frequency over the right one")
+    axis.set_xlabel("probability under chi-square [-]")
+    axis.set_ylabel("frequency over that expected [-]")
 
 
 def _coverage(
@@ -192,12 +197,13 @@ def _crps(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
     _right(axis, 1)
     axis.set_ylim(bottom=0)
     axis.set_title(f"mean CRPS {_told([part.value for part in report.crps], rounded)}")
-    axis.set_xlabel("step")
-    axis.set_ylabel("CRPS over its expectation")
+    axis.set_xlabel("step [-]")
+    axis.set_ylabel("CRPS over its expectation [-]")
     axis.margins(x=0.01)
 
 
 def _ranks(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
+    assert report.ensemble is not None  # this panel is drawn of ensembles alone
     size = report.ensemble.size
     for i, colour in _of_states(places).items():
         found = report.ensemble.ranks[i]
@@ -205,8 +211,8 @@ def _ranks(axis, report: ConsistencyReport, places: Sequence[int]) -> None:
     _right(axis, 1)
     axis.set_ylim(bottom=0)
     axis.set_title(f"rank of the truth among {size} members")
-    axis.set_xlabel("members below the truth")
-    axis.set_ylabel("frequency over the right one")
+    axis.set_xlabel("members below the truth [-]")
+    axis.set_ylabel("frequency over that expected [-]")
 
 
 def _comparison(axis, comparison: Mapping[str, tuple[Interval, ...]], places: Sequence[int]) -> None:
@@ -221,4 +227,4 @@ def _comparison(axis, comparison: Mapping[str, tuple[Interval, ...]], places: Se
     axis.set_ylim(0.5 - len(comparison), 0.5)
     axis.grid(axis="y", visible=False)
     axis.set_title("RMSE over that of the other")
-    axis.set_xlabel("ratio with its 95 % interval, paired by run")
+    axis.set_xlabel("ratio, 95 % interval paired by run [-]")

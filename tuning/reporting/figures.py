@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from optuna.trial import FrozenTrial, TrialState
 
-from numerics.plots import BLUE, RUST, panels, save_figure
+from filters.looks import colour_of
+from numerics.plots import BLUE, DARK, GREEN, GREY, PALE, RUST, panels, save_figure
 from tuning.evaluation.baselines import ORACLE, RULE, SCALED, TUNED
 from tuning.evaluation.held_out import Comparison
 from tuning.reporting.panels import COLUMNS, shown_states
@@ -19,9 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SCORE = "score: mean RMSE over bound [-]"
-ESTIMATE, BOUND = BLUE, RUST
-GREY = "#9aa5ad"
-COLOURS = {RULE: "#c5ccd1", SCALED: "#8a959d", TUNED: ESTIMATE, ORACLE: "#5a8f3c"}
+COLOURS = {RULE: PALE, SCALED: GREY, ORACLE: GREEN}  # of baselines; the tuned filter has its own
 
 
 def history_figure(path: str | Path, trials: Sequence[FrozenTrial], title: str, label: str = SCORE) -> Path:
@@ -48,12 +47,12 @@ def draw_history(trials: Sequence[FrozenTrial], title: str, label: str = SCORE) 
             x, y = [trial.number + 1 for trial in some], [trial.values[0] for trial in some]
             axis.plot(x, y, "o", color=GREY, markerfacecolor=face, markersize=4, label=name)
     if done:
-        axis.plot(done[0].number + 1, values[0], "s", color=BOUND, markersize=7, label="first trial")
+        axis.plot(done[0].number + 1, values[0], "s", color=RUST, markersize=7, label="first trial")
         kept = [is_consistent(trial) for trial in done]
         counted = np.where(kept, values, np.inf) if any(kept) else values
         best = np.minimum.accumulate(counted)
         best[np.isinf(best)] = np.nan
-        axis.step([t.number + 1 for t in done], best, where="post", color=ESTIMATE, label="best so far")
+        axis.step([t.number + 1 for t in done], best, where="post", color=BLUE, label="best so far")
         beyond = limit_values(axis, values + [value for _, value in early])
         figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     above = f" ({beyond} of {len(done) + len(early)} lie above the axis)" if done and beyond else ""
@@ -78,21 +77,22 @@ def limit_values(axis, values: list[float]) -> int:
     return sum(value > top for value in values)
 
 
-def comparison_figure(path: str | Path, proof: Comparison, title: str) -> Path:
+def comparison_figure(path: str | Path, proof: Comparison, title: str, filter_name: str = "ekf") -> Path:
     """Save what `draw_comparison` draws."""
-    return save_figure(draw_comparison(proof, title), path)
+    return save_figure(draw_comparison(proof, title, filter_name), path)
 
 
-def draw_comparison(proof: Comparison, title: str) -> Figure:
+def draw_comparison(proof: Comparison, title: str, filter_name: str = "ekf") -> Figure:
     """RMSE of a tuned filter and its baselines on held-out seeds with 95 % intervals, and the bound.
 
-    A panel is a state; of many some are shown.
+    A panel is a state; of many some are shown. Bars of the tuned filter have the colour of the one of that name.
 
     Raises:
         ValueError: if there is no truth, and so no RMSE.
     """
     if not proof.tuned.has_truth:
         raise ValueError("a figure of errors needs the truth, but there is none")
+    colours = {**COLOURS, TUNED: colour_of(filter_name)}
     names, states = proof.evaluations, proof.tuned.states
     places, left_out = shown_states(states, proof.tuned.scored)
     width = 4.0 if len(places) > 1 else 5.2
@@ -101,10 +101,10 @@ def draw_comparison(proof: Comparison, title: str) -> Figure:
         for place, (name, evaluation) in enumerate(names.items()):
             rmse = evaluation.rmse[i]
             whiskers = [[rmse.value - rmse.low], [rmse.high - rmse.value]]
-            axis.bar(place, rmse.value, 0.62, yerr=whiskers, color=COLOURS[name], capsize=4)
+            axis.bar(place, rmse.value, 0.62, yerr=whiskers, color=colours[name], capsize=4)
             axis.annotate(f"{rmse.value:.3g}", (place, rmse.high), (0, 4), textcoords="offset points", ha="center")
         if np.isfinite(proof.bound[i]):
-            axis.axhline(proof.bound[i], color=BOUND, linestyle="--", label="posterior Cramér-Rao bound")
+            axis.axhline(proof.bound[i], color=DARK, linestyle="--", label="posterior Cramér-Rao bound")
         axis.set_xticks(range(len(names)), [name.replace(" ", "\n", 1) for name in names])
         axis.set_ylabel(f"RMSE of {states[i].plot_label}")
         axis.margins(y=0.15)

@@ -2,46 +2,19 @@
 
 from __future__ import annotations
 
-import base64
 import re
 from collections.abc import Sequence
 from html import escape
 from typing import NamedTuple
 
+from tuning.reporting.script import SCRIPT
+from tuning.reporting.style import STYLE
+from tuning.reporting.svg import palette
+
 INTERVAL = re.compile(r"(\S+) (\[\S+, \S+\])")
-WIDE = 800  # [px] pictures beyond this are scrolled on a phone
-STYLE = """
-:root { color-scheme: light; }
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 60rem; padding: 1.5rem 1rem 4rem; background: #fff; color: #222;
-       font: 1rem/1.55 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; overflow-wrap: break-word; }
-h1 { font-size: 1.6rem; line-height: 1.25; margin: 0 0 1rem; }
-h2 { font-size: 1.2rem; margin: 2.5rem 0 .5rem; padding-top: .75rem; border-top: 1px solid #ddd; }
-p, ul { max-width: 46rem; }
-.advice { margin: 0 0 1rem; padding: .75rem 1rem; border-left: 4px solid #0b6fa4; background: #f1f6f9;
-          font-size: 1.1rem; }
-.scroll { overflow-x: auto; margin: 1rem 0; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-.caption { font-weight: 600; margin: 1.25rem 0 0; }
-.caption + .scroll { margin-top: .35rem; }
-th, td { padding: .3rem 0 .3rem 1.1rem; text-align: right; vertical-align: top; border-bottom: 1px solid #e4e4e4; }
-th:first-child { text-align: left; padding-left: 0; position: sticky; left: 0; background: #fff; }
-td { white-space: nowrap; }
-td small { display: block; color: #444; }
-table.words td { text-align: left; white-space: normal; }
-thead th { border-bottom: 2px solid #bbb; vertical-align: bottom; }
-figure { margin: 1rem 0; overflow-x: auto; }
-img { display: block; max-width: 100%; height: auto; }
-figcaption { color: #444; font-size: .92rem; position: sticky; left: 0; }
-@media (max-width: 40rem) {
-  body { padding: 1rem .75rem 3rem; }
-  h1 { font-size: 1.35rem; }
-  th, td { padding-left: .7rem; }
-  th:first-child { max-width: 6.5rem; }
-  img.wide { max-width: none; width: 38rem; }
-}
-@media print { figure, table { break-inside: avoid; } }
-"""
+WIDE = 480.0  # [pt] pictures beyond this are scrolled on a phone
+MANY = 9  # columns of a table that is set small on paper
+NARROW = 5  # columns of a table that fits beside another
 
 
 class Table(NamedTuple):
@@ -59,6 +32,8 @@ class Table(NamedTuple):
         )
         head = f"<thead><tr>{head}</tr></thead>\n" if head else ""
         kind, label = ("", escape(self.caption)) if self.columns else (' class="words"', "a list")
+        if len(self.columns) >= MANY:
+            kind = ' class="many"'
         caption = f'<p class="caption">{escape(self.caption)}</p>\n' if self.caption else ""
         scroll = f'<div class="scroll" role="region" aria-label="{label}" tabindex="0">'
         return f"{caption}{scroll}<table{kind}>\n{head}<tbody>\n{rows}\n</tbody></table></div>"
@@ -71,19 +46,41 @@ class Table(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A picture with a sentence below, which is what one hears who cannot see it."""
+    """A picture with a sentence below, and in words what it shows, for whoever cannot see it."""
 
-    png: bytes
+    svg: str  # an element without a size
     caption: str
+    alt: str
+    readings: str = ""  # what a script reads off the picture
 
     def html(self) -> str:
         """The picture within the page itself."""
-        data = base64.b64encode(self.png).decode()
-        said = escape(self.caption)
-        width, height = (int.from_bytes(self.png[place : place + 4]) for place in (16, 20))  # of the PNG's header
-        size = f'width="{width}" height="{height}"' + (' class="wide"' if width > WIDE else "")
-        image = f'<img alt="{said}" {size} src="data:image/png;base64,{data}">'
-        return f"<figure>{image}<figcaption>{said}</figcaption></figure>"
+        found = re.match(r'<svg viewBox="0 0 ([\d.]+) ([\d.]+)"', self.svg)
+        width, height = (float(part) for part in found.groups()) if found else (0.0, 0.0)
+        size = f'width="{width * 4 / 3:.0f}" height="{height * 4 / 3:.0f}"'
+        kinds = [name for name, there in (("read", self.readings), ("wide", width > WIDE)) if there]
+        marks = f' class="{" ".join(kinds)}"' if kinds else ""
+        read = f' data-read="{self.readings}"' if self.readings else ""
+        svg = self.svg.replace("<svg", f'<svg role="img" aria-label="{escape(self.alt)}" {size}', 1)
+        return (
+            f'<figure{marks}{read}><div class="picture">{svg}</div>'
+            f"<figcaption>{escape(self.caption)}</figcaption></figure>"
+        )
+
+
+class Code(NamedTuple):
+    """Lines to copy."""
+
+    title: str
+    text: str
+    folded: bool = False  # whether they are shown on a click alone
+
+    def html(self) -> str:
+        """The lines below their title."""
+        lines = f'<div class="code"><pre>{escape(self.text)}</pre></div>'
+        if self.folded:
+            return f"<details><summary>{escape(self.title)}</summary>{lines}</details>"
+        return f"<h3>{escape(self.title)}</h3>{lines}"
 
 
 class Words(NamedTuple):
@@ -98,26 +95,69 @@ class Words(NamedTuple):
         return f"<ul>{''.join(f'<li>{escape(sentence)}</li>' for sentence in self.sentences)}</ul>"
 
 
+class Pair(NamedTuple):
+    """Parts of two studies side by side where there is room, each below the name of its study."""
+
+    names: Sequence[str]
+    parts: Sequence[Table | Picture | Words | Code | None]
+
+    def html(self) -> str:
+        """A grid of the parts; one that is the same in both stands once."""
+        first, second = self.parts
+        if first is not None and second is not None and first == second:
+            return first.html()
+        cells = "".join(
+            f'<div><p class="whose">{escape(name)}</p>{part.html() if part else ""}</div>'
+            for name, part in zip(self.names, self.parts, strict=True)
+        )
+        tables = [one for one in self.parts if isinstance(one, Table)]
+        kind = "pair close" if not tables else "pair"
+        kind += " deep" if any(len(one.columns) > NARROW for one in tables) else ""
+        return f'<div class="{kind}">{cells}</div>'
+
+
+Part = Table | Picture | Words | Code | Pair
+
+
 class Section(NamedTuple):
     """A heading and what stands below it."""
 
     title: str
-    parts: Sequence[Table | Picture | Words]
+    parts: Sequence[Part]
+
+    @property
+    def anchor(self) -> str:
+        """Where a list of contents leads."""
+        return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-") or "section"
 
 
-def html_page(title: str, advice: str, sections: Sequence[Section]) -> str:
-    """The whole page; all that is said is escaped."""
+def html_page(title: str, advice: str | Sequence[str], sections: Sequence[Section], beside: bool = False) -> str:
+    """The whole page; all that is said is escaped.
+
+    Args:
+        title: of the page.
+        advice: what it comes to, a sentence or several.
+        sections: what follows.
+        beside: whether it is wide, for two studies.
+    """
+    told = [advice] if isinstance(advice, str) else advice
+    said = "\n".join(f'<p class="advice">{escape(one)}</p>' for one in told)
+    contents = "".join(f'<li><a href="#{one.anchor}">{escape(one.title)}</a></li>' for one in sections)
     body = "\n".join(
-        f"<section>\n<h2>{escape(section.title)}</h2>\n"
+        f'<section id="{section.anchor}">\n<h2>{escape(section.title)}</h2>\n'
         + "\n".join(part.html() for part in section.parts)
         + "\n</section>"
         for section in sections
     )
+    script = f"\n<script>{SCRIPT}</script>" if "data-read=" in body or 'class="code"' in body else ""
+    kind = ' class="beside"' if beside else ""
     return (
         f'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n<main>\n"
-        f'<h1>{escape(title)}</h1>\n<p class="advice">{escape(advice)}</p>\n{body}\n</main>\n</body>\n</html>\n'
+        f"<title>{escape(title)}</title>\n<style>{STYLE}{palette(body)}</style>\n</head>\n<body{kind}>\n<main>\n"
+        f"<h1>{escape(title)}</h1>\n{said}\n"
+        f'<nav aria-label="contents"><strong>Contents</strong><ol>{contents}</ol></nav>\n'
+        f"{body}\n</main>{script}\n</body>\n</html>\n"
     )
 
 

@@ -10,7 +10,9 @@ MOST_PANELS = 6  # of states in one figure
 COLUMNS = 3  # of panels side by side
 
 
-def shown_states(states: Sequence[Quantity], scored: Collection[int] | None = None) -> tuple[list[int], str]:
+def shown_states(
+    states: Sequence[Quantity] | Sequence[str], scored: Collection[int] | None = None
+) -> tuple[list[int], str]:
     """Places of the states that a figure shows, in their order, and a line that says how many it leaves out.
 
     Args:
@@ -26,5 +28,6 @@ def shown_states(states: Sequence[Quantity], scored: Collection[int] | None = No
 
 def axis_label(quantity: Quantity) -> str:
     """Name and symbol above the unit, as axes of narrow panels have it."""
-    label = quantity._replace(unit="").plot_label
+    named = quantity.symbol in quantity.name.split()  # as "measured thrust" is
+    label = quantity.name if named else quantity._replace(unit="").plot_label
     return f"{label}\n[{quantity.unit}]" if quantity.unit else label

@@ -1,55 +1,42 @@
-"""What stands in a report: the advice, tables of what was achieved, and sections with pictures."""
+"""What stands in a report: the advice, what was achieved, how the search went, and ensemble sizes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import isnan
-from pathlib import Path
-from typing import NamedTuple
+from textwrap import fill
 
-from optuna.trial import FrozenTrial, TrialState
+from numpy import isfinite
+from optuna import Study
+from optuna.trial import FrozenTrial
 
 from filters.consistency.intervals import Interval
-from filters.consistency.verdicts import confidence, rounded, sentences
-from filters.registry import filter_class
-from numerics.plots import save_figure
-from tuning.evaluation.baselines import TUNED, baselines
-from tuning.evaluation.evaluate import Evaluation, check_consistency
+from filters.consistency.verdicts import confidence, rounded
+from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
-from tuning.evaluation.versions import versions
 from tuning.evaluation.worth import scaling_sentence, without_truth, worth
-from tuning.reporting.consistency_figures import draw_consistency
+from tuning.reporting.alternatives import of_comparison, of_front, of_history, of_importances, of_sizes, of_slices
 from tuning.reporting.figures import SCORE, draw_comparison, draw_history
-from tuning.reporting.page import Picture, Section, Table, Words
+from tuning.reporting.page import Part, Picture, Section, Table, Words
 from tuning.reporting.search_figures import (
     FEWEST_TRIALS,
+    counted_trials,
     draw_front,
     draw_importance,
     draw_sizes,
     draw_slices,
     importances,
 )
+from tuning.reporting.sketchbook import Sketchbook
 from tuning.reporting.subject import Subject
 from tuning.reporting.tables import errors_table
-from tuning.reporting.time_figures import draw_estimates
 from tuning.search.filter_types import kinds_tried, trials_of_kind
-from tuning.search.objectives import NIS_BAND, find_objective
-from tuning.search.plan import SIZE_SEEDS, TRAINING_SEEDS, Plan
+from tuning.search.objectives import find_objective
+from tuning.search.plan import SIZE_SEEDS, Plan
 from tuning.search.space import AUTO, Choice
 
 MANY_TRIALS = 50
-
-
-class Sketchbook(NamedTuple):
-    """A folder in which pictures are drawn that a page then holds."""
-
-    folder: Path
-
-    def picture(self, caption: str, draw: Callable, *arguments, **options) -> Picture:
-        """What a function draws that returns a figure."""
-        path = save_figure(draw(*arguments, **options), self.folder / "picture.png")
-        return Picture(path.read_bytes(), caption)
 
 
 def advice(choice: Choice, plan: Plan, proofs: Sequence[Comparison]) -> str:
@@ -81,19 +68,19 @@ def _squares(evaluation: Evaluation) -> tuple[str, Interval, float]:
 
 def held_out_section(book: Sketchbook, subject: Subject, proofs: Sequence[Comparison]) -> Section:
     """Errors before and after, scenario by scenario; without truth what the innovations tell."""
-    parts = []
+    parts: list[Part] = []
     for scenario, proof in zip(subject.plan.scenarios, proofs, strict=True):
         if not proof.tuned.has_truth:
             parts += [Words([without_truth(scenario.name)]), errors_table(scenario, proof)]
             continue
-        caption = (
-            f"RMSE on {len(proof.seeds)} held-out seeds of {scenario.name} with 95 % intervals, and the bound."
-        )
-        title = f"{subject.choice.name} on {scenario.name}"
+        where = f"{len(proof.seeds)} held-out {scenario.seed_word} of {scenario.name}"
+        bound = ", and the bound" if isfinite(proof.bound).any() else ""
+        name, place = subject.choice.name, f"{subject.choice.name} on {scenario.name}"
         said = scaling_sentence(proof)
         parts += [errors_table(scenario, proof), *([Words([said])] if said else [])]
-        parts.append(book.picture(caption, draw_comparison, proof, title))
-    return Section("Before and after, on held-out seeds", parts)
+        caption = f"RMSE on {where} with 95 % intervals{bound}. Each panel has an axis of its own."
+        parts.append(book.picture(draw_comparison(proof, place, name), caption, of_comparison(proof)))
+    return Section(f"Before and after, on held-out {subject.plan.scenarios[0].seed_word}", parts)
 
 
 def search_section(book: Sketchbook, subject: Subject) -> Section:
@@ -104,30 +91,41 @@ def search_section(book: Sketchbook, subject: Subject) -> Section:
         return Section(title, [Words([said])])
     trials = study.get_trials(deepcopy=False)
     objectives = subject.plan.objectives
-    labels = [SCORE if name == "score" else f"{name}:\n{find_objective(name).about}" for name in objectives]
-    caption = "First objective of each trial on the training seeds, and the best so far."
-    parts = [book.picture(caption, draw_history, trials, f"Study {subject.name}", labels[0])]
-    found = importances(study)
-    if found:
-        complete = [trial.state for trial in trials].count(TrialState.COMPLETE)
-        caption = (
-            "How much each number matters for a trial to be among the best tenth: PED-ANOVA on "
-            f"{complete} complete trials{', rough on so few' if complete < MANY_TRIALS else ''}."
-        )
-        parts.append(book.picture(caption, draw_importance, found))
-    else:
-        parts.append(Words([f"Importances of the numbers need {FEWEST_TRIALS} complete trials or more."]))
+    labels = [
+        SCORE if name == "score" else fill(f"{name}: {find_objective(name).about}", 34) for name in objectives
+    ]
+    word = subject.plan.scenarios[0].seed_word
+    caption = f"First objective of each trial on the training {word}, and the best so far."
+    picture = draw_history(trials, f"Study {subject.name}", labels[0])
+    parts: list[Part] = [book.picture(picture, caption, of_history(trials)), _importance_part(book, study, word)]
     caption = (
-        "First objective against each number; dashed is the best trial. Hollow: mean NIS outside its band. "
-        "Crosses: pruned, at the mean of the seeds seen."
+        "First objective against each parameter; dashed is the best trial. Hollow: mean NIS outside its band. "
+        f"Crosses: pruned, at the mean of the {word} seen."
     )
-    parts.append(book.picture(caption, draw_slices, trials_of_kind(trials, subject.choice.name), labels[0]))
+    of_kind = trials_of_kind(trials, subject.choice.name)
+    parts.append(book.picture(draw_slices(of_kind, labels[0]), caption, of_slices(of_kind)))
     if subject.plan.filter == AUTO:
         parts.append(_kinds_table(trials, objectives[0]))
     if len(objectives) > 1:
         caption = "Trials by both objectives; no trial beats those of the Pareto front in both."
-        parts.append(book.picture(caption, draw_front, trials, study.best_trials, labels))
+        picture = draw_front(trials, study.best_trials, labels)
+        parts.append(book.picture(picture, caption, of_front(study.best_trials, objectives)))
     return Section(title, parts)
+
+
+def _importance_part(book: Sketchbook, study: Study, word: str) -> Picture | Words:
+    """Importances, and how they were computed; or how many trials they need."""
+    found = importances(study)
+    if not found:
+        return Words([f"Importances need {FEWEST_TRIALS} finished trials or more."])
+    complete, early = counted_trials(study)
+    rough = ", rough on so few" if complete + early < MANY_TRIALS else ""
+    pruned = f" and {early} pruned ones, each at the mean of the {word} that it came to" if early else ""
+    caption = (
+        "How much each parameter matters for a trial to be among the best tenth: PED-ANOVA on "
+        f"{complete} complete trials{pruned}{rough}."
+    )
+    return book.picture(draw_importance(found), caption, of_importances(found))
 
 
 def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
@@ -139,7 +137,7 @@ def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
         + ["" if kind.microseconds is None else f"{kind.microseconds:.4g}"]
         for kind in kinds_tried(trials)
     ]
-    caption = "Filters that were tried, on the training seeds; the slices are those of the best"
+    caption = "Filters that were tried; the slices are those of the best"
     return Table(f"{caption}. *: mean NIS outside its band, to be chosen only where all are", columns, rows)
 
 
@@ -147,66 +145,16 @@ def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) 
     """Errors against ensemble size; how many seeds tell it of each is said where that differs."""
     first = subject.plan.scenarios[0]
     fresh = first.size_seeds(subject.plan.seed, SIZE_SEEDS)
-    where = f"seeds {fresh.start} to {fresh.stop - 1} of {first.name}"
+    where = f"{first.seed_word} {fresh.start} to {fresh.stop - 1} of {first.name}"
     caption = f"RMSE with 95 % intervals on {where}, which chose neither Q nor R; dashed is N."
     kept = subject.choice.numbers["ensemble_size"]
     ratios = [[f"{row.size}", f"{row.ratio.value:.4f}", f"{row.ratio.high:.4f}", f"{row.seeds}"] for row in sizes]
     said = (
-        "Score over the best, paired on the same seeds; of several scenarios the largest. The smallest N whose "
-        "upper end is below 1.01 is sufficient"
+        f"Score over the best, paired on the same {first.seed_word}; of several scenarios the largest. The "
+        "smallest N whose upper end is below 1.01 is sufficient"
     )
-    columns = ["N", "score over the best", "upper end of its 95 % interval", "seeds"]
+    columns = ["N", "score over the best", "upper end of its 95 % interval", first.seed_word]
     if len({row.seeds for row in sizes}) == 1:
         columns, ratios = columns[:-1], [row[:-1] for row in ratios]
-    picture = book.picture(caption, draw_sizes, sizes, kept)
+    picture = book.picture(draw_sizes(sizes, kept), caption, of_sizes(sizes, kept))
     return Section("Error against ensemble size", [picture, Table(said, columns, ratios)])
-
-
-def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[Section]:
-    """One held-out run over time, and whether the covariance is consistent, both on the first scenario."""
-    choice, scenario = subject.choice, subject.plan.scenarios[0]
-    data, tuned = scenario.data(proof.seeds), choice.filter(scenario)
-    name, before = next(iter(baselines(choice.name, scenario, subject.plan.seed, proof.default).items()))
-    pair = {name: before.filter(scenario), TUNED: tuned}
-    what = "Estimate and innovation, each with its" if data.states is None else "Truth, estimate and"
-    caption = f"{what} 95 % band on {scenario.name}, held-out seed {proof.seeds.start}, before and after."
-    scored = proof.tuned.scored or None
-    picture = book.picture(caption, draw_estimates, pair, data, 0, scenario.dt, scored, sharey="row")
-    sections = [Section("One run over time", [picture])]
-    if filter_class(choice.name).has_covariance:
-        report = check_consistency(tuned, data)
-        caption = f"Checks of the tuned filter's covariance on {report.runs} held-out seeds of {scenario.name}."
-        title = f"{choice.name}, tuned, on {report.runs} seeds of {scenario.name}"
-        picture = book.picture(caption, draw_consistency, report, title, scored=scored)
-        sections.append(Section("Is the covariance consistent?", [Words(sentences(report)), picture]))
-    return sections
-
-
-def facts_section(subject: Subject, nis: Sequence[float]) -> Section:
-    """What was tuned, on what and with what; `nis` is the choice's on training seeds, over the channels."""
-    plan = subject.plan
-    training = plan.scenarios[0].training_seeds(plan.seed, TRAINING_SEEDS)
-    about = [f"{one.name}: {one.about}" if one.about else one.name for one in plan.scenarios]
-    rows = [
-        ["filter", plan.filter if plan.filter == subject.choice.name else f"{plan.filter}: {subject.choice.name}"],
-        *([["budget", f"{plan.budget:g} µs a step of one core"]] if plan.budget is not None else []),
-        ["scenarios" if len(about) > 1 else "scenario", "; ".join(about)],
-        ["minimised", "; ".join(f"{name}: {find_objective(name).about}" for name in plan.objectives)],
-        ["mean NIS", _nis_words(nis) if plan.is_constrained else "free"],
-        ["sampler", plan.sampler],
-        ["training seeds", f"{training.start} to {training.stop - 1}"],
-        ["study", subject.name],
-    ]
-    if subject.study is not None:
-        states = [trial.state for trial in subject.study.get_trials(deepcopy=False)]
-        complete, early = states.count(TrialState.COMPLETE), states.count(TrialState.PRUNED)
-        rows.append(["finished trials", f"{complete + early}, {early} of them pruned"])
-    rows.append(["computed here with", ", ".join(f"{name} {version}" for name, version in versions().items())])
-    return Section("What was done", [Table("", [], rows)])
-
-
-def _nis_words(nis: Sequence[float]) -> str:
-    low, high = NIS_BAND
-    place = "inside" if all(low <= ratio <= high for ratio in nis) else "outside"
-    found = " and ".join(f"{ratio:.3g}" for ratio in nis)
-    return f"to lie between {low:g} and {high:g} of what is right; it is {found}, {place}, on the training seeds"

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from numerics.files import check_target, write_whole
-from tuning.evaluation.held_out import prove
+from tuning.evaluation.held_out import Comparison, prove
 from tuning.evaluation.kept import kept_comparison, kept_sizes
-from tuning.evaluation.sizes import ensemble_sizes, sufficient_size
+from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
 from tuning.likelihood.identifiability import identify, sentences, too_many
 from tuning.problems.problem import Problem
-from tuning.reporting.page import Section, Words, html_page, markdown_page
-from tuning.reporting.parts import (
-    Sketchbook,
-    advice,
-    facts_section,
-    held_out_section,
-    run_sections,
-    search_section,
-    sizes_section,
-)
-from tuning.reporting.subject import find_subject, is_file
+from tuning.reporting.facts_parts import facts_section, model_section, score_section
+from tuning.reporting.lines_parts import lines_section
+from tuning.reporting.page import Section, Table, Words, html_page, markdown_page
+from tuning.reporting.parts import advice, held_out_section, search_section, sizes_section
+from tuning.reporting.run_parts import run_sections
+from tuning.reporting.sketchbook import Sketchbook
+from tuning.reporting.subject import Subject, find_subject, is_file
 from tuning.reporting.tables import errors_table, known_table, numbers_table
 from tuning.search.objectives import nis_ratio
 from tuning.search.space import has_ensemble
@@ -31,11 +26,22 @@ from tuning.search.trials import measure
 
 
 class Report(NamedTuple):
-    """What was written, and the sentence that sums it up."""
+    """What was written, and the sentences that sum it up, one a study."""
 
     page: Path
     tables: Path
     advice: str
+
+
+class Pages(NamedTuple):
+    """All that is known of one study, ready for a page."""
+
+    subject: Subject
+    title: str
+    advice: str
+    sections: list[Section]
+    tables: list[Table]  # of errors and parameters
+    proofs: list[Comparison]
 
 
 def write_report(
@@ -56,17 +62,31 @@ def write_report(
         ValueError: if the tuned file is refused, there is no such study, or the folder cannot be written.
     """
     subject = find_subject(source, storage, problems)
-    plan, choice = subject.plan, subject.choice
-    folder = Path(out) if out is not None else Path(source).parent if is_file(source) else Path("out")
     name = Path(source).stem if is_file(source) else subject.name
-    page, tables = folder / f"{name}.html", folder / f"{name}.md"
-    for target in (page, tables):
+    page, tables = report_files(source, name, out)
+    found = pages_of(source, subject)
+    write_whole(page, html_page(found.title, found.advice, found.sections))
+    write_whole(tables, markdown_page(found.title, found.advice, found.tables))
+    return Report(page, tables, found.advice)
+
+
+def report_files(source: str | Path, name: str, out: str | Path | None) -> tuple[Path, Path]:
+    """Page and tables of a name, in `out` or beside the tuned file; ValueError if they cannot be written."""
+    folder = Path(out) if out is not None else Path(source).parent if is_file(source) else Path("out")
+    found = folder / f"{name}.html", folder / f"{name}.md"
+    for target in found:
         check_target(target)
+    return found
+
+
+def pages_of(source: str | Path, subject: Subject, prefix: str = "p") -> Pages:
+    """Everything that a page holds of a study, whose pictures' names begin with a prefix."""
+    plan, choice = subject.plan, subject.choice
     data = plan.training_data()
-    sizes = []
+    sizes: Sequence[SizeRow] = []
     if has_ensemble(choice.name):
-        sizes = kept_sizes(subject.sizes, choice, plan)
-        sizes = ensemble_sizes(choice, plan, data, subject.consistent) if sizes is None else sizes
+        kept_rows = kept_sizes(subject.sizes, choice, plan)
+        sizes = ensemble_sizes(choice, plan, data, subject.consistent) if kept_rows is None else kept_rows
     if sizes and not subject.chosen:
         choice = choice.with_size(sufficient_size(sizes, subject.consistent))
         subject = subject._replace(choice=choice)
@@ -76,7 +96,6 @@ def write_report(
         for proof, scenario in zip(kept, plan.scenarios, strict=True)
     ]
     title = f"{choice.name} tuned on {', '.join(_short(scenario.name) for scenario in plan.scenarios)}"
-    said = advice(choice, plan, proofs)
     known = identify(choice, plan.scenarios, data, plan.space())
     identified = sentences(known) if known else too_many(choice, plan.space())
     nis = subject.nis or [nis_ratio(found) for found in measure(choice, plan, data)]
@@ -84,20 +103,20 @@ def write_report(
         numbers_table(choice, plan.scenarios[0], plan.seed, proofs[0].default),
         *([known_table(known)] if known else []),
     ]
-    with tempfile.TemporaryDirectory() as scratch:
-        book = Sketchbook(Path(scratch))
-        sections = [
-            held_out_section(book, subject, proofs),
-            Section("The numbers", [*numbers, *([Words(identified)] if identified else [])]),
-            search_section(book, subject),
-            *([sizes_section(book, subject, sizes)] if sizes else []),
-            *run_sections(book, subject, proofs[0]),
-            facts_section(subject, nis),
-        ]
-    write_whole(page, html_page(title, said, sections))
+    book = Sketchbook(prefix)
+    sections = [
+        held_out_section(book, subject, proofs),
+        score_section(subject),
+        Section("The parameters", [*numbers, *([Words(identified)] if identified else [])]),
+        model_section(choice, plan.scenarios[0]),
+        search_section(book, subject),
+        *([sizes_section(book, subject, sizes)] if sizes else []),
+        *run_sections(book, subject, proofs[0]),
+        lines_section(choice, plan.scenarios[0], str(source) if is_file(source) else None),
+        facts_section(subject, nis),
+    ]
     errors = [errors_table(scenario, proof) for scenario, proof in zip(plan.scenarios, proofs, strict=True)]
-    write_whole(tables, markdown_page(title, said, [*errors, *numbers]))
-    return Report(page, tables, said)
+    return Pages(subject, title, advice(choice, plan, proofs), sections, [*errors, *numbers], proofs)
 
 
 def _short(name: str) -> str:

@@ -10,9 +10,9 @@ import optuna
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.trial import FrozenTrial, TrialState
 
-from numerics.plots import BLUE, RUST, grid_of, new_figure, panels, tidy
+from numerics.plots import BLUE, GREY, RUST, grid_of, new_figure, panels, tidy
 from tuning.evaluation.sizes import SizeRow
-from tuning.reporting.figures import GREY, early_trials, limit_values
+from tuning.reporting.figures import early_trials, limit_values
 from tuning.reporting.panels import COLUMNS, shown_states
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.space import KIND
@@ -25,19 +25,41 @@ CROSS = {"color": GREY, "markersize": 4, "markeredgewidth": 0.8}
 
 
 def importances(study: optuna.Study) -> dict[str, float]:
-    """How much each number matters for a trial to be among the best tenth; empty where trials are too few.
+    """How much each parameter matters for a trial to be among the best tenth; empty where trials are too few.
 
-    With two objectives the best are those nearest to the Pareto front. In a study over several kinds of filters
-    only numbers that all kinds have are told.
+    Where fewer than ten trials are complete, pruned ones count, too, at the mean of the seeds that they came to:
+    they are among the worse ones, whatever seeds were left. With two objectives the best are those nearest to the
+    Pareto front. In a study over several kinds of filters only parameters that all kinds have are told.
 
     Source: Watanabe et al. (2023), "PED-ANOVA: efficiently quantifying hyperparameter importance in arbitrary
     subspaces".
     """
-    complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    if len(complete) < FEWEST_TRIALS:
+    complete, early = counted_trials(study)
+    if complete + early < FEWEST_TRIALS:
         return {}
-    shared = [name for name in complete[0].params if all(name in trial.params for trial in complete)]
+    study = _with_pruned(study) if early else study
+    done = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    shared = [name for name in done[0].params if all(name in trial.params for trial in done)]
     return get_param_importances(study, evaluator=PedAnovaImportanceEvaluator(), params=shared)
+
+
+def counted_trials(study: optuna.Study) -> tuple[int, int]:
+    """How many complete trials, and how many pruned ones, importances are made of."""
+    trials = study.get_trials(deepcopy=False)
+    complete = sum(trial.state == TrialState.COMPLETE for trial in trials)
+    alone = complete >= FEWEST_TRIALS or len(study.directions) > 1
+    return complete, 0 if alone else len(early_trials(trials))
+
+
+def _with_pruned(study: optuna.Study) -> optuna.Study:
+    """A copy of a study in memory, whose pruned trials are complete at the mean of what they reported."""
+    trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    copied = optuna.create_study(direction=study.direction)
+    copied.add_trials(trials)
+    for trial, value in early_trials(study.get_trials(deepcopy=False)):
+        made = optuna.trial.create_trial(params=trial.params, distributions=trial.distributions, value=value)
+        copied.add_trial(made)
+    return copied
 
 
 def draw_importance(found: Mapping[str, float]) -> Figure:
@@ -51,7 +73,7 @@ def draw_importance(found: Mapping[str, float]) -> Figure:
         axis.annotate(f"{value:.2f}", (value, place), (4, 0), textcoords="offset points", va="center", fontsize=9)
     axis.margins(x=0.12)
     axis.grid(axis="y", visible=False)
-    axis.set_xlabel("importance, of a sum of 1")
+    axis.set_xlabel("importance, of a sum of 1 [-]")
     return figure
 
 
@@ -64,6 +86,7 @@ def draw_slices(trials: Sequence[FrozenTrial], label: str) -> Figure:
     early, names = early_trials(trials), [name for name in done[0].params if name != KIND]
     figure, axes = panels(len(names), COLUMNS, (3.2, 2.7), extra=0.4, sharey=True)
     best, values = best_trial(done), [trial.values[0] for trial in done]
+    assert best is not None  # a report is of a study with a complete trial
     faces = [BLUE if is_consistent(trial) else "white" for trial in done]
     for axis, name in zip(axes, names, strict=True):
         places = [trial.params[name] for trial in done]
@@ -117,7 +140,7 @@ def draw_sizes(sizes: Sequence[SizeRow], kept: int) -> Figure:
         place = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
         axis.annotate(f"N = {kept}", (kept, 1), (4, -10), **place, color=RUST, fontsize=9)
         _size_axis(axis, numbers)
-        axis.set_xlabel("ensemble size N")
+        axis.set_xlabel("ensemble size N [-]")
         axis.set_ylabel(f"RMSE of {states[i].plot_label}")
     if left_out:
         figure.supxlabel(left_out, fontsize=9)

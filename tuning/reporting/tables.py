@@ -90,10 +90,10 @@ def _output_label(output: Quantity) -> str:
 def numbers_table(choice: Choice, scenario: Problem, seed: int, default: Scaled | None = None) -> Table:
     """The numbers of a tuned filter and of its baselines; the scaled default is found unless it is given."""
     found = baselines(choice.name, scenario, seed, default)
-    choices, default = {TUNED: choice, **found}, found[RULE].numbers
-    whole = [one._replace(numbers={**default, **one.numbers}) for one in choices.values()]
+    choices, usual = {TUNED: choice, **found}, found[RULE].numbers
+    whole = [one._replace(numbers={**usual, **one.numbers}) for one in choices.values()]
     rows = number_rows(whole, choice.name, scenario, _number, "²")
-    return Table(f"Numbers of the {choice.name} filter", ["", *choices], rows)
+    return Table(f"Parameters of the {choice.name} filter", ["", *choices], rows)
 
 
 def _number(value: float | None) -> str:

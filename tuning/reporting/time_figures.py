@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from filters.engine.batch import Estimates, run
 from filters.filter import Filter
-from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
+from filters.looks import TRUTH, colour_of
+from numerics.plots import new_figure, save_figure, thinned, tidy
 from plants.quantities import Quantity
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data
@@ -20,7 +21,7 @@ from tuning.reporting.panels import axis_label, shown_states
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-TRUTH, ESTIMATE, ERROR = DARK, BLUE, RUST
+TWO_SIDED = 1.96
 WIDTH = 5.4  # of a filter [inch]
 TALL, LOW = 2.0, 1.3  # relative heights of panels of values and of errors ...
 UNIT, UNIT_OF_MANY = 8.0 / 6.6, 0.9  # ... in so many inches, for up to two states and for more
@@ -41,7 +42,7 @@ class Row(NamedTuple):
 
     height: float
     label: str
-    draw: Callable  # draw(axis, run)
+    draw: Callable  # draw(axis, run, colour=that of the filter)
 
 
 def estimates_figure(path: str | Path, filters: Mapping[str, Filter], data: Data, *arguments, **options) -> Path:
@@ -68,7 +69,7 @@ def draw_estimates(
         run_index: which of its runs.
         dt: sample time [s]; None for an axis of steps.
         scored: places of the states that count in the score, which come first where not all are shown.
-        **options: of matplotlib's `subplots`, such as `sharey="row"`.
+        **options: of matplotlib's `subplots`; by default the panels of a row share their axes.
     """
     model = next(iter(filters.values())).model
     states = model.states if data.states is None else model.states[: data.states.shape[-1]]
@@ -77,19 +78,19 @@ def draw_estimates(
     heights = [row.height for row in rows]
     unit = UNIT if len(places) <= 2 else UNIT_OF_MANY
     figure = new_figure((WIDTH * len(filters), unit * sum(heights)))
-    options = {"sharex": True, "height_ratios": heights, **options}
+    options = {"sharex": True, "sharey": "row", "height_ratios": heights, **options}
     axes = figure.subplots(len(rows), len(filters), squeeze=False, **options)
     tidy(axes.flat)
     for column, (title, filter_) in zip(axes.T, filters.items(), strict=True):
-        found = _run(filter_, data, run_index, dt)
+        found = one_run(filter_, data, run_index, dt)
         for axis, row in zip(column, rows, strict=True):
-            row.draw(axis, found)
+            row.draw(axis, found, colour=colour_of(filter_.name))
         column[0].set_title(title, fontsize=11)
         column[-1].set_xlabel("step" if dt is None else "time [s]")
     for axis, row in zip(axes[:, 0], rows, strict=True):
         axis.set_ylabel(row.label)
     figure.align_ylabels(axes[:, 0])
-    named = {}
+    named: dict[str, Any] = {}
     for axis in axes[:, 0]:
         handles, labels = axis.get_legend_handles_labels()
         named |= dict(zip(labels, handles, strict=True))
@@ -113,7 +114,8 @@ def _rows(
     return rows
 
 
-def _run(filter_: Filter, data: Data, index: int, dt: float | None) -> Run:
+def one_run(filter_: Filter, data: Data, index: int, dt: float | None) -> Run:
+    """One run of a filter on some data, with errors where there is a truth; `dt` as in `draw_estimates`."""
     one = slice(index, index + 1)
     estimates = run(filter_, data.filter_keys[one], data.inputs[one], data.measurements[one])
     time = (1.0 if dt is None else dt) * np.arange(data.measurements.shape[1])
@@ -124,25 +126,32 @@ def _run(filter_: Filter, data: Data, index: int, dt: float | None) -> Run:
     return Run(time, data.states[index], errors, estimates, innovations)
 
 
-def _values(axis, found: Run, i: int) -> None:
-    mean, band = found.estimates.means[0, :, i], 1.96 * np.sqrt(found.estimates.covs[0, :, i, i])
-    axis.fill_between(found.time, mean - band, mean + band, color=ESTIMATE, alpha=0.3, linewidth=0)
+def _values(axis, found: Run, i: int, colour: str) -> None:
+    mean, band = found.estimates.means[0, :, i], TWO_SIDED * np.sqrt(found.estimates.covs[0, :, i, i])
+    draw_band(axis, found.time, mean - band, mean + band, colour)
     if found.truth is not None:
-        axis.plot(found.time, found.truth[:, i], color=TRUTH, linewidth=1.6, label="truth")
-    axis.plot(found.time, mean, color=ESTIMATE, linewidth=1.0, label="estimate")
+        axis.plot(*thinned(found.time, found.truth[:, i]), label="truth", **TRUTH)
+    axis.plot(*thinned(found.time, mean), color=colour, linewidth=1.0, label="estimate")
 
 
-def _error(axis, found: Run, i: int) -> None:
-    band = 1.96 * np.sqrt(found.estimates.covs[0, :, i, i])
-    _in_band(axis, found.time, found.errors[:, i], band, "error of the estimate")
+def _error(axis, found: Run, i: int, colour: str) -> None:
+    assert found.errors is not None  # rows of errors are made where there is a truth
+    band = TWO_SIDED * np.sqrt(found.estimates.covs[0, :, i, i])
+    draw_in_band(axis, found.time, found.errors[:, i], band, "error of the estimate", colour)
 
 
-def _innovation(axis, found: Run, j: int) -> None:
-    band = 1.96 * np.sqrt(found.estimates.innovation_covs[0, :, j, j])
-    _in_band(axis, found.time, found.innovations[:, j], band, "innovation")
+def _innovation(axis, found: Run, j: int, colour: str) -> None:
+    band = TWO_SIDED * np.sqrt(found.estimates.innovation_covs[0, :, j, j])
+    draw_in_band(axis, found.time, found.innovations[:, j], band, "innovation", colour)
 
 
-def _in_band(axis, time: np.ndarray, values: np.ndarray, band: np.ndarray, label: str) -> None:
+def draw_in_band(axis, time: np.ndarray, values: np.ndarray, band: np.ndarray, label: str, colour: str) -> None:
     """An error over time in the band that a filter believes in."""
-    axis.fill_between(time, -band, band, color=ESTIMATE, alpha=0.3, linewidth=0, label="95 % band of the filter")
-    axis.plot(time, values, color=ERROR, linewidth=0.9, label=label)
+    draw_band(axis, time, -band, band, colour)
+    axis.plot(*thinned(time, values), color=colour, linewidth=0.9, label=label)
+
+
+def draw_band(axis, time: np.ndarray, low: np.ndarray, high: np.ndarray, colour: str) -> None:
+    """A band over time; of long series the widest of each stretch."""
+    (times, below), (_, above) = thinned(time, low, np.fmin), thinned(time, high, np.fmax)
+    axis.fill_between(times, below, above, color=colour, alpha=0.22, linewidth=0, label="95 % band of the filter")

@@ -1,0 +1,120 @@
+"""What pictures show, in words and numbers, for whoever cannot see them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import isfinite
+
+import numpy as np
+from optuna.trial import FrozenTrial, TrialState
+
+from filters.engine.batch import Estimates
+from filters.filter import Filter
+from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.sizes import SizeRow
+from tuning.problems.data import Data
+from tuning.reporting.time_figures import one_run
+from tuning.search.outcome import best_trial
+
+NO_TRIALS = "No trial was finished."
+TWO_SIDED = 1.96
+
+
+def of_history(trials: Sequence[FrozenTrial]) -> str:
+    """First and best trial of a study, and how many were pruned."""
+    done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    best = best_trial(done) if done else None
+    if best is None:
+        return NO_TRIALS
+    early = sum(trial.state == TrialState.PRUNED for trial in trials)
+    first, last = done[0], best
+    return (
+        f"Objective over {len(trials)} trials, {early} of them pruned: trial {first.number + 1} has "
+        f"{first.values[0]:.4g}, the best, trial {last.number + 1}, {last.values[0]:.4g}."
+    )
+
+
+def of_comparison(proof: Comparison) -> str:
+    """RMSE of every filter, state by state, and the bound."""
+    told = []
+    for i, state in enumerate(proof.tuned.states):
+        values = [f"{name} {found.rmse[i].value:.3g}" for name, found in proof.evaluations.items()]
+        values += [f"bound {proof.bound[i]:.3g}"] if isfinite(proof.bound[i]) else []
+        told.append(f"RMSE of {state.name}{f' in {state.unit}' if state.unit else ''}: {', '.join(values)}")
+    return f"Bars with whiskers. {'; '.join(told)}."
+
+
+def of_importances(found: Mapping[str, float]) -> str:
+    """Every importance."""
+    return f"Bars: {', '.join(f'{name} {value:.2f}' for name, value in found.items())}."
+
+
+def of_slices(trials: Sequence[FrozenTrial]) -> str:
+    """Parameters of the best trial, and the range that was searched."""
+    done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    best = best_trial(done) if done else None
+    if best is None:
+        return NO_TRIALS
+    told = []
+    for name, value in best.params.items():
+        if isinstance(value, (int, float)):
+            tried = [trial.params[name] for trial in done if name in trial.params]
+            told.append(f"{name} {value:.3g}, tried from {min(tried):.3g} to {max(tried):.3g}")
+    return f"Scatter of {len(done)} complete trials. The best has {'; '.join(told)}."
+
+
+def of_front(front: Sequence[FrozenTrial], objectives: Sequence[str]) -> str:
+    """Both ends of a Pareto front."""
+    ends = sorted(trial.values for trial in front)
+    told = [
+        " and ".join(f"{name} {value:.3g}" for name, value in zip(objectives, end, strict=True)) for end in ends
+    ]
+    return f"Pareto front of {len(front)} trials, from {told[0]} to {told[-1]}."
+
+
+def of_sizes(sizes: Sequence[SizeRow], kept: int) -> str:
+    """RMSE at the smallest, the kept and the largest size."""
+    states, told = sizes[0].evaluation.states, []
+    for i, state in enumerate(states):
+        some = {sizes[0].size, kept, sizes[-1].size}
+        values = [f"{row.evaluation.rmse[i].value:.3g} at N = {row.size}" for row in sizes if row.size in some]
+        told.append(f"RMSE of {state.name}{f' in {state.unit}' if state.unit else ''}: {', '.join(values)}")
+    return f"{'; '.join(told)}."
+
+
+def of_estimates(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None) -> str:
+    """RMSE of each filter in one run and how much of the truth, or of the innovations, is in its band."""
+    told = []
+    for name, filter_ in filters.items():
+        found, parts = one_run(filter_, data, index, dt), []
+        values, covs, what = _against(found.errors, found.innovations, found.estimates)
+        quantities = filter_.model.states if found.errors is not None else filter_.model.measurements
+        for i in range(values.shape[-1]):
+            there = np.isfinite(values[:, i]) & np.isfinite(covs[:, i, i])
+            inside = np.abs(values[there, i]) <= TWO_SIDED * np.sqrt(covs[there, i, i])
+            size = np.sqrt(np.mean(values[np.isfinite(values[:, i]), i] ** 2))
+            share = f", {100 * inside.mean():.0f} % in the band" if there.any() else ""
+            parts.append(f"{quantities[i].name} {size:.3g} {quantities[i].unit}".rstrip() + share)
+        told.append(f"{name}: {what} {'; '.join(parts)}")
+    return f"{'. '.join(told)}."
+
+
+def of_series(names: Sequence[str], values: np.ndarray, units: Sequence[str]) -> str:
+    """Range and mean of every column of values (K, m), and how many are missing."""
+    told = []
+    for name, unit, column in zip(names, units, values.T, strict=True):
+        there = column[np.isfinite(column)]
+        if not there.size:
+            told.append(f"{name}: nothing")
+            continue
+        missing = f", {len(column) - len(there)} of {len(column)} missing" if len(there) < len(column) else ""
+        ends = f"from {there.min():.3g} to {there.max():.3g} {unit}".rstrip()
+        told.append(f"{name} {ends}, mean {there.mean():.3g}{missing}")
+    return f"{'; '.join(told)}."
+
+
+def _against(errors, innovations: np.ndarray, estimates: Estimates):
+    """What is held against a band: values, covariances and their name."""
+    if errors is not None:
+        return errors, estimates.covs[0], "RMSE of"
+    return innovations, estimates.innovation_covs[0], "RMS innovation of"
