@@ -40,9 +40,9 @@ def written(function: Callable) -> str:
     maker = file.strip("<>").partition("written out by ")[2]
     text = ast.unparse(ast.parse("".join(linecache.getlines(file))))
     body, _, result = text.rpartition("    return ")
-    if result.startswith("(("):  # a matrix
-        rows = "".join(f"        {ast.unparse(row)},\n" for row in ast.parse(result).body[0].value.elts)
-        result = f"(\n{rows}    )"
+    rows = [ast.unparse(row) for row in ast.parse(result).body[0].value.elts] if result.startswith("((") else []
+    if len(rows) > 1:  # of a matrix, each on its own line
+        result = "(\n" + "".join(f"        {row},\n" for row in rows) + "    )"
     return f"# {maker}\n{body}    return {result}"
 
 
@@ -69,7 +69,7 @@ def prediction() -> str:
     advance = inside(kernels.predict, "advance", "advance")
     parts = [inside(advance, name) for name in PREDICTION[1:]]
     parts.append(inside(kernels.predict, "finish", "settle", "add"))
-    return python("\n\n".join(written(part) for part in parts))
+    return python("\n\n\n".join(written(part) for part in parts))
 
 
 def correction() -> str:
@@ -89,7 +89,7 @@ def correction() -> str:
         ("reduce", "less"),
         ("likelihood",),
     )
-    return python("\n\n".join(written(inside(condition, *path)) for path in paths))
+    return python("\n\n\n".join(written(inside(condition, *path)) for path in paths))
 
 
 def operation() -> str:

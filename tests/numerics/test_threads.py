@@ -121,6 +121,7 @@ def interrupted_at(moment):
         return count(frame, event, argument) if frame.f_code in OF_THE_WORKERS else None
 
     before = sys.gettrace()
+    sys._getframe().f_trace_opcodes = True  # Python 3.12 tells byte codes only if a frame asks before settrace
     sys.settrace(trace)
     try:
         yield lambda: passed
