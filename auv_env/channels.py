@@ -90,7 +90,7 @@ def _of_state(symbol: str, code: int, name: str | None = None) -> Channel:
 
 
 def unit_row(place: int, count: int) -> str:
-    """Source of a tuple of so many zeros, with a one at a place."""
+    """Source of a tuple of `count` zeros, with a one at a place."""
     return tuple_of("1.0" if i == place else "0.0" for i in range(count))
 
 
@@ -109,7 +109,7 @@ MEASURED = {name: name.removesuffix("_gps") for name in CHANNELS}
 
 @cache
 def channels_of(names: tuple[str, ...], states: int) -> tuple[Channel, ...]:
-    """Channels by name, for a model of the first so many states; ValueError if it lacks what one measures."""
+    """Channels by name, for a model of the first `states` states; ValueError if it lacks what one measures."""
     known = SYMBOLS[:states]
     unknown = [name for name in names if MEASURED[name] not in known]
     if unknown:

@@ -113,7 +113,7 @@ class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
         self._set_up(action_space(plant), rows, *rendering)
 
     def copies_of(self, count: int) -> Copies:
-        """So many vehicles with the env's task."""
+        """Return `count` vehicles with the env's task."""
         return Copies(self.plant, self.task, count)
 
 

@@ -24,7 +24,7 @@ LONGEST_STEP = 0.05  # [s]
 
 
 class Manoeuvre(NamedTuple):
-    """Planes [deg] over so many seconds, held or, with periods [s], switched as the sign of a sine."""
+    """Planes [deg] over a time [s], held or, with periods [s], switched as the sign of a sine."""
 
     stern: float
     rudder: float

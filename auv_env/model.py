@@ -97,7 +97,7 @@ def no_outputs(x, c):
 
 @makes_functions
 def observation_of(channels: tuple[str, ...], count: int) -> tuple[Callable, Callable]:
-    """`observe` and its Jacobian for some measured quantities of the first so many states."""
+    """`observe` and its Jacobian for some measured quantities of the first `count` states."""
     return functions_of(channels_of(channels, count), no_outputs, no_outputs, count)
 
 
@@ -166,7 +166,7 @@ def auv_model(
         **plant_arguments: others of `auv_env.plant.make_plant`.
 
     Raises:
-        ValueError: states the rule and the value.
+        ValueError: if an argument is wrong; the message states the rule and the value.
     """
     if sensors is None:
         states = "motion" if states is None else one_of("states", states, tuple(MODELS))

@@ -41,8 +41,8 @@ def operating_range(p: VehicleParameters, thrust: float) -> np.ndarray:
 def required_substeps(p: VehicleParameters, dt: float, thrust: float, plane: float) -> int:
     """Fewest Runge-Kutta steps a sample time that hold the one-step accuracy over the operating range.
 
-    One step of so many is compared with one of twice as many, from the corners of the range and 100 states between
-    them, under thrusts up to `thrust` [N] and planes within `plane` [rad].
+    A step with that many substeps is compared with one of twice as many, from the corners of the range and 100
+    states between them, under thrusts up to `thrust` [N] and planes within `plane` [rad].
 
     Raises ValueError if 64 substeps do not suffice: dt is then far too long for the vehicle.
     """

@@ -69,7 +69,7 @@ class Path(NamedTuple):
 def make_path(given, depth: float = 0.0) -> Path:
     """A path from a manoeuvre's name or from two or more points (north, east, down) [m], so much [m] deeper.
 
-    Raises ValueError that states the rule and the value.
+    Raises ValueError if an argument is wrong; the message states the rule and the value.
     """
     if isinstance(given, str):
         points = by_arc_length(run(one_of("path", given, tuple(MANOEUVRES)))[:, 9:], SPACING)

@@ -126,7 +126,7 @@ def make_plant(
         substeps: Runge-Kutta steps per sample time; None for the fewest that reach `operating.ONE_STEP_ACCURACY`.
 
     Raises:
-        ValueError: states the rule and the value.
+        ValueError: if an argument is wrong; the message states the rule and the value.
     """
     parameters = preset_parameters(preset)
     dt = between("dt", positive("dt", dt), *SAMPLE_TIMES, "s")
@@ -185,7 +185,7 @@ def _sensors(given, dt: float) -> tuple[dict[str, tuple[Effect, ...]], dict[str,
 
 
 def _timing(instrument: Instrument, dt: float) -> tuple[Effect, ...]:
-    """When an instrument has a measurement: every so many steps, the nearest to its rate, and where it works."""
+    """Effects for the rate of an instrument, as the nearest number of steps, and for where it works."""
     steps = 1 if instrument.rate is None else max(1, round(1.0 / (instrument.rate * dt)))
     return (SampleEvery(steps),) * (steps > 1) + (NearSurface(),) * instrument.at_surface
 

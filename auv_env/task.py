@@ -57,7 +57,7 @@ def make_task(
         plane_weight: of the squares of both planes' angles over their limit.
 
     Raises:
-        ValueError: states the rule and the value.
+        ValueError: if an argument is wrong; the message states the rule and the value.
     """
     weights = {
         "cross_track": cross_track_weight,

@@ -9,6 +9,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 os.environ.setdefault("MPLBACKEND", "agg")
 
+from pages.site.gallery import SHOWN_ONLY  # noqa: E402
 from thruster_env import __version__ as release  # noqa: E402
 
 project = "thruster-env"
@@ -55,8 +56,10 @@ napoleon_use_ivar = True
 sphinx_gallery_conf = {
     "examples_dirs": "../examples",
     "gallery_dirs": "tutorials",
-    "filename_pattern": r"\.py$",
+    "filename_pattern": rf"/(?!{'|'.join(SHOWN_ONLY)})\w+\.py$",
     "within_subsection_order": "pages.site.gallery.in_order",
+    "image_scrapers": ("matplotlib", "pages.site.gallery.result_figures"),
+    "default_thumb_file": str(ROOT / "docs" / "plant_frame.png"),
     "capture_repr": ("_repr_html_", "__repr__"),
     "download_all_examples": False,
     "show_signature": False,

@@ -14,8 +14,6 @@ pendulum, of which noisy sensors measure cosine, sine and rate.
 
 import math
 
-import gymnasium as gym
-
 import tuning
 from filters import EstimateState, StateSpaceModel
 from tuning.problems.env_problem import EnvProblem
@@ -83,9 +81,9 @@ figure = study.plot_errors()
 # Around the env
 # --------------
 #
-# The wrapper takes the tuned filter as it is. What the agent observes is now the estimate of angle and rate.
+# ``make_env`` is the env that the study ran. What the agent observes is now the estimate of angle and rate.
 
-env = EstimateState(gym.make("Pendulum-v1"), filter=study.filter)
+env = EstimateState(problem.make_env(), filter="ekf", model=study.filter.model)
 observation, info = env.reset(seed=0)
 for _ in range(20):
     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())

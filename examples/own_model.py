@@ -28,7 +28,8 @@ from filters import StateSpaceModel, make_filter
 from tuning.problems.excitation import Steps
 from tuning.problems.model_problem import ModelProblem
 
-TRIALS, SEEDS = 25, 50
+TRIALS = 25
+SEEDS = 50
 DT = 1.0  # [s]
 
 

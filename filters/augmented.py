@@ -53,6 +53,9 @@ def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unkno
 
     Raises:
         ValueError: if a name is not one of the model's constants, or a standard deviation is not positive.
+
+    Source: Kopp, Orford (1963), "Linear regression applied to system identification for adaptive control systems",
+    AIAA Journal 1(10).
     """
     fields = getattr(model.constants, "_fields", range(len(model.constants)))
     places, means, variances, walks = [], [], [], []

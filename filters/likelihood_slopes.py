@@ -156,7 +156,7 @@ def terms_writer(size: int):
 
 @inlined
 def no_terms(row, dy, ds):
-    """In the place of these, where no information is asked for."""
+    """In place of `terms_writer`, where no information is asked for."""
 
 
 @cache
@@ -196,4 +196,4 @@ def information_sum(size: int):
 
 @inlined
 def no_information(out, terms, s_inverse):
-    """In the place of this, likewise."""
+    """In place of `information_sum`, where no information is asked for."""

@@ -244,7 +244,7 @@ class CompiledOrPython:
 
     @property
     def direct(self) -> Callable:
-        """What a call runs: machine code, once it has run, without the detour through this object."""
+        """The compiled function itself once it has run, so that calls avoid this object; else this object."""
         return self._run if self._proven and self._run is not self._python else self
 
     def _call_first(self, *arguments):

@@ -30,7 +30,7 @@ def tidy(axes: Iterable) -> None:
 
 
 def grid_of(count: int, columns: int) -> tuple[int, int]:
-    """Rows and columns of so many panels, at most `columns` side by side, and none of the rows empty."""
+    """Rows and columns for `count` panels, at most `columns` side by side, and none of the rows empty."""
     columns = max(1, min(columns, count))
     return -(-count // columns), columns
 
@@ -40,7 +40,7 @@ def panels(count: int, columns: int, size: tuple[float, float], extra: float = 0
 
     Args:
         count: of panels.
-        columns: at most so many side by side.
+        columns: largest number side by side.
         size: of a panel [inch].
         extra: height for a title or a legend [inch].
         **options: of matplotlib's `subplots`.

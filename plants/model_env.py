@@ -33,12 +33,12 @@ class ModelEnv(gym.Env):
         assumed: the model that filters assume, returned by `state_space_model`: a model, or a function that makes
             one from changes by name; the truth if None.
         low: smallest input, one number or p, in the units of the inputs.
-        high: largest input, likewise.
+        high: largest input, one number or p.
         dt: sample time [s], which tuned files are checked against; None if unknown. It changes nothing else:
             covariances are per step and do not scale with dt.
 
     Raises:
-        ValueError: if the truth is no model, or bounds or dt are off.
+        ValueError: if the truth is not a model, or bounds or dt are wrong.
     """
 
     metadata = {"render_modes": []}

@@ -34,7 +34,7 @@ class ModelledEnv:
     def state_space_model(self, **changes) -> StateSpaceModel:
         """The model of the env's plant, exact unless changed; changes are arguments of its `model_maker`.
 
-        Raises ValueError that states the rule and the value.
+        Raises ValueError if an argument is wrong; the message states the rule and the value.
         """
         make = self.model_maker()
         known = list(inspect.signature(make).parameters)[1:]

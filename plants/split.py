@@ -23,7 +23,7 @@ class Split(NamedTuple):
 
 
 def split(model: StateSpaceModel, actions: int, channels: Sequence[str]) -> Split | None:
-    """Find a model's inputs beyond so many actions, and its measurements, among channels by their symbols.
+    """Find a model's inputs beyond the first `actions`, and its measurements, among channels by their symbols.
 
     None where there are no such inputs, or the model has some that are no channels.
     """

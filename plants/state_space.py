@@ -67,6 +67,10 @@ class StateSpaceModel:
         input_quantities: the same for the inputs; u_1, ... if None.
         measurements: the same for the measurements; z_1, ... if None.
         outputs: outputs of the model by symbol: an `Output` each, a quantity and a function of (x, c).
+
+    Raises:
+        ValueError: if shapes do not fit, a covariance or constant is not valid, or a function does not work at the
+            prior mean; the message states the rule and the value.
     """
 
     transition: Callable

@@ -35,7 +35,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
         **arguments: those of the single env.
 
     Raises:
-        ValueError: states the rule and the value.
+        ValueError: if an argument is wrong; the message states the rule and the value.
     """
 
     single_env: ClassVar[type[PlantEnv]]

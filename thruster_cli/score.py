@@ -12,7 +12,7 @@ import typer
 from filters.consistency.intervals import mean_interval
 from numerics.checks import one_of
 from thruster_cli.error_tables import about, unless_blank
-from thruster_cli.options import INPUT, RUNS, JsonOption, SeedOption
+from thruster_cli.options import INPUT, RUNS, JsonOption, OfPresetOption, SeedOption
 from thruster_cli.output import announce_compilation, emit, progress_console, table
 from thruster_cli.train import LEARNABLE
 from training.extras import check_installed
@@ -22,6 +22,7 @@ from training.setup import Setup, in_scenario
 from tuning.problems.scenario import BaseScenario
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import HELD_OUT_SEEDS
+from tuning.thruster.logs import of_preset
 
 if TYPE_CHECKING:
     from training.score import Scores
@@ -46,6 +47,7 @@ def command(
             help=f"Another plant than that of training: {LEARNABLE}, or a .toml file.", rich_help_panel=INPUT
         ),
     ] = None,
+    preset: OfPresetOption = None,
     classical: Annotated[
         list[str] | None,
         typer.Option(
@@ -76,6 +78,8 @@ def command(
     Example: thruster score out/policies/* --classical mpc --scenario ambient
     """
     check_installed()
+    if preset is not None and scenario is None:
+        raise ValueError(f"--preset must come with --scenario, but got --preset {preset} alone")
     held_out = held_out_seeds(seed, seeds)
     with progress_console.status("loading torch ..."):
         from training.saved import find_saved, read_setup
@@ -84,7 +88,7 @@ def command(
     kind = plant_of(next(iter(setups.values())).task)
     for name in classical or []:
         one_of("classical", name, kind.controllers)
-    plant = None if scenario is None else kind.find_scenario(scenario)
+    plant = None if scenario is None else of_preset(kind.find_scenario(scenario), preset)
     check_alike(list(setups.values()), plant)
     announce_compilation()
     scored = []

@@ -15,14 +15,16 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least
-from thruster_cli.options import FILTER, INPUT, LEARNING, OUTPUT, JsonOption, spelt
+from thruster_cli.options import FILTER, INPUT, LEARNING, OUTPUT, JsonOption, OfPresetOption, spelt
 from thruster_cli.output import announce_compilation, emit, progress_console, table
 from training.algorithms import ALGORITHMS
 from training.extras import check_installed
 from training.observations import ARMS
 from training.plants.find import PLANTS, TASKS, plant_of
 from training.setup import Setup, make_setup
+from tuning.api.run import file_name
 from tuning.problems.plain import plain
+from tuning.thruster.logs import of_preset
 
 if TYPE_CHECKING:
     from training.learn import Trained
@@ -66,6 +68,7 @@ def command(
             rich_help_panel=INPUT,
         ),
     ] = None,
+    preset: OfPresetOption = None,
     tuned: Annotated[
         Path | None,
         typer.Option(
@@ -132,7 +135,7 @@ def command(
     """
     plant = plant_of(task)
     scenario = plant.scenario if scenario is None else scenario
-    chosen = plant.find_scenario(scenario)
+    chosen = of_preset(plant.find_scenario(scenario), preset)
     if untuned and tuned is not None:
         raise ValueError(f"give either --tuned FILE or --untuned, but got both, --tuned {tuned}")
     setup = make_setup(
@@ -153,7 +156,7 @@ def command(
     )
     check_installed()
     folder = out or POLICIES / name_of(setup, tuned, untuned)
-    if tuned is not None and (meant := read_tuned_file(tuned)["problem"]) != scenario:
+    if tuned is not None and (meant := read_tuned_file(tuned)["problem"]) != chosen.name:
         progress_console.print(f"{tuned} was tuned on {meant}, and its filter assumes what it did there.")
     with progress_console.status("loading torch ..."):
         from training.learn import train
@@ -174,7 +177,7 @@ def command(
 
 def name_of(setup: Setup, tuned: Path | None = None, untuned: bool = False) -> str:
     """Name of the folder of a training: what it learns, from what, by what."""
-    parts = [setup.task, Path(setup.scenario).stem, setup.observe]
+    parts = [setup.task, file_name(setup.scenario), setup.observe]
     parts += ["untuned"] * untuned + ([] if tuned is None else [tuned.stem])
     parts += [] if setup.controller is None else [setup.controller]
     return "-".join([*parts, setup.algo, f"seed{setup.seed}"])

@@ -99,7 +99,7 @@ class BowThrusterEnv(ModelledThruster, RenderedThruster, PlantEnv):
         self._set_up(gym.spaces.Box(-top, top, shape=(1,), dtype=np.float32), rows, *rendering)
 
     def copies_of(self, count: int) -> Copies:
-        """So many thrusters with the env's task."""
+        """Return `count` thrusters with the env's task."""
         return Copies(self.plant, self.task, count)
 
     def _reference_signals(self, reference):

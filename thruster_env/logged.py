@@ -55,7 +55,7 @@ class Shown(NamedTuple):
 
 
 def shown_of(plant: Plant, dead_band=None, bias: Mapping | None = None, lag: Mapping | None = None) -> Shown:
-    """Check what logs show of a plant; ValueError states the rule and the value.
+    """Check dead band, bias and lag of a plant's logs; ValueError states the rule and the value.
 
     Args:
         plant: whose channels these are.
@@ -98,11 +98,11 @@ def logged_model(
         bias: of channels, in their units.
         lag: time constants of channels [s].
         operating_voltage: as for `thruster_model`.
-        prior_cov_factor: likewise.
+        prior_cov_factor: as for `thruster_model`.
         **plant_arguments: those of `thruster_env.plant.make_plant`.
 
     Raises:
-        ValueError: states the rule and the value.
+        ValueError: if an argument is wrong; the message states the rule and the value.
     """
     plant, seen = logged_plant(dead_band=dead_band, bias=bias, lag=lag, **plant_arguments)
     base = model_of_plant(

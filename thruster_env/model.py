@@ -98,7 +98,7 @@ def thruster_model(
         **plant_arguments: those of `thruster_env.plant.make_plant`; the noise covariances are the filter's.
 
     Raises:
-        ValueError: states the rule and the value.
+        ValueError: if an argument is wrong; the message states the rule and the value.
     """
     return model_of_plant(
         make_plant(**plant_arguments),

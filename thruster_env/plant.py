@@ -111,7 +111,7 @@ def make_plant(
         uncertainty: distributions of factors on parameters, {"load_gain": {"name": "log-normal", "std": 0.1}}.
 
     Raises:
-        ValueError: states the rule and the value.
+        ValueError: if an argument is wrong; the message states the rule and the value.
     """
     parameters, dead_band = preset_and_dead_band(preset)
     dt = between("dt", positive("dt", dt), *SAMPLE_TIMES, "s")

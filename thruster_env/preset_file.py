@@ -47,7 +47,7 @@ def read_preset(path: str | Path) -> PresetFile:
     """A thruster from a preset file.
 
     Raises:
-        ValueError: states the rule and the value, with the path.
+        ValueError: if the file is wrong; the message states the rule, the value and the path.
     """
     content = read_toml(path, "a preset file")
     try:

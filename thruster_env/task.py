@@ -51,7 +51,7 @@ def make_task(
         voltage_rate_weight: of the squared change of voltage over max_voltage.
 
     Raises:
-        ValueError: states the rule and the value.
+        ValueError: if an argument is wrong; the message states the rule and the value.
     """
     weights = {"tracking": tracking_weight, "energy": energy_weight, "voltage_rate": voltage_rate_weight}
     tracking, energy, voltage_rate = (

@@ -26,4 +26,4 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     """Public names, whether or not they are imported yet."""
-    return sorted({*__all__, *globals()})
+    return sorted([*__all__, *(name for name in globals() if name.startswith("__"))])

@@ -35,7 +35,7 @@ class ClassicalPolicy:
         inputs, state = self.controller.predict(seen, state, episode_start)
         return (inputs - self.middle) / self.half, state
 
-    def tell(self, state: np.ndarray, actions: np.ndarray) -> None:
+    def replace_last_actions(self, state: np.ndarray, actions: np.ndarray) -> None:
         """Replace the last actions in a state by those that were applied, (n, p)."""
         if self.keeps_input:
             state[:, 0] = self.middle + self.half * actions[:, 0]
@@ -69,7 +69,7 @@ class CorrectController(VecEnvWrapper):
     def step_async(self, actions: np.ndarray) -> None:
         """Correct the controller's actions."""
         applied = np.clip(self._actions + self._share * np.clip(actions, -1.0, 1.0), -1.0, 1.0)
-        self._controller.tell(self._state, applied)
+        self._controller.replace_last_actions(self._state, applied)
         self.venv.step_async(applied.astype(np.float32))
 
     def step_wait(self):

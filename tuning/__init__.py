@@ -36,4 +36,4 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     """Names of the functions."""
-    return sorted({*__all__, *globals()})
+    return sorted([*__all__, *(name for name in globals() if name.startswith("__"))])

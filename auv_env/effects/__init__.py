@@ -1,1 +1,1 @@
-"""What disturbs the vehicle: its sensors, and the current that it goes in."""
+"""Disturbances of the vehicle: sensor effects and the current."""

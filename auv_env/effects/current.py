@@ -33,7 +33,7 @@ def make_current(given) -> Current:
     Each entry of a mapping is a number or a list of signals of CURRENT_SIGNALS, which are added:
     {"north": 0.2, "east": [{"name": "gauss-markov", "std": 0.1, "time_constant": 60.0}]}.
 
-    Raises ValueError that states the rule and the value.
+    Raises ValueError if an argument is wrong; the message states the rule and the value.
     """
     if given is None:
         return {}

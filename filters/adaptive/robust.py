@@ -90,6 +90,9 @@ class RobustExtendedKalmanFilter(Filter):
         degrees_of_freedom: d, positive; as it grows the filter becomes the extended one.
         iterations: of the fixed point, at least 1.
 
+    Raises:
+        ValueError: if a parameter is out of its range.
+
     Source: Agamennoni, Nieto, Nebot (2012), "Approximate inference in state-space models with heavy-tailed noise",
     IEEE Trans. Signal Processing 60(10), section III; Piche, Sarkka, Hartikainen (2012), "Recursive outlier-robust
     filtering and smoothing for nonlinear systems using the multivariate Student-t distribution".
@@ -100,7 +103,7 @@ class RobustExtendedKalmanFilter(Filter):
     iterations: int = 5
 
     def __post_init__(self):
-        """Check the numbers; raise ValueError that states the rule and the value."""
+        """Check the parameters; raise ValueError that states the rule and the value."""
         object.__setattr__(self, "degrees_of_freedom", positive("degrees_of_freedom", self.degrees_of_freedom))
         object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1, MOST_ITERATIONS))
 

@@ -135,6 +135,9 @@ class SageHusaFilter(Filter):
             a = 1 the model's.
         process_forgetting_factor: b, above 0 and at most 1.
 
+    Raises:
+        ValueError: if a factor is not above 0 and at most 1.
+
     Source: Sage, Husa (1969), "Adaptive filtering with unknown prior statistics"; Mehra (1972), "Approaches to
     adaptive filtering", IEEE Trans. Automatic Control 17(5), on matching covariances. The bound on d is ours.
     """

@@ -97,6 +97,9 @@ class VariationalBayesFilter(Filter):
             as it grows, the filter becomes the extended one.
         iterations: of the fixed point, at least 1.
 
+    Raises:
+        ValueError: if a parameter is out of its range.
+
     Source: Sarkka, Nummenmaa (2009), "Recursive noise adaptive Kalman filtering by variational Bayesian
     approximations", IEEE Trans. Automatic Control 54(3); with inverse Wishart Sarkka, Hartikainen (2013),
     "Non-linear noise adaptive Kalman filtering via variational Bayes".
@@ -109,7 +112,7 @@ class VariationalBayesFilter(Filter):
     iterations: int = 3
 
     def __post_init__(self):
-        """Check the numbers; raise ValueError that states the rule and the value."""
+        """Check the parameters; raise ValueError that states the rule and the value."""
         factor = part_that_is_kept("forgetting_factor", self.forgetting_factor)
         object.__setattr__(self, "forgetting_factor", factor)
         object.__setattr__(self, "prior_weight", positive("prior_weight", self.prior_weight))

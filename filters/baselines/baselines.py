@@ -146,6 +146,9 @@ class Inversion(OpenLoop):
         reach: largest distance from the open loop's x_i at which a root is looked for, in the unit of x_i; if
             None, the width of the range of x_i in the model (`state_high` minus `state_low`), or, without a range,
             20 times its spread in prior and process noise.
+
+    Raises:
+        ValueError: if the model has no such component or channel, or reach is not positive.
     """
 
     name: ClassVar[str] = "inversion"
@@ -154,7 +157,7 @@ class Inversion(OpenLoop):
     reach: float | None = None
 
     def __post_init__(self):
-        """Check the numbers; raise ValueError that states the rule and the value."""
+        """Check the parameters; raise ValueError that states the rule and the value."""
         model = self.model
         i = place_of("inverted", self.inverted, model.n)
         object.__setattr__(self, "inverted", i)
@@ -195,13 +198,16 @@ class LowPass(Inversion):
         inverted: index i of the component that is solved for; -1 is the last.
         channel: index of the channel of z.
         reach: largest distance from the open loop's x_i at which a root is looked for; see `Inversion`.
+
+    Raises:
+        ValueError: as `Inversion`, or if time_constant is not positive.
     """
 
     name: ClassVar[str] = "low-pass"
     time_constant: float = 2.0
 
     def __post_init__(self):
-        """Check the numbers; raise ValueError that states the rule and the value."""
+        """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         object.__setattr__(self, "time_constant", positive("time_constant", self.time_constant))
 

@@ -221,7 +221,7 @@ def check_ensemble(members: Members, states: np.ndarray, angles: Sequence[bool] 
 
 
 def _named(rule: str, names: Sequence[str] | None, count: int, kind: str) -> tuple[str, ...]:
-    """Names of so many components, numbered where there are none; ValueError if there are more or fewer."""
+    """Names of `count` components, numbered if there are none; ValueError for another number of names."""
     names = tuple(names or (f"{kind} {i + 1}" for i in range(count)))
     if len(names) != count:
         raise ValueError(f"{rule} must be {count}, one a {kind}, but got {names!r}")

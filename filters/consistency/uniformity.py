@@ -31,7 +31,7 @@ def uniformity(values: np.ndarray, steps: int = POINTS) -> Uniformity:
 
     Args:
         values: probabilities of B runs.
-        steps: at so many equal steps the distributions are compared; for ranks, their number.
+        steps: number of equally spaced points at which the distributions are compared; for ranks, their number.
 
     Source: Bickel, Freedman (1981), "Some asymptotic theory for the bootstrap", section 4, with runs in place of
     single values.

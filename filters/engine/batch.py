@@ -115,7 +115,7 @@ def _run_side_by_side(filter_: Filter, data: tuple, noise: tuple, out: Estimates
 def trajectories(
     filter_: Filter, keys: np.ndarray | None, inputs: np.ndarray | None, measurements: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The arguments of `run` as the arrays that compiled code takes; ValueError if something is off."""
+    """The arguments of `run` as the arrays that compiled code takes; ValueError if something is wrong."""
     model = filter_.kernel_model
     # Arrays that may be written to: others are another type to numba, which compiles once more for them.
     requirements: tuple[Literal["C_CONTIGUOUS", "WRITEABLE"], ...] = "C_CONTIGUOUS", "WRITEABLE"

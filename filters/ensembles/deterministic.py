@@ -96,7 +96,7 @@ class DeterministicUpdateFilter(EnsembleFilter):
     rotations: int = 0
 
     def __post_init__(self):
-        """Check the numbers; raise ValueError that states the rule and the value."""
+        """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         switch("rotations", self.rotations)
 

@@ -147,7 +147,7 @@ class EnsembleFilter(Filter):
     relaxation: float = 0.0
 
     def __post_init__(self):
-        """Check the numbers; raise ValueError that states the rule and the value."""
+        """Check the parameters; raise ValueError that states the rule and the value."""
         size = at_least("ensemble_size", self.ensemble_size, 2)
         if size > LARGEST_ENSEMBLE:
             raise ValueError(f"ensemble_size must be at most {LARGEST_ENSEMBLE}, but got {size}")
@@ -258,6 +258,9 @@ class EnsembleKalmanFilter(EnsembleFilter):
 
     The other attributes are those of `EnsembleFilter`.
 
+    Raises:
+        ValueError: if a parameter is out of its range.
+
     Source: Evensen (1994); Burgers, van Leeuwen, Evensen (1998), "Analysis scheme in the EnKF"; centred: Evensen
     (2004), "Sampling strategies and square root analysis schemes for the EnKF".
     """
@@ -266,7 +269,7 @@ class EnsembleKalmanFilter(EnsembleFilter):
     centred_perturbations: int = 0
 
     def __post_init__(self):
-        """Check the numbers; raise ValueError that states the rule and the value."""
+        """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         switch("centred_perturbations", self.centred_perturbations)
 

@@ -142,6 +142,9 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
         iterations: evaluations of h by all members in an update, at least 1. The others are those of
             `EnsembleFilter`.
 
+    Raises:
+        ValueError: if a parameter is out of its range.
+
     Source: Sakov, Oliver, Bertino (2012), "An iterative EnKF for strongly nonlinear systems"; over the update
     alone it is the filter of Zupanski (2005), "Maximum likelihood ensemble filter: theoretical aspects", solved as
     in Bocquet, Sakov (2012), "Combining inflation-free and iterative ensemble Kalman filters for strongly
@@ -157,7 +160,7 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
         return iterated_analysis
 
     def __post_init__(self):
-        """Check the numbers; raise ValueError that states the rule and the value."""
+        """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1, MOST_ITERATIONS))
 

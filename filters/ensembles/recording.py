@@ -42,7 +42,7 @@ def record_members(
         every: ... and how many measurements later they are kept again.
 
     Raises:
-        ValueError: if the filter has no ensemble, or a number is off.
+        ValueError: if the filter has no ensemble, or a number is wrong.
     """
     if filter_.size == 0:
         raise ValueError(f"members need a filter with an ensemble, but got {filter_.name!r}")

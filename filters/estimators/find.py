@@ -43,7 +43,7 @@ def foreign_filter(given, model: StateSpaceModel, **numbers) -> Filter:
         **numbers: further arguments of the function.
 
     Raises:
-        ValueError: states the rule and the value, if there is no such thing, or it is no estimator.
+        ValueError: if there is no such object, or it is not an estimator.
     """
     found, label = _found(given), label_of(given)
     if not is_estimator(found):

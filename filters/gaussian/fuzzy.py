@@ -199,6 +199,9 @@ class FuzzyKalmanFilter(Filter):
             first state of a larger affine model. Rules are linearised at the middle of the range of other states.
         offsets: whether rules have the offset a_r that makes them exact at their corners; the sources print none.
 
+    Raises:
+        ValueError: if the range of the states is unknown or empty, or a choice is not one of those above.
+
     Source: Ngatini, Apriliani, Nurhadi (2017), "Ensemble and fuzzy Kalman filter for position estimation of an
     autonomous underwater vehicle", Expert Systems with Applications 68, for the recursion and the memberships of
     minima and maxima (whose names are exchanged in the authors' slides); Takagi, Sugeno (1985), "Fuzzy

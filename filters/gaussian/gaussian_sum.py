@@ -134,6 +134,9 @@ class GaussianSumFilter(Filter):
         parts: number of Gaussians, at least 7.
         component: index i of the component along which the belief is split; -1 is the last.
 
+    Raises:
+        ValueError: if parts or component is out of its range.
+
     Source: Alspach, Sorenson (1972), "Nonlinear Bayesian estimation using Gaussian sum approximations"; splitting
     along one direction: Faubel, McDonough, Klakow (2009), "The split and merge unscented Gaussian mixture filter".
     """
@@ -144,7 +147,7 @@ class GaussianSumFilter(Filter):
     component: int = -1
 
     def __post_init__(self):
-        """Check the numbers; raise ValueError that states the rule and the value."""
+        """Check the parameters; raise ValueError that states the rule and the value."""
         object.__setattr__(self, "parts", at_least("parts", self.parts, FEWEST_PARTS, MOST_PARTS))
         object.__setattr__(self, "component", place_of("component", self.component, self.model.n))
 

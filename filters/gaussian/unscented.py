@@ -48,7 +48,7 @@ class UnscentedKalmanFilter(Filter):
     kappa: float = 0.0
 
     def __post_init__(self):
-        """Check the numbers; raise ValueError that states the rule and the value."""
+        """Check the parameters; raise ValueError that states the rule and the value."""
         n = self.model.n
         alpha, beta, kappa = positive("alpha", self.alpha), finite("beta", self.beta), finite("kappa", self.kappa)
         if n + kappa <= 0:

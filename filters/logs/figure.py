@@ -38,7 +38,7 @@ def draw_log(found: LogEstimate, title: str, *, states: bool = True) -> Figure:
     values = [f"{STATE}:{one.symbol}" for one in model.states] + [f"{OUTPUT}:{symbol}" for symbol in model.outputs]
     shown = sorted(values, key=lambda key: key not in references)[:MOST_PANELS]
     shown = [key for key in values if key in shown] if states else []
-    heights = [TALL] * len(shown) + [LOW] * len(found.log.measured)
+    heights = [TALL] * len(shown) + [LOW if shown else TALL] * len(found.log.measured)
     figure = new_figure((WIDTH, sum(heights) + ROOM))
     axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
     tidy(axes)

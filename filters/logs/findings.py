@@ -20,7 +20,7 @@ from plants.quantities import Quantity
 
 
 class Residual(NamedTuple):
-    """How far a prediction or an estimate is off a channel of the log."""
+    """Error of a prediction or an estimate with respect to a channel of the log."""
 
     quantity: Quantity
     rmse: float  # in the channel's unit

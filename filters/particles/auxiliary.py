@@ -33,7 +33,7 @@ from plants.shape import Functions, Shape
 def auxiliary_kernels(functions: Functions, shape: Shape, regularised: bool) -> Kernels:
     """Kernels of the auxiliary particle filter for a model's functions and shape.
 
-    If it is regularised, the parents that it draws are spread, by the first of its own numbers.
+    If it is regularised, the parents that it draws are spread, by the first of its own parameters.
 
     The table's rows: n of particles, one of log weights, n of the noise in the particles, weights, scratch.
     """

@@ -24,7 +24,7 @@ from plants.shape import Functions, Shape
 def particle_kernels(functions: Functions, shape: Shape, regularised: bool) -> Kernels:
     """Kernels of the bootstrap particle filter for a model's functions and shape.
 
-    If it is regularised, the particles that it draws anew are spread, by the first of its own numbers.
+    If it is regularised, resampled particles are spread, by the first of its own parameters.
     """
     n, m, observe = shape.n, shape.m, functions.observe
     places, weights = memory_places(n, m), n + 1
@@ -98,6 +98,9 @@ class ParticleFilter(WeightedFilter):
             (never) to 1.
 
     The other attributes are those of `WeightedFilter`, c its regularisation.
+
+    Raises:
+        ValueError: if a parameter is out of its range.
 
     Source: Gordon, Salmond, Smith (1993), "Novel approach to nonlinear/non-Gaussian Bayesian state estimation";
     Kitagawa (1996) for the resampling; Kong, Liu, Wong (1994) for the ESS; Musso, Oudjane, Le Gland (2001),

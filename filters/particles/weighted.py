@@ -151,7 +151,7 @@ class WeightedFilter(Filter):
     regularisation: float = 0.0
 
     def __post_init__(self):
-        """Check the numbers; raise ValueError that states the rule and the value."""
+        """Check the parameters; raise ValueError that states the rule and the value."""
         size = at_least("ensemble_size", self.ensemble_size, 2)
         if size > LARGEST_ENSEMBLE:
             raise ValueError(f"ensemble_size must be at most {LARGEST_ENSEMBLE}, but got {size}")

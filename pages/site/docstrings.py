@@ -70,6 +70,7 @@ def escaped(lines: list[str]) -> list[str]:
     """Lines in which bars, asterisks and underscores at the end of a name are only what they are."""
     parts = PROSE_OR_CODE.split("\n".join(lines))
     parts[::2] = [MISREAD.sub(r"\\\g<0>", part) for part in parts[::2]]
+    parts[2::2] = [rf"\ {part}" if part[:1].isalnum() else part for part in parts[2::2]]  # the plural of a name
     return "".join(parts).split("\n") if lines else []
 
 
@@ -77,6 +78,11 @@ def _process(app, what, name, obj, options, lines: list[str]) -> None:
     if lines and lines[0].startswith(NOT_OURS):
         lines[:] = [""]
     lines[:] = readable(lines)
+
+
+def _skip(app, what, name, obj, skip: bool, options) -> bool | None:
+    """Fields of named tuples stand in the list of attributes, with shapes and units."""
+    return True if what == "class" and type(obj).__name__ == "_tuplegetter" else None
 
 
 def setup(app) -> dict[str, bool]:
@@ -87,4 +93,5 @@ def setup(app) -> dict[str, bool]:
         if field.name == "variable":
             field.label = "Attributes"
     app.connect("autodoc-process-docstring", _process, priority=100)
+    app.connect("autodoc-skip-member", _skip)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

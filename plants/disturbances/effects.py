@@ -94,7 +94,7 @@ class Registry:
     def make(self, given) -> tuple[Effect, ...]:
         """Effects from None, one effect or a sequence of them, each an object or a mapping with its `name`.
 
-        Raises ValueError that states the rule and the value.
+        Raises ValueError if an argument is wrong; the message states the rule and the value.
         """
         if given is None:
             return ()

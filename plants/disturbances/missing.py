@@ -93,7 +93,7 @@ class Dropout(Effect):
 
 @dataclass(frozen=True)
 class SampleEvery(Effect):
-    """A sensor slower than the plant's step: a sample every so many `steps`, from step number `first` on.
+    """A sensor slower than the plant: a sample every `steps` steps, from step number `first` on.
 
     Between two samples the measurement is missing, as with `Dropout`. A sensor of 5 Hz on a plant with a step of
     0.05 s has a sample every 4 steps.

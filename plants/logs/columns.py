@@ -77,8 +77,8 @@ def find_columns(
     """Find the column of each quantity that the file has, and of "time", by key.
 
     Quantities that are not given are found by headers: a header without its unit is the quantity's name or symbol.
-    Names are tried before symbols, and inputs, measurements, states and outputs in this order; a column is used
-    once.
+    A header that is a symbol as it stands, such as "V_s", has no unit. Names are tried before symbols, and inputs,
+    measurements, states and outputs in this order; a column is used once.
 
     Args:
         wanted: from `quantities_of`.
@@ -134,6 +134,11 @@ def _by_headers(found: dict, wanted: Sequence[Wanted], headers: Sequence[str], u
     for one in wanted:
         name = plain(one.quantity.name).lower()
         take(one.key, lambda base, name=name: plain(base).lower() == name)
+    for one in wanted:  # the whole header: what stands behind the line of "V_s" is no unit
+        header = next((header for header in bare if plain(header) == plain(one.quantity.symbol)), None)
+        if header is not None and one.key not in found:
+            del bare[header]
+            found[one.key] = Column(header, units.get(header))
     for one in wanted:
         symbol = plain(one.quantity.symbol)
         take(one.key, lambda base, symbol=symbol: plain(base) == symbol)

@@ -79,7 +79,7 @@ def read_table(path: str | Path) -> Table:
         path: of the file.
 
     Raises:
-        ValueError: states the rule and the value, with file, line and column.
+        ValueError: if the file is wrong; the message names file, line and column.
     """
     if not isinstance(path, (str, PathLike)):
         raise ValueError(f"a log must be the path of a file, but got {shown(path)}")

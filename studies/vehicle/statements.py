@@ -1,4 +1,7 @@
-"""Sentences with numbers on the two papers on the vehicle, from our runs."""
+"""Sentences with numbers on the two papers on the vehicle, from our runs.
+
+NEES is the normalised estimation error squared.
+"""
 
 from __future__ import annotations
 

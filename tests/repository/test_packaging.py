@@ -52,6 +52,16 @@ def test_whatever_of_rl_zoo3_imports_requests_is_brought_by_the_extra():
     assert "requests" in EXTRAS["peers"] or "requests" in theirs
 
 
+def test_every_package_is_known_wherever_packages_are_listed():
+    """Its folder is packed, its types and imports are checked, and what it warns of is an error."""
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]
+    included = {name.removesuffix("*") for name in settings["setuptools"]["packages"]["find"]["include"]}
+    warned = next(line for line in settings["pytest"]["ini_options"]["filterwarnings"] if line.startswith("error"))
+    there = {path.parent.name for path in ROOT.glob("*/py.typed")}
+    assert there == set(ROOMS) == included == set(settings["mypy"]["files"])
+    assert there == set(re.search(r"\((.*?)\)", warned)[1].split("|"))
+
+
 @pytest.fixture(scope="module")
 def packed(tmp_path_factory):
     """A folder with what git knows, and in dist/ a source distribution and a wheel built from it."""

@@ -70,6 +70,7 @@ def test_a_filter_shows_its_equations(name):
 
 def test_prose_keeps_its_bars_asterisks_and_underscores():
     assert readable(["|e| of x_ and `*args`"]) == [r"\|e\| of x\_ and `*args`"]
+    assert readable(["All `Log`s."]) == [r"All `Log`\ s."]
     assert readable(["One.", "", "    [columns]", "    thrust = 1"])[2] == ".. code-block:: text"
 
 

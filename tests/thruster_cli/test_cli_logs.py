@@ -12,6 +12,8 @@ import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState
 from filters.logs.estimate import estimate
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from thruster_env.parameters import PRESETS
+from thruster_env.preset_file import PresetFile, write_preset
 
 TWO_STATES = """
 from plants.affine import affine_model
@@ -188,3 +190,17 @@ def test_rows_in_which_nothing_was_measured_tell_nothing(thruster, tmp_path):  #
     assert "Nothing was measured in the rows that count, from 50 on" in " ".join(
         thruster("estimate", "run.csv").stdout.split()
     )
+
+
+def test_clock_offsets_of_a_preset_file_are_taken_off(thruster, as_json, tmp_path):  # noqa: F811
+    thruster("simulate", "--out", "run.csv", "--steps", 200)
+    table = (tmp_path / "run.csv").read_text().splitlines()
+    rows = [line.split(",") for line in table]
+    late = [row[:5] + [rows[max(k - 4, 1)][5]] for k, row in enumerate(rows[1:], start=1)]  # by 40 ms
+    (tmp_path / "late.csv").write_text("\n".join(",".join(row[:2] + row[5:]) for row in [rows[0], *late]) + "\n")
+    recorder = {"sensors": ["thrust"], "clock_offset": {"thrust": 0.04}}
+    write_preset(tmp_path / "mine.toml", PresetFile(PRESETS["tunnel"], recorder=recorder))
+    told = as_json("estimate", "late.csv", "--preset", "mine.toml")
+    assert told["mean_nis"] == pytest.approx(as_json("estimate", "run.csv")["mean_nis"], rel=0.05)
+    assert told == as_json("estimate", "late.csv", "--clock-offset", "thrust=0.04")
+    assert as_json("estimate", "late.csv", "--preset", "mine.toml", "--clock-offset", "thrust=0")["mean_nis"] > 2

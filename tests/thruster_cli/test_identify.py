@@ -91,6 +91,12 @@ MISTAKES = [
     *((("identify", "run0.csv", *OF_LOGS, *arguments), message) for arguments, message in WITH_LOG),
     (("identify", "run0.csv", "--preset", "none.toml"), "a preset file must be readable, but none.toml is not"),
     (("identify", "run0.csv", "--bollard", "table.csv"), "give either logs or --bollard TABLE.csv"),
+    (("identify", "--bollard", "t.csv", "--free", "x"), "--free must come with logs, .* but got --free x"),
+    (
+        ("identify", "--bollard", "t.csv", "--hold-noise"),
+        "--hold-noise must come with logs, .* but got --hold-noise",
+    ),
+    (("identify", "--bollard", "t.csv", "--range", "a=1:2"), "--range must come with logs"),
 ]
 
 

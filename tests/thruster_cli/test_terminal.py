@@ -15,6 +15,7 @@ from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtur
 from thruster_cli import output
 from thruster_cli.app import COMMANDS, PANELS, listed
 from thruster_cli.benchmark import fitted
+from tuning.api.run import file_name
 from tuning.search.interruption import STOPPING, stop_on_interrupt
 
 
@@ -38,6 +39,13 @@ def test_every_option_is_in_a_panel(thruster, name):  # noqa: F811
     options = rest[: rest.index("╰")]
     assert options.count("--") == 1 and "--help" in options
     assert "--json" in said[said.index("─ Output ─") :]
+
+
+def test_what_is_random_has_a_seed_and_all_write_json(thruster):  # noqa: F811
+    without = {name for name in COMMANDS if name != "study" and "--seed " not in thruster(name, "--help").stdout}
+    assert without == {"inspect", "filters", "new", "report", "verify"}
+    for name in (*set(COMMANDS) - {"study"}, "study policies", "study recordings"):
+        assert "--json " in thruster(*name.split(), "--help").stdout
 
 
 def test_names_are_taken_in_any_case(as_json):  # noqa: F811
@@ -132,3 +140,17 @@ def test_a_preset_beyond_its_range_is_warned_about(thruster):  # noqa: F811
     assert "warning" not in thruster("inspect", "--preset", "t200", "--voltage", 13, "--out", "x.png").stderr
     done = thruster("inspect", "--voltage", 60, "--max-voltage", 60, "--out", "x.png")
     assert "tunnel is known up to 24 V, but is driven by 60 V" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("auv:motion", "auv-motion"),
+        ("my folder/mine.toml", "mine"),
+        ("nominal (presets/mine.toml)", "nominal-mine"),
+        ("nominal (t200)", "nominal-t200"),
+        ("run1.csv and 2 more", "run1.csv-and-2-more"),
+    ],
+)
+def test_names_of_files_need_no_quotes(name, file):
+    assert file_name(name) == file

@@ -185,5 +185,5 @@ def test_of_more_numbers_than_can_be_paired_off_it_says_so():
         patch.setattr(identifiability, "MOST_NUMBERS", 2)
         assert identify(choice, plan.scenarios, [], plan.space()) is None
         (said,) = too_many(choice, plan.space())
-        assert "at most 2 numbers" in said and "here are 3" in said
+        assert "at most 2 parameters" in said and "here are 3" in said
         assert too_many(oracle_choice("open-loop", nominal), plan.space()) == []

@@ -97,6 +97,11 @@ def test_patience_has_an_end(flaky, monkeypatch):
         study.set_user_attr("a", 1)
 
 
+def test_a_proxy_must_have_a_host():
+    with pytest.raises(ValueError, match="got grpc://:13000: it names no host"):
+        open_storage("grpc://:13000")
+
+
 def test_a_proxy_stands_between_a_study_and_its_database(tmp_path, monkeypatch):
     pytest.importorskip("grpc")
     with socket.socket() as free:

@@ -61,10 +61,10 @@ class PIController:
             proportional_gain: K_p [V/N]; that of `lambda_gains` if None.
             integral_gain: K_i [V/(N s)]; that of `lambda_gains` if None.
             operating_voltage: where `lambda_gains` linearises [V].
-            time_constant: what `lambda_gains` gives the loop [s].
+            time_constant: closed-loop time constant for `lambda_gains` [s].
 
         Raises:
-            ValueError: if the env does not measure its thrust, an argument is off, or the rule finds no gains.
+            ValueError: if the env does not measure its thrust, an argument is wrong, or the rule finds no gains.
         """
         plant = env.unwrapped.plant
         if "thrust" not in plant.channels:
@@ -98,7 +98,7 @@ class PIController:
 
 @dataclass(frozen=True, eq=False)
 class LQRController:
-    """Follow a reference thrust by the true state, with the feedback that costs least by the reward.
+    """Follow a reference thrust by the true state, with the feedback that is optimal for the reward.
 
         V_k = V* - K_T (T(x_k) - r) - K_U (U_a - U_a*) - K_V (V_{k-1} - V*),    cut off at the voltage range
 
@@ -122,7 +122,7 @@ class LQRController:
 
     @classmethod
     def for_env(cls, env) -> LQRController:
-        """A controller for a bow thruster env, single or in number, from its plant and the weights of its reward.
+        """A controller for a bow thruster env or vector env, from its plant and the weights of its reward.
 
         Raises:
             ValueError: if `quadratic_gain` finds no gain.

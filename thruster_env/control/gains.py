@@ -15,7 +15,7 @@ from thruster_env.task import Task, thrust_scale
 def lambda_gains(
     plant: Plant, operating_voltage: float | None = None, time_constant: float | None = None
 ) -> tuple[float, float]:
-    """Gains K_p [V/N] and K_i [V/(N s)] of a PI controller from the time constant lambda that its loop is to have.
+    """Gains K_p [V/N] and K_i [V/(N s)] of a PI controller for a closed-loop time constant lambda.
 
         K_p = (1 - exp(-dt/lambda))/(C B_d),    K_i dt = K_p (1 - p)
 
@@ -33,7 +33,7 @@ def lambda_gains(
         time_constant: lambda [s]; by default that of the motor, or two sample times if these are longer.
 
     Raises:
-        ValueError: if an argument is off, or the plant is unstable or its thrust has no slope there.
+        ValueError: if an argument is wrong, or the plant is unstable or its thrust has no slope there.
 
     Source: E. B. Dahlin (1968), "Designing and tuning digital controllers", Instruments and Control Systems 41(6);
     for zeros, S. Skogestad (2003), "Simple analytic rules for model reduction and PID controller tuning",

@@ -1,4 +1,4 @@
-"""Voltages that cost least over the next steps by the equations of motion: a search, and Gauss-Newton's method.
+"""Optimal voltages over the next steps by the equations of motion: a grid search, and Gauss-Newton's method.
 
 The cost is the env's own, `task.step_cost`, of the thrust that the model predicts. Compiled, copy by copy.
 """

@@ -28,8 +28,8 @@ class PredictiveController:
         V_k, .. = argmin sum_{i=0}^{H-1} c(T(x_{k+i+1}) - r, V_{k+i}, V_{k+i} - V_{k+i-1}),   |V| <= V_max
         x_{k+i+1} = F(x_{k+i}, V_{k+i}),     c = `task.step_cost`
 
-    of which the first is applied: model-predictive control. The reference r_{k+1} is held, for nobody knows the
-    next one. With H = 1, the one-step controller, V_k is the best voltage of a grid, refined once, which no local
+    of which the first is applied: model-predictive control. The reference r_{k+1} is held, because the next one is
+    unknown. With H = 1, the one-step controller, V_k is the best voltage of a grid, refined once, which no local
     minimum can trap. Beyond, Gauss-Newton's method starts from it and the last plan (`planning.improve_plans`).
 
     There is no integral: where the thruster is not the model, an error stays. On an estimate this is certainty
@@ -42,12 +42,12 @@ class PredictiveController:
 
     @classmethod
     def for_env(cls, env, horizon: int = HORIZON, constants: Constants | None = None) -> PredictiveController:
-        """A controller for a bow thruster env, single or in number, from its plant and the weights of its reward.
+        """A controller for a bow thruster env or vector env, from its plant and the weights of its reward.
 
         Args:
             env: the env, wrapped or not.
             horizon: H, steps that are planned.
-            constants: of the thruster it believes in; the plant's nominal ones if None.
+            constants: of the thruster that it assumes; the plant's nominal ones if None.
 
         Raises:
             ValueError: if the env moves by a published linear system, or the horizon is less than 1.

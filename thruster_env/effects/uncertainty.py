@@ -87,7 +87,7 @@ DISTRIBUTIONS = {cls.name: cls for cls in (Uniform, LogNormal)}
 def make_uncertainty(given) -> dict[str, Uniform | LogNormal]:
     """Distributions by parameter from None or a mapping such as {"load_gain": {"name": "uniform", ...}}.
 
-    Raises ValueError that states the rule and the value.
+    Raises ValueError if an argument is wrong; the message states the rule and the value.
     """
     if given is None:
         return {}

@@ -23,7 +23,7 @@ def make_linear_plant(system: str = "tunnel", **plant_arguments) -> Plant:
             is the published 0.5 for every channel if None.
 
     Raises:
-        ValueError: states the rule and the value.
+        ValueError: if an argument is wrong; the message states the rule and the value.
     """
     model = PUBLISHED[one_of("system", system, tuple(PUBLISHED))]
     plant = make_plant("tunnel", substeps=1, **plant_arguments)

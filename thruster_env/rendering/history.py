@@ -1,4 +1,4 @@
-"""What a picture shows: moments, and what a filter believes of them."""
+"""Contents of a picture: the truth at each step, and the estimate of a filter."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Moment(NamedTuple):
 
 
 class Overlay(NamedTuple):
-    """What a filter believes of a moment; None where it believes nothing."""
+    """The estimate of a filter at a step; None where it has none."""
 
     label: str  # name of the filter in the legend
     thrust: float | None = None  # [N]

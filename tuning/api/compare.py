@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from filters.augmented import Unknown
-from filters.estimators.find import is_foreign
+from filters.estimators.find import is_foreign, label_of
 from filters.registry import filter_class
 from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least, shown
@@ -118,10 +118,10 @@ def contenders_of(
         sizes: ensemble size by name; under None that of all others.
         seed: of the study whose training runs scale the scaled default.
     """
-    for name, size in sizes.items():
+    for name, number in sizes.items():
         if name is not None and not has_ensemble(name):
-            raise ValueError(f"ensemble_size must be for a filter with an ensemble, but got {name}: {size}")
-        at_least("ensemble_size", size, 2)
+            raise ValueError(f"ensemble_size must be for a filter with an ensemble, but got {name}: {number}")
+        at_least("ensemble_size", number, 2)
 
     def size_of(name: Any) -> int | None:
         return sizes[name] if name in sizes else sizes.get(None)
@@ -130,7 +130,7 @@ def contenders_of(
     for one in filters:
         if isinstance(one, Study):
             choice = sized(one.choice, size_of(one.choice.name))
-            out.append(Contender(_new(f"{choice.name} tuned", out), partial(_same, choice)))
+            out.append(Contender(_new(f"{label_of(choice.name)} tuned", out), partial(_same, choice)))
         elif not is_filter(one):
             size = size_of(read_tuned_file(one)["filter"]["name"])
             out.append(Contender(_new(Path(one).stem, out), partial(_from_file, Path(one), size)))

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from filters.consistency.intervals import Interval
 from filters.consistency.report import ConsistencyReport
+from filters.estimators.find import label_of
 from filters.filter import Filter
 from numerics.checks import at_least
 from tuning.api.progress import working
@@ -123,7 +124,8 @@ class HeldOut:
         """
         from tuning.reporting.figures import draw_comparison
 
-        return drawn(draw_comparison(self.proof, f"{self.choice.name} on {self.problem.name}", self.choice.name))
+        name = self.choice.name
+        return drawn(draw_comparison(self.proof, f"{label_of(name)} on {self.problem.name}", name))
 
     def plot_run(self, place: int = 0) -> Figure:
         """One held-out run over time, of the first baseline and the filter: truth, estimate and 95 % band.
@@ -151,13 +153,14 @@ class HeldOut:
         """
         from tuning.reporting.consistency_figures import draw_consistency
 
-        title = f"{self.choice.name} on {len(self.seeds)} seeds of {self.problem.name}"
+        title = f"{label_of(self.choice.name)} on {len(self.seeds)} seeds of {self.problem.name}"
         scored = self.evaluation.scored or None
         report, name = self.check_consistency(), self.choice.name
         return drawn(draw_consistency(report, title, scored=scored, filter_name=name))
 
     def __repr__(self) -> str:
-        what = f"{self.choice.name} on {self.problem.name}, {len(self.seeds)} held-out {self.problem.seed_word}"
+        seeds = f"{len(self.seeds)} held-out {self.problem.seed_word}"
+        what = f"{label_of(self.choice.name)} on {self.problem.name}, {seeds}"
         if not self.evaluation.has_truth:
             return f"HeldOut({what}: log-likelihood of a run {number(self.evaluation.log_likelihood)})"
         ratios = [f"{about(one)} x {name}" for name, one in self.ratios.items()][: int(self.is_tuned)]
@@ -184,7 +187,7 @@ def on_held_out(
     console: Console,
 ) -> HeldOut:
     """Run a choice and its baselines on held-out seeds; the arguments are those of `HeldOut` and `prove`."""
-    with working(f"{choice.name} on {seeds} seeds of {problem.name}", console):
+    with working(f"{label_of(choice.name)} on {seeds} seeds of {problem.name}", console):
         return HeldOut(choice, problem, prove(choice, problem, seed, seeds), is_tuned, seed)
 
 

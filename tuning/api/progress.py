@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import (
@@ -17,8 +17,10 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from filters.estimators.find import label_of
 from numerics.checks import shown
 from numerics.progress import listening
+from tuning.api.notebook import NotebookLine
 from tuning.search.interruption import STOPPING
 
 if TYPE_CHECKING:
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from tuning.search.plan import Plan
     from tuning.search.study import OnTrial
 
+WIDTH = 100  # of a line in a notebook
 ShowKinds = Callable[[Sequence[str]], None]
 
 
@@ -41,10 +44,11 @@ def console_for(progress: bool | None) -> Console:
     if progress not in (True, False, None):
         raise ValueError(f"progress must be True, False or None, but got {shown(progress)}")
     console = Console(stderr=True, markup=False, highlight=False)
-    if console.is_jupyter and importlib.util.find_spec("ipywidgets") is None:  # by which rich shows live displays
-        console = Console(stderr=True, markup=False, highlight=False, force_jupyter=False)
-        return console if progress else Console(quiet=True)
-    console.quiet = progress is False or (progress is None and not (console.is_terminal or console.is_jupyter))
+    shown_live = console.is_terminal or console.is_jupyter
+    if console.is_jupyter and importlib.util.find_spec("ipywidgets") is None:  # by which rich draws in notebooks
+        options: dict[str, Any] = {"force_jupyter": False, "force_terminal": True, "color_system": None}
+        console = Console(file=NotebookLine(), width=WIDTH, markup=False, highlight=False, **options)
+    console.quiet = progress is False or (progress is None and not shown_live)
     return console
 
 
@@ -71,7 +75,7 @@ def trial_bar(
     from tuning.search.filter_types import kinds_running
     from tuning.search.outcome import best_trial
 
-    title = f"tuning {{}} on {names}"
+    title, named = f"tuning {{}} on {names}", label_of(plan.filter)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -80,11 +84,11 @@ def trial_bar(
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console) as progress:
-        task = progress.add_task(title.format(plan.filter), total=total, completed=min(done, total), best="-")
+        task = progress.add_task(title.format(named), total=total, completed=min(done, total), best="-")
 
         def show_kinds(kinds: Sequence[str]) -> None:
             if len(plan.kinds) > 1:
-                progress.update(task, description=title.format(f"{plan.filter} ({', '.join(kinds)})"))
+                progress.update(task, description=title.format(f"{named} ({', '.join(kinds)})"))
 
         def advance(study, finished: int) -> None:
             trials = study.get_trials(deepcopy=False)

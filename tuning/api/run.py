@@ -12,6 +12,7 @@ from typing import NamedTuple
 import optuna
 from rich.console import Console
 
+from filters.estimators.find import label_of
 from numerics.checks import at_least, one_of, shown
 from numerics.files import check_target
 from tuning.api.progress import trial_bar, working
@@ -141,7 +142,11 @@ def _check_method(plan: Plan, by_gradient: bool) -> None:
 
 def name_of(plan: Plan, by_gradient: bool = False) -> str:
     """A name for a study of a plan: what differs from the default is in it."""
-    parts = [plan.filter, names_of(plan).replace(", ", "+"), f"seed{plan.seed}"]
+    parts = [
+        re.sub(r"[^\w.+-]+", "-", label_of(plan.filter)),
+        names_of(plan).replace(", ", "+"),
+        f"seed{plan.seed}",
+    ]
     parts += ["+".join(plan.objectives)] * (plan.objectives != ("score",))
     parts += ["hold-r"] * plan.hold_r + ["full-q"] * plan.full_q
     parts += [] if plan.budget is None else [f"budget{plan.budget:g}"]
@@ -155,10 +160,15 @@ def names_of(plan: Plan) -> str:
 
 
 def short_name(problem: Problem) -> str:
-    """A problem's name as that of a study and of a file has it: without folders and what shells read."""
-    name = Path(problem.name)
-    text = name.stem if name.suffix == ".toml" else name.name
-    return re.sub(r"[^\w.+-]+", "-", text.replace(".toml)", ")")).strip("-")
+    """A problem's name as that of a study and of a file has it."""
+    return file_name(problem.name)
+
+
+def file_name(name: str) -> str:
+    """A problem's name without folders and what shells read: "nominal-mine" of "nominal (presets/mine.toml)"."""
+    paths = [Path(part.removesuffix(")")) for part in name.split(" (")]
+    text = "-".join(path.stem if path.suffix == ".toml" else path.name for path in paths)
+    return re.sub(r"[^\w.+-]+", "-", text).strip("-")
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from optuna.trial import FrozenTrial, TrialState
 
+from filters.estimators.find import label_of
 from filters.filter import Filter
 from tuning.api.held_out import HeldOut
 from tuning.api.run import Tuning
@@ -157,7 +158,7 @@ class Study:
 
     def __repr__(self) -> str:
         result, names = self.tuning.result, ", ".join(one.name for one in self.problems)
-        said = f"Study({self.choice.name} on {names}, {result.finished} trials"
+        said = f"Study({label_of(self.choice.name)} on {names}, {result.finished} trials"
         ended = ", interrupted" if self.interrupted else ""
         if not self.tuning.proof.tuned.has_truth:
             return f"{said}{ended}: tuning {worth(self.tuning.proof)})"
@@ -168,7 +169,7 @@ class Study:
 
         found = self.held_out
         rows = number_rows(list(found.choices.values()), self.choice.name, self.problem, _text)
-        numbers = html(f"Numbers of the {self.choice.name} filter", ["", *found.choices], rows)
+        numbers = html(f"Numbers of the {label_of(self.choice.name)} filter", ["", *found.choices], rows)
         return numbers + found._repr_html_() + f"<p>Tuning {worth(self.tuning.proof)}.</p>"
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from numerics.checks import one_of
+from numerics.checks import one_of, shown
 from tuning.api.problems import problems_of
 from tuning.api.progress import console_for
 from tuning.api.run import METHODS, run_tuning
@@ -16,7 +16,7 @@ from tuning.search.plan import Plan
 
 def tune(
     problem: Any,
-    filter: Any = "ekf",
+    filter: str = "ekf",
     *,
     trials: int = 50,
     seed: int = 0,
@@ -59,7 +59,8 @@ def tune(
             `Problem`; a pair (model, data) of a model, or a thruster's preset, and recorded runs; or a list of
             several problems, whose objectives are averaged. Recorded runs are paths, tables of pandas, mappings
             from headers to arrays, or `Log`s.
-        filter: name of a filter; "auto" for the best of all within the budget; or somebody's estimator.
+        filter: name of a filter; "auto" for the best of all within the budget; or "module:object" for an estimator
+            of your own, which can be used and evaluated, but not saved.
         trials: finished trials that the study shall have in total.
         seed: of all randomness; the same seed repeats all.
         objective: what is minimised, or two for a Pareto front, as `thruster tune --objective` lists them; the
@@ -93,6 +94,10 @@ def tune(
         KeyboardInterrupt: after Ctrl-C before any trial is complete, or in the midst of the proof.
     """
     one_of("method", method, METHODS)
+    if not isinstance(filter, str):
+        raise ValueError(
+            f"filter must be a name or 'module:object', by which trials keep it, but got {shown(filter)}"
+        )
     of_logs = {"sensors": sensors, "columns": columns, "clock_offset": clock_offset, "dt": dt}
     problems = problems_of(problem, preset, **of_logs, held_out=held_out, blocks=blocks, lead=lead)
     if objective is None:

@@ -2,7 +2,7 @@
 
     python -m tuning.auv.scenarios [NAME ...]
 
-computes their scales anew and prints them.
+recomputes their scales and prints them.
 """
 
 from __future__ import annotations

@@ -249,7 +249,7 @@ def timed_runs(filter_: Filter, data: Data) -> tuple[RunMetrics, float]:
     few = data.filter_keys[:2], data.inputs[:2, :2], data.measurements[:2, :3]
     first = [np.ascontiguousarray(part) for part in few]
     for part in first:
-        part.setflags(write=False)  # as the data's are: numba compiles writable arrays anew
+        part.setflags(write=False)  # as the data's arrays: numba compiles again for writable ones
     run(filter_, *first)
     found, seconds, started = [], 0.0, time.perf_counter()
     for some, estimates in estimates_in_parts(filter_, data):

@@ -1,4 +1,7 @@
-"""The ensemble size: score against N on fresh seeds, and the smallest N that is as good as the best."""
+"""The ensemble size: score against N on fresh seeds, and the smallest N that is as good as the best.
+
+NIS is the normalised innovation squared.
+"""
 
 from __future__ import annotations
 

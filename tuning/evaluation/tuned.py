@@ -1,4 +1,7 @@
-"""The tuned file: one JSON file with a filter's parameters, their origin and their held-out metrics."""
+"""The tuned file: one JSON file with a filter's parameters, their origin and their held-out metrics.
+
+NIS is the normalised innovation squared.
+"""
 
 from __future__ import annotations
 
@@ -91,7 +94,7 @@ def check_keepable(name) -> None:
     if is_foreign(name):
         raise ValueError(
             f"a tuned file must be of a filter of filters.FILTERS, but got {label_of(name)!r}: "
-            "tune an estimator by tuning.search.study.run_study, and keep its choice yourself"
+            "tune an estimator by tuning.tune, and keep its choice yourself"
         )
 
 

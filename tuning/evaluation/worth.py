@@ -1,4 +1,7 @@
-"""Held-out results in words: the gain over each baseline, and what the scaled default is."""
+"""Held-out results in words: the gain over each baseline, and what the scaled default is.
+
+NIS is the normalised innovation squared.
+"""
 
 from __future__ import annotations
 

@@ -99,15 +99,20 @@ class Identification(NamedTuple):
         """The former name of `least_determined`."""
         return self.least_determined
 
-    @property
-    def _at_zero(self) -> list[str]:
-        """Parameters at an end that is zero, beyond which there is nothing, as of the width of a dead band."""
-        free = self.objective.coordinates.free
-        return [
+    def _end_sentences(self) -> list[str]:
+        """Which values are at an end of their range; beyond zero, as of a dead band's width, there is nothing."""
+        said, free = [], [one for one in self.objective.coordinates.free if self.at_end[one.name]]
+        gone = [
             one.name
             for one in free
             if 0.0 in (one.low, one.high) and abs(self.values[one.name]) <= 1e-5 * (one.high - one.low)
         ]
+        others = [one.name for one in free if one.name not in gone]
+        if gone:
+            said.append(f"At zero, where the range ends: {', '.join(gone)}. The data ask for none of it.")
+        if others:
+            said.append(f"At an end of the range: {', '.join(others)}. A wider one may fit better.")
+        return said
 
     def sentences(self) -> list[str]:
         """Sentences on what the data determine, and what they do not."""
@@ -119,12 +124,7 @@ class Identification(NamedTuple):
         if wide:
             rule = "a 95 % interval takes half the range, or a factor of ten"
             said.append(f"The data do not determine {', '.join(wide)}: {rule}.")
-        gone = [name for name in ends if name in self._at_zero]
-        if gone:
-            said.append(f"At zero, where the range ends: {', '.join(gone)}. The data ask for none of it.")
-        if len(ends) > len(gone):
-            others = ", ".join(name for name in ends if name not in gone)
-            said.append(f"At an end of the range: {others}. A wider one may fit better.")
+        said += self._end_sentences()
         for one, other, correlation in self.traded:
             said.append(f"{one} and {other} trade off (correlation {correlation:.3f}).")
         if len(self.least_determined) > 1 and wide:
@@ -193,7 +193,7 @@ def covariance(information: np.ndarray, scores: np.ndarray, width: np.ndarray) -
 
     J is the Fisher information, g_b the scores of B nearly independent runs, or of blocks where there are few
     runs. The first holds for a wrong model, too; the second is for directions in which the scatter is too small.
-    In a direction on which the data have no information the standard deviation is at least that of the range.
+    In a direction on which the data have no information the standard deviation is larger than the range.
 
     Args:
         information: J, (p, p).

@@ -98,8 +98,8 @@ def identify(
     untuned = parameters_of(untuned_choice(choice.name, scenarios[0]))
     starts = np.log(tuned), np.log([untuned.get(name, own[name]) for name in names])
     best = maximum(log_likelihoods, starts, bounds)
-    told = known_information(choice, scenarios, data, names, np.exp(best))
-    cov = covariance(curvatures(log_likelihoods, best) if told is None else told)
+    known = known_information(choice, scenarios, data, names, np.exp(best))
+    cov = covariance(curvatures(log_likelihoods, best) if known is None else known)
     identified = is_identified(log_likelihoods, best, cov, bounds)
     return Identifiability(names, tuned, np.exp(best), cov, identified)
 

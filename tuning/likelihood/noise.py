@@ -90,10 +90,10 @@ def known_information(
             return None
         try:
             noise_at = noise_family(choice, scenario, [known[name] for name in names])
-            told = information(*noise_at(values, one))
+            in_runs = information(*noise_at(values, one))
             if scenario.leads_in and one.first_scored:  # the lead-in is left out
-                told = told - information(*noise_at(values, one.beginning))
-            found.append(told)
+                in_runs = in_runs - information(*noise_at(values, one.beginning))
+            found.append(in_runs)
         except ValueError:  # more than Q and R changes
             return None
     return np.concatenate(found)

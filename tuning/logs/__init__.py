@@ -1,1 +1,1 @@
-"""Recorded runs as a user names them: which log, whose model, and the problem that some logs make."""
+"""Recorded runs as a user names them: the log, its model, and the problem of several logs."""

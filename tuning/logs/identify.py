@@ -1,4 +1,4 @@
-"""What is to be identified: runs to learn from, those held out, and whose parameters they are of."""
+"""The input of an identification: training runs, held-out runs, and the model family."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from tuning.problems.parameter import Parameter
 from tuning.problems.rooms import room_of_logs
 
 EVERY_THIRD = 3
-OFFSET_SHARE = 4  # of a log, that a clock offset may take away
+OFFSET_SHARE = 4  # a clock offset may be at most the length of a log divided by this
 
 
 def split_runs(
     logs: Any, held_out: Any = None, *, use_all: bool = False, **options: Any
 ) -> tuple[list[Log], list[Log]]:
-    """The logs to learn from, and those that only validate: every third of three or more, unless it is told.
+    """The training logs, and the held-out ones for validation: by default every third of three or more.
 
     Args:
         logs: recorded runs, as `tuning.logs.read.read_named` takes them.
-        held_out: those that only validate, themselves or by path or name.
-        use_all: whether none is held out.
-        **options: of `read_named`.
+        held_out: the held-out runs, or their paths or names.
+        use_all: whether no run is held out.
+        **options: options of `read_named`.
 
     Raises:
         ValueError: states the rule and the value.
     """
-    runs, proving = runs_by_name(logs, held_out)
-    if use_all and proving:
-        raise ValueError(f"give either --held-out or --use-all, but got both, --held-out {proving[0]}")
+    runs, validating = runs_by_name(logs, held_out)
+    if use_all and validating:
+        raise ValueError(f"give either --held-out or --use-all, but got both, --held-out {validating[0]}")
     names = list(runs)
-    if not proving and not use_all and len(names) >= EVERY_THIRD:
-        proving = names[EVERY_THIRD - 1 :: EVERY_THIRD]
-    learning = [name for name in names if name not in proving]
+    if not validating and not use_all and len(names) >= EVERY_THIRD:
+        validating = names[EVERY_THIRD - 1 :: EVERY_THIRD]
+    learning = [name for name in names if name not in validating]
     if not learning:
         raise ValueError("at least one log must be left to learn from, but all are held out")
-    read = {name: read_named(runs[name], **options, name=name)[0] for name in (*learning, *proving)}
+    read = {name: read_named(runs[name], **options, name=name)[0] for name in (*learning, *validating)}
     _check_times(list(read.values()))
-    return [read[name] for name in learning], [read[name] for name in proving]
+    return [read[name] for name in learning], [read[name] for name in validating]
 
 
 def family_of(
@@ -62,16 +62,16 @@ def family_of(
     """The thruster or the model whose parameters are free.
 
     Args:
-        logs: to learn from.
-        free: names of what is to be found; of a thruster there is a default.
+        logs: training logs.
+        free: names of the free parameters; a thruster has a default.
         preset: the thruster where the search starts.
-        model: in its place: a model, what makes one, or "module:object".
-        sensors: what the filter sees of a thruster.
-        noise: whether the variances of Q and R are found, too.
-        filter: whose innovations count; a thruster's are the ekf's.
+        model: instead of a thruster: a model, a function that makes one, or "module:object".
+        sensors: measured channels of a thruster.
+        noise: whether the variances of Q and R are free, too.
+        filter: the filter whose innovations are used; for a thruster always the ekf.
 
     Raises:
-        ValueError: for an unknown name, with those that are known.
+        ValueError: for an unknown name; the message has the known ones.
     """
     if model is None:
         if filter != "ekf":
@@ -85,7 +85,7 @@ def family_of(
 
 
 class LoggedFamily(ModelFamily):
-    """A model's family with the logs it is identified on, as that of a thruster has them."""
+    """A model's family with the logs that it is identified on, as `ThrusterFamily` has them."""
 
     def __init__(self, logs: Sequence[Log], make: Any, free: Sequence[str], **options: Any):
         """Keep the logs."""
@@ -93,12 +93,12 @@ class LoggedFamily(ModelFamily):
         self.data = tuple(logs)
 
     def shifted(self, logs: Sequence[Log]) -> tuple[Log, ...]:
-        """Other logs as this family takes them."""
+        """Other logs for this family, unchanged."""
         return tuple(logs)
 
 
 def check_offsets(parameters: Sequence[Parameter], logs: Sequence[Log]) -> None:
-    """Raise ValueError unless the ranges of clock offsets leave most of each log: no data fit any model."""
+    """Raise ValueError unless ranges of clock offsets are short: without common data any model would fit."""
     most = min(log.times[-1] for log in logs) / OFFSET_SHARE
     for one in parameters:
         if one.name.startswith("clock_offset_") and max(-one.low, one.high) > most:
@@ -112,10 +112,10 @@ def write_found(path: str | Path, found: Identification, family: Any, logs: Sequ
     """Write the preset file of a thruster, or the values of a model.
 
     Args:
-        path: of a file that ends in .toml.
+        path: path of a file that ends in .toml.
         found: from `tuning.identification.identify`.
         family: from `family_of`.
-        logs: names of the runs it learned from.
+        logs: names of the training runs.
 
     Raises:
         ValueError: if the path has another ending or cannot be written.
@@ -129,7 +129,7 @@ def write_found(path: str | Path, found: Identification, family: Any, logs: Sequ
 
 
 def _check_times(logs: Sequence[Log]) -> None:
-    """Raise ValueError unless all logs have one sample time."""
+    """Raise ValueError unless all logs have the same sample time."""
     for log in logs[1:]:
         if abs(log.dt - logs[0].dt) > 1e-6 * logs[0].dt:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""Recorded logs as the problem of a study: from what a user says of them, or as a tuned file names them."""
+"""Recorded logs as the problem of a study: from a user's options, or from those in a tuned file."""
 
 from __future__ import annotations
 
@@ -31,44 +31,43 @@ def log_problem(
     """The problem of some logs.
 
     Args:
-        logs: a recorded run or several: paths, tables or `Log`s, as `read_named` takes them. Tables are called
-            run1, run2, ...
-        held_out: runs that a study never sees, by path or name, or themselves; those that are not among the logs
-            are added to them.
-        blocks: of each run.
+        logs: a recorded run or several: paths, tables or `Log`s, as `read_named` takes them. Names of
+            tables are run1, run2, ...
+        held_out: held-out runs, or their paths or names; those that are not among the logs are added to them.
+        blocks: number of blocks of each run.
         lead: rows of a block's lead-in.
-        **options: of `read_named`.
+        **options: options of `read_named`.
 
     Raises:
         ValueError: states the rule and the value.
     """
-    runs, proving = runs_by_name(logs, held_out)
+    runs, held = runs_by_name(logs, held_out)
     if not runs:
         raise ValueError("a problem of logs must have at least one, but got none: say --log FILE")
     pairs = [read_named(log, **options, name=name) for name, log in runs.items()]
     recorded = [log for log, _ in pairs]
     model = read_for(recorded[0], pairs[0][1])[1]()
-    cuts: dict[str, Any] = {"held_out": proving, "blocks": blocks, "lead": lead}
+    cuts: dict[str, Any] = {"held_out": held, "blocks": blocks, "lead": lead}
     cuts = {key: value for key, value in cuts.items() if value is not None and value != []}
     return LogProblem(recorded, model, **cuts, content=_content(runs, options, cuts))
 
 
 def runs_by_name(logs: Any, held_out: Any = None) -> tuple[dict[str, Any], list[str]]:
-    """All runs by name, those held out behind the others unless they are among them, and the names of these."""
+    """All runs by name, with further held-out runs at the end, and the names of the held-out runs."""
     runs: dict[str, Any] = {}
     for log in listed(logs):
         _add(runs, name_of(log, len(runs)), log)
-    proving = []
+    held = []
     for log in listed(held_out):
         name = name_of(log, len(runs))
         if not (isinstance(log, str) and name in runs):
             _add(runs, name, log)
-        proving.append(name)
-    return runs, list(dict.fromkeys(proving))
+        held.append(name)
+    return runs, list(dict.fromkeys(held))
 
 
 def listed(logs: Any) -> list:
-    """Several recorded runs as a list, which one may be given without; nothing for None."""
+    """Recorded runs as a list; a single run need not be in one. Empty for None."""
     if logs is None:
         return []
     return list(logs) if isinstance(logs, list | tuple) else [logs]
@@ -81,32 +80,33 @@ def _add(runs: dict[str, Any], name: str, log: Any) -> None:
 
 
 def name_of(log: Any, place: int) -> str:
-    """What a log is called: by its path, its own name, or a table by its place among the others."""
+    """Name of a log: its path, its own name, or for a table its number."""
     if isinstance(log, Log):
         return log.name
     return str(log) if isinstance(log, str | PathLike) else f"run{place + 1}"
 
 
 def _content(runs: Mapping[str, Any], options: Mapping[str, Any], cuts: Mapping[str, Any]) -> dict | None:
-    """What makes the problem anew, as JSON can hold it; None where logs are no files, or the model an object."""
-    model, told = options.get("model"), dict(options)
+    """The options of the problem as data for JSON; None where a log is not a file, or the model is an object."""
+    model, plain = options.get("model"), dict(options)
     if not all(isinstance(log, str | PathLike) for log in runs.values()) or not isinstance(model, str | None):
         return None
     for name in ("columns", "clock_offset"):
-        told[name] = texts(told.get(name))
-    told["preset"] = None if told.get("preset") is None else str(told["preset"])
-    told["sensors"] = None if told.get("sensors") is None else list(told["sensors"])
-    kept = {name: told[name] for name in options if told[name] is not None}
+        plain[name] = texts(plain.get(name))
+    plain["preset"] = None if plain.get("preset") is None else str(plain["preset"])
+    plain["sensors"] = None if plain.get("sensors") is None else list(plain["sensors"])
+    kept = {name: plain[name] for name in options if plain[name] is not None}
     return {"options": {**kept, **cuts}}
 
 
 def problems_in(file: Path, model: str | None = None) -> list[Problem]:
-    """The problems of logs that a tuned file names, read anew; none if it names none.
+    """The problems of logs that a tuned file names, read again; empty if it names none.
 
-    A model that is code is not imported because a file names it: the caller says it once more.
+    A model that is code is not imported because a file names it: the caller has to give it again.
 
     Raises:
-        ValueError: if a log cannot be read, the options in the file are none, or the model is code and not given.
+        ValueError: if a log cannot be read, the options in the file are damaged, or a model that is code is not
+            given.
     """
     if not file.is_file():
         return []
@@ -134,7 +134,7 @@ def problems_in(file: Path, model: str | None = None) -> list[Problem]:
 
 
 def _check_model(named, given: str | None, file: Path) -> None:
-    """Raise ValueError unless the caller gives the code that a file names, or none where it names none."""
+    """Raise ValueError unless the caller gives exactly the code that a file names."""
     if named is None and given is not None:
         raise ValueError(f"--model must be left out for logs of a thruster, as in {file}, but got {shown(given)}")
     if named != given:

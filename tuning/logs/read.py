@@ -1,4 +1,4 @@
-"""One recorded run and what offers its model: a file or a table, whose it is, and which column is which."""
+"""One recorded run with its model: a file or a table, its plant, and the meaning of its columns."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from plants.logs.log import Log
 from plants.replay import ANY_DT, read_for
 from tuning.problems.rooms import room_of_logs
 
-Told = Mapping[str, Any] | Sequence[str] | None  # by name, or texts NAME=VALUE as command lines have them
+Named = Mapping[str, Any] | Sequence[str] | None  # a mapping, or texts NAME=VALUE as on a command line
 
 
 def read_named(
@@ -20,23 +20,23 @@ def read_named(
     preset: str | Path | None = None,
     model: Any = None,
     sensors: Sequence[str] | None = None,
-    columns: Told = None,
-    clock_offset: Told = None,
+    columns: Named = None,
+    clock_offset: Named = None,
     dt: float | None = None,
     name: str | None = None,
 ) -> tuple[Log, Any]:
-    """A log, and what offers its model at its sample time.
+    """A log, and the source of its model at its sample time.
 
     Args:
-        path: of a file; a table, as a pandas.DataFrame or a mapping from headers to arrays; or a `Log`.
-        preset: the thruster that it is of, by name or file, whose clock offsets are taken off; of a model a
-            FILE.toml with its numbers.
-        model: in place of a thruster: a `StateSpaceModel`, what makes or offers one, or "module:object".
-        sensors: what a filter sees of a thruster.
+        path: path of a file; a table, as a pandas.DataFrame or a mapping from headers to arrays; or a `Log`.
+        preset: the recorded thruster, by name or file, whose clock offsets are corrected; for a model a FILE.toml
+            with its values.
+        model: instead of a thruster: a `StateSpaceModel`, what makes or offers one, or "module:object".
+        sensors: measured channels of a thruster.
         columns: headers by quantity, a mapping or texts NAME=HEADER[UNIT].
         clock_offset: seconds by quantity, a mapping or texts NAME=SECONDS.
         dt: sample time [s].
-        name: of a log that is no file.
+        name: name of a log that is not a file.
 
     Raises:
         ValueError: states the rule and the value.
@@ -67,14 +67,14 @@ def read_named(
     thruster = room.Preset(whose, sensors, ANY_DT)
     log, _ = read_for(path, thruster.state_space_model(), **options)
     known = {key: value for key, value in thruster.clock_offset.items() if f"measurement:{key}" not in log.offsets}
-    if known and not isinstance(path, Log):  # what the user or the log itself says goes first
+    if known and not isinstance(path, Log):  # offsets of the user or of the log itself have priority
         options["clock_offset"] |= known
         log, _ = read_for(path, thruster.state_space_model(), **options)
     return log, room.Preset(whose, sensors, log.dt)
 
 
-def pairs(option: str, given: Told) -> dict[str, Any]:
-    """A mapping from itself, or from texts NAME=VALUE; ValueError for another form, or a name that comes twice."""
+def pairs(option: str, given: Named) -> dict[str, Any]:
+    """A mapping, from a mapping or from texts NAME=VALUE; ValueError for another form, or a repeated name."""
     if isinstance(given, Mapping):
         return dict(given)
     if isinstance(given, str) or not isinstance(given, Sequence | None):
@@ -89,8 +89,8 @@ def pairs(option: str, given: Told) -> dict[str, Any]:
     return found
 
 
-def texts(given: Told) -> list[str] | None:
-    """The same as texts NAME=VALUE, as files keep them; None for nothing."""
+def texts(given: Named) -> list[str] | None:
+    """The same as texts NAME=VALUE, as in files; None for nothing."""
     if given is None:
         return None
     return [f"{name}={value}" for name, value in given.items()] if isinstance(given, Mapping) else list(given)

@@ -1,4 +1,4 @@
-"""Excitations: inputs that move a plant through its range, drawn anew for every seed.
+"""Excitations: inputs that move a plant through its range, drawn for every seed.
 
 An excitation is a frozen dataclass of plain numbers, registered by name. Its inputs are a function of the
 episodes' keys alone, so that all filters get the same inputs.

@@ -17,7 +17,7 @@ def room_of(plant: str) -> ModuleType:
 
 
 def room_of_logs() -> ModuleType:
-    """What knows the plant that a log is of unless it is told, by its preset: `tuning.thruster.logs`."""
+    """The package of the plant of logs without a model, `tuning.thruster.logs`."""
     return importlib.import_module(LOGS)
 
 

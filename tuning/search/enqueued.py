@@ -1,4 +1,7 @@
-"""Trials that a finished trial calls for: a sampler would find them by chance only, and late."""
+"""Trials that a finished trial calls for: a sampler would find them by chance only, and late.
+
+NIS is the normalised innovation squared.
+"""
 
 from __future__ import annotations
 

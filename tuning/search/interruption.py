@@ -14,7 +14,7 @@ STOPPING = "stopping after what runs now; Ctrl-C again stops at once"
 
 @contextmanager
 def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Within this context the first Ctrl-C only makes the yielded function return True, and tells who listens.
+    """Within this context the first Ctrl-C makes the yielded function return True, with a message to listeners.
 
     An exception within compiled code or a storage's lock could get lost or leave the lock behind. Outside the main
     thread, where Python delivers no signals, nothing changes.

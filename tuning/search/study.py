@@ -1,4 +1,7 @@
-"""Optuna studies of a filter's parameters, with common random numbers for all trials."""
+"""Optuna studies of a filter's parameters, with common random numbers for all trials.
+
+NIS is the normalised innovation squared.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs of a thruster: whose model they are of, and scenarios of another thruster than the one by default."""
+"""Logs of a thruster with its model, and scenarios of another thruster than the default one."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from tuning.problems.files import FILE_SEQUENCES
 from tuning.problems.problem import Problem
 
 DEFAULT_PRESET = "tunnel"
-FREE = ("motor_damping", "voltage_gain", "lift_coefficient")  # to be identified, where nothing is said
+FREE = ("motor_damping", "voltage_gain", "lift_coefficient")  # free parameters by default
 
 
 class Preset(ModelledThruster):
-    """A thruster of a preset, of which logs are: it offers the model, and checks tuned files.
+    """The thruster of a preset as the plant of logs: it offers the model, and checks tuned files.
 
-    Of a preset file the model has the recorder, too: biases, lags, ambient flow, Q and R; `clock_offset` [s], by
-    measured channel, is for who reads the logs.
+    With a preset file the model includes the recorder: biases, lags, ambient flow, Q and R; `clock_offset` [s], by
+    measured channel, is for the reader of logs.
     """
 
     def __init__(self, preset: str, sensors: Sequence[str] | None, dt: float):
@@ -37,21 +37,21 @@ class Preset(ModelledThruster):
         self.clock_offset = {name: value for name, value in offsets.items() if name in self.plant.channels}
 
     def state_space_model(self, **changes) -> StateSpaceModel:
-        """The model, with what logs show beside the equations."""
+        """The model of the plant with its recorder."""
         bare = self.plant._replace(dead_band=NO_BAND)
         return with_shown(model_of_plant(bare, **changes), bare, self._seen)
 
 
 def of_preset(problem: Problem, preset: str | Path | None, sequences: int = FILE_SEQUENCES) -> Problem:
-    """A scenario of another thruster, whose scale is computed anew; the problem itself where no preset is given.
+    """A scenario with another thruster, whose scale is computed; the same problem without a preset.
 
     Args:
         problem: a scenario.
         preset: a preset's name or file.
-        sequences: of inputs, that the scale is made of.
+        sequences: number of input sequences for the scale.
 
     Raises:
-        ValueError: for a problem that is no scenario of a thruster that moves by its equations.
+        ValueError: for a problem that is not a scenario of the thruster's equations.
     """
     if preset is None:
         return problem
@@ -77,10 +77,10 @@ def family_of_preset(
     """The thruster of a preset whose parameters are free, `tuning.thruster.identification.ThrusterFamily`.
 
     Args:
-        logs: to learn from.
-        preset: where the search starts; the one by default if None.
-        sensors: what the filter sees.
-        free: names of the parameters; motor damping, voltage gain and lift if there are none.
+        logs: training logs.
+        preset: the thruster where the search starts; the default one if None.
+        sensors: measured channels.
+        free: names of the free parameters; motor damping, voltage gain and lift by default.
         noise: whether Q and R are free, too.
     """
     from tuning.thruster.identification import ThrusterFamily  # which imports Optuna
@@ -95,11 +95,11 @@ def family_of_preset(
 
 
 def preset_of(found: Any, family: Any, logs: Sequence[str]):
-    """The identified thruster as a preset file holds it, `thruster_env.preset_file.PresetFile`.
+    """The identified thruster as the content of a preset file, `thruster_env.preset_file.PresetFile`.
 
     Args:
         found: from `tuning.identification.identify`.
-        family: the `ThrusterFamily` it is of.
+        family: its `ThrusterFamily`.
         logs: names of the runs.
     """
     from thruster_env.preset_file import PresetFile
@@ -135,7 +135,7 @@ def preset_of(found: Any, family: Any, logs: Sequence[str]):
 
 
 def _taken_off(logs: Sequence[Log], channel: str) -> float:
-    """The clock offset with which all logs were read; 0 if they differ, and so belong to the logs."""
+    """The clock offset with which all logs were read; 0 if they differ, since they then belong to the logs."""
     found = {log.offsets.get(f"measurement:{channel}", 0.0) for log in logs}
     return found.pop() if len(found) == 1 else 0.0
 

@@ -53,7 +53,7 @@ class Scenario(BaseScenario):
         sensors: channels, a list of their names or a mapping from each to a list of effects.
         flow: list of signals.
         amplifier: list of effects.
-        uncertainty: distributions of factors on parameters, drawn anew for each seed.
+        uncertainty: distributions of factors on parameters, drawn for each seed.
     """
 
     plant_kind = "thruster"

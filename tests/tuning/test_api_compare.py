@@ -1,0 +1,121 @@
+"""`tuning.compare`: the rows of the command, as a value; and filters that are tuned first."""
+
+import copy
+import pickle
+
+import matplotlib.figure
+import numpy as np
+import pytest
+
+import tuning
+from filters.augmented import Unknown
+from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from tests.tuning.test_api_study import plain
+from thruster_cli.leaderboard import as_json as boards_as_json
+from tuning.problems.find import find_problem
+
+SHORT = find_problem("nominal").replace(steps=70, name="short")
+
+
+def without_time(boards):
+    """Boards as plain data, without what the clock says."""
+    for board in boards["scenarios"].values():
+        for row in board["filters"].values():
+            del row["microseconds_a_step"]
+    return boards
+
+
+@pytest.fixture(scope="module")
+def comparison():
+    return tuning.compare(["kf", "ekf"], SHORT, seeds=6, progress=False)
+
+
+def test_compare_is_the_command_in_one_call(as_json):  # noqa: F811
+    told = as_json(
+        *("compare", "--filter", "ekf", "--filter", "enkf", "--problem", "nominal", "--seeds", 3, "--seed", 2),
+        *("--ensemble-size", "enkf=7", "--augment", "ambient_velocity:0.3"),
+    )
+    unknown = {"ambient_velocity": 0.3}
+    found = tuning.compare(["ekf", "enkf"], seeds=3, seed=2, ensemble_size={"enkf": 7}, augment=unknown)
+    ours = plain(boards_as_json(list(found.boards)))
+    assert without_time(ours) == without_time({key: told[key] for key in ours}) and told["seed"] == found.seed
+    assert found.filters == ("ekf", "ekf + U_0", "enkf 7", "enkf 7 + U_0")
+
+
+def test_a_comparison_shows_itself(comparison):
+    assert repr(comparison).startswith("FilterComparison(short: ekf ") and comparison.ranked() == ["ekf", "kf"]
+    assert comparison.sentences() == ["On short, against kf by the score: better: ekf."]
+    table = comparison.to_frame()
+    rows = comparison.boards[0].rows
+    assert table["filter"].tolist() == ["kf", "ekf"] and table["verdict"].tolist() == [row.verdict for row in rows]
+    assert table["score over first"].tolist() == [row.score_ratio.value for row in rows]
+    assert table["score"].tolist() == [row.evaluation.score.value for row in rows]
+    text = comparison._repr_html_()
+    assert "better" in text and "nan" not in text and text.count("<tr>") == 3
+    for other in (copy.deepcopy(comparison), pickle.loads(pickle.dumps(comparison))):
+        assert repr(other) == repr(comparison)
+
+
+def test_scores_are_drawn_with_their_intervals(comparison):
+    figure = comparison.plot_scores()
+    assert isinstance(figure, matplotlib.figure.Figure)
+    (axis,) = figure.axes
+    assert [text.get_text() for text in axis.get_yticklabels()] == ["kf", "ekf"]
+    whiskers = [line.get_xdata().tolist() for line in axis.lines if len(line.get_xdata()) == 2]
+    assert whiskers == [[row.evaluation.score.low, row.evaluation.score.high] for row in comparison.boards[0].rows]
+
+
+def test_filters_are_tuned_first_where_that_is_asked_for(tmp_path):
+    found = tuning.compare(["kf", "ekf"], SHORT, trials=2, seeds=4, progress=False)
+    assert found.filters == ("kf tuned", "ekf tuned")
+    study = tuning.tune(SHORT, "ekf", trials=2, progress=False)
+    assert found.boards[0].rows[1].evaluation.score == tuning.evaluate(study, seeds=4).score
+    file = study.save(tmp_path / "mine.json")
+    again = tuning.compare([study, file, study, "ekf"], seeds=4, progress=False)
+    assert again.filters == ("ekf tuned", "mine", "ekf tuned 2", "ekf") and again.problems == (SHORT,)
+    scores = [row.evaluation.score.value for row in again.boards[0].rows]
+    assert scores[0] == scores[1] == scores[2] != scores[3]
+
+
+def test_where_nobody_knows_the_noise_filters_have_the_scaled_default():
+    from tests.linear_problem import LinearProblem
+
+    found = tuning.compare("ekf", LinearProblem(n=2, m=1, truth=False), seeds=4, progress=False)
+    assert not found.boards[0].rows[0].evaluation.has_truth and "nan" not in found._repr_html_()
+    assert np.isfinite(found.to_frame()["log-likelihood"]).all() and found.plot_scores().axes
+
+
+WRONG = [
+    (lambda: tuning.compare(["ekf", "ekf"], SHORT, seeds=2), "must be of different filters, but got ekf, ekf"),
+    (lambda: tuning.compare([]), "a comparison must be of different filters, but got none"),
+    (
+        lambda: tuning.compare(["ekf", 3]),
+        "a tuned file, a Study or an estimator, but got 3",
+    ),
+    (lambda: tuning.compare("no-filter"), "filter must be one of .*, but got 'no-filter'"),
+    (
+        lambda: tuning.compare("ekf", ensemble_size={"ekf": 5}),
+        "must be for a filter with an ensemble, but got ekf: 5",
+    ),
+    (
+        lambda: tuning.compare("enkf", ensemble_size=1),
+        "must be a whole number of at least 2, but got 1",
+    ),
+    (lambda: tuning.compare("ekf", knows="all"), "knows must be one of true, scaled, untuned, but got 'all'"),
+    (lambda: tuning.compare("ekf", trials=2, knows="true"), "knows must be left out where filters are tuned"),
+    (lambda: tuning.compare("ekf", seeds=1), "held-out seeds must be a whole number of at least 2, but got 1"),
+]
+
+
+@pytest.mark.parametrize("call, said", WRONG)
+def test_errors_state_the_rule_and_the_value(call, said):
+    with pytest.raises(ValueError, match=said):
+        call()
+
+
+def test_beliefs_have_several_forms():
+    from tuning.api.compare import beliefs_of
+
+    mine = Unknown(0.2)
+    assert beliefs_of(["a", "b"]) == {"a": None, "b": None} == beliefs_of({"a": None, "b": None})
+    assert beliefs_of({"a": mine, "b": 0.2, "c": (0.2, 0.1)}) == {"a": mine, "b": mine, "c": Unknown(0.2, 0.1)}

@@ -1,0 +1,117 @@
+"""`tuning.estimate` and `identify`: the numbers of the commands on recorded runs, as values."""
+
+import copy
+import json
+import pickle
+
+import matplotlib.figure
+import numpy as np
+import pytest
+
+import tuning
+from plants.logs.write import write_log
+from studies.identification import record
+from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from tests.tuning.test_api_study import plain
+from thruster_env.preset_file import read_preset
+
+FREE = ["motor_damping", "voltage_gain"]
+OF_LOGS = ("--preset", "tunnel_physical", "--sensor", "thrust", "--sensor", "speed")
+WHOSE = {"preset": "tunnel_physical", "sensors": ["thrust", "speed"]}
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    return record(0, 2, 150)
+
+
+@pytest.fixture
+def runs(recorded, tmp_path):
+    for place, log in enumerate(recorded):
+        write_log(tmp_path / f"run{place}.csv", log)
+    return [f"run{place}.csv" for place in range(len(recorded))]
+
+
+@pytest.fixture(scope="module")
+def found(recorded):
+    return tuning.identify(recorded, FREE, **WHOSE, noise=False, starts=1, progress=False)
+
+
+def test_estimate_is_the_command_in_one_call(as_json, runs, tmp_path):  # noqa: F811
+    told = as_json("estimate", "run0.csv", *OF_LOGS, "--smoother", "--lag", 5, "--skip", 20, "--out", "theirs.csv")
+    mine = tuning.estimate("run0.csv", **WHOSE, smoother=True, lag=5, skip=20)
+    assert mine.log_likelihood == told["log_likelihood"] and mine.findings.mean_nis == told["mean_nis"]
+    assert mine.log.digest == told["digest"] and mine.found.smoothed
+    assert mine.save("mine.csv").read_text() == (tmp_path / "theirs.csv").read_text()
+    table = mine.to_frame()
+    assert len(table) == told["rows"] == 151 and table.index.name == "time_s"
+    np.testing.assert_array_equal(table["omega_m_rad_per_s"], mine.means[:, 0])
+    assert "mean NIS over channels" in repr(mine) and len(repr(mine)) < 200 and "nan" not in mine._repr_html_()
+
+
+def test_estimates_are_drawn_and_copied(recorded):
+    mine = tuning.estimate(recorded[0], **WHOSE)
+    whole, innovations = mine.plot_states(), mine.plot_innovations()
+    assert isinstance(whole, matplotlib.figure.Figure) and len(whole.axes) > len(innovations.axes) == 2
+    for other in (copy.copy(mine), pickle.loads(pickle.dumps(mine))):
+        assert repr(other) == repr(mine)
+
+
+def test_a_baseline_has_no_nis(recorded):
+    mine = tuning.estimate(recorded[0], filter="open-loop", **WHOSE)
+    assert repr(mine).endswith("rows)") and "nan" not in mine._repr_html_()
+
+
+def test_identify_is_the_command_in_one_call(as_json, runs, tmp_path):  # noqa: F811
+    options = ("--free", ",".join(FREE), "--hold-noise", "--starts", 2, "--range", "voltage_gain=100:5000")
+    told = as_json("identify", *runs, *OF_LOGS, *options, "--out", "theirs.toml")
+    ranges = {"voltage_gain": (100, 5000)}
+    mine = tuning.identify(runs, FREE, **WHOSE, noise=False, starts=2, ranges=ranges, progress=False)
+    assert mine.values == told["values"] and mine.standard_errors == told["standard_errors"]
+    assert plain({name: one._asdict() for name, one in mine.validation.items()}) == told["validation"]
+    assert mine.save("mine.toml").read_text() == (tmp_path / "theirs.toml").read_text()
+    assert read_preset("mine.toml").parameters.voltage_gain == mine.values["voltage_gain"]
+    assert json.dumps(mine.sentences()) == json.dumps(told["sentences"])
+
+
+def test_what_was_identified_shows_itself(found):
+    assert repr(found).startswith("Identified(motor_damping ") and repr(found).endswith("all determined, 2 runs)")
+    table = found.to_frame()
+    assert table["value"].to_dict() == found.values and table.loc["voltage_gain", "unit"] == "rad/(s^2 V)"
+    assert "voltage_gain" in found._repr_html_() and found.model.n == 2
+    assert found.plot_profiles(["voltage_gain"]).axes
+    for other in (copy.deepcopy(found), pickle.loads(pickle.dumps(found))):
+        assert other.values == found.values
+
+
+def test_runs_that_are_held_out_only_validate(recorded):
+    options = {"noise": False, "starts": 1, "progress": False}
+    mine = tuning.identify([recorded[0]], "voltage_gain", **WHOSE, held_out=[recorded[1]], **options)
+    assert [log.name for log in mine.held_out] == [recorded[1].name] and len(mine.runs) == 1
+    assert set(mine.validation) == {"start", "identified"}
+
+
+WRONG = [
+    (
+        lambda log: tuning.estimate(log, "a.json", filter="ekf"),
+        "either a tuned file or a filter, but got both",
+    ),
+    (lambda log: tuning.estimate(log, 5, **WHOSE), "what is tuned must be a tuned file or a Study, but got 5"),
+    (lambda log: tuning.estimate(log, lag=3, **WHOSE), "a lag must be that of a smoother, but got lag 3"),
+    (lambda log: tuning.identify([]), "at least one log must be left to learn from"),
+    (lambda log: tuning.identify(log, "mass", **WHOSE), "free parameters must be of .*, but got 'mass'"),
+    (lambda log: tuning.identify(log, model="tunnel", preset="t200"), "give either a model or a preset"),
+    (lambda log: tuning.identify(log, FREE, **WHOSE, filter="kf"), "a thruster must be identified with the ekf"),
+    (lambda log: tuning.identify(log, FREE, **WHOSE, start={"x": 1.0}), "must be of free parameters, .*but got x"),
+]
+
+
+@pytest.mark.parametrize("call, said", WRONG)
+def test_errors_state_the_rule_and_the_value(call, said, recorded):
+    with pytest.raises(ValueError, match=said):
+        call(recorded[0])
+
+
+def test_a_file_of_what_was_identified_ends_in_toml(found, tmp_path):
+    with pytest.raises(ValueError, match=r"must end in \.toml, but got 'x\.json'"):
+        found.save("x.json")

@@ -1,0 +1,179 @@
+"""What a user may give for a problem: names, problems, and pairs of a model and recorded runs in any form."""
+
+import gymnasium as gym
+import numpy as np
+import pandas
+import pytest
+
+import thruster_env  # noqa: F401 - registers the env
+import tuning
+from filters import EstimateState
+from plants.affine import affine_model
+from plants.logs.log import Log
+from plants.logs.read import read_log
+from plants.logs.write import write_log
+from plants.simulate import simulate
+from tests.pendulum_problem import problem as pendulum
+from tests.small_problems import pair
+from tuning.api.problems import problem_of, problems_of
+from tuning.problems.find import find_problem
+from tuning.problems.log_problem import LogProblem
+
+
+def cart(dt=0.1):
+    return affine_model(
+        a=[[1.0, dt], [0.0, 0.9]],
+        b=[[0.0], [dt]],
+        c=[[1.0, 0.0]],
+        process_noise_cov=[1e-4, 1e-3],
+        measurement_noise_cov=[1e-2],
+        prior_mean=[0.0, 0.0],
+        prior_cov=[1.0, 1.0],
+        states=[("place", "p", "m"), ("speed", "v", "m/s")],
+        input_quantities=[("push", "F", "N")],
+        measurements=[("tape", "z", "m")],
+    )
+
+
+@pytest.fixture(scope="module")
+def logs():
+    """Two runs of the cart without their true states."""
+    model, runs = cart(), []
+    pushes = np.sin(0.3 * np.arange(240))[None, :, None] * [[[1.0]], [[2.0]]]
+    found = simulate(model, np.array([[1.0, 2.0], [3.0, 4.0]]), pushes)
+    for place in range(2):
+        parts = pushes[place], found.measurements[place], model.input_quantities, model.measurements
+        runs.append(Log(f"log {place}", 0.1, *parts))
+    return runs
+
+
+def table_of(log):
+    """A log as columns by header."""
+    push = np.append(log.inputs[:, 0], np.nan)
+    return {"time_s": log.times, "push_N": push, "tape_m": log.measurements[:, 0]}
+
+
+def test_recorded_runs_are_the_same_in_any_form(logs, tmp_path):
+    columns = [table_of(log) for log in logs]
+    frames = [pandas.DataFrame(one) for one in columns]
+    stamps = [pandas.to_datetime(frame.time_s, unit="s").dt.round("ms") for frame in frames]
+    dated = [frame.drop(columns="time_s").set_index(stamp) for frame, stamp in zip(frames, stamps, strict=True)]
+    indexed = [frame.set_index("time_s") for frame in frames]
+    paths = [tmp_path / f"{place}.csv" for place in range(2)]
+    for path, log in zip(paths, logs, strict=True):
+        write_log(path, log)
+    wanted = problem_of((cart(), logs)).data(range(4))
+    for data in (columns, frames, indexed, dated, paths, list(map(str, paths))):
+        found = problem_of((cart, data), lead=20)
+        assert isinstance(found, LogProblem) and len(found.logs) == 2
+        got = problem_of((cart(), data)).data(range(4))
+        np.testing.assert_allclose(got.measurements, wanted.measurements, rtol=1e-12)
+        np.testing.assert_allclose(got.inputs, wanted.inputs, rtol=1e-12)
+    assert [log.name for log in problem_of((cart(), columns)).logs] == ["run1", "run2"]
+    assert [log.name for log in problem_of((cart(), logs)).logs] == ["log 0", "log 1"]
+    assert (
+        problem_of((cart(), frames), held_out="run2").parts.held_out != problem_of((cart(), frames)).parts.held_out
+    )
+
+
+def test_tuning_on_a_model_and_frames_finds_a_filter(logs):
+    frames = [pandas.DataFrame(table_of(log)) for log in logs]
+    study = tuning.tune((cart(), frames), "kf", trials=3, lead=20, progress=False)
+    assert study.tuning.plan.objectives == ("likelihood",) and "log-likelihood" in repr(study)
+    assert study.problem.name == "run1+1" and study.filter.name == "kf"
+    estimates = tuning.estimate(frames[0], study, model=cart())
+    assert estimates.filter.name == "kf" and np.isfinite(estimates.means).all()
+    assert "log-likelihood" in study.held_out.to_frame().columns
+    assert "log-likelihood" in repr(study.held_out) and "nan" not in study._repr_html_()
+    with pytest.raises(ValueError, match="a figure of errors needs the truth"):
+        study.plot_errors()
+
+
+def test_columns_with_true_states_are_the_truth():
+    problem = find_problem("nominal")
+    data = problem.data([5])
+    states, inputs = data.states[0], np.append(data.inputs[0, :, 0], np.nan)
+    table = {
+        "time_s": 0.01 * np.arange(len(states)),
+        "V_s": inputs,
+        "measured_thrust_N": data.measurements[0, :, 0],
+    }
+    table |= {"omega_m": states[:, 0], "U_a": states[:, 1]}
+    found = problem_of(("tunnel", table))
+    assert found.scale is not None and found.data([0]).states is not None
+    assert problem_of(("tunnel", {k: v for k, v in table.items() if k not in ("omega_m", "U_a")})).scale is None
+
+
+def test_problems_by_name_and_themselves():
+    assert problem_of("mismatch").name == "mismatch" and problem_of("auv:motion").name == "auv:motion"
+    mine = pair()
+    assert problem_of(mine) is mine
+    assert [one.name for one in problems_of(["nominal", "mismatch"])] == ["nominal", "mismatch"]
+    assert problem_of("nominal", preset="tunnel_physical").name == "nominal (tunnel_physical)"
+
+
+WRONG = [
+    (lambda: problem_of(3), "a problem must be a name, .* of a model and recorded runs, but got 3"),
+    (lambda: problems_of([]), "or a list of some, but got an empty list"),
+    (lambda: problem_of("nominal", dt=0.1), r"dt must come with a pair \(model, data\), but got 'nominal'"),
+    (lambda: problem_of(("tunnel", "x.csv"), preset="t200"), "must come without another, but got 't200'"),
+    (lambda: problem_of((cart(), 5)), "a log must be the path of a file, a pandas.DataFrame, .* but got 5"),
+    (lambda: problem_of((cart(), [])), "a problem of logs must have at least one"),
+    (lambda: problem_of((cart(), {"a": np.zeros(3)})), "a log must have a column for the input"),
+    (lambda: problem_of((cart(), {"F": np.zeros(3), "z": np.zeros(2)})), "columns of equal length .*, but run1"),
+    (lambda: problem_of((5, {"F": np.zeros(3)})), "the model of a log must be a StateSpaceModel, .* but got 5"),
+    (lambda: problem_of((cart(), "none.csv")), "none.csv is not"),
+    (
+        lambda: problem_of((cart(), {"z": np.zeros(9)}), columns=5),
+        "--column must be a mapping by name, .* but got 5",
+    ),
+]
+
+
+@pytest.mark.parametrize("call, said", WRONG)
+def test_errors_state_the_rule_and_the_value(call, said):
+    with pytest.raises(ValueError, match=said):
+        call()
+
+
+def test_two_logs_of_one_name_are_told_apart(logs):
+    with pytest.raises(ValueError, match="logs must have different names, but got two called log 0"):
+        problem_of((cart(), [logs[0], logs[1].named("log 0")]))
+    with pytest.raises(ValueError, match="dt must come with a file or a table, but log 0 is a Log already"):
+        problem_of((cart(), logs), dt=0.2)
+
+
+def test_a_table_is_read_as_a_file_is(logs, tmp_path):
+    write_log(tmp_path / "run.csv", logs[0])
+    found = read_log(table_of(logs[0]), cart(), name="mine")
+    assert found.name == "mine" and found.digest == read_log(tmp_path / "run.csv", cart()).digest
+
+
+@pytest.mark.parametrize("name", ["nominal", "published_tunnel", "auv:motion"])
+def test_an_env_of_a_scenario_makes_its_data(name):
+    problem = find_problem(name)
+    env, data = problem.make_env(), problem.data([3])
+    assert env.spec.max_episode_steps == problem.steps
+    _, info = env.reset(seed=3)
+    for k in range(20):
+        there = np.isfinite(data.measurements[0, k])  # of several sensors some are slower
+        assert there.any()
+        np.testing.assert_allclose(info["measurement"][there], data.measurements[0, k][there], rtol=1e-12)
+        info = env.step(data.inputs[0, k, : env.action_space.shape[0]])[4]
+
+
+def test_envs_of_other_problems(logs):
+    mine = pair()
+    env, data = mine.make_env(low=-9.0, high=9.0), mine.data([2])
+    _, info = env.reset(seed=2)
+    np.testing.assert_array_equal(info["measurement"], data.measurements[0, 0])
+    assert type(mine.env()) is type(env)  # the name that it had
+    swinging = pendulum().make_env(g=9.0)
+    assert isinstance(swinging, gym.Env) and swinging.unwrapped.g == 9.0
+    recorded = problem_of((cart(), logs))
+    replayed = EstimateState(recorded.make_env(run=1), "kf")
+    assert replayed.unwrapped.log is logs[1] and replayed.reset()[0].shape == (2,)
+    with pytest.raises(ValueError, match="run must be at most 1, but got 2"):
+        recorded.make_env(run=2)
+    with pytest.raises(ValueError, match="must come with run alone, but got low"):
+        recorded.make_env(low=1.0)

@@ -1,0 +1,200 @@
+"""`tuning.tune`, `evaluate` and `report`: the numbers of the commands, as values that show and keep themselves."""
+
+import copy
+import json
+import pickle
+import signal
+import subprocess
+import sys
+
+import matplotlib.figure
+import numpy as np
+import optuna
+import pytest
+
+import tuning
+from filters import EstimateState
+from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from thruster_cli.tuning_report import as_json as tuning_as_json
+from tuning.problems.find import find_problem
+
+TRIALS = 5
+SHORT = find_problem("nominal").replace(steps=70, name="short")  # quick to tune on
+FIGURES = ("plot_history", "plot_errors", "plot_run", "plot_consistency")
+
+
+@pytest.fixture(scope="module")
+def study():
+    return tuning.tune("mismatch", trials=TRIALS, progress=False)
+
+
+def plain(data):
+    """Numbers as JSON has them."""
+    from thruster_cli.output import as_text
+
+    return json.loads(as_text(data))
+
+
+def test_tune_is_the_command_in_one_call(study, as_json, tmp_path):  # noqa: F811
+    told = as_json("tune", "--filter", "ekf", "--problem", "mismatch", "--trials", TRIALS, "--out", "theirs.json")
+    assert study.save("mine.json").name == "mine.json"
+    mine, theirs = (json.loads((tmp_path / name).read_text()) for name in ("mine.json", "theirs.json"))
+    assert mine == theirs
+    ours = plain(tuning_as_json(study.tuning))
+    assert {**ours, "file": ""} == {**told, "file": ""} and told["trials"] == TRIALS
+    found = as_json("evaluate", "--tuned", "mine.json", "--seeds", 4)
+    for source in ("mine.json", study):
+        assert plain(tuning.evaluate(source, seeds=4).to_dict()) == found
+
+
+def test_the_tuned_filter_is_ready_to_use(study, tmp_path):
+    assert study.filter.name == study.choice.name == "ekf"
+    belief, innovation = study.filter.update(study.filter.init(), [1.0])
+    assert np.isfinite(belief.mean).all() and np.isfinite(innovation.cov).all()
+    file = study.save(tmp_path / "tuned.json")
+    wrapped = EstimateState(study.problem.make_env(), tuned=str(file))
+    assert wrapped.filter.name == "ekf"
+    np.testing.assert_allclose(wrapped.filter.model.process_noise_cov, study.filter.model.process_noise_cov)
+
+
+def test_a_study_in_memory_is_that_of_a_storage_and_goes_on_there(tmp_path, capsys):
+    storage = tmp_path / "studies.journal"
+    options = {"storage": storage, "progress": True}
+    short = tuning.tune(SHORT, trials=2, **options)
+    whole = tuning.tune(SHORT, trials=TRIALS, **options)
+    assert "goes on after 2 finished trials" in capsys.readouterr().err
+    alone = tuning.tune(SHORT, trials=2, progress=False)
+    first = [trial.params for trial in alone.trials]
+    assert first == [trial.params for trial in short.trials] == [trial.params for trial in whole.trials[:2]]
+    page = tuning.report(whole.name, tmp_path / "page.html", storage=storage, problem=SHORT, progress=False)
+    assert "Study &#x27;" not in page.read_text() and page.with_suffix(".md").is_file()
+
+
+def test_results_show_themselves_in_few_words(study):
+    assert repr(study).startswith("Study(ekf on mismatch, 5 trials: score ") and len(repr(study)) < 250
+    found = study.held_out
+    assert repr(found).startswith("HeldOut(ekf on mismatch, 200 held-out seeds: score ") and len(repr(found)) < 150
+    for one in (study, found):
+        text = one._repr_html_()
+        assert text.startswith("<table>") and text.count("<table") == text.count("</table>") and "nan" not in text
+    assert "tuned" in study._repr_html_() and "oracle" in found._repr_html_()
+
+
+def test_tables_have_what_is_in_the_values(study):
+    trials, errors = study.to_frame(), study.held_out.to_frame()
+    assert len(trials) == len(study.trials) and trials.index.tolist() == list(range(1, TRIALS + 1))
+    assert (
+        trials.loc[1, "R"] == study.trials[0].params["R"] and trials.loc[1, "score"] == study.trials[0].values[0]
+    )
+    assert errors.index.tolist() == list(study.held_out.evaluations)
+    tuned = study.held_out.evaluation
+    assert errors.loc["tuned", "score"] == tuned.score.value and errors.loc["tuned", "NEES"] == tuned.nees.value
+    assert errors.loc["tuned", "RMSE omega_m [rad/s] high"] == tuned.rmse[0].high
+
+
+def test_without_pandas_one_line_says_what_to_install(study, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ValueError, match=r"to_frame must have pandas, .* pip install 'thruster-env\[frames\]'"):
+        study.to_frame()
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_figures_are_those_of_matplotlib(study, name):
+    figure = getattr(study, name)()
+    assert isinstance(figure, matplotlib.figure.Figure) and figure.axes
+    assert figure._repr_png_().startswith(b"\x89PNG")  # as notebooks show it
+
+
+def test_copies_and_pickles_are_the_same(study, tmp_path):
+    for other in (copy.copy(study), copy.deepcopy(study), pickle.loads(pickle.dumps(study))):
+        assert repr(other) == repr(study) and other.choice == study.choice
+        assert other.save(tmp_path / "o.json").read_text() == study.save(tmp_path / "s.json").read_text()
+    assert repr(pickle.loads(pickle.dumps(study.held_out))) == repr(study.held_out)
+    with pytest.raises(AttributeError):
+        study.tuning = None
+
+
+def test_a_report_of_a_value_is_that_of_its_file_and_storage(study, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = study.report("mine.html")
+    assert page.name == "mine.html" and "The study" in page.read_text()
+    study.save("ekf-mismatch-seed0.json")
+    folder = tuning.report("ekf-mismatch-seed0.json", progress=False).parent
+    assert sorted(path.name for path in folder.glob("ekf*")) == [
+        f"ekf-mismatch-seed0.{end}" for end in ("html", "json", "md")
+    ]
+    assert page.with_suffix(".md").read_text() == (folder / "ekf-mismatch-seed0.md").read_text()
+
+
+def test_ctrl_c_keeps_what_is_finished(monkeypatch):
+    from tuning.search import study as module
+
+    run_trial = module.run_trial
+
+    def interrupted(trial, *arguments):
+        if trial.number == 2:
+            signal.raise_signal(signal.SIGINT)
+        return run_trial(trial, *arguments)
+
+    monkeypatch.setattr(module, "run_trial", interrupted)
+    found = tuning.tune(SHORT, trials=30, progress=False)
+    assert found.interrupted and found.tuning.result.finished == 3 and "3 trials, interrupted" in repr(found)
+    assert found.filter.name == "ekf" and found.held_out.score.value > 0
+
+
+def test_progress_is_silent_where_nobody_looks(capsys):
+    before = optuna.logging.get_verbosity()
+    tuning.tune(SHORT, trials=1)
+    assert capsys.readouterr() == ("", "") and optuna.logging.get_verbosity() == before
+    tuning.tune(SHORT, trials=1, progress=True)
+    assert "tuning ekf on short" in capsys.readouterr().err
+
+
+def test_importing_tuning_is_light_and_says_what_there_is():
+    code = (
+        "import sys, tuning; print([n for n in ('numpy', 'optuna', 'rich') if n in sys.modules], dir(tuning)[-6:])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    names = ["compare", "estimate", "evaluate", "identify", "report", "tune"]
+    assert done.stdout.strip() == f"[] {names}"
+    with pytest.raises(AttributeError, match="module 'tuning' has no attribute 'tunes'"):
+        tuning.tunes  # noqa: B018
+    for name in names:
+        assert "Args:" in getattr(tuning, name).__doc__ and "tuning." in getattr(tuning, name).__doc__
+
+
+WRONG = [
+    (lambda: tuning.tune("mismatch", trials=0), "trials must be a whole number of at least 1, but got 0"),
+    (lambda: tuning.tune("mismatch", method="newton"), "method must be one of optuna, gradient, but got 'newton'"),
+    (lambda: tuning.tune("mismatch", workers=2), "workers must be 1 without a storage that they share, but got 2"),
+    (lambda: tuning.tune("mismatch", progress="yes"), "progress must be True, False or None, but got 'yes'"),
+    (lambda: tuning.tune("mismatch", name="a/b"), "study must be a name without slashes, but got 'a/b'"),
+    (lambda: tuning.evaluate("none.json"), "none.json"),
+    (lambda: tuning.evaluate(3), "a filter must be a name, a tuned file, a Study or an estimator, but got 3"),
+    (
+        lambda: tuning.tune("mismatch", len),
+        "filter must be a name or 'module:object', by which trials keep it, but",
+    ),
+    (lambda: tuning.report(3), "a report must be of a Study, a tuned file or the name of a study, but got 3"),
+    (lambda: tuning.report("no such study"), "a report must be of a tuned file or of a study in"),
+    (
+        lambda: tuning.tune(SHORT, trials=1).plot_sizes(),
+        "a figure of ensemble sizes needs an ensemble and truth",
+    ),
+    (lambda: tuning.evaluate("ekf", seeds=2).plot_run(2), "place must be at most 1, but got 2"),
+]
+
+
+@pytest.mark.parametrize("call, said", WRONG)
+def test_errors_state_the_rule_and_the_value(call, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=said):
+        call()
+
+
+def test_a_scenario_that_was_changed_has_another_name_in_files(tmp_path):
+    changed = find_problem("nominal").replace(steps=120)
+    found = tuning.tune(changed, trials=1, progress=False)
+    assert found.problem.name == "nominal (changed)" and found.problem.steps == 120
+    file = found.save(tmp_path / "t.json")
+    assert tuning.evaluate(file, seeds=2, progress=False).problem.steps == 120
