@@ -30,7 +30,12 @@ def cores() -> int:
 
 
 def spread(part: Callable[[int, int], None], count: int) -> None:
-    """Call part(first, last) on all cores until it has covered 0 ... count; part releases the lock."""
+    """Call part(first, last) on all cores until it has covered 0 ... count; part releases the lock.
+
+    The caller makes a call of nothing first, part(0, 0). What part compiles or loads is then there. A worker that
+    loads code imports modules, and would wait for ever for one in whose import its caller is.
+    """
+    part(0, 0)
     edges = np.linspace(0, count, 1 + min(count, 4 * cores())).astype(int)
     list(_pool().map(part, edges[:-1], edges[1:]))
 

@@ -30,6 +30,11 @@ def filter_for(env, filter, model, tuned: str | None, model_arguments, numbers: 
         if filter is not None or numbers or model_arguments is not None:
             raise ValueError("tuned must come without filter, numbers and model_arguments: its file holds them")
         return tuned_filter(env, model, tuned)
+    if isinstance(filter, Filter):
+        if model is not None or model_arguments is not None or numbers:
+            rule = "a filter that is made must come without model, model_arguments and numbers: it has its own"
+            raise ValueError(f"{rule}, but got {shown(filter)} with some")
+        return filter
     filter = "ekf" if filter is None else filter
     known = () if is_foreign(filter) else tunable_numbers(filter)
     for name in numbers:
@@ -60,10 +65,10 @@ class ModelInSpec:
 
 
 class EstimatorInSpec(ModelInSpec):
-    """An estimator as an env's spec keeps it, likewise."""
+    """A filter that is made, or an estimator, as an env's spec keeps it, likewise."""
 
 
-EstimatorInSpec.__name__ = "Estimator (give filter='module:object' instead)"
+EstimatorInSpec.__name__ = "Filter or Estimator (give its name or 'module:object' instead)"
 ModelInSpec.__name__ = "StateSpaceModel (give model='module:factory' instead)"
 
 

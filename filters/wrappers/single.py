@@ -10,6 +10,7 @@ import numpy as np
 
 from filters.engine.checks import checked_actions
 from filters.estimators.estimator import Estimator
+from filters.filter import Filter
 from filters.wrappers.arguments import (
     APPENDED,
     OBSERVATIONS,
@@ -50,8 +51,9 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
 
     Args:
         env: any env with Box actions and observations.
-        filter: name of a filter in `filters.FILTERS`, which `thruster filters` lists; "ekf" if None. Or an
-            estimator of another package, as `filters.estimators.estimator.Estimator`, a function that makes one
+        filter: name of a filter in `filters.FILTERS`, which `thruster filters` lists; "ekf" if None. Or a filter
+            that is made already, such as `tuning.tune(...).filter`, which brings its model; or an estimator of
+            another package, as `filters.estimators.estimator.Estimator`, a function that makes one
             from a model, or "module:object" for either; covariances or innovations that it does not give are zero.
         observation: one of the three forms above.
         model: None for the model that the env itself offers by `env.unwrapped.state_space_model(**arguments)`,
@@ -70,7 +72,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     def __init__(
         self,
         env: gym.Env,
-        filter: str | Estimator | Callable | None = None,
+        filter: str | Filter | Estimator | Callable | None = None,
         observation: str = "estimate",
         model: str | StateSpaceModel | None = None,
         tuned: str | None = None,

@@ -15,6 +15,7 @@ from filters.engine.checks import checked_actions
 from filters.estimators.estimator import Estimator
 from filters.estimators.foreign import ForeignFilter
 from filters.estimators.session import EstimatorBeliefs
+from filters.filter import Filter
 from filters.wrappers.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for
 from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
 from numerics.checks import one_of, shown
@@ -45,7 +46,7 @@ class EstimateStates(gym.vector.VectorWrapper):
     def __init__(
         self,
         env: gym.vector.VectorEnv,
-        filter: str | Estimator | Callable | None = None,
+        filter: str | Filter | Estimator | Callable | None = None,
         observation: str = "estimate",
         model: str | StateSpaceModel | None = None,
         tuned: str | None = None,

@@ -360,6 +360,19 @@ class TestModels:
         assert other.filter.model.operating_input.tolist() == [-3.0]
 
 
+def test_a_filter_that_is_made_is_run_as_it_is():
+    made = make_filter("enkf", thruster_model(measurement_noise_cov=9.0), ensemble_size=7)
+    actions = np.full((20, 1), 10.0, dtype=np.float32)
+    env = EstimateState(gym.make("BowThruster-v0"), filter=made)
+    named = wrapped("enkf", ensemble_size=7, **assumed(measurement_noise_cov=9.0))
+    one, other = played(env, actions, 1)[2], played(named, actions, 1)[2]
+    assert env.filter is made
+    np.testing.assert_array_equal(infos_of("estimate", one), infos_of("estimate", other))
+    for wrong in ({"model": thruster_model()}, {"ensemble_size": 9}, assumed(measurement_noise_cov=1.0)):
+        with pytest.raises(ValueError, match="a filter that is made must come without model"):
+            EstimateState(gym.make("BowThruster-v0"), filter=made, **wrong)
+
+
 @pytest.mark.parametrize(
     ("arguments", "rule"),
     [

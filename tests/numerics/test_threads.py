@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from importlib import import_module
 from queue import SimpleQueue
 
 import numpy as np
@@ -183,3 +184,24 @@ def test_spread_covers_everything_once():
     values = np.zeros(COUNT)
     spread(lambda first, last: add_index(first, last, values), COUNT)
     assert np.array_equal(values, np.arange(COUNT))
+
+
+def test_work_that_is_spread_while_a_module_is_imported_may_import_it(tmp_path, monkeypatch):
+    # A worker that loads compiled code of a model imports the model's module: it would wait for the end of an import
+    # that waits for the worker.
+    source = """
+from importlib import import_module
+from numerics.threads import spread
+found = []
+def part(first, last):
+    if not found:
+        found.append(import_module(__name__))
+spread(part, 8)
+"""
+    (tmp_path / "spreads_at_import.py").write_text(source)
+    monkeypatch.syspath_prepend(tmp_path)
+    importing = threading.Thread(target=import_module, args=("spreads_at_import",), daemon=True)
+    importing.start()
+    importing.join(60.0)  # a guard, not a measurement
+    assert not importing.is_alive()
+    assert import_module("spreads_at_import").found
