@@ -187,8 +187,8 @@ def test_spread_covers_everything_once():
 
 
 def test_work_that_is_spread_while_a_module_is_imported_may_import_it(tmp_path, monkeypatch):
-    # A worker that loads compiled code of a model imports the model's module: it would wait for the end of an import
-    # that waits for the worker.
+    # A worker that loads compiled code of a model imports the model's module: it would wait for the end of
+    # an import that waits for the worker.
     source = """
 from importlib import import_module
 from numerics.threads import spread

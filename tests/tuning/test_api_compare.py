@@ -47,7 +47,7 @@ def test_a_comparison_shows_itself(comparison):
     assert comparison.sentences() == ["On short, against kf by the score: better: ekf."]
     table = comparison.to_frame()
     rows = comparison.boards[0].rows
-    assert table["filter"].tolist() == ["kf", "ekf"] and table["verdict"].tolist() == [row.verdict for row in rows]
+    assert table["filter"].tolist() == ["kf", "ekf"] and table["verdict"].tolist() == ["", rows[1].verdict]
     assert table["score over first"].tolist() == [row.score_ratio.value for row in rows]
     assert table["score"].tolist() == [row.evaluation.score.value for row in rows]
     text = comparison._repr_html_()

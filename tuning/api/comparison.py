@@ -62,13 +62,15 @@ class FilterComparison:
         columns: dict[str, list] = {"problem": [board.scenario.name for board, _ in pairs]}
         columns["filter"] = [row.label for _, row in pairs]
         cells: list[dict[str, Any]] = []
-        for _, row in pairs:
+        for board, row in pairs:
             ratio, gain = row.score_ratio, row.likelihood_gain
             cells.append(cells_of(row.evaluation))
             cells[-1] |= {"score over first": ratio.value, "score over first low": ratio.low}
             cells[-1] |= {"score over first high": ratio.high, "log-likelihood less first": gain.value}
             cells[-1] |= {"median NEES": row.evaluation.median_nees, "us/step": row.microseconds}
-            cells[-1] |= {"verdict": row.verdict}
+            cells[-1] |= {
+                "verdict": "" if row is board.rows[0] else row.verdict
+            }  # the first is compared with itself
         for name in dict.fromkeys(name for one in cells for name in one):
             columns[name] = [one.get(name, np.nan) for one in cells]
         return frame(columns)

@@ -167,14 +167,17 @@ class HeldOut:
         return f"HeldOut({', '.join([f'{what}: score {about(self.score)}', *ratios])})"
 
     def _repr_html_(self) -> str:
-        rows, heads = [], ["filter", *(state.short_label for state in self.evaluation.states)]
+        truth, rows = self.evaluation.has_truth, []
+        heads = [*(state.short_label for state in self.evaluation.states), "score", "NEES"] if truth else ["log L"]
         for name, one in self.evaluations.items():
-            errors = [about(rmse) for rmse in one.rmse]
-            last = [about(one.score), number(one.nees.value, ".3g"), number(one.nis.value, ".3g")]
-            rows.append([name, *errors, *last])
-        title = f"RMSE on {len(self.seeds)} held-out {self.problem.seed_word} of {self.problem.name}"
-        note = "In brackets 95 % intervals. Score: mean over states of RMSE over scale."
-        return html(title, [*heads, "score", "NEES", "NIS"], rows, note)
+            found = [number(one.log_likelihood, ".2f")]
+            if truth:
+                found = [*(about(rmse) for rmse in one.rmse), about(one.score), number(one.nees.value, ".3g")]
+            rows.append([name, *found, number(one.nis.value, ".3g")])
+        what = "RMSE" if truth else "Log-likelihood of the innovations of a run, and their mean NIS,"
+        title = f"{what} on {len(self.seeds)} held-out {self.problem.seed_word} of {self.problem.name}"
+        note = "In brackets 95 % intervals. Score: mean over states of RMSE over scale." if truth else ""
+        return html(title, ["filter", *heads, "NIS"], rows, note)
 
 
 def on_held_out(
