@@ -83,7 +83,7 @@ figure = study.plot_errors()
 #
 # ``make_env`` is the env that the study ran. What the agent observes is now the estimate of angle and rate.
 
-env = EstimateState(problem.make_env(), filter="ekf", model=study.filter.model)
+env = EstimateState(problem.make_env(), filter=study.filter)
 observation, info = env.reset(seed=0)
 for _ in range(20):
     observation, reward, terminated, truncated, info = env.step(env.action_space.sample())

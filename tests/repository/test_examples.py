@@ -1,5 +1,6 @@
 """The scripts in examples/, which are the tutorials, each run with small numbers in place of its own."""
 
+import json
 import re
 import sys
 import types
@@ -9,6 +10,7 @@ import matplotlib.pyplot as plt
 import pytest
 
 from pages.site.gallery import SHOWN_ONLY
+from tests.models import TUNED
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 QUICK = {
@@ -22,6 +24,13 @@ QUICK = {
     "vehicle": {"STEPS": 20},
 }
 DRAWING = set(QUICK) - {"policies"}
+
+
+HOW_TO = [
+    pytest.param(page.stem, "\n".join(blocks), id=page.stem)
+    for page in sorted((EXAMPLES.parent / "docs" / "howto").glob("*.md"))
+    if (blocks := re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL))
+]
 
 
 def quick(name):
@@ -54,3 +63,14 @@ def test_an_example_runs(name, capsys, monkeypatch):
     assert printed
     if name in DRAWING:
         assert "figure" in vars(module)
+
+
+@pytest.mark.parametrize(("page", "code"), HOW_TO)
+def test_what_a_how_to_page_shows_runs(page, code, tmp_path, monkeypatch):
+    if page == "stable_baselines":
+        pytest.importorskip("stable_baselines3")
+        code = code.replace("num_envs=64", "num_envs=2").replace("n_steps=64", "n_steps=8")
+        code = code.replace("batch_size=256", "batch_size=16").replace("400_000", "16")
+    (tmp_path / "tuned.json").write_text(json.dumps(TUNED))
+    monkeypatch.chdir(tmp_path)
+    exec(compile(code, f"docs/howto/{page}.md", "exec"), {})
