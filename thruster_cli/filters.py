@@ -81,7 +81,7 @@ def command(
 def entry(name: str) -> Entry:
     """What the class of a filter says of it."""
     kind = filter_class(name)
-    text, meaning = cleandoc(kind.__doc__), _meanings(kind)
+    text, meaning = cleandoc(kind.__doc__ or ""), _meanings(kind)
     defaults = {field.name: field.default for field in dataclasses.fields(kind)}
     numbers = tuple(Number(number, defaults[number], meaning[number]) for number in tunable_numbers(name))
     return Entry(name, first_sentence(text), kind.has_covariance, has_ensemble(name), numbers, text)
@@ -95,7 +95,7 @@ def overview(entries: list[Entry]) -> list:
         for number in one.numbers:
             owners.setdefault(number, []).append(one.name)
     numbers = []
-    for names, group in groupby(owners, owners.get):
+    for names, group in groupby(owners, owners.__getitem__):
         numbers.append([Text(textwrap.fill(", ".join(names), OWNERS_WIDTH), style="bold"), "", ""])
         numbers += [[f"  {number.name}", number.default, first_sentence(number.meaning)] for number in group]
     return [
@@ -122,7 +122,7 @@ def in_full(one: Entry, width: int) -> list:
 
 def first_sentence(text: str) -> str:
     """The text up to the first full stop that ends a sentence, on one line."""
-    return re.match(r".*?(\.(?=\s|$)|$)", " ".join(text.split())).group()
+    return re.split(r"(?<=\.)\s", " ".join(text.split()), maxsplit=1)[0]
 
 
 def fitted(documentation: str, width: int) -> str:
@@ -139,15 +139,16 @@ def _fitted_paragraph(text: str, width: int) -> str:
 
 def _fitted_equations(line: str, width: int) -> str:
     """A line of equations, broken where two spaces part them; the rest stands below the first one."""
-    label = re.match(r" *([\w, ]+: +)?", line).end()
-    lines, parts = [line[:label]], re.split(r"(?<=\S)  (?=\S)", line[label:])
+    equations = re.sub(r"^ *([\w, ]+: +)?", "", line)
+    label = len(line) - len(equations)
+    lines, parts = [line[:label]], re.split(r"(?<=\S)  (?=\S)", equations)
     for number, part in enumerate(parts):
         if number and len(lines[-1]) + 2 + len(part) <= width:
             lines[-1] += "  " + part
             continue
         first = " " * label if number else lines.pop()
-        indents = {"initial_indent": first, "subsequent_indent": " " * (label + 2)}
-        lines += textwrap.wrap(part, width, **indents, break_on_hyphens=False)
+        rest = " " * (label + 2)
+        lines += textwrap.wrap(part, width, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False)
     return "\n".join(lines)
 
 
