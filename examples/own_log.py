@@ -51,8 +51,8 @@ print({header: column[:3] for header, column in runs[0].items()})
 # What the data sheet gets wrong
 # ------------------------------
 #
-# A first estimate, with the data sheet's model: the innovations are too large for what the filter believes, and
-# not white.
+# A first estimate, with the data sheet's model: the innovations are larger than the filter believes, for the
+# mean NIS (normalised innovation squared) lies above its band.
 
 before = tuning.estimate(runs[3], preset="tunnel_physical")
 before

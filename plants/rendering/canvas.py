@@ -40,9 +40,9 @@ class Canvas:
         self._whole.fill(WHITE)
         corner = (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2
         self.small = self._whole.subsurface(pygame.Rect(corner, inner))
-        self._fonts = {}
-        self._words = {}
-        self._on_top = []
+        self._fonts: dict[int, pygame.font.Font] = {}
+        self._words: dict[tuple, pygame.Surface] = {}
+        self._on_top: list[tuple] = []
         self._background = self.large
 
     def polygon(self, points, colour) -> None:
