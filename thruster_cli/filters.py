@@ -10,6 +10,7 @@ from itertools import groupby
 from typing import Annotated, Any, NamedTuple
 
 import typer
+from rich.console import RenderableType
 from rich.text import Text
 
 from filters.ensembles.ensemble import EnsembleKalmanFilter
@@ -87,7 +88,7 @@ def entry(name: str) -> Entry:
     return Entry(name, first_sentence(text), kind.has_covariance, has_ensemble(name), numbers, text)
 
 
-def overview(entries: list[Entry]) -> list:
+def overview(entries: list[Entry]) -> list[RenderableType]:
     """All filters in one table and all their numbers in another, each number once for all who share it."""
     filters = [[one.name, one.about, _yes(one.covariance), _yes(one.ensemble)] for one in entries]
     owners: dict[Number, list[str]] = {}
@@ -109,11 +110,11 @@ def overview(entries: list[Entry]) -> list:
     ]
 
 
-def in_full(one: Entry, width: int) -> list:
+def in_full(one: Entry, width: int) -> list[RenderableType]:
     """One filter: its documentation, fitted to a width, and a table of its numbers."""
     kind = filter_class(one.name)
     has = f"covariance: {_yes(one.covariance)}, ensemble: {_yes(one.ensemble)}"
-    shown = [Text(one.name, style="bold"), f"{kind.__module__}.{kind.__name__}", has, ""]
+    shown: list[RenderableType] = [Text(one.name, style="bold"), f"{kind.__module__}.{kind.__name__}", has, ""]
     shown.append(fitted(one.documentation, width))
     if one.numbers:
         shown += ["", table("Its own numbers", ["number", "default", "meaning"], list(one.numbers), words=True)]
