@@ -43,7 +43,7 @@ fuzz: $(TEST) ## attack everything at random for ten minutes; ARGS="--seconds 60
 lint: $(TEST) ## check style, formatting and types
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
-	@$(BIN)/python -m tests.repository.types
+	@$(BIN)/python -m mypy
 
 clean: ## remove .venv, build products and caches; results in out/ stay
 	rm -rf $(VENV) docs/tutorials build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -5,10 +5,10 @@ from __future__ import annotations
 import ast
 import importlib
 import sys
+from collections.abc import MutableMapping
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Final
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -22,7 +22,7 @@ PANELS = {
     "Published results and long studies": ("reproduce", "study"),
 }
 COMMANDS = {name: panel for panel, names in PANELS.items() for name in names}
-MARKUP = "markdown"
+MARKUP: Final = "markdown"
 LOADING = "loading ..."
 
 
@@ -36,12 +36,12 @@ class Commands(TyperGroup):
         return list(COMMANDS)
 
     @property
-    def commands(self) -> dict:
+    def commands(self) -> MutableMapping[str, Any]:
         """All commands by name, as they are listed."""
         return {name: listed(name) for name in COMMANDS}
 
     @commands.setter
-    def commands(self, given: dict) -> None:
+    def commands(self, given: MutableMapping[str, Any]) -> None:
         self._made = given
 
     def format_help(self, ctx, formatter) -> None:
@@ -72,9 +72,9 @@ class Commands(TyperGroup):
 
 def listed(name: str) -> TyperCommand:
     """A command with its name, panel and help alone, read from its file."""
-    tree = ast.parse(Path(find_spec(f"thruster_cli.{name}").origin).read_text(encoding="utf-8"))
+    tree = ast.parse(Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8"))
     functions = [part for part in tree.body if isinstance(part, ast.FunctionDef) and part.name == "command"]
-    text = ast.get_docstring(functions[0] if functions else tree)
+    text = ast.get_docstring(functions[0] if functions else tree) or ""
     return TyperCommand(
         name, help=text if functions else text.partition(": ")[2].capitalize(), rich_help_panel=COMMANDS[name]
     )

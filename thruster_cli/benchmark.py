@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -11,13 +12,13 @@ from studies.benchmark import WHY, Benchmark, Row, find_benchmark
 from thruster_cli.output import announce_compilation, console, progress_console, table
 
 
-def reproduce_benchmark(name: str, runs: int, seed: int) -> tuple[list, dict]:
+def reproduce_benchmark(name: str, runs: int, seed: int) -> tuple[list[RenderableType], dict]:
     """Solve a standard problem; return what to show, a list, and it as plain data."""
     announce_compilation()
     benchmark = find_benchmark(name)
     with progress_console.status("...") as status:
         rows = benchmark.reproduce(runs, seed, lambda row: status.update(f"done: {row.label}"))
-    shown = [_table(benchmark, rows, runs), Text(""), Text(f"{name}: {benchmark.source}")]
+    shown: list[RenderableType] = [_table(benchmark, rows, runs), Text(""), Text(f"{name}: {benchmark.source}")]
     if benchmark.remarks:
         shown.append(list_of(benchmark.remarks))
     return shown, {

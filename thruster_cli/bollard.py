@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.console import RenderableType
 
 from studies.bollard_fit import FITTED, Identified, identify, relative_errors
 from studies.bollard_table import read_table
@@ -127,10 +128,12 @@ def from_step(
     return found, family.parameters(values_of(**found.values))
 
 
-def _report(found: Identified, errors: dict, held_out, timed: Identification | None, out: Path) -> list:
+def _report(
+    found: Identified, errors: dict, held_out, timed: Identification | None, out: Path
+) -> list[RenderableType]:
     rows = [[name, f"{getattr(found.thruster, name):.5g}"] for name in FITTED]
     rows += [[name, f"{value:.5g}"] for name, value in found.pulse_widths._asdict().items()]
-    part = [table("Fitted to the table", ["", "value"], rows)]
+    part: list[RenderableType] = [table("Fitted to the table", ["", "value"], rows)]
     rows = [
         [quantity, *(f"{e['median']:.1%} ({e['90 %']:.1%})" for group in groups.values() for e in group.values())]
         for quantity, groups in errors.items()

@@ -47,10 +47,11 @@ def command(
     started = time.perf_counter()
     storage = str(out / "studies.journal")
     plan = Plan(FILTER, (find_scenario(SCENARIO),), seed)
-    tuning = tune(plan, trials, storage=storage, out=out / f"{FILTER}-{SCENARIO}-seed{seed}.json")
+    file = out / f"{FILTER}-{SCENARIO}-seed{seed}.json"
+    tuning = tune(plan, trials, storage=storage, out=file)
     with working("drawing"):
         pictures = draw(tuning, out)
-        report = write_report(tuning.file, storage, out)
+        report = write_report(file, storage, out)
     seconds = time.perf_counter() - started
     data = {
         "tuning": as_json(tuning),
@@ -59,7 +60,7 @@ def command(
         "report": str(report.page),
         "seconds": seconds,
     }
-    emit([*result(tuning, report, seconds), *files(tuning, pictures, report), *next_steps()], data, json)
+    emit([*result(tuning, report, seconds), *files(file, pictures, report), *next_steps()], data, json)
     if tuning.result.interrupted:
         sys.exit(130)
 
@@ -127,12 +128,12 @@ def best_baseline(tuning: Tuning) -> str:
     return min((name for name in found if name not in (TUNED, ORACLE)), key=lambda name: found[name].score.value)
 
 
-def files(tuning: Tuning, pictures: dict[Path, str], report: Report) -> list[str]:
+def files(tuned: Path, pictures: dict[Path, str], report: Report) -> list[str]:
     """Where all that was made is."""
     about = {
         **pictures,
         report.page: "the report: open it in a browser",
-        tuning.file: "the tuned filter: EstimateState(env, tuned=FILE)",
+        tuned: "the tuned filter: EstimateState(env, tuned=FILE)",
     }
     width = max(len(str(path)) for path in about)
     return [f"{path!s:{width}}  {what}" for path, what in about.items()]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -21,7 +22,7 @@ from thruster_cli.output import warn_beyond
 from thruster_env.control.controllers import PIController
 from thruster_env.rendering.env import renderer_of
 from thruster_env.rendering.history import Moment, Overlay
-from tuning.problems.excitation import EXCITATIONS
+from tuning.problems.excitation import EXCITATIONS, excitation_of
 from tuning.thruster.excitation import voltages_of
 
 POLICIES = ("pi",)
@@ -58,14 +59,15 @@ def play_voltages(
     if not isinstance(given, str):
         warn_beyond(arguments.get("preset", "tunnel"), given)
     with estimated_env(film, steps=steps, **arguments) as env:
-        plant = env.unwrapped.plant
+        thruster: Any = env.unwrapped
+        plant = thruster.plant
         if isinstance(given, str):
-            excitation = EXCITATIONS.make({"name": one_of("excitation", given, SEQUENCES)})[0]
+            excitation = excitation_of({"name": one_of("excitation", given, SEQUENCES)})
             voltages = voltages_of(excitation, plant, episode_keys([seed]), steps)[0]
         else:
             voltages = np.full(steps, within("voltage", given, plant.max_voltage))
-        moment = env.unwrapped.moment_of  # there is a reference, but nobody follows it
-        env.unwrapped.moment_of = lambda report: moment(report)._replace(reference=None)
+        moment = thruster.moment_of  # there is a reference, but nobody follows it
+        thruster.moment_of = lambda report: moment(report)._replace(reference=None)
         return _shown(env, lambda observation, step: voltages[[step]], film, seed, on_step)
 
 
@@ -139,14 +141,14 @@ def play_log(
     largest = float(np.abs(log.inputs).max())
     plant = offer.plant._replace(max_voltage=max(offer.plant.max_voltage, largest), dt=log.dt)
     renderer = renderer_of(plant, "human" if film is None else "rgb_array", max(1, round(1 / log.dt)))
-    frames = []
+    frames: list[np.ndarray] = []
     try:
         for row, (moment, overlay) in enumerate(zip(moments(log), overlays(found), strict=True)):
             renderer.add(moment, overlay)
-            if film is None:
-                renderer.draw()
-            elif row % every == 0:
-                frames.append(renderer.draw())
+            if film is None or row % every == 0:
+                frame = renderer.draw()
+                if frame is not None:  # in no window
+                    frames.append(frame)
             on_step(row, log.steps)
         if film is not None:
             write_film(film, frames, 1 / (log.dt * every))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from math import isnan
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from rich.console import RenderableType
 
 from filters.logs.columns import columns_of
 from filters.logs.estimate import LogEstimate, estimate
@@ -94,7 +95,7 @@ def command(
     check_targets((out, plot), json, read=(log, tuned, preset))
     announce_compilation()
     numbers = {} if ensemble_size is None else {"ensemble_size": ensemble_size}
-    options = {"tuned": tuned, "smoother": smoother, "lag": lag, "seed": seed, **numbers}
+    options: dict[str, Any] = {"tuned": tuned, "smoother": smoother, "lag": lag, "seed": seed, **numbers}
     found = estimate(recorded, filter_name, offer, **options)
     told = findings(found, skip)
     if out is not None:
@@ -110,7 +111,7 @@ def _title(found: LogEstimate) -> str:
     return f"{found.filter.name}, smoothed," if found.smoothed else found.filter.name
 
 
-def _shown(found: LogEstimate, told: LogFindings, out: Path | None, plot: Path | None) -> list:
+def _shown(found: LogEstimate, told: LogFindings, out: Path | None, plot: Path | None) -> list[RenderableType]:
     log = found.log
     about = f"{log.steps + 1} rows, dt {log.dt:g} s" + (", put on a grid" if log.irregular else "")
     title = f"{_title(found)} on {log.name} ({about}); rows {told.first} to {log.steps} count"
@@ -124,7 +125,7 @@ def _shown(found: LogEstimate, told: LogFindings, out: Path | None, plot: Path |
     elif told.whiteness is not None:
         white = told.whiteness
         rows.insert(1, ["whiteness, p-value", f"{white.p_value:.3g}", f"above {ALPHA:g}"])
-    shown = [table(title, ["innovations", "", "if consistent"], rows)]
+    shown: list[RenderableType] = [table(title, ["innovations", "", "if consistent"], rows)]
     columns = ["", "RMSE", "bias", "rows"]
     shown.append(table("One step ahead, prediction less measurement", columns, list(map(_row, told.predictions))))
     if told.references:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import RenderableType
 
 from thruster_cli.consistency import check_covariance, check_request
 from thruster_cli.error_tables import comparison_table
@@ -82,7 +83,8 @@ def command(
     found = on_held_out(choice, chosen, seed, seeds, is_tuned=tuned is not None, console=progress_console)
     proof, data = found.proof, found.to_dict()
     where = f"held-out {chosen.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
-    shown = [choice_table(found.choices, chosen), comparison_table(found.evaluations, proof.bound, where)]
+    shown: list[RenderableType] = [choice_table(found.choices, chosen)]
+    shown.append(comparison_table(found.evaluations, proof.bound, where))
     if tuned is None and not proof.tuned.has_truth:
         shown.append(without_truth(chosen.name))
     shown += [scaling_sentence(proof)] if tuned is None else gains(proof, chosen.seed_word)

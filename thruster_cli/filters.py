@@ -10,6 +10,7 @@ from itertools import groupby
 from typing import Annotated, Any, NamedTuple
 
 import typer
+from rich.console import RenderableType
 from rich.text import Text
 
 from filters.ensembles.ensemble import EnsembleKalmanFilter
@@ -81,13 +82,13 @@ def command(
 def entry(name: str) -> Entry:
     """What the class of a filter says of it."""
     kind = filter_class(name)
-    text, meaning = cleandoc(kind.__doc__), _meanings(kind)
+    text, meaning = cleandoc(kind.__doc__ or ""), _meanings(kind)
     defaults = {field.name: field.default for field in dataclasses.fields(kind)}
     numbers = tuple(Number(number, defaults[number], meaning[number]) for number in tunable_numbers(name))
     return Entry(name, first_sentence(text), kind.has_covariance, has_ensemble(name), numbers, text)
 
 
-def overview(entries: list[Entry]) -> list:
+def overview(entries: list[Entry]) -> list[RenderableType]:
     """All filters in one table and all their numbers in another, each number once for all who share it."""
     filters = [[one.name, one.about, _yes(one.covariance), _yes(one.ensemble)] for one in entries]
     owners: dict[Number, list[str]] = {}
@@ -95,7 +96,7 @@ def overview(entries: list[Entry]) -> list:
         for number in one.numbers:
             owners.setdefault(number, []).append(one.name)
     numbers = []
-    for names, group in groupby(owners, owners.get):
+    for names, group in groupby(owners, owners.__getitem__):
         numbers.append([Text(textwrap.fill(", ".join(names), OWNERS_WIDTH), style="bold"), "", ""])
         numbers += [[f"  {number.name}", number.default, first_sentence(number.meaning)] for number in group]
     return [
@@ -109,11 +110,11 @@ def overview(entries: list[Entry]) -> list:
     ]
 
 
-def in_full(one: Entry, width: int) -> list:
+def in_full(one: Entry, width: int) -> list[RenderableType]:
     """One filter: its documentation, fitted to a width, and a table of its numbers."""
     kind = filter_class(one.name)
     has = f"covariance: {_yes(one.covariance)}, ensemble: {_yes(one.ensemble)}"
-    shown = [Text(one.name, style="bold"), f"{kind.__module__}.{kind.__name__}", has, ""]
+    shown: list[RenderableType] = [Text(one.name, style="bold"), f"{kind.__module__}.{kind.__name__}", has, ""]
     shown.append(fitted(one.documentation, width))
     if one.numbers:
         shown += ["", table("Its own numbers", ["number", "default", "meaning"], list(one.numbers), words=True)]
@@ -122,7 +123,7 @@ def in_full(one: Entry, width: int) -> list:
 
 def first_sentence(text: str) -> str:
     """The text up to the first full stop that ends a sentence, on one line."""
-    return re.match(r".*?(\.(?=\s|$)|$)", " ".join(text.split())).group()
+    return re.split(r"(?<=\.)\s", " ".join(text.split()), maxsplit=1)[0]
 
 
 def fitted(documentation: str, width: int) -> str:
@@ -139,15 +140,16 @@ def _fitted_paragraph(text: str, width: int) -> str:
 
 def _fitted_equations(line: str, width: int) -> str:
     """A line of equations, broken where two spaces part them; the rest stands below the first one."""
-    label = re.match(r" *([\w, ]+: +)?", line).end()
-    lines, parts = [line[:label]], re.split(r"(?<=\S)  (?=\S)", line[label:])
+    equations = re.sub(r"^ *([\w, ]+: +)?", "", line)
+    label = len(line) - len(equations)
+    lines, parts = [line[:label]], re.split(r"(?<=\S)  (?=\S)", equations)
     for number, part in enumerate(parts):
         if number and len(lines[-1]) + 2 + len(part) <= width:
             lines[-1] += "  " + part
             continue
         first = " " * label if number else lines.pop()
-        indents = {"initial_indent": first, "subsequent_indent": " " * (label + 2)}
-        lines += textwrap.wrap(part, width, **indents, break_on_hyphens=False)
+        rest = " " * (label + 2)
+        lines += textwrap.wrap(part, width, initial_indent=first, subsequent_indent=rest, break_on_hyphens=False)
     return "\n".join(lines)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from rich.console import RenderableType
+
 from filters.engine.compile import new_memory
 from filters.registry import FILTERS
 from thruster_cli.output import table
@@ -35,7 +37,7 @@ def fits_of(problem: Problem, names: tuple[str, ...] = tuple(FILTERS)) -> list[F
     return found
 
 
-def fit_table(problem: Problem, fits: list[Fit]) -> list:
+def fit_table(problem: Problem, fits: list[Fit]) -> list[RenderableType]:
     """The table of `fits_of`."""
     model = problem.model()
     rows = [

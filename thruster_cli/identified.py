@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from rich.console import RenderableType
+
 from numerics.plots import save_figure
 from plants.logs.log import Log
 from thruster_cli.output import table
@@ -20,7 +22,7 @@ def report(
     runs: Sequence[Log],
     proving: Sequence[Log],
     files: Sequence[str],
-) -> list:
+) -> list[RenderableType]:
     """Tables and sentences for the terminal."""
     units = {one.name: one.unit for one in found.objective.coordinates.free}
     rows = []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -156,14 +156,20 @@ def command(
     if bollard is not None:
         from thruster_cli.bollard import check_of_table, identify_bollard
 
-        for_logs = {"--free": free, "--model": model, "--sensor": sensor, "--range": range_, "--start": start}
+        for_logs: dict[str, Any] = {
+            "--free": free,
+            "--model": model,
+            "--sensor": sensor,
+            "--range": range_,
+            "--start": start,
+        }
         for_logs |= {"--hold-noise": hold_noise, "--held-out": held_out, "--use-all": use_all, "--plot": plot}
         check_of_table(for_logs | {"--predicted": predicted})
         reading = {"columns": column, "clock_offset": clock_offset, "dt": dt}
         return identify_bollard(bollard, step, logs, preset, out or DEFAULT_OUT, json, **reading)
     if step is not None:
         raise ValueError(f"--step must come with --bollard TABLE.csv, but got --step {step} alone")
-    whose = {"preset": preset, "model": model, "sensors": sensor}
+    whose: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensor}
     options = whose | {"columns": column, "clock_offset": clock_offset, "dt": dt}
     if not logs:
         raise ValueError("identify must have at least one log, or --bollard TABLE.csv, but got none")
@@ -175,8 +181,10 @@ def command(
         raise ValueError(f"--out must end in .toml, but got {str(out)!r}")
     check_targets((out, plot), json, read=(*logs, *(held_out or [])))
     announce_compilation()
-    search = {"gate": gate, "degrees": degrees, "predicted": predicted or (), "starts": starts, "seed": seed}
-    whole = identified(family, runs, proving, ranges, numbers, progress_console, filter=filter_name, **search)
+    search: dict[str, Any] = {"gate": gate, "degrees": degrees, "predicted": predicted or (), "starts": starts}
+    whole = identified(
+        family, runs, proving, ranges, numbers, progress_console, filter=filter_name, seed=seed, **search
+    )
     found, checked, made = whole.found, whole.validation, []
     if plot is not None and not found.interrupted:
         with progress_console.status("profiles ...") as status:

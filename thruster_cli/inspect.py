@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -183,7 +183,8 @@ def _plain_analysis(analysis: Analysis) -> dict:
 
 def _plain_responses(model: LinearModel) -> dict:
     frequencies, times = response_grids(model)
-    bode, step = {"frequency [rad/s]": frequencies}, {"time [s]": times}
+    bode: dict[str, Any] = {"frequency [rad/s]": frequencies}
+    step: dict[str, Any] = {"time [s]": times}
     for name in INPUTS:
         gain = frequency_response(model, frequencies, name)
         bode[f"T/{name}"] = {

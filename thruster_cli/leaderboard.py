@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import isnan
 
+from rich.console import RenderableType
 from rich.table import Table
 
 from thruster_cli.error_tables import (
@@ -23,7 +24,7 @@ from tuning.evaluation.tuned import summary
 from tuning.evaluation.worth import without_truth
 
 
-def report(board: Leaderboard) -> list:
+def report(board: Leaderboard) -> list[RenderableType]:
     """Two tables of a scenario, one without truth, and a sentence on who wins."""
     scenario, evaluation = board.scenario, board.rows[0].evaluation
     title = f"{scenario.name}: {scenario.about}" if scenario.about else scenario.name

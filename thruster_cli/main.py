@@ -147,7 +147,9 @@ def _leave_full_disks_to_the_main_thread() -> None:
     threading.excepthook = say
 
 
-def _as_one_line(message, category, *where) -> str:
+def _as_one_line(
+    message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
+) -> str:
     """A warning, without the line of code that gave it."""
     return f"thruster: {message}\n" if category is UserWarning else f"thruster: {category.__name__}: {message}\n"
 

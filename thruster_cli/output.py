@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
-from rich.console import Console, ConsoleOptions, RenderResult
+from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType, RenderResult
 from rich.table import Table
 from rich.text import Text
 
@@ -38,37 +38,37 @@ class WholeTable(Table):
         title, caption = self.title, self.caption
         self.title = self.caption = None
         try:
-            yield from [Text(title, style="table.title")] if title else []
+            yield from [Text(str(title), style="table.title")] if title else []
             yield from super().__rich_console__(console, options)
-            yield from [Text(caption, style="table.caption")] if caption else []
+            yield from [Text(str(caption), style="table.caption")] if caption else []
         finally:
             self.title, self.caption = title, caption
 
 
 def table(
-    title: str,
-    columns: list[str],
-    rows: list[list[Any]],
+    title: str | None,
+    columns: Sequence[str],
+    rows: Sequence[Sequence[Any]],
     *,
     caption: str | None = None,
     words: bool = False,
-    best: Container[int] = (),
+    best: Container[int | None] = (),
 ) -> Table:
     """A table for the terminal; where it is narrow, cells fold and no column is lost.
 
     Args:
-        title: above it.
+        title: above it, if there is one.
         columns: their headers; the first one is left-aligned.
         rows: cells.
         caption: below it.
         words: whether the other columns hold words, and are left-aligned, too.
-        best: places of rows that win, which stand out on a terminal.
+        best: places of rows that win, which stand out on a terminal; None is no row's place.
     """
     title, caption = (part and showable(part, console.encoding) for part in (title, caption))
     out = WholeTable(title=title, caption=caption, box=SIMPLE_HEAD)
     out.padding, out.pad_edge = (0, 1, 0, 0), False  # five figures with their intervals fit into 80 columns
     for index, column in enumerate(columns):
-        justify = "left" if index == 0 or words else "right"
+        justify: JustifyMethod = "left" if index == 0 or words else "right"
         out.add_column(Text(showable(column, console.encoding), overflow="fold"), justify=justify, overflow="fold")
     for place, row in enumerate(rows):  # Text: units in brackets are no markup
         cells = [cell if isinstance(cell, Text) else Text(showable(str(cell), console.encoding)) for cell in row]
@@ -88,7 +88,7 @@ def _keep_words_whole(out: Table) -> None:
             column.min_width = width
 
 
-def emit(shown: list, data: dict, json_target: str | None) -> None:
+def emit(shown: Sequence[RenderableType], data: dict, json_target: str | None) -> None:
     """Print tables and lines, unless JSON goes to standard output; write JSON where asked."""
     if json_target == "-":
         sys.stdout.write(as_text(data))

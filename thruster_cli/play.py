@@ -99,7 +99,7 @@ def command(
     what = one_given(chosen)
     _check_options(what, {"--sensor": sensor, "--column": column}, ("--log",))
     _check_options(what, {"--steps": steps}, ("--policy", "--voltage", "--excitation"))
-    if what == "MODEL":
+    if model is not None:  # then it is what is played
         given = {"--preset": preset, "--filter": filter_name, "--tuned": tuned}
         _check_options(what, given, tuple(name for name in chosen if name != "MODEL"))
         played, shown, film = _of_policy(model, out, window, seed, json)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -135,11 +135,12 @@ def reproduce(names: tuple[str, ...], runs: int = RUNS, members: int = MEMBERS, 
     shown, general = [], general_statements(comparisons)
     for case in dict.fromkeys(c.case for c in comparisons):
         shown += [_own_table(case, [c for c in comparisons if c.case == case], runs, members), blank]
+    studies: dict[str, Any] = {}
     data = {
         "settings": {"runs": runs, "members": members, "seed": seed},
         "states": ["omega_m [rad/s]", "U_a [m/s]"],
         "results": [_plain_comparison(c) for c in comparisons],
-        "studies": {},
+        "studies": studies,
         "statements": general,
     }
     for name in names:
@@ -148,7 +149,7 @@ def reproduce(names: tuple[str, ...], runs: int = RUNS, members: int = MEMBERS, 
             shown += [_published_table(name, case, [f for f in found if f.case == case]), blank]
         statements = study_statements(STUDIES[name], found)
         shown += [Text(f"{name}: {STUDIES[name].source}"), list_of(statements), blank]
-        data["studies"][name] = {
+        studies[name] = {
             "source": STUDIES[name].source,
             "rows": [_plain_finding(f) for f in found],
             "statements": statements,

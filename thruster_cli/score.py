@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
+from rich.console import RenderableType
 
 from filters.consistency.intervals import mean_interval
 from numerics.checks import one_of
@@ -145,7 +146,7 @@ def _each_arm(setups) -> list[Setup]:
     return found
 
 
-def report(scored: Sequence[Scored], seeds: range) -> list:
+def report(scored: Sequence[Scored], seeds: range) -> list[RenderableType]:
     """A table of policies, and where the learnt ones lie."""
     kind = plant_of(scored[0].setup.task)
     rows, first, shown_parts = [], scored[0].scores.returns, [part for part in kind.parts if part != "all"]
@@ -157,7 +158,7 @@ def report(scored: Sequence[Scored], seeds: range) -> list:
     columns = ["policy", "mean return", "over the\nfirst", *headers]
     title = f"Held-out episodes {seeds.start} to {seeds.stop - 1}, {scored[0].setup.task}"
     caption = f"±: half of the 95 % interval. Then root mean square errors: {kind.errors}; blank: no such step."
-    shown: list = [table(title, columns, rows, caption=caption)]
+    shown: list[RenderableType] = [table(title, columns, rows, caption=caption)]
     learnt = [(number, one) for number, one in enumerate(scored, start=1) if one.folder is not None]
     return shown + [f"{number} {one.label}: {one.folder}" for number, one in learnt]
 

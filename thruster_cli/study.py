@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.progress import (
@@ -95,7 +95,7 @@ def policies(
     from training.comparison.tables import HEADER, rows_of, summary_rows
 
     comparison = QUICK if quick else Comparison()
-    given = {"seeds": seeds, "steps": steps, "recurrent": recurrent or None}
+    given: dict[str, Any] = {"seeds": seeds, "steps": steps, "recurrent": recurrent or None}
     comparison = comparison._replace(**{name: value for name, value in given.items() if value is not None})
     target = page or out / PAGE
     check_page(target)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from filters.tuned_file import read_tuned_file
@@ -183,14 +184,16 @@ def name_of(setup: Setup, tuned: Path | None = None, untuned: bool = False) -> s
     return "-".join([*parts, setup.algo, f"seed{setup.seed}"])
 
 
-def report(setup: Setup, trained: Trained) -> list:
+def report(setup: Setup, trained: Trained) -> list[RenderableType]:
     """What to print of a training: returns in its course, its speed, and what to do next."""
     curve, title = trained.curve, f"{setup.algo} on {setup.observe}, {setup.task}, scenario {setup.scenario}"
     last = len(curve) - 1
     picked = sorted({round(i * last / (SHOWN_EVALUATIONS - 1)) for i in range(SHOWN_EVALUATIONS)}) if curve else []
     rows = [[curve[i][0], f"{curve[i][1]:.3f}"] for i in picked]
     speed = f"{trained.learnt / trained.seconds:.0f} steps/s" if trained.learnt else "nothing was left to learn"
-    shown = [title, table("", ["steps", "mean return"], rows, caption="0 is perfect.")] if rows else []
+    shown: list[RenderableType] = []
+    if rows:
+        shown += [title, table("", ["steps", "mean return"], rows, caption="0 is perfect.")]
     shown.append(f"{trained.steps} steps, {trained.learnt} of them now in {trained.seconds:.1f} s: {speed}.")
     shown.append(f"Policy: {trained.folder}")
     if trained.interrupted:

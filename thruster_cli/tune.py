@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -155,7 +155,7 @@ def command(
     """
     one_of("method", method, METHODS)
     check_keepable(filter_name)
-    of_logs = {"preset": preset, "model": model, "sensors": sensor, "columns": column}
+    of_logs: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensor, "columns": column}
     of_logs |= {"clock_offset": clock_offset, "dt": dt, "held_out": held_out, "blocks": blocks, "lead": lead}
     scenarios = problems_of(scenario, log, of_logs, "mismatch")
     check_targets((out,), json, read=(*(log or []), *(held_out or [])))
@@ -194,5 +194,6 @@ def tune(
     name = study_name or name_of(plan, by_gradient)
     file = out or Path("out") / f"{name}.json"
     announce_compilation()
-    options = {"by_gradient": by_gradient, "workers": workers}
-    return run_tuning(plan, trials, progress_console, storage, name, file, **options)
+    return run_tuning(
+        plan, trials, progress_console, storage, name, file, by_gradient=by_gradient, workers=workers
+    )

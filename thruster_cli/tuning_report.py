@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import isfinite
 
 from numpy import isnan
+from rich.console import RenderableType
 
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import mean_sentence
@@ -17,6 +18,7 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SIZE_TOLERANCE
 from tuning.evaluation.tuned import consistency, metrics
 from tuning.evaluation.worth import scaling_sentence, without_truth
+from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
 from tuning.search.filter_types import kinds_tried
 from tuning.search.objectives import NIS_BAND
@@ -26,10 +28,10 @@ from tuning.search.space import size_ladder
 from tuning.search.study import StudyResult
 
 
-def report(tuning: Tuning) -> list:
+def report(tuning: Tuning) -> list[RenderableType]:
     """Tables and sentences that say what a tuning found and what it is worth."""
     result, plan = tuning.result, tuning.plan
-    shown = []
+    shown: list[RenderableType] = []
     for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True):
         found = {TUNED: result.choice, **baselines(result.choice.name, scenario, plan.seed)}
         evaluations = proof.evaluations
@@ -55,11 +57,13 @@ def report(tuning: Tuning) -> list:
     return shown
 
 
-def _search_sentences(tuning: Tuning) -> list:
+def _search_sentences(tuning: Tuning) -> list[RenderableType]:
     """What the search itself has to say: sizes, the price of consistency, optimism, a front, a maximum."""
-    result, plan, word, shown = tuning.result, tuning.plan, tuning.scenario.seed_word, []
-    if tuning.gradient is not None:
-        return [gradient_table(tuning.gradient, tuning.scenario.seed_word), *_gradient_sentences(tuning)]
+    result, plan, word = tuning.result, tuning.plan, tuning.scenario.seed_word
+    if tuning.gradient is not None and tuning.rival is not None:  # which come together
+        said = _gradient_sentences(tuning, tuning.gradient, tuning.rival)
+        return [gradient_table(tuning.gradient, word), *said]
+    shown: list[RenderableType] = []
     kinds = kinds_tried(result.trials)
     if kinds:
         shown.append(kinds_table(kinds, plan))
@@ -106,8 +110,8 @@ def _none_consistent(result: StudyResult, plan: Plan) -> str:
     )
 
 
-def _gradient_sentences(tuning: Tuning) -> list[str]:
-    gradient, ours, theirs = tuning.gradient, tuning.proof.tuned, tuning.rival.tuned
+def _gradient_sentences(tuning: Tuning, gradient: GradientResult, rival: Comparison) -> list[str]:
+    ours, theirs = tuning.proof.tuned, rival.tuned
     loose = [name for name, known in zip(gradient.names, gradient.identified, strict=True) if not known]
     words = []
     if loose:
@@ -167,7 +171,7 @@ def as_json(tuning: Tuning) -> dict:
     }
     if tuning.known is not None:
         data["innovations_alone"] = as_data(tuning.known)
-    if tuning.gradient is not None:
+    if tuning.gradient is not None and tuning.rival is not None:
         found = tuning.gradient
         data["gradient"] = {
             "log_likelihood": found.best.log_likelihood,

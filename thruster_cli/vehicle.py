@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rich.console import RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
@@ -28,11 +29,11 @@ from thruster_cli.vehicle_tables import (
 
 def reproduce_vehicle(
     paper: str, runs: int = RUNS, seed: int = 0, steps: int | None = None, series: Path | None = None
-) -> tuple[list, dict]:
+) -> tuple[list[RenderableType], dict]:
     """Run a paper's filters on its paths; return what to show, a list, and it as plain data."""
     results = _run(paper, runs, seed, steps)
     found, said = findings(paper, results), statements(paper, results)
-    shown = [] if paper == "ngatini2017" else [particulars_table(), Text()]
+    shown: list[RenderableType] = [] if paper == "ngatini2017" else [particulars_table(), Text()]
     for result in results:
         here = [one for one in found if one.path == result.path and result.world == "vehicle"]
         if here:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import RenderableType
 
 from thruster_cli.options import CodeOption, JsonOption, LogModelOption
 from thruster_cli.output import announce_compilation, emit, table, working
@@ -38,8 +39,8 @@ def command(
         sys.exit(1)
 
 
-def _shown(file: Path, found: Verification) -> list:
-    shown = []
+def _shown(file: Path, found: Verification) -> list[RenderableType]:
+    shown: list[RenderableType] = []
     if found.holds:
         shown.append(f"{file} holds: {found.checked} numbers are the same within {TOLERANCE:g} of their size.")
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from thruster_env.modelled import ModelledThruster
 from thruster_env.preset_file import is_file, read_preset
 from tuning.problems.files import FILE_SEQUENCES
 from tuning.problems.problem import Problem
+from tuning.problems.scenario import BaseScenario
 
 DEFAULT_PRESET = "tunnel"
 FREE = ("motor_damping", "voltage_gain", "lift_coefficient")  # free parameters by default
@@ -40,6 +41,14 @@ class Preset(ModelledThruster):
         """The model of the plant with its recorder."""
         bare = self.plant._replace(dead_band=NO_BAND)
         return with_shown(model_of_plant(bare, **changes), bare, self._seen)
+
+
+@overload
+def of_preset(problem: BaseScenario, preset: str | Path | None, sequences: int = ...) -> BaseScenario: ...
+
+
+@overload
+def of_preset(problem: Problem, preset: str | Path | None, sequences: int = ...) -> Problem: ...
 
 
 def of_preset(problem: Problem, preset: str | Path | None, sequences: int = FILE_SEQUENCES) -> Problem:
