@@ -122,7 +122,7 @@ def test_a_file_says_whose_scenario_it_is(tmp_path, monkeypatch):
         ({"scale": (1.0,) * 8}, "scale must be 12 finite numbers"),
         (
             {"measurement_noise_cov": 1.0},
-            "measurement_noise_cov must be 1 to 14 variances, one a channel",
+            "measurement_noise_cov must be 1 to 14 variances, one for each channel",
         ),
         ({"preset": "titanic"}, "preset must be"),
         ({"excitation": {"name": "manoeuvre", "path": "V"}}, "path must be one of I, II, III, IV, dynamic"),

@@ -68,7 +68,7 @@ def test_a_study_without_a_consistent_trial_says_so_everywhere(thruster, tmp_pat
     assert study["consistent"] is True, "what was asked for"
     thruster("report", "out/ekf-mismatch-seed0.json")
     page = (tmp_path / "out" / "ekf-mismatch-seed0.html").read_text()
-    assert f"to lie between 0.8 and 1.25 of what is right; it is {nis:.3g}, outside" in page
+    assert f"to lie between 0.8 and 1.25 of what is expected; it is {nis:.3g}, outside" in page
     code, said = thruster("tune", "--filter", "ekf", "--trials", 2, "--json", "two.json")
     data = json.loads((tmp_path / "two.json").read_text())
     assert not code and data["any_trial_consistent"] is True and "with it in its band" in said
