@@ -13,6 +13,7 @@ from numerics.plots import panels
 from tuning.api.held_out import cells_of
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.compare import Leaderboard, Row, winners
+from tuning.evaluation.knowledge import noise_sentence
 from tuning.problems.problem import Problem
 
 if TYPE_CHECKING:
@@ -110,7 +111,7 @@ class FilterComparison:
                 rows.append([row.label, found[0], "" if first else found[1], *last, "" if first else row.verdict])
             heads += ["NEES", "NIS", "us/step", "verdict"]
             title = f"{len(board.seeds)} held-out {board.scenario.seed_word} of {board.scenario.name}"
-            parts.append(html(title, heads, rows, winners(board)))
+            parts.append(html(title, heads, rows, f"{noise_sentence(board.rows)} {winners(board)}".strip()))
         return "".join(parts)
 
 
