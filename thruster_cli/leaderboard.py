@@ -7,6 +7,7 @@ from math import isnan
 from rich.console import RenderableType
 from rich.table import Table
 
+from filters.consistency.intervals import slightly
 from thruster_cli.error_tables import (
     MOST_COLUMNS,
     about,
@@ -103,7 +104,7 @@ def _against(board: Leaderboard) -> Table:
     rows = []
     for row in board.rows:
         ratios = [*row.ratios[: len(shown)], row.score_ratio]
-        cells = ["1" if row.label == first else about(ratio, 3) for ratio in ratios]
+        cells = ["1" if row.label == first else about(ratio, 4 if slightly(ratio) else 3) for ratio in ratios]
         nees, nis = consistency_cells(row.evaluation)
         if nees:
             nees = f"{'~' if row.nees_is_median else ''}{row.nees:.3g}"

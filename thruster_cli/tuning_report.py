@@ -7,7 +7,7 @@ from math import isfinite
 from numpy import isnan
 from rich.console import RenderableType
 
-from filters.consistency.intervals import Interval
+from filters.consistency.intervals import Interval, slightly
 from filters.consistency.verdicts import mean_sentence
 from thruster_cli.error_tables import comparison_table, span
 from thruster_cli.tables import choice_table, front_table, gradient_table, kinds_table
@@ -214,6 +214,9 @@ def _likelihood_gains(proof: Comparison, seed_word: str) -> list[str]:
 
 
 def _verdict(ratio: Interval, name: str, seed_word: str) -> str:
+    if slight := slightly(ratio):
+        changed = "lower" if ratio.high < 1 else "higher"
+        return f"Practically equal to the {name}: the error is {changed} by {slight}."
     if ratio.high < 1:
         return f"Tuning lowers the error by {100 * (1 - ratio.value):.0f} % against the {name}."
     if ratio.low > 1:

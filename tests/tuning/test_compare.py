@@ -11,8 +11,8 @@ from filters.augmented import Unknown
 from numerics.compiled import interpreted
 from plants.affine import affine_model
 from thruster_cli.main import main
-from tuning.evaluation.compare import compare, contender, sized
-from tuning.evaluation.evaluate import evaluate, score_ratio
+from tuning.evaluation.compare import Leaderboard, Row, compare, contender, sized, winners
+from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.knowledge import belief_sentences, beliefs_of, default_belief
 from tuning.evaluation.tuned import write_tuned
@@ -23,6 +23,7 @@ from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import StudyResult
 from tuning.thruster.find import find_scenario
 
+EVALUATION = Evaluation(*[None] * len(Evaluation._fields))
 NOMINAL, SEEDS = find_scenario("nominal"), held_out_seeds(0, 12)
 
 
@@ -82,6 +83,30 @@ def test_beliefs_are_said_with_their_numbers():
         f"load_gain is believed to be {gain:.4g} at first, with a standard deviation of {gain / 5:.3g},"
     )
     assert "believed to be 0 at first, with a standard deviation of 0.4, and to change by 0.01 a step" in second
+
+
+def scored(mean_squares, first=None):
+    """A row and the first one, with these mean square errors by run."""
+    one = EVALUATION._replace(mean_squares=np.array(mean_squares)[:, None], scale=np.ones(1), states=())
+    ratio = score_ratio(one, first.evaluation if first else one)
+    return Row("b" if first else "a", "ekf", one, None, 0.0, False, 0.0, (), ratio, ratio)
+
+
+@pytest.mark.parametrize(
+    ("squares", "said"),
+    [
+        (np.full(30, 1.0004), "worse: b by 0.02 % (practically equal)."),
+        (np.full(30, 0.9), "better: b."),
+        (
+            [1e4, *np.full(29, 0.5)],
+            "no different: b (undecided: few runs dominate; the median ratio of a run is 0.71).",
+        ),
+    ],
+)
+def test_a_verdict_says_how_much_it_is_worth(squares, said):
+    first = scored(np.ones(30))
+    board = Leaderboard(NOMINAL, range(30), np.ones(1), [first, scored(squares, first)])
+    assert winners(board) == f"On nominal, against a by the score: {said}"
 
 
 def test_a_size_is_for_filters_that_have_an_ensemble():

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.augmented import Unknown, augmented_model
-from filters.consistency.intervals import Interval, rmse_ratios
+from filters.consistency.intervals import Interval, rmse_ratios, slightly
 from filters.engine.batch import run
 from filters.estimators.find import is_foreign, label_of
 from filters.filter import Filter
@@ -20,7 +20,13 @@ from filters.particles.weighted import WeightedFilter
 from filters.registry import filter_class, make_filter
 from numerics.checks import one_of
 from tuning.evaluation.baselines import oracle, rule_of_thumb, scaled_default
-from tuning.evaluation.evaluate import Evaluation, compute_metrics, likelihood_gain, score_ratio
+from tuning.evaluation.evaluate import (
+    Evaluation,
+    compute_metrics,
+    likelihood_gain,
+    median_score_ratio,
+    score_ratio,
+)
 from tuning.evaluation.knowledge import KNOWLEDGE, beliefs_of
 from tuning.evaluation.runs import RunMetrics, joined, metrics_by_run
 from tuning.problems.data import Data
@@ -30,6 +36,7 @@ from tuning.search.interruption import stop_on_interrupt
 from tuning.search.space import Choice, ensemble_sizes_of, has_ensemble
 
 VERDICTS = {"better": "better", "worse": "worse", "tie": "no different", "unknown": "not to be told"}
+WIDE = 1.0  # length of a ratio's interval over its value, above which a few runs dominate the mean
 SYMBOLS = {"ambient_velocity": "U_0"}  # for labels
 
 
@@ -105,10 +112,21 @@ def winners(board: Leaderboard) -> str:
         return f"On {board.scenario.name} there is nothing to compare {first.label} with."
     said = []
     for verdict, words in VERDICTS.items():
-        names = [row.label for row in others if row.verdict == verdict]
+        names = [f"{row.label}{_doubt(row, first)}" for row in others if row.verdict == verdict]
         said += [f"{words}: {', '.join(names)}"] if names else []
     by = "score" if first.evaluation.has_truth else "log-likelihood"
     return f"On {board.scenario.name}, against {first.label} by the {by}: {'; '.join(said)}."
+
+
+def _doubt(row: Row, first: Row) -> str:
+    """What has to be said beside a verdict: the difference is hardly one, or a few runs make the ratio."""
+    ratio = row.score_ratio
+    if slight := slightly(ratio):
+        return f" by {slight} (practically equal)"
+    if row.verdict == "tie" and ratio.high - ratio.low > WIDE * ratio.value:
+        median = median_score_ratio(row.evaluation, first.evaluation)
+        return f" (undecided: few runs dominate; the median ratio of a run is {median:.2f})"
+    return ""
 
 
 def contender(
