@@ -5,16 +5,19 @@ import io
 import os
 import signal
 import sys
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
+from filters.consistency.intervals import Interval
 from numerics.checks import any_case, meant, one_of
 from numerics.progress import listening
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_cli import output
 from thruster_cli.app import COMMANDS, PANELS, listed
 from thruster_cli.benchmark import fitted
+from thruster_cli.tuning_report import way_out
 from tuning.api.run import file_name
 from tuning.search.interruption import STOPPING, stop_on_interrupt
 
@@ -154,3 +157,16 @@ def test_a_preset_beyond_its_range_is_warned_about(thruster):  # noqa: F811
 )
 def test_names_of_files_need_no_quotes(name, file):
     assert file_name(name) == file
+
+
+def test_a_tuning_that_made_it_worse_says_what_to_do_next():
+    proof = SimpleNamespace(
+        tuned=SimpleNamespace(has_truth=True), ratios={"scaled default": Interval(1.2, 1.1, 1.3)}
+    )
+    tuning = SimpleNamespace(
+        proofs=[proof], gradient=None, plan=SimpleNamespace(prune=True), result=SimpleNamespace(finished=6)
+    )
+    (said,) = way_out(tuning)
+    assert "(--trials 12), or without pruning (--no-pruning)" in said and "Q and R of the scaled default" in said
+    proof.ratios["scaled default"] = Interval(0.9, 0.8, 0.95)
+    assert way_out(tuning) == []
