@@ -12,6 +12,7 @@ from tuning.api.run import run_tuning
 from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem
 from tuning.problems.excitation import Steps
+from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
 from tuning.search.plan import Plan
@@ -144,6 +145,15 @@ def test_what_does_not_fit_is_one_clear_line(make, line):
     with pytest.raises(ValueError, match=line) as caught:
         make()
     assert "\n" not in str(caught.value)
+
+
+def test_a_module_in_the_folder_is_what_was_meant(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tank.py").write_text("problem = 3")
+    for name in ("tank", "tank.py"):
+        with pytest.raises(ValueError, match="did you mean 'tank:problem'") as caught:
+            find_problem(name)
+    assert len(str(caught.value)) < 250
 
 
 def test_what_is_wrong_with_held_out_data_is_said_before_the_search(tmp_path, monkeypatch):

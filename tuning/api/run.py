@@ -24,7 +24,7 @@ from tuning.problems.assumed import AssumedProblem
 from tuning.problems.problem import Problem
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.storage import open_storage
-from tuning.search.study import StudyResult, checked, finished_trials, open_study, run_study, run_trials
+from tuning.search.study import FINISHED, StudyResult, checked, finished_trials, open_study, run_study, run_trials
 from tuning.search.workers import run_in_workers
 
 MOST_TRIALS = 1_000_000
@@ -101,9 +101,10 @@ def run_tuning(
         _draw_first(plan, console)
         study = open_study(name, plan, None if storage is None else open_storage(storage))
         already = finished_trials(study)
+        before = [trial for trial in study.get_trials(deepcopy=False) if trial.state in FINISHED]
         if already:
             console.print(f"study {name!r} goes on after {already} finished trials")
-        with trial_bar(plan, names_of(plan), trials, already, console) as (advance, show_kinds):
+        with trial_bar(plan, names_of(plan), trials, before, console) as (advance, show_kinds):
             run = partial(run_trials, on_choice=lambda choice: show_kinds([choice.name]))
             if storage is not None and workers > 1:
                 run = partial(run_in_workers, storage=storage, workers=workers)
