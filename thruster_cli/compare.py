@@ -16,7 +16,7 @@ from thruster_cli.leaderboard import as_json, report
 from thruster_cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption, SeedOption, filter_option
 from thruster_cli.output import announce_compilation, emit, progress_console
 from thruster_cli.problems import PROBLEMS
-from tuning.api.compare import DEFAULT_FILTERS, compared, contenders_of
+from tuning.api.compare import DEFAULT_FILTERS, compared, contenders_of, knowledge_on
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
@@ -43,13 +43,13 @@ def command(
     preset: OfPresetOption = None,
     seeds: Annotated[int, typer.Option(help="Number of held-out seeds.", rich_help_panel=RUNS)] = HELD_OUT_SEEDS,
     knows: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="What a filter named by --filter knows of the plant's noise: true (oracle), scaled (scaled "
-            "default) or untuned (rule of thumb).",
+            "default) or untuned (rule of thumb). By default true, or scaled if the plant's Q and R are unknown.",
             rich_help_panel=FILTER,
         ),
-    ] = "true",
+    ] = None,
     augment: Annotated[
         list[str] | None,
         typer.Option(
@@ -86,6 +86,7 @@ def command(
         read_choice(file, problem)  # a clear error for a file that is for another plant
     names = filters or ([] if files else list(DEFAULT_FILTERS))
     sizes, unknown = dict(map(_size, ensemble_size or [])), dict(map(_unknown, augment or []))
+    knows = knowledge_on(chosen) if knows is None else knows
     contenders = contenders_of([*(files or []), *names], knows, unknown, sizes, seed)
     for problem in chosen:
         problem.held_out_seeds(seed, seeds)  # a clear error before any filter runs

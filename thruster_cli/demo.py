@@ -93,7 +93,9 @@ def error_table(tuning: Tuning) -> Table:
     speed, flow = (f"{limit:#.3g}" for limit in proof.bound)
     rows.append(["bound", "", speed, "", flow, "", str(len(proof.bound)), "1"])
     heads = [
-        head for state in scenario.model().states for head in (f"{state.symbol}\n[{state.unit}]", "above\nbound")
+        head
+        for state in scenario.model().states
+        for head in ("\n".join([*state.name.split(), f"[{state.unit}]"]), "above\nbound")
     ]
     shown = table(None, ["filter", "R\n[N^2]", *heads, "mean\nNEES", "mean\nNIS"], rows)
     shown.show_edge = False

@@ -27,6 +27,7 @@ from thruster_cli.options import (
     SeedOption,
     SensorOption,
     filter_option,
+    one_file,
 )
 from thruster_cli.output import announce_compilation, check_targets, emit, table
 from tuning.logs.read import read_named
@@ -36,12 +37,15 @@ ALPHA = 0.05  # below which a p-value speaks against white innovations
 
 def command(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="A .csv, .parquet or .npz file with a header.")],
+    file: Annotated[
+        Path | None, typer.Argument(metavar="FILE", help="Tuned file: filter, Q, R and the like.")
+    ] = None,
     filter_name: Annotated[
         str | None,
         filter_option(f"Without a tuned file; ekf by default. {FILTER_HELP}"),
     ] = None,
     tuned: Annotated[
-        Path | None, typer.Option(help="Tuned file: filter, Q, R and the like.", rich_help_panel=FILTER)
+        Path | None, typer.Option(metavar="FILE", help="The same as the argument.", rich_help_panel=FILTER)
     ] = None,
     preset: LogPresetOption = None,
     model: ModelOption = None,
@@ -85,8 +89,11 @@ def command(
 
     Example: thruster estimate run.csv --sensor speed --column speed=motor_rpm --column thrust=loadcell[kgf]
     """
+    if file is not None and log.suffix == ".json":  # the other way round
+        log, file = file, log
+    tuned = one_file(file, tuned)
     if tuned is not None and filter_name is not None:
-        raise ValueError(f"give either --tuned FILE or --filter NAME, but got both, {tuned} and {filter_name}")
+        raise ValueError(f"give either a tuned file or --filter NAME, but got both, {tuned} and {filter_name}")
     if plot is not None and plot.suffix != ".png":
         raise ValueError(f"--plot must end in .png, but got {str(plot)!r}")
     if out is not None:

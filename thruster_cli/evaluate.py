@@ -21,6 +21,7 @@ from thruster_cli.options import (
     OfPresetOption,
     SeedOption,
     filter_option,
+    one_file,
 )
 from thruster_cli.output import announce_compilation, emit, progress_console, working
 from thruster_cli.problems import PROBLEMS
@@ -34,9 +35,12 @@ from tuning.search.plan import HELD_OUT_SEEDS
 
 
 def command(
-    tuned: Annotated[
+    file: Annotated[
         Path | None,
-        typer.Option(help="Tuned file; it names filter, numbers and scenario.", rich_help_panel=FILTER),
+        typer.Argument(metavar="FILE", help="Tuned file; it names filter, numbers and scenario."),
+    ] = None,
+    tuned: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The same as the argument.", rich_help_panel=FILTER)
     ] = None,
     filter_name: Annotated[str | None, filter_option(f"Without a tuned file. {FILTER_HELP}")] = None,
     scenario: Annotated[
@@ -71,11 +75,14 @@ def command(
     With --consistency a filter's errors and innovations are held against its own covariances: NEES, NIS,
     whiteness, coverage, CRPS and, for ensembles, ranks; a sentence each, and a picture of all.
 
+    Example: thruster evaluate out/enkf-mismatch-seed0.json
+
     Example: thruster evaluate --filter enkf --scenario mismatch --consistency calibrated.png
     """
+    tuned = one_file(file, tuned)
     if (tuned is None) == (filter_name is None):
         got = "none" if tuned is None else f"both, {tuned} and {filter_name}"
-        raise ValueError(f"give either --tuned FILE or --filter NAME, but got {got}")
+        raise ValueError(f"give either a tuned file or --filter NAME, but got {got}")
     choice, chosen, _ = subject_of(tuned or filter_name, scenario, preset, model)
     if consistency is not None:
         check_request(consistency, choice.filter(chosen))

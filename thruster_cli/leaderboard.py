@@ -7,6 +7,7 @@ from math import isnan
 from rich.console import RenderableType
 from rich.table import Table
 
+from filters.consistency.intervals import slightly
 from thruster_cli.error_tables import (
     MOST_COLUMNS,
     about,
@@ -20,6 +21,7 @@ from thruster_cli.error_tables import (
 )
 from thruster_cli.output import table
 from tuning.evaluation.compare import Leaderboard, Row, winners
+from tuning.evaluation.knowledge import belief_sentences, noise_sentence
 from tuning.evaluation.tuned import summary
 from tuning.evaluation.worth import without_truth
 
@@ -31,11 +33,14 @@ def report(board: Leaderboard) -> list[RenderableType]:
     seeds = f"held-out {scenario.seed_word} {board.seeds[0]} to {board.seeds[-1]}"
     if not evaluation.has_truth:
         shown = [_predictions(board, f"{title}\nInnovations on {seeds}")]
-        said = [without_truth(scenario.name), f"{winners(board)}\n"]
+        said = [without_truth(scenario.name)]
     else:
         errors = _errors_across if 2 * len(evaluation.states) < MOST_COLUMNS else _errors_below
-        shown, said = [errors(board, f"{title}\nRMSE on {seeds}"), _against(board)], [f"{winners(board)}\n"]
-    return [*shown, *said]
+        shown, said = [errors(board, f"{title}\nRMSE on {seeds}"), _against(board)], []
+    noise = noise_sentence(board.rows, "--knows")
+    beliefs = belief_sentences(board.rows)
+    hint = ["--augment NAME:STD:WALK changes what is believed."] if beliefs else []
+    return [*shown, *([noise] if noise else []), *beliefs, *hint, *said, f"{winners(board)}\n"]
 
 
 def winner(board: Leaderboard) -> int | None:
@@ -99,7 +104,7 @@ def _against(board: Leaderboard) -> Table:
     rows = []
     for row in board.rows:
         ratios = [*row.ratios[: len(shown)], row.score_ratio]
-        cells = ["1" if row.label == first else about(ratio, 3) for ratio in ratios]
+        cells = ["1" if row.label == first else about(ratio, 4 if slightly(ratio) else 3) for ratio in ratios]
         nees, nis = consistency_cells(row.evaluation)
         if nees:
             nees = f"{'~' if row.nees_is_median else ''}{row.nees:.3g}"
@@ -164,6 +169,8 @@ def _row_as_json(row: Row) -> dict:
     gain = {} if row.evaluation.has_truth else {"log_likelihood_less_first": row.likelihood_gain}
     return {
         "filter": row.filter_name,
+        **({"knows": row.knows} if row.knows else {}),
+        **({"beliefs": {name: belief._asdict() for name, belief in row.beliefs.items()}} if row.beliefs else {}),
         **summary(row.evaluation),
         "median_nees": row.evaluation.median_nees,
         "above_bound": row.above_bound,

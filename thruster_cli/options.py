@@ -16,6 +16,13 @@ from thruster_env.parameters import PRESETS
 INPUT, FILTER, SEARCH, LEARNING, RUNS, OUTPUT = "Input", "Filter", "Search", "Learning", "Runs", "Output"
 
 
+def one_file(argument: Path | None, option: Path | None) -> Path | None:
+    """The tuned file, which may be given as an argument or by --tuned; ValueError where two are."""
+    if argument is not None and option is not None:
+        raise ValueError(f"a tuned file must be one, but got {argument} and --tuned {option}")
+    return argument or option
+
+
 def spelt(choices: Iterable[str]) -> Callable:
     """A callback of an option or argument that takes names of choices in upper or lower case."""
     known = tuple(choices)

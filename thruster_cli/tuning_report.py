@@ -7,8 +7,9 @@ from math import isfinite
 from numpy import isnan
 from rich.console import RenderableType
 
-from filters.consistency.intervals import Interval
+from filters.consistency.intervals import Interval, slightly
 from filters.consistency.verdicts import mean_sentence
+from numerics.modules import is_code
 from thruster_cli.error_tables import comparison_table, span
 from thruster_cli.tables import choice_table, front_table, gradient_table, kinds_table
 from tuning.api.run import Tuning
@@ -20,6 +21,7 @@ from tuning.evaluation.tuned import consistency, metrics
 from tuning.evaluation.worth import scaling_sentence, without_truth
 from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
+from tuning.problems.rooms import built_in
 from tuning.search.filter_types import kinds_tried
 from tuning.search.objectives import NIS_BAND
 from tuning.search.outcome import is_over_budget
@@ -29,9 +31,16 @@ from tuning.search.study import StudyResult
 
 
 def report(tuning: Tuning) -> list[RenderableType]:
-    """Tables and sentences that say what a tuning found and what it is worth."""
+    """What a tuning is worth, where its filter is and what to do next; then tables and sentences on it all."""
     result, plan = tuning.result, tuning.plan
     shown: list[RenderableType] = []
+    for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True):
+        where = f"{scenario.name}: " if len(tuning.proofs) > 1 else ""
+        first, *others = gains(proof, scenario.seed_word)
+        shown += [f"{where}{first}", *others]
+    if result.consistent is False:
+        shown.append(_none_consistent(result, plan))
+    shown += [*way_out(tuning), *next_steps(tuning), ""]
     for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True):
         found = {TUNED: result.choice, **baselines(result.choice.name, scenario, plan.seed)}
         evaluations = proof.evaluations
@@ -39,7 +48,6 @@ def report(tuning: Tuning) -> list[RenderableType]:
         span_of_seeds = f"{scenario.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}"
         where = f"held-out {span_of_seeds}, scenario {scenario.name}"
         shown += [choice_table(choices, scenario), comparison_table(evaluations, proof.bound, where)]
-        shown += gains(proof, scenario.seed_word)
         shown.append(_consistency_sentence(proof.tuned))
         if proof.tuned.has_truth and isnan(proof.bound).all():
             shown.append(
@@ -51,8 +59,28 @@ def report(tuning: Tuning) -> list[RenderableType]:
     trained = f"{result.finished} trials, {result.pruned} of them pruned, {result.seconds:.1f} s in this run"
     over = sum(map(is_over_budget, result.trials))
     trained += f"; {over} ended for their cost" if over else ""
-    shown.append(f"Study {tuning.study!r}: {trained}. Tuned filter: {tuning.file}")
-    if result.interrupted:
+    return [*shown, f"Study {tuning.study!r}: {trained}."]
+
+
+def way_out(tuning: Tuning) -> list[str]:
+    """What to do where the tuned filter is worse than the best of what anybody has; empty where it is not."""
+    ratios = [next(iter(proof.ratios.items())) for proof in tuning.proofs if proof.tuned.has_truth]
+    worse = [name for name, ratio in ratios if ratio.low > 1 and not slightly(ratio)]
+    if not worse or tuning.gradient is not None:
+        return []
+    pruning = ", or without pruning (--no-pruning)" if tuning.plan.prune else ""
+    return [
+        f"What may help: more trials (--trials {2 * tuning.result.finished}){pruning}. The file below holds the "
+        f"tuned filter all the same; Q and R of the {worse[0]} are in the table."
+    ]
+
+
+def next_steps(tuning: Tuning) -> list[str]:
+    """Where the tuned filter is, and the command that shows more of it; of an interrupted study how it goes on."""
+    shown = [f"Tuned filter: {tuning.file}"]
+    names = [one.name for one in tuning.plan.scenarios if is_code(one.name) and one.name not in built_in()]
+    shown.append(f"Next: thruster report {tuning.file}{''.join(f' --problem {name}' for name in names)}")
+    if tuning.result.interrupted:
         shown.append("Interrupted: this is on the trials that were finished; the same command goes on.")
     return shown
 
@@ -81,19 +109,18 @@ def _search_sentences(tuning: Tuning) -> list[RenderableType]:
             f"Score over the best by ensemble size, on {word} that chose neither Q nor R, with the upper end of "
             f"its 95 % interval: {ratios}. {_size_sentence(kept, result)}{_seeds_sentence(result, word)}"
         )
-    if result.consistent is False:
-        shown.append(_none_consistent(result, plan))
-    elif result.free_value is not None:
+    if result.consistent is not False and result.free_value is not None:
         price = 100 * (result.best_value / result.free_value - 1)
         shown.append(
-            f"Consistency costs {price:.1f} % of the score on the training {word}: the best trial has "
-            f"{result.free_value:.3f} whatever its NIS, {result.best_value:.3f} with it in its band."
+            f"Consistency, a mean NIS (normalised innovation squared) in its band, costs {price:.1f} % of the "
+            f"score on the training {word}: the best trial has {result.free_value:.3f} whatever its NIS, "
+            f"{result.best_value:.3f} with it in the band."
         )
     if plan.objectives == ("score",):  # which needs truth
         found = sum(proof.tuned.score.value for proof in tuning.proofs) / len(tuning.proofs)
         shown.append(
-            f"Optimism: the best trial scores {result.best_value:.3f} on the training {word}, the tuned filter "
-            f"{found:.3f} on the held-out ones."
+            f"Optimism, by how much the score flatters on the {word} that chose the filter: the best trial has "
+            f"{result.best_value:.3f} on the training {word}, the tuned filter {found:.3f} on the held-out ones."
         )
     if result.front:
         shown.append(front_table(plan, result.front))
@@ -214,6 +241,9 @@ def _likelihood_gains(proof: Comparison, seed_word: str) -> list[str]:
 
 
 def _verdict(ratio: Interval, name: str, seed_word: str) -> str:
+    if slight := slightly(ratio):
+        changed = "lower" if ratio.high < 1 else "higher"
+        return f"Practically equal to the {name}: the error is {changed} by {slight}."
     if ratio.high < 1:
         return f"Tuning lowers the error by {100 * (1 - ratio.value):.0f} % against the {name}."
     if ratio.low > 1:

@@ -73,7 +73,7 @@ def test_tune_resume_evaluate_and_wrap(thruster, as_json, tmp_path):
     assert second["trials"] == 15
     assert second["best_training_value"] <= first["best_training_value"]
 
-    evaluated = as_json("evaluate", "--tuned", second["file"])
+    evaluated = as_json("evaluate", second["file"])
     held_out = second["held_out"]["mismatch"]
     assert all(evaluated[key] == held_out[key] for key in ("tuned", "scaled", "scaled_default"))
     assert held_out["scaled_default"]["factor"] == 0.03248  # on 1 % of the ranges, which is far too much
@@ -200,7 +200,7 @@ BAD = [
     (("tune", "--storage", "text.txt"), "storage must be a journal file"),
     (("tune", "--filter", "ekf", "--trials", "1", "--out", "text.txt/x.json"), "must be where it can be written"),
     (("evaluate", "--tuned", "missing.json"), "a tuned file must be readable"),
-    (("evaluate", "--tuned", "text.txt"), "a tuned file must be whole JSON"),
+    (("evaluate", "text.txt"), "a tuned file must be whole JSON"),
     (
         ("evaluate", "--tuned", "old.json"),
         "a tuned file must be of version 2, 3 or 4, but old.json is of version 1: tune again",
@@ -210,7 +210,8 @@ BAD = [
         ("report", "missing"),
         "a report must be of a tuned file or of a study in out/studies.journal, but got 'missing'",
     ),
-    (("evaluate",), "give either --tuned FILE or --filter NAME"),
+    (("evaluate",), "give either a tuned file or --filter NAME"),
+    (("evaluate", "a.json", "--tuned", "b.json"), "a tuned file must be one, but got a.json and --tuned b.json"),
     (("evaluate", "--filter", "ekf", "--seeds", "1"), "held-out seeds must be a whole number of at least 2"),
     (("evaluate", "--filter", "ekf", "--consistency", "x.pdf"), "--consistency must end in .png, but got 'x.pdf'"),
     (("evaluate", "--filter", "ekf", "--consistency", "text.txt/x.png"), "must be where it can be written"),

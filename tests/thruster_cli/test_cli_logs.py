@@ -102,7 +102,7 @@ def test_a_filter_tuned_on_logs_is_verified_reported_and_used(simulated, as_json
     assert as_json("verify", "tuned.json")["holds"]
     assert "held-out blocks" in thruster("evaluate", "--tuned", "tuned.json").stdout
     assert "log-likelihood" in as_json("report", "tuned.json")["advice"]
-    told = as_json("estimate", "c.csv", "--tuned", "tuned.json")
+    told = as_json("estimate", "tuned.json", "c.csv")
     assert told["filter"] == "ekf"
     wrapped = EstimateState(gym.make("BowThruster-v0"), tuned=str(tmp_path / "tuned.json"))
     assert wrapped.filter.name == "ekf"
@@ -151,7 +151,7 @@ def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  
         (("estimate", "run.csv", "--model", "m:x", "--preset", "tunnel"), "must be of --model or of a thruster"),
         (
             ("estimate", "run.csv", "--filter", "ekf", "--tuned", "x.json"),
-            "give either --tuned FILE or --filter NAME",
+            "give either a tuned file or --filter NAME",
         ),
         (("estimate", "run.csv", "--out", "est.txt"), "--out must end in .csv, .parquet or .npz"),
         (("estimate", "run.csv", "--plot", "est.pdf"), "--plot must end in .png, but got 'est.pdf'"),

@@ -35,6 +35,7 @@ def test_demo_tells_its_result_in_thirty_lines_and_draws_what_it_tuned(run_demo,
     assert code == 0 and len(lines) <= 30 and max(map(len, lines)) <= 80
     data = json.loads((tmp_path / "demo.json").read_text())
     held_out = data["tuning"]["held_out"]["outliers"]
+    assert any("motor" in line and "flow" in line for line in lines)
     words = " ".join(" ".join(lines).split())
     assert words.startswith("An extended Kalman filter")
     assert 0 < words.index(data["advice"]) < words.index("rule of thumb 0.25")

@@ -5,18 +5,27 @@ import io
 import os
 import signal
 import sys
+from types import SimpleNamespace
 
+import optuna
 import pytest
+from optuna.trial import create_trial
 from rich.console import Console
 
+from filters.consistency.intervals import Interval
 from numerics.checks import any_case, meant, one_of
 from numerics.progress import listening
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_cli import output
 from thruster_cli.app import COMMANDS, PANELS, listed
 from thruster_cli.benchmark import fitted
+from thruster_cli.tuning_report import way_out
+from tuning.api.progress import trial_bar
 from tuning.api.run import file_name
+from tuning.problems.find import find_problem
+from tuning.reporting.figures import draw_history
 from tuning.search.interruption import STOPPING, stop_on_interrupt
+from tuning.search.plan import Plan
 
 
 def test_the_version_is_that_of_the_package(thruster):  # noqa: F811
@@ -154,3 +163,32 @@ def test_a_preset_beyond_its_range_is_warned_about(thruster):  # noqa: F811
 )
 def test_names_of_files_need_no_quotes(name, file):
     assert file_name(name) == file
+
+
+def test_a_tuning_that_made_it_worse_says_what_to_do_next():
+    proof = SimpleNamespace(
+        tuned=SimpleNamespace(has_truth=True), ratios={"scaled default": Interval(1.2, 1.1, 1.3)}
+    )
+    tuning = SimpleNamespace(
+        proofs=[proof], gradient=None, plan=SimpleNamespace(prune=True), result=SimpleNamespace(finished=6)
+    )
+    (said,) = way_out(tuning)
+    assert "(--trials 12), or without pruning (--no-pruning)" in said and "Q and R of the scaled default" in said
+    proof.ratios["scaled default"] = Interval(0.9, 0.8, 0.95)
+    assert way_out(tuning) == []
+
+
+def test_a_study_that_is_done_shows_its_best_and_no_time_left():
+    stream = io.StringIO()
+    plan = Plan("ekf", (find_problem("nominal"),))
+    with trial_bar(plan, "nominal", 3, [create_trial(value=1.5)] * 3, Console(file=stream, width=90)):
+        pass
+    assert "3/3 best 1.500 0:00:00" in stream.getvalue()
+
+
+def test_trials_have_whole_numbers_in_pictures():
+    study = optuna.create_study()
+    for value in (3.0, 2.0, 2.5):
+        study.add_trial(create_trial(value=value))
+    figure = draw_history(study.trials, "a study")
+    assert all(float(tick).is_integer() for tick in figure.axes[0].get_xticks())

@@ -2,14 +2,17 @@
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from plants.state_space import StateSpaceModel
 from tests import pendulum_problem
 from tests.models import wide_model
 from tests.small_problems import pair, thruster
+from tuning.api.run import run_tuning
 from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem
 from tuning.problems.excitation import Steps
+from tuning.problems.find import find_problem
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
 from tuning.search.plan import Plan
@@ -61,7 +64,8 @@ BAD = {
     ),
     "true NaN": (
         lambda: ModelProblem(line(nowhere_else), steps=60).data([5]),
-        "states of problem a pair of models must be finite, but those of seed 5 are not from step 1 on",
+        "states of problem a pair of models must be finite, but those of seed 5 are not from step 1 on: "
+        "x_1 was .* one step earlier; a root or a logarithm may have left its domain",
     ),
     "assumed NaN": (
         lambda: checked_problem(ModelProblem(line(), line(nowhere_else), steps=60, scale=(1.0,))),
@@ -141,3 +145,23 @@ def test_what_does_not_fit_is_one_clear_line(make, line):
     with pytest.raises(ValueError, match=line) as caught:
         make()
     assert "\n" not in str(caught.value)
+
+
+def test_a_module_in_the_folder_is_what_was_meant(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tank.py").write_text("problem = 3")
+    for name in ("tank", "tank.py"):
+        with pytest.raises(ValueError, match="did you mean 'tank:problem'") as caught:
+            find_problem(name)
+    assert len(str(caught.value)) < 250
+
+
+def test_what_is_wrong_with_held_out_data_is_said_before_the_search(tmp_path, monkeypatch):
+    def inputs(seeds, steps):
+        return np.where(np.array(seeds) >= 500_000, np.nan, 1.0)[:, None, None] * np.ones((1, steps, 2))
+
+    monkeypatch.setattr("tuning.api.run.HELD_OUT_SEEDS", 2)
+    journal = tmp_path / "study.journal"
+    with pytest.raises(ValueError, match="inputs of problem .* must be finite"):
+        run_tuning(Plan("ekf", (pair(inputs=inputs),)), 2, Console(quiet=True), str(journal))
+    assert not journal.exists()

@@ -2,22 +2,28 @@ import json
 import os
 import signal
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from filters.augmented import Unknown
+from numerics.compiled import interpreted
+from plants.affine import affine_model
 from thruster_cli.main import main
-from tuning.evaluation.compare import compare, contender, default_belief, sized
-from tuning.evaluation.evaluate import evaluate, score_ratio
+from tuning.evaluation.compare import Leaderboard, Row, compare, contender, sized, winners
+from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison
+from tuning.evaluation.knowledge import belief_sentences, beliefs_of, default_belief
 from tuning.evaluation.tuned import write_tuned
+from tuning.problems.model_problem import ModelProblem
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan
 from tuning.search.space import oracle_choice, untuned_choice
 from tuning.search.study import StudyResult
 from tuning.thruster.find import find_scenario
 
+EVALUATION = Evaluation(*[None] * len(Evaluation._fields))
 NOMINAL, SEEDS = find_scenario("nominal"), held_out_seeds(0, 12)
 
 
@@ -66,6 +72,41 @@ def test_what_is_believed_by_default():
     assert default_belief("load_gain", -20.0) == Unknown(4.0, pytest.approx(0.08))
     with pytest.raises(ValueError, match="the assumed asymmetry, .* must be positive, but got 0.0"):
         default_belief("asymmetry", 0.0)
+
+
+def test_beliefs_are_said_with_their_numbers():
+    constants = NOMINAL.model().constants
+    found = beliefs_of(constants, {"load_gain": None, "ambient_velocity": Unknown(0.4, 0.01)})
+    first, second = belief_sentences([SimpleNamespace(beliefs=found)])
+    gain = constants.load_gain
+    assert first.startswith(
+        f"load_gain is believed to be {gain:.4g} at first, with a standard deviation of {gain / 5:.3g},"
+    )
+    assert "believed to be 0 at first, with a standard deviation of 0.4, and to change by 0.01 a step" in second
+
+
+def scored(mean_squares, first=None):
+    """A row and the first one, with these mean square errors by run."""
+    one = EVALUATION._replace(mean_squares=np.array(mean_squares)[:, None], scale=np.ones(1), states=())
+    ratio = score_ratio(one, first.evaluation if first else one)
+    return Row("b" if first else "a", "ekf", one, None, 0.0, False, 0.0, (), ratio, ratio)
+
+
+@pytest.mark.parametrize(
+    ("squares", "said"),
+    [
+        (np.full(30, 1.0004), "worse: b by 0.02 % (practically equal)."),
+        (np.full(30, 0.9), "better: b."),
+        (
+            [1e4, *np.full(29, 0.5)],
+            "no different: b (undecided: few runs dominate; the median ratio of a run is 0.71).",
+        ),
+    ],
+)
+def test_a_verdict_says_how_much_it_is_worth(squares, said):
+    first = scored(np.ones(30))
+    board = Leaderboard(NOMINAL, range(30), np.ones(1), [first, scored(squares, first)])
+    assert winners(board) == f"On nominal, against a by the score: {said}"
 
 
 def test_a_size_is_for_filters_that_have_an_ensemble():
@@ -137,6 +178,7 @@ def test_the_command_ranks_filters_on_scenarios(thruster, tmp_path):
     for word in ("one measured thrust in twenty", "RMSE on held-out seeds 500000 to 500007", "rad/s", "bound"):
         assert word in out
     assert "On outliers, against ekf by the score: better: ekf-robust." in out
+    assert "Q and R: the plant's own (oracle; --knows true)." in out
     content = json.loads((tmp_path / "board.json").read_text())
     assert content["seeds"] == [500000, 500008] and set(content["scenarios"]) == {"outliers", "nominal"}
     row = content["scenarios"]["outliers"]["filters"]["ekf-robust"]
@@ -165,8 +207,27 @@ def test_the_command_takes_tuned_files(thruster, tmp_path):
     write_tuned(tmp_path / "mine.json", Plan("enkf", (scenario,)), result, [proof], "s")
     code, out, _ = thruster("mine.json", "--filter", "ekf", "--seeds", 4, "--ensemble-size", 20)
     assert code == 0 and "mismatch:" in out and "Over mine, paired" in out
+    assert "Q and R: of mine the tuned ones; of ekf the plant's own (oracle; --knows true)." in out
     code, out, _ = thruster("mine.json", "--seeds", 4, "--scenario", "nominal")
     assert code == 0 and "On nominal there is nothing to compare mine with." in out
+
+
+def small_unknown():
+    """A walk that drifts, and a model that knows nothing of the drift: its Q is not the plant's."""
+    noise = {"measurement_noise_cov": [1.0], "c": [[1.0, 0.0]]}
+    start = {"prior_mean": [0.0, 0.1], "prior_cov": [1.0, 0.01], "process_noise_cov": [0.1, 1e-4]}
+    truth = affine_model(a=[[0.9, 1.0], [0.0, 0.9]], b=np.zeros((2, 0)), states=["x", "y"], **noise, **start)
+    one = {"prior_mean": [0.0], "prior_cov": [1.0], "process_noise_cov": [0.1], "measurement_noise_cov": [1.0]}
+    assumed = affine_model(a=[[0.9]], b=np.zeros((1, 0)), c=[[1.0]], states=["x"], **one)
+    return ModelProblem(truth, assumed, steps=60, scale=(1.0,))
+
+
+def test_where_nobody_knows_the_plants_noise_filters_have_the_scaled_default(thruster, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "of_their_own", SimpleNamespace(problem=small_unknown()))
+    with interpreted():
+        code, out, errors = thruster("--filter", "ekf", "--problem", "of_their_own:problem", "--seeds", 2)
+    assert code == 0, errors
+    assert "Q and R: the scaled default (--knows scaled)." in out
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from tuning.api.study import Study
 from tuning.api.tune import tune
 from tuning.evaluation.compare import Contender, contender, sized
 from tuning.evaluation.compare import compare as compare_all
+from tuning.evaluation.knowledge import OF_FILE
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.problem import Problem
 from tuning.search.plan import HELD_OUT_SEEDS
@@ -86,7 +87,7 @@ def compare(
             tune(list(problems), one, trials=trials, seed=seed, progress=progress) if _is_named(one) else one
             for one in some
         ]
-    knows = _knowledge(problems) if knows is None else knows
+    knows = knowledge_on(problems) if knows is None else knows
     beliefs = beliefs_of(augment or {})
     return compared(contenders_of(some, knows, beliefs, sizes, seed), problems, seed, seeds, console_for(progress))
 
@@ -130,10 +131,12 @@ def contenders_of(
     for one in filters:
         if isinstance(one, Study):
             choice = sized(one.choice, size_of(one.choice.name))
-            out.append(Contender(_new(f"{label_of(choice.name)} tuned", out), partial(_same, choice)))
+            out.append(
+                Contender(_new(f"{label_of(choice.name)} tuned", out), partial(_same, choice), knows=OF_FILE)
+            )
         elif not is_filter(one):
             size = size_of(read_tuned_file(one)["filter"]["name"])
-            out.append(Contender(_new(Path(one).stem, out), partial(_from_file, Path(one), size)))
+            out.append(Contender(_new(Path(one).stem, out), partial(_from_file, Path(one), size), knows=OF_FILE))
         else:
             size = size_of(one) if not is_foreign(one) and has_ensemble(one) else None
             out.append(contender(one, knows, seed=seed, ensemble_size=size))
@@ -169,7 +172,7 @@ def _default(filters: Sequence[Any]) -> Any:
     return NOMINAL
 
 
-def _knowledge(problems: Sequence[Problem]) -> str:
+def knowledge_on(problems: Sequence[Problem]) -> str:
     """What filters know of the noise unless it is said: all of it, or the scaled default where nobody does."""
     return "scaled" if any(one.true is None for one in problems) else "true"
 

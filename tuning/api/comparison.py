@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from filters.consistency.intervals import Interval
+from filters.consistency.intervals import Interval, slightly
 from filters.looks import colour_of
 from numerics.plots import panels
 from tuning.api.held_out import cells_of
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.compare import Leaderboard, Row, winners
+from tuning.evaluation.knowledge import noise_sentence
 from tuning.problems.problem import Problem
 
 if TYPE_CHECKING:
@@ -107,10 +108,12 @@ class FilterComparison:
                     found = [number(one.log_likelihood, ".2f"), about(row.likelihood_gain, 2)]
                 last = [number(one.nees.value, ".3g"), number(one.nis.value, ".3g"), f"{row.microseconds:.3g}"]
                 first = row is board.rows[0]  # which is compared with itself
-                rows.append([row.label, found[0], "" if first else found[1], *last, "" if first else row.verdict])
+                rows.append(
+                    [row.label, found[0], "" if first else found[1], *last, "" if first else _verdict(row)]
+                )
             heads += ["NEES", "NIS", "us/step", "verdict"]
             title = f"{len(board.seeds)} held-out {board.scenario.seed_word} of {board.scenario.name}"
-            parts.append(html(title, heads, rows, winners(board)))
+            parts.append(html(title, heads, rows, f"{noise_sentence(board.rows)} {winners(board)}".strip()))
         return "".join(parts)
 
 
@@ -122,6 +125,11 @@ def _rank(row: Row) -> float:
 def _figure(row: Row) -> str:
     one = row.evaluation
     return number(one.score.value if one.has_truth else one.log_likelihood)
+
+
+def _verdict(row: Row) -> str:
+    slight = slightly(row.score_ratio)
+    return f"{row.verdict} by {slight}" if slight else row.verdict
 
 
 def _draw(axis: Any, board: Leaderboard) -> None:

@@ -24,6 +24,8 @@ from tuning.api.notebook import NotebookLine
 from tuning.search.interruption import STOPPING
 
 if TYPE_CHECKING:
+    from optuna.trial import FrozenTrial
+
     from tuning.problems.problem import Problem
     from tuning.search.plan import Plan
     from tuning.search.study import OnTrial
@@ -61,7 +63,7 @@ def working(text: str, console: Console) -> Iterator[None]:
 
 @contextmanager
 def trial_bar(
-    plan: Plan, names: str, total: int, done: int, console: Console
+    plan: Plan, names: str, total: int, before: Sequence[FrozenTrial], console: Console
 ) -> Iterator[tuple[OnTrial, ShowKinds]]:
     """What is called after each trial of a study, and with the kinds of filters that are under trial.
 
@@ -69,11 +71,10 @@ def trial_bar(
         plan: of the study.
         names: of its scenarios.
         total: trials that it shall have.
-        done: trials that it has.
+        before: finished trials that it has.
         console: where it is shown.
     """
     from tuning.search.filter_types import kinds_running
-    from tuning.search.outcome import best_trial
 
     title, named = f"tuning {{}} on {names}", label_of(plan.filter)
     columns = (
@@ -84,7 +85,9 @@ def trial_bar(
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console) as progress:
-        task = progress.add_task(title.format(named), total=total, completed=min(done, total), best="-")
+        done = min(len(before), total)
+        task = progress.add_task(title.format(named), total=total, completed=done, best=_best(before))
+        progress.update(task, completed=done)  # so that no time remains where all trials are done
 
         def show_kinds(kinds: Sequence[str]) -> None:
             if len(plan.kinds) > 1:
@@ -92,8 +95,7 @@ def trial_bar(
 
         def advance(study, finished: int) -> None:
             trials = study.get_trials(deepcopy=False)
-            best = best_trial(trials)
-            progress.update(task, completed=finished, best="-" if best is None else f"{best.values[0]:.3f}")
+            progress.update(task, completed=finished, best=_best(trials))
             if running := kinds_running(trials):
                 show_kinds(running)
 
@@ -105,6 +107,14 @@ def trial_bar(
 
         with listening(show_rest):
             yield advance, show_kinds
+
+
+def _best(trials: Sequence[FrozenTrial]) -> str:
+    """The first objective of the best trial; a dash before there is one."""
+    from tuning.search.outcome import best_trial
+
+    best = best_trial(trials)
+    return "-" if best is None else f"{best.values[0]:.3f}"
 
 
 @contextmanager

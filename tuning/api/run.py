@@ -20,10 +20,11 @@ from tuning.evaluation.held_out import Comparison, prove
 from tuning.evaluation.tuned import write_tuned
 from tuning.likelihood.gradient import DIFFERENTIABLE, GradientResult, maximise_likelihood
 from tuning.likelihood.identifiability import Identifiability, identify
+from tuning.problems.assumed import AssumedProblem
 from tuning.problems.problem import Problem
-from tuning.search.plan import Plan
+from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.storage import open_storage
-from tuning.search.study import StudyResult, checked, finished_trials, open_study, run_study, run_trials
+from tuning.search.study import FINISHED, StudyResult, checked, finished_trials, open_study, run_study, run_trials
 from tuning.search.workers import run_in_workers
 
 MOST_TRIALS = 1_000_000
@@ -97,11 +98,13 @@ def run_tuning(
         check_target(out)
     with quiet_optuna():
         plan = checked(plan)  # before there is a journal
+        _draw_first(plan, console)
         study = open_study(name, plan, None if storage is None else open_storage(storage))
         already = finished_trials(study)
+        before = [trial for trial in study.get_trials(deepcopy=False) if trial.state in FINISHED]
         if already:
             console.print(f"study {name!r} goes on after {already} finished trials")
-        with trial_bar(plan, names_of(plan), trials, already, console) as (advance, show_kinds):
+        with trial_bar(plan, names_of(plan), trials, before, console) as (advance, show_kinds):
             run = partial(run_trials, on_choice=lambda choice: show_kinds([choice.name]))
             if storage is not None and workers > 1:
                 run = partial(run_in_workers, storage=storage, workers=workers)
@@ -125,6 +128,14 @@ def run_tuning(
     if by_gradient:
         return tuning
     return tuning._replace(known=identify(result.choice, plan.scenarios, plan.training_data(), plan.space()))
+
+
+def _draw_first(plan: Plan, console: Console) -> None:
+    """Draw the held-out data of users' problems, which are kept: what is wrong is said before the search."""
+    for problem in plan.scenarios:
+        if isinstance(problem, AssumedProblem):
+            with working(f"drawing the held-out {problem.seed_word}", console):
+                problem.data(problem.held_out_seeds(plan.seed, HELD_OUT_SEEDS))
 
 
 def _check_method(plan: Plan, by_gradient: bool) -> None:

@@ -12,15 +12,22 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.augmented import Unknown, augmented_model
-from filters.consistency.intervals import Interval, rmse_ratios
+from filters.consistency.intervals import Interval, rmse_ratios, slightly
 from filters.engine.batch import run
 from filters.estimators.find import is_foreign, label_of
 from filters.filter import Filter
 from filters.particles.weighted import WeightedFilter
 from filters.registry import filter_class, make_filter
-from numerics.checks import one_of, positive
+from numerics.checks import one_of
 from tuning.evaluation.baselines import oracle, rule_of_thumb, scaled_default
-from tuning.evaluation.evaluate import Evaluation, compute_metrics, likelihood_gain, score_ratio
+from tuning.evaluation.evaluate import (
+    Evaluation,
+    compute_metrics,
+    likelihood_gain,
+    median_score_ratio,
+    score_ratio,
+)
+from tuning.evaluation.knowledge import KNOWLEDGE, beliefs_of
 from tuning.evaluation.runs import RunMetrics, joined, metrics_by_run
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts
@@ -28,10 +35,8 @@ from tuning.problems.problem import Problem
 from tuning.search.interruption import stop_on_interrupt
 from tuning.search.space import Choice, ensemble_sizes_of, has_ensemble
 
-KNOWLEDGE = ("true", "scaled", "untuned")  # of the plant's Q and R: oracle, scaled default, rule of thumb
-# Default belief of a constant: standard deviation of a flow [m/s], of others as a fraction of their value ...
-FLOW_STD, RELATIVE_STD, WALK_PART = 0.5, 0.2, 0.02  # ... and of a step's change, as a fraction of the prior's
 VERDICTS = {"better": "better", "worse": "worse", "tie": "no different", "unknown": "not to be told"}
+WIDE = 1.0  # length of a ratio's interval over its value, above which a few runs dominate the mean
 SYMBOLS = {"ambient_velocity": "U_0"}  # for labels
 
 
@@ -41,6 +46,7 @@ class Contender(NamedTuple):
     label: str
     choose: Callable[[Problem], Choice]
     unknown: Mapping[str, Unknown | None] = {}  # constants that it estimates, too; None for a default
+    knows: str = ""  # of the plant's Q and R: one of `KNOWLEDGE`, or "tuned"
 
     def filter(self, scenario: Problem) -> Filter:
         """The filter, with what the scenario lets it assume of the plant."""
@@ -48,12 +54,16 @@ class Contender(NamedTuple):
         filter_ = choice.filter(scenario)
         if not self.unknown:
             return filter_
-        constants = filter_.model.constants
-        beliefs: dict[str | int, Unknown] = {}
-        for name, belief in self.unknown.items():
-            one_of("a constant to estimate", name, getattr(constants, "_fields", ()))
-            beliefs[name] = default_belief(name, getattr(constants, name)) if belief is None else belief
+        beliefs = beliefs_of(filter_.model.constants, self.unknown)
         return make_filter(choice.name, augmented_model(filter_.model, beliefs), **choice.numbers)
+
+    def beliefs(self, scenario: Problem) -> dict[str | int, Unknown]:
+        """What is believed at first of the constants that it estimates, too."""
+        return (
+            beliefs_of(self.choose(scenario).filter(scenario).model.constants, self.unknown)
+            if self.unknown
+            else {}
+        )
 
 
 class Row(NamedTuple):
@@ -69,6 +79,8 @@ class Row(NamedTuple):
     ratios: tuple[Interval, ...]  # by state, RMSE over the first filter's, paired
     score_ratio: Interval  # score over the first filter's, paired
     likelihood_gain: Interval  # log-likelihood of a run less the first filter's, paired
+    knows: str = ""  # of the plant's Q and R, as its `Contender` does
+    beliefs: Mapping[str | int, Unknown] = {}  # of the constants that it estimates, too, at first
 
     @property
     def verdict(self) -> str:
@@ -100,10 +112,21 @@ def winners(board: Leaderboard) -> str:
         return f"On {board.scenario.name} there is nothing to compare {first.label} with."
     said = []
     for verdict, words in VERDICTS.items():
-        names = [row.label for row in others if row.verdict == verdict]
+        names = [f"{row.label}{_doubt(row, first)}" for row in others if row.verdict == verdict]
         said += [f"{words}: {', '.join(names)}"] if names else []
     by = "score" if first.evaluation.has_truth else "log-likelihood"
     return f"On {board.scenario.name}, against {first.label} by the {by}: {'; '.join(said)}."
+
+
+def _doubt(row: Row, first: Row) -> str:
+    """What has to be said beside a verdict: the difference is hardly one, or a few runs make the ratio."""
+    ratio = row.score_ratio
+    if slight := slightly(ratio):
+        return f" by {slight} (practically equal)"
+    if row.verdict == "tie" and ratio.high - ratio.low > WIDE * ratio.value:
+        median = median_score_ratio(row.evaluation, first.evaluation)
+        return f" (undecided: few runs dominate; the median ratio of a run is {median:.2f})"
+    return ""
 
 
 def contender(
@@ -136,7 +159,7 @@ def contender(
     others = [f"{key} {value:g}" for key, value in numbers.items() if key != "ensemble_size"]
     added = [f"+ {SYMBOLS.get(constant, constant)}" for constant in unknown]
     return Contender(
-        " ".join([label_of(name) if is_foreign(name) else name, *size, *others, *added]), chosen, unknown
+        " ".join([label_of(name) if is_foreign(name) else name, *size, *others, *added]), chosen, unknown, knows
     )
 
 
@@ -158,20 +181,6 @@ def _known(knows: str, name: str, scenario: Problem, seed: int) -> Choice:
 def sized(choice: Choice, ensemble_size: int | None) -> Choice:
     """A choice with another ensemble size, if one is given and the filter has an ensemble."""
     return choice if ensemble_size is None or not has_ensemble(choice.name) else choice.with_size(ensemble_size)
-
-
-def default_belief(name: str, value: float) -> Unknown:
-    """The default belief of a constant of the model.
-
-    Its prior has a standard deviation of 0.5 m/s for the ambient flow, and of a fifth of its value otherwise; a
-    step changes it by 2 % of that.
-
-    Raises:
-        ValueError: if the constant is zero, because its spread is a fraction of its value.
-    """
-    std = FLOW_STD if name == "ambient_velocity" else RELATIVE_STD * abs(value)
-    positive(f"the assumed {name}, of which a part is its spread,", std)
-    return Unknown(std=std, walk_std=WALK_PART * std)
 
 
 def compare(
@@ -212,9 +221,10 @@ def compare(
                 data = scenario.data(chosen)
                 board = Leaderboard(scenario, chosen, scenario.bound(data), [])
                 boards.append(board)
-                for label, filter_ in zip(labels, filters, strict=True):
-                    on_row(scenario, label)
-                    board.rows.append(_row(label, filter_, data, board))
+                for one, filter_ in zip(contenders, filters, strict=True):
+                    on_row(scenario, one.label)
+                    row = _row(one.label, filter_, data, board)
+                    board.rows.append(row._replace(knows=one.knows, beliefs=one.beliefs(scenario)))
                     if stopped():
                         raise KeyboardInterrupt
     except KeyboardInterrupt:

@@ -186,6 +186,13 @@ def score_ratio(a: Evaluation, b: Evaluation) -> Interval:
     return interval(value, resampled_ratios(a, b))
 
 
+def median_score_ratio(a: Evaluation, b: Evaluation) -> float:
+    """Median over runs of the ratio of the run's scores, which a few runs do not dominate; NaN without truth."""
+    _check_paired(a, b)
+    scores = [_scores(np.sqrt(one.mean_squares), one.scale) for one in (a, b)]
+    return float(np.median(scores[0] / scores[1]))
+
+
 def resampled_ratios(a: Evaluation, b: Evaluation) -> np.ndarray:
     """Score of a over that of b for every bootstrap resample of the runs, which are the same for both."""
     scores = [_scores(np.sqrt(resampled_means(e.mean_squares)), e.scale) for e in (a, b)]

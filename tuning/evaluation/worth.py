@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from math import isnan
 
-from filters.consistency.intervals import Interval
+from filters.consistency.intervals import Interval, slightly
 from tuning.evaluation.baselines import ORACLE, RULE, SCALED
 from tuning.evaluation.held_out import Comparison
 
@@ -51,6 +51,8 @@ def gain(ratio: Interval, seeds: int, what: str = "the score") -> str:
         return f"makes no difference that {seeds} seeds can show"
     ends = sorted(100 * abs(1 - part) for part in (ratio.low, ratio.high))
     verb = "lowers" if ratio.high < 1 else "raises"
+    if slight := slightly(ratio):
+        return f"{verb} {what} by {slight} (practically nothing)"
     return f"{verb} {what} by {100 * abs(1 - ratio.value):.0f} % [{ends[0]:.0f}, {ends[1]:.0f}]"
 
 

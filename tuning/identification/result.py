@@ -129,7 +129,7 @@ class Identification(NamedTuple):
             said.append(f"{one} and {other} trade off (correlation {correlation:.3f}).")
         if len(self.least_determined) > 1 and wide:
             parts = ", ".join(f"{name} {part:+.2g}" for name, part in self.least_determined.items())
-            said.append(f"The least determined direction is (as fractions of the ranges) {parts}.")
+            said.append(f"Least determined is a change of several together (as fractions of the ranges): {parts}.")
         if len(self.optima) > 1:
             said.append(f"{self.agreement} of {len(self.optima)} starts led to this maximum.")
         if self.left_out:

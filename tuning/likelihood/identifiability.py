@@ -228,7 +228,7 @@ def sentences(found: Identifiability) -> list[str]:
     said = [f"The innovations of the training runs determine {_listed(known or ['nothing'])} (95 %)."]
     if loose:
         parts = [f"{name} x {factor:.2g}" for name, factor in found.least_determined.items()]
-        trade = f" The least determined direction is {_listed(parts)}." if len(parts) > 1 else ""
+        trade = f" Least determined is a change of several together: {_listed(parts)}." if len(parts) > 1 else ""
         said.append(
             f"They do not determine {_listed(loose)}: a factor of ten makes no significant difference, or "
             f"the most likely value lies at the end of the range.{trade}"

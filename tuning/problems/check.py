@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from numerics.checks import shown
@@ -65,16 +67,24 @@ def check_data(data: Data, model: StateSpaceModel, name: str) -> None:
         finite = np.isfinite(one) if entry != "measurements" else ~np.isinf(one)
         if not finite.all():
             rule = "finite or NaN" if entry == "measurements" else "finite"
-            run, step = np.argwhere(~finite)[0][:2]
+            run, step, *place = np.argwhere(~finite)[0]
             raise ValueError(
-                f"{entry} of problem {name} must be {rule}, "
-                f"but those of seed {data.seeds[run]} are not from step {step} on"
+                f"{entry} of problem {name} must be {rule}, but those of seed {data.seeds[run]} are not from step "
+                f"{step} on{_before(one[run], step, place, model) if entry == 'states' else ''}"
             )
     if not 0 <= data.first_scored <= steps:
         raise ValueError(
             f"first_scored of problem {name} must be from 0 to the number of steps, {steps}, "
             f"but got {data.first_scored}"
         )
+
+
+def _before(states: np.ndarray, step: int, place: Sequence, model: StateSpaceModel) -> str:
+    """The first state of a run (K+1, n) that is not finite, its value one step earlier, and why."""
+    state = model.states[place[0]]
+    unit = f" {state.unit}" if state.unit else ""
+    value = f"{state.symbol} was {states[step - 1, place[0]]:.4g}{unit} one step earlier" if step else state.symbol
+    return f": {value}; a root or a logarithm may have left its domain, or the plant is unstable"
 
 
 def check_model(model: StateSpaceModel, data: Data, name: str) -> None:

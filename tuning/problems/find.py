@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from numerics.checks import any_case, meant, shown
 from numerics.modules import is_code, object_named, said
@@ -12,6 +13,8 @@ from tuning.problems.check import checked_problem
 from tuning.problems.files import read_scenario
 from tuning.problems.problem import Problem
 from tuning.problems.rooms import built_in
+
+FEW = 4  # names of problems in a message
 
 
 def find_problem(name: str) -> Problem:
@@ -30,8 +33,16 @@ def find_problem(name: str) -> Problem:
         return _from_module(name)
     if isinstance(name, str) and name.endswith(".toml"):
         return read_scenario(name)
-    rule = f"problem must be one of {', '.join(known)}, a file that ends in .toml, or module:object"
-    raise ValueError(f"{rule}, but got {shown(name)}{meant(name, known)}")
+    rule = f"problem must be one of {', '.join([*known][:FEW])} and {len(known) - FEW} more"
+    rule += " (thruster tune --help lists all), a file that ends in .toml, or module:object"
+    raise ValueError(f"{rule}, but got {shown(name)}{_module_meant(name) or meant(name, known)}")
+
+
+def _module_meant(name: Any) -> str:
+    """The end of a message on the name of a module in the working folder; empty if there is none."""
+    plain = name.removesuffix(".py") if isinstance(name, str) else ""
+    there = plain.isidentifier() and Path(f"{plain}.py").is_file()
+    return f"; did you mean '{plain}:problem'?" if there else ""
 
 
 def find_same(name: str, digest: str) -> Problem:

@@ -57,6 +57,7 @@ def draw_history(trials: Sequence[FrozenTrial], title: str, label: str = SCORE) 
         figure.legend(loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     above = f" ({beyond} of {len(done) + len(early)} lie above the axis)" if done and beyond else ""
     axis.set_xlabel(f"trial{above}")
+    axis.xaxis.get_major_locator().set_params(integer=True, min_n_ticks=1)
     axis.set_ylabel(label)
     axis.set_title(title, fontsize=11)
     return figure

@@ -122,8 +122,8 @@ def _importance_part(book: Sketchbook, study: Study, word: str) -> Picture | Wor
     rough = ", rough on so few" if complete + early < MANY_TRIALS else ""
     pruned = f" and {early} pruned ones, each at the mean of the {word} that it came to" if early else ""
     caption = (
-        "How much each parameter matters for a trial to be among the best tenth: PED-ANOVA on "
-        f"{complete} complete trials{pruned}{rough}."
+        "How much each parameter matters for a trial to be among the best tenth, by how its values there differ "
+        f"from those of all trials (PED-ANOVA): {complete} complete trials{pruned}{rough}."
     )
     return book.picture(draw_importance(found), caption, of_importances(found))
 
