@@ -56,7 +56,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
             another package, as `filters.estimators.estimator.Estimator`, a function that makes one
             from a model, or "module:object" for either; covariances or innovations that it does not give are zero.
         observation: one of the three forms above.
-        model: None for the model that the env itself offers by `env.unwrapped.state_space_model(**arguments)`,
+        model: None for the model that the env, or a wrapper around it, offers by `state_space_model(**arguments)`,
             as a bow thruster does; "module:factory" of a function that returns a `StateSpaceModel`; or a
             `StateSpaceModel` (which the env's spec cannot hold as JSON).
         tuned: path of a tuned file, which gives filter, parameters and model arguments.

@@ -162,6 +162,21 @@ def test_an_env_of_a_scenario_makes_its_data(name):
         info = env.step(data.inputs[0, k, : env.action_space.shape[0]])[4]
 
 
+@pytest.mark.parametrize("noise", [None, (0.01, 0.02, 0.25)], ids=["exact", "noisy"])
+def test_an_env_of_a_users_env_offers_the_problems_model_and_makes_its_data(noise):
+    problem = pendulum(measurement_noise_cov=noise)
+    data, wrapped = problem.data([3]), EstimateState(gym.wrappers.TimeLimit(problem.make_env(), 50), "ekf")
+    assert wrapped.filter.model.states == problem.model().states
+    for _ in range(2):  # once more from the same seed
+        _, info = wrapped.reset(seed=3)
+        for k in range(10):
+            np.testing.assert_allclose(info["measurement"], data.measurements[0, k], rtol=1e-12)
+            np.testing.assert_allclose(info["state"], data.states[0, k], rtol=1e-12)
+            info = wrapped.step(data.inputs[0, k])[4]
+    _, other = wrapped.reset()
+    assert (other["measurement"] != info["measurement"]).all()
+
+
 def test_envs_of_other_problems(logs):
     mine = pair()
     env, data = mine.make_env(low=-9.0, high=9.0), mine.data([2])

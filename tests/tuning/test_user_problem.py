@@ -160,7 +160,9 @@ def test_a_tuned_file_takes_the_same_model_from_the_env_a_factory_or_the_caller(
     found.append(EstimateState(env, tuned=path, model=pendulum_problem.model()))
     covs = [one.filter.model.process_noise_cov for one in found]
     np.testing.assert_allclose(covs[1:], [covs[0]] * 2, rtol=1e-12)
-    with pytest.raises(ValueError, match="an env that offers no state_space_model must come with a model"):
+    found = EstimateState(tuned[2].make_env(), tuned=path)  # the line that a report gives to copy
+    np.testing.assert_allclose(found.filter.model.process_noise_cov, covs[0], rtol=1e-12)
+    with pytest.raises(ValueError, match="must come with a model, but got .* alone: pass model=..."):
         EstimateState(gym.make("Pendulum-v1"), tuned=path)
 
 

@@ -183,7 +183,7 @@ class ModelProblem(AssumedProblem):
 class NamedArguments:
     """A problem's `model` with a signature that names its arguments."""
 
-    def __init__(self, problem: ModelProblem):
+    def __init__(self, problem: AssumedProblem):
         """Take the problem."""
         self._problem = problem
 
