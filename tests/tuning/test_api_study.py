@@ -55,6 +55,22 @@ def test_the_tuned_filter_is_ready_to_use(study, tmp_path):
     wrapped = EstimateState(study.problem.make_env(), tuned=str(file))
     assert wrapped.filter.name == "ekf"
     np.testing.assert_allclose(wrapped.filter.model.process_noise_cov, study.filter.model.process_noise_cov)
+    for same in (EstimateState(study.problem.make_env(), tuned=study), EstimateState(wrapped.env, tuned=file)):
+        np.testing.assert_array_equal(same.reset(seed=1)[0], wrapped.reset(seed=1)[0])
+    with pytest.raises(ValueError, match="tuned must be the path of a tuned file, or what tuning.tune returns"):
+        EstimateState(wrapped.env, tuned={"filter": "ekf"})
+    with pytest.raises(ValueError, match="tuned must come without filter: it has its own, but got 'ukf'"):
+        EstimateState(wrapped.env, "ukf", tuned=study)
+    with pytest.raises(ValueError, match="filter must be a name, .* a study is tuned=study; but got Study"):
+        EstimateState(wrapped.env, study)
+
+
+def test_baselines_are_filters_that_go_around_an_env(study):
+    filters = study.held_out.filters
+    assert list(filters) == list(study.held_out.evaluations)
+    q = study.held_out.choices["rule of thumb"].model["process_noise_cov"]
+    wrapped = EstimateState(study.problem.make_env(), filter=filters["rule of thumb"])
+    np.testing.assert_allclose(wrapped.filter.model.process_noise_cov.diagonal(), q)
 
 
 def test_a_study_in_memory_is_that_of_a_storage_and_goes_on_there(tmp_path, capsys):

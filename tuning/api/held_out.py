@@ -69,6 +69,11 @@ class HeldOut:
         return {name: found[name] for name in self.evaluations}
 
     @property
+    def filters(self) -> dict[str, Filter]:
+        """Each filter, ready to use, as in `EstimateState(env, filter=study.held_out.filters["scaled default"])`."""
+        return {name: one.filter(self.problem) for name, one in self.choices.items()}
+
+    @property
     def bound(self) -> np.ndarray:
         """Bound on the standard error of each state, (n,); NaN where there is none."""
         return self.proof.bound
