@@ -12,14 +12,15 @@ import typer
 from filters.augmented import Unknown
 from filters.registry import FILTERS
 from numerics.checks import at_least
-from thruster_cli.leaderboard import as_json, report
 from thruster_cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption, SeedOption, filter_option
 from thruster_cli.output import announce_compilation, emit, progress_console
 from thruster_cli.problems import PROBLEMS
 from tuning.api.compare import DEFAULT_FILTERS, compared, contenders_of
+from tuning.api.comparison import INTERRUPTED
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
+from tuning.reporting.leaderboard import as_json, report
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import has_ensemble
 from tuning.thruster.logs import of_preset
@@ -94,7 +95,7 @@ def command(
     boards, interrupted = list(found.boards), found.interrupted
     shown = [part for board in boards for part in report(board)]
     if interrupted:
-        shown.append("Interrupted: these are the rows that were done.")
+        shown.append(INTERRUPTED)
     emit(shown, {"seed": seed, "knows": knows, "interrupted": interrupted, **as_json(boards)}, json)
     if interrupted:
         sys.exit(130)

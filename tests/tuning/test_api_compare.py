@@ -11,8 +11,8 @@ import tuning
 from filters.augmented import Unknown
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.test_api_study import plain
-from thruster_cli.leaderboard import as_json as boards_as_json
 from tuning.problems.find import find_problem
+from tuning.reporting.leaderboard import as_json as boards_as_json
 
 SHORT = find_problem("nominal").replace(steps=70, name="short")
 

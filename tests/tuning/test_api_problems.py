@@ -80,7 +80,7 @@ def test_tuning_on_a_model_and_frames_finds_a_filter(logs):
     frames = [pandas.DataFrame(table_of(log)) for log in logs]
     study = tuning.tune((cart(), frames), "kf", trials=3, lead=20, progress=False)
     assert study.tuning.plan.objectives == ("likelihood",) and "log-likelihood" in repr(study)
-    assert study.problem.name == "run1+1" and study.filter.name == "kf"
+    assert study.problem.name == "run1 and 1 more" and study.filter.name == "kf"
     estimates = tuning.estimate(frames[0], study, model=cart())
     assert estimates.filter.name == "kf" and np.isfinite(estimates.means).all()
     assert "log-likelihood" in study.held_out.to_frame().columns
@@ -125,7 +125,7 @@ WRONG = [
     (lambda: problem_of((cart(), "none.csv")), "none.csv is not"),
     (
         lambda: problem_of((cart(), {"z": np.zeros(9)}), columns=5),
-        "--column must be a mapping by name, .* but got 5",
+        r"columns \(--column\) must be a mapping by name, .* but got 5",
     ),
 ]
 

@@ -65,6 +65,15 @@ def test_the_tuned_filter_is_ready_to_use(study, tmp_path):
         EstimateState(wrapped.env, study)
 
 
+def test_what_is_printed_are_the_tables_of_the_command_line(study):
+    found = study.held_out
+    lines = str(found).splitlines()
+    assert lines[0].startswith("RMSE on held-out seeds") and "\x1b" not in str(found)
+    assert any(line.startswith(" scaled ") or line.startswith(" scaled default") for line in lines)
+    assert f"{found.evaluation.rmse[0].value:.2f}" in str(found) and "Score of the tuned filter" in str(found)
+    assert "\n" not in repr(found) and str(study).startswith(repr(study)) and str(found) in str(study)
+
+
 def test_baselines_are_filters_that_go_around_an_env(study):
     filters = study.held_out.filters
     assert list(filters) == list(study.held_out.evaluations)
@@ -182,7 +191,10 @@ def test_importing_tuning_is_light_and_says_what_there_is():
 WRONG = [
     (lambda: tuning.tune("mismatch", trials=0), "trials must be a whole number of at least 1, but got 0"),
     (lambda: tuning.tune("mismatch", method="newton"), "method must be one of optuna, gradient, but got 'newton'"),
-    (lambda: tuning.tune("mismatch", workers=2), "workers must be 1 without a storage that they share, but got 2"),
+    (
+        lambda: tuning.tune("mismatch", workers=2),
+        "workers must be 1 without a storage that they share, such as storage='studies.journal'",
+    ),
     (lambda: tuning.tune("mismatch", progress="yes"), "progress must be True, False or None, but got 'yes'"),
     (lambda: tuning.tune("mismatch", name="a/b"), "study must be a name without slashes, but got 'a/b'"),
     (lambda: tuning.evaluate("none.json"), "none.json"),

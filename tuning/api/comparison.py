@@ -10,14 +10,18 @@ import numpy as np
 from filters.consistency.intervals import Interval
 from filters.looks import colour_of
 from numerics.plots import panels
+from numerics.text_tables import plain_text
 from tuning.api.held_out import cells_of
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.compare import Leaderboard, Row, winners
 from tuning.problems.problem import Problem
+from tuning.reporting.leaderboard import report
 
 if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
+
+INTERRUPTED = "Interrupted: these are the rows that were done."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -93,6 +97,11 @@ class FilterComparison:
             said.append(f"{board.scenario.name}: {', '.join(found)}")
         ended = ", interrupted" if self.interrupted else ""
         return f"FilterComparison({'; '.join(said)}{ended})"
+
+    def __str__(self) -> str:
+        """The tables that `thruster compare` prints."""
+        ended = [INTERRUPTED] if self.interrupted else []
+        return plain_text([*(part for board in self.boards for part in report(board)), *ended])
 
     def _repr_html_(self) -> str:
         parts = []

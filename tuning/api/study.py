@@ -164,6 +164,10 @@ class Study:
             return f"{said}{ended}: tuning {worth(self.tuning.proof)})"
         return f"{said}{ended}: score {about(self.held_out.score)}; tuning {worth(self.tuning.proof)})"
 
+    def __str__(self) -> str:
+        """What it is in a line, and the tables of its held-out evaluations."""
+        return "\n\n".join([repr(self), *map(str, self.evaluations)])
+
     def _repr_html_(self) -> str:
         from tuning.reporting.units import number_rows
 
