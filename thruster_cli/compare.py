@@ -15,8 +15,8 @@ from numerics.checks import at_least
 from thruster_cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption, SeedOption, filter_option
 from thruster_cli.output import announce_compilation, emit, progress_console
 from thruster_cli.problems import PROBLEMS
-from tuning.api.compare import DEFAULT_FILTERS, compared, contenders_of
-from tuning.api.comparison import INTERRUPTED
+from tuning.api.compare import DEFAULT_FILTERS, compared, contenders_of, without_unfit
+from tuning.api.comparison import INTERRUPTED, left_out_lines
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
@@ -87,16 +87,19 @@ def command(
         read_choice(file, problem)  # a clear error for a file that is for another plant
     names = filters or ([] if files else list(DEFAULT_FILTERS))
     sizes, unknown = dict(map(_size, ensemble_size or [])), dict(map(_unknown, augment or []))
-    contenders = contenders_of([*(files or []), *names], knows, unknown, sizes, seed)
+    some, left_out = without_unfit([*(files or []), *names], chosen)
+    contenders = contenders_of(some, knows, unknown, sizes, seed)
     for problem in chosen:
         problem.held_out_seeds(seed, seeds)  # a clear error before any filter runs
     announce_compilation()
     found = compared(contenders, chosen, seed, seeds, progress_console)
     boards, interrupted = list(found.boards), found.interrupted
     shown = [part for board in boards for part in report(board)]
+    shown += left_out_lines(left_out)
     if interrupted:
         shown.append(INTERRUPTED)
-    emit(shown, {"seed": seed, "knows": knows, "interrupted": interrupted, **as_json(boards)}, json)
+    told = {"seed": seed, "knows": knows, "interrupted": interrupted, "left_out": left_out}
+    emit(shown, {**told, **as_json(boards)}, json)
     if interrupted:
         sys.exit(130)
 

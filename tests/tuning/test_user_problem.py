@@ -1,6 +1,7 @@
 """From a user's own file to a tuned filter around an env, by the command line and by Python."""
 # ruff: noqa: F811 - fixtures come by import and go by name
 
+import copy
 import json
 import re
 import shutil
@@ -12,6 +13,7 @@ import numpy as np
 import optuna
 import pytest
 
+import tuning
 from filters import EstimateState
 from filters.engine.batch import run
 from filters.tuned_file import read_tuned_file
@@ -236,3 +238,15 @@ def test_the_problems_of_the_page_are_problems():
         assert [one.symbol for one in checked_problem(names["problem"]).quantities.states] == ["theta", "omega"]
         assert [one.name for one in parameters("kf", checked_problem(names["pair"]))] == ["Q11", "Q22", "R"]
         assert [one.name for one in parameters("kf", checked_problem(names["one_number"]))] == ["sigma_a"]
+
+
+def test_a_file_on_an_object_of_the_users_says_how_to_give_it(tuned, tmp_path):
+    problem = copy.copy(tuned[2])
+    problem.name = "motor"
+    study = tuning.tune(problem, trials=1, progress=False)
+    file = study.save(tmp_path / "motor.json")
+    said = r"motor.json was tuned on 'motor', an object of yours: pass problem=... \(--problem module:object\)"
+    for refused in (tuning.evaluate, tuning.report, verify):
+        with pytest.raises(ValueError, match=said):
+            refused(file)
+    assert tuning.evaluate(file, problem, seeds=2).choice == study.choice
