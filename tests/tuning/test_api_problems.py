@@ -16,6 +16,7 @@ from plants.simulate import simulate
 from tests.pendulum_problem import problem as pendulum
 from tests.small_problems import pair
 from tuning.api.problems import problem_of, problems_of
+from tuning.problems.excitation import Dwells, Levels, MultiSine, Steps
 from tuning.problems.find import find_problem
 from tuning.problems.log_problem import LogProblem
 
@@ -175,6 +176,25 @@ def test_an_env_of_a_users_env_offers_the_problems_model_and_makes_its_data(nois
             info = wrapped.step(data.inputs[0, k])[4]
     _, other = wrapped.reset()
     assert (other["measurement"] != info["measurement"]).all()
+
+
+@pytest.mark.parametrize(
+    ("inputs", "low", "high"),
+    [
+        (Steps(amplitude=(1.0, 2.0)), [-1.0, -2.0], [1.0, 2.0]),
+        (Levels(low=-3.0, high=(1.0, 2.0)), [-3.0, -3.0], [1.0, 2.0]),
+        (MultiSine(amplitude=2.0, offset=(1.0, -1.0)), [-5.0, -7.0], [7.0, 5.0]),
+        (Dwells(amplitude=4.0), [-4.0, -4.0], [4.0, 4.0]),
+        (np.linspace([-1.0, 5.0], [3.0, 5.0], 60), [-1.0, -np.inf], [3.0, np.inf]),
+        (lambda seeds, steps: np.zeros((len(seeds), steps, 2)), [-np.inf] * 2, [np.inf] * 2),
+    ],
+)
+def test_actions_of_a_models_env_are_within_what_the_problem_applies(inputs, low, high):
+    problem = pair(inputs=inputs)
+    space, applied = problem.make_env().action_space, problem.data([1, 2]).inputs
+    assert space.low.tolist() == low and space.high.tolist() == high
+    assert (applied >= space.low).all() and (applied <= space.high).all()
+    assert problem.make_env(high=9.0).action_space.high.tolist() == [9.0, 9.0]
 
 
 def test_envs_of_other_problems(logs):
