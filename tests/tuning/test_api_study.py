@@ -1,6 +1,7 @@
 """`tuning.tune`, `evaluate` and `report`: the numbers of the commands, as values that show and keep themselves."""
 
 import copy
+import html
 import json
 import pickle
 import signal
@@ -17,6 +18,7 @@ from filters import EstimateState
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_cli.tuning_report import as_json as tuning_as_json
 from tuning.problems.find import find_problem
+from tuning.reporting.lines_parts import lines_section
 
 TRIALS = 5
 SHORT = find_problem("nominal").replace(steps=70, name="short")  # quick to tune on
@@ -72,6 +74,30 @@ def test_what_is_printed_are_the_tables_of_the_command_line(study):
     assert any(line.startswith(" scaled ") or line.startswith(" scaled default") for line in lines)
     assert f"{found.evaluation.rmse[0].value:.2f}" in str(found) and "Score of the tuned filter" in str(found)
     assert "\n" not in repr(found) and str(study).startswith(repr(study)) and str(found) in str(study)
+
+
+def lines_of(page):
+    """The lines of Python of a report."""
+    found = page.read_text().split("from filters import EstimateState", 1)[1].split("</pre>", 1)[0]
+    return "from filters import EstimateState" + html.unescape(found)
+
+
+def test_lines_to_copy_name_the_file_that_was_saved_and_run(study, tmp_path):
+    fresh, page, file = (
+        type(study)(study.tuning._replace(file=None)),
+        tmp_path / "page.html",
+        tmp_path / "motor.json",
+    )
+    assert "tuned='TUNED.json'" in lines_of(tuning.report(fresh, page, progress=False))
+    fresh.save(file)
+    lines = lines_of(tuning.report(fresh, page, progress=False))
+    names = {"measurements": [[1.0]], "inputs": [[0.0]]}
+    exec(compile(lines.replace("'motor.json'", repr(str(file))), "lines to copy", "exec"), names)
+    assert "tuned='motor.json'" in lines and names["tuned"].name == study.choice.name
+    (code,) = [
+        part for part in lines_section(study.choice, SHORT, None).parts if getattr(part, "title", "") == "Python"
+    ]
+    assert "from your_module import problem" in code.text
 
 
 def test_baselines_are_filters_that_go_around_an_env(study):

@@ -88,11 +88,14 @@ class Study:
     def save(self, path: str | Path) -> Path:
         """Write the tuned file, which `EstimateState(env, tuned=path)` and all commands take; return the path.
 
+        A report of the study names this file afterwards.
+
         Raises:
             ValueError: if the file cannot be written, or the filter is an estimator that is code.
         """
         check_keepable(self.choice.name)
         self.tuning.write(path)
+        object.__setattr__(self, "tuning", self.tuning._replace(file=Path(path)))
         return Path(path)
 
     def to_frame(self) -> pandas.DataFrame:
