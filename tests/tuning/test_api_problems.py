@@ -197,6 +197,18 @@ def test_actions_of_a_models_env_are_within_what_the_problem_applies(inputs, low
     assert problem.make_env(high=9.0).action_space.high.tolist() == [9.0, 9.0]
 
 
+def test_a_reset_without_info_is_said():
+    class Bare(gym.Wrapper):
+        def reset(self, **options):
+            return super().reset(**options)[0]
+
+    problem = pendulum().__class__(
+        Bare(gym.make("Pendulum-v1").unwrapped), "random", pendulum().model(), steps=60, has_truth=False
+    )
+    with pytest.raises(ValueError, match=r"must return \(observation, info\), but returned"):
+        problem.data([1])
+
+
 def test_envs_of_other_problems(logs):
     mine = pair()
     env, data = mine.make_env(low=-9.0, high=9.0), mine.data([2])

@@ -180,7 +180,11 @@ class EnvProblem(AssumedProblem):
     def _run(self, env: gym.Env, seed: int, given: np.ndarray | None) -> tuple[list, list, list]:
         """Inputs (K, p), measurements (K + 1, m) and states (K + 1, n) of one episode."""
         space, inputs = _box(env, self.name), []
-        observation, info = env.reset(seed=seed)
+        begun = env.reset(seed=seed)
+        if not isinstance(begun, tuple) or len(begun) != 2:
+            rule = f"reset of the env of problem {self.name} must return (observation, info)"
+            raise ValueError(f"{rule}, but returned {shown(begun)}")
+        observation, info = begun
         measurements, states = [self.measured(observation, info)], [self.state(env, info)]
         choose = _chooser(self.policy, space, seed)
         for k in range(self.steps):
