@@ -25,9 +25,11 @@ def object_named(name: str, what: str):
     """
     module_name, _, path = name.partition(":")
     try:
-        found = _module(module_name)
+        found = _executed(module_name, name, what)
         for part in path.split("."):
             found = getattr(found, part)
+    except RuleBroken:
+        raise
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(
             f"{what} must be 'module:object' that can be imported, but {name!r} is not: {error}"
@@ -36,6 +38,20 @@ def object_named(name: str, what: str):
         article = "an" if what[0] in "aeiou" else "a"
         raise ValueError(f"{article} {what}'s module must import, but {name!r} raised {said(error)}") from error
     return found
+
+
+def _executed(module_name: str, name: str, what: str) -> ModuleType:
+    """The module; an error of rule and value that its lines raise needs no words about imports."""
+    try:
+        return _module(module_name)
+    except ValueError as error:
+        if not module_name:
+            raise
+        raise RuleBroken(f"{error} ({what} {name!r})") from error
+
+
+class RuleBroken(ValueError):
+    """What a module of the user's raised while it ran."""
 
 
 def said(error: BaseException) -> str:

@@ -15,10 +15,10 @@ from pathlib import Path
 from filters.consistency.intervals import Interval
 from numerics.files import write_whole
 from pages.page import DOCS, with_tables
-from thruster_cli.error_tables import unless_blank
 from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender
 from tuning.problems.excitation import Steps
 from tuning.problems.seeds import held_out_seeds
+from tuning.reporting.error_tables import unless_blank
 from tuning.thruster.find import find_scenario
 from tuning.thruster.scenario import Scenario
 from tuning.thruster.scenarios import SCENARIOS

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
@@ -58,6 +59,14 @@ def _check_arguments(name: str, function: Callable, arguments: str) -> None:
         raise ValueError(f"{name} must be a function of ({arguments}), but takes {signature}") from None
 
 
+def _place(function: Callable) -> str:
+    """Where a function stands, in brackets; nothing where it does not tell, as one that is built from a text."""
+    code = getattr(inspect.unwrap(function), "__code__", None)
+    if code is None or not Path(code.co_filename).is_file():
+        return ""
+    return f" (function {function.__name__}, {Path(code.co_filename).name} line {code.co_firstlineno})"
+
+
 def _check_result(name: str, function: Callable, model, arguments: str, shape: tuple, rule: str) -> None:
     for point in (model.prior_mean, model.prior_mean + model.scales):
         must_be_known = point is model.prior_mean and not name.endswith("jacobian")
@@ -75,7 +84,8 @@ def _check_result(name: str, function: Callable, model, arguments: str, shape: t
                     raise ValueError(_not_nan(name, str(error))) from None
                 continue
             sizes = f"{_count(model.n, 'state')}{_form(model.n)} and {_count(model.inputs, 'input')}"
-            raise ValueError(f"{name} must work for {sizes}, but raised {said(error)}") from error
+            where = _place(function)
+            raise ValueError(f"{name}{where} must work for {sizes}, but raised {said(error)}") from error
         found = _shape(result)
         if found != shape:
             raise ValueError(f"{name} must return {rule}, but returned {_said(found, result)}")

@@ -12,14 +12,15 @@ import typer
 from filters.augmented import Unknown
 from filters.registry import FILTERS
 from numerics.checks import at_least
-from thruster_cli.leaderboard import as_json, report
 from thruster_cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption, SeedOption, filter_option
 from thruster_cli.output import announce_compilation, emit, progress_console
 from thruster_cli.problems import PROBLEMS
-from tuning.api.compare import DEFAULT_FILTERS, compared, contenders_of, knowledge_on
+from tuning.api.compare import DEFAULT_FILTERS, compared, contenders_of, knowledge_on, without_unfit
+from tuning.api.comparison import INTERRUPTED, left_out_lines
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
+from tuning.reporting.leaderboard import as_json, report
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import has_ensemble
 from tuning.thruster.logs import of_preset
@@ -87,16 +88,19 @@ def command(
     names = filters or ([] if files else list(DEFAULT_FILTERS))
     sizes, unknown = dict(map(_size, ensemble_size or [])), dict(map(_unknown, augment or []))
     knows = knowledge_on(chosen) if knows is None else knows
-    contenders = contenders_of([*(files or []), *names], knows, unknown, sizes, seed)
+    some, left_out = without_unfit([*(files or []), *names], chosen)
+    contenders = contenders_of(some, knows, unknown, sizes, seed)
     for problem in chosen:
         problem.held_out_seeds(seed, seeds)  # a clear error before any filter runs
     announce_compilation()
     found = compared(contenders, chosen, seed, seeds, progress_console)
     boards, interrupted = list(found.boards), found.interrupted
     shown = [part for board in boards for part in report(board)]
+    shown += left_out_lines(left_out)
     if interrupted:
-        shown.append("Interrupted: these are the rows that were done.")
-    emit(shown, {"seed": seed, "knows": knows, "interrupted": interrupted, **as_json(boards)}, json)
+        shown.append(INTERRUPTED)
+    told = {"seed": seed, "knows": knows, "interrupted": interrupted, "left_out": left_out}
+    emit(shown, {**told, **as_json(boards)}, json)
     if interrupted:
         sys.exit(130)
 

@@ -13,11 +13,11 @@ import typer
 from rich.table import Table
 
 from filters.filter import Filter
-from thruster_cli.error_tables import above_bound, consistency_cells
 from thruster_cli.output import JsonOption, SeedOption, emit, table, working
 from thruster_cli.tune import tune
 from thruster_cli.tuning_report import Tuning, as_json
 from tuning.evaluation.baselines import ORACLE, TUNED, baselines
+from tuning.reporting.error_tables import above_bound, consistency_cells
 from tuning.reporting.figures import comparison_figure, history_figure
 from tuning.reporting.report import Report, write_report
 from tuning.reporting.time_figures import estimates_figure

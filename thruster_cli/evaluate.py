@@ -9,7 +9,6 @@ import typer
 from rich.console import RenderableType
 
 from thruster_cli.consistency import check_covariance, check_request
-from thruster_cli.error_tables import comparison_table
 from thruster_cli.options import (
     FILTER,
     FILTER_HELP,
@@ -26,11 +25,10 @@ from thruster_cli.options import (
 from thruster_cli.output import announce_compilation, emit, progress_console, working
 from thruster_cli.problems import PROBLEMS
 from thruster_cli.tables import choice_table
-from thruster_cli.tuning_report import gains
 from tuning.api.evaluate import subject_of
 from tuning.api.held_out import on_held_out
 from tuning.evaluation.baselines import RULE, TUNED
-from tuning.evaluation.worth import scaling_sentence, without_truth
+from tuning.reporting.error_tables import comparison_table
 from tuning.search.plan import HELD_OUT_SEEDS
 
 
@@ -92,9 +90,7 @@ def command(
     where = f"held-out {chosen.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
     shown: list[RenderableType] = [choice_table(found.choices, chosen)]
     shown.append(comparison_table(found.evaluations, proof.bound, where))
-    if tuned is None and not proof.tuned.has_truth:
-        shown.append(without_truth(chosen.name))
-    shown += [scaling_sentence(proof)] if tuned is None else gains(proof, chosen.seed_word)
+    shown += found.sentences()
     if consistency is not None:
         name = RULE if tuned is None else TUNED
         with working("checking the covariance"):

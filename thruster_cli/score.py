@@ -12,7 +12,6 @@ from rich.console import RenderableType
 
 from filters.consistency.intervals import mean_interval
 from numerics.checks import one_of
-from thruster_cli.error_tables import about, unless_blank
 from thruster_cli.options import INPUT, RUNS, JsonOption, OfPresetOption, SeedOption
 from thruster_cli.output import announce_compilation, emit, progress_console, table
 from thruster_cli.train import LEARNABLE
@@ -22,6 +21,7 @@ from training.plants.find import plant_of
 from training.setup import Setup, in_scenario
 from tuning.problems.scenario import BaseScenario
 from tuning.problems.seeds import held_out_seeds
+from tuning.reporting.error_tables import about, unless_blank
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.thruster.logs import of_preset
 

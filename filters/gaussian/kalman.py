@@ -34,7 +34,8 @@ class AffineFilter(Filter):
         point = self.model.operating_state, self.model.operating_input
         if any(part is None for part in point) and not isinstance(self.model, AffineModel):
             raise ValueError(
-                "a Kalman filter must have an affine model, or one with an operating state and input, but got "
+                "a Kalman filter must have an affine model (filters.affine_model makes one), or one with an "
+                "operating state and input (operating_state=..., operating_input=...), but got "
                 f"operating_state={point[0]!r}, operating_input={point[1]!r}"
             )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from os import PathLike, fspath
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +18,27 @@ from plants.state_space import StateSpaceModel
 
 OBSERVATIONS = ("estimate", "measurement+estimate", "belief")
 APPENDED = "appended_entries"  # attribute of an env: entries of its observation after the measurement
+
+
+def given_filter(filter, tuned) -> tuple:
+    """The arguments `filter` and `tuned` as a wrapper keeps them: what has a filter, as a study, is that filter.
+
+    Raises ValueError if either is something else than the wrapper's class says, or both are given.
+    """
+    if isinstance(tuned, PathLike):
+        tuned = fspath(tuned)
+    if tuned is not None and not isinstance(tuned, str):
+        offered = getattr(tuned, "filter", None)
+        if not isinstance(offered, Filter):
+            rule = "tuned must be the path of a tuned file, or what tuning.tune returns"
+            raise ValueError(f"{rule} (a filter that is made is filter=...), but got {shown(tuned)}")
+        if filter is not None:
+            raise ValueError(f"tuned must come without filter: it has its own, but got {shown(filter)}")
+        filter, tuned = offered, None
+    if not (filter is None or isinstance(filter, str | Filter) or is_foreign(filter)):
+        rule = "filter must be a name, a filter that is made (as study.filter) or an estimator"
+        raise ValueError(f"{rule}; a study is tuned=study; but got {shown(filter)}")
+    return filter, tuned
 
 
 def filter_for(env, filter, model, tuned: str | None, model_arguments, numbers: dict) -> Filter:

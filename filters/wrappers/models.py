@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium as gym
 
 from numerics.checks import shown
 from plants.state_space import StateSpaceModel
@@ -15,9 +18,10 @@ def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | 
     Raises ValueError if there is none.
     """
     if model is None:
-        make = getattr(env.unwrapped, "state_space_model", None)
+        make = offered(env, "state_space_model")
         if make is None:
-            raise ValueError(f"an env that offers no state_space_model must come with a model, but got {env}")
+            rule = "an env that offers no state_space_model must come with a model"
+            raise ValueError(f"{rule}, but got {env} alone: pass model=...")
         return f"the model of {env.unwrapped}", make
     if isinstance(model, StateSpaceModel):
         return "the model", model
@@ -29,6 +33,13 @@ def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | 
             f"model must be 'module:factory' that can be imported, or a StateSpaceModel, but got {model!r}"
         ) from None
     return f"model {model!r}", found
+
+
+def offered(env, name: str) -> Any:
+    """What an env, or a wrapper around it, offers by an attribute; None if nothing does."""
+    if isinstance(env, gym.Env) and env.has_wrapper_attr(name):
+        return env.get_wrapper_attr(name)
+    return getattr(env.unwrapped, name, None)
 
 
 def made(what: str, make: Callable, arguments: Mapping) -> StateSpaceModel:

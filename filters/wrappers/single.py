@@ -18,6 +18,7 @@ from filters.wrappers.arguments import (
     ModelInSpec,
     check_spaces,
     filter_for,
+    given_filter,
 )
 from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
 from numerics.checks import one_of, shown
@@ -56,10 +57,11 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
             another package, as `filters.estimators.estimator.Estimator`, a function that makes one
             from a model, or "module:object" for either; covariances or innovations that it does not give are zero.
         observation: one of the three forms above.
-        model: None for the model that the env itself offers by `env.unwrapped.state_space_model(**arguments)`,
+        model: None for the model that the env, or a wrapper around it, offers by `state_space_model(**arguments)`,
             as a bow thruster does; "module:factory" of a function that returns a `StateSpaceModel`; or a
             `StateSpaceModel` (which the env's spec cannot hold as JSON).
-        tuned: path of a tuned file, which gives filter, parameters and model arguments.
+        tuned: path of a tuned file, which gives filter, parameters and model arguments; or what `tuning.tune`
+            returns, whose `filter` is then taken with its model.
         model_arguments: mapping of arguments of the env's own model or of the factory: for a bow thruster
             `process_noise_cov`, `measurement_noise_cov`, `prior_cov_factor`, `parameter_factors`,
             `operating_voltage`.
@@ -75,7 +77,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         filter: str | Filter | Estimator | Callable | None = None,
         observation: str = "estimate",
         model: str | StateSpaceModel | None = None,
-        tuned: str | None = None,
+        tuned: Any = None,
         model_arguments: Mapping | None = None,
         **numbers,
     ):
@@ -83,6 +85,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         model = model.content if isinstance(model, ModelInSpec) else model
         held = ModelInSpec(model) if isinstance(model, StateSpaceModel) else model
         filter = filter.content if isinstance(filter, EstimatorInSpec) else filter
+        filter, tuned = given_filter(filter, tuned)
         kept = filter if filter is None or isinstance(filter, str) else EstimatorInSpec(filter)
         recorded = {"filter": kept, "observation": observation, "model": held, "tuned": tuned, **numbers}
         recorded["model_arguments"] = model_arguments

@@ -16,7 +16,7 @@ from filters.estimators.estimator import Estimator
 from filters.estimators.foreign import ForeignFilter
 from filters.estimators.session import EstimatorBeliefs
 from filters.filter import Filter
-from filters.wrappers.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for
+from filters.wrappers.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for, given_filter
 from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
 from numerics.checks import one_of, shown
 from numerics.keys import EpisodeKeys, reset_mask
@@ -49,13 +49,14 @@ class EstimateStates(gym.vector.VectorWrapper):
         filter: str | Filter | Estimator | Callable | None = None,
         observation: str = "estimate",
         model: str | StateSpaceModel | None = None,
-        tuned: str | None = None,
+        tuned: Any = None,
         model_arguments: Mapping | None = None,
         **numbers,
     ):
         """Build model and filter; see the class for the arguments."""
         super().__init__(env)
         self._form = one_of("observation", observation, OBSERVATIONS)
+        filter, tuned = given_filter(filter, tuned)
         self.filter = filter_for(env, filter, model, tuned, model_arguments, numbers)
         split = split_of(env, self.filter.model)
         inputs = len(split.inputs)

@@ -114,7 +114,9 @@ def find_columns(
                 name = plain(one.quantity.name)
                 raise ValueError(
                     f"a log must have a column for the {kind} {one.quantity.label} (say --column "
-                    f"{one.quantity.symbol}=HEADER, or call it {name}), but {file} has {', '.join(headers)}"
+                    f"{one.quantity.symbol}=HEADER, in Python "
+                    f"columns={{{one.quantity.symbol!r}: 'HEADER'}}, or call it {name}), but "
+                    f"{file} has {', '.join(headers)}"
                 )
     return found
 

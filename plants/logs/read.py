@@ -153,7 +153,8 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str) -> t
     if column is None:
         if dt is None:
             raise ValueError(
-                f"a log must have a column of times (say --column time=HEADER) or a sample time (--dt), but "
+                f"a log must have a column of times (say --column time=HEADER, in Python "
+                f"columns={{'time': 'HEADER'}}) or a sample time (--dt, dt=), but "
                 f"{file} has {', '.join(table.names)}"
             )
         return Grid(dt, count, dt * np.arange(count), False), 0.0

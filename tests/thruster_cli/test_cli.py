@@ -190,7 +190,10 @@ def test_help_teaches(command, thruster):
 BAD = [
     (("tune", "--filter", "none"), "filter must be one of kf, kf-steady, ekf, "),
     (("tune", "--scenario", "none"), "problem must be one of"),
-    (("tune", "--filter", "ekf", "--method", "gradient", "--hold-r"), "R must be free for --method gradient"),
+    (
+        ("tune", "--filter", "ekf", "--method", "gradient", "--hold-r"),
+        "R must be free for method='gradient' (--method), but got hold_r (--hold-r)",
+    ),
     (
         ("tune", "--filter", "enkf", "--method", "gradient"),
         "a filter whose likelihood has a gradient must be one of kf",

@@ -11,7 +11,7 @@ import time
 import pytest
 
 import thruster_cli.app
-from thruster_cli.characters import showable
+from numerics.characters import showable
 from thruster_cli.main import main
 
 INTERRUPTED = "thruster: interrupted\n"

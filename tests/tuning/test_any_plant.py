@@ -11,8 +11,7 @@ from filters.consistency.verdicts import NO_TRUTH, sentences
 from filters.engine.batch import run
 from numerics.compiled import interpreted
 from tests.linear_problem import LinearProblem
-from thruster_cli import consistency, leaderboard
-from thruster_cli.error_tables import comparison_table
+from thruster_cli import consistency
 from thruster_cli.tables import choice_table
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
@@ -20,7 +19,9 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import ensemble_sizes
 from tuning.evaluation.tuned import summary
 from tuning.evaluation.worth import worth
+from tuning.reporting import leaderboard
 from tuning.reporting.consistency_figures import consistency_figure
+from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.figures import comparison_figure
 from tuning.reporting.panels import shown_states
 from tuning.reporting.parts import advice, held_out_section

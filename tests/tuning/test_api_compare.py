@@ -9,10 +9,11 @@ import pytest
 
 import tuning
 from filters.augmented import Unknown
+from tests import pendulum_problem
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.test_api_study import plain
-from thruster_cli.leaderboard import as_json as boards_as_json
 from tuning.problems.find import find_problem
+from tuning.reporting.leaderboard import as_json as boards_as_json
 
 SHORT = find_problem("nominal").replace(steps=70, name="short")
 
@@ -119,3 +120,13 @@ def test_beliefs_have_several_forms():
     mine = Unknown(0.2)
     assert beliefs_of(["a", "b"]) == {"a": None, "b": None} == beliefs_of({"a": None, "b": None})
     assert beliefs_of({"a": mine, "b": 0.2, "c": (0.2, 0.1)}) == {"a": mine, "b": mine, "c": Unknown(0.2, 0.1)}
+
+
+def test_a_filter_that_refuses_the_model_is_left_out_and_the_others_are_compared():
+    problem = pendulum_problem.problem(name="pendulum of mine")
+    found = tuning.compare(["kf", "ekf", "ukf"], problem, seeds=2, progress=False)
+    assert found.filters == ("ekf", "ukf") and list(found.left_out) == ["kf"]
+    said = "a Kalman filter must have an affine model (filters.affine_model makes one)"
+    assert f"kf is left out: {said}" in " ".join(str(found).split())
+    with pytest.raises(ValueError, match="a Kalman filter must have an affine model .* operating_state=None"):
+        tuning.compare(["kf"], problem, seeds=2, progress=False)

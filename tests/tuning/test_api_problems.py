@@ -16,6 +16,7 @@ from plants.simulate import simulate
 from tests.pendulum_problem import problem as pendulum
 from tests.small_problems import pair
 from tuning.api.problems import problem_of, problems_of
+from tuning.problems.excitation import Dwells, Levels, MultiSine, Steps
 from tuning.problems.find import find_problem
 from tuning.problems.log_problem import LogProblem
 
@@ -125,7 +126,7 @@ WRONG = [
     (lambda: problem_of((cart(), "none.csv")), "none.csv is not"),
     (
         lambda: problem_of((cart(), {"z": np.zeros(9)}), columns=5),
-        "--column must be a mapping by name, .* but got 5",
+        r"columns \(--column\) must be a mapping by name, .* but got 5",
     ),
 ]
 
@@ -160,6 +161,52 @@ def test_an_env_of_a_scenario_makes_its_data(name):
         assert there.any()
         np.testing.assert_allclose(info["measurement"][there], data.measurements[0, k][there], rtol=1e-12)
         info = env.step(data.inputs[0, k, : env.action_space.shape[0]])[4]
+
+
+@pytest.mark.parametrize("noise", [None, (0.01, 0.02, 0.25)], ids=["exact", "noisy"])
+def test_an_env_of_a_users_env_offers_the_problems_model_and_makes_its_data(noise):
+    problem = pendulum(measurement_noise_cov=noise)
+    data, wrapped = problem.data([3]), EstimateState(gym.wrappers.TimeLimit(problem.make_env(), 50), "ekf")
+    assert wrapped.filter.model.states == problem.model().states
+    for _ in range(2):  # once more from the same seed
+        _, info = wrapped.reset(seed=3)
+        for k in range(10):
+            np.testing.assert_allclose(info["measurement"], data.measurements[0, k], rtol=1e-12)
+            np.testing.assert_allclose(info["state"], data.states[0, k], rtol=1e-12)
+            info = wrapped.step(data.inputs[0, k])[4]
+    _, other = wrapped.reset()
+    assert (other["measurement"] != info["measurement"]).all()
+
+
+@pytest.mark.parametrize(
+    ("inputs", "low", "high"),
+    [
+        (Steps(amplitude=(1.0, 2.0)), [-1.0, -2.0], [1.0, 2.0]),
+        (Levels(low=-3.0, high=(1.0, 2.0)), [-3.0, -3.0], [1.0, 2.0]),
+        (MultiSine(amplitude=2.0, offset=(1.0, -1.0)), [-5.0, -7.0], [7.0, 5.0]),
+        (Dwells(amplitude=4.0), [-4.0, -4.0], [4.0, 4.0]),
+        (np.linspace([-1.0, 5.0], [3.0, 5.0], 60), [-1.0, -np.inf], [3.0, np.inf]),
+        (lambda seeds, steps: np.zeros((len(seeds), steps, 2)), [-np.inf] * 2, [np.inf] * 2),
+    ],
+)
+def test_actions_of_a_models_env_are_within_what_the_problem_applies(inputs, low, high):
+    problem = pair(inputs=inputs)
+    space, applied = problem.make_env().action_space, problem.data([1, 2]).inputs
+    assert space.low.tolist() == low and space.high.tolist() == high
+    assert (applied >= space.low).all() and (applied <= space.high).all()
+    assert problem.make_env(high=9.0).action_space.high.tolist() == [9.0, 9.0]
+
+
+def test_a_reset_without_info_is_said():
+    class Bare(gym.Wrapper):
+        def reset(self, **options):
+            return super().reset(**options)[0]
+
+    problem = pendulum().__class__(
+        Bare(gym.make("Pendulum-v1").unwrapped), "random", pendulum().model(), steps=60, has_truth=False
+    )
+    with pytest.raises(ValueError, match=r"must return \(observation, info\), but returned"):
+        problem.data([1])
 
 
 def test_envs_of_other_problems(logs):

@@ -1,6 +1,7 @@
 """`tuning.tune`, `evaluate` and `report`: the numbers of the commands, as values that show and keep themselves."""
 
 import copy
+import html
 import json
 import pickle
 import signal
@@ -17,6 +18,7 @@ from filters import EstimateState
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_cli.tuning_report import as_json as tuning_as_json
 from tuning.problems.find import find_problem
+from tuning.reporting.lines_parts import lines_section
 
 TRIALS = 5
 SHORT = find_problem("nominal").replace(steps=70, name="short")  # quick to tune on
@@ -55,6 +57,55 @@ def test_the_tuned_filter_is_ready_to_use(study, tmp_path):
     wrapped = EstimateState(study.problem.make_env(), tuned=str(file))
     assert wrapped.filter.name == "ekf"
     np.testing.assert_allclose(wrapped.filter.model.process_noise_cov, study.filter.model.process_noise_cov)
+    for same in (EstimateState(study.problem.make_env(), tuned=study), EstimateState(wrapped.env, tuned=file)):
+        np.testing.assert_array_equal(same.reset(seed=1)[0], wrapped.reset(seed=1)[0])
+    with pytest.raises(ValueError, match="tuned must be the path of a tuned file, or what tuning.tune returns"):
+        EstimateState(wrapped.env, tuned={"filter": "ekf"})
+    with pytest.raises(ValueError, match="tuned must come without filter: it has its own, but got 'ukf'"):
+        EstimateState(wrapped.env, "ukf", tuned=study)
+    with pytest.raises(ValueError, match="filter must be a name, .* a study is tuned=study; but got Study"):
+        EstimateState(wrapped.env, study)
+
+
+def test_what_is_printed_are_the_tables_of_the_command_line(study):
+    found = study.held_out
+    lines = str(found).splitlines()
+    assert lines[0].startswith("RMSE on held-out seeds") and "\x1b" not in str(found)
+    assert any(line.startswith(" scaled ") or line.startswith(" scaled default") for line in lines)
+    assert f"{found.evaluation.rmse[0].value:.2f}" in str(found) and "Score of the tuned filter" in str(found)
+    assert "\n" not in repr(found) and str(study).startswith(repr(study)) and str(found) in str(study)
+
+
+def lines_of(page):
+    """The lines of Python of a report."""
+    found = page.read_text().split("from filters import EstimateState", 1)[1].split("</pre>", 1)[0]
+    return "from filters import EstimateState" + html.unescape(found)
+
+
+def test_lines_to_copy_name_the_file_that_was_saved_and_run(study, tmp_path):
+    fresh, page, file = (
+        type(study)(study.tuning._replace(file=None)),
+        tmp_path / "page.html",
+        tmp_path / "motor.json",
+    )
+    assert "tuned='TUNED.json'" in lines_of(tuning.report(fresh, page, progress=False))
+    fresh.save(file)
+    lines = lines_of(tuning.report(fresh, page, progress=False))
+    names = {"measurements": [[1.0]], "inputs": [[0.0]]}
+    exec(compile(lines.replace("'motor.json'", repr(str(file))), "lines to copy", "exec"), names)
+    assert "tuned='motor.json'" in lines and names["tuned"].name == study.choice.name
+    (code,) = [
+        part for part in lines_section(study.choice, SHORT, None).parts if getattr(part, "title", "") == "Python"
+    ]
+    assert "from your_module import problem" in code.text
+
+
+def test_baselines_are_filters_that_go_around_an_env(study):
+    filters = study.held_out.filters
+    assert list(filters) == list(study.held_out.evaluations)
+    q = study.held_out.choices["rule of thumb"].model["process_noise_cov"]
+    wrapped = EstimateState(study.problem.make_env(), filter=filters["rule of thumb"])
+    np.testing.assert_allclose(wrapped.filter.model.process_noise_cov.diagonal(), q)
 
 
 def test_a_study_in_memory_is_that_of_a_storage_and_goes_on_there(tmp_path, capsys):
@@ -166,7 +217,10 @@ def test_importing_tuning_is_light_and_says_what_there_is():
 WRONG = [
     (lambda: tuning.tune("mismatch", trials=0), "trials must be a whole number of at least 1, but got 0"),
     (lambda: tuning.tune("mismatch", method="newton"), "method must be one of optuna, gradient, but got 'newton'"),
-    (lambda: tuning.tune("mismatch", workers=2), "workers must be 1 without a storage that they share, but got 2"),
+    (
+        lambda: tuning.tune("mismatch", workers=2),
+        "workers must be 1 without a storage that they share, such as storage='studies.journal'",
+    ),
     (lambda: tuning.tune("mismatch", progress="yes"), "progress must be True, False or None, but got 'yes'"),
     (lambda: tuning.tune("mismatch", name="a/b"), "study must be a name without slashes, but got 'a/b'"),
     (lambda: tuning.evaluate("none.json"), "none.json"),

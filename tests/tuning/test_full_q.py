@@ -110,7 +110,7 @@ def test_a_consistent_twin_has_the_same_correlation():
 
 
 def test_the_gradient_refuses_it_with_one_clear_line(tmp_path):
-    with pytest.raises(ValueError, match="Q must be diagonal for --method gradient, but got --full-q"):
+    with pytest.raises(ValueError, match=r"Q must be diagonal for method='gradient' \(--method\), but got full_q"):
         tune(PLAN, 1, out=tmp_path / "t.json", by_gradient=True)
-    with pytest.raises(ValueError, match="--method gradient must come without a budget, but got --budget"):
+    with pytest.raises(ValueError, match="must come without a budget, but got budget"):
         tune(PLAN._replace(full_q=False, budget=1.0), 1, out=tmp_path / "t.json", by_gradient=True)

@@ -1,6 +1,7 @@
 """From a user's own file to a tuned filter around an env, by the command line and by Python."""
 # ruff: noqa: F811 - fixtures come by import and go by name
 
+import copy
 import json
 import re
 import shutil
@@ -12,6 +13,7 @@ import numpy as np
 import optuna
 import pytest
 
+import tuning
 from filters import EstimateState
 from filters.engine.batch import run
 from filters.tuned_file import read_tuned_file
@@ -160,7 +162,9 @@ def test_a_tuned_file_takes_the_same_model_from_the_env_a_factory_or_the_caller(
     found.append(EstimateState(env, tuned=path, model=pendulum_problem.model()))
     covs = [one.filter.model.process_noise_cov for one in found]
     np.testing.assert_allclose(covs[1:], [covs[0]] * 2, rtol=1e-12)
-    with pytest.raises(ValueError, match="an env that offers no state_space_model must come with a model"):
+    found = EstimateState(tuned[2].make_env(), tuned=path)  # the line that a report gives to copy
+    np.testing.assert_allclose(found.filter.model.process_noise_cov, covs[0], rtol=1e-12)
+    with pytest.raises(ValueError, match="must come with a model, but got .* alone: pass model=..."):
         EstimateState(gym.make("Pendulum-v1"), tuned=path)
 
 
@@ -234,3 +238,15 @@ def test_the_problems_of_the_page_are_problems():
         assert [one.symbol for one in checked_problem(names["problem"]).quantities.states] == ["theta", "omega"]
         assert [one.name for one in parameters("kf", checked_problem(names["pair"]))] == ["Q11", "Q22", "R"]
         assert [one.name for one in parameters("kf", checked_problem(names["one_number"]))] == ["sigma_a"]
+
+
+def test_a_file_on_an_object_of_the_users_says_how_to_give_it(tuned, tmp_path):
+    problem = copy.copy(tuned[2])
+    problem.name = "motor"
+    study = tuning.tune(problem, trials=1, progress=False)
+    file = study.save(tmp_path / "motor.json")
+    said = r"motor.json was tuned on 'motor', an object of yours: pass problem=... \(--problem module:object\)"
+    for refused in (tuning.evaluate, tuning.report, verify):
+        with pytest.raises(ValueError, match=said):
+            refused(file)
+    assert tuning.evaluate(file, problem, seeds=2).choice == study.choice

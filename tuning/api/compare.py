@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from tuning.api.study import Study
 from tuning.api.tune import tune
 from tuning.evaluation.compare import Contender, contender, sized
 from tuning.evaluation.compare import compare as compare_all
+from tuning.evaluation.fitting import fitting
 from tuning.evaluation.knowledge import OF_FILE
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.problem import Problem
@@ -47,7 +49,8 @@ def compare(
 
     All filters meet the same truth, inputs and measurements. A filter is better or worse than the first one if the
     paired 95 % interval of the ratio of their scores leaves out 1; where there is no truth, if that of the
-    difference of their log-likelihoods leaves out 0. Ctrl-C keeps the rows that are done.
+    difference of their log-likelihoods leaves out 0. A filter that is named, and refuses a problem's model, is
+    left out, and `left_out` says why. Ctrl-C keeps the rows that are done.
 
         comparison = tuning.compare(["kf", "ekf", "enkf"], "mismatch", seeds=50)
         comparison.to_frame()
@@ -80,6 +83,7 @@ def compare(
     problems = problems_of(_default(some) if problem is None else problem, preset)
     each = ensemble_size if isinstance(ensemble_size, Mapping) else {None: ensemble_size}
     sizes = {name: size for name, size in each.items() if size is not None}
+    some, left_out = without_unfit(some, problems)
     if trials is not None:
         if knows is not None:
             raise ValueError(f"knows must be left out where filters are tuned, but got {shown(knows)} and trials")
@@ -89,7 +93,17 @@ def compare(
         ]
     knows = knowledge_on(problems) if knows is None else knows
     beliefs = beliefs_of(augment or {})
-    return compared(contenders_of(some, knows, beliefs, sizes, seed), problems, seed, seeds, console_for(progress))
+    contenders = contenders_of(some, knows, beliefs, sizes, seed)
+    return replace(compared(contenders, problems, seed, seeds, console_for(progress)), left_out=left_out)
+
+
+def without_unfit(filters: Sequence[Any], problems: Sequence[Problem]) -> tuple[list[Any], dict[str, str]]:
+    """The filters without those named ones that refuse a problem's model, and by label why these do."""
+    named = [one for one in filters if _is_named(one)]
+    kept, left_out = fitting(named, problems)
+    if not kept and len(named) == len(filters):  # not even a tuned one
+        raise ValueError(next(iter(left_out.values()), "a comparison must be of filters, but got none"))
+    return [one for one in filters if not _is_named(one) or one in kept], left_out
 
 
 def compared(

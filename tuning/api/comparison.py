@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,15 +12,19 @@ import numpy as np
 from filters.consistency.intervals import Interval, slightly
 from filters.looks import colour_of
 from numerics.plots import panels
+from numerics.text_tables import plain_text
 from tuning.api.held_out import cells_of
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.compare import Leaderboard, Row, winners
 from tuning.evaluation.knowledge import noise_sentence
 from tuning.problems.problem import Problem
+from tuning.reporting.leaderboard import report
 
 if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
+
+INTERRUPTED = "Interrupted: these are the rows that were done."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -29,11 +35,13 @@ class FilterComparison:
         boards: a `Leaderboard` a problem: seeds, bound and rows.
         seed: of the study to which the held-out seeds belong.
         interrupted: whether Ctrl-C ended it; the rows are those that were done.
+        left_out: by label, why a filter could not run.
     """
 
     boards: tuple[Leaderboard, ...]
     seed: int = 0
     interrupted: bool = False
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def problems(self) -> tuple[Problem, ...]:
@@ -95,6 +103,11 @@ class FilterComparison:
         ended = ", interrupted" if self.interrupted else ""
         return f"FilterComparison({'; '.join(said)}{ended})"
 
+    def __str__(self) -> str:
+        """The tables that `thruster compare` prints."""
+        ended = [*left_out_lines(self.left_out), *([INTERRUPTED] if self.interrupted else [])]
+        return plain_text([*(part for board in self.boards for part in report(board)), *ended])
+
     def _repr_html_(self) -> str:
         parts = []
         for board in self.boards:
@@ -114,7 +127,12 @@ class FilterComparison:
             heads += ["NEES", "NIS", "us/step", "verdict"]
             title = f"{len(board.seeds)} held-out {board.scenario.seed_word} of {board.scenario.name}"
             parts.append(html(title, heads, rows, f"{noise_sentence(board.rows)} {winners(board)}".strip()))
-        return "".join(parts)
+        return "".join(parts) + "".join(f"<p>{escape(line)}</p>" for line in left_out_lines(self.left_out))
+
+
+def left_out_lines(left_out: Mapping[str, str]) -> list[str]:
+    """A line for each filter that could not run, and why."""
+    return [f"{label} is left out: {why}" for label, why in left_out.items()]
 
 
 def _rank(row: Row) -> float:

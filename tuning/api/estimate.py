@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,4 +91,4 @@ def _as_file(tuned: Any) -> Iterator[str | Path | None]:
     if not hasattr(tuned, "save"):
         raise ValueError(f"what is tuned must be a tuned file or a Study, but got {shown(tuned)}")
     with tempfile.TemporaryDirectory() as folder:
-        yield tuned.save(Path(folder) / "tuned.json")
+        yield copy(tuned).save(Path(folder) / "tuned.json")  # the study itself does not remember this one

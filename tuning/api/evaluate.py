@@ -74,7 +74,8 @@ def subject_of(
     if problem is None:
         if preset is not None:
             raise ValueError(
-                "--preset must come with --scenario, for a tuned file names its own, but got it alone"
+                "preset (--preset) must come with a problem (--problem), for a tuned file names its "
+                "own, but got it alone"
             )
         choice, found, _ = read_tuned(tuned, given_for(tuned, model=model))
         return choice, found, True

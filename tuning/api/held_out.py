@@ -13,13 +13,17 @@ from filters.consistency.report import ConsistencyReport
 from filters.estimators.find import label_of
 from filters.filter import Filter
 from numerics.checks import at_least
+from numerics.text_tables import plain_text
 from tuning.api.progress import working
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.baselines import RULE, SCALED, TUNED, baselines
 from tuning.evaluation.evaluate import Evaluation, check_consistency
 from tuning.evaluation.held_out import Comparison, prove
 from tuning.evaluation.tuned import metrics
+from tuning.evaluation.worth import scaling_sentence, without_truth
 from tuning.problems.problem import Problem
+from tuning.reporting.error_tables import comparison_table
+from tuning.reporting.gains import gains
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
 
@@ -67,6 +71,11 @@ class HeldOut:
         """The numbers of each filter."""
         found = {TUNED: self.choice, **baselines(self.choice.name, self.problem, self.seed, self.proof.default)}
         return {name: found[name] for name in self.evaluations}
+
+    @property
+    def filters(self) -> dict[str, Filter]:
+        """Each filter, ready to use: `EstimateState(env, filter=study.held_out.filters["scaled default"])`."""
+        return {name: one.filter(self.problem) for name, one in self.choices.items()}
 
     @property
     def bound(self) -> np.ndarray:
@@ -165,6 +174,19 @@ class HeldOut:
             return f"HeldOut({what}: log-likelihood of a run {number(self.evaluation.log_likelihood)})"
         ratios = [f"{about(one)} x {name}" for name, one in self.ratios.items()][: int(self.is_tuned)]
         return f"HeldOut({', '.join([f'{what}: score {about(self.score)}', *ratios])})"
+
+    def __str__(self) -> str:
+        """The table of errors and what tuning is worth, as `thruster evaluate` prints them."""
+        where = f"held-out {self.problem.seed_word} {self.seeds.start} to {self.seeds.stop - 1}"
+        shown = [comparison_table(self.evaluations, self.bound, f"{where}, scenario {self.problem.name}")]
+        return plain_text([*shown, *self.sentences()])
+
+    def sentences(self) -> list[str]:
+        """What tuning is worth beside each baseline; of a filter that is not tuned what the scaled default is."""
+        if self.is_tuned:
+            return gains(self.proof, self.problem.seed_word)
+        truth = [] if self.evaluation.has_truth else [without_truth(self.problem.name)]
+        return [*truth, scaling_sentence(self.proof)]
 
     def _repr_html_(self) -> str:
         truth, rows = self.evaluation.has_truth, []

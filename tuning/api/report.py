@@ -63,7 +63,8 @@ def report(
         if isinstance(source, Study):
             folder = Path("out") if folder is None else folder
             with _as_files(source, Path(scratch)) as (file, journal):
-                made = write_report(file, journal, folder, source.problems)
+                saved = source.tuning.file
+                made = write_report(file, journal, folder, source.problems, str(saved) if saved else "")
         else:
             made = write_report(source, str(storage), folder, _given(source, problem, model))
         if page is None:
@@ -95,4 +96,6 @@ def _as_files(study: Study, folder: Path) -> Iterator[tuple[Path, str]]:
     if sizes:
         kept.set_user_attr(SIZES, sizes_as_data(sizes, study.choice, plan))
     kept.add_trials(study.trials)
-    yield study.save(folder / f"{study.name}.json"), journal
+    file = folder / f"{study.name}.json"
+    tuning.write(file)
+    yield file, journal

@@ -90,7 +90,10 @@ def run_tuning(
     trials, workers = at_least("trials", trials, 1, MOST_TRIALS), at_least("workers", workers, 1, MOST_WORKERS)
     _check_method(plan, by_gradient)
     if workers > 1 and storage is None:
-        raise ValueError(f"workers must be 1 without a storage that they share, but got {workers}")
+        raise ValueError(
+            f"workers must be 1 without a storage that they share, such as "
+            f"storage='studies.journal', but got {workers}"
+        )
     name = name or name_of(plan, by_gradient)
     if not isinstance(name, str) or "/" in name:
         raise ValueError(f"study must be a name without slashes, but got {shown(name)}")
@@ -144,11 +147,11 @@ def _check_method(plan: Plan, by_gradient: bool) -> None:
         return
     one_of("a filter whose likelihood has a gradient", plan.filter, DIFFERENTIABLE)
     if plan.hold_r:
-        raise ValueError("R must be free for --method gradient, but got --hold-r")
+        raise ValueError("R must be free for method='gradient' (--method), but got hold_r (--hold-r)")
     if plan.full_q:
-        raise ValueError("Q must be diagonal for --method gradient, but got --full-q")
+        raise ValueError("Q must be diagonal for method='gradient' (--method), but got full_q (--full-q)")
     if plan.budget is not None:
-        raise ValueError("--method gradient must come without a budget, but got --budget")
+        raise ValueError("method='gradient' (--method) must come without a budget, but got budget (--budget)")
 
 
 def name_of(plan: Plan, by_gradient: bool = False) -> str:

@@ -29,9 +29,7 @@ def frame(columns: Mapping[str, Any], index: str | None = None) -> pandas.DataFr
     try:
         import pandas
     except ImportError:
-        raise ValueError(
-            "to_frame must have pandas, which is not installed: pip install 'thruster-env[frames]'"
-        ) from None
+        raise ValueError("to_frame must have pandas, which is not installed: pip install pandas") from None
     found = pandas.DataFrame(dict(columns))
     return found if index is None else found.set_index(index)
 

@@ -88,11 +88,14 @@ class Study:
     def save(self, path: str | Path) -> Path:
         """Write the tuned file, which `EstimateState(env, tuned=path)` and all commands take; return the path.
 
+        A report of the study names this file afterwards.
+
         Raises:
             ValueError: if the file cannot be written, or the filter is an estimator that is code.
         """
         check_keepable(self.choice.name)
         self.tuning.write(path)
+        object.__setattr__(self, "tuning", self.tuning._replace(file=Path(path)))
         return Path(path)
 
     def to_frame(self) -> pandas.DataFrame:
@@ -163,6 +166,10 @@ class Study:
         if not self.tuning.proof.tuned.has_truth:
             return f"{said}{ended}: tuning {worth(self.tuning.proof)})"
         return f"{said}{ended}: score {about(self.held_out.score)}; tuning {worth(self.tuning.proof)})"
+
+    def __str__(self) -> str:
+        """What it is in a line, and the tables of its held-out evaluations."""
+        return "\n\n".join([repr(self), *map(str, self.evaluations)])
 
     def _repr_html_(self) -> str:
         from tuning.reporting.units import number_rows

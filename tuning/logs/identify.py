@@ -37,7 +37,9 @@ def split_runs(
     """
     runs, validating = runs_by_name(logs, held_out)
     if use_all and validating:
-        raise ValueError(f"give either --held-out or --use-all, but got both, --held-out {validating[0]}")
+        raise ValueError(
+            f"give either held_out (--held-out) or use_all (--use-all), but got both, held out {validating[0]}"
+        )
     names = list(runs)
     if not validating and not use_all and len(names) >= EVERY_THIRD:
         validating = names[EVERY_THIRD - 1 :: EVERY_THIRD]
@@ -75,11 +77,11 @@ def family_of(
     """
     if model is None:
         if filter != "ekf":
-            raise ValueError(f"a thruster must be identified with the ekf, but got --filter {filter}")
+            raise ValueError(f"a thruster must be identified with the ekf, but got filter {filter} (--filter)")
         whose = None if preset is None else str(preset)
         return room_of_logs().family_of_preset(logs, whose, sensors, list(free), noise=noise)
     if not free:
-        raise ValueError("--free must name what of the model is to be found, but got none")
+        raise ValueError("free (--free) must name what of the model is to be found, but got none")
     found = object_named(model, "model") if isinstance(model, str) else model
     return LoggedFamily(logs, found, list(free), noise=noise, dt=logs[0].dt)
 

@@ -43,7 +43,9 @@ def log_problem(
     """
     runs, held = runs_by_name(logs, held_out)
     if not runs:
-        raise ValueError("a problem of logs must have at least one, but got none: say --log FILE")
+        raise ValueError(
+            "a problem of logs must have at least one, in (model, logs) or by --log FILE, but got none"
+        )
     pairs = [read_named(log, **options, name=name) for name, log in runs.items()]
     recorded = [log for log, _ in pairs]
     model = read_for(recorded[0], pairs[0][1])[1]()
@@ -136,7 +138,9 @@ def problems_in(file: Path, model: str | None = None) -> list[Problem]:
 def _check_model(named, given: str | None, file: Path) -> None:
     """Raise ValueError unless the caller gives exactly the code that a file names."""
     if named is None and given is not None:
-        raise ValueError(f"--model must be left out for logs of a thruster, as in {file}, but got {shown(given)}")
+        raise ValueError(
+            f"model (--model) must be left out for logs of a thruster, as in {file}, but got {shown(given)}"
+        )
     if named != given:
         raise ValueError(
             f"the model of logs must be given where it is code, but {file} only names {shown(named)}: say --model "

@@ -42,10 +42,12 @@ def read_named(
         ValueError: states the rule and the value.
     """
     if model is not None and (sensors or (preset is not None and not str(preset).endswith(".toml"))):
-        raise ValueError("a log must be of --model or of a thruster (--preset, --sensor), but got both")
-    offsets = pairs("--clock-offset", clock_offset)
+        raise ValueError(
+            "a log must be of model (--model) or of a thruster (preset, sensors; --preset, --sensor), but got both"
+        )
+    offsets = pairs("clock_offset (--clock-offset)", clock_offset)
     options: dict[str, Any] = {
-        "columns": pairs("--column", columns),
+        "columns": pairs("columns (--column)", columns),
         "clock_offset": {key: _seconds(key, value) for key, value in offsets.items()},
         "dt": dt,
     }
@@ -100,4 +102,6 @@ def _seconds(name: str, value: Any) -> float:
     try:
         return finite(f"the clock offset of {name}", value)
     except ValueError:
-        raise ValueError(f"--clock-offset {name} must be seconds, but got {shown(value)}") from None
+        raise ValueError(
+            f"clock_offset (--clock-offset) of {name} must be seconds, but got {shown(value)}"
+        ) from None

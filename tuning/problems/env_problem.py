@@ -9,13 +9,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from numerics.checks import covariance, covariance_root, shown
+from numerics.checks import covariance, shown
 from numerics.modules import said
-from numerics.streams import MEASUREMENT, episode_keys, filter_keys, normal_block
+from numerics.streams import episode_keys, filter_keys
 from plants.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_of
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.digest import digest_of
+from tuning.problems.episodes import Episodes, measurement_noise
 from tuning.problems.excitation import Excitation, excitation_of
 from tuning.problems.parameter import Parameter
 
@@ -103,9 +104,9 @@ class EnvProblem(AssumedProblem):
                 f"the action space of problem {name} must have the model's {assumed.inputs} entries, "
                 f"but got {space}"
             )
-        self._noise = None
+        self.noise_cov = None
         if measurement_noise_cov is not None:
-            self._noise = covariance("measurement_noise_cov", measurement_noise_cov, assumed.m)
+            self.noise_cov = covariance("measurement_noise_cov", measurement_noise_cov, assumed.m)
 
     @property
     def digest(self) -> str:
@@ -116,15 +117,15 @@ class EnvProblem(AssumedProblem):
             env = spec.to_json() if spec is not None else type(self.env.unwrapped).__qualname__
         else:
             env = self.env
-        shown_by = self.state_of, self.measure, self.has_truth, self._noise
+        shown_by = self.state_of, self.measure, self.has_truth, self.noise_cov
         return digest_of(env, self.env_arguments, self.policy, shown_by, self.assumptions)
 
     @property
     def untuned(self) -> dict:
         """As for any problem, with the R of the noise that is added to the measurements."""
-        if self._noise is None or self._parameters is not None:
+        if self.noise_cov is None or self._parameters is not None:
             return super().untuned
-        return super().untuned | {"measurement_noise_cov": as_argument(self._noise)} | (self._untuned or {})
+        return super().untuned | {"measurement_noise_cov": as_argument(self.noise_cov)} | (self._untuned or {})
 
     def make(self, seeds: tuple[int, ...]) -> Data:
         """Runs of the env, one a seed."""
@@ -138,14 +139,17 @@ class EnvProblem(AssumedProblem):
         finally:
             self._close(env)
         inputs, measurements, found = (np.array(part, dtype=np.float64) for part in zip(*runs, strict=True))
-        if self._noise is not None:
-            measurements = measurements + _noise(keys, measurements.shape, self._noise)
+        if self.noise_cov is not None:
+            measurements = measurements + measurement_noise(keys, np.arange(measurements.shape[1]), self.noise_cov)
         states = found if self.has_truth else None
         outputs = None if states is None else self._outputs(states)
         return Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, states, outputs)
 
     def make_env(self, **arguments: Any) -> gym.Env:
-        """The env itself, where that was given; else a new one.
+        """The env, a new one unless an env was given, which offers filters the problem's model.
+
+        The first episode of a seed has the measurements of the seed's data under the same inputs; `info` has the
+        measurement and, where the problem knows it, the state.
 
         Args:
             **arguments: of the id or the function, in place of `env_arguments` of the same name.
@@ -155,7 +159,7 @@ class EnvProblem(AssumedProblem):
         """
         if arguments and isinstance(self.env, gym.Env):
             raise ValueError(f"the env of problem {self.name} is made already, but got {', '.join(arguments)}")
-        return self._make_env(self.name, arguments)
+        return Episodes(self._make_env(self.name, arguments), self)
 
     def found_scale(self) -> np.ndarray:
         """The standard deviation of each true state over the scored steps of 16 seeds."""
@@ -176,16 +180,20 @@ class EnvProblem(AssumedProblem):
     def _run(self, env: gym.Env, seed: int, given: np.ndarray | None) -> tuple[list, list, list]:
         """Inputs (K, p), measurements (K + 1, m) and states (K + 1, n) of one episode."""
         space, inputs = _box(env, self.name), []
-        observation, info = env.reset(seed=seed)
-        measurements, states = [self._measured(observation, info)], [self._state(env, info)]
+        begun = env.reset(seed=seed)
+        if not isinstance(begun, tuple) or len(begun) != 2:
+            rule = f"reset of the env of problem {self.name} must return (observation, info)"
+            raise ValueError(f"{rule}, but returned {shown(begun)}")
+        observation, info = begun
+        measurements, states = [self.measured(observation, info)], [self.state(env, info)]
         choose = _chooser(self.policy, space, seed)
         for k in range(self.steps):
             action = choose(observation) if given is None else given[k]
             action = np.asarray(action, dtype=space.dtype).reshape(space.shape)
             inputs.append(np.clip(np.ravel(action).astype(np.float64), np.ravel(space.low), np.ravel(space.high)))
             observation, _, terminated, _, info = env.step(action)
-            measurements.append(self._measured(observation, info))
-            states.append(self._state(env, info))
+            measurements.append(self.measured(observation, info))
+            states.append(self.state(env, info))
             if terminated and k + 1 < self.steps:
                 raise ValueError(
                     f"episodes of problem {self.name} must last {self.steps} steps, "
@@ -193,7 +201,8 @@ class EnvProblem(AssumedProblem):
                 )
         return inputs, measurements, states
 
-    def _measured(self, observation, info: Mapping) -> np.ndarray:
+    def measured(self, observation, info: Mapping) -> np.ndarray:
+        """The measurement (m,) of an observation and its info, without the noise that is added."""
         if self.measure is not None:
             return np.ravel(np.asarray(self.measure(observation, info), dtype=np.float64))
         if "measurement" not in info:
@@ -201,7 +210,8 @@ class EnvProblem(AssumedProblem):
         z = np.ravel(np.asarray(info["measurement"], dtype=np.float64))
         return np.where(np.ravel(info.get("measurement_valid", True)), z, np.nan)
 
-    def _state(self, env: gym.Env, info: Mapping) -> np.ndarray:
+    def state(self, env: gym.Env, info: Mapping) -> np.ndarray:
+        """The true state (n,), empty without truth; ValueError where nothing tells it."""
         if not self.has_truth:
             return np.zeros(0)
         if self.state_of is None and "state" not in info:
@@ -257,11 +267,3 @@ def _chooser(policy, space: gym.spaces.Box, seed: int) -> Callable:
     if hasattr(policy, "predict"):
         return lambda observation: policy.predict(observation)[0]
     return policy
-
-
-def _noise(keys: np.ndarray, shape: tuple[int, ...], cov: np.ndarray) -> np.ndarray:
-    """Normal noise (B, K + 1, m) with a covariance, a function of each episode's key and the step only."""
-    steps = np.arange(shape[1])[None, :]
-    blocks = [normal_block(b, steps, MEASUREMENT, keys[:, :1], keys[:, 1:]) for b in range(-(-shape[2] // 4))]
-    draws = np.stack([one for block in blocks for one in block][: shape[2]], axis=-1)
-    return draws @ covariance_root(cov).T

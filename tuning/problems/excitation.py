@@ -40,6 +40,16 @@ class Excitation(Effect):
         """One of the inputs, (B, steps), by its index from 0."""
         raise TypeError(f"{type(self).__name__} has no inputs: use one of its subclasses")
 
+    def limits(self, count: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Smallest and largest input, each (count,), in the inputs' units; None where nothing tells them."""
+        return None
+
+
+def limits_about(offset: Any, amplitude: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Plus and minus an amplitude about an offset, each (count,)."""
+    middle, half = (np.array(np.broadcast_to(one, count), dtype=np.float64) for one in (offset, amplitude))
+    return middle - half, middle + half
+
 
 def excitation_of(given: Excitation | Mapping) -> Excitation:
     """An excitation as it is, or from a mapping with its name; ValueError for an unknown one."""
@@ -61,6 +71,10 @@ class Steps(Excitation):
         """Check the arguments."""
         set_field(self, "amplitude", levels("amplitude", self.amplitude))
         set_field(self, "hold", at_least("hold", self.hold, 1, MOST_STEPS))
+
+    def limits(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest input, each (count,)."""
+        return limits_about(0.0, self.amplitude, count)
 
     def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
         """One of the inputs, (B, steps)."""
@@ -96,6 +110,10 @@ class Levels(Excitation):
         set_field(self, "shortest", at_least("shortest", self.shortest, 1, MOST_STEPS))
         set_field(self, "longest", at_least("longest", self.longest, self.shortest, MOST_STEPS))
 
+    def limits(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest input, each (count,)."""
+        return limits_about(self.low, 0.0, count)[0], limits_about(self.high, 0.0, count)[1]
+
     def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
         """One of the inputs, (B, steps)."""
         share, length, *_ = uniforms(keys, np.arange(steps // self.shortest + 1), number)
@@ -121,6 +139,10 @@ class MultiSine(Excitation):
         set_field(self, "offset", levels("offset", self.offset, signed=True))
         periods = tuple(positive("periods", period) for period in vector("periods", self.periods).tolist())
         set_field(self, "periods", periods)
+
+    def limits(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest input, each (count,)."""
+        return limits_about(self.offset, len(self.periods) * np.asarray(self.amplitude), count)
 
     def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
         """One of the inputs, (B, steps)."""
@@ -150,6 +172,10 @@ class Dwells(Excitation):
         set_field(self, "ramp", at_least("ramp", self.ramp, 1, MOST_STEPS))
         set_field(self, "dwell", at_least("dwell", self.dwell, 0, MOST_STEPS))
         set_field(self, "zeros", probability("zeros", self.zeros))
+
+    def limits(self, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest input, each (count,)."""
+        return limits_about(0.0, self.amplitude, count)
 
     def input(self, keys: np.ndarray, steps: int, dt: float, number: int) -> np.ndarray:
         """One of the inputs, (B, steps)."""

@@ -71,8 +71,13 @@ def find_given(name, given: Sequence[Problem], where: str | Path) -> Problem:
     for one in given:
         if one.name == name:
             return one
-    if not is_code(name) or name in built_in():
+    known = built_in()
+    if isinstance(name, str) and (any_case(name, known) in known or name.endswith(".toml")):
         return find_problem(name)
+    if isinstance(name, str) and not is_code(name):
+        raise ValueError(
+            f"{where} was tuned on {name!r}, an object of yours: pass problem=... (--problem module:object)"
+        )
     raise ValueError(
         f"a problem that is code must be given, but {where} only names {shown(name)}: "
         f"say --problem {name}, if you trust it"

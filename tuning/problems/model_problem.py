@@ -160,11 +160,24 @@ class ModelProblem(AssumedProblem):
         """The truth as a Gymnasium env, which offers filters the assumed model; the data of a seed is its episode.
 
         Args:
-            **arguments: `low` and `high` of the inputs, as `ModelEnv` takes them.
+            **arguments: `low` and `high` of the inputs, as `ModelEnv` takes them; by default those of the
+                problem's inputs, where these are an excitation that tells them, or an array; others have none.
         """
-        return ModelEnv(self.truth, NamedArguments(self), dt=self._dt, **arguments)
+        low, high = self._limits()
+        return ModelEnv(self.truth, NamedArguments(self), dt=self._dt, **{"low": low, "high": high, **arguments})
 
     env = make_env  # its name before there was one for all problems
+
+    def _limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest of each input, as far as the problem's inputs tell; none where one stands still."""
+        found = None
+        if isinstance(self.inputs, Excitation):
+            found = self.inputs.limits(self.truth.inputs)
+        elif isinstance(self.inputs, np.ndarray):
+            found = self.inputs.min(axis=0), self.inputs.max(axis=0)
+        low, high = (0.0, 0.0) if found is None else found
+        moved = np.broadcast_to(np.less(low, high), self.truth.inputs)
+        return np.where(moved, low, -np.inf), np.where(moved, high, np.inf)
 
     def _inputs_of(self, seeds: tuple[int, ...]) -> np.ndarray:
         shape = len(seeds), self.steps, self.truth.inputs
@@ -183,7 +196,7 @@ class ModelProblem(AssumedProblem):
 class NamedArguments:
     """A problem's `model` with a signature that names its arguments."""
 
-    def __init__(self, problem: ModelProblem):
+    def __init__(self, problem: AssumedProblem):
         """Take the problem."""
         self._problem = problem
 

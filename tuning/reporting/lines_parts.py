@@ -12,26 +12,24 @@ from tuning.reporting.matlab import matlab_function
 from tuning.reporting.page import Code, Section, Words
 from tuning.search.space import Choice
 
-PYTHON = """from tuning.evaluation.tuned import read_tuned
+ON_ENV = """from filters import EstimateState
+{problem}
+env = EstimateState(problem.make_env(), tuned={file!r})  # observations are estimates
+tuned = env.filter  # with its model, Q and R
+"""
+ON_LOG = """import tuning
 
-choice, problem, _ = read_tuned({file!r}{given})
-tuned = choice.filter(problem)  # with its model, Q and R
+found = tuning.estimate("run.csv", tuned={file!r})  # of a log; the same as `thruster estimate`
+tuned = found.filter  # with its model, Q and R
+"""
+BY_HAND = """
 belief = tuned.init()
 for measurement, command in zip(measurements, inputs):  # arrays of your own, a row a step
     belief, innovation = tuned.update(belief, measurement)
     print(belief.mean, belief.cov)
     belief = tuned.predict(belief, command)
 """
-ON_ENV = """
-from filters import EstimateState
-
-env = EstimateState(problem.make_env(), tuned={file!r})  # observations are estimates
-"""
-ON_LOG = """
-import tuning
-
-found = tuning.estimate("run.csv", tuned={file!r})  # of a log; the same as `thruster estimate`
-"""
+UNSAVED = "TUNED.json"  # a name to be replaced
 
 
 def lines_section(choice: Choice, problem: Problem, file: str | None) -> Section:
@@ -42,15 +40,15 @@ def lines_section(choice: Choice, problem: Problem, file: str | None) -> Section
         problem: what it was tuned on.
         file: the tuned file; None where the report is of a study, which has none yet.
     """
-    name = Path(file).name if file else "tuned.json"
+    name = Path(file).name if file else UNSAVED
     model = problem.model(**choice.model)
-    given = "" if problem.name in built_in() or problem.as_mapping() is not None else ", [problem]  # yours"
-    python = PYTHON.format(file=name, given=given).replace("  # yours)", ")  # the problem is code of yours")
-    python += ON_LOG.format(file=name) if isinstance(problem, LogProblem) else ON_ENV.format(file=name)
+    lines = ON_LOG if isinstance(problem, LogProblem) else ON_ENV
+    python = lines.format(file=name, problem=_found_by(problem)) + BY_HAND
     noise = {"process_noise_cov": model.process_noise_cov, "measurement_noise_cov": model.measurement_noise_cov}
     entry = {"name": choice.name, "numbers": dict(choice.numbers)}
     entry["model"] = {key: value.tolist() for key, value in noise.items()} | dict(choice.model)
-    said = [] if file else [Words(["`thruster tune` writes the tuned file of a study, which these lines read."])]
+    command = f"`study.save({UNSAVED!r})` or `thruster tune --out {UNSAVED}`"
+    said = [] if file else [Words([f"{command} writes the tuned file that these lines read."])]
     matlab = matlab_function(choice, model, problem.name, problem.dt)
     return Section(
         "Lines to copy",
@@ -61,3 +59,14 @@ def lines_section(choice: Choice, problem: Problem, file: str | None) -> Section
             Code("MATLAB or GNU Octave: a function that needs no toolbox", matlab, folded=True),
         ],
     )
+
+
+def _found_by(problem: Problem) -> str:
+    """Lines that give a problem: by its name or, where it is code of the user's, from where they have it."""
+    if problem.name in built_in() or problem.name.endswith(".toml"):
+        return f"from tuning.problems.find import find_problem\n\nproblem = find_problem({problem.name!r})"
+    module, colon, name = problem.name.partition(":")
+    if colon and module.replace(".", "").isidentifier() and name.isidentifier():
+        found = f"from {module} import {name}" + ("" if name == "problem" else " as problem")
+        return f"{found}  # if it is a function: problem = problem()\n"
+    return "from your_module import problem  # the object that it was tuned on\n"

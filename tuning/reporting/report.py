@@ -45,7 +45,11 @@ class Pages(NamedTuple):
 
 
 def write_report(
-    source: str | Path, storage: str, out: str | Path | None = None, problems: Sequence[Problem] = ()
+    source: str | Path,
+    storage: str,
+    out: str | Path | None = None,
+    problems: Sequence[Problem] = (),
+    file: str | None = None,
 ) -> Report:
     """Write a page, NAME.html, and its tables, NAME.md, on a tuned file or a study.
 
@@ -57,6 +61,7 @@ def write_report(
         storage: where the study is; without it a page on a tuned file leaves the search out.
         out: folder of the two files, by default that of the tuned file, or `out`.
         problems: what it is of, where that is code: nothing that a file or a study names is imported.
+        file: what the page calls the tuned file, empty for one that is not saved; the source itself if None.
 
     Raises:
         ValueError: if the tuned file is refused, there is no such study, or the folder cannot be written.
@@ -64,7 +69,7 @@ def write_report(
     subject = find_subject(source, storage, problems)
     name = Path(source).stem if is_file(source) else subject.name
     page, tables = report_files(source, name, out)
-    found = pages_of(source, subject)
+    found = pages_of(source, subject, file=file)
     write_whole(page, html_page(found.title, found.advice, found.sections))
     write_whole(tables, markdown_page(found.title, found.advice, found.tables))
     return Report(page, tables, found.advice)
@@ -79,9 +84,10 @@ def report_files(source: str | Path, name: str, out: str | Path | None) -> tuple
     return found
 
 
-def pages_of(source: str | Path, subject: Subject, prefix: str = "p") -> Pages:
+def pages_of(source: str | Path, subject: Subject, prefix: str = "p", file: str | None = None) -> Pages:
     """Everything that a page holds of a study, whose pictures' names begin with a prefix."""
     plan, choice = subject.plan, subject.choice
+    file = str(source) if file is None and is_file(source) else file or None
     data = plan.training_data()
     sizes: Sequence[SizeRow] = []
     if has_ensemble(choice.name):
@@ -112,7 +118,7 @@ def pages_of(source: str | Path, subject: Subject, prefix: str = "p") -> Pages:
         search_section(book, subject),
         *([sizes_section(book, subject, sizes)] if sizes else []),
         *run_sections(book, subject, proofs[0]),
-        lines_section(choice, plan.scenarios[0], str(source) if is_file(source) else None),
+        lines_section(choice, plan.scenarios[0], file),
         facts_section(subject, nis),
     ]
     errors = [errors_table(scenario, proof) for scenario, proof in zip(plan.scenarios, proofs, strict=True)]

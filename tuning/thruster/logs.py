@@ -69,7 +69,9 @@ def of_preset(problem: Problem, preset: str | Path | None, sequences: int = FILE
 
     preset = str(preset)
     if not isinstance(problem, Scenario) or problem.system is not None:
-        raise ValueError(f"--preset must come with scenarios of the thruster's equations, but got {problem.name}")
+        raise ValueError(
+            f"preset (--preset) must come with scenarios of the thruster's equations, but got {problem.name}"
+        )
     name = f"{problem.name} ({preset})"
     made = problem.replace(preset=preset, name=name, scale=problem.scale)
     return made.replace(scale=tuple(float(one) for one in computed_scale(made, sequences)))

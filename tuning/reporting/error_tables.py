@@ -9,8 +9,8 @@ import numpy as np
 from rich.table import Table
 
 from filters.consistency.intervals import Interval
+from numerics.text_tables import table
 from plants.quantities import Quantity
-from thruster_cli.output import table
 from tuning.evaluation.evaluate import Evaluation
 
 MOST_COLUMNS = 5  # of errors, that fit into 80 columns with their intervals

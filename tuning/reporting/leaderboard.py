@@ -8,7 +8,12 @@ from rich.console import RenderableType
 from rich.table import Table
 
 from filters.consistency.intervals import slightly
-from thruster_cli.error_tables import (
+from numerics.text_tables import table
+from tuning.evaluation.compare import Leaderboard, Row, winners
+from tuning.evaluation.knowledge import belief_sentences, noise_sentence
+from tuning.evaluation.tuned import summary
+from tuning.evaluation.worth import without_truth
+from tuning.reporting.error_tables import (
     MOST_COLUMNS,
     about,
     consistency_cells,
@@ -19,11 +24,6 @@ from thruster_cli.error_tables import (
     two_lines,
     unless_blank,
 )
-from thruster_cli.output import table
-from tuning.evaluation.compare import Leaderboard, Row, winners
-from tuning.evaluation.knowledge import belief_sentences, noise_sentence
-from tuning.evaluation.tuned import summary
-from tuning.evaluation.worth import without_truth
 
 
 def report(board: Leaderboard) -> list[RenderableType]:
