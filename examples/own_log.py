@@ -1,6 +1,6 @@
 """
-A log of your own
-=================
+Tutorial: a log of your own
+===========================
 
 Inputs and measurements in a table, no true state: how to read it, find the model's parameters, tune Q and R from
 the innovations, and estimate the hidden state.

@@ -3,7 +3,7 @@ PPO in a script of one's own
 ============================
 
 A policy that makes the thruster's thrust follow a reference, from the estimate of a Kalman filter, learnt with
-Stable-Baselines3 (``pip install 'thruster-env[rl]'``) and hyperparameters that suit this plant. In a third of the
+Stable-Baselines3 (``pip install '.[rl]'``) and hyperparameters that suit this plant. In a third of the
 steps that ``thruster train`` takes; with all of them::
 
     python examples/ppo.py --steps 401408 --out ppo_thruster
