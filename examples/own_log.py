@@ -49,7 +49,8 @@ def record(seed):
 
 
 runs = [record(seed) for seed in range(4)]
-print({header: column[:3] for header, column in runs[0].items()})
+for header, column in runs[0].items():
+    print(header, column[:3])
 
 # %%
 # What the data sheet gets wrong
