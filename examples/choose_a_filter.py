@@ -39,7 +39,9 @@ tuning.compare(["ekf", "kf", "ukf", "enkf", "pf", "open-loop"], "nominal", seeds
 # With outliers in the sensor the ranking is another one. No filter is told of them; ``ekf-robust`` expects that
 # there may be some, and weighs a measurement less the less likely it is.
 
-comparison = tuning.compare(["ekf", "ekf-robust", "enkf", "pf"], "outliers", seeds=SEEDS)
+comparison = tuning.compare(
+    ["ekf", "ekf-robust", "enkf", "pf"], "outliers", seeds=SEEDS
+)
 comparison
 
 # %%

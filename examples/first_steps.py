@@ -37,7 +37,9 @@ print("true state       ", info["state"])
 # The voltage changes at random four times a second. In each step we keep the truth, the estimate, its covariance
 # and the innovation: what the measurement said beyond the prediction.
 
-voltages = np.repeat(np.random.default_rng(0).uniform(-24.0, 24.0, STEPS // 25 + 1), 25)[:STEPS]
+voltages = np.repeat(
+    np.random.default_rng(0).uniform(-24.0, 24.0, STEPS // 25 + 1), 25
+)[:STEPS]
 truth, estimate, variance, innovation, innovation_variance = [], [], [], [], []
 for voltage in voltages:
     _, _, _, _, info = env.step([voltage])
@@ -59,12 +61,20 @@ time = 0.01 * np.arange(1, STEPS + 1)
 figure, axes = plt.subplots(2, 2, figsize=(9, 4.6), layout="constrained", sharex=True)
 for column, name in enumerate(("motor speed [rad/s]", "flow velocity [m/s]")):
     axes[0, column].plot(time, truth[:, column], "k", linewidth=2.5, label="truth")
-    axes[0, column].plot(time, estimate[:, column], "tab:orange", linewidth=1, label="estimate")
+    axes[0, column].plot(
+        time, estimate[:, column], "tab:orange", linewidth=1, label="estimate"
+    )
     axes[0, column].set_title(name)
     band = 1.96 * deviation[:, column]
-    axes[1, column].fill_between(time, -band, band, color="tab:blue", alpha=0.25, linewidth=0, label="95 % band")
+    axes[1, column].fill_between(
+        time, -band, band, color="tab:blue", alpha=0.25, linewidth=0, label="95 % band"
+    )
     axes[1, column].plot(
-        time, estimate[:, column] - truth[:, column], color="tab:red", linewidth=0.8, label="error"
+        time,
+        estimate[:, column] - truth[:, column],
+        color="tab:red",
+        linewidth=0.8,
+        label="error",
     )
     axes[1, column].set_xlabel("time [s]")
 axes[0, 0].legend()

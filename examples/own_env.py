@@ -86,7 +86,9 @@ figure = study.plot_errors()
 env = EstimateState(problem.make_env(), filter=study.filter)
 observation, info = env.reset(seed=0)
 for _ in range(20):
-    observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
+    observation, reward, terminated, truncated, info = env.step(
+        env.action_space.sample()
+    )
 print(info["estimate"], info["estimate_cov"].diagonal())
 
 # %%

@@ -1,6 +1,6 @@
 """
-A log of your own
-=================
+Tutorial: a log of your own
+===========================
 
 Inputs and measurements in a table, no true state: how to read it, find the model's parameters, tune Q and R from
 the innovations, and estimate the hidden state.
@@ -41,11 +41,16 @@ def record(seed):
     for voltage in voltages[:-1]:
         observation, *_ = env.step([voltage])
         thrusts.append(observation[0])
-    return {"time_s": 0.01 * np.arange(ROWS), "voltage_V": voltages, "measured_thrust_N": np.array(thrusts)}
+    return {
+        "time_s": 0.01 * np.arange(ROWS),
+        "voltage_V": voltages,
+        "measured_thrust_N": np.array(thrusts),
+    }
 
 
 runs = [record(seed) for seed in range(4)]
-print({header: column[:3] for header, column in runs[0].items()})
+for header, column in runs[0].items():
+    print(header, column[:3])
 
 # %%
 # What the data sheet gets wrong
@@ -68,6 +73,9 @@ found
 # %%
 # Q and R
 # -------
+#
+# For an EKF, the Q and R that ``identify`` found are the answer, and ``mine`` below holds them. A study is for
+# other filters, other criteria, or logs with true states. It is shown on the EKF, for that is the quickest filter.
 #
 # Without a true state the innovations judge: the study looks for the Q and R under which they are most likely,
 # with their NIS (normalised innovation squared) held in its band, and proves the choice on runs that it did not

@@ -80,7 +80,12 @@ belief = ekf.init()
 for level in (0.25, 0.26, 0.28):
     belief = ekf.predict(belief, u=[0.01])
     belief, innovation = ekf.update(belief, z=[level])
-print("upper and lower level", belief.mean.round(3), "+-", np.sqrt(belief.cov.diagonal()).round(3))
+print(
+    "upper and lower level",
+    belief.mean.round(3),
+    "+-",
+    np.sqrt(belief.cov.diagonal()).round(3),
+)
 
 # %%
 # A problem
@@ -89,7 +94,13 @@ print("upper and lower level", belief.mean.round(3), "+-", np.sqrt(belief.cov.di
 # A :term:`problem` is a pair: the model that makes the data, and the model that filters assume. Here they
 # differ, as they always do: the filter believes in an outflow that is a tenth too small.
 
-problem = ModelProblem(tanks(0.055), tanks(0.05), inputs=Steps(amplitude=0.01, hold=40), steps=300, name="tanks")
+problem = ModelProblem(
+    tanks(0.055),
+    tanks(0.05),
+    inputs=Steps(amplitude=0.01, hold=40),
+    steps=300,
+    name="tanks",
+)
 study = tuning.tune(problem, filter="ekf", trials=TRIALS)
 study
 

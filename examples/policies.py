@@ -33,7 +33,9 @@ SENSOR = {"measurement_noise_cov": [16.0]}  # a standard deviation of 4 N
 
 def make(env_id, copies):
     """Copies of an env, side by side."""
-    return NativeVecEnv(gym.make_vec(env_id, num_envs=copies, autoreset_mode="SameStep", **SENSOR))
+    return NativeVecEnv(
+        gym.make_vec(env_id, num_envs=copies, autoreset_mode="SameStep", **SENSOR)
+    )
 
 
 # %%
@@ -72,7 +74,9 @@ def score(env_id, model, training_envs, first_seed=1_000_000):
     envs.seed(first_seed)
     observations, returns = envs.reset(), np.zeros(EPISODES)
     for _ in range(500):
-        actions, _ = model.predict(training_envs.normalize_obs(observations), deterministic=True)
+        actions, _ = model.predict(
+            training_envs.normalize_obs(observations), deterministic=True
+        )
         observations, rewards, dones, _ = envs.step(actions)
         returns += rewards
     assert dones.all()

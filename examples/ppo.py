@@ -3,10 +3,12 @@ PPO in a script of one's own
 ============================
 
 A policy that makes the thruster's thrust follow a reference, from the estimate of a Kalman filter, learnt with
-Stable-Baselines3 (``pip install 'thruster-env[rl]'``) and hyperparameters that suit this plant. In a third of the
+Stable-Baselines3 (``pip install '.[rl]'``) and hyperparameters that suit this plant. In a third of the
 steps that ``thruster train`` takes; with all of them::
 
     python examples/ppo.py --steps 401408 --out ppo_thruster
+
+This page is not run while the site is built: learning takes a minute or so. What it printed stands at its end.
 """
 
 import argparse
@@ -47,7 +49,9 @@ PPO_NUMBERS = {
 def make_training(copies=COPIES, seed=0):
     """Copies of the env with a filter each, as PPO takes them."""
     envs = gym.make_vec(ENV, num_envs=copies, autoreset_mode="SameStep")
-    venv = VecNormalize(VecMonitor(NativeVecEnv(EstimateStates(envs, FILTER))), gamma=DISCOUNT)
+    venv = VecNormalize(
+        VecMonitor(NativeVecEnv(EstimateStates(envs, FILTER))), gamma=DISCOUNT
+    )
     venv.seed(seed)
     return venv
 
@@ -58,7 +62,9 @@ def make_training(copies=COPIES, seed=0):
 
 def make_single():
     """One env with its filter, for the policy at work."""
-    return RescaleAction(EstimateState(gym.make(ENV), FILTER), np.float32(-1.0), np.float32(1.0))
+    return RescaleAction(
+        EstimateState(gym.make(ENV), FILTER), np.float32(-1.0), np.float32(1.0)
+    )
 
 
 # %%
@@ -75,7 +81,9 @@ def learn(steps, copies=COPIES, seed=0):
     def falling(remaining):  # to zero, as the share of the steps that is left does
         return rate * max(remaining, 0.0)
 
-    model = PPO("MlpPolicy", venv, learning_rate=falling, seed=seed, device="cpu", **PPO_NUMBERS)
+    model = PPO(
+        "MlpPolicy", venv, learning_rate=falling, seed=seed, device="cpu", **PPO_NUMBERS
+    )
     model.learn(steps)
     return model, venv
 
@@ -101,14 +109,23 @@ def episode_return(model, venv, seed):
 def main(arguments=None):
     """Learn, say what it is worth on held-out episodes, and save it."""
     parser = argparse.ArgumentParser(description="PPO on the estimate of a filter.")
-    parser.add_argument("--steps", type=int, default=131_072, help="steps to learn from; 401408 is what is best")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        default=131_072,
+        help="steps to learn from; 401408 is what is best",
+    )
     parser.add_argument("--copies", type=int, default=COPIES, help="of the env")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--episodes", type=int, default=5, help="held-out ones")
-    parser.add_argument("--out", help="where to save: OUT.zip, and OUT.pkl with the normalisation")
+    parser.add_argument(
+        "--out", help="where to save: OUT.zip, and OUT.pkl with the normalisation"
+    )
     given = parser.parse_args(arguments)
     model, venv = learn(given.steps, given.copies, given.seed)
-    returns = [episode_return(model, venv, 1_000_000 + seed) for seed in range(given.episodes)]
+    returns = [
+        episode_return(model, venv, 1_000_000 + seed) for seed in range(given.episodes)
+    ]
     print(f"mean return of {given.episodes} held-out episodes: {np.mean(returns):.3f}")
     if given.out:
         model.save(given.out)
@@ -118,3 +135,10 @@ def main(arguments=None):
 
 if __name__ == "__main__":
     main()
+
+# %%
+# What it printed on two cores, within a minute, of 131072 steps::
+#
+#    mean return of 5 held-out episodes: -0.917
+#
+# The return is minus a squared error, so nearer to zero is better.

@@ -48,7 +48,7 @@ figure = study.plot_run()
 figure = study.plot_history()
 
 # %%
-# The trials are a table, too (pandas, ``pip install '.[frames]'``):
+# The trials are a table, too (pandas, ``pip install pandas``):
 
 study.to_frame().tail(4).round(4)
 

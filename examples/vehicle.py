@@ -47,7 +47,9 @@ for _ in range(STEPS):
         break
 truth, estimate, deviation = np.array(truth), np.array(estimate), np.array(deviation)
 across, below = np.sqrt(np.mean(np.square(distances), axis=0))
-print(f"{len(truth)} steps; distance from the path {across:.2f} m across, {below:.2f} m in depth (RMS)")
+print(
+    f"{len(truth)} steps; distance from the path {across:.2f} m across, {below:.2f} m in depth (RMS)"
+)
 
 # %%
 # What it does not know
@@ -59,8 +61,16 @@ time = 0.05 * np.arange(1, len(truth) + 1)
 figure, axes = plt.subplots(1, 3, figsize=(10, 3), layout="constrained")
 for axis, place in zip(axes, (6, 9, 11), strict=True):
     band = 1.96 * deviation[:, place]
-    axis.fill_between(time, -band, band, color="tab:blue", alpha=0.25, linewidth=0, label="95 % band")
-    axis.plot(time, estimate[:, place] - truth[:, place], color="tab:red", linewidth=0.8, label="error")
+    axis.fill_between(
+        time, -band, band, color="tab:blue", alpha=0.25, linewidth=0, label="95 % band"
+    )
+    axis.plot(
+        time,
+        estimate[:, place] - truth[:, place],
+        color="tab:red",
+        linewidth=0.8,
+        label="error",
+    )
     axis.set(title=f"{states[place].name} [{states[place].unit}]", xlabel="time [s]")
 axes[0].legend()
 

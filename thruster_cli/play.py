@@ -85,7 +85,7 @@ def command(
     A policy sees what it was trained on: the same measurements, filter and scaling. The strip charts show the
     thrust, its reference and its measurement, and the filter's estimate with a band of two standard deviations.
 
-    Needs the extra render, for MODEL also rl: pip install 'thruster-env[rl,render]'
+    Needs the extra render, for MODEL also rl: pip install '.[rl,render]' in the project's folder
 
     Example: thruster play --policy pi --filter enkf --out pi.gif
 

@@ -72,7 +72,7 @@ def command(
     With --scenario the plant changes, its noise and sensors too, and nobody is told: a filter goes on assuming the
     plant of training, a classical controller keeps its gains. What a scenario says of filters is left out.
 
-    Needs the extra rl: pip install 'thruster-env[rl]'
+    Needs the extra rl: pip install '.[rl]' in the project's folder
 
     mpc plans a few steps ahead by the thruster's equations, one-step a single one; lqr is linear.
 

@@ -130,7 +130,8 @@ def command(
 
     Ctrl-C saves a checkpoint, and the same command goes on from it; so it does after a crash, or with more steps.
 
-    Needs the extra rl: pip install 'thruster-env[rl]'. To watch it learn: tensorboard --logdir out/policies
+    Needs the extra rl: pip install '.[rl]' in the project's folder. To watch it learn:
+    tensorboard --logdir out/policies
 
     Example: thruster train --task manoeuvre --observe enkf --seed 1
     """

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 
+from numerics.extras import to_install
+
 NEEDED = ("torch", "stable_baselines3", "sb3_contrib")
 
 
@@ -11,4 +13,4 @@ def check_installed() -> None:
     """Raise ValueError, with the command to install it, unless the extra `rl` is installed."""
     for package in NEEDED:
         if importlib.util.find_spec(package) is None:
-            raise ValueError(f"policies need {package}, which is not installed: pip install 'thruster-env[rl]'")
+            raise ValueError(f"policies need {package}, which is not installed: {to_install('rl')}")

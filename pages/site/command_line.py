@@ -2,19 +2,55 @@
 
 from __future__ import annotations
 
+import re
+
 import typer
 from typer.cli import get_docs_for_click
 
 PAGE = "reference/command_line"
+KINDS = {
+    "<path>": "FILE",
+    "<list[Path]>": "FILE",
+    "<str>": "TEXT",
+    "<list[str]>": "TEXT",
+    "<int>": "INTEGER",
+    "<int range>": "INTEGER",
+    "<float>": "NUMBER",
+    "<float range>": "NUMBER",
+    "<list[float]>": "NUMBER",
+    "<float,float>...": "NUMBER NUMBER",
+}
+ITEM = re.compile(r"^\* `([^`<]+) (<[^`]+)`(: Folder)?", re.MULTILINE)
+EXAMPLES = re.compile(r"^Example: thruster .*(?:\n\nExample: thruster .*)*$", re.MULTILINE)
+GIVEN_BY_NAME = re.compile(r"\[default: \(([^()]*)\)")
 
 
 def commands() -> str:
-    """All commands with their arguments and options, in Markdown."""
+    """All commands with their arguments and options, in Markdown.
+
+    Examples stand in blocks that can be copied, and what an option takes is in capitals everywhere.
+    """
     from thruster_cli.app import app
 
     command = typer.main.get_command(app)
     context = typer.Context(command, info_name="thruster")
-    return get_docs_for_click(obj=command, ctx=context, name="thruster", indent=1)
+    text = get_docs_for_click(obj=command, ctx=context, name="thruster", indent=1)
+    text = EXAMPLES.sub(_copied, text)
+    text = ITEM.sub(_in_capitals, text)
+    return GIVEN_BY_NAME.sub(r"[default: \1", text)
+
+
+def _copied(found: re.Match[str]) -> str:
+    """Lines of examples as one block, as a shell has them."""
+    lines = [line.removeprefix("Example: ") for line in found[0].split("\n\n")]
+    return "\n".join(["```console", *(f"$ {line}" for line in lines), "```"])
+
+
+def _in_capitals(found: re.Match[str]) -> str:
+    """An option with what it takes, or an argument, without typer's name of the type."""
+    name, kind, folder = found.groups(default="")
+    taken = f" {'FOLDER' if folder else KINDS[kind]}" if name.startswith("-") else ""
+    return f"* `{name}{taken}`{folder}"
 
 
 def _append(app, name: str, source: list[str]) -> None:

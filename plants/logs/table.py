@@ -13,6 +13,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from numerics.checks import shown
+from numerics.extras import to_install
 
 MISSING = {"", "nan", "na", "n/a", "null", "none"}  # what stands for a missing number, in any case of letters
 DELIMITERS = ",;\t"
@@ -144,8 +145,8 @@ def _read_parquet(path: Path) -> Table:
         from pyarrow import ArrowException, parquet
     except ImportError:
         raise ValueError(
-            f"a Parquet file must be read by pyarrow, which is not installed (pip install "
-            f"'thruster-env[parquet]'), but got {path}"
+            f"a Parquet file must be read by pyarrow, which is not installed ({to_install('parquet')}), "
+            f"but got {path}"
         ) from None
     try:
         table = parquet.read_table(path)

@@ -6,6 +6,8 @@ import re
 
 import numpy as np
 
+from numerics.extras import to_install
+
 WORDS = (
     *("V", "mV", "kV", "A", "mA", "W", "kW", "Hz", "kHz", "rpm", "rad", "mrad", "deg", "turn"),
     *("N", "mN", "kN", "kgf", "lbf", "Nm", "kg", "g", "Pa", "kPa", "bar", "K", "degC"),
@@ -59,7 +61,7 @@ def converted(values: np.ndarray, unit: str | None, wanted: str, where: str) -> 
         import pint
     except ImportError:
         raise ValueError(
-            f"units must be converted by pint, which is not installed (pip install 'thruster-env[units]'), but "
+            f"units must be converted by pint, which is not installed ({to_install('units')}), but "
             f"{where} is in {unit!r} in place of {wanted!r}"
         ) from None
     registry = pint.application_registry.get()

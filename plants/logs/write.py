@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from numerics.extras import to_install
 from numerics.files import write_whole
 from plants.logs.columns import plain
 from plants.logs.log import Log
@@ -92,7 +93,6 @@ def _pyarrow():
         import pyarrow.parquet
     except ImportError:
         raise ValueError(
-            "a Parquet file must be written by pyarrow, which is not installed (pip install "
-            "'thruster-env[parquet]')"
+            f"a Parquet file must be written by pyarrow, which is not installed ({to_install('parquet')})"
         ) from None
     return pyarrow

@@ -5,5 +5,5 @@ that returns an overlay or None; a filter wrapper sets it: `env.unwrapped.render
 its estimate only after the env's step has ended. So the env asks for it when it draws and at the start of the next
 step, and hands it to the renderer's `amend`: each estimate is then drawn at the time that it is of.
 
-Needs pygame, which is imported when a renderer is made: `pip install 'thruster-env[render]'`.
+Needs pygame (the extra `render`), which is imported when a renderer is made.
 """

@@ -1,4 +1,4 @@
-"""Films of an episode, .mp4 or .gif; needs moviepy: `pip install 'thruster-env[render]'`."""
+"""Films of an episode, .mp4 or .gif; needs moviepy, of the extra `render`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from numerics.extras import to_install
 from numerics.files import check_target, write_whole
 
 FRAME_RATES = {".mp4": 50, ".gif": 25}  # frames a second, at most: browsers show no faster gif
@@ -32,9 +33,7 @@ def check_drawing(film: Path | None) -> None:
     """
     for package in ("pygame",) if film is None else ("pygame", "moviepy"):
         if importlib.util.find_spec(package) is None:
-            raise ValueError(
-                f"drawing needs {package}, which is not installed: pip install 'thruster-env[render]'"
-            )
+            raise ValueError(f"drawing needs {package}, which is not installed: {to_install('render')}")
     if film is not None:
         if film.suffix not in FRAME_RATES:
             raise ValueError(f"--out must end in {' or '.join(FRAME_RATES)}, but got {str(film)!r}")

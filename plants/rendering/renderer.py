@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.error import DependencyNotInstalled
 
 from numerics.checks import one_of, positive
+from numerics.extras import to_install
 from plants.rendering.history import History
 
 MODES = ("human", "rgb_array")
@@ -50,7 +51,7 @@ class PlantRenderer:
             import pygame  # noqa: F401
         except ImportError as error:
             raise DependencyNotInstalled(
-                "rendering needs pygame, which is not installed: run `pip install 'thruster-env[render]'`"
+                f"rendering needs pygame, which is not installed: {to_install('render')}"
             ) from error
         from plants.rendering.canvas import SIZE, Canvas
         from plants.rendering.window import Window

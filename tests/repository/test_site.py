@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from filters.registry import FILTERS
+from pages.site.command_line import commands
 from pages.site.docstrings import readable
 from pages.site.equations import inline, latex_of
 from pages.site.gallery import ORDER
@@ -90,3 +91,13 @@ def test_tables_of_an_env_become_tables():
 
 def test_tutorials_are_the_scripts_in_examples():
     assert sorted(path.stem for path in (ROOT / "examples").glob("*.py")) == sorted(ORDER)
+
+
+def test_examples_of_the_command_line_page_can_be_copied():
+    text = commands()
+    assert (
+        "```console\n$ thruster filters ukf\n$ thruster filters --problem" in text
+        and "Example: thruster" not in text
+    )
+    assert "* `--json FILE`: " in text and "* `--seed INTEGER`: " in text
+    assert not re.search(r"^\* `[^`]*<", text, re.MULTILINE) and "[default: (" not in text

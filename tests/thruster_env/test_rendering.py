@@ -427,7 +427,7 @@ def test_a_wrong_argument_is_refused(changes, message):
 
 def test_without_pygame_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(DependencyNotInstalled, match=r"pip install 'thruster-env\[render\]'"):
+    with pytest.raises(DependencyNotInstalled, match=r"pip install '\.\[render\]'"):
         renderer()
 
 

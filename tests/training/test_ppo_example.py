@@ -36,9 +36,7 @@ def test_the_vec_env_is_public_and_found_lazily():
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setattr("training.extras.NEEDED", ("no_such_package",))
-    with pytest.raises(
-        ValueError, match=r"no_such_package, which is not installed: pip install 'thruster-env\[rl\]'"
-    ):
+    with pytest.raises(ValueError, match=r"no_such_package, which is not installed: pip install '\.\[rl\]'"):
         training.NativeVecEnv  # noqa: B018
 
 

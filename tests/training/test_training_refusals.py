@@ -132,7 +132,7 @@ def without(package, monkeypatch):
 @pytest.mark.parametrize("package", ["torch", "stable_baselines3", "sb3_contrib"])
 def test_a_missing_extra_is_named(package, monkeypatch, thruster, tmp_path):
     without(package, monkeypatch)
-    line = f"policies need {package}, which is not installed: pip install 'thruster-env[rl]'"
+    line = f"policies need {package}, which is not installed: pip install '.[rl]' in the project's folder"
     with pytest.raises(ValueError) as error:
         check_installed()
     assert str(error.value) == line
@@ -146,7 +146,7 @@ def test_a_missing_extra_is_named(package, monkeypatch, thruster, tmp_path):
 def test_drawing_names_its_extra(package, monkeypatch, copied):
     without(package, monkeypatch)
     before = contents(copied)
-    with pytest.raises(ValueError, match=f"drawing needs {package}, .* pip install 'thruster-env\\[render\\]'"):
+    with pytest.raises(ValueError, match=f"drawing needs {package}, .* pip install '.\\[render\\]'"):
         play(copied / FINAL, copied / "film.mp4", 1)
     assert contents(copied) == before
 

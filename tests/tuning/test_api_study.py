@@ -145,7 +145,7 @@ def test_tables_have_what_is_in_the_values(study):
 
 def test_without_pandas_one_line_says_what_to_install(study, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ValueError, match=r"to_frame must have pandas, .* pip install 'thruster-env\[frames\]'"):
+    with pytest.raises(ValueError, match=r"to_frame must have pandas, .* pip install pandas"):
         study.to_frame()
 
 

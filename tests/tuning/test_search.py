@@ -124,7 +124,7 @@ def test_every_sampler_proposes_within_the_ranges(name):
     needed = {"gp": "torch", "cma-es": "cmaes"}.get(name)
     plan = PLAN._replace(sampler=name, consistent=False)
     if needed is not None and importlib.util.find_spec(needed) is None:
-        with pytest.raises(ValueError, match=f"the sampler {name!r} needs {needed}: pip install"):
+        with pytest.raises(ValueError, match=f"the sampler {name!r} needs {needed}, .*: pip install"):
             open_study("s", plan, optuna.storages.InMemoryStorage())
         return
     result = studied(plan, 4)

@@ -6,7 +6,7 @@ One step is one frame, so `render_fps = 1/dt` shows true speed.
 
 What pictures of all plants have, and how a filter shows its estimate in them, is in `plants.rendering`.
 
-Needs pygame, which is imported when a `Renderer` is made: `pip install 'thruster-env[render]'`.
+Needs pygame (the extra `render`), which is imported when a `Renderer` is made.
 """
 
 from thruster_env.rendering.history import Moment, Overlay

@@ -10,6 +10,7 @@ from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from filters.consistency.intervals import Interval
+from numerics.extras import to_install
 
 if TYPE_CHECKING:
     import pandas
@@ -29,7 +30,7 @@ def frame(columns: Mapping[str, Any], index: str | None = None) -> pandas.DataFr
     try:
         import pandas
     except ImportError:
-        raise ValueError("to_frame must have pandas, which is not installed: pip install pandas") from None
+        raise ValueError(f"to_frame must have pandas, which is not installed: {to_install('frames')}") from None
     found = pandas.DataFrame(dict(columns))
     return found if index is None else found.set_index(index)
 

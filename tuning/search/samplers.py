@@ -11,6 +11,7 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from optuna.trial import FrozenTrial, TrialState
 
 from numerics.checks import one_of
+from numerics.extras import to_install
 from tuning.search.cma_es import CmaEsSampler
 from tuning.search.space import FILTER_TYPE
 
@@ -45,7 +46,7 @@ def make_sampler(
     one_of("sampler", name, tuple(SAMPLERS))
     package, extra = NEEDS.get(name, (None, None))
     if package is not None and importlib.util.find_spec(package) is None:
-        raise ValueError(f"the sampler {name!r} needs {package}: pip install 'thruster-env[{extra}]'")
+        raise ValueError(f"the sampler {name!r} needs {package}, which is not installed: {to_install(extra)}")
     if name in WITHOUT_FILTER_TYPES and FILTER_TYPE in distributions:
         able = ", ".join(one for one in SAMPLERS if one not in WITHOUT_FILTER_TYPES)
         raise ValueError(f"a sampler that chooses among filters must be one of {able}, but got {name!r}")
