@@ -18,6 +18,7 @@ from thruster_cli.output import JsonOption, SeedOption, emit, table, working
 from thruster_cli.tune import tune
 from thruster_cli.tuning_report import Tuning, as_json
 from tuning.evaluation.baselines import ORACLE, TUNED, baselines
+from tuning.problems.problem import score_label
 from tuning.reporting.figures import comparison_figure, history_figure
 from tuning.reporting.report import Report, write_report
 from tuning.reporting.time_figures import estimates_figure
@@ -28,7 +29,7 @@ FILTER, SCENARIO = "ekf", "outliers"  # where tuning Q and R is worth most: docs
 LEGEND = """\
 RMSE, by how much it exceeds its lower bound (posterior Cramér-Rao), normalised
 estimation error squared (NEES) and normalised innovation squared (NIS). Score:
-mean of RMSE over bound. The oracle is told the plant's own Q and R."""
+mean RMSE over bound. The oracle is told the plant's own Q and R."""
 
 
 def command(
@@ -106,7 +107,9 @@ def draw(tuning: Tuning, out: Path) -> dict[Path, str]:
     label, data = f"{tuning.result.choice.name} on {scenario.name}", scenario.data(proof.seeds[:1])
     run = estimates_figure(out / "estimates.png", before_and_after(tuning), data, 0, scenario.dt, sharey="row")
     errors = comparison_figure(out / "rmse.png", proof, f"{label}: RMSE on {len(proof.seeds)} held-out seeds")
-    search = history_figure(out / "history.png", tuning.result.trials, f"Study of {label}")
+    search = history_figure(
+        out / "history.png", tuning.result.trials, f"Study of {label}", score_label((scenario,))
+    )
     return {
         run: f"one of these runs: {best_baseline(tuning)}, then tuned",
         errors: "the errors of the table",

@@ -84,7 +84,7 @@ def command(
     proof, data = found.proof, found.to_dict()
     where = f"held-out {chosen.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
     shown: list[RenderableType] = [choice_table(found.choices, chosen)]
-    shown.append(comparison_table(found.evaluations, proof.bound, where))
+    shown.append(comparison_table(found.evaluations, proof.bound, where, chosen.scale_about))
     if tuned is None and not proof.tuned.has_truth:
         shown.append(without_truth(chosen.name))
     shown += [scaling_sentence(proof)] if tuned is None else gains(proof, chosen.seed_word)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from math import isnan
 
+import numpy as np
 from rich.console import RenderableType
 from rich.table import Table
 
 from thruster_cli.error_tables import (
+    ABOVE,
     MOST_COLUMNS,
     about,
     consistency_cells,
@@ -17,6 +19,7 @@ from thruster_cli.error_tables import (
     right_nis,
     two_lines,
     unless_blank,
+    without,
 )
 from thruster_cli.output import table
 from tuning.evaluation.compare import Leaderboard, Row, winners
@@ -56,10 +59,12 @@ def _errors_across(board: Leaderboard, title: str) -> Table:
     limits = [
         cell for bound, places in zip(board.bound, digits, strict=True) for cell in (limit_cell(bound, places), "")
     ]
-    rows.append(["bound", *limits, *("" for _ in states)])
-    heads = [head for state in states for head in (two_lines(state), "above\n[%]")]
+    if not np.isnan(board.bound).all():
+        rows.append(["bound", *limits, *("" for _ in states)])
+    heads = [head for state in states for head in (two_lines(state), ABOVE)]
     begun = [f"{'' if i else 'start-up'}\n{f'[{s.unit}]' if s.unit else ''}" for i, s in enumerate(states)]
-    return table(title, ["filter", *heads, *begun], rows, caption=_CAPTION, best=[winner(board)])
+    columns, rows, caption = _with_bound_or_not(board, ["filter", *heads, *begun], rows)
+    return table(title, columns, rows, caption=caption, best=[winner(board)])
 
 
 def _errors_below(board: Leaderboard, title: str) -> Table:
@@ -79,13 +84,19 @@ def _errors_below(board: Leaderboard, title: str) -> Table:
     bounds = [[state.short_label, limit_cell(bound, places), "", "", ""] for state, bound, places in limits]
     if any(cells[1] for cells in bounds):
         rows += [["bound" if i == 0 else "", *cells] for i, cells in enumerate(bounds)]
-    heads = ["filter", "state", "RMSE", "above\n[%]", "start-up", f"over\n{board.rows[0].label}"]
+    heads = ["filter", "state", "RMSE", ABOVE, "start-up", f"over\n{board.rows[0].label}"]
     place, lines = winner(board), len(states)
     best = () if place is None else range(place * lines, (place + 1) * lines)
-    return table(title, heads, rows, caption=_CAPTION, best=best)
+    heads, rows, caption = _with_bound_or_not(board, heads, rows)
+    return table(title, heads, rows, caption=caption, best=best)
 
 
-_CAPTION = "above: the bound. ±: half of the 95 % interval. start-up: the first 50 steps."
+def _with_bound_or_not(board: Leaderboard, heads: list[str], rows: list[list[str]]) -> tuple:
+    """Columns, rows and caption; where there is no bound the caption says what the scale is."""
+    rest = "±: half of the 95 % interval. start-up: the first 50 steps."
+    if not np.isnan(board.bound).all():
+        return heads, rows, f"above: the bound. {rest}"
+    return *without(heads, rows, ABOVE), f"No bound; the score is RMSE over {board.scenario.scale_about}. {rest}"
 
 
 def _start_up(rmse: float) -> str:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from math import isnan
 
+import numpy as np
+
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import rounded
 from plants.quantities import Quantity
@@ -16,8 +18,8 @@ from tuning.reporting.page import Table
 from tuning.reporting.units import number_rows
 from tuning.search.space import Choice
 
-MOST_ACROSS = 3  # states side by side; more stand one below the other
-EXPECTED = "bound; expected value"  # what stands beside the metrics
+MOST_ACROSS = 3  # errors of states and outputs side by side; more stand one below the other
+RATIO = "score of tuned over this"
 
 
 def errors_table(scenario: Problem, proof: Comparison) -> Table:
@@ -30,27 +32,43 @@ def errors_table(scenario: Problem, proof: Comparison) -> Table:
     where = f"{scenario.name}, held-out {seeds}, with 95 % intervals"
     if not proof.tuned.has_truth:
         return _innovations_table(proof, where)
-    return _errors_across(proof, where) if len(proof.bound) <= MOST_ACROSS else _errors_below(proof, where)
+    count = len(proof.bound) + len(proof.tuned.outputs)
+    return _errors_across(proof, where) if count <= MOST_ACROSS else _errors_below(proof, where)
 
 
 def _errors_across(proof: Comparison, where: str) -> Table:
     ratios, outputs = proof.ratios, proof.tuned.outputs
     rows = [
-        [name, *map(_span, e.rmse), *(_span(e.output_rmse.get(symbol, NOTHING)) for symbol in outputs)]
-        + [*map(_span, (e.score, e.nees, e.nis)), _span(ratios[name]) if name in ratios else ""]
+        [name, *map(_span, (ratios.get(name, NOTHING), e.score, *e.rmse))]
+        + [_span(e.output_rmse.get(symbol, NOTHING)) for symbol in outputs]
+        + [*map(_span, (e.nees, e.nis))]
         for name, e in proof.evaluations.items()
     ]
-    right = [str(len(proof.bound)), f"{proof.tuned.expected_nis:.3g}"] if rows[0][-2] else ["", ""]
+    right = (
+        [str(len(proof.bound)), f"{proof.tuned.expected_nis:.3g}"]
+        if not isnan(proof.tuned.nis.value)
+        else ["", ""]
+    )
     bound = ["" if isnan(part) else rounded(part) for part in proof.bound]
-    rows.append([EXPECTED, *bound, *("" for _ in outputs), "", *right, ""])
-    columns = ["filter", *map(_state_label, proof.tuned.states), *map(_output_label, outputs.values())]
-    return Table(where, [*columns, "score", "mean NEES", "mean NIS", "score of tuned over this"], rows)
+    rows.append([_expected(proof), "", "", *bound, *("" for _ in outputs), *right])
+    columns = [
+        "filter",
+        RATIO,
+        "score",
+        *map(_state_label, proof.tuned.states),
+        *map(_output_label, outputs.values()),
+    ]
+    return Table(where, [*columns, "mean NEES", "mean NIS"], rows)
 
 
 def _errors_below(proof: Comparison, where: str) -> Table:
     ratios, found, tuned = proof.ratios, proof.evaluations, proof.tuned
     bound = ["" if isnan(part) else rounded(part) for part in proof.bound]
     rows = [
+        [RATIO, *(_span(ratios.get(name, NOTHING)) for name in found), ""],
+        ["score", *(_span(e.score) for e in found.values()), ""],
+    ]
+    rows += [
         [_state_label(state), *(_span(e.rmse[i]) for e in found.values()), bound[i]]
         for i, state in enumerate(tuned.states)
     ]
@@ -59,11 +77,14 @@ def _errors_below(proof: Comparison, where: str) -> Table:
         for symbol, output in tuned.outputs.items()
     ]
     right = [str(len(proof.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
-    rows.append(["score", *(_span(e.score) for e in found.values()), ""])
     rows.append(["mean NEES", *(_span(e.nees) for e in found.values()), right[0]])
     rows.append(["mean NIS", *(_span(e.nis) for e in found.values()), right[1]])
-    rows.append(["score of tuned over this", *(_span(ratios.get(name, NOTHING)) for name in found), ""])
-    return Table(where, ["", *found, EXPECTED], rows)
+    return Table(where, ["", *found, _expected(proof)], rows)
+
+
+def _expected(proof: Comparison) -> str:
+    """What the row is called that stands beside the metrics."""
+    return "expected" if np.isnan(proof.bound).all() else "bound; expected"
 
 
 def _innovations_table(proof: Comparison, where: str) -> Table:
@@ -74,7 +95,7 @@ def _innovations_table(proof: Comparison, where: str) -> Table:
         for name, e in proof.evaluations.items()
     ]
     right = "" if isnan(proof.tuned.nis.value) else f"{proof.tuned.expected_nis:.3g}"
-    rows.append(["expected value", "", right, "", ""])
+    rows.append(["expected", "", right, "", ""])
     columns = ["filter", "log-likelihood of a run", "mean NIS", "that of tuned less this", "restarts"]
     return Table(where, columns, rows)
 
