@@ -105,7 +105,7 @@ def draw(tuning: Tuning, out: Path) -> dict[Path, str]:
     """Draw the tuned filter before and after, errors and search; return what each picture shows, by its file."""
     proof, scenario = tuning.proof, tuning.scenario
     label, data = f"{tuning.result.choice.name} on {scenario.name}", scenario.data(proof.seeds[:1])
-    run = estimates_figure(out / "estimates.png", before_and_after(tuning), data, 0, scenario.dt, sharey="row")
+    run = estimates_figure(out / "estimates.png", before_and_after(tuning), data, 0, scenario.dt)
     errors = comparison_figure(out / "rmse.png", proof, f"{label}: RMSE on {len(proof.seeds)} held-out seeds")
     search = history_figure(
         out / "history.png", tuning.result.trials, f"Study of {label}", score_label((scenario,))

@@ -220,7 +220,7 @@ def test_figures_are_drawn_for_any_plant(proofs, case, tmp_path):
         "two": oracle_choice("kf", problem).filter(problem),
     }
     with interpreted():
-        estimates_figure(tmp_path / "run.png", filters, problem.data(SEEDS), 1, problem.dt, sharey="row")
+        estimates_figure(tmp_path / "run.png", filters, problem.data(SEEDS), 1, problem.dt)
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
     if problem.truth:
         assert comparison_figure(tmp_path / "rmse.png", proof, "a title").is_file()
