@@ -14,6 +14,7 @@ from thruster_cli.output import table
 from tuning.evaluation.evaluate import Evaluation
 
 ABOVE = "above\n[%]"  # head of the columns that need a bound
+MOST_DECIMALS = 6  # beyond which a column has powers of ten, as 8.59e-06
 MOST_COLUMNS = 5  # of errors, that fit into 80 columns with their intervals
 
 
@@ -141,7 +142,7 @@ def expected_word(bound: np.ndarray) -> str:
 
 def limit_cell(bound: float, digits: int) -> str:
     """A bound with so many decimals; empty where there is none."""
-    return unless_blank(bound, f".{digits}f")
+    return unless_blank(bound, ".2e" if digits > MOST_DECIMALS else f".{digits}f")
 
 
 def _output(found: Evaluation, symbol: str) -> str:
@@ -153,6 +154,8 @@ def _output(found: Evaluation, symbol: str) -> str:
 def about(value: Interval, digits: int) -> str:
     """A value with half of its 95 % interval; empty if there is no value."""
     half_width = (value.high - value.low) / 2
+    if digits > MOST_DECIMALS and not isnan(value.value):
+        return f"{value.value:.2e} ±{half_width:.0e}"
     return "" if isnan(value.value) else f"{value.value:.{digits}f} ±{half_width:.{digits}f}"
 
 

@@ -8,14 +8,13 @@ import numpy as np
 
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import rounded
-from plants.quantities import Quantity
 from tuning.evaluation.baselines import RULE, TUNED, Scaled, baselines
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.held_out import Comparison
 from tuning.likelihood.identifiability import Identifiability
 from tuning.problems.problem import Problem
 from tuning.reporting.page import Table
-from tuning.reporting.units import number_rows
+from tuning.reporting.units import number_rows, power_of_ten, scaled_unit
 from tuning.search.space import Choice
 
 MOST_ACROSS = 3  # errors of states and outputs side by side; more stand one below the other
@@ -37,49 +36,49 @@ def errors_table(scenario: Problem, proof: Comparison) -> Table:
 
 
 def _errors_across(proof: Comparison, where: str) -> Table:
-    ratios, outputs = proof.ratios, proof.tuned.outputs
+    ratios, tuned, errors = proof.ratios, proof.tuned, _errors(proof)
     rows = [
-        [name, *map(_span, (ratios.get(name, NOTHING), e.score, *e.rmse))]
-        + [_span(e.output_rmse.get(symbol, NOTHING)) for symbol in outputs]
-        + [*map(_span, (e.nees, e.nis))]
-        for name, e in proof.evaluations.items()
+        [name, _span(ratios.get(name, NOTHING)), _span(found.score), *(cells[place] for _, cells, _ in errors)]
+        + [*map(_span, (found.nees, found.nis))]
+        for place, (name, found) in enumerate(proof.evaluations.items())
     ]
-    right = (
-        [str(len(proof.bound)), f"{proof.tuned.expected_nis:.3g}"]
-        if not isnan(proof.tuned.nis.value)
-        else ["", ""]
-    )
-    bound = ["" if isnan(part) else rounded(part) for part in proof.bound]
-    rows.append([_expected(proof), "", "", *bound, *("" for _ in outputs), *right])
-    columns = [
-        "filter",
-        RATIO,
-        "score",
-        *map(_state_label, proof.tuned.states),
-        *map(_output_label, outputs.values()),
-    ]
-    return Table(where, [*columns, "mean NEES", "mean NIS"], rows)
+    right = [str(len(proof.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
+    rows.append([_expected(proof), "", "", *(bound for *_, bound in errors), *right])
+    columns = ["filter", RATIO, "score", *(label for label, *_ in errors), "mean NEES", "mean NIS"]
+    return Table(where, columns, rows)
 
 
 def _errors_below(proof: Comparison, where: str) -> Table:
     ratios, found, tuned = proof.ratios, proof.evaluations, proof.tuned
-    bound = ["" if isnan(part) else rounded(part) for part in proof.bound]
+    right = [str(len(proof.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
     rows = [
         [RATIO, *(_span(ratios.get(name, NOTHING)) for name in found), ""],
         ["score", *(_span(e.score) for e in found.values()), ""],
+        *([label, *cells, bound] for label, cells, bound in _errors(proof)),
+        ["mean NEES", *(_span(e.nees) for e in found.values()), right[0]],
+        ["mean NIS", *(_span(e.nis) for e in found.values()), right[1]],
     ]
-    rows += [
-        [_state_label(state), *(_span(e.rmse[i]) for e in found.values()), bound[i]]
-        for i, state in enumerate(tuned.states)
-    ]
-    rows += [
-        [_output_label(output), *(_span(e.output_rmse.get(symbol, NOTHING)) for e in found.values()), ""]
-        for symbol, output in tuned.outputs.items()
-    ]
-    right = [str(len(proof.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
-    rows.append(["mean NEES", *(_span(e.nees) for e in found.values()), right[0]])
-    rows.append(["mean NIS", *(_span(e.nis) for e in found.values()), right[1]])
     return Table(where, ["", *found, _expected(proof)], rows)
+
+
+def _errors(proof: Comparison) -> list[tuple[str, list[str], str]]:
+    """RMSE of each state and output: label, a cell a filter, and the bound, all with one power of ten."""
+    found, told = proof.evaluations.values(), []
+    parts = [
+        (state.text_symbol, state.unit, [e.rmse[i] for e in found], float(proof.bound[i]))
+        for i, state in enumerate(proof.tuned.states)
+    ]
+    parts += [
+        (output.name, output.unit, [e.output_rmse.get(symbol, NOTHING) for e in found], float("nan"))
+        for symbol, output in proof.tuned.outputs.items()
+    ]
+    for name, unit, values, bound in parts:
+        power = power_of_ten([value.value for value in values])
+        cells = [_span(Interval(*(part / 10.0**power for part in value))) for value in values]
+        label = scaled_unit(unit, power)
+        limit = "" if isnan(bound) else rounded(bound / 10.0**power)
+        told.append((f"RMSE {name} [{label}]" if label else f"RMSE {name}", cells, limit))
+    return told
 
 
 def _expected(proof: Comparison) -> str:
@@ -98,14 +97,6 @@ def _innovations_table(proof: Comparison, where: str) -> Table:
     rows.append(["expected", "", right, "", ""])
     columns = ["filter", "log-likelihood of a run", "mean NIS", "that of tuned less this", "restarts"]
     return Table(where, columns, rows)
-
-
-def _state_label(state: Quantity) -> str:
-    return f"RMSE {state.text_symbol} [{state.unit}]" if state.unit else f"RMSE {state.text_symbol}"
-
-
-def _output_label(output: Quantity) -> str:
-    return f"RMSE {output.label}"
 
 
 def numbers_table(choice: Choice, scenario: Problem, seed: int, default: Scaled | None = None) -> Table:
