@@ -28,11 +28,18 @@ class Unknown(NamedTuple):
         walk_std: standard deviation of its change per step (random walk); 0 for a constant. It does not scale with
             dt.
         mean: of the prior; the model's value if None.
+        unit: of the constant, for tables and figures.
     """
 
     std: float
     walk_std: float = 0.0
     mean: float | None = None
+    unit: str = ""
+
+    @classmethod
+    def of_numbers(cls, std: float, walk_std: float = 0.0, mean: float | None = None) -> Unknown:
+        """A prior of numbers alone, in their order; TypeError if there are more."""
+        return cls(std, walk_std, mean)
 
 
 def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unknown]) -> StateSpaceModel:
@@ -83,6 +90,7 @@ def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unkno
     helpful: dict[str, Any] = {
         name: None if value is None else np.append(value, further[name]) for name, value in given.items()
     }
+    further_states = [Quantity(str(name), str(name), Unknown(*one).unit) for name, one in parameters.items()]
     return StateSpaceModel(
         **functions,
         process_noise_cov=_block_diagonal(model.process_noise_cov, walks),
@@ -93,7 +101,7 @@ def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unkno
         constants=(*map(float, model.constants), *map(float, spread)),
         substeps=model.substeps,
         operating_input=model.operating_input,
-        states=(*model.states, *(Quantity(str(name), str(name)) for name in parameters)),
+        states=(*model.states, *further_states),
         input_quantities=model.input_quantities,
         measurements=model.measurements,
         **helpful,

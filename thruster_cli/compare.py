@@ -122,6 +122,6 @@ def _size(text: str) -> tuple[str | None, int]:
 def _unknown(text: str) -> tuple[str, Unknown | None]:
     name, *numbers = text.split(":")
     try:
-        return name, Unknown(*map(float, numbers)) if numbers else None
+        return name, Unknown.of_numbers(*map(float, numbers)) if numbers else None
     except (TypeError, ValueError):
         raise ValueError(f"--augment must be NAME, NAME:STD or NAME:STD:WALK, but got {text!r}") from None

@@ -17,6 +17,7 @@ from thruster_cli.output import JsonOption, SeedOption, emit, table, working
 from thruster_cli.tune import tune
 from thruster_cli.tuning_report import Tuning, as_json
 from tuning.evaluation.baselines import ORACLE, TUNED, baselines
+from tuning.problems.problem import score_label
 from tuning.reporting.error_tables import above_bound, consistency_cells
 from tuning.reporting.figures import comparison_figure, history_figure
 from tuning.reporting.report import Report, write_report
@@ -28,7 +29,7 @@ FILTER, SCENARIO = "ekf", "outliers"  # where tuning Q and R is worth most: docs
 LEGEND = """\
 RMSE, by how much it exceeds its lower bound (posterior Cramér-Rao), normalised
 estimation error squared (NEES) and normalised innovation squared (NIS). Score:
-mean of RMSE over bound. The oracle is told the plant's own Q and R."""
+mean RMSE over bound. The oracle is told the plant's own Q and R."""
 
 
 def command(
@@ -106,9 +107,11 @@ def draw(tuning: Tuning, out: Path) -> dict[Path, str]:
     """Draw the tuned filter before and after, errors and search; return what each picture shows, by its file."""
     proof, scenario = tuning.proof, tuning.scenario
     label, data = f"{tuning.result.choice.name} on {scenario.name}", scenario.data(proof.seeds[:1])
-    run = estimates_figure(out / "estimates.png", before_and_after(tuning), data, 0, scenario.dt, sharey="row")
+    run = estimates_figure(out / "estimates.png", before_and_after(tuning), data, 0, scenario.dt)
     errors = comparison_figure(out / "rmse.png", proof, f"{label}: RMSE on {len(proof.seeds)} held-out seeds")
-    search = history_figure(out / "history.png", tuning.result.trials, f"Study of {label}")
+    search = history_figure(
+        out / "history.png", tuning.result.trials, f"Study of {label}", score_label((scenario,))
+    )
     return {
         run: f"one of these runs: {best_baseline(tuning)}, then tuned",
         errors: "the errors of the table",

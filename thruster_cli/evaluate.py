@@ -89,7 +89,7 @@ def command(
     proof, data = found.proof, found.to_dict()
     where = f"held-out {chosen.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
     shown: list[RenderableType] = [choice_table(found.choices, chosen)]
-    shown.append(comparison_table(found.evaluations, proof.bound, where))
+    shown.append(comparison_table(found.evaluations, proof.bound, where, chosen.scale_about))
     shown += found.sentences()
     if consistency is not None:
         name = RULE if tuned is None else TUNED

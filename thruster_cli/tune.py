@@ -134,7 +134,7 @@ def command(
 ) -> None:
     """Find the Q, R and ensemble size that make a filter's estimate best, and prove it on held-out seeds.
 
-    The score is the mean over states of RMSE over its bound, on 32 training seeds that every trial shares. The
+    The score is the mean over states of RMSE over its scale, on 32 training seeds that every trial shares. The
     first trial is the rule of thumb: R from the sensor's data sheet, Q from 1 % of each state's range. Ctrl-C
     keeps all finished trials: the same command goes on with the study. The report is on 200 seeds that no trial
     saw, against the scaled default first: the rule of thumb with one factor on its Q that brings the mean NIS

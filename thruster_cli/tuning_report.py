@@ -47,12 +47,15 @@ def report(tuning: Tuning) -> list[RenderableType]:
         choices = {name: found[name] for name in evaluations}
         span_of_seeds = f"{scenario.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}"
         where = f"held-out {span_of_seeds}, scenario {scenario.name}"
-        shown += [choice_table(choices, scenario), comparison_table(evaluations, proof.bound, where)]
+        shown += [
+            choice_table(choices, scenario),
+            comparison_table(evaluations, proof.bound, where, scenario.scale_about),
+        ]
         shown.append(_consistency_sentence(proof.tuned))
         if proof.tuned.has_truth and isnan(proof.bound).all():
             shown.append(
                 f"{scenario.name} has no bound: there is none for a singular Q, or if the plant is no model. Its "
-                "score is RMSE over its scale."
+                f"score is RMSE over {scenario.scale_about}."
             )
     shown += sentences(tuning.known) if tuning.known else too_many(result.choice, plan.space())
     shown += _search_sentences(tuning)

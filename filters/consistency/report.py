@@ -57,6 +57,7 @@ class ConsistencyReport(NamedTuple):
     innovation_coverage: tuple[Interval, ...]  # share of each channel's innovations within 1.96 deviations of S
     innovation_coverage_by_level: np.ndarray  # (levels, m)
     has_truth: bool  # without it only the innovations are looked at
+    constants: tuple[str, ...] = ()  # names of the model's constants, which may be estimated as states
 
 
 class Residuals(NamedTuple):

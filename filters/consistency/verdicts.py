@@ -20,6 +20,7 @@ SLIGHT_DISTANCE = 0.02  # so are distributions this close
 SLIGHT_CORRELATION = 0.05  # and correlations this small
 SIGNIFICANT = 0.05
 EVEN = "even, as far as these runs show"
+MOST_CONSTANTS = 8  # of a model, that are named
 MOST_STATES = 6  # of which there are sentences
 NO_TRUTH = "These data come without truth: what follows is from the innovations alone."
 
@@ -204,6 +205,8 @@ def remedy_sentence(report: ConsistencyReport) -> str:
     strongest = next_step[np.argmax(np.abs(next_step))]
     slow, quick = strongest > SLIGHT_CORRELATION, strongest < -SLIGHT_CORRELATION
     word = "consistent" if np.isnan(nees.mean.value) else confidence(nees.mean, nees.dimension)
+    white = is_white(report.whiteness)
+    lasting = "overconfident" in word and not white and not quick
     if over:
         what = "raise Q, or repair the model" if slow else "raise R" if quick else "raise Q and R alike"
     elif under:
@@ -213,12 +216,32 @@ def remedy_sentence(report: ConsistencyReport) -> str:
     elif "overconfident" in word and _ranks_are_right(report):
         what = "more members; their ranks are right, it is their covariance that is a rough estimate"
     elif word == "overconfident":
-        what = "raise Q where nothing is measured, or repair the model there; the measured part is consistent"
+        what = "raise Q where nothing is measured, or repair the model there"
+        what += "; the innovations are consistent" if white else ""
     elif word == "underconfident":
-        what = "lower Q where nothing is measured; the measured part is consistent"
+        what = "lower Q where nothing is measured" + ("; the innovations are consistent" if white else "")
     else:
-        return ""
-    return f"To try: {what}."
+        what = ""
+    if lasting:
+        first, second = what or "raise Q", _augment(report.constants)
+        what = f"{first}; or {second}" if over or under or slow else f"{second}; or {first}"
+    return f"To try: {what}." if what else ""
+
+
+def is_white(found: Whiteness) -> bool:
+    """Whether innovations are white as far as the runs show, or were not tested: no sentence says otherwise."""
+    return found.statistic == 0 or bool(found.p_value >= SIGNIFICANT)
+
+
+def _augment(constants: Sequence[str]) -> str:
+    """What to do about a model whose errors last: a constant that is off becomes a state."""
+    some = ", ".join(constants[:MOST_CONSTANTS])
+    more = f" and {len(constants) - MOST_CONSTANTS} more" if len(constants) > MOST_CONSTANTS else ""
+    of_it = f" (it has {some}{more})" if constants else ""
+    return (
+        f"estimate a constant of the model that may be off{of_it} as a further state, with "
+        "`thruster compare --augment NAME` or `filters.augmented_model`"
+    )
 
 
 def _ranks_are_right(report: ConsistencyReport) -> bool:

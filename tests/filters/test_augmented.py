@@ -25,9 +25,13 @@ from tests.models import held_voltages, scalar_model
 
 def test_the_new_states_stand_in_for_the_constants():
     model = thruster_model(preset="tunnel_physical", ambient_velocity=0.3)
-    parameters = {"ambient_velocity": Unknown(0.5, walk_std=0.01), "load_gain": Unknown(1e3, mean=17e3)}
+    parameters = {
+        "ambient_velocity": Unknown(0.5, walk_std=0.01, unit="m/s"),
+        "load_gain": Unknown(1e3, mean=17e3),
+    }
     augmented = augmented_model(model, parameters)
     assert (augmented.n, augmented.m, augmented.inputs) == (4, 1, 1)
+    assert [state.short_label for state in augmented.states[2:]] == ["ambient_velocity [m/s]", "load_gain"]
     np.testing.assert_array_equal(augmented.prior_mean, [*model.prior_mean, 0.3, 17e3])
     np.testing.assert_allclose(np.diag(augmented.prior_cov)[2:], [0.25, 1e6])
     np.testing.assert_allclose(np.diag(augmented.process_noise_cov)[2:], [1e-4, 0.0])

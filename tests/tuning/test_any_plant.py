@@ -19,6 +19,8 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import ensemble_sizes
 from tuning.evaluation.tuned import summary
 from tuning.evaluation.worth import worth
+from tuning.problems.model_problem import ModelProblem
+from tuning.problems.problem import score_label
 from tuning.reporting import leaderboard
 from tuning.reporting.consistency_figures import consistency_figure
 from tuning.reporting.error_tables import comparison_table
@@ -31,6 +33,7 @@ from tuning.reporting.time_figures import estimates_figure
 from tuning.search.objectives import check_objectives, find_objective, nis_ratio
 from tuning.search.plan import Plan
 from tuning.search.space import oracle_choice, untuned_choice
+from tuning.thruster.find import find_scenario
 
 SEEDS = range(8)
 
@@ -128,10 +131,35 @@ def test_tables_fit_a_terminal_and_say_what_each_number_is(proofs, case, words):
         assert "Q88 [K^2]" in numbers
 
 
+def test_without_a_bound_nothing_is_said_to_be_above_it(proofs):
+    problem, proof = proofs[3, True]
+    without = proof._replace(bound=np.full(3, np.nan))
+    shown = printed(comparison_table(without.evaluations, without.bound, "here", problem.scale_about))
+    assert "above" not in shown and "bound " not in shown and "expected" in shown
+    assert "No bound; the score is RMSE over the scale given with the problem." in " ".join(shown.split())
+    assert "above" in printed(comparison_table(proof.evaluations, proof.bound, "here", problem.scale_about))
+    assert errors_table(problem, without).columns[-1] == "expected"
+    assert errors_table(problem, proof).columns[-1] == "bound; expected"
+    assert score_label([problem]) == "score: mean RMSE over scale [-]"
+    assert score_label([find_scenario("outliers")]) == "score: mean RMSE over bound [-]"
+    assert score_label([find_scenario("outliers"), problem]) == "score: mean RMSE over scale [-]"
+
+
+def test_one_zero_in_the_true_q_is_said_to_change_the_scale():
+    model = LinearProblem(1, 1).model()
+    singular = "the RMSE of the open loop, for the true Q is singular"
+    for variance, words in ((0.1, "the posterior Cramér-Rao bound"), (0.0, singular)):
+        problem = ModelProblem(model.replace(process_noise_cov=[variance]), model, np.zeros((60, 1)), steps=60)
+        assert problem.scale_about == words
+
+
 def test_the_tables_of_a_report_grow_downwards_with_the_states(proofs):
-    few, many, blind = (errors_table(*proofs[case]) for case in ((3, True), (8, True), (3, False)))
-    assert list(few.columns[1:5]) == ["RMSE p [m]", "RMSE v [m/s]", "RMSE b [m]", "RMSE energy [J]"]
-    assert [row[0] for row in many.rows][:3] == ["RMSE p [m]", "RMSE v [m/s]", "RMSE b [m]"]
+    cases = (1, True), (3, True), (8, True), (3, False)
+    few, three, many, blind = (errors_table(*proofs[case]) for case in cases)
+    assert list(few.columns[:4]) == ["filter", "score of tuned over this", "score", "RMSE p [m]"]
+    first = ["score of tuned over this", "score", "RMSE p [m]", "RMSE v [m/s]", "RMSE b [m]", "RMSE energy [J]"]
+    assert [row[0] for row in three.rows][:6] == first and [row[0] for row in many.rows][:5] == first[:5]
+    assert 'class="fold"' in few.html() and 'data-head="score of tuned over this"' in few.html()
     assert len(many.rows) == 8 + 1 + 4 and {len(row) for row in many.rows} == {len(many.columns)}
     assert {len(row) for row in few.rows} == {len(few.columns)}
     assert "log-likelihood of a run" in blind.columns and "nan" not in blind.markdown()
@@ -193,7 +221,7 @@ def test_figures_are_drawn_for_any_plant(proofs, case, tmp_path):
         "two": oracle_choice("kf", problem).filter(problem),
     }
     with interpreted():
-        estimates_figure(tmp_path / "run.png", filters, problem.data(SEEDS), 1, problem.dt, sharey="row")
+        estimates_figure(tmp_path / "run.png", filters, problem.data(SEEDS), 1, problem.dt)
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
     if problem.truth:
         assert comparison_figure(tmp_path / "rmse.png", proof, "a title").is_file()

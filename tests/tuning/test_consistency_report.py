@@ -50,11 +50,17 @@ def scalar_report(drawn, **assumed):
     return consistency_report(estimates, drawn.states, first_step=20)
 
 
+AUGMENT = (
+    "estimate a constant of the model that may be off as a further state, with `thruster compare --augment NAME` "
+    "or `filters.augmented_model`"
+)
+
+
 @pytest.mark.parametrize(
     ("assumed", "remedy"),
     [
         ({}, ""),
-        ({"process_noise_cov": [0.02]}, "To try: raise Q, or repair the model."),
+        ({"process_noise_cov": [0.02]}, f"To try: raise Q, or repair the model; or {AUGMENT}."),
         ({"process_noise_cov": [4.0]}, "To try: lower Q."),
         ({"measurement_noise_cov": [0.05]}, "To try: raise R."),
         ({"measurement_noise_cov": [6.0]}, "To try: lower R."),
@@ -64,6 +70,19 @@ def scalar_report(drawn, **assumed):
 )
 def test_the_remedy_undoes_what_was_done(scalar_truth, assumed, remedy):
     assert remedy_sentence(scalar_report(scalar_truth, **assumed)) == remedy
+
+
+def test_where_errors_last_a_constant_as_a_state_comes_first_and_nothing_is_called_consistent(scalar_truth):
+    report = scalar_report(scalar_truth, process_noise_cov=[0.02])
+    assert report.nees.mean.low > 1 and report.whiteness.p_value < 0.05
+    mild = report.whiteness._replace(correlations=0.1 * report.whiteness.correlations)
+    expected = report.nis._replace(mean=report.nis.mean._replace(value=1.0))
+    said = remedy_sentence(report._replace(nis=expected, whiteness=mild, constants=("outflow", "area")))
+    assert said.startswith("To try: estimate a constant of the model that may be off (it has outflow, area) as")
+    assert said.endswith("; or raise Q where nothing is measured, or repair the model there.")
+    white = mild._replace(p_value=0.5)
+    said = remedy_sentence(report._replace(nis=expected, whiteness=white))
+    assert said.endswith("; the innovations are consistent.") and "constant" not in said
 
 
 def test_of_the_right_filter_every_sentence_is_good_news(scalar_truth):

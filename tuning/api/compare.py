@@ -168,7 +168,7 @@ def beliefs_of(augment: Sequence[str] | Mapping[str, Any]) -> dict[str, Unknown 
         if given is None or isinstance(given, Unknown):
             found[name] = given
         else:
-            found[name] = Unknown(*map(float, given if isinstance(given, list | tuple) else (given,)))
+            found[name] = Unknown.of_numbers(*map(float, given if isinstance(given, list | tuple) else (given,)))
     return found
 
 

@@ -152,7 +152,7 @@ class HeldOut:
             pair = {first: others[first], TUNED: self.choice}
         filters = {name: one.filter(self.problem) for name, one in pair.items()}
         data, scored = self.problem.data(self.seeds), self.evaluation.scored or None
-        return drawn(draw_estimates(filters, data, place, self.problem.dt, scored, sharey="row"))
+        return drawn(draw_estimates(filters, data, place, self.problem.dt, scored))
 
     def plot_consistency(self) -> Figure:
         """The checks of `check_consistency`, a panel each.

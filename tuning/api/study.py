@@ -15,7 +15,7 @@ from tuning.api.run import Tuning
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.tuned import check_keepable
 from tuning.evaluation.worth import worth
-from tuning.problems.problem import Problem
+from tuning.problems.problem import Problem, score_label
 from tuning.search.outcome import is_consistent
 from tuning.search.space import Choice
 
@@ -118,10 +118,10 @@ class Study:
 
     def plot_history(self) -> Figure:
         """First objective of every trial, and the best so far."""
-        from tuning.reporting.figures import SCORE, draw_history
+        from tuning.reporting.figures import draw_history
 
         objective = self.tuning.plan.objectives[0]
-        label = SCORE if objective == "score" else objective
+        label = score_label(self.tuning.plan.scenarios) if objective == "score" else objective
         return drawn(draw_history(self.trials, f"Study {self.name}", label))
 
     def plot_errors(self) -> Figure:

@@ -22,6 +22,7 @@ from plants.state_space import StateSpaceModel
 from tuning.auv.excitation import commands_of
 from tuning.problems.data import Data
 from tuning.problems.plain import plain
+from tuning.problems.problem import GIVEN, PATH_BOUND
 from tuning.problems.scenario import BaseScenario
 
 UNTUNED_RANGE_FRACTION = 0.01  # standard deviation of the untuned Q, as a fraction of each state's range
@@ -142,6 +143,11 @@ class Scenario(BaseScenario):
         own = tuple(self.process_noise_cov[: self.count])
         of_current = np.diag(model_of_plant(self.plant, states=self.states).process_noise_cov)[len(STATES) :]
         return {**super().true, "process_noise_cov": (*own, *of_current.tolist())}
+
+    @property
+    def scale_about(self) -> str:
+        """What the scale is, in words; that of a file may be any."""
+        return GIVEN if self.name.endswith(".toml") else PATH_BOUND
 
     def bound(self, data: Data) -> np.ndarray:
         """Standard deviation of each state (n,) by the Riccati equation along noise-free paths, over scored steps.

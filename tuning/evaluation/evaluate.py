@@ -144,7 +144,7 @@ def check_consistency(filter_: Filter, data: Data) -> ConsistencyReport:
     for one, estimates in estimates_in_parts(filter_, data):
         own = estimates._replace(means=estimates.means[..., :n], covs=estimates.covs[..., :n, :n])
         parts.append(findings(own, one.states, one.measurements, first, angles))
-    return report_of(
+    found = report_of(
         joined(parts),
         data.states,
         members=members,
@@ -153,6 +153,7 @@ def check_consistency(filter_: Filter, data: Data) -> ConsistencyReport:
         angles=angles,
         channels=[channel.label for channel in model.measurements],
     )
+    return found._replace(constants=tuple(getattr(model.constants, "_fields", ())))
 
 
 def score(mean_squares: np.ndarray, scale: np.ndarray) -> float:

@@ -17,7 +17,7 @@ from plants.state_space import StateSpaceModel
 from tuning.problems.check import check_data
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.parameter import Parameter
-from tuning.problems.problem import Problem
+from tuning.problems.problem import GIVEN, SPREAD, Problem
 
 RANGE_SEEDS = range(8)  # seeds whose runs determine each state's range, unless the model has it
 RANGE_FRACTION = 0.01  # standard deviation of the rule of thumb's Q, as a fraction of each state's range
@@ -81,6 +81,16 @@ class AssumedProblem(Problem):
     @abstractmethod
     def found_scale(self) -> np.ndarray:
         """The scale where none is given."""
+
+    @property
+    def found_scale_about(self) -> str:
+        """What that scale is, in words."""
+        return SPREAD
+
+    @property
+    def scale_about(self) -> str:
+        """What the scale is, in words."""
+        return GIVEN if self._scale is not None else self.found_scale_about
 
     def model(self, **changes) -> StateSpaceModel:
         """The assumed model with some changes; see `Problem.model`."""

@@ -24,6 +24,7 @@ from tuning.problems.digest import digest_of
 from tuning.problems.excitation import Excitation, excitation_of
 from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.parameter import Parameter
+from tuning.problems.problem import BOUND, OPEN_LOOP
 
 SCALE_SEEDS = range(200)  # seeds of the inputs for which the scale is the bound, where none is given
 Inputs = np.ndarray | Sequence | Mapping | Excitation | Callable | None
@@ -149,6 +150,11 @@ class ModelProblem(AssumedProblem):
                 f"loop is finite and positive in every state, but the latter is {scale.tolist()}"
             )
         return scale
+
+    @property
+    def found_scale_about(self) -> str:
+        """What the scale is where none is given: one zero on the diagonal of the true Q is enough for no bound."""
+        return BOUND if has_bound(self.truth.process_noise_cov) else f"{OPEN_LOOP}, for the true Q is singular"
 
     def _bound(self, data: Data, truths: int) -> np.ndarray:
         if not has_bound(self.truth.process_noise_cov):

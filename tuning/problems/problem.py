@@ -16,6 +16,12 @@ from tuning.problems import seeds
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 
+BOUND = "the posterior Cramér-Rao bound"  # what a scale is, in words
+PATH_BOUND = "the bound along noise-free paths"
+OPEN_LOOP = "the RMSE of the open loop"
+SPREAD = "the standard deviation of the true states"
+GIVEN = "the scale given with the problem"
+
 
 class Problem(ABC):
     """A plant that makes data, and a family of models that filters may assume for it.
@@ -78,6 +84,11 @@ class Problem(ABC):
         """Bound on the standard error of each state over scored steps, (n,); NaN where there is no bound."""
         return np.full(self.model().n if self.scale is None else len(self.scale), np.nan)
 
+    @property
+    def scale_about(self) -> str:
+        """What `scale` is, in words, for captions: a bound, a spread, or what the problem gives."""
+        return GIVEN
+
     def make_env(self, **arguments: Any) -> gym.Env:
         """A Gymnasium env of the plant, for wrappers and policies; an episode of a seed is the data of that seed.
 
@@ -134,6 +145,12 @@ class Problem(ABC):
     def as_mapping(self) -> Mapping | None:
         """The complete problem as data for JSON; None if it is code, or found by its name."""
         return None
+
+
+def score_label(problems: Sequence[Problem]) -> str:
+    """What axes call the score of some problems: over the bound where that is the scale of them all."""
+    bounds = all(problem.scale_about in (BOUND, PATH_BOUND) for problem in problems)
+    return f"score: mean RMSE over {'bound' if bounds else 'scale'} [-]"
 
 
 def scored_states(problem: Problem) -> tuple[str, ...]:

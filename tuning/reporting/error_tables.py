@@ -13,10 +13,14 @@ from numerics.text_tables import table
 from plants.quantities import Quantity
 from tuning.evaluation.evaluate import Evaluation
 
+ABOVE = "above\n[%]"  # head of the columns that need a bound
+MOST_DECIMALS = 6  # beyond which a column has powers of ten, as 8.59e-06
 MOST_COLUMNS = 5  # of errors, that fit into 80 columns with their intervals
 
 
-def comparison_table(evaluations: Mapping[str, Evaluation], bound: np.ndarray, where: str) -> Table:
+def comparison_table(
+    evaluations: Mapping[str, Evaluation], bound: np.ndarray, where: str, scale_about: str = ""
+) -> Table:
     """Metrics of filters on the same seeds: RMSE, distance from the bound and consistency.
 
     A row is a filter. Where states are more than fit side by side, a row is a state of a filter; without truth the
@@ -26,6 +30,7 @@ def comparison_table(evaluations: Mapping[str, Evaluation], bound: np.ndarray, w
         evaluations: by what the filters are called.
         bound: (n,), NaN where there is none.
         where: on what seeds of what, for the title.
+        scale_about: what the score divides errors by, in words, for the caption where there is no bound.
     """
     first = next(iter(evaluations.values()))
     if not first.has_truth:
@@ -33,7 +38,13 @@ def comparison_table(evaluations: Mapping[str, Evaluation], bound: np.ndarray, w
     outputs = {symbol: one for found in evaluations.values() for symbol, one in found.outputs.items()}
     layout = _across if 2 * len(first.states) + len(outputs) <= MOST_COLUMNS else _below
     columns, rows = layout(evaluations, bound, outputs)
-    caption = f"above: the bound. ±: half of the 95 % interval. Ideal: NEES {len(bound)}, NIS {right_nis(first)}."
+    has_bound = not np.isnan(bound).all()
+    if has_bound:
+        above = "above: the bound. "
+    else:
+        above = f"No bound; the score is RMSE over {scale_about}. " if scale_about else ""
+        columns, rows = without(columns, rows, ABOVE)
+    caption = f"{above}±: half of the 95 % interval. Ideal: NEES {len(bound)}, NIS {right_nis(first)}."
     lines = 1 if layout is _across else len(first.states) + len(outputs)
     place = lowest([found.score.value for found in evaluations.values()])
     best = range(place * lines, (place + 1) * lines) if place is not None else ()
@@ -44,6 +55,12 @@ def lowest(values: Sequence[float]) -> int | None:
     """Place of the lowest of several values, NaN left out; None if there are none to compare."""
     known = [value for value in values if not isnan(value)]
     return list(values).index(min(known)) if len(known) > 1 else None
+
+
+def without(columns: Sequence[str], rows: Sequence[Sequence[str]], head: str) -> tuple[list, list]:
+    """Columns and rows less the columns of one head."""
+    kept = [place for place, column in enumerate(columns) if column != head]
+    return [columns[i] for i in kept], [[row[i] for i in kept] for row in rows]
 
 
 def _across(evaluations: Mapping[str, Evaluation], bound: np.ndarray, outputs: Mapping[str, Quantity]) -> tuple:
@@ -58,8 +75,8 @@ def _across(evaluations: Mapping[str, Evaluation], bound: np.ndarray, outputs: M
     limits = [
         cell for limit, places in zip(bound, digits, strict=True) for cell in (limit_cell(limit, places), "")
     ]
-    rows.append(["bound", *limits, *("" for _ in outputs), str(len(bound)), right_nis(first)])
-    heads = [head for state in first.states for head in (two_lines(state), "above\n[%]")]
+    rows.append([expected_word(bound), *limits, *("" for _ in outputs), str(len(bound)), right_nis(first)])
+    heads = [head for state in first.states for head in (two_lines(state), ABOVE)]
     return ["filter", *heads, *map(two_lines, outputs.values()), "NEES", "NIS"], rows
 
 
@@ -76,9 +93,9 @@ def _below(evaluations: Mapping[str, Evaluation], bound: np.ndarray, outputs: Ma
         rows += [[head[0], *cells, *head[1:]] for head, cells in zip(heads, block, strict=True)]
     limits = [[s.short_label, limit_cell(b, d), ""] for s, b, d in zip(first.states, bound, digits, strict=True)]
     limits = limits if any(cells[1] for cells in limits) else [["", "", ""]]
-    heads = [["bound", str(len(bound)), right_nis(first)]] + [["", "", ""]] * (len(limits) - 1)
+    heads = [[expected_word(bound), str(len(bound)), right_nis(first)]] + [["", "", ""]] * (len(limits) - 1)
     rows += [[head[0], *cells, *head[1:]] for head, cells in zip(heads, limits, strict=True)]
-    return ["filter", "state", "RMSE", "above\n[%]", "NEES", "NIS"], rows
+    return ["filter", "state", "RMSE", ABOVE, "NEES", "NIS"], rows
 
 
 def _innovations_table(evaluations: Mapping[str, Evaluation], where: str) -> Table:
@@ -118,9 +135,14 @@ def two_lines(quantity: Quantity) -> str:
     return f"{quantity.symbol}\n[{quantity.unit}]" if quantity.unit else f"{quantity.symbol}\n"
 
 
+def expected_word(bound: np.ndarray) -> str:
+    """What the row below the filters is called: without a bound it holds what NEES and NIS should be."""
+    return "expected" if np.isnan(bound).all() else "bound"
+
+
 def limit_cell(bound: float, digits: int) -> str:
     """A bound with so many decimals; empty where there is none."""
-    return unless_blank(bound, f".{digits}f")
+    return unless_blank(bound, ".2e" if digits > MOST_DECIMALS else f".{digits}f")
 
 
 def _output(found: Evaluation, symbol: str) -> str:
@@ -132,6 +154,8 @@ def _output(found: Evaluation, symbol: str) -> str:
 def about(value: Interval, digits: int) -> str:
     """A value with half of its 95 % interval; empty if there is no value."""
     half_width = (value.high - value.low) / 2
+    if digits > MOST_DECIMALS and not isnan(value.value):
+        return f"{value.value:.2e} ±{half_width:.0e}"
     return "" if isnan(value.value) else f"{value.value:.{digits}f} ±{half_width:.{digits}f}"
 
 

@@ -10,7 +10,7 @@ from optuna.trial import TrialState
 from filters.registry import filter_class
 from plants.quantities import Quantity
 from tuning.evaluation.versions import versions
-from tuning.problems.problem import Problem
+from tuning.problems.problem import BOUND, OPEN_LOOP, Problem
 from tuning.reporting.page import Section, Table, Words
 from tuning.reporting.subject import Subject
 from tuning.search.objectives import NIS_BAND, find_objective
@@ -39,14 +39,25 @@ def score_section(subject: Subject) -> Section:
         said.append(
             f"The score of a filter on {scenario.name} is the mean over {', '.join(_scored(scenario))} of its "
             f"RMSE over a fixed scale: {', '.join(scales)}. It has no unit, less is better, and 1 means errors as "
-            "large as the scale. Where a posterior Cramér-Rao bound (the least error that any filter can have) is "
-            "known the scale is that bound, else it is what the problem says, such as the spread of the state."
+            f"large as the scale, which is {scenario.scale_about}.{_no_bound(scenario)}"
         )
     said.append(
         f"What was learnt on training {_word(subject)} is evaluated on held-out {_word(subject)}, which no "
         "trial saw. Intervals hold 95 % of resampled sets of runs; ratios are paired, run by run."
     )
     return Section("What the score is", [Words(said)])
+
+
+def _no_bound(scenario: Problem) -> str:
+    """Why a score counts something else than the bound, where it does; empty where it does not."""
+    if scenario.scale_about == BOUND:
+        return " It is the least error that any filter can have."
+    if not scenario.scale_about.startswith(OPEN_LOOP):
+        return ""
+    return (
+        " A posterior Cramér-Rao bound needs the inverse of Q: one state without noise of its own is enough for "
+        "none, so scores here cannot be compared with those of a problem whose scale is the bound."
+    )
 
 
 def _scored(scenario: Problem) -> list[str]:

@@ -19,16 +19,15 @@ from tuning.search.outcome import is_consistent
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SCORE = "score: mean RMSE over bound [-]"
 COLOURS = {RULE: PALE, SCALED: GREY, ORACLE: GREEN}  # of baselines; the tuned filter has its own
 
 
-def history_figure(path: str | Path, trials: Sequence[FrozenTrial], title: str, label: str = SCORE) -> Path:
+def history_figure(path: str | Path, trials: Sequence[FrozenTrial], title: str, label: str) -> Path:
     """Save what `draw_history` draws."""
     return save_figure(draw_history(trials, title, label), path)
 
 
-def draw_history(trials: Sequence[FrozenTrial], title: str, label: str = SCORE) -> Figure:
+def draw_history(trials: Sequence[FrozenTrial], title: str, label: str) -> Figure:
     """First objective of every trial of a study and the best so far; the first trial is the untuned filter.
 
     Hollow circles are trials whose mean NIS is outside its band: they are not among the best, unless all are.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import isnan
 
+import numpy as np
 from rich.console import RenderableType
 from rich.table import Table
 
@@ -14,6 +15,7 @@ from tuning.evaluation.knowledge import belief_sentences, noise_sentence
 from tuning.evaluation.tuned import summary
 from tuning.evaluation.worth import without_truth
 from tuning.reporting.error_tables import (
+    ABOVE,
     MOST_COLUMNS,
     about,
     consistency_cells,
@@ -23,6 +25,7 @@ from tuning.reporting.error_tables import (
     right_nis,
     two_lines,
     unless_blank,
+    without,
 )
 
 
@@ -61,10 +64,12 @@ def _errors_across(board: Leaderboard, title: str) -> Table:
     limits = [
         cell for bound, places in zip(board.bound, digits, strict=True) for cell in (limit_cell(bound, places), "")
     ]
-    rows.append(["bound", *limits, *("" for _ in states)])
-    heads = [head for state in states for head in (two_lines(state), "above\n[%]")]
+    if not np.isnan(board.bound).all():
+        rows.append(["bound", *limits, *("" for _ in states)])
+    heads = [head for state in states for head in (two_lines(state), ABOVE)]
     begun = [f"{'' if i else 'start-up'}\n{f'[{s.unit}]' if s.unit else ''}" for i, s in enumerate(states)]
-    return table(title, ["filter", *heads, *begun], rows, caption=_CAPTION, best=[winner(board)])
+    columns, rows, caption = _with_bound_or_not(board, ["filter", *heads, *begun], rows)
+    return table(title, columns, rows, caption=caption, best=[winner(board)])
 
 
 def _errors_below(board: Leaderboard, title: str) -> Table:
@@ -84,13 +89,19 @@ def _errors_below(board: Leaderboard, title: str) -> Table:
     bounds = [[state.short_label, limit_cell(bound, places), "", "", ""] for state, bound, places in limits]
     if any(cells[1] for cells in bounds):
         rows += [["bound" if i == 0 else "", *cells] for i, cells in enumerate(bounds)]
-    heads = ["filter", "state", "RMSE", "above\n[%]", "start-up", f"over\n{board.rows[0].label}"]
+    heads = ["filter", "state", "RMSE", ABOVE, "start-up", f"over\n{board.rows[0].label}"]
     place, lines = winner(board), len(states)
     best = () if place is None else range(place * lines, (place + 1) * lines)
-    return table(title, heads, rows, caption=_CAPTION, best=best)
+    heads, rows, caption = _with_bound_or_not(board, heads, rows)
+    return table(title, heads, rows, caption=caption, best=best)
 
 
-_CAPTION = "above: the bound. ±: half of the 95 % interval. start-up: the first 50 steps."
+def _with_bound_or_not(board: Leaderboard, heads: list[str], rows: list[list[str]]) -> tuple:
+    """Columns, rows and caption; where there is no bound the caption says what the scale is."""
+    rest = "±: half of the 95 % interval. start-up: the first 50 steps."
+    if not np.isnan(board.bound).all():
+        return heads, rows, f"above: the bound. {rest}"
+    return *without(heads, rows, ABOVE), f"No bound; the score is RMSE over {board.scenario.scale_about}. {rest}"
 
 
 def _start_up(rmse: float) -> str:

@@ -10,10 +10,12 @@ from typing import NamedTuple
 from tuning.reporting.script import SCRIPT
 from tuning.reporting.style import STYLE
 from tuning.reporting.svg import palette
+from tuning.reporting.units import typeset
 
 INTERVAL = re.compile(r"(\S+) (\[\S+, \S+\])")
 WIDE = 480.0  # [pt] pictures beyond this are scrolled on a phone
 MANY = 9  # columns of a table that is set small on paper
+FOLDED = 4  # columns from which a row is folded on a phone
 NARROW = 5  # columns of a table that fits beside another
 
 
@@ -25,18 +27,25 @@ class Table(NamedTuple):
     rows: Sequence[Sequence[str]]
 
     def html(self) -> str:
-        """The table for a page; what is too wide is scrolled by itself."""
-        head = "".join(f'<th scope="col">{escape(column)}</th>' for column in self.columns)
+        """The table for a page: on a phone a row of many columns is folded, what is still too wide is scrolled."""
+        head = "".join(f'<th scope="col">{_text(column)}</th>' for column in self.columns)
         rows = "\n".join(
-            f'<tr><th scope="row">{escape(row[0])}</th>{"".join(map(_cell, row[1:]))}</tr>' for row in self.rows
+            f'<tr><th scope="row">{_text(row[0])}</th>{self._cells(row[1:])}</tr>' for row in self.rows
         )
         head = f"<thead><tr>{head}</tr></thead>\n" if head else ""
-        kind, label = ("", escape(self.caption)) if self.columns else (' class="words"', "a list")
+        kind, label = ("", _text(self.caption)) if self.columns else (' class="words"', "a list")
         if len(self.columns) >= MANY:
-            kind = ' class="many"'
-        caption = f'<p class="caption">{escape(self.caption)}</p>\n' if self.caption else ""
+            kind = ' class="many fold"'
+        elif len(self.columns) >= FOLDED:
+            kind = ' class="fold"'
+        caption = f'<p class="caption">{_text(self.caption)}</p>\n' if self.caption else ""
         scroll = f'<div class="scroll" role="region" aria-label="{label}" tabindex="0">'
         return f"{caption}{scroll}<table{kind}>\n{head}<tbody>\n{rows}\n</tbody></table></div>"
+
+    def _cells(self, cells: Sequence[str]) -> str:
+        """Cells of a row, each with the head of its column where there is one, for a folded row."""
+        heads = self.columns[1:] if len(self.columns) >= FOLDED else ("",) * len(cells)
+        return "".join(_cell(cell, head) for cell, head in zip(cells, heads, strict=True))
 
     def markdown(self) -> str:
         """The table for a Markdown file, its caption above."""
@@ -60,11 +69,11 @@ class Picture(NamedTuple):
         size = f'width="{width * 4 / 3:.0f}" height="{height * 4 / 3:.0f}"'
         kinds = [name for name, there in (("read", self.readings), ("wide", width > WIDE)) if there]
         marks = f' class="{" ".join(kinds)}"' if kinds else ""
-        read = f' data-read="{self.readings}"' if self.readings else ""
-        svg = self.svg.replace("<svg", f'<svg role="img" aria-label="{escape(self.alt)}" {size}', 1)
+        read = f' data-read="{typeset(self.readings)}"' if self.readings else ""
+        svg = typeset(self.svg).replace("<svg", f'<svg role="img" aria-label="{_text(self.alt)}" {size}', 1)
         return (
             f'<figure{marks}{read}><div class="picture">{svg}</div>'
-            f"<figcaption>{escape(self.caption)}</figcaption></figure>"
+            f"<figcaption>{_text(self.caption)}</figcaption></figure>"
         )
 
 
@@ -91,8 +100,8 @@ class Words(NamedTuple):
     def html(self) -> str:
         """A paragraph or a list."""
         if len(self.sentences) == 1:
-            return f"<p>{escape(self.sentences[0])}</p>"
-        return f"<ul>{''.join(f'<li>{escape(sentence)}</li>' for sentence in self.sentences)}</ul>"
+            return f"<p>{_text(self.sentences[0])}</p>"
+        return f"<ul>{''.join(f'<li>{_text(sentence)}</li>' for sentence in self.sentences)}</ul>"
 
 
 class Pair(NamedTuple):
@@ -166,11 +175,17 @@ def markdown_page(title: str, advice: str, tables: Sequence[Table]) -> str:
     return "\n\n".join([f"# {_plain(title)}", _plain(advice), *(one.markdown() for one in tables)]) + "\n"
 
 
-def _cell(text: str) -> str:
-    """A cell of a page; the interval of a value stands below it."""
+def _cell(text: str, head: str = "") -> str:
+    """A cell of a page; the interval of a value stands below it, and the head of its column is kept with it."""
     found = INTERVAL.fullmatch(text)
     value, below = (found[1], f"<small>{escape(found[2])}</small>") if found else (text, "")
-    return f"<td>{escape(value)}{below}</td>"
+    named = f' data-head="{_text(head)}"' if head else ""
+    return f"<td{named}>{_text(value)}{below}</td>"
+
+
+def _text(text: str) -> str:
+    """Text of a page, its units typeset."""
+    return escape(typeset(text))
 
 
 def _line(cells: Sequence[str]) -> str:

@@ -16,8 +16,9 @@ from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.worth import scaling_sentence, without_truth, worth
+from tuning.problems.problem import score_label
 from tuning.reporting.alternatives import of_comparison, of_front, of_history, of_importances, of_sizes, of_slices
-from tuning.reporting.figures import SCORE, draw_comparison, draw_history
+from tuning.reporting.figures import draw_comparison, draw_history
 from tuning.reporting.page import Part, Picture, Section, Table, Words
 from tuning.reporting.search_figures import (
     FEWEST_TRIALS,
@@ -92,7 +93,10 @@ def search_section(book: Sketchbook, subject: Subject) -> Section:
     trials = study.get_trials(deepcopy=False)
     objectives = subject.plan.objectives
     labels = [
-        SCORE if name == "score" else fill(f"{name}: {find_objective(name).about}", 34) for name in objectives
+        score_label(subject.plan.scenarios)
+        if name == "score"
+        else fill(f"{name}: {find_objective(name).about}", 34)
+        for name in objectives
     ]
     word = subject.plan.scenarios[0].seed_word
     caption = f"First objective of each trial on the training {word}, and the best so far."

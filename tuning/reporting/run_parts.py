@@ -18,6 +18,10 @@ from tuning.reporting.sketchbook import Sketchbook
 from tuning.reporting.subject import Subject
 from tuning.reporting.time_figures import draw_estimates
 
+AXES = (
+    "Limits are those of the scored steps, the same in a row unless its panels say that their axes differ; RMSE "
+    "and RMS are over these steps."
+)
 READ = "Values are read off under the pointer; drag sideways to enlarge a stretch, double-click for all of it."
 
 
@@ -31,7 +35,7 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
     where = f"{scenario.name}, held-out {word} {proof.seeds.start}"
     has_covariance, scored = filter_class(choice.name).has_covariance, proof.tuned.scored or None
     what = "Estimate and innovation, each with its" if data.states is None else "Truth, estimate and"
-    caption = f"{what} 95 % band on {where}, before and after. The panels of a row share their axis. {READ}"
+    caption = f"{what} 95 % band on {where}, before and after. {AXES} {READ}"
     alt = of_estimates(pair, data, 0, dt)
     remark = [] if data.states is not None else [Words([f"{scenario.name} has no truth, so there are no errors."])]
     picture = book.picture(draw_estimates(pair, data, 0, dt, scored), caption, alt)
@@ -47,7 +51,9 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
         return sections
     if data.states is not None:
         without = data._replace(states=None, outputs=None)
-        caption = f"Innovations on {where}, each in the 95 % band that the filter expects, before and after."
+        caption = (
+            f"Innovations on {where}, each in the 95 % band that the filter expects, before and after. {AXES}"
+        )
         picture = book.picture(draw_innovations(pair, data, 0, dt), caption, of_estimates(pair, without, 0, dt))
         sections.append(Section("Innovations", [picture]))
     if not is_array(model.n, model.m):

@@ -14,7 +14,7 @@ from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.reporting.panels import axis_label, shown_states
-from tuning.reporting.time_figures import TWO_SIDED, WIDTH, draw_in_band, one_run
+from tuning.reporting.time_figures import TWO_SIDED, WIDTH, draw_in_band, limit_innovations, one_run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,21 +52,22 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
 
 
 def draw_innovations(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None) -> Figure:
-    """Innovations of every channel in the band that each filter expects, a column a filter, with equal axes."""
+    """Innovations of every channel in the band that each filter expects; one column a filter."""
     channels = next(iter(filters.values())).model.measurements
     seen, left_out = shown_states(channels)
     figure = new_figure((WIDTH * len(filters), HEIGHT * 1.2 * len(seen) + 0.8))
-    axes = figure.subplots(len(seen), len(filters), squeeze=False, sharex=True, sharey="row")
+    axes = figure.subplots(len(seen), len(filters), squeeze=False, sharex=True)
     tidy(axes.flat)
-    for column, (title, filter_) in zip(axes.T, filters.items(), strict=True):
-        found = one_run(filter_, data, index, dt)
+    runs = [one_run(filter_, data, index, dt) for filter_ in filters.values()]
+    for column, found, (title, filter_) in zip(axes.T, runs, filters.items(), strict=True):
         for axis, j in zip(column, seen, strict=True):
             band = TWO_SIDED * np.sqrt(found.estimates.innovation_covs[0, :, j, j])
             draw_in_band(axis, found.time, found.innovations[:, j], band, "innovation", colour_of(filter_.name))
         column[0].set_title(title, fontsize=11)
         column[-1].set_xlabel(_time(dt))
-    for axis, j in zip(axes[:, 0], seen, strict=True):
-        axis.set_ylabel(axis_label(channels[j]))
+    for line, j in zip(axes, seen, strict=True):
+        line[0].set_ylabel(axis_label(channels[j]))
+        limit_innovations(line, runs, data.scored.start, j)
     _legend(figure, axes[:, 0], left_out.replace("states", "channels"))
     return figure
 

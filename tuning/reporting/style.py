@@ -54,11 +54,20 @@ summary {{ cursor: pointer; font-weight: 600; }}
 .pair.deep {{ display: block; }}
 .whose {{ font-weight: 600; color: var(--mark); margin: .75rem 0 0; }}
 body.beside {{ max-width: 84rem; }}
-@media (max-width: 40rem) {{
+@media screen and (max-width: 40rem) {{
   body {{ padding: 1rem .75rem 3rem; }}
   h1 {{ font-size: 1.35rem; }}
   th, td {{ padding-left: .7rem; }}
   th:first-child {{ max-width: 6.5rem; }}
+  table.fold, table.fold tbody, table.fold tr, table.fold th, table.fold td {{ display: block; }}
+  table.fold thead {{ display: none; }}
+  table.fold tr {{ padding: .4rem 0; border-bottom: 1px solid var(--strong); }}
+  table.fold th:first-child {{ max-width: none; }}
+  table.fold th, table.fold td {{ border: 0; padding: .1rem 0; }}
+  table.fold td {{ display: flex; flex-wrap: wrap; justify-content: flex-end; gap: 0 .5rem; white-space: normal; }}
+  table.fold td::before {{ content: attr(data-head); margin-right: auto; color: var(--soft); }}
+  table.fold td small {{ flex-basis: 100%; }}
+  table.fold td:empty {{ display: none; }}
   .wide svg {{ max-width: none; width: 38rem; }}
 }}
 @media print {{

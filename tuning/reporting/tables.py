@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from math import isnan
 
+import numpy as np
+
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import rounded
-from plants.quantities import Quantity
 from tuning.evaluation.baselines import RULE, TUNED, Scaled, baselines
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.held_out import Comparison
 from tuning.likelihood.identifiability import Identifiability
 from tuning.problems.problem import Problem
 from tuning.reporting.page import Table
-from tuning.reporting.units import number_rows
+from tuning.reporting.units import number_rows, power_of_ten, scaled_unit
 from tuning.search.space import Choice
 
-MOST_ACROSS = 3  # states side by side; more stand one below the other
-EXPECTED = "bound; expected value"  # what stands beside the metrics
+MOST_ACROSS = 3  # errors of states and outputs side by side; more stand one below the other
+RATIO = "score of tuned over this"
 
 
 def errors_table(scenario: Problem, proof: Comparison) -> Table:
@@ -30,40 +31,59 @@ def errors_table(scenario: Problem, proof: Comparison) -> Table:
     where = f"{scenario.name}, held-out {seeds}, with 95 % intervals"
     if not proof.tuned.has_truth:
         return _innovations_table(proof, where)
-    return _errors_across(proof, where) if len(proof.bound) <= MOST_ACROSS else _errors_below(proof, where)
+    count = len(proof.bound) + len(proof.tuned.outputs)
+    return _errors_across(proof, where) if count <= MOST_ACROSS else _errors_below(proof, where)
 
 
 def _errors_across(proof: Comparison, where: str) -> Table:
-    ratios, outputs = proof.ratios, proof.tuned.outputs
+    ratios, tuned, errors = proof.ratios, proof.tuned, _errors(proof)
     rows = [
-        [name, *map(_span, e.rmse), *(_span(e.output_rmse.get(symbol, NOTHING)) for symbol in outputs)]
-        + [*map(_span, (e.score, e.nees, e.nis)), _span(ratios[name]) if name in ratios else ""]
-        for name, e in proof.evaluations.items()
+        [name, _span(ratios.get(name, NOTHING)), _span(found.score), *(cells[place] for _, cells, _ in errors)]
+        + [*map(_span, (found.nees, found.nis))]
+        for place, (name, found) in enumerate(proof.evaluations.items())
     ]
-    right = [str(len(proof.bound)), f"{proof.tuned.expected_nis:.3g}"] if rows[0][-2] else ["", ""]
-    bound = ["" if isnan(part) else rounded(part) for part in proof.bound]
-    rows.append([EXPECTED, *bound, *("" for _ in outputs), "", *right, ""])
-    columns = ["filter", *map(_state_label, proof.tuned.states), *map(_output_label, outputs.values())]
-    return Table(where, [*columns, "score", "mean NEES", "mean NIS", "score of tuned over this"], rows)
+    right = [str(len(proof.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
+    rows.append([_expected(proof), "", "", *(bound for *_, bound in errors), *right])
+    columns = ["filter", RATIO, "score", *(label for label, *_ in errors), "mean NEES", "mean NIS"]
+    return Table(where, columns, rows)
 
 
 def _errors_below(proof: Comparison, where: str) -> Table:
     ratios, found, tuned = proof.ratios, proof.evaluations, proof.tuned
-    bound = ["" if isnan(part) else rounded(part) for part in proof.bound]
-    rows = [
-        [_state_label(state), *(_span(e.rmse[i]) for e in found.values()), bound[i]]
-        for i, state in enumerate(tuned.states)
-    ]
-    rows += [
-        [_output_label(output), *(_span(e.output_rmse.get(symbol, NOTHING)) for e in found.values()), ""]
-        for symbol, output in tuned.outputs.items()
-    ]
     right = [str(len(proof.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
-    rows.append(["score", *(_span(e.score) for e in found.values()), ""])
-    rows.append(["mean NEES", *(_span(e.nees) for e in found.values()), right[0]])
-    rows.append(["mean NIS", *(_span(e.nis) for e in found.values()), right[1]])
-    rows.append(["score of tuned over this", *(_span(ratios.get(name, NOTHING)) for name in found), ""])
-    return Table(where, ["", *found, EXPECTED], rows)
+    rows = [
+        [RATIO, *(_span(ratios.get(name, NOTHING)) for name in found), ""],
+        ["score", *(_span(e.score) for e in found.values()), ""],
+        *([label, *cells, bound] for label, cells, bound in _errors(proof)),
+        ["mean NEES", *(_span(e.nees) for e in found.values()), right[0]],
+        ["mean NIS", *(_span(e.nis) for e in found.values()), right[1]],
+    ]
+    return Table(where, ["", *found, _expected(proof)], rows)
+
+
+def _errors(proof: Comparison) -> list[tuple[str, list[str], str]]:
+    """RMSE of each state and output: label, a cell a filter, and the bound, all with one power of ten."""
+    found, told = proof.evaluations.values(), []
+    parts = [
+        (state.text_symbol, state.unit, [e.rmse[i] for e in found], float(proof.bound[i]))
+        for i, state in enumerate(proof.tuned.states)
+    ]
+    parts += [
+        (output.name, output.unit, [e.output_rmse.get(symbol, NOTHING) for e in found], float("nan"))
+        for symbol, output in proof.tuned.outputs.items()
+    ]
+    for name, unit, values, bound in parts:
+        power = power_of_ten([value.value for value in values])
+        cells = [_span(Interval(*(part / 10.0**power for part in value))) for value in values]
+        label = scaled_unit(unit, power)
+        limit = "" if isnan(bound) else rounded(bound / 10.0**power)
+        told.append((f"RMSE {name} [{label}]" if label else f"RMSE {name}", cells, limit))
+    return told
+
+
+def _expected(proof: Comparison) -> str:
+    """What the row is called that stands beside the metrics."""
+    return "expected" if np.isnan(proof.bound).all() else "bound; expected"
 
 
 def _innovations_table(proof: Comparison, where: str) -> Table:
@@ -74,17 +94,9 @@ def _innovations_table(proof: Comparison, where: str) -> Table:
         for name, e in proof.evaluations.items()
     ]
     right = "" if isnan(proof.tuned.nis.value) else f"{proof.tuned.expected_nis:.3g}"
-    rows.append(["expected value", "", right, "", ""])
+    rows.append(["expected", "", right, "", ""])
     columns = ["filter", "log-likelihood of a run", "mean NIS", "that of tuned less this", "restarts"]
     return Table(where, columns, rows)
-
-
-def _state_label(state: Quantity) -> str:
-    return f"RMSE {state.text_symbol} [{state.unit}]" if state.unit else f"RMSE {state.text_symbol}"
-
-
-def _output_label(output: Quantity) -> str:
-    return f"RMSE {output.label}"
 
 
 def numbers_table(choice: Choice, scenario: Problem, seed: int, default: Scaled | None = None) -> Table:

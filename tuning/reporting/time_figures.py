@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,10 +12,11 @@ import numpy as np
 from filters.engine.batch import Estimates, run
 from filters.filter import Filter
 from filters.looks import TRUTH, colour_of
-from numerics.plots import new_figure, save_figure, thinned, tidy
+from numerics.plots import BLUE, RUST, new_figure, save_figure, thinned, tidy
 from plants.quantities import Quantity
 from tuning.evaluation.runs import state_errors
 from tuning.problems.data import Data
+from tuning.reporting.limits import limit_errors, limit_values
 from tuning.reporting.panels import axis_label, shown_states
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ class Row(NamedTuple):
     height: float
     label: str
     draw: Callable  # draw(axis, run, colour=that of the filter)
+    limit: Callable  # limit(axes, runs, start) once all is drawn
 
 
 def estimates_figure(path: str | Path, filters: Mapping[str, Filter], data: Data, *arguments, **options) -> Path:
@@ -60,6 +62,8 @@ def draw_estimates(
 ) -> Figure:
     """Truth and estimate of every state over time, and the error in its 95 % band; one column a filter.
 
+    The panels of a row have the same limits, those of the scored steps, unless one error is far larger.
+
     Without truth it is the estimates, and the innovation of every channel in the band that the filter expects. Of
     many states some are shown.
 
@@ -69,7 +73,7 @@ def draw_estimates(
         run_index: which of its runs.
         dt: sample time [s]; None for an axis of steps.
         scored: places of the states that count in the score, which come first where not all are shown.
-        **options: of matplotlib's `subplots`; by default the panels of a row share their axes.
+        **options: of matplotlib's `subplots`.
     """
     model = next(iter(filters.values())).model
     states = model.states if data.states is None else model.states[: data.states.shape[-1]]
@@ -78,17 +82,18 @@ def draw_estimates(
     heights = [row.height for row in rows]
     unit = UNIT if len(places) <= 2 else UNIT_OF_MANY
     figure = new_figure((WIDTH * len(filters), unit * sum(heights)))
-    options = {"sharex": True, "sharey": "row", "height_ratios": heights, **options}
+    options = {"sharex": True, "height_ratios": heights, **options}
     axes = figure.subplots(len(rows), len(filters), squeeze=False, **options)
     tidy(axes.flat)
-    for column, (title, filter_) in zip(axes.T, filters.items(), strict=True):
-        found = one_run(filter_, data, run_index, dt)
+    runs = [one_run(filter_, data, run_index, dt) for filter_ in filters.values()]
+    for column, found, (title, filter_) in zip(axes.T, runs, filters.items(), strict=True):
         for axis, row in zip(column, rows, strict=True):
             row.draw(axis, found, colour=colour_of(filter_.name))
         column[0].set_title(title, fontsize=11)
         column[-1].set_xlabel("step" if dt is None else "time [s]")
-    for axis, row in zip(axes[:, 0], rows, strict=True):
-        axis.set_ylabel(row.label)
+    for line, row in zip(axes, rows, strict=True):
+        line[0].set_ylabel(row.label)
+        row.limit(line, runs, data.scored.start)
     figure.align_ylabels(axes[:, 0])
     named: dict[str, Any] = {}
     for axis in axes[:, 0]:
@@ -105,12 +110,16 @@ def _rows(
     """Each state above its error; without truth all states, then the innovations of the channels."""
     rows = []
     for i in places:
-        rows.append(Row(TALL, axis_label(states[i]), partial(_values, i=i)))
+        rows.append(Row(TALL, axis_label(states[i]), partial(_values, i=i), partial(_limit_values, i=i)))
         if has_truth:
-            rows.append(Row(LOW, axis_label(Quantity("error", "error", states[i].unit)), partial(_error, i=i)))
+            label = axis_label(Quantity("error", "error", states[i].unit))
+            rows.append(Row(LOW, label, partial(_error, i=i), partial(_limit_errors, i=i)))
     if not has_truth:
         seen, _ = shown_states(channels)
-        rows += [Row(LOW, axis_label(channels[j]), partial(_innovation, j=j)) for j in seen]
+        rows += [
+            Row(LOW, axis_label(channels[j]), partial(_innovation, j=j), partial(limit_innovations, j=j))
+            for j in seen
+        ]
     return rows
 
 
@@ -145,10 +154,30 @@ def _innovation(axis, found: Run, j: int, colour: str) -> None:
     draw_in_band(axis, found.time, found.innovations[:, j], band, "innovation", colour)
 
 
+def _limit_values(axes, runs: Sequence[Run], start: int, i: int) -> None:
+    means, ends = [found.estimates.means[0, start:, i] for found in runs], []
+    for found, mean in zip(runs, means, strict=True):
+        band = TWO_SIDED * np.sqrt(found.estimates.covs[0, start:, i, i])
+        ends += [mean - band, mean + band]
+    limit_values(axes, [*means, *(found.truth[:, i] for found in runs if found.truth is not None)], ends)
+
+
+def _limit_errors(axes, runs: Sequence[Run], start: int, i: int) -> None:
+    bands = [TWO_SIDED * np.sqrt(found.estimates.covs[0, :, i, i]) for found in runs]
+    limit_errors(axes, [found.errors[:, i] for found in runs if found.errors is not None], bands, start)
+
+
+def limit_innovations(axes, runs: Sequence[Run], start: int, j: int) -> None:
+    """Limits of a row of innovations of channel j."""
+    bands = [TWO_SIDED * np.sqrt(found.estimates.innovation_covs[0, :, j, j]) for found in runs]
+    limit_errors(axes, [found.innovations[:, j] for found in runs], bands, start, "RMS")
+
+
 def draw_in_band(axis, time: np.ndarray, values: np.ndarray, band: np.ndarray, label: str, colour: str) -> None:
     """An error over time in the band that a filter believes in."""
     draw_band(axis, time, -band, band, colour)
-    axis.plot(*thinned(time, values), color=colour, linewidth=0.9, label=label)
+    own = BLUE if colour == RUST else RUST  # an error never looks like the estimate
+    axis.plot(*thinned(time, values), color=own, linewidth=0.9, label=label)
 
 
 def draw_band(axis, time: np.ndarray, low: np.ndarray, high: np.ndarray, colour: str) -> None:

@@ -4,11 +4,32 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from math import floor, isfinite, log10
 
 from tuning.problems.problem import Problem
 from tuning.search.space import Choice, neutral, parameters, parameters_of
 
+SMALL, LARGE = 1e-3, 1e5  # what is smaller or larger is told in a unit with a power of ten
+RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 ALIKE = 4  # so many numbers of one kind and more, which are the same in every column, share a row
+
+
+def typeset(text: str) -> str:
+    """Units in a text as pages have them: m^3/s is m³/s."""
+    return re.sub(r"(?<=[A-Za-z)])\^(-?\d+)", lambda found: found[1].translate(RAISED), text)
+
+
+def power_of_ten(values: Iterable[float]) -> int:
+    """The exponent, of three or a multiple, that some numbers in one column share; 0 where they need none."""
+    sizes = [abs(value) for value in values if isfinite(value) and value]
+    largest = max(sizes, default=1.0)
+    return 0 if SMALL <= largest < LARGE else 3 * floor(log10(largest) / 3)
+
+
+def scaled_unit(unit: str, power: int) -> str:
+    """A unit with a power of ten before it: "10⁻⁶ m"."""
+    factor = f"10{str(power).translate(RAISED)}" if power else ""
+    return " ".join(filter(None, (factor, unit)))
 
 
 def labels(names: Iterable[str], kind: str, problem: Problem, square: str = "^2") -> dict[str, str]:

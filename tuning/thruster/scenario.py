@@ -24,6 +24,7 @@ from thruster_env.preset_file import is_file, preset_mapping
 from thruster_env.simulation import simulate
 from tuning.problems.data import Data
 from tuning.problems.plain import plain
+from tuning.problems.problem import BOUND, GIVEN, OPEN_LOOP
 from tuning.problems.scenario import BaseScenario
 from tuning.thruster.excitation import voltages_of
 
@@ -132,6 +133,13 @@ class Scenario(BaseScenario):
     def has_bound(self) -> bool:
         """Whether there is a posterior Cramér-Rao bound: its recursion needs the inverse of Q."""
         return has_bound(self.plant.process_noise_cov)
+
+    @property
+    def scale_about(self) -> str:
+        """What the scale is, in words; that of a file may be any."""
+        if self.name.endswith(".toml"):
+            return GIVEN
+        return BOUND if self.has_bound else f"{OPEN_LOOP}, for the true Q is singular"
 
     def bound(self, data: Data, truths: int = 100) -> np.ndarray:
         """Bound on the standard error of each state (2,), averaged over the data's inputs and scored steps.

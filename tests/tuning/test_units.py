@@ -1,0 +1,36 @@
+"""Units of a report: typeset in one way, with one power of ten in a column."""
+
+from math import nan
+
+import pytest
+
+from filters.consistency.intervals import Interval
+from tuning.reporting.error_tables import about, limit_cell
+from tuning.reporting.page import Table, Words
+from tuning.reporting.units import power_of_ten, scaled_unit, typeset
+
+
+@pytest.mark.parametrize(
+    ("unit", "page"), [("m^3/s", "m³/s"), ("(m/s)^2", "(m/s)²"), ("1/s", "1/s"), ("s^-1", "s⁻¹"), ("m", "m")]
+)
+def test_units_are_typeset_in_words_and_tables(unit, page):
+    assert typeset(unit) == page
+    assert (
+        page in Words([f"It is 1 {unit}."]).html() and page in Table("", ["", f"q [{unit}]"], [["a", "1"]]).html()
+    )
+
+
+@pytest.mark.parametrize(
+    ("values", "power"),
+    [([8.59e-6, 2.3e-5], -6), ([0.00009, nan], -6), ([1e-3, 1e-9], 0), ([2e6], 6), ([0.0, nan], 0), ([], 0)],
+)
+def test_a_column_has_one_power_of_ten(values, power):
+    assert power_of_ten(values) == power
+    assert scaled_unit("m", -6) == "10⁻⁶ m" and scaled_unit("m", 0) == "m" and scaled_unit("", 3) == "10³"
+
+
+def test_small_errors_on_a_terminal_have_powers_of_ten():
+    value = Interval(8.59e-6, 8.37e-6, 8.81e-6)
+    assert about(value, 8) == "8.59e-06 ±2e-07" and limit_cell(7.5e-6, 8) == "7.50e-06"
+    assert about(value._replace(value=0.1, low=0.09, high=0.11), 4) == "0.1000 ±0.0100"
+    assert about(value._replace(value=float("nan")), 8) == limit_cell(float("nan"), 8) == ""
