@@ -17,7 +17,7 @@ from tuning.evaluation.evaluate import Evaluation, likelihood_gain, score_ratio
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SIZE_TOLERANCE
 from tuning.evaluation.tuned import consistency, metrics
-from tuning.evaluation.worth import scaling_sentence, without_truth
+from tuning.evaluation.worth import scaling_sentence, sized, without_truth
 from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
 from tuning.search.filter_types import kinds_tried
@@ -35,10 +35,10 @@ def report(tuning: Tuning) -> list[RenderableType]:
     for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True):
         found = {TUNED: result.choice, **baselines(result.choice.name, scenario, plan.seed)}
         evaluations = proof.evaluations
-        choices = {name: found[name] for name in evaluations}
+        choices = {proof.label(name): found[name] for name in evaluations}
         span_of_seeds = f"{scenario.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}"
         where = f"held-out {span_of_seeds}, scenario {scenario.name}"
-        shown += [choice_table(choices, scenario), comparison_table(evaluations, proof.bound, where)]
+        shown += [choice_table(choices, scenario), comparison_table(proof.labelled, proof.bound, where)]
         shown += gains(proof, scenario.seed_word)
         shown.append(_consistency_sentence(proof.tuned))
         if proof.tuned.has_truth and isnan(proof.bound).all():
@@ -195,11 +195,11 @@ def gains(proof: Comparison, seed_word: str) -> list[str]:
     if not proof.tuned.has_truth:
         return _likelihood_gains(proof, seed_word)
     ratios = proof.ratios
-    parts = [f"x {span(ratio, 3)} that of the {name}" for name, ratio in ratios.items()]
+    parts = [f"x {span(ratio, 3)} that of the {proof.label(name)}" for name, ratio in ratios.items()]
     first, place = next(iter(ratios)), f"{len(proof.seeds)} held-out {seed_word}"
     said = f"Score of the tuned filter on {place}: {', '.join(parts)} (paired 95 % intervals)."
     scaling = scaling_sentence(proof)
-    return [f"{said} {_verdict(ratios[first], first, seed_word)}", *([scaling] if scaling else [])]
+    return [f"{said} {_verdict(ratios[first], proof.label(first), seed_word)}", *([scaling] if scaling else [])]
 
 
 def _likelihood_gains(proof: Comparison, seed_word: str) -> list[str]:
@@ -207,7 +207,10 @@ def _likelihood_gains(proof: Comparison, seed_word: str) -> list[str]:
     gained = {name: found for name, found in proof.likelihood_gains.items() if not isnan(found.value)}
     said, scaling = [without_truth("This problem")], scaling_sentence(proof)
     if gained:
-        parts = [f"{span(found, 2)} above that of the {name}" for name, found in gained.items()]
+        parts = [
+            f"{span(sized(found), 2)} {'above' if found.value >= 0 else 'below'} that of the {proof.label(name)}"
+            for name, found in gained.items()
+        ]
         place = f"{len(proof.seeds)} held-out {seed_word}"
         said.append(f"Log-likelihood of a run of the tuned filter on {place}: {', '.join(parts)}.")
     return [*said, *([scaling] if scaling else [])]

@@ -7,7 +7,7 @@ from math import isnan
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import rounded
 from plants.quantities import Quantity
-from tuning.evaluation.baselines import RULE, TUNED, Scaled, baselines
+from tuning.evaluation.baselines import RULE, TUNED, Scaled, baselines, rule_label
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.held_out import Comparison
 from tuning.likelihood.identifiability import Identifiability
@@ -36,7 +36,11 @@ def errors_table(scenario: Problem, proof: Comparison) -> Table:
 def _errors_across(proof: Comparison, where: str) -> Table:
     ratios, outputs = proof.ratios, proof.tuned.outputs
     rows = [
-        [name, *map(_span, e.rmse), *(_span(e.output_rmse.get(symbol, NOTHING)) for symbol in outputs)]
+        [
+            proof.label(name),
+            *map(_span, e.rmse),
+            *(_span(e.output_rmse.get(symbol, NOTHING)) for symbol in outputs),
+        ]
         + [*map(_span, (e.score, e.nees, e.nis)), _span(ratios[name]) if name in ratios else ""]
         for name, e in proof.evaluations.items()
     ]
@@ -63,13 +67,13 @@ def _errors_below(proof: Comparison, where: str) -> Table:
     rows.append(["mean NEES", *(_span(e.nees) for e in found.values()), right[0]])
     rows.append(["mean NIS", *(_span(e.nis) for e in found.values()), right[1]])
     rows.append(["score of tuned over this", *(_span(ratios.get(name, NOTHING)) for name in found), ""])
-    return Table(where, ["", *found, EXPECTED], rows)
+    return Table(where, ["", *map(proof.label, found), EXPECTED], rows)
 
 
 def _innovations_table(proof: Comparison, where: str) -> Table:
     gains = proof.likelihood_gains
     rows = [
-        [name, "" if isnan(e.log_likelihood) else f"{e.log_likelihood:.2f}", _span(e.nis)]
+        [proof.label(name), "" if isnan(e.log_likelihood) else f"{e.log_likelihood:.2f}", _span(e.nis)]
         + [_span(gains.get(name, NOTHING)), str(e.divergences)]
         for name, e in proof.evaluations.items()
     ]
@@ -93,7 +97,11 @@ def numbers_table(choice: Choice, scenario: Problem, seed: int, default: Scaled 
     choices, usual = {TUNED: choice, **found}, found[RULE].numbers
     whole = [one._replace(numbers={**usual, **one.numbers}) for one in choices.values()]
     rows = number_rows(whole, choice.name, scenario, _number, "²")
-    return Table(f"Parameters of the {choice.name} filter", ["", *choices], rows)
+    return Table(
+        f"Parameters of the {choice.name} filter",
+        ["", *(rule_label(scenario) if name == RULE else name for name in choices)],
+        rows,
+    )
 
 
 def _number(value: float | None) -> str:
