@@ -13,6 +13,7 @@ from plants.state_space import StateSpaceModel
 INPUT, MEASUREMENT, STATE, OUTPUT = "input", "measurement", "state", "output"
 TIME = "time"
 TIME_NAMES = ("t", "time", "Time", "TIME", "timestamp", "stamp")
+DATE_NAMES = ("timestamp", "datetime", "date_time", "date time")
 
 
 class Wanted(NamedTuple):
@@ -131,6 +132,7 @@ def _by_headers(found: dict, wanted: Sequence[Wanted], headers: Sequence[str], u
             bare.pop(header, None)
 
     take(TIME, lambda name: name in TIME_NAMES)
+    take(TIME, lambda name: name.lower() in DATE_NAMES)
     for one in wanted:
         name = plain(one.quantity.name).lower()
         take(one.key, lambda base, name=name: plain(base).lower() == name)

@@ -76,6 +76,48 @@ def test_units_are_converted(tmp_path):
             read_log(tmp_path / "b.csv", MODEL, columns | {"tach": f"motor[{unit}]"})
 
 
+DATES = ["2026-05-01T12:00:00.900", "2026-05-01T12:00:01", "2026-05-01T12:00:01.100", "2026-05-01T12:00:01.200"]
+
+
+@pytest.mark.parametrize("zone", ["", "Z", "+02:00"])
+def test_times_may_be_dates(tmp_path, zone):
+    rows = [f"{date}{zone},{k},{k * k}" for k, date in enumerate(DATES)]
+    log = log_of(tmp_path / "run.csv", "Timestamp,voltage,tach\n" + "\n".join(rows))
+    assert log.dt == pytest.approx(0.1) and log.start == 0.0 and log.steps == 3 and not log.irregular
+    apart = [
+        DATES[0] + "+02:00",
+        "2026-05-01T10:00:01Z",
+        "2026-05-01T13:00:01.100+03:00",
+    ]  # one clock, three zones
+    mixed = "t,voltage,tach\n" + "\n".join(f"{date},{k},{k}" for k, date in enumerate(apart))
+    assert log_of(tmp_path / "b.csv", mixed).dt == pytest.approx(0.1)
+    for wrong, said in (
+        ("noon", "times must be dates as of ISO 8601.*, but got 'noon' in line 4, column 't'"),
+        ("2026-05-01T12:00:02", "times must all have a time zone, or none, .* in column 't' of .*b.csv"),
+        ("", "every row must have a time, but there is none in line 4"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            log_of(tmp_path / "b.csv", mixed.replace(apart[2], wrong))
+
+
+def test_tables_of_pandas_have_dates_and_objects():
+    pandas = pytest.importorskip("pandas")
+    values = {"voltage": [1.0, 2.0, 3.0, 4.0], "tach": [2, None, "5", 7.5]}
+    for zone in (None, "Europe/Berlin"):
+        dates = pandas.to_datetime(DATES, format="ISO8601").tz_localize(zone)
+        column = pandas.DataFrame({"datetime": dates, **values}, columns=["datetime", "voltage", "tach"])
+        column["tach"] = column["tach"].astype(object)
+        for frame in (column, column.set_index("datetime"), column.assign(datetime=DATES)):
+            log = read_log(frame, MODEL)
+            assert log.dt == pytest.approx(0.1) and not log.irregular
+            np.testing.assert_array_equal(log.measurements[:, 0], [2.0, np.nan, 5.0, 7.5])
+    column.loc[2, "tach"] = "off"
+    with pytest.raises(
+        ValueError, match="columns must hold numbers, but got 'off' in row 3, column 'tach' of run"
+    ):
+        read_log(column, MODEL, name="run")
+
+
 def test_a_file_beside_tells_columns_units_and_clocks(tmp_path):
     pytest.importorskip("pint")
     (tmp_path / "run.toml").write_text(
