@@ -86,7 +86,7 @@ def read_log(
     beside = _described(Path(path)) if is_file else Description()
     said = beside.updated(Description(columns or {}, {}, clock_offset or {}, dt))
     wanted = quantities_of(model)
-    found = find_columns(wanted, table.names, said.columns, said.units, file)
+    found = find_columns(wanted, table.names, said.columns, said.units, file, needs_time=said.dt is None)
     grid, start = _grid(table, found.get(TIME), said.dt, file)
     offsets = _offsets(said.clock_offset, wanted, found, grid, file)
     source, parts, last = {}, {}, grid.rows - 1

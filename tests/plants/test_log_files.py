@@ -1,10 +1,12 @@
 """Logs in files: columns by name, units, what is said beside a file, and one line for what is wrong."""
 
+import sys
+
 import numpy as np
 import pytest
 
 from plants.logs.read import read_log
-from plants.logs.units import parted
+from plants.logs.units import converted, parted
 from plants.logs.write import write_columns, write_log
 from tests.plants.test_logs import MODEL, log_of
 from thruster_env.model import thruster_model
@@ -118,6 +120,39 @@ def test_tables_of_pandas_have_dates_and_objects():
         read_log(column, MODEL, name="run")
 
 
+@pytest.mark.parametrize(
+    ("unit", "wanted", "factor"),
+    [
+        ("mV", "V", 1e-3),
+        ("ms", "s", 1e-3),
+        ("µA", "A", 1e-6),
+        ("min", "s", 60.0),
+        ("rpm", "rad/s", 2 * np.pi / 60),
+        ("deg/min", "rad/s", np.pi / 180 / 60),
+        ("rad/s", "rpm", 60 / (2 * np.pi)),
+        ("mm/s^2", "m/s^2", 1e-3),
+        ("kNm", "N*m", 1e3),
+        ("g", "kg", 1e-3),
+    ],
+)
+def test_simple_units_need_no_package(monkeypatch, unit, wanted, factor):
+    monkeypatch.setitem(sys.modules, "pint", None)
+    np.testing.assert_allclose(converted(np.array([3.0]), unit, wanted, "here"), [3.0 * factor], rtol=1e-15)
+    for other in ("degC", "kgf", "min"):
+        with pytest.raises(ValueError, match="units must be converted by pint, which is not installed"):
+            converted(np.array([3.0]), other, "K", "here")
+
+
+def test_a_header_may_be_named_without_its_unit(tmp_path):
+    text = "t,U_mot [mV],n_mot (rpm)\n0,1000,60\n0.1,2000,120\n0.2,0,180\n"
+    log = log_of(tmp_path / "run.csv", text, columns={"V_s": "U_mot", "tach": "n_mot"})
+    np.testing.assert_allclose(log.inputs[:, 0], [1.0, 2.0])
+    np.testing.assert_allclose(log.measurements[:, 0], 2 * np.pi * np.array([1, 2, 3]))
+    two = text.replace("n_mot (rpm)", "U_mot [V]")
+    with pytest.raises(ValueError, match="the column for V_s must be one of t, U_mot"):
+        log_of(tmp_path / "run.csv", two, columns={"V_s": "U_mot"})
+
+
 def test_a_file_beside_tells_columns_units_and_clocks(tmp_path):
     pytest.importorskip("pint")
     (tmp_path / "run.toml").write_text(
@@ -173,6 +208,11 @@ def test_a_file_beside_tells_columns_units_and_clocks(tmp_path):
         (
             "t,voltage,speed\n0,1,2\n",
             r"a log must have a column for the measurement tachometer \[rad/s\] \(say --column",
+        ),
+        (
+            "clock,u,speed\n0,1,2\n",
+            r"for the input voltage \[V\] .*and for the measurement tachometer .* and for times \(say --column "
+            r"time=HEADER, or --dt\), but .* has clock, u, speed; in Python columns=\{'V_s': 'HEADER'\}",
         ),
     ],
 )
