@@ -170,7 +170,7 @@ def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  
             "give either --tuned FILE or --filter NAME",
         ),
         (("estimate", "run.csv", "--out", "est.txt"), "--out must end in .csv, .parquet or .npz"),
-        (("estimate", "run.csv", "--plot", "est.pdf"), "--plot must end in .png, but got 'est.pdf'"),
+        (("estimate", "run.csv", "--plot", "est.tex"), "--plot must end in .png, .svg or .pdf, but got"),
         (("estimate", "run.csv", "--skip", "9999"), "skip must be at most 60, but got 9999"),
         (("estimate", "run.csv", "--clock-offset", "thrust=late"), "--clock-offset thrust must be seconds"),
         (("estimate", "run.csv", "--clock-offset", "thrust=-0.6"), "thrust must be shorter than the log, 0.6 s"),
