@@ -1,4 +1,4 @@
-"""The common form of pictures, each saved as one PNG file."""
+"""The common form of pictures, each saved as one PNG, SVG or PDF file."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def thinned(x: np.ndarray, y: np.ndarray, keep: np.ufunc | None = None) -> tuple
 
 
 def save_figure(figure, path: str | Path) -> Path:
-    """Write a figure as SVG where the name ends in .svg, else as PNG, whole or not at all; return the path."""
-    form = "svg" if Path(path).suffix == ".svg" else "png"
+    """Write a figure as SVG or PDF where the name ends so, else as PNG, whole or not at all; return the path."""
+    form = {".svg": "svg", ".pdf": "pdf"}.get(Path(path).suffix, "png")
     write_whole(path, lambda stream: figure.savefig(stream, format=form))
     return Path(path)

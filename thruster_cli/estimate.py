@@ -74,7 +74,10 @@ def command(
         typer.Option(help="Estimates, bands and innovations as .csv, .parquet or .npz.", rich_help_panel=OUTPUT),
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Picture of all over time.", rich_help_panel=OUTPUT)
+        Path | None,
+        typer.Option(
+            metavar="FILE.png", help="Picture of all over time, .png, .svg or .pdf.", rich_help_panel=OUTPUT
+        ),
     ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
@@ -94,8 +97,8 @@ def command(
     tuned = one_file(file, tuned)
     if tuned is not None and filter_name is not None:
         raise ValueError(f"give either a tuned file or --filter NAME, but got both, {tuned} and {filter_name}")
-    if plot is not None and plot.suffix != ".png":
-        raise ValueError(f"--plot must end in .png, but got {str(plot)!r}")
+    if plot is not None:
+        check_suffix(plot, "--plot", (".png", ".svg", ".pdf"))
     if out is not None:
         check_suffix(out)
     recorded, offer = read_named(log, preset, model, sensor, column, clock_offset, dt)

@@ -27,7 +27,7 @@ from thruster_cli.problems import PROBLEMS
 from thruster_cli.tables import choice_table
 from tuning.api.evaluate import subject_of
 from tuning.api.held_out import on_held_out
-from tuning.evaluation.baselines import RULE, TUNED
+from tuning.evaluation.baselines import TUNED
 from tuning.reporting.error_tables import comparison_table
 from tuning.search.plan import HELD_OUT_SEEDS
 
@@ -88,11 +88,14 @@ def command(
     found = on_held_out(choice, chosen, seed, seeds, is_tuned=tuned is not None, console=progress_console)
     proof, data = found.proof, found.to_dict()
     where = f"held-out {chosen.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
-    shown: list[RenderableType] = [choice_table(found.choices, chosen)]
-    shown.append(comparison_table(found.evaluations, proof.bound, where, chosen.scale_about))
+    shown: list[RenderableType] = [
+        choice_table({proof.label(name): one for name, one in found.choices.items()}, chosen)
+    ]
+    evaluations = {proof.label(name): one for name, one in found.evaluations.items()}
+    shown.append(comparison_table(evaluations, proof.bound, where, chosen.scale_about))
     shown += found.sentences()
     if consistency is not None:
-        name = RULE if tuned is None else TUNED
+        name = proof.rule if tuned is None else TUNED
         with working("checking the covariance"):
             words, data["consistency"] = check_covariance(choice, name, chosen, proof, consistency)
         shown += words

@@ -10,6 +10,7 @@ import typer
 
 from filters.registry import FILTERS
 from numerics.checks import any_case
+from thruster_env.channels import CHANNELS
 from thruster_env.parameters import PRESETS
 
 # Panels, in the order in which commands declare their options.
@@ -94,7 +95,11 @@ ModelOption = Annotated[
 ]
 SensorOption = Annotated[
     list[str] | None,
-    typer.Option("--sensor", help="What the filter sees of a thruster: thrust, speed, ...", rich_help_panel=INPUT),
+    typer.Option(
+        "--sensor",
+        help=f"What the filter sees of a thruster, thrust by default: {', '.join(CHANNELS)}.",
+        rich_help_panel=INPUT,
+    ),
 ]
 ColumnOption = Annotated[
     list[str] | None,

@@ -35,7 +35,8 @@ def command(
     policy: Annotated[
         str | None,
         typer.Option(
-            help="pi: the controller, on the measured thrust, follows a reference.", rich_help_panel=INPUT
+            help="pi, the default: the controller on the measured thrust follows a reference.",
+            rich_help_panel=INPUT,
         ),
     ] = None,
     voltage: Annotated[float | None, typer.Option(help="A constant voltage [V].", rich_help_panel=INPUT)] = None,
@@ -96,6 +97,8 @@ def command(
     if filter_name is not None and tuned is not None:
         raise ValueError(f"give either --tuned FILE or --filter NAME, but got both, {tuned} and {filter_name}")
     chosen = {"MODEL": model, "--policy": policy, "--voltage": voltage, "--excitation": excitation, "--log": log}
+    if all(value is None for value in chosen.values()):
+        chosen["--policy"] = "pi"
     what = one_given(chosen)
     _check_options(what, {"--sensor": sensor, "--column": column}, ("--log",))
     _check_options(what, {"--steps": steps}, ("--policy", "--voltage", "--excitation"))

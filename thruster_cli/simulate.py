@@ -25,6 +25,7 @@ from tuning.problems.excitation import held_levels
 
 MOST_STEPS = 10_000_000  # which take a gigabyte
 TRUTH = ("time_s", "voltage_V", "omega_m_rad_per_s", "U_a_m_per_s", "thrust_N")
+HIDDEN = TRUTH[2:]  # from a recorder
 
 
 def command(
@@ -55,6 +56,14 @@ def command(
         typer.Option(help=f"What is measured, thrust by default: {', '.join(CHANNELS)}.", rich_help_panel=INPUT),
     ] = None,
     seed: SeedOption = 0,
+    measured_only: Annotated[
+        bool,
+        typer.Option(
+            "--measured-only",
+            help="Leave out true state and thrust: time, voltage and measurements, as a recorder has them.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = False,
     out: Annotated[
         Path,
         typer.Option(
@@ -64,6 +73,8 @@ def command(
     json: JsonOption = None,
 ) -> None:
     """Simulate a thruster and write time, voltage, true state, true thrust and measurements to a log.
+
+    With --measured-only the log is one as of a real thruster: whatever reads it has no truth to go by.
 
     Row k holds the state at time k dt and the voltage that acts from then on; the last row has none. The
     numbers are those of BowThruster-v0 after reset(seed=SEED) under the same voltages. A simulation that does not
@@ -99,6 +110,9 @@ def command(
         *run.measurements[0].T,
     ]
     columns = [*TRUTH, *(header_of(CHANNELS[channel].quantity) for channel in plant.channels)]
-    write_columns(out, dict(zip(columns, values, strict=True)))
-    data = {"file": str(out), "rows": steps + 1, "columns": columns, "seed": seed, "preset": preset}
-    emit([f"{steps + 1} rows of {', '.join(columns)} in {out}"], data, json)
+    table = dict(zip(columns, values, strict=True))
+    if measured_only:
+        table = {header: table[header] for header in columns if header not in HIDDEN}
+    write_columns(out, table)
+    data = {"file": str(out), "rows": steps + 1, "columns": list(table), "seed": seed, "preset": preset}
+    emit([f"{steps + 1} rows of {', '.join(table)} in {out}"], data, json)

@@ -44,12 +44,12 @@ def report(tuning: Tuning) -> list[RenderableType]:
     for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True):
         found = {TUNED: result.choice, **baselines(result.choice.name, scenario, plan.seed)}
         evaluations = proof.evaluations
-        choices = {name: found[name] for name in evaluations}
+        choices = {proof.label(name): found[name] for name in evaluations}
         span_of_seeds = f"{scenario.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}"
         where = f"held-out {span_of_seeds}, scenario {scenario.name}"
         shown += [
             choice_table(choices, scenario),
-            comparison_table(evaluations, proof.bound, where, scenario.scale_about),
+            comparison_table(proof.labelled, proof.bound, where, scenario.scale_about),
         ]
         shown.append(_consistency_sentence(proof.tuned))
         if proof.tuned.has_truth and isnan(proof.bound).all():

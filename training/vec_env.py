@@ -9,8 +9,10 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env import VecEnv
 
-from numerics.checks import one_of
+from numerics.checks import shown
 from training.spaces import box_of
+
+RULE = "env must be a vector env, of gym.make_vec(..., autoreset_mode='SameStep')"
 
 
 class NativeVecEnv(VecEnv):
@@ -26,12 +28,15 @@ class NativeVecEnv(VecEnv):
         env: a vector env that resets within the step (autoreset mode "SameStep"), with Box spaces.
 
     Raises:
-        ValueError: if the env resets in another mode.
+        ValueError: if the env is no vector env, or resets in another mode.
     """
 
     def __init__(self, env: gym.vector.VectorEnv):
         """Adapt the env; see the class."""
-        one_of("autoreset mode", AutoresetMode(env.metadata["autoreset_mode"]).value, ("SameStep",))
+        mode = env.metadata.get("autoreset_mode") if isinstance(env, gym.vector.VectorEnv) else None
+        if mode is None or AutoresetMode(mode) != AutoresetMode.SAME_STEP:
+            got = shown(env) if mode is None else f"one with autoreset mode {AutoresetMode(mode).value!r}"
+            raise ValueError(f"{RULE}, but got {got}")
         self.env = env
         self.arrays: dict[str, Any] = {}
         space = box_of(env.single_action_space)

@@ -13,6 +13,7 @@ from plants.state_space import StateSpaceModel
 INPUT, MEASUREMENT, STATE, OUTPUT = "input", "measurement", "state", "output"
 TIME = "time"
 TIME_NAMES = ("t", "time", "Time", "TIME", "timestamp", "stamp")
+DATE_NAMES = ("timestamp", "datetime", "date_time", "date time")
 
 
 class Wanted(NamedTuple):
@@ -62,6 +63,9 @@ def column_of(text: str, headers: Sequence[str], units: Mapping[str, str], what:
     if text not in headers and text.endswith("]"):
         bare, _, unit = text[:-1].rpartition("[")
         bare, unit = bare.strip(), unit.strip()
+    if bare not in headers:  # the header without its unit will do
+        same = [header for header in headers if parted(header)[0] == bare]
+        bare = same[0] if len(same) == 1 else bare
     if bare not in headers:
         raise ValueError(f"the column for {what} must be one of {', '.join(headers)}, but got {bare!r} ({file})")
     return Column(bare, unit or units.get(bare) or parted(bare)[1])
@@ -73,6 +77,7 @@ def find_columns(
     given: Mapping[str, str],
     units: Mapping[str, str],
     file: str,
+    needs_time: bool = False,
 ) -> dict[str, Column]:
     """Find the column of each quantity that the file has, and of "time", by key.
 
@@ -86,6 +91,7 @@ def find_columns(
         given: columns by quantity: "thrust" or "output:T", and "time", to "loadcell_N" or "loadcell[N]".
         units: by header, where the header gives none or another one.
         file: for messages.
+        needs_time: whether a missing column of times is named with other missing ones.
 
     Raises:
         ValueError: for a quantity that the model has not, a column that the file has not, or one given twice.
@@ -108,17 +114,28 @@ def find_columns(
         if header not in headers:
             raise ValueError(f"units must be of columns {', '.join(headers)}, but got {header!r} ({file})")
     _by_headers(found, wanted, headers, units)
-    for kind in (INPUT, MEASUREMENT):
-        for one in wanted:
-            if one.kind == kind and one.key not in found:
-                name = plain(one.quantity.name)
-                raise ValueError(
-                    f"a log must have a column for the {kind} {one.quantity.label} (say --column "
-                    f"{one.quantity.symbol}=HEADER, in Python "
-                    f"columns={{{one.quantity.symbol!r}: 'HEADER'}}, or call it {name}), but "
-                    f"{file} has {', '.join(headers)}"
-                )
+    _check_found(found, wanted, headers, needs_time, file)
     return found
+
+
+def _check_found(
+    found: Mapping[str, Column], wanted: Sequence[Wanted], headers: Sequence[str], needs_time: bool, file: str
+) -> None:
+    """Raise ValueError, naming all that is missing, unless inputs, measurements and times are there."""
+    missing = [one for one in wanted if one.kind in (INPUT, MEASUREMENT) and one.key not in found]
+    if not missing:
+        return
+    said = [
+        f"the {one.kind} {one.quantity.label} (say --column {one.quantity.symbol}=HEADER, or call it "
+        f"{plain(one.quantity.name)})"
+        for one in missing
+    ]
+    if needs_time and TIME not in found:
+        said.append("times (say --column time=HEADER, or --dt)")
+    python = f"in Python columns={{{missing[0].quantity.symbol!r}: 'HEADER'}}"
+    raise ValueError(
+        f"a log must have a column for {' and for '.join(said)}, but {file} has {', '.join(headers)}; {python}"
+    )
 
 
 def _by_headers(found: dict, wanted: Sequence[Wanted], headers: Sequence[str], units: Mapping[str, str]) -> None:
@@ -133,6 +150,7 @@ def _by_headers(found: dict, wanted: Sequence[Wanted], headers: Sequence[str], u
             bare.pop(header, None)
 
     take(TIME, lambda name: name in TIME_NAMES)
+    take(TIME, lambda name: name.lower() in DATE_NAMES)
     for one in wanted:
         name = plain(one.quantity.name).lower()
         take(one.key, lambda base, name=name: plain(base).lower() == name)

@@ -52,7 +52,8 @@ def read_log(
     """Read a log of a model's inputs and measurements from a file; columns of states and outputs are references.
 
     Columns are found by their headers (`plants.logs.columns.find_columns`), converted to the model's units
-    (`plants.logs.units`) and put on a grid (`plants.logs.grid`). A file beside it, run.toml for run.csv, may say
+    (`plants.logs.units`) and put on a grid (`plants.logs.grid`). Times are numbers, or dates as of ISO 8601, of
+    which the first is time 0. A file beside it, run.toml for run.csv, may say
 
         dt = 0.01
         [columns]
@@ -85,7 +86,7 @@ def read_log(
     beside = _described(Path(path)) if is_file else Description()
     said = beside.updated(Description(columns or {}, {}, clock_offset or {}, dt))
     wanted = quantities_of(model)
-    found = find_columns(wanted, table.names, said.columns, said.units, file)
+    found = find_columns(wanted, table.names, said.columns, said.units, file, needs_time=said.dt is None)
     grid, start = _grid(table, found.get(TIME), said.dt, file)
     offsets = _offsets(said.clock_offset, wanted, found, grid, file)
     source, parts, last = {}, {}, grid.rows - 1
@@ -158,7 +159,10 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str) -> t
                 f"{file} has {', '.join(table.names)}"
             )
         return Grid(dt, count, dt * np.arange(count), False), 0.0
-    stamps = converted(table.numbers(column.header), column.unit, SECOND, f"column {column.header!r} of {file}")
+    stamps = table.dates(column.header)
+    if stamps is None:
+        where = f"column {column.header!r} of {file}"
+        stamps = converted(table.numbers(column.header), column.unit, SECOND, where)
     if np.isnan(stamps).any():
         row = int(np.argmax(np.isnan(stamps)))
         raise ValueError(f"every row must have a time, but there is none in {table.place(row, column.header)}")

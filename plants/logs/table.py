@@ -14,8 +14,12 @@ import numpy as np
 
 from numerics.checks import shown
 from numerics.extras import to_install
+from plants.logs.stamps import MISSING as MISSING_TEXT
+from plants.logs.stamps import seconds_of, since_first
 
-MISSING = {"", "nan", "na", "n/a", "null", "none"}  # what stands for a missing number, in any case of letters
+# What stands for a missing number, in any case of letters.
+MISSING = ("", "nan", "na", "n/a", "null", "none", "<na>", "nat")
+DATES = "times must be dates as of ISO 8601, such as 2026-05-01T12:00:00.01"
 DELIMITERS = ",;\t"
 TIME_HEADER = "time_s"  # of an index of dates
 SUFFIXES = (".csv", ".parquet", ".npz")
@@ -50,13 +54,14 @@ class Table:
         """A column as float64 (rows,), NaN where a number is missing; ValueError for text and infinite numbers."""
         cells = self.cells[column]
         if isinstance(cells, np.ndarray):
-            if cells.dtype.kind not in "biuf" or cells.ndim != 1:
+            if cells.dtype.kind not in "biufOU" or cells.ndim != 1:
                 raise ValueError(
                     f"columns must hold numbers, but column {column!r} of {self.file} holds {cells.dtype}"
                 )
+        if isinstance(cells, np.ndarray) and cells.dtype.kind not in "OU":
             found = cells.astype(np.float64)
         else:
-            texts = ["nan" if cell.lower() in MISSING else cell for cell in cells]
+            texts = _texts(cells)
             try:
                 found = np.array(texts, dtype=np.float64)
             except ValueError:
@@ -67,6 +72,33 @@ class Table:
             row = int(np.argmax(np.isinf(found)))
             raise ValueError(f"numbers must be finite, but got {found[row]} in {self.place(row, column)}")
         return found
+
+    def dates(self, column: str) -> np.ndarray | None:
+        """Seconds since the first date of a column, (rows,), NaN for a missing one; None where it has no dates."""
+        cells = self.cells[column]
+        if isinstance(cells, np.ndarray) and cells.dtype.kind not in "mMOU":
+            return None
+        if isinstance(cells, np.ndarray) and cells.dtype.kind in "mM":
+            return since_first(cells)
+        texts = _texts(cells)
+        if all(map(_is_number, texts)):
+            return None
+        try:
+            found = seconds_of(texts)
+        except ValueError as error:
+            raise ValueError(f"{error} in column {column!r} of {self.file}") from None
+        if found is None:
+            return None
+        for row, text in enumerate(texts):
+            if text != MISSING_TEXT and np.isnan(found[row]):
+                raise ValueError(f"{DATES}, but got {shown(text)} in {self.place(row, column)}")
+        return found
+
+
+def _texts(cells: Sequence | np.ndarray) -> list[str]:
+    """Cells as texts, "nan" for what is missing."""
+    texts = [str(cell).strip() for cell in cells]
+    return [MISSING_TEXT if text.lower() in MISSING else text for text in texts]
 
 
 def read_table(path: str | Path) -> Table:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 import numpy as np
@@ -13,6 +14,16 @@ WORDS = (
     *("N", "mN", "kN", "kgf", "lbf", "Nm", "kg", "g", "Pa", "kPa", "bar", "K", "degC"),
     *("m", "mm", "cm", "km", "s", "ms", "us", "ns", "min", "h"),
 )
+PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
+PREFIXED = ("V", "A", "W", "N", "N*m", "Pa", "Hz", "g", "m", "s", "rad", "K")
+# Units as multiples of others; degrees Celsius are none.
+MULTIPLES = {
+    "rpm": ("rad/s", 2.0 * math.pi / 60.0),
+    "min": ("s", 60.0),
+    "h": ("s", 3600.0),
+    "deg": ("rad", math.pi / 180.0),
+    "turn": ("rad", 2.0 * math.pi),
+}
 WRITTEN = {"Nm": "N*m"}  # as pint reads them
 LENGTHS = ("rad", "deg", "m", "mm", "cm", "km")  # over a time even without "_per_"
 _RATE = re.compile(r"^(?P<base>.*?)_(?P<over>[A-Za-z]+)(?P<per>_per)?_(?P<under>s|min|h)(?P<power>[23]?)$")
@@ -42,6 +53,22 @@ def suffix(unit: str) -> str:
     return unit.replace("/", "_per_").replace("^", "").replace("*", "").replace(" ", "")
 
 
+def simple(unit: str) -> tuple[str, float]:
+    """A unit without prefix and the factor to it: ("V", 0.001) of "mV"; what is not known here is itself.
+
+    Known are SI prefixes, minutes, hours, degrees, turns and rpm, also as parts of a quotient.
+    """
+    unit = WRITTEN.get(unit, unit)
+    if unit in MULTIPLES:
+        return MULTIPLES[unit]
+    over, slash, under = unit.partition("/")
+    if slash:
+        (above, factor), (below, divisor) = simple(over), simple(under)
+        return f"{above}/{below}", factor / divisor
+    prefix, base = unit[:1], WRITTEN.get(unit[1:], unit[1:])
+    return (base, PREFIXES[prefix]) if prefix in PREFIXES and base in PREFIXED else (unit, 1.0)
+
+
 def converted(values: np.ndarray, unit: str | None, wanted: str, where: str) -> np.ndarray:
     """Convert values to another unit; unchanged where a column gives no unit, or the wanted one.
 
@@ -52,11 +79,14 @@ def converted(values: np.ndarray, unit: str | None, wanted: str, where: str) -> 
         where: the column, for messages.
 
     Raises:
-        ValueError: if pint, which converts, does not know a unit or is not installed, or it is one of something
-            else.
+        ValueError: if pint, which converts what `simple` does not, does not know a unit or is not installed, or it
+            is one of something else.
     """
     if unit is None or unit == wanted:
         return values
+    (given, factor), (target, of_wanted) = simple(unit), simple(wanted)
+    if given == target:
+        return values * (factor / of_wanted)
     try:
         import pint
     except ImportError:

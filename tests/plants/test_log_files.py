@@ -1,10 +1,12 @@
 """Logs in files: columns by name, units, what is said beside a file, and one line for what is wrong."""
 
+import sys
+
 import numpy as np
 import pytest
 
 from plants.logs.read import read_log
-from plants.logs.units import parted
+from plants.logs.units import converted, parted
 from plants.logs.write import write_columns, write_log
 from tests.plants.test_logs import MODEL, log_of
 from thruster_env.model import thruster_model
@@ -76,6 +78,81 @@ def test_units_are_converted(tmp_path):
             read_log(tmp_path / "b.csv", MODEL, columns | {"tach": f"motor[{unit}]"})
 
 
+DATES = ["2026-05-01T12:00:00.900", "2026-05-01T12:00:01", "2026-05-01T12:00:01.100", "2026-05-01T12:00:01.200"]
+
+
+@pytest.mark.parametrize("zone", ["", "Z", "+02:00"])
+def test_times_may_be_dates(tmp_path, zone):
+    rows = [f"{date}{zone},{k},{k * k}" for k, date in enumerate(DATES)]
+    log = log_of(tmp_path / "run.csv", "Timestamp,voltage,tach\n" + "\n".join(rows))
+    assert log.dt == pytest.approx(0.1) and log.start == 0.0 and log.steps == 3 and not log.irregular
+    apart = [
+        DATES[0] + "+02:00",
+        "2026-05-01T10:00:01Z",
+        "2026-05-01T13:00:01.100+03:00",
+    ]  # one clock, three zones
+    mixed = "t,voltage,tach\n" + "\n".join(f"{date},{k},{k}" for k, date in enumerate(apart))
+    assert log_of(tmp_path / "b.csv", mixed).dt == pytest.approx(0.1)
+    for wrong, said in (
+        ("noon", "times must be dates as of ISO 8601.*, but got 'noon' in line 4, column 't'"),
+        ("2026-05-01T12:00:02", "times must all have a time zone, or none, .* in column 't' of .*b.csv"),
+        ("", "every row must have a time, but there is none in line 4"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            log_of(tmp_path / "b.csv", mixed.replace(apart[2], wrong))
+
+
+def test_tables_of_pandas_have_dates_and_objects():
+    pandas = pytest.importorskip("pandas")
+    values = {"voltage": [1.0, 2.0, 3.0, 4.0], "tach": [2, None, "5", 7.5]}
+    for zone in (None, "Europe/Berlin"):
+        dates = pandas.to_datetime(DATES, format="ISO8601").tz_localize(zone)
+        column = pandas.DataFrame({"datetime": dates, **values}, columns=["datetime", "voltage", "tach"])
+        column["tach"] = column["tach"].astype(object)
+        for frame in (column, column.set_index("datetime"), column.assign(datetime=DATES)):
+            log = read_log(frame, MODEL)
+            assert log.dt == pytest.approx(0.1) and not log.irregular
+            np.testing.assert_array_equal(log.measurements[:, 0], [2.0, np.nan, 5.0, 7.5])
+    column.loc[2, "tach"] = "off"
+    with pytest.raises(
+        ValueError, match="columns must hold numbers, but got 'off' in row 3, column 'tach' of run"
+    ):
+        read_log(column, MODEL, name="run")
+
+
+@pytest.mark.parametrize(
+    ("unit", "wanted", "factor"),
+    [
+        ("mV", "V", 1e-3),
+        ("ms", "s", 1e-3),
+        ("µA", "A", 1e-6),
+        ("min", "s", 60.0),
+        ("rpm", "rad/s", 2 * np.pi / 60),
+        ("deg/min", "rad/s", np.pi / 180 / 60),
+        ("rad/s", "rpm", 60 / (2 * np.pi)),
+        ("mm/s^2", "m/s^2", 1e-3),
+        ("kNm", "N*m", 1e3),
+        ("g", "kg", 1e-3),
+    ],
+)
+def test_simple_units_need_no_package(monkeypatch, unit, wanted, factor):
+    monkeypatch.setitem(sys.modules, "pint", None)
+    np.testing.assert_allclose(converted(np.array([3.0]), unit, wanted, "here"), [3.0 * factor], rtol=1e-15)
+    for other in ("degC", "kgf", "min"):
+        with pytest.raises(ValueError, match="units must be converted by pint, which is not installed"):
+            converted(np.array([3.0]), other, "K", "here")
+
+
+def test_a_header_may_be_named_without_its_unit(tmp_path):
+    text = "t,U_mot [mV],n_mot (rpm)\n0,1000,60\n0.1,2000,120\n0.2,0,180\n"
+    log = log_of(tmp_path / "run.csv", text, columns={"V_s": "U_mot", "tach": "n_mot"})
+    np.testing.assert_allclose(log.inputs[:, 0], [1.0, 2.0])
+    np.testing.assert_allclose(log.measurements[:, 0], 2 * np.pi * np.array([1, 2, 3]))
+    two = text.replace("n_mot (rpm)", "U_mot [V]")
+    with pytest.raises(ValueError, match="the column for V_s must be one of t, U_mot"):
+        log_of(tmp_path / "run.csv", two, columns={"V_s": "U_mot"})
+
+
 def test_a_file_beside_tells_columns_units_and_clocks(tmp_path):
     pytest.importorskip("pint")
     (tmp_path / "run.toml").write_text(
@@ -131,6 +208,11 @@ def test_a_file_beside_tells_columns_units_and_clocks(tmp_path):
         (
             "t,voltage,speed\n0,1,2\n",
             r"a log must have a column for the measurement tachometer \[rad/s\] \(say --column",
+        ),
+        (
+            "clock,u,speed\n0,1,2\n",
+            r"for the input voltage \[V\] .*and for the measurement tachometer .* and for times \(say --column "
+            r"time=HEADER, or --dt\), but .* has clock, u, speed; in Python columns=\{'V_s': 'HEADER'\}",
         ),
     ],
 )

@@ -81,6 +81,22 @@ def test_what_is_simulated_has_the_sensors_that_are_asked_for(thruster, as_json)
     assert set(as_json("estimate", "run.csv", *options[2:])["one_step_ahead"]) == {"thrust", "speed"}
 
 
+def test_a_simulated_log_may_be_without_truth(thruster, as_json):  # noqa: F811
+    options = "--steps", 60, "--seed", 3, "--sensor", "thrust", "--sensor", "speed"
+    as_json("simulate", "--out", "whole.csv", *options)
+    data = as_json("simulate", "--out", "run.csv", *options, "--measured-only")
+    measured = ["time_s", "voltage_V", "measured_thrust_N", "measured_speed_rad_per_s"]
+    table, whole = (np.genfromtxt(name, delimiter=",", names=True) for name in ("run.csv", "whole.csv"))
+    assert data["columns"] == list(table.dtype.names) == measured
+    for name in measured:
+        np.testing.assert_array_equal(table[name], whole[name])
+    told = as_json("estimate", "run.csv", "--skip", 9)
+    assert (
+        not told["references"]
+        and told["log_likelihood"] == as_json("estimate", "whole.csv", "--skip", 9)["log_likelihood"]
+    )
+
+
 def test_a_load_cell_is_held_against_what_the_tachometer_tells(simulated, as_json):  # noqa: F811
     simulated("run.csv")
     columns = "--column", "speed=omega_m_rad_per_s", "--column", "thrust=thrust_N"
@@ -154,7 +170,7 @@ def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  
             "give either a tuned file or --filter NAME",
         ),
         (("estimate", "run.csv", "--out", "est.txt"), "--out must end in .csv, .parquet or .npz"),
-        (("estimate", "run.csv", "--plot", "est.pdf"), "--plot must end in .png, but got 'est.pdf'"),
+        (("estimate", "run.csv", "--plot", "est.tex"), "--plot must end in .png, .svg or .pdf, but got"),
         (("estimate", "run.csv", "--skip", "9999"), "skip must be at most 60, but got 9999"),
         (("estimate", "run.csv", "--clock-offset", "thrust=late"), "--clock-offset thrust must be seconds"),
         (("estimate", "run.csv", "--clock-offset", "thrust=-0.6"), "thrust must be shorter than the log, 0.6 s"),

@@ -29,6 +29,11 @@ def test_pi_follows_a_reference_under_an_estimate(as_json, frames):  # noqa: F81
     assert path.name == "x.gif" and rate == 25 and len(pictures) == 4 and pictures[0].shape[2] == 3
 
 
+def test_alone_it_plays_pi(as_json, frames):  # noqa: F811
+    alone = as_json("play", "--steps", 8, "--out", "x.gif")
+    assert alone == as_json("play", "--policy", "pi", "--steps", 8, "--out", "x.gif") and alone["steps"] == 8
+
+
 @pytest.mark.parametrize("option", [("--voltage", 8), ("--excitation", "prbs")])
 def test_voltages_drive_the_thruster(as_json, frames, monkeypatch, option):  # noqa: F811
     seen = []
@@ -81,7 +86,6 @@ def test_where_a_log_has_no_truth_the_estimate_moves_the_propeller(thruster, tmp
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ((), "play must be given one of MODEL, --policy, --voltage, --excitation, --log, but got none"),
         (("--policy", "pi", "--voltage", 3), "but got --policy and --voltage"),
         (("--policy", "ip"), "policy must be one of pi, but got 'ip'"),
         (("--excitation", "stebs"), "but got 'stebs'; did you mean 'steps'?"),

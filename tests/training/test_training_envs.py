@@ -102,8 +102,12 @@ def test_attributes_and_methods_are_those_of_all_copies():
 
 
 def test_only_envs_that_reset_within_the_step_are_taken():
-    with pytest.raises(ValueError, match="autoreset mode must be one of SameStep, but got 'NextStep'"):
+    with pytest.raises(
+        ValueError, match="make_vec.*autoreset_mode='SameStep'.*, but got one with autoreset mode 'NextStep'"
+    ):
         native(autoreset_mode="NextStep")
+    with pytest.raises(ValueError, match="env must be a vector env, of gym.make_vec"):
+        NativeVecEnv(gym.make("BowThruster-v0"))
 
 
 class Still:

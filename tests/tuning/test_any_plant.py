@@ -13,6 +13,7 @@ from numerics.compiled import interpreted
 from tests.linear_problem import LinearProblem
 from thruster_cli import consistency
 from thruster_cli.tables import choice_table
+from thruster_cli.tuning_report import gains
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
 from tuning.evaluation.held_out import Comparison
@@ -106,7 +107,13 @@ def test_without_truth_the_innovations_stay(proofs):
     assert said["rmse"] == [None] * 3 and said["score"] is said["nees"] is None and said["nis"] is not None
     gain = likelihood_gain(blind.true, blind.untuned)
     assert 0 < gain.low < gain.value == pytest.approx(without.log_likelihood - blind.untuned.log_likelihood)
-    assert worth(blind).startswith("changes the log-likelihood of a run by +")
+    assert worth(blind).startswith("raises the log-likelihood of a run by ")
+    worse = blind._replace(tuned=blind.untuned, untuned=blind.tuned)
+    loss = worse.likelihood_gains["rule of thumb"]
+    assert loss.low < loss.high < 0
+    size = f"{-loss.value:.2f} [{-loss.high:.2f}, {-loss.low:.2f}]"
+    assert worth(worse).startswith(f"lowers the log-likelihood of a run by {size} against the rule of thumb")
+    assert f"{size} below that of the rule of thumb" in " ".join(gains(worse, "runs"))
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,14 @@ def test_estimate_is_the_command_in_one_call(as_json, runs, tmp_path):  # noqa: 
     assert "mean NIS over channels" in repr(mine) and len(repr(mine)) < 200 and "nan" not in mine._repr_html_()
 
 
+def test_a_pair_of_model_and_log_is_the_same(recorded):
+    alone = tuning.estimate(recorded[0], model="tunnel_physical", sensors=WHOSE["sensors"])
+    pair = tuning.estimate(("tunnel_physical", recorded[0]), sensors=WHOSE["sensors"])
+    assert pair.log_likelihood == alone.log_likelihood
+    with pytest.raises(ValueError, match="'mass'"):  # the logs of the pair are read as those of the thruster
+        tuning.identify(("tunnel_physical", [recorded[0]]), "mass", sensors=WHOSE["sensors"])
+
+
 def test_estimates_are_drawn_and_copied(recorded):
     mine = tuning.estimate(recorded[0], **WHOSE)
     whole, innovations = mine.plot_states(), mine.plot_innovations()
@@ -98,6 +106,12 @@ WRONG = [
     ),
     (lambda log: tuning.estimate(log, 5, **WHOSE), "what is tuned must be a tuned file or a Study, but got 5"),
     (lambda log: tuning.estimate(log, lag=3, **WHOSE), "a lag must be that of a smoother, but got lag 3"),
+    (lambda log: tuning.identify(log, lambda dt: None), "free must be names of parameters, but got .*model=..."),
+    (
+        lambda log: tuning.identify(log, FREE, model="motor"),
+        "or a thruster's preset, but got 'motor'",
+    ),
+    (lambda log: tuning.estimate(("tunnel", log), model="a:b"), "a pair .* must come without another model"),
     (lambda log: tuning.identify([]), "at least one log must be left to learn from"),
     (lambda log: tuning.identify(log, "mass", **WHOSE), "free parameters must be of .*, but got 'mass'"),
     (lambda log: tuning.identify(log, model="tunnel", preset="t200"), "give either a model or a preset"),

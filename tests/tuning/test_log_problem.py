@@ -14,15 +14,18 @@ from plants.affine import affine_model
 from plants.logs.log import Log
 from plants.simulate import simulate
 from studies.hidden_truth import hide_truth
+from tuning.evaluation.baselines import rule_label
 from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.sizes import close_size
+from tuning.evaluation.worth import scaling_sentence, worth
 from tuning.likelihood.gradient import maximise_likelihood
 from tuning.likelihood.identifiability import identify
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem
 from tuning.problems.log_parts import LEAD, parts_of
 from tuning.problems.log_problem import LogProblem
+from tuning.reporting.tables import errors_table, numbers_table
 from tuning.search.plan import Plan
 from tuning.search.space import size_ladder, untuned_choice
 from tuning.search.study import open_study, run_study
@@ -149,6 +152,20 @@ def test_the_noise_of_a_simulation_is_found_again_without_its_truth():
     assert proof.likelihood_gains["rule of thumb"].low > 0
     known = identify(result.choice, (problem,), plan.training_data(), plan.space())
     assert known.identified.all() and (known.factors < 3).all()  # the errors of blocks of two runs are finite
+    assert "The scaled default is the model's Q times" in scaling_sentence(proof)  # for the model has no ranges
+    assert "give the model state_low and state_high" in scaling_sentence(proof)
+    assert "against the model's Q" in worth(proof) and "rule of thumb" not in worth(proof)
+    assert [row[0] for row in errors_table(problem, proof).rows][:2] == ["model's Q", "scaled default"]
+    assert "model's Q" in numbers_table(result.choice, problem, 0, proof.default).columns
+
+
+def test_what_has_ranges_has_a_rule_of_thumb():
+    ranged = GUESS.replace(state_low=[0.0], state_high=[5.0])
+    for problem in (LogProblem(logs_of(600), ranged), LogProblem(logs_of(600, truth=True), GUESS)):
+        assert not problem.lacks_ranges and rule_label(problem) == "rule of thumb"
+    problem = LogProblem(logs_of(600), GUESS)
+    assert problem.lacks_ranges and problem.untuned["process_noise_cov"] == (GUESS.process_noise_cov[0, 0],)
+    assert not LogProblem(logs_of(600), GUESS, untuned={"process_noise_cov": (1.0,)}).lacks_ranges
 
 
 def test_true_states_in_the_logs_give_a_scale_and_runs_of_their_own_for_the_ensemble_size():

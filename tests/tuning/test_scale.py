@@ -68,7 +68,7 @@ def test_another_content_of_a_file_is_another_study(file):
     text = "scale = [1.0, 0.05]\nsteps = 60\nmeasurement_noise_cov = {}"
     open_study("s", Plan("ekf", (file(text.format(1.0)),)), storage)
     open_study("s", Plan("ekf", (file(text.format(1.0) + "\nabout = 'the same'"),)), storage)
-    rule = "study 's' must be for {'scenario_digests': .*, but it was made for {'scenario_digests'"
+    rule = "'s' exists here for another model or other logs: give it another name"
     with pytest.raises(ValueError, match=rule):
         open_study("s", Plan("ekf", (file(text.format(2.0)),)), storage)
 

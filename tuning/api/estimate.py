@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 from filters.logs.estimate import estimate as estimate_log
 from filters.logs.findings import findings
 from numerics.checks import shown
-from numerics.modules import is_code
 from tuning.api.estimates import LogEstimates
 from tuning.logs.problem import name_of
 from tuning.logs.read import read_named
+from tuning.logs.whose import whose_logs
 
 if TYPE_CHECKING:
     from tuning.api.study import Study
@@ -49,7 +49,7 @@ def estimate(
 
     Args:
         log: the path of a .csv, .parquet or .npz file; a table, as a pandas.DataFrame or a mapping from headers to
-            arrays; or a `Log`.
+            arrays; or a `Log`; or a pair (model, log).
         tuned: a tuned file or a `Study`: filter, Q, R and the like.
         filter: without these, the name of a filter, or somebody's estimator; "ekf" if None.
         model: whose log it is, in place of a thruster: a `StateSpaceModel`, what makes or offers one,
@@ -73,8 +73,7 @@ def estimate(
     """
     if tuned is not None and filter is not None:
         raise ValueError(f"give either a tuned file or a filter, but got both, {shown(tuned)} and {shown(filter)}")
-    if isinstance(model, str | Path) and not is_code(str(model)):
-        preset, model = (model, None) if preset is None else (preset, model)
+    log, model, preset = whose_logs(log, model, preset)
     named = {"preset": preset, "model": model, "sensors": sensors, "columns": columns}
     read, offer = read_named(log, **named, clock_offset=clock_offset, dt=dt, name=name_of(log, 0))
     with _as_file(tuned) as file:

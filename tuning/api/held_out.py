@@ -150,7 +150,7 @@ class HeldOut:
             others = {name: one for name, one in self.choices.items() if name != TUNED}
             first = SCALED if SCALED in others else RULE
             pair = {first: others[first], TUNED: self.choice}
-        filters = {name: one.filter(self.problem) for name, one in pair.items()}
+        filters = {self.proof.label(name): one.filter(self.problem) for name, one in pair.items()}
         data, scored = self.problem.data(self.seeds), self.evaluation.scored or None
         return drawn(draw_estimates(filters, data, place, self.problem.dt, scored))
 
@@ -172,7 +172,9 @@ class HeldOut:
         what = f"{label_of(self.choice.name)} on {self.problem.name}, {seeds}"
         if not self.evaluation.has_truth:
             return f"HeldOut({what}: log-likelihood of a run {number(self.evaluation.log_likelihood)})"
-        ratios = [f"{about(one)} x {name}" for name, one in self.ratios.items()][: int(self.is_tuned)]
+        ratios = [f"{about(one)} x {self.proof.label(name)}" for name, one in self.ratios.items()][
+            : int(self.is_tuned)
+        ]
         return f"HeldOut({', '.join([f'{what}: score {about(self.score)}', *ratios])})"
 
     def __str__(self) -> str:
@@ -195,7 +197,7 @@ class HeldOut:
             found = [number(one.log_likelihood, ".2f")]
             if truth:
                 found = [*(about(rmse) for rmse in one.rmse), about(one.score), number(one.nees.value, ".3g")]
-            rows.append([name, *found, number(one.nis.value, ".3g")])
+            rows.append([self.proof.label(name), *found, number(one.nis.value, ".3g")])
         what = "RMSE" if truth else "Log-likelihood of the innovations of a run, and their mean NIS,"
         title = f"{what} on {len(self.seeds)} held-out {self.problem.seed_word} of {self.problem.name}"
         note = "In brackets 95 % intervals. Score: mean over states of RMSE over scale." if truth else ""

@@ -10,7 +10,6 @@ from typing import Any
 from rich.console import Console
 
 from numerics.checks import shown
-from numerics.modules import is_code
 from plants.logs.log import Log
 from tuning.api.identified import Identified
 from tuning.api.progress import console_for
@@ -22,6 +21,7 @@ from tuning.identification.identify import identify as identify_runs
 from tuning.identification.objective import Objective
 from tuning.identification.validation import validate
 from tuning.logs.identify import check_offsets, family_of, split_runs
+from tuning.logs.whose import whose_logs
 from tuning.problems.parameter import Parameter
 
 
@@ -59,7 +59,8 @@ def identify(
         found.save("mine.toml")
 
     Args:
-        logs: one recorded run or several: paths of .csv, .parquet or .npz files, tables, or `Log`s.
+        logs: one recorded run or several: paths of .csv, .parquet or .npz files, tables, or `Log`s; or a pair
+            (model, logs).
         free: names of what is to be found; of a thruster its damping, gain and lift by default.
         model: in place of a thruster: a function that makes a `StateSpaceModel` (of dt, if it takes it), a model,
             "module:object" for either, or a thruster's preset.
@@ -88,19 +89,27 @@ def identify(
         ValueError: states the rule and the value.
         KeyboardInterrupt: after Ctrl-C before there is a best so far.
     """
-    if isinstance(model, str | Path) and not is_code(str(model)):
-        if preset is not None:
-            raise ValueError(f"give either a model or a preset, but got both, {shown(model)} and {shown(preset)}")
-        preset, model = model, None
+    names = names_of(free)
+    logs, model, preset = whose_logs(logs, model, preset)
     whose: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensors}
     read: dict[str, Any] = {**whose, "columns": columns, "clock_offset": clock_offset, "dt": dt}
     runs, proving = split_runs(logs, held_out, use_all=use_all, **read)
-    names = [free] if isinstance(free, str) else list(free)
     family = family_of(runs, names, **whose, noise=noise, filter=filter)
     search: dict[str, Any] = {"predicted": tuple(predicted), "degrees": degrees, "gate": gate, "starts": starts}
     return identified(
         family, runs, proving, ranges, start, console_for(progress), filter=filter, seed=seed, **search
     )
+
+
+def names_of(free: Any) -> list[str]:
+    """Names of free parameters as a list; ValueError for anything but one name or some."""
+    names = [free] if isinstance(free, str) else list(free) if isinstance(free, list | tuple) else None
+    if names is None or not all(isinstance(name, str) for name in names):
+        raise ValueError(
+            f"free must be names of parameters, but got {shown(free)}: a model is given as model=..., or with the "
+            "logs as the pair (model, logs)"
+        )
+    return names
 
 
 def identified(

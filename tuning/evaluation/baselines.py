@@ -21,6 +21,8 @@ from tuning.search.space import Choice, oracle_choice, untuned_choice
 
 # Their names in tables, sentences and pictures.
 SCALED, RULE, ORACLE, TUNED = "scaled default", "rule of thumb", "oracle", "tuned"
+MODEL_Q = "model's Q"  # the rule of thumb's name in these where there is no range for it to take 1 % of
+NO_RANGES = f"No ranges: the {MODEL_Q} is taken in place of a {RULE}; give the model state_low and state_high."
 DECADES = 8  # powers of ten, up and down, within which the factor on Q is searched
 DIGITS = 4  # to which the factor is rounded, so that the printed factor is the one in use
 CLOSE = 0.02  # tolerance of the mean NIS about 1: that of an ensemble need not be continuous in Q
@@ -38,6 +40,11 @@ class Scaled(NamedTuple):
 def rule_of_thumb(name: str, scenario: Problem) -> Choice:
     """R from the sensor's data sheet, Q = diag((1 % of each state's range)^2), N = 30 (particles: 1000)."""
     return untuned_choice(name, scenario)
+
+
+def rule_label(scenario: Problem) -> str:
+    """What the rule of thumb is called in tables and sentences on a problem."""
+    return MODEL_Q if scenario.lacks_ranges else RULE
 
 
 def oracle(name: str, scenario: Problem) -> Choice | None:

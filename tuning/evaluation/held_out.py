@@ -9,7 +9,17 @@ import numpy as np
 
 from filters.consistency.intervals import Interval
 from numerics.progress import told
-from tuning.evaluation.baselines import ORACLE, RULE, SCALED, TUNED, Scaled, oracle, rule_of_thumb, scaled_default
+from tuning.evaluation.baselines import (
+    ORACLE,
+    RULE,
+    SCALED,
+    TUNED,
+    Scaled,
+    oracle,
+    rule_label,
+    rule_of_thumb,
+    scaled_default,
+)
 from tuning.evaluation.evaluate import Evaluation, evaluate, likelihood_gain, score_ratio
 from tuning.problems.problem import Problem
 from tuning.search.plan import HELD_OUT_SEEDS
@@ -28,12 +38,22 @@ class Comparison(NamedTuple):
     default: Scaled | None = None  # its factor, or the reason why there is none; None where it was not requested
     kept_ratios: Mapping[str, Interval] | None = None  # given where evaluations are summaries without single runs
     kept_gains: Mapping[str, Interval] | None = None
+    rule: str = RULE  # what the rule of thumb is called where people read it: `rule_label`
 
     @property
     def evaluations(self) -> dict[str, Evaluation]:
         """All evaluations by the names in tables, in the order of the rows."""
         found = {RULE: self.untuned, SCALED: self.scaled, TUNED: self.tuned, ORACLE: self.true}
         return {name: evaluation for name, evaluation in found.items() if evaluation is not None}
+
+    def label(self, name: str) -> str:
+        """What a filter of `evaluations` is called where people read it."""
+        return self.rule if name == RULE else name
+
+    @property
+    def labelled(self) -> dict[str, Evaluation]:
+        """`evaluations` by what people read."""
+        return {self.label(name): evaluation for name, evaluation in self.evaluations.items()}
 
     @property
     def ratios(self) -> dict[str, Interval]:
@@ -73,7 +93,8 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
             done.append((one, evaluate(one.filter(scenario), data, scenario.scale)))
     untuned, tuned, true, scaled = (None if one is None else _found(one, done) for one in choices)
     assert untuned is not None and tuned is not None  # these two choices are never None
-    return Comparison(untuned, tuned, true, scenario.bound(data), seeds, scaled, default)
+    bound, rule = scenario.bound(data), rule_label(scenario)
+    return Comparison(untuned, tuned, true, bound, seeds, scaled, default, rule=rule)
 
 
 prove = evaluate_held_out  # its former name

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from tuning.evaluation.baselines import Scaled, rule_of_thumb, scaled_rule
+from tuning.evaluation.baselines import Scaled, rule_label, rule_of_thumb, scaled_rule
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SizeRow
@@ -125,6 +125,7 @@ def kept_comparison(content: Mapping, choice: Choice, problem: Problem) -> Compa
             default=default,
             kept_ratios={str(name): as_interval(ratio) for name, ratio in more["score_ratios"].items()},
             kept_gains={str(name): as_interval(gain) for name, gain in more["likelihood_gains"].items()},
+            rule=rule_label(problem),
         )
     except (AttributeError, KeyError, TypeError, ValueError):
         return None

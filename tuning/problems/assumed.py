@@ -134,6 +134,15 @@ class AssumedProblem(Problem):
         return self._thumb | (self._untuned or {})
 
     @property
+    def lacks_ranges(self) -> bool:
+        """Whether the Q of `untuned` is the model's own: neither the model nor true states tell a range."""
+        if self._parameters is not None or "process_noise_cov" in (self._untuned or {}):
+            return False
+        model = self.model()
+        given = model.state_low is not None and model.state_high is not None
+        return not given and self.data(self.range_seeds).states is None
+
+    @property
     def true(self) -> dict | None:
         """Arguments of the oracle's model, with the plant's own Q and R; None if they are unknown."""
         return self._true

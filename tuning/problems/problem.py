@@ -76,6 +76,11 @@ class Problem(ABC):
         """Arguments of the model by rule of thumb: R from the data sheet, Q from 1 % of each state's range."""
 
     @property
+    def lacks_ranges(self) -> bool:
+        """Whether the Q of `untuned` is the model's own, because no range of its states is known."""
+        return False
+
+    @property
     def true(self) -> Mapping | None:
         """Arguments of the oracle's model, with the plant's own Q and R; None if they are unknown."""
         return None

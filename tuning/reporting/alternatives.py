@@ -38,7 +38,7 @@ def of_comparison(proof: Comparison) -> str:
     """RMSE of every filter, state by state, and the bound."""
     told = []
     for i, state in enumerate(proof.tuned.states):
-        values = [f"{name} {found.rmse[i].value:.3g}" for name, found in proof.evaluations.items()]
+        values = [f"{name} {found.rmse[i].value:.3g}" for name, found in proof.labelled.items()]
         values += [f"bound {proof.bound[i]:.3g}"] if isfinite(proof.bound[i]) else []
         told.append(f"RMSE of {state.name}{f' in {state.unit}' if state.unit else ''}: {', '.join(values)}")
     return f"Bars with whiskers. {'; '.join(told)}."

@@ -105,7 +105,7 @@ def draw_comparison(proof: Comparison, title: str, filter_name: str = "ekf") -> 
             axis.annotate(f"{rmse.value:.3g}", (place, rmse.high), (0, 4), textcoords="offset points", ha="center")
         if np.isfinite(proof.bound[i]):
             axis.axhline(proof.bound[i], color=DARK, linestyle="--", label="posterior Cramér-Rao bound")
-        axis.set_xticks(range(len(names)), [name.replace(" ", "\n", 1) for name in names])
+        axis.set_xticks(range(len(names)), [proof.label(name).replace(" ", "\n", 1) for name in names])
         axis.set_ylabel(f"RMSE of {states[i].plot_label}")
         axis.margins(y=0.15)
         axis.grid(axis="x", visible=False)

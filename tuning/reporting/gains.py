@@ -6,7 +6,7 @@ from math import isnan
 
 from filters.consistency.intervals import Interval, slightly
 from tuning.evaluation.held_out import Comparison
-from tuning.evaluation.worth import scaling_sentence, without_truth
+from tuning.evaluation.worth import scaling_sentence, sized, without_truth
 from tuning.reporting.error_tables import span
 
 
@@ -15,11 +15,11 @@ def gains(proof: Comparison, seed_word: str) -> list[str]:
     if not proof.tuned.has_truth:
         return _likelihood_gains(proof, seed_word)
     ratios = proof.ratios
-    parts = [f"x {span(ratio, 3)} that of the {name}" for name, ratio in ratios.items()]
+    parts = [f"x {span(ratio, 3)} that of the {proof.label(name)}" for name, ratio in ratios.items()]
     first, place = next(iter(ratios)), f"{len(proof.seeds)} held-out {seed_word}"
     said = f"Score of the tuned filter on {place}: {', '.join(parts)} (paired 95 % intervals)."
     scaling = scaling_sentence(proof)
-    return [f"{said} {_verdict(ratios[first], first, seed_word)}", *([scaling] if scaling else [])]
+    return [f"{said} {_verdict(ratios[first], proof.label(first), seed_word)}", *([scaling] if scaling else [])]
 
 
 def _likelihood_gains(proof: Comparison, seed_word: str) -> list[str]:
@@ -27,7 +27,10 @@ def _likelihood_gains(proof: Comparison, seed_word: str) -> list[str]:
     gained = {name: found for name, found in proof.likelihood_gains.items() if not isnan(found.value)}
     said, scaling = [without_truth("This problem")], scaling_sentence(proof)
     if gained:
-        parts = [f"{span(found, 2)} above that of the {name}" for name, found in gained.items()]
+        parts = [
+            f"{span(sized(found), 2)} {'above' if found.value >= 0 else 'below'} that of the {proof.label(name)}"
+            for name, found in gained.items()
+        ]
         place = f"{len(proof.seeds)} held-out {seed_word}"
         said.append(f"Log-likelihood of a run of the tuned filter on {place}: {', '.join(parts)}.")
     return [*said, *([scaling] if scaling else [])]

@@ -30,7 +30,7 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
     choice, scenario = subject.choice, subject.plan.scenarios[0]
     data, tuned = scenario.data(proof.seeds), choice.filter(scenario)
     name, before = next(iter(baselines(choice.name, scenario, subject.plan.seed, proof.default).items()))
-    pair, dt = {name: before.filter(scenario), TUNED: tuned}, scenario.dt
+    pair, dt = {proof.label(name): before.filter(scenario), TUNED: tuned}, scenario.dt
     word = scenario.seed_word.removesuffix("s")
     where = f"{scenario.name}, held-out {word} {proof.seeds.start}"
     has_covariance, scored = filter_class(choice.name).has_covariance, proof.tuned.scored or None

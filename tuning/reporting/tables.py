@@ -8,7 +8,7 @@ import numpy as np
 
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import rounded
-from tuning.evaluation.baselines import RULE, TUNED, Scaled, baselines
+from tuning.evaluation.baselines import RULE, TUNED, Scaled, baselines, rule_label
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.held_out import Comparison
 from tuning.likelihood.identifiability import Identifiability
@@ -38,8 +38,8 @@ def errors_table(scenario: Problem, proof: Comparison) -> Table:
 def _errors_across(proof: Comparison, where: str) -> Table:
     ratios, tuned, errors = proof.ratios, proof.tuned, _errors(proof)
     rows = [
-        [name, _span(ratios.get(name, NOTHING)), _span(found.score), *(cells[place] for _, cells, _ in errors)]
-        + [*map(_span, (found.nees, found.nis))]
+        [proof.label(name), _span(ratios.get(name, NOTHING)), _span(found.score)]
+        + [*(cells[place] for _, cells, _ in errors), *map(_span, (found.nees, found.nis))]
         for place, (name, found) in enumerate(proof.evaluations.items())
     ]
     right = [str(len(proof.bound)), f"{tuned.expected_nis:.3g}"] if not isnan(tuned.nis.value) else ["", ""]
@@ -58,7 +58,7 @@ def _errors_below(proof: Comparison, where: str) -> Table:
         ["mean NEES", *(_span(e.nees) for e in found.values()), right[0]],
         ["mean NIS", *(_span(e.nis) for e in found.values()), right[1]],
     ]
-    return Table(where, ["", *found, _expected(proof)], rows)
+    return Table(where, ["", *map(proof.label, found), _expected(proof)], rows)
 
 
 def _errors(proof: Comparison) -> list[tuple[str, list[str], str]]:
@@ -89,7 +89,7 @@ def _expected(proof: Comparison) -> str:
 def _innovations_table(proof: Comparison, where: str) -> Table:
     gains = proof.likelihood_gains
     rows = [
-        [name, "" if isnan(e.log_likelihood) else f"{e.log_likelihood:.2f}", _span(e.nis)]
+        [proof.label(name), "" if isnan(e.log_likelihood) else f"{e.log_likelihood:.2f}", _span(e.nis)]
         + [_span(gains.get(name, NOTHING)), str(e.divergences)]
         for name, e in proof.evaluations.items()
     ]
@@ -105,7 +105,11 @@ def numbers_table(choice: Choice, scenario: Problem, seed: int, default: Scaled 
     choices, usual = {TUNED: choice, **found}, found[RULE].numbers
     whole = [one._replace(numbers={**usual, **one.numbers}) for one in choices.values()]
     rows = number_rows(whole, choice.name, scenario, _number, "²")
-    return Table(f"Parameters of the {choice.name} filter", ["", *choices], rows)
+    return Table(
+        f"Parameters of the {choice.name} filter",
+        ["", *(rule_label(scenario) if name == RULE else name for name in choices)],
+        rows,
+    )
 
 
 def _number(value: float | None) -> str:

@@ -44,8 +44,8 @@ def make_sampler(
         ValueError: for an unknown name, a missing package, or one that cannot choose among filter types.
     """
     one_of("sampler", name, tuple(SAMPLERS))
-    package, extra = NEEDS.get(name, (None, None))
-    if package is not None and importlib.util.find_spec(package) is None:
+    package, extra = NEEDS.get(name, ("", ""))
+    if package and importlib.util.find_spec(package) is None:
         raise ValueError(f"the sampler {name!r} needs {package}, which is not installed: {to_install(extra)}")
     if name in WITHOUT_FILTER_TYPES and FILTER_TYPE in distributions:
         able = ", ".join(one for one in SAMPLERS if one not in WITHOUT_FILTER_TYPES)

@@ -129,10 +129,12 @@ def _check_identity(name: str, wanted: dict, found: dict) -> None:
     if found != wanted:
         differing = [key for key in {**wanted, **found} if wanted.get(key) != found.get(key)]
         wanted, found = ({key: part.get(key) for key in differing} for part in (wanted, found))
-        changed = "; a scenario is not what it was" if list(wanted) == ["scenario_digests"] else ""
-        raise ValueError(
-            f"study {name!r} must be for {wanted}, but it was made for {found}{changed}: give it another name"
-        )
+        if differing == ["scenario_digests"]:  # its numbers would tell nobody anything
+            raise ValueError(
+                f"a study must be for one model and its data, but {name!r} exists here for another model or other "
+                "logs: give it another name (--study NAME), or move the file that keeps it (out/studies.journal)"
+            )
+        raise ValueError(f"study {name!r} must be for {wanted}, but it was made for {found}: give it another name")
 
 
 def finished_trials(study: optuna.Study) -> int:

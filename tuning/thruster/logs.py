@@ -13,6 +13,7 @@ from plants.state_space import StateSpaceModel
 from thruster_env.logged import NO_BAND, logged_plant, with_shown
 from thruster_env.model import model_of_plant
 from thruster_env.modelled import ModelledThruster
+from thruster_env.parameters import PRESETS
 from thruster_env.preset_file import is_file, read_preset
 from tuning.problems.files import FILE_SEQUENCES
 from tuning.problems.problem import Problem
@@ -41,6 +42,11 @@ class Preset(ModelledThruster):
         """The model of the plant with its recorder."""
         bare = self.plant._replace(dead_band=NO_BAND)
         return with_shown(model_of_plant(bare, **changes), bare, self._seen)
+
+
+def is_preset(name: str | Path) -> bool:
+    """Whether a name is that of a preset, or of a file that may be one."""
+    return str(name) in PRESETS or is_file(name)
 
 
 @overload

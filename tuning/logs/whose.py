@@ -1,0 +1,51 @@
+"""Whose recorded runs are: a pair (model, logs), a model, or a thruster's preset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from numerics.checks import shown
+from numerics.modules import is_code
+from plants.logs.log import Log
+from plants.logs.table import SUFFIXES
+from plants.state_space import StateSpaceModel
+from tuning.problems.rooms import room_of_logs
+
+
+def whose_logs(logs: Any, model: Any, preset: str | Path | None) -> tuple[Any, Any, str | Path | None]:
+    """Logs, their model (None for a thruster) and the preset, from what a user gives.
+
+    Args:
+        logs: recorded runs, or a pair (model, logs) as `tuning.tune` takes it.
+        model: a model, what makes or offers one, "module:object", or a thruster's preset.
+        preset: a thruster, by name or file.
+
+    Raises:
+        ValueError: if a model or a preset is given twice, or a model is neither code nor a preset.
+    """
+    if isinstance(logs, tuple) and len(logs) == 2 and _is_model(logs[0]):
+        if model is not None:
+            raise ValueError(f"a pair (model, logs) must come without another model, but got {shown(model)}")
+        model, logs = logs
+    if not isinstance(model, str | Path) or is_code(str(model)):
+        return logs, model, preset
+    if preset is not None:
+        raise ValueError(f"give either a model or a preset, but got both, {shown(model)} and {shown(preset)}")
+    if not room_of_logs().is_preset(model):
+        rule = "a model must be an object, 'module:object' or a thruster's preset"
+        raise ValueError(f"{rule}, but got {shown(model)}")
+    return logs, None, model
+
+
+def _is_model(one: Any) -> bool:
+    """Whether something is a model, what makes or offers one, code, or a thruster's preset, but no log."""
+    if isinstance(one, str | Path):
+        if Path(one).suffix in SUFFIXES:  # a log in a folder of Windows has a colon, too
+            return False
+        return is_code(str(one)) or room_of_logs().is_preset(one)
+    return isinstance(one, StateSpaceModel) or hasattr(one, "state_space_model") or _makes_one(one)
+
+
+def _makes_one(one: Any) -> bool:
+    return callable(one) and not isinstance(one, Log) and not hasattr(one, "columns")
