@@ -308,7 +308,7 @@ def test_an_object_is_kept_in_the_spec_but_not_as_text():
     env = EstimateState(gym.make("BowThruster-v0"), filter=Drawing())
     again = gym.make(env.spec)
     np.testing.assert_array_equal(env.reset(seed=2)[0], again.reset(seed=2)[0])
-    with pytest.raises(TypeError, match="give filter='module:object' instead"):
+    with pytest.raises(TypeError, match="give its name or 'module:object' instead"):
         env.spec.to_json()
     with pytest.raises(ValueError, match="must have reset.* and step.* to run beside an env"):
         only = AtOnce()
