@@ -377,7 +377,7 @@ def test_a_filter_that_is_made_is_run_as_it_is():
     ("arguments", "rule"),
     [
         ({"filter": "no filter"}, "filter must be one of .*but got 'no filter'"),
-        ({"filter": 3}, "filter must be one of .*but got 3"),
+        ({"filter": 3}, "filter must be a name, a filter that is made .*but got 3"),
         ({"observation": "state"}, "observation must be one of estimate, .*but got 'state'"),
         ({"filter": "enkf", "ensemble_size": 1}, "ensemble_size must be .*at least 2, but got 1"),
         (

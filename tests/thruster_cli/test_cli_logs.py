@@ -157,14 +157,17 @@ def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  
         (("estimate", "no.csv"), "a log must be a file that can be read, but no.csv is not: No such file"),
         (
             ("estimate", "run.csv", "--column", "thrust"),
-            "--column must have the form NAME=VALUE, but got 'thrust'",
+            "columns (--column) must have the form NAME=VALUE, but got 'thrust'",
         ),
         (("estimate", "run.csv", "--column", "flow=x"), "columns must be given for some of V_s, thrust, omega_m"),
         (
             ("estimate", "run.csv", "--column", "thrust=x"),
             "the column for thrust must be one of time_s, voltage_V",
         ),
-        (("estimate", "run.csv", "--model", "m:x", "--preset", "tunnel"), "must be of --model or of a thruster"),
+        (
+            ("estimate", "run.csv", "--model", "m:x", "--preset", "tunnel"),
+            "must be of model (--model) or of a thruster",
+        ),
         (
             ("estimate", "run.csv", "--filter", "ekf", "--tuned", "x.json"),
             "give either a tuned file or --filter NAME",
@@ -172,7 +175,10 @@ def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  
         (("estimate", "run.csv", "--out", "est.txt"), "--out must end in .csv, .parquet or .npz"),
         (("estimate", "run.csv", "--plot", "est.tex"), "--plot must end in .png, .svg or .pdf, but got"),
         (("estimate", "run.csv", "--skip", "9999"), "skip must be at most 60, but got 9999"),
-        (("estimate", "run.csv", "--clock-offset", "thrust=late"), "--clock-offset thrust must be seconds"),
+        (
+            ("estimate", "run.csv", "--clock-offset", "thrust=late"),
+            "clock_offset (--clock-offset) of thrust must be seconds",
+        ),
         (("estimate", "run.csv", "--clock-offset", "thrust=-0.6"), "thrust must be shorter than the log, 0.6 s"),
         (("estimate", "run.csv", "--out", "./run.csv"), "what is written must not replace what is read"),
         (("estimate", "run.csv", "--out", "est.csv", "--json", "run.csv"), "must not replace what is read"),

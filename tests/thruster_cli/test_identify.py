@@ -82,7 +82,7 @@ WITH_LOG = [
     (("--gate", "nan"), "gate must be positive, but got nan"),
     (("--starts", "10000"), "starts must be at most 1000, but got 10000"),
     (("--range", "voltage_gain=5"), "--range must have the form NAME=LOW:HIGH, but got 'voltage_gain=5'"),
-    (("--filter", "kf"), "a thruster must be identified with the ekf, but got --filter kf"),
+    (("--filter", "kf"), "a thruster must be identified with the ekf, but got filter kf"),
     (("--held-out", "run0.csv"), "at least one log must be left to learn from"),
     (("--out", "x.json"), "--out must end in .toml"),
 ]
@@ -159,6 +159,8 @@ def test_scenarios_are_of_another_thruster_by_its_preset_file(thruster, tmp_path
     assert again.digest == made.digest != find_problem("nominal").digest
     assert of_preset(made, None) is made
     done = thruster("compare", "--filter", "ekf", "--scenario", "published_tunnel", "--preset", "t200")
-    assert done.returncode == 2 and "--preset must come with scenarios of the thruster's equations" in done.stderr
+    assert (
+        done.returncode == 2 and "(--preset) must come with scenarios of the thruster's equations" in done.stderr
+    )
     done = thruster("evaluate", "--tuned", "t.json", "--preset", "t200")
-    assert done.returncode == 2 and "--preset must come with --scenario" in done.stderr
+    assert done.returncode == 2 and "(--preset) must come with a problem" in done.stderr

@@ -190,5 +190,5 @@ def test_trials_have_whole_numbers_in_pictures():
     study = optuna.create_study()
     for value in (3.0, 2.0, 2.5):
         study.add_trial(create_trial(value=value))
-    figure = draw_history(study.trials, "a study")
+    figure = draw_history(study.trials, "a study", "score [-]")
     assert all(float(tick).is_integer() for tick in figure.axes[0].get_xticks())

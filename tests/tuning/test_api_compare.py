@@ -88,7 +88,7 @@ def test_where_nobody_knows_the_noise_filters_have_the_scaled_default():
 
 WRONG = [
     (lambda: tuning.compare(["ekf", "ekf"], SHORT, seeds=2), "must be of different filters, but got ekf, ekf"),
-    (lambda: tuning.compare([]), "a comparison must be of different filters, but got none"),
+    (lambda: tuning.compare([]), "a comparison must be of filters, but got none"),
     (
         lambda: tuning.compare(["ekf", 3]),
         "a tuned file, a Study or an estimator, but got 3",

@@ -82,7 +82,7 @@ def test_a_number_that_is_missing_or_none_differs(content, file):
         ({}, "must have held-out metrics to verify"),
         ({"nominal": {}}, "must tell their first seed and that after the last"),
         ({"nominal": {"seeds": [3]}}, "must tell their first seed and that after the last"),
-        ({"none": {"seeds": [0, 2]}}, "problem must be one of"),
+        ({"none": {"seeds": [0, 2]}}, "was tuned on 'none', an object of yours"),
         ({"nominal": {"seeds": [2, 2]}}, "held-out seeds must be a whole number of at least 2, but got 0"),
     ],
 )
