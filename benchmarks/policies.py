@@ -69,6 +69,6 @@ def acting(seed: int, observe: str, native: bool, steps: int = 200) -> Measure:
 
 
 def _setup(observe: str, seed: int):
-    from training.setup import make_setup
+    from training.setup import make_configuration
 
-    return make_setup("manoeuvre", find_scenario("medium_noise"), observe, seed=seed, num_envs=COPIES)
+    return make_configuration("manoeuvre", find_scenario("medium_noise"), observe, seed=seed, num_envs=COPIES)

@@ -85,7 +85,7 @@ def as_json(
         "at_end": found.at_end,
         "correlations": {"names": found.names, "matrix": found.correlations},
         "trade_off": found.traded,
-        "least_known_direction": found.loosest,
+        "least_known_direction": found.least_determined,
         "log_likelihood": found.log_likelihood,
         "log_likelihood_at_start": found.start_log_likelihood,
         "optima": [one._asdict() for one in found.optima],

@@ -146,9 +146,9 @@ def _of_policy(model: Path, out: Path | None, window: bool, seed: int | None, js
     check_installed()
     with progress_console.status("loading torch ..."):
         from training.play import play
-        from training.saved import find_saved, read_setup
+        from training.saved import find_saved, read_configuration
     folder = find_saved(model)
-    seed = held_out_seeds(read_setup(folder).seed, 2)[0] if seed is None else seed
+    seed = held_out_seeds(read_configuration(folder).seed, 2)[0] if seed is None else seed
     film = None if window else out or model / f"episode-seed{seed}.mp4"
     check_drawing(film)
     check_targets((film,), json)

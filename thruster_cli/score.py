@@ -16,9 +16,9 @@ from thruster_cli.options import INPUT, RUNS, JsonOption, OfPresetOption, SeedOp
 from thruster_cli.output import announce_compilation, emit, progress_console, table
 from thruster_cli.train import LEARNABLE
 from training.extras import check_installed
-from training.observations import find_arm
+from training.observations import find_observation_set
 from training.plants.find import plant_of
-from training.setup import Setup, in_scenario
+from training.setup import TrainingConfiguration, in_scenario
 from tuning.problems.scenario import BaseScenario
 from tuning.problems.seeds import held_out_seeds
 from tuning.reporting.error_tables import about, unless_blank
@@ -36,7 +36,7 @@ class Scored(NamedTuple):
 
     label: str
     folder: Path | None  # of a learnt policy
-    setup: Setup
+    setup: TrainingConfiguration
     scores: Scores
 
 
@@ -83,9 +83,9 @@ def command(
         raise ValueError(f"--preset must come with --scenario, but got --preset {preset} alone")
     held_out = held_out_seeds(seed, seeds)
     with progress_console.status("loading torch ..."):
-        from training.saved import find_saved, read_setup
+        from training.saved import find_saved, read_configuration
     folders = {model: find_saved(model) for model in models}
-    setups = {model: read_setup(folder) for model, folder in folders.items()}
+    setups = {model: read_configuration(folder) for model, folder in folders.items()}
     kind = plant_of(next(iter(setups.values())).task)
     for name in classical or []:
         one_of("classical", name, kind.controllers)
@@ -99,14 +99,14 @@ def command(
             scored.append(_learnt(model, folder, setups[model], plant, held_out))
         for name in classical or []:
             for setup in _each_arm(setups.values()):
-                if name in kind.of_states and not find_arm(setup.observe).shows_state:
+                if name in kind.of_states and not find_observation_set(setup.observe).shows_state:
                     continue
                 status.update(f"scoring {name} on {setup.observe} ...")
                 scored.append(_classical(name, setup, plant, held_out))
     emit(report(scored, held_out), as_json(scored, held_out), json)
 
 
-def check_alike(setups: Sequence[Setup], plant: BaseScenario | None) -> None:
+def check_alike(setups: Sequence[TrainingConfiguration], plant: BaseScenario | None) -> None:
     """Raise ValueError unless all policies do the same task, on the same plant once a scenario is given."""
     for name in ("task", "env_id") + (("scenario",) if plant is None else ()):
         found = sorted({getattr(setup, name) for setup in setups})
@@ -117,7 +117,9 @@ def check_alike(setups: Sequence[Setup], plant: BaseScenario | None) -> None:
             )
 
 
-def _learnt(model: Path, folder: Path, setup: Setup, plant: BaseScenario | None, seeds: Sequence[int]) -> Scored:
+def _learnt(
+    model: Path, folder: Path, setup: TrainingConfiguration, plant: BaseScenario | None, seeds: Sequence[int]
+) -> Scored:
     from training.environments import make_environments
     from training.saved import load
     from training.score import score
@@ -128,7 +130,9 @@ def _learnt(model: Path, folder: Path, setup: Setup, plant: BaseScenario | None,
     return Scored(f"{setup.observe} {name}", model, setup, score(policy, met, seeds))
 
 
-def _classical(name: str, setup: Setup, plant: BaseScenario | None, seeds: Sequence[int]) -> Scored:
+def _classical(
+    name: str, setup: TrainingConfiguration, plant: BaseScenario | None, seeds: Sequence[int]
+) -> Scored:
     from training.classical import classical_policy
     from training.score import score
 
@@ -137,9 +141,9 @@ def _classical(name: str, setup: Setup, plant: BaseScenario | None, seeds: Seque
     return Scored(f"{setup.observe} {name}", None, setup, score(classical_policy(name, setup), met, seeds))
 
 
-def _each_arm(setups) -> list[Setup]:
+def _each_arm(setups) -> list[TrainingConfiguration]:
     """One setup for each way to observe, filter arguments included."""
-    found: list[Setup] = []
+    found: list[TrainingConfiguration] = []
     for setup in setups:
         if all((setup.observe, setup.filter_arguments) != (one.observe, one.filter_arguments) for one in found):
             found.append(setup)

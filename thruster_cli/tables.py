@@ -11,7 +11,7 @@ from thruster_cli.output import table
 from tuning.likelihood.gradient import GradientResult
 from tuning.problems.problem import Problem
 from tuning.reporting.units import number_rows
-from tuning.search.filter_types import Kind
+from tuning.search.filter_types import FilterType
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 
@@ -49,7 +49,7 @@ def front_table(plan: Plan, front: Sequence) -> Table:
     )
 
 
-def kinds_table(kinds: Sequence[Kind], plan: Plan) -> Table:
+def kinds_table(kinds: Sequence[FilterType], plan: Plan) -> Table:
     """Kinds of filters that a study tried, the best first."""
     rows = [
         [kind.name, str(kind.trials), str(kind.pruned), str(kind.over_budget), _best(kind)]
@@ -63,7 +63,7 @@ def kinds_table(kinds: Sequence[Kind], plan: Plan) -> Table:
     return table(title, columns, rows, caption=caption, best=best)
 
 
-def _best(kind: Kind) -> str:
+def _best(kind: FilterType) -> str:
     return "" if kind.value is None else f"{kind.value:.4g}{'' if kind.consistent else '*'}"
 
 

@@ -20,9 +20,9 @@ from thruster_cli.options import FILTER, INPUT, LEARNING, OUTPUT, JsonOption, Of
 from thruster_cli.output import announce_compilation, emit, progress_console, table
 from training.algorithms import ALGORITHMS
 from training.extras import check_installed
-from training.observations import ARMS
+from training.observations import OBSERVATION_SETS
 from training.plants.find import PLANTS, TASKS, plant_of
-from training.setup import Setup, make_setup
+from training.setup import TrainingConfiguration, make_configuration
 from tuning.api.run import file_name
 from tuning.problems.plain import plain
 from tuning.thruster.logs import of_preset
@@ -46,8 +46,8 @@ def command(
         str,
         typer.Option(
             metavar="ARM",
-            help=f"What the policy sees: {', '.join(ARMS)}.",
-            callback=spelt(ARMS),
+            help=f"What the policy sees: {', '.join(OBSERVATION_SETS)}.",
+            callback=spelt(OBSERVATION_SETS),
             rich_help_panel=FILTER,
         ),
     ] = "ekf",
@@ -140,7 +140,7 @@ def command(
     chosen = of_preset(plant.find_scenario(scenario), preset)
     if untuned and tuned is not None:
         raise ValueError(f"give either --tuned FILE or --untuned, but got both, --tuned {tuned}")
-    setup = make_setup(
+    setup = make_configuration(
         task,
         chosen,
         observe,
@@ -177,7 +177,7 @@ def command(
         sys.exit(130)
 
 
-def name_of(setup: Setup, tuned: Path | None = None, untuned: bool = False) -> str:
+def name_of(setup: TrainingConfiguration, tuned: Path | None = None, untuned: bool = False) -> str:
     """Name of the folder of a training: what it learns, from what, by what."""
     parts = [setup.task, file_name(setup.scenario), setup.observe]
     parts += ["untuned"] * untuned + ([] if tuned is None else [tuned.stem])
@@ -185,7 +185,7 @@ def name_of(setup: Setup, tuned: Path | None = None, untuned: bool = False) -> s
     return "-".join([*parts, setup.algo, f"seed{setup.seed}"])
 
 
-def report(setup: Setup, trained: Trained) -> list[RenderableType]:
+def report(setup: TrainingConfiguration, trained: Trained) -> list[RenderableType]:
     """What to print of a training: returns in its course, its speed, and what to do next."""
     curve, title = trained.curve, f"{setup.algo} on {setup.observe}, {setup.task}, scenario {setup.scenario}"
     last = len(curve) - 1
@@ -202,7 +202,7 @@ def report(setup: Setup, trained: Trained) -> list[RenderableType]:
     return [*shown, f"Watch it: thruster play {trained.folder}", f"Score it: thruster score {trained.folder}"]
 
 
-def as_json(setup: Setup, trained: Trained) -> dict:
+def as_json(setup: TrainingConfiguration, trained: Trained) -> dict:
     """The same as plain data."""
     return {
         "folder": str(trained.folder),

@@ -22,7 +22,7 @@ from tuning.likelihood.identifiability import as_data, sentences, too_many
 from tuning.problems.rooms import built_in
 from tuning.reporting.error_tables import comparison_table, span
 from tuning.reporting.gains import gains
-from tuning.search.filter_types import kinds_tried
+from tuning.search.filter_types import filter_types_tried
 from tuning.search.objectives import NIS_BAND
 from tuning.search.outcome import is_over_budget
 from tuning.search.plan import Plan
@@ -95,7 +95,7 @@ def _search_sentences(tuning: Tuning) -> list[RenderableType]:
         said = _gradient_sentences(tuning, tuning.gradient, tuning.rival)
         return [gradient_table(tuning.gradient, word), *said]
     shown: list[RenderableType] = []
-    kinds = kinds_tried(result.trials)
+    kinds = filter_types_tried(result.trials)
     if kinds:
         shown.append(kinds_table(kinds, plan))
     if plan.budget is not None:
@@ -180,7 +180,7 @@ def as_json(tuning: Tuning) -> dict:
         "trials": result.finished,
         "pruned": result.pruned,
         "microseconds_a_step": result.microseconds,
-        "kinds": [kind._asdict() for kind in kinds_tried(result.trials)],
+        "kinds": [kind._asdict() for kind in filter_types_tried(result.trials)],
         "best_training_value": result.best_value,
         "best_training_value_without_consistency": result.free_value,
         **consistency(result),

@@ -60,9 +60,3 @@ OBSERVATION_SETS: dict[str, ObservationSet] = {
 def find_observation_set(name: str) -> ObservationSet:
     """The observation set of a name; raises ValueError for an unknown one."""
     return OBSERVATION_SETS[one_of("observe", name, tuple(OBSERVATION_SETS))]
-
-
-# Former names.
-Arm = ObservationSet
-ARMS = OBSERVATION_SETS
-find_arm = find_observation_set

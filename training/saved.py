@@ -189,6 +189,3 @@ def whole(path: Path, read: Callable[[Path], Any]) -> Any:
     except (pickle.UnpicklingError, Exception) as error:  # a damaged zip or pickle raises nearly anything
         said = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise ValueError(f"{path} must be a whole file as it was saved, but cannot be read: {said}") from None
-
-
-read_setup = read_configuration  # its former name

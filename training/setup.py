@@ -182,9 +182,3 @@ def configuration_from_json(text: str, name: str) -> TrainingConfiguration:
         raise ValueError(f"{name} must hold the configuration of a policy, but got {shown(text)}") from None
     except ValueError as error:
         raise ValueError(f"{error} (in {name})") from None
-
-
-# Former names.
-Setup = TrainingConfiguration
-make_setup = make_configuration
-setup_from_json = configuration_from_json

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from training.setup import Setup, configuration_from_json, make_configuration
+from training.setup import TrainingConfiguration, configuration_from_json, make_configuration
 from tuning.thruster.find import find_scenario
 
 KILLS = 20
@@ -142,7 +142,9 @@ def _wait_for_end_of(session: int, moment: str) -> None:
     raise AssertionError(f"processes must end with their parent: {moment}")
 
 
-def _train(folder: Path, setup: Setup, stop_after: int | None = None, delay: float = 0.0) -> list[int]:
+def _train(
+    folder: Path, setup: TrainingConfiguration, stop_after: int | None = None, delay: float = 0.0
+) -> list[int]:
     """Train in a process of its own, killed after so many steps and seconds; return the steps that it told."""
     command = [sys.executable, "-m", "tests.fuzz.checkpoints", str(folder)]
     seen: list[int] = []
@@ -176,7 +178,7 @@ def _learnt(saved: Path) -> int:
     return load(saved, make_environments(read_configuration(saved), [0])).model.num_timesteps
 
 
-def _check_training(folder: Path, setup: Setup | None = None) -> None:
+def _check_training(folder: Path, setup: TrainingConfiguration | None = None) -> None:
     """What is in the folder of a training that has ended is whole, and nothing is left aside."""
     from training.saved import BEST, FINAL, read_configuration
 

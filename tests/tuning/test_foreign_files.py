@@ -11,7 +11,7 @@ import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState, EstimateStates
 from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
 from tests.tuned_files import rewrite, write_untuned
-from training.setup import in_scenario, make_setup, setup_from_json
+from training.setup import configuration_from_json, in_scenario, make_configuration
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.verify import verify
 from tuning.reporting.report import write_report
@@ -70,7 +70,7 @@ def test_a_tuned_file_that_names_code_is_refused_by_all_that_take_one(file):
         lambda: EstimateState(gym.make("BowThruster-v0"), tuned=path),
         lambda: EstimateStates(gym.make_vec("BowThruster-v0", num_envs=2), tuned=path),
         lambda: EstimateState(gym.make("Pendulum-v1"), tuned=path, model=f"{__name__}:never"),
-        lambda: make_setup("tracking", scenario, "ekf", tuned=path),
+        lambda: make_configuration("tracking", scenario, "ekf", tuned=path),
         lambda: read_tuned(path),
         lambda: verify(path),
         lambda: write_report(path, "none.journal"),
@@ -92,7 +92,7 @@ def test_every_command_refuses_it(command, file, thruster, tmp_path):
     assert "Traceback" not in done.stderr and [path.name for path in tmp_path.iterdir()] == ["ekf.json"]
 
 
-SETUP = make_setup("tracking", find_scenario("medium_noise"), "ekf", steps=256, num_envs=4)
+SETUP = make_configuration("tracking", find_scenario("medium_noise"), "ekf", steps=256, num_envs=4)
 DOCTORED = {
     "a model": (
         {"filter_arguments": {"model": TRAP}},
@@ -137,7 +137,7 @@ def doctored(change):
 @pytest.mark.parametrize(("change", "rule"), DOCTORED.values(), ids=list(DOCTORED))
 def test_a_setup_holds_nothing_but_what_is_known(change, rule):
     with pytest.raises(ValueError, match=rule) as error:
-        setup_from_json(doctored(change), "setup.json")
+        configuration_from_json(doctored(change), "setup.json")
     assert "setup.json" in str(error.value) and "\n" not in str(error.value)
 
 

@@ -11,7 +11,7 @@ import pytest
 from filters.consistency.intervals import Interval
 from thruster_cli.main import main
 from tuning.evaluation.evaluate import evaluate, score_ratio
-from tuning.evaluation.held_out import Comparison, prove
+from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.reporting.figures import early_trials
 from tuning.reporting.page import Code, Picture, Section, Table, Words, html_page, markdown_page
@@ -63,7 +63,7 @@ def tuned(plan, trials, name="s", seeds=6):
     """A small study in a journal, and its tuned file, s.json."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     result = run_study(open_study(name, plan, open_storage(STORAGE)), plan, trials)
-    proofs = [prove(result.choice, scenario, plan.seed, seeds) for scenario in plan.scenarios]
+    proofs = [evaluate_held_out(result.choice, scenario, plan.seed, seeds) for scenario in plan.scenarios]
     write_tuned(f"{name}.json", plan, result, proofs, name)
     return result
 
@@ -203,7 +203,7 @@ def test_trials_that_ended_early_stand_at_the_mean_of_their_seeds():
 
 def test_the_advice_says_when_tuning_is_worth_nothing_or_harms():
     choice = untuned_choice("ekf", MISMATCH)
-    proof = prove(choice, MISMATCH, 0, 4)
+    proof = evaluate_held_out(choice, MISMATCH, 0, 4)
     plan = Plan("ekf", (MISMATCH,))
     assert advice(choice, plan, [proof]).startswith(
         "Tuning raises the score by 10 % [4, 21] against the scaled default and makes no difference that 4 seeds "

@@ -19,7 +19,7 @@ from thruster_env.effects.flow import Gusts
 from thruster_env.parameters import PRESETS
 from thruster_env.plant import make_plant
 from thruster_env.plant_data import differences, plant_data
-from training.setup import make_setup
+from training.setup import make_configuration
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.verify import verify
 from tuning.problems.files import scenario_of
@@ -113,8 +113,8 @@ def test_a_policy_a_comparison_and_an_evaluation_refuse_it_too(nominal, thruster
         done = thruster(*command, nominal, "--scenario", "slow.toml")
         assert done.returncode == 2 and said in done.stderr, command
     with pytest.raises(ValueError, match=r"was tuned for dt 0.01 \(here 0.02\)"):
-        make_setup("tracking", find_scenario("slow.toml"), "ekf", tuned=nominal)
-    assert make_setup("tracking", find_scenario("medium_noise"), "ekf", tuned=nominal).filter_arguments
+        make_configuration("tracking", find_scenario("slow.toml"), "ekf", tuned=nominal)
+    assert make_configuration("tracking", find_scenario("medium_noise"), "ekf", tuned=nominal).filter_arguments
 
 
 def test_plants_are_compared_as_data_and_not_by_the_names_of_their_presets():

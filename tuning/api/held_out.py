@@ -18,7 +18,7 @@ from tuning.api.progress import working
 from tuning.api.showing import about, drawn, frame, html, number
 from tuning.evaluation.baselines import RULE, SCALED, TUNED, baselines
 from tuning.evaluation.evaluate import Evaluation, check_consistency
-from tuning.evaluation.held_out import Comparison, prove
+from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import metrics
 from tuning.evaluation.worth import scaling_sentence, without_truth
 from tuning.problems.problem import Problem
@@ -213,9 +213,9 @@ def on_held_out(
     is_tuned: bool,
     console: Console,
 ) -> HeldOut:
-    """Run a choice and its baselines on held-out seeds; the arguments are those of `HeldOut` and `prove`."""
+    """Run a choice and its baselines on held-out seeds; arguments as of `HeldOut` and `evaluate_held_out`."""
     with working(f"{label_of(choice.name)} on {seeds} seeds of {problem.name}", console):
-        return HeldOut(choice, problem, prove(choice, problem, seed, seeds), is_tuned, seed)
+        return HeldOut(choice, problem, evaluate_held_out(choice, problem, seed, seeds), is_tuned, seed)
 
 
 def cells_of(one: Evaluation) -> dict[str, float]:

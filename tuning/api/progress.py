@@ -74,7 +74,7 @@ def trial_bar(
         before: finished trials that it has.
         console: where it is shown.
     """
-    from tuning.search.filter_types import kinds_running
+    from tuning.search.filter_types import filter_types_running
 
     title, named = f"tuning {{}} on {names}", label_of(plan.filter)
     columns = (
@@ -90,13 +90,13 @@ def trial_bar(
         progress.update(task, completed=done)  # so that no time remains where all trials are done
 
         def show_kinds(kinds: Sequence[str]) -> None:
-            if len(plan.kinds) > 1:
+            if len(plan.filter_types) > 1:
                 progress.update(task, description=title.format(f"{named} ({', '.join(kinds)})"))
 
         def advance(study, finished: int) -> None:
             trials = study.get_trials(deepcopy=False)
             progress.update(task, completed=finished, best=_best(trials))
-            if running := kinds_running(trials):
+            if running := filter_types_running(trials):
                 show_kinds(running)
 
         def show_rest(far: str) -> None:

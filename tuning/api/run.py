@@ -16,7 +16,7 @@ from filters.estimators.find import label_of
 from numerics.checks import at_least, one_of, shown
 from numerics.files import check_target
 from tuning.api.progress import trial_bar, working
-from tuning.evaluation.held_out import Comparison, prove
+from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.likelihood.gradient import DIFFERENTIABLE, GradientResult, maximise_likelihood
 from tuning.likelihood.identifiability import Identifiability, identify
@@ -116,11 +116,11 @@ def run_tuning(
     if by_gradient:
         with working("maximising the likelihood", console):
             gradient = maximise_likelihood(plan.filter, plan.scenarios[0], plan.training_data()[0])
-        rival = prove(result.choice, plan.scenarios[0], plan.seed)
+        rival = evaluate_held_out(result.choice, plan.scenarios[0], plan.seed)
         result = result._replace(choice=gradient.choice, consistent=None, nis=())
     try:
         with working(f"proving the choice on held-out {plan.scenarios[0].seed_word}", console):
-            proofs = tuple(prove(result.choice, scenario, plan.seed) for scenario in plan.scenarios)
+            proofs = tuple(evaluate_held_out(result.choice, scenario, plan.seed) for scenario in plan.scenarios)
     except KeyboardInterrupt:
         if storage is not None:
             console.print(f"study {name!r} keeps its trials: the same command goes on with the proof")

@@ -97,9 +97,6 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
     return Comparison(untuned, tuned, true, bound, seeds, scaled, default, rule=rule)
 
 
-prove = evaluate_held_out  # its former name
-
-
 def _found(choice: Choice, done: Sequence[tuple[Choice, Evaluation]]) -> Evaluation | None:
     """The evaluation of the same filter, if there is one."""
     return next((evaluation for before, evaluation in done if _same(choice, before)), None)

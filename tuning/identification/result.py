@@ -94,11 +94,6 @@ class Identification(NamedTuple):
         order = [i for i in np.argsort(-np.abs(axis)) if abs(axis[i]) >= COMPANION * np.abs(axis).max()]
         return {self.names[i]: float(axis[i]) for i in order}
 
-    @property
-    def loosest(self) -> dict[str, float]:
-        """The former name of `least_determined`."""
-        return self.least_determined
-
     def _end_sentences(self) -> list[str]:
         """Which values are at an end of their range; beyond zero, as of a dead band's width, there is nothing."""
         said, free = [], [one for one in self.objective.coordinates.free if self.at_end[one.name]]

@@ -42,11 +42,6 @@ class Identifiability(NamedTuple):
         return np.exp(TWO_SIDED * np.sqrt(np.diag(self.cov)))
 
     @property
-    def likeliest(self) -> np.ndarray:
-        """The former name of `most_likely`."""
-        return self.most_likely
-
-    @property
     def least_determined(self) -> dict[str, float]:
         """The least determined direction: factors on the parameters when the first of them grows by ten.
 

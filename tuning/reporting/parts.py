@@ -32,7 +32,7 @@ from tuning.reporting.search_figures import (
 from tuning.reporting.sketchbook import Sketchbook
 from tuning.reporting.subject import Subject
 from tuning.reporting.tables import errors_table
-from tuning.search.filter_types import kinds_tried, trials_of_kind
+from tuning.search.filter_types import filter_types_tried, trials_of_type
 from tuning.search.objectives import find_objective
 from tuning.search.plan import SIZE_SEEDS, Plan
 from tuning.search.space import AUTO, Choice
@@ -106,7 +106,7 @@ def search_section(book: Sketchbook, subject: Subject) -> Section:
         "First objective against each parameter; dashed is the best trial. Hollow: mean NIS outside its band. "
         f"Crosses: pruned, at the mean of the {word} seen."
     )
-    of_kind = trials_of_kind(trials, subject.choice.name)
+    of_kind = trials_of_type(trials, subject.choice.name)
     parts.append(book.picture(draw_slices(of_kind, labels[0]), caption, of_slices(of_kind)))
     if subject.plan.filter == AUTO:
         parts.append(_kinds_table(trials, objectives[0]))
@@ -139,7 +139,7 @@ def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
         [kind.name, f"{kind.trials}", f"{kind.pruned}", f"{kind.over_budget}"]
         + ["" if kind.value is None else f"{kind.value:.4g}{'' if kind.consistent else '*'}"]
         + ["" if kind.microseconds is None else f"{kind.microseconds:.4g}"]
-        for kind in kinds_tried(trials)
+        for kind in filter_types_tried(trials)
     ]
     caption = "Filters that were tried; the slices are those of the best"
     return Table(f"{caption}. *: mean NIS outside its band, to be chosen only where all are", columns, rows)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from numerics.files import check_target, write_whole
-from tuning.evaluation.held_out import Comparison, prove
+from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.kept import kept_comparison, kept_sizes
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size
 from tuning.likelihood.identifiability import identify, sentences, too_many
@@ -98,7 +98,7 @@ def pages_of(source: str | Path, subject: Subject, prefix: str = "p", file: str 
         subject = subject._replace(choice=choice)
     kept = [kept_comparison(subject.content, choice, scenario) for scenario in plan.scenarios]
     proofs = [
-        prove(choice, scenario, plan.seed, subject.seeds) if proof is None else proof
+        evaluate_held_out(choice, scenario, plan.seed, subject.seeds) if proof is None else proof
         for proof, scenario in zip(kept, plan.scenarios, strict=True)
     ]
     title = f"{choice.name} tuned on {', '.join(_short(scenario.name) for scenario in plan.scenarios)}"

@@ -15,7 +15,7 @@ from tuning.evaluation.sizes import SizeRow
 from tuning.reporting.figures import early_trials, limit_values
 from tuning.reporting.panels import COLUMNS, shown_states
 from tuning.search.outcome import best_trial, is_consistent
-from tuning.search.space import KIND
+from tuning.search.space import FILTER_TYPE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -83,7 +83,7 @@ def draw_slices(trials: Sequence[FrozenTrial], label: str) -> Figure:
     Hollow circles have a mean NIS outside its band; crosses were pruned and stand at the mean of their seeds.
     """
     done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    early, names = early_trials(trials), [name for name in done[0].params if name != KIND]
+    early, names = early_trials(trials), [name for name in done[0].params if name != FILTER_TYPE]
     figure, axes = panels(len(names), COLUMNS, (3.2, 2.7), extra=0.4, sharey=True)
     best, values = best_trial(done), [trial.values[0] for trial in done]
     assert best is not None  # a report is of a study with a complete trial

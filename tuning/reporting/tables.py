@@ -119,7 +119,7 @@ def _number(value: float | None) -> str:
 
 def known_table(found: Identifiability) -> Table:
     """What the innovations alone say of the numbers, and whether they determine them."""
-    columns = found.names, found.tuned, found.likeliest, found.factors, found.identified
+    columns = found.names, found.tuned, found.most_likely, found.factors, found.identified
     rows = [
         [name, f"{tuned:.4g}", f"{best:.4g}", f"{factor:.3g}" if known else "", "yes" if known else "no"]
         for name, tuned, best, factor, known in zip(*columns, strict=True)

@@ -57,10 +57,3 @@ def _row(name: str, trials: list[FrozenTrial]) -> FilterType:
         best is not None and is_consistent(best),
         min(costs, default=None),
     )
-
-
-# Former names.
-Kind = FilterType
-kinds_tried = filter_types_tried
-kinds_running = filter_types_running
-trials_of_kind = trials_of_type

@@ -61,11 +61,6 @@ class Plan(NamedTuple):
         return AUTO_FILTER_TYPES if self.filter == AUTO else (self.filter,)
 
     @property
-    def kinds(self) -> tuple[str, ...]:
-        """The former name of `filter_types`."""
-        return self.filter_types
-
-    @property
     def is_constrained(self) -> bool:
         """Whether the mean NIS has to be within its band: a filter without a covariance has no NIS."""
         return self.consistent and self._has_covariance

@@ -25,7 +25,7 @@ from tuning.search.parameters import (
 AUTO = "auto"  # in place of a filter: a study chooses among the following, all filters with a covariance.
 # The first one is the first trial.
 AUTO_FILTER_TYPES = ("ekf", *(name for name, kind in FILTERS.items() if kind.has_covariance and name != "ekf"))
-FILTER_TYPE = KIND = "filter"  # the trial parameter that is the filter type; KIND is its former name
+FILTER_TYPE = "filter"  # the trial parameter that is the filter type
 SIZE_LADDER = (5, 7, 10, 14, 20, 30, 50, 70, 100, 140, 200, 300, 500, 700, 1000, 1400, 2000, 3000, 5000)
 
 
@@ -65,9 +65,6 @@ def untuned_choice(name: str, problem: Problem) -> Choice:
 def oracle_choice(name: str, problem: Problem) -> Choice | None:
     """The filter that knows the plant's own Q and R, with the untuned ensemble size; None if they are unknown."""
     return None if problem.true is None else Choice(name, dict(problem.true), _default_numbers(name, problem))
-
-
-true_choice = oracle_choice  # its former name
 
 
 def has_ensemble(name: str) -> bool:
