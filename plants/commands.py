@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy import ndarray
 
 from numerics.checks import as_floats, shown
 from plants.quantities import Quantity
@@ -12,6 +13,10 @@ from plants.quantities import Quantity
 
 def one_number(action, quantity: Quantity) -> float:
     """The command of a plant with one input; ValueError unless an action is one number and not NaN."""
+    if type(action) is ndarray and action.size == 1:  # the frequent case has to be quick
+        number = action.item()
+        if type(number) is float and number == number:
+            return number
     try:
         item = action.item if hasattr(action, "item") else np.asarray(action).item
         given = item()

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from numerics.checks import seed as checked_seed
+from numerics.direct import direct
 from numerics.streams import draw_key
 from plants.commands import one_number, some_numbers
 from plants.copies import PlantCopies
@@ -19,7 +20,7 @@ from plants.rendered import RenderedEnv
 from plants.report import FLOAT32_ENDS, ReportRows, info_maker, observation_of, views_of
 
 # What `_set_views` makes.
-VIEWS = ("_memory", "_command", "_numbers", "_advance", "_report", "_views", "_info")
+VIEWS = ("_memory", "_command", "_arguments", "_advance", "_report", "_outcome", "_views", "_info")
 
 
 class PlantEnv(RenderedEnv):
@@ -77,9 +78,12 @@ class PlantEnv(RenderedEnv):
     def _set_views(self) -> None:
         """Short ways into the memory of the one copy, for a step has to be quick."""
         copies = self._copies
-        self._memory, self._numbers, self._advance = copies.memory, copies.numbers, copies.advance
+        self._advance: Callable = copies.advance
+        self._memory = copies.memory
+        self._arguments = (0, 1, self._memory, copies.numbers, self._out, False)
         self._command = self._memory[0, copies.commands[0] : copies.commands[-1] + 1, 0]
         self._report = self._out.reshape(-1)
+        self._outcome = self._report[REWARD : TERMINATED + 1]
         self._views, self._info = views_of(self._report, self._rows), info_maker(self._rows)
 
     def __getstate__(self) -> dict:
@@ -126,10 +130,10 @@ class PlantEnv(RenderedEnv):
         numbers = self._copies.numbers_from(options)
         super().reset(seed=checked_seed(seed))
         self._report[:] = self._copies.begin(draw_key(self.np_random)[None], numbers=numbers)[:, 0]
-        report = self._report.tolist()
+        self._advance = direct(self._copies.advance, *self._arguments)  # `step` has to be quick
         if self.render_mode is not None:
-            self._show(report, begin=True)
-        return self._observation(report), self._info(self._report, self._views)
+            self._show(self._report.tolist(), begin=True)
+        return self._observation(), self._info(self._report, self._views)
 
     def step(self, action):
         """Apply an action for one sample time.
@@ -140,17 +144,19 @@ class PlantEnv(RenderedEnv):
             self._command[0] = one_number(action, self.inputs[0])
         else:
             self._command[:] = some_numbers(action, self.inputs)
-        self._advance(0, 1, self._memory, self._numbers, self._out, False)
-        report = self._report.tolist()
+        self._advance(*self._arguments)
         if self.render_mode is not None:
-            self._show(report)
-        info = self._info(self._report, self._views)
-        return self._observation(report), report[REWARD], report[TERMINATED] > 0.0, False, info
+            self._show(self._report.tolist())
+        reward, terminated = self._outcome.tolist()
+        return self._observation(), reward, terminated > 0.0, False, self._info(self._report, self._views)
 
-    def _observation(self, report: list[float]) -> np.ndarray:
-        if self._single and -FLOAT32_ENDS < report[self._readings] < FLOAT32_ENDS:
-            self._observation_buffer[0] = report[self._readings]
-            return self._observation_buffer.copy()  # twice as fast as a new array of one number
+    def _observation(self) -> np.ndarray:
+        if self._single:
+            reading = self._report.item(self._readings)
+            if -FLOAT32_ENDS < reading < FLOAT32_ENDS:
+                self._observation_buffer[0] = reading
+                return self._observation_buffer.copy()  # twice as fast as a new array of one number
+        report = self._report.tolist()
         return observation_of([report[row] for row in self._observed])
 
 

@@ -12,6 +12,7 @@ from filters.engine.checks import check_belief, checked_key, vector_like
 from filters.engine.compile import PREDICT, START, UPDATE, new_memory, operation
 from filters.engine.layout import memory_places
 from numerics.checks import covariance
+from numerics.direct import direct
 from plants.layout import number_places, with_root
 
 if TYPE_CHECKING:
@@ -83,7 +84,11 @@ class Session:
         type(self).__init__(self, filter_)
         for own, kept in zip((*self._memory, self._values, self._numbers), arrays, strict=True):
             own[...] = kept
-        self.divergences, self._operate = divergences, operation(self._kernels).direct
+        self.divergences = divergences
+        self._call_directly()
+
+    def _call_directly(self) -> None:
+        self._operate = direct(operation(self._kernels), *self._given, STEP)  # `step` has to be quick
 
     def _do(self, task: int) -> None:
         self.divergences = self._operate(*self._given, task)
@@ -107,7 +112,7 @@ class Session:
         self.set_key(key)
         self._z[:] = z
         self._do(START + UPDATE)
-        self._operate = operation(self._kernels).direct  # `step` has to be quick
+        self._call_directly()
 
     def step(self, u, z) -> None:
         """Predict with input u (p,), then update with measurement z (m,); NaN marks a missing channel."""
