@@ -33,6 +33,7 @@ _waiting: list[Callable] = []
 _marked: set[Callable] = set()
 _called: set[Callable] = set()  # of these, functions that are called and not inlined
 _apart: set[Callable] = set()  # of these, functions of which there is one copy
+_narrow: set[Callable] = set()  # functions whose vectors are as wide as LLVM prefers
 _asked: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions that `compiled` has been given
 _lessons: list[Callable[[], None]] = [lambda: optimise_once(_which())]
 _interpreting = False
@@ -65,6 +66,12 @@ def kept_apart(function: Callable) -> Callable:
     return inlined(function, into_callers=False)
 
 
+def narrow(function: Callable) -> Callable:
+    """Mark a function whose loops keep the vectors that LLVM prefers: it was measured that wide ones take longer."""
+    _narrow.add(function)
+    return function
+
+
 def _which() -> Which:
     return Which(
         asked=_asked.__contains__,
@@ -72,6 +79,7 @@ def _which() -> Which:
         called=_called.__contains__,
         large=_is_large,
         apart=_apart.__contains__,
+        narrow=_narrow.__contains__,
     )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
 from filters.engine.restart import LARGEST, restart_if_lost, row_magnitude
-from numerics.compiled import function_fingerprint, inlined
+from numerics.compiled import function_fingerprint, inlined, narrow
 from plants.layout import number_places
 
 # Beliefs in a block, and so the distance of one belief's numbers. The compiler has to know it: it then sees that
@@ -27,6 +27,7 @@ def _all_predicting(kernels: Kernels) -> Callable:
     if kernels.stages is None:
         predict = kernels.predict
 
+        @narrow
         @inlined
         def predict_all(rows, us, ensemble, numbers, width):
             table, draws = ensemble
@@ -37,6 +38,7 @@ def _all_predicting(kernels: Kernels) -> Callable:
     begin, advance, finish = kernels.stages
     substeps_place = number_places(kernels.n, kernels.m).substeps
 
+    @narrow
     @inlined
     def predict_in_stages(rows, us, ensemble, numbers, width):
         table, draws = ensemble
@@ -66,6 +68,7 @@ def build_lanes(kernels: Kernels) -> Callable:
     predict_all, magnitude, restart = _all_predicting(kernels), row_magnitude(n, m), restart_if_lost(kernels)
     fingerprint = function_fingerprint(start, predict, update, within=__name__)
 
+    @narrow
     def lanes(together, keys, inputs, measurements, given_numbers, noise, out, first, last):
         fingerprint  # noqa: B018 - part of the cache's key
         qs, rs = noise
