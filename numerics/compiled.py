@@ -67,7 +67,7 @@ def kept_apart(function: Callable) -> Callable:
 
 
 def narrow(function: Callable) -> Callable:
-    """Mark a function whose loops keep the vectors that LLVM prefers: it was measured that wide ones take longer."""
+    """Mark a function whose loops keep the vectors that LLVM prefers: wide ones were measured to take longer."""
     _narrow.add(function)
     return function
 

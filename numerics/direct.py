@@ -1,4 +1,4 @@
-"""Compiled functions called without a look at the types of their arguments, where a call takes less than that look."""
+"""Compiled functions called without a look at the types of their arguments, where that would take longest."""
 
 from __future__ import annotations
 

@@ -3,8 +3,8 @@
 numba compiles each function for itself, together with all that it calls, as if Python could call it, too. For a
 filter of a large model, whose functions call one another over many levels, that would be most of the time.
 
-Loops of ours also get vectors of 512 bits where the processor has them. LLVM would take 256 on Intel's, for the sake
-of the first ones with 512, which slowed down.
+Loops of ours also get vectors of 512 bits where the processor has them. LLVM would take 256 on Intel's, for the
+sake of the first ones with 512, which slowed down.
 """
 
 from __future__ import annotations

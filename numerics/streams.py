@@ -28,8 +28,8 @@ _LN_2, _TWO_TO_MINUS_32 = float(np.log(2.0)), 2.0**-32
 
 @inlined
 def _round(counter, key):
-    # Of each word the low 32 bits count. What lies above them is taken off where it would matter, before a product:
-    # there it costs nothing, for vector code multiplies the lower halves of 64 bits anyway.
+    # Of each word the low 32 bits count. What lies above them is taken off where it would matter, before a
+    # product: there it costs nothing, for vector code multiplies the lower halves of 64 bits anyway.
     c0, c1, c2, c3 = counter
     product_0 = _MULTIPLIER_0 * (c0 & _LOW)
     product_1 = _MULTIPLIER_1 * (c2 & _LOW)
