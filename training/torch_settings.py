@@ -10,6 +10,8 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.distributions import Distribution
 
+from training.tanh import numpys_tanh
+
 
 @contextmanager
 def one_thread() -> Iterator[None]:
@@ -52,8 +54,8 @@ def fuse_optimizers(model: BaseAlgorithm) -> None:
 def learning(model: BaseAlgorithm) -> Iterator[None]:
     """Within this context a model learns as quickly as it can on one core.
 
-    Equal to Stable-Baselines3 by itself but for rounding of its optimizers.
+    Equal to Stable-Baselines3 by itself but for rounding, of its optimizers and of tanh.
     """
     fuse_optimizers(model)
-    with one_thread(), unchecked_distributions():
+    with one_thread(), unchecked_distributions(), numpys_tanh(model.policy):
         yield

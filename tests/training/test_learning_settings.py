@@ -1,4 +1,4 @@
-"""What makes learning quick changes nothing but rounding: minibatches, optimizers, checks that are left out."""
+"""What makes learning quick changes nothing but rounding: minibatches, optimizers, tanh, checks left out."""
 # ruff: noqa: F811 - fixtures come by import and go by name
 
 import numpy as np
@@ -16,6 +16,7 @@ from training.algorithms import ALGORITHMS
 from training.environments import make_environments
 from training.model import new_model
 from training.rollouts import EpochBuffer
+from training.tanh import NumpyTanh, numpys_tanh
 from training.torch_settings import learning
 
 SEEDS = range(4)
@@ -62,10 +63,31 @@ def test_while_a_model_learns_every_optimizer_is_fused_and_torch_is_given_back_a
     assert isinstance(getattr(model, "rollout_buffer", None), EpochBuffer) == (algo == "ppo")
 
 
-def learnt(fused):
+def test_tanh_and_its_derivative_are_those_of_torch():
+    quick, x = NumpyTanh(), torch.linspace(-12, 12, 4001).reshape(-1, 1).requires_grad_()
+    assert torch.autograd.gradcheck(quick, torch.linspace(-3, 3, 21, dtype=torch.float64).requires_grad_())
+    with torch.no_grad():
+        torch.testing.assert_close(quick(x), torch.tanh(x), rtol=3e-7, atol=0)
+    quickly, usual = (torch.autograd.grad(f(x).sum(), x)[0] for f in (quick, torch.tanh))
+    torch.testing.assert_close(quickly, usual, rtol=1e-6, atol=3e-7)
+
+
+@pytest.mark.parametrize("algo", ["ppo", "recurrent-ppo", "sac"])
+def test_only_while_a_model_learns_tanh_is_numpys(algo):
+    setup = setup_of(algo=algo)
+    policy = new_model(setup, make_environments(setup, SEEDS)).policy
+    kinds = [type(module) for module in policy.modules()]
+    with pytest.raises(KeyboardInterrupt), numpys_tanh(policy):
+        inside = {type(module) for module in policy.modules()}
+        assert (NumpyTanh in inside) == (torch.nn.Tanh in kinds) and torch.nn.Tanh not in inside
+        raise KeyboardInterrupt
+    assert [type(module) for module in policy.modules()] == kinds and NumpyTanh not in kinds
+
+
+def learnt(quickly):
     setup, steps = setup_of(), 384  # three rollouts; the last one is learnt from at the rate zero
     model = new_model(setup, make_environments(setup, SEEDS))
-    if fused:
+    if quickly:
         with learning(model):
             model.learn(steps)
     else:
@@ -77,7 +99,7 @@ def test_what_is_learnt_is_what_stable_baselines3_learns_by_itself_but_for_round
     setup = setup_of()
     first = new_model(setup, make_environments(setup, SEEDS)).policy.parameters()
     start = torch.nn.utils.parameters_to_vector(first).detach().numpy()
-    ours, theirs = learnt(fused=True), learnt(fused=False)
+    ours, theirs = learnt(quickly=True), learnt(quickly=False)
     moved = abs(theirs - start).max()
     assert moved > 1e-3 and abs(ours - theirs).max() < 1e-4 * moved
 
