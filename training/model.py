@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from training.algorithms import find_algorithm
-from training.rollouts import EpochBuffer
 from training.setup import TrainingConfiguration
 
 
@@ -34,8 +32,6 @@ def new_model(setup: TrainingConfiguration, envs: VecEnv, tensorboard: Path | No
     if "noise_std" in numbers:
         deviation = numbers.pop("noise_std")
         numbers["action_noise"] = NormalActionNoise(np.zeros(1), np.full(1, deviation))
-    if kind is PPO:
-        numbers["rollout_buffer_class"] = EpochBuffer
     normalised = VecNormalize(envs, gamma=numbers["gamma"])
     log = None if tensorboard is None else str(tensorboard)
     return kind(algorithm.policy, normalised, seed=setup.seed, tensorboard_log=log, device="cpu", **numbers)

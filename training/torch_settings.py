@@ -10,6 +10,8 @@ import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from torch.distributions import Distribution
 
+from numerics.wait_policy import PASSIVE, waiting
+from training.rollouts import epoch_minibatches
 from training.tanh import numpys_tanh
 
 
@@ -52,10 +54,21 @@ def fuse_optimizers(model: BaseAlgorithm) -> None:
 
 @contextmanager
 def learning(model: BaseAlgorithm) -> Iterator[None]:
-    """Within this context a model learns as quickly as it can on one core.
+    """Within this context a model of Stable-Baselines3 learns as quickly as it can on one core.
 
-    Equal to Stable-Baselines3 by itself but for rounding, of its optimizers and of tanh.
+    What it learns is the same but for rounding, of its optimizers and of tanh. torch has one thread and checks no
+    arguments of distributions, minibatches are parts of an epoch's samples, and worker threads of vector envs
+    sleep while torch works.
+
+    Args:
+        model: on the CPU.
     """
     fuse_optimizers(model)
-    with one_thread(), unchecked_distributions(), numpys_tanh(model.policy):
+    with (
+        waiting(PASSIVE),
+        one_thread(),
+        unchecked_distributions(),
+        epoch_minibatches(model),
+        numpys_tanh(model.policy),
+    ):
         yield

@@ -11,6 +11,7 @@ from gymnasium.spaces import Box
 from stable_baselines3.common.buffers import RolloutBuffer
 from torch.distributions import Distribution
 
+from numerics.wait_policy import wait_policy
 from tests.learners import setup_of, short_episodes  # noqa: F401 - a fixture
 from training.algorithms import ALGORITHMS
 from training.environments import make_environments
@@ -48,19 +49,20 @@ def optimizers_of(model):
 def test_while_a_model_learns_every_optimizer_is_fused_and_torch_is_given_back_as_it_was(algo):
     setup = setup_of(algo=algo)
     model = new_model(setup, make_environments(setup, SEEDS))
-    before = torch.get_num_threads(), Distribution._validate_args
+    before = torch.get_num_threads(), Distribution._validate_args, wait_policy()
     torch.set_num_threads(2)
     try:
         with pytest.raises(KeyboardInterrupt), learning(model):
-            assert torch.get_num_threads() == 1 and not Distribution._validate_args
+            assert torch.get_num_threads() == 1 and not Distribution._validate_args and wait_policy() == "passive"
+            assert isinstance(getattr(model, "rollout_buffer", None), EpochBuffer) == (algo == "ppo")
             raise KeyboardInterrupt
-        assert torch.get_num_threads() == 2 and Distribution._validate_args == before[1]
+        assert not isinstance(getattr(model, "rollout_buffer", None), EpochBuffer)
+        assert (torch.get_num_threads(), Distribution._validate_args, wait_policy()) == (2, *before[1:])
     finally:
         torch.set_num_threads(before[0])
     found = optimizers_of(model)
     assert len(found) == {"ppo": 1, "recurrent-ppo": 1, "sac": 3, "td3": 2}[algo]
     assert all(group["fused"] for state in found.values() for group in state["param_groups"])
-    assert isinstance(getattr(model, "rollout_buffer", None), EpochBuffer) == (algo == "ppo")
 
 
 def test_tanh_and_its_derivative_are_those_of_torch():
