@@ -18,7 +18,7 @@ LINE = 16  # integers of 8 bytes: two cache lines, for processors that fetch pai
 CALL = 0  # place of the current call's number
 OPEN, TAKEN, DONE = 0, 1, 2  # what a part of a call may be
 SPINS = 64  # at a number between two moments in which another thread may have the core
-SPIN_ROUNDS = 1000  # such moments, of about half a microsecond each
+SPIN_ROUNDS = 1000  # such moments in a wait for the next call, of about half a microsecond each
 
 
 def new_flags(places: int) -> np.ndarray:
@@ -63,9 +63,9 @@ def wait_for(marks, place):
 
 
 @inlined
-def spin_for_call(flags, call):
-    """Wait for the next call for a limited time (spin-wait)."""
-    for _ in range(SPIN_ROUNDS):
+def spin_for_call(flags, call, rounds):
+    """Wait for the next call for a limited time, of some rounds (spin-wait)."""
+    for _ in range(rounds):
         for _ in range(SPINS):
             if read(flags, CALL) > call:
                 return

@@ -1,7 +1,8 @@
 """Work on all cores: calls in parts, and worker threads for calls that take some hundred microseconds.
 
 A thread that has gone to sleep wakes up tens of microseconds after it is called. So worker threads wait for
-the next call spinning, during half a millisecond, in compiled code that holds no lock, before they go to sleep.
+the next call spinning, during half a millisecond, in compiled code that holds no lock, before they go to sleep;
+unless the wait policy is "passive" (`numerics.wait_policy`).
 """
 
 from __future__ import annotations
@@ -16,8 +17,21 @@ from queue import SimpleQueue
 
 import numpy as np
 
-from numerics.atomics import CALL, DONE, LINE, TAKEN, new_flags, post, spin_for_call, take, teach_numba, wait_for
+from numerics.atomics import (
+    CALL,
+    DONE,
+    LINE,
+    SPIN_ROUNDS,
+    TAKEN,
+    new_flags,
+    post,
+    spin_for_call,
+    take,
+    teach_numba,
+    wait_for,
+)
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined
+from numerics.wait_policy import ACTIVE, wait_policy
 
 CALLER = 0  # place of the thread that makes a call; helpers are 1, 2, ...
 BEHIND = 2  # calls that wait for a helper, with which it gets no more
@@ -51,7 +65,7 @@ def in_parts(work: Callable) -> CompiledOrPython:
     inlined(work)
     fingerprint = function_fingerprint(work, within=work.__module__)
 
-    def part(flags, marks, place, helpers, call, count, arguments):
+    def part(flags, marks, place, helpers, call, rounds, count, arguments):
         fingerprint  # noqa: B018 - part of the cache's key
         if place == CALLER and helpers > 0:
             post(flags, CALL, call)
@@ -65,7 +79,7 @@ def in_parts(work: Callable) -> CompiledOrPython:
             elif place == CALLER:
                 wait_for(marks, LINE * p)
         if place != CALLER:
-            spin_for_call(flags, call)
+            spin_for_call(flags, call, rounds)
 
     return CompiledOrPython(part)
 
@@ -105,21 +119,22 @@ class WorkerThreads:
         """
         direct = part.direct
         if alone or direct is part or not self._jobs:
-            part(self._flags, self._nothing, CALLER, 0, 0, count, arguments)
+            part(self._flags, self._nothing, CALLER, 0, 0, 0, count, arguments)
         else:
             self._share(direct, count, arguments)
 
     def _share(self, part: Callable, count: int, arguments: tuple) -> None:
         flags, helpers, call = self._flags, len(self._jobs), next(self._calls)
+        rounds = SPIN_ROUNDS if wait_policy() == ACTIVE else 0
         marks = new_flags(helpers + 1)
         errors: list[BaseException] = []
         try:
             for place, jobs in enumerate(self._jobs, 1):
                 if jobs.qsize() < BEHIND:  # else it would keep the arguments of calls that are over
-                    jobs.put((part, (flags, marks, place, helpers, call, count, arguments), errors))
-            part(flags, marks, CALLER, helpers, call, count, arguments)
+                    jobs.put((part, (flags, marks, place, helpers, call, rounds, count, arguments), errors))
+            part(flags, marks, CALLER, helpers, call, rounds, count, arguments)
         except BaseException:  # no helper may be at work when the caller goes on
-            part(flags, marks, CALLER, helpers, call, 0, arguments)
+            part(flags, marks, CALLER, helpers, call, rounds, 0, arguments)
             raise
         if errors:
             raise errors[0]

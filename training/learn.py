@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from copy import deepcopy
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
-from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from numerics.files import write_whole
-from training.algorithms import find_algorithm
 from training.environments import make_environments, seed_episodes
+from training.model import new_model
 from training.saved import (
     BEST,
     CHECKPOINTS,
@@ -37,6 +33,7 @@ from training.saved import (
     whole,
 )
 from training.setup import TrainingConfiguration
+from training.torch_settings import learning
 from tuning.problems.seeds import SEEDS_APART, training_seeds
 from tuning.search.interruption import stop_on_interrupt
 
@@ -102,7 +99,7 @@ def train(
     if not (folder / FINAL).exists():
         write_whole(folder / SETUP, setup.as_json())
     began = time.perf_counter()
-    with stop_on_interrupt() as interrupted, one_thread():
+    with stop_on_interrupt() as interrupted, learning(model):
         watch = _Watch(setup, folder, checkpoints, evaluation, interrupted, on_progress)
         if remaining > 0:
             model.learn(remaining, [evaluation, watch], tb_log_name=setup.observe, reset_num_timesteps=False)
@@ -116,17 +113,6 @@ def train(
     envs.close()
     validation.close()
     return Trained(folder, model.num_timesteps, model.num_timesteps - before, seconds, curve, stopped)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Within this context torch uses one thread, which is fastest for such small networks."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _start(folder: Path, setup: TrainingConfiguration) -> Path | None:
@@ -153,22 +139,11 @@ def _episodes_after(setup: TrainingConfiguration, steps: int) -> list[int]:
 def _model(
     setup: TrainingConfiguration, envs: VecEnv, start: Path | None, tensorboard: Path | None
 ) -> BaseAlgorithm:
-    algorithm = find_algorithm(setup.algo)
-    kind = algorithm.load_class()
-    if start is not None:
-        model = load(start, envs, training=True).model
-        model.tensorboard_log = None if tensorboard is None else str(tensorboard)
-        return model
-    numbers = deepcopy(dict(setup.hyperparameters))  # off-policy algorithms write into policy_kwargs
-    rate = numbers["learning_rate"]
-    # The last rollout may exceed the requested steps: `remaining` is then negative.
-    numbers["learning_rate"] = lambda remaining: rate * max(remaining, 0.0)
-    if "noise_std" in numbers:
-        deviation = numbers.pop("noise_std")
-        numbers["action_noise"] = NormalActionNoise(np.zeros(1), np.full(1, deviation))
-    normalised = VecNormalize(envs, gamma=numbers["gamma"])
-    log = None if tensorboard is None else str(tensorboard)
-    return kind(algorithm.policy, normalised, seed=setup.seed, tensorboard_log=log, device="cpu", **numbers)
+    if start is None:
+        return new_model(setup, envs, tensorboard)
+    model = load(start, envs, training=True).model
+    model.tensorboard_log = None if tensorboard is None else str(tensorboard)
+    return model
 
 
 def _evaluations_in(path: Path) -> dict[str, np.ndarray]:

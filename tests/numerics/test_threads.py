@@ -13,9 +13,10 @@ from queue import SimpleQueue
 import numpy as np
 import pytest
 
-from numerics.atomics import LINE, TAKEN, take
+from numerics.atomics import LINE, SPIN_ROUNDS, TAKEN, take
 from numerics.compiled import interpreted
 from numerics.threads import BEHIND, CALLER, WorkerThreads, in_parts, spread, worker_threads
+from numerics.wait_policy import waiting
 
 COUNT = 1000
 
@@ -84,14 +85,14 @@ class Rehearsed:
     def direct(self):
         return self._fail_or_do
 
-    def _fail_or_do(self, flags, marks, place, helpers, call, count, arguments):
+    def _fail_or_do(self, flags, marks, place, helpers, call, rounds, count, arguments):
         if count > 0:  # else it only makes sure that no helper is at work
             if place != CALLER and place in self.failing:
                 take(marks, LINE * place, TAKEN)
             self.begun.wait(30)
             if place in self.failing:
                 raise KeyboardInterrupt
-        self.part(flags, marks, place, helpers, call, count, arguments)
+        self.part(flags, marks, place, helpers, call, rounds, count, arguments)
 
 
 @pytest.mark.parametrize("failing", [{0}, {1}, {2}, {1, 2}])
@@ -102,6 +103,32 @@ def test_after_a_failure_in_any_thread_the_next_call_is_right(part, failing):
     values[:] = 0.0
     workers.run(part, COUNT, values)
     assert np.array_equal(values, np.arange(COUNT))
+
+
+class Noted:
+    """Stands in for a compiled part, and notes for how many rounds the helpers are to wait."""
+
+    def __init__(self, part):
+        self.part, self.rounds = part, set()
+
+    @property
+    def direct(self):
+        return self._note
+
+    def _note(self, flags, marks, place, helpers, call, rounds, count, arguments):
+        self.rounds.add(rounds)
+        self.part(flags, marks, place, helpers, call, rounds, count, arguments)
+
+
+def test_the_wait_policy_reaches_the_helpers_and_changes_no_number(part):
+    workers = WorkerThreads(2)
+    for policy, rounds in (("passive", 0), ("active", SPIN_ROUNDS)):
+        noted, values = Noted(part), np.zeros(COUNT)
+        with waiting(policy):
+            for _ in range(5):
+                workers.run(noted, COUNT, values)
+        assert noted.rounds == {rounds}
+        assert np.array_equal(values, 5.0 * np.arange(COUNT))
 
 
 @contextmanager

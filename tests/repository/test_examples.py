@@ -30,6 +30,7 @@ SHOWN = {  # what a page's code makes
     "export": {"content"},
     "missing": {"belief", "innovation"},
     "noise": {"env"},
+    "processes": {"rewards"},
     "stable_baselines": {"model", "normalise", "action"},
 }
 HOW_TO = [

@@ -20,10 +20,11 @@ from numerics.threads import cores
 from training.classical import classical_policy
 from training.comparison.plan import CLASSICAL, Comparison, Run, runs_of
 from training.environments import make_environments
-from training.learn import one_thread, train
+from training.learn import train
 from training.plants.plant import Part
 from training.saved import FINAL, load
 from training.score import Policy, Scores, score
+from training.torch_settings import one_thread
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.interruption import without_interrupts
 
