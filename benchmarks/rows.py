@@ -11,38 +11,60 @@ from typing import NamedTuple
 
 from benchmarks.timing import Timing
 
-COLUMNS = ["what; peer", "ours", "peer", "ratio", "goal", "met?"]
+COLUMNS = ["what; peer", "ours", "peer", "ratio", "limit", "x limit", "goal", "met?"]
 PACKAGES = ("numba", "gymnasium", "numpy", "filterpy", "jax", "stable_baselines3", "torch")
 
 
 class Row(NamedTuple):
-    """A timing, and the most that its ratio or its time may be."""
+    """A timing, what it would be on the machine's arithmetic limit, and the most that it may be of something.
+
+    A goal is one of the ratio to the peer, of the multiple of the limit, or of the time, where that was asked for.
+    """
 
     what: str
     peer_name: str | None
     timing: Timing
     ratio_goal: float | None = None
+    limit: float | None = None  # [s]
+    limit_goal: float | None = None  # of `of_limit`
     time_goal: float | None = None  # [s]
+
+    @property
+    def of_limit(self) -> float | None:
+        """Our time as a multiple of the limit."""
+        return None if self.limit is None else self.timing.ours / self.limit
 
     @property
     def met(self) -> bool | None:
         """Whether the goal is met; None without a goal."""
+        for value, goal in (
+            (self.timing.ratio, self.ratio_goal),
+            (self.of_limit, self.limit_goal),
+            (self.timing.ours, self.time_goal),
+        ):
+            if goal is not None:
+                return value <= goal
+        return None
+
+    @property
+    def goal(self) -> str:
+        """The goal as text."""
         if self.ratio_goal is not None:
-            return self.timing.ratio <= self.ratio_goal
-        return None if self.time_goal is None else self.timing.ours <= self.time_goal
+            return f"{self.ratio_goal:.2g}"
+        if self.limit_goal is not None:
+            return f"{self.limit_goal:g} x limit"
+        return "-" if self.time_goal is None else readable(self.time_goal)
 
     def cells(self) -> list[str]:
         """The row as text, by `COLUMNS`."""
-        if self.ratio_goal is not None:
-            goal = f"{self.ratio_goal:.2g}"
-        else:
-            goal = "-" if self.time_goal is None else readable(self.time_goal)
         return [
             self.what if self.peer_name is None else f"{self.what}; {self.peer_name}",
             readable(self.timing.ours),
             "-" if self.timing.peer is None else readable(self.timing.peer),
             "-" if self.timing.ratio is None else f"{self.timing.ratio:.3g}",
-            goal,
+            "-" if self.limit is None else readable(self.limit),
+            "-" if self.of_limit is None else _rounded(self.of_limit),
+            self.goal,
             {True: "yes", False: "no", None: "-"}[self.met],
         ]
 
@@ -54,10 +76,17 @@ class Row(NamedTuple):
             "ours_seconds": self.timing.ours,
             "peer_seconds": self.timing.peer,
             "ratio": self.timing.ratio,
+            "limit_seconds": self.limit,
+            "of_limit": self.of_limit,
             "ratio_goal": self.ratio_goal,
+            "limit_goal": self.limit_goal,
             "time_goal_seconds": self.time_goal,
             "met": self.met,
         }
+
+
+def _rounded(ratio: float) -> str:
+    return f"{ratio:.2g}" if ratio < 99.5 else f"{ratio:.0f}"
 
 
 def readable(seconds: float) -> str:
@@ -74,6 +103,8 @@ def machine() -> dict[str, str | int]:
         "cpu": _cpu(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         "system": f"{platform.system()} {platform.machine()}",
+        "vector_bits": vector_bits(),
+        "avx512": _has_avx512(),
         "python": platform.python_version(),
         **{package: version(package) for package in PACKAGES if find_spec(package)},
     }
@@ -88,10 +119,34 @@ def _cpu() -> str:
     return models[0] if models else platform.processor() or "unknown processor"
 
 
+def _has_avx512() -> bool:
+    import llvmlite.binding  # comes with numba
+
+    return bool(llvmlite.binding.get_host_cpu_features().get("avx512f", False))
+
+
+def vector_bits() -> int:
+    """Bits in the vectors of which the compiler makes loops by itself: fewer than there are on some processors."""
+    import numba
+
+    def scale(values):
+        for j in range(values.shape[0]):
+            values[j] *= 2.0
+
+    (code,) = numba.njit("void(float64[::1])")(scale).inspect_asm().values()
+    return 512 if "%zmm" in code else 256 if "%ymm" in code else 128
+
+
+def machine_name(facts: dict) -> str:
+    """Processor and cores: what tells machines apart."""
+    return f"{facts['cpu']}, {facts['cores']} cores"
+
+
 def machine_lines(facts: dict) -> list[str]:
     """The machine in two lines of text."""
     packages = ", ".join(f"{name} {facts[name]}" for name in PACKAGES if name in facts)
+    avx512 = "AVX-512" if facts["avx512"] else "no AVX-512"
     return [
-        f"Machine: {facts['cpu']}, {facts['cores']} cores, {facts['system']}.",
+        f"Machine: {machine_name(facts)}, {facts['system']}, vectors of {facts['vector_bits']} bits, {avx512}.",
         f"Python {facts['python']}, {packages}.",
     ]
