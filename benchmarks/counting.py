@@ -79,7 +79,7 @@ class Graph:
 
     def number(self, name: str, inputs: tuple, value, kind: str | None) -> Counted:
         """The number that an operation makes; that of the same operation on the same operands is the same."""
-        names = [id(x) if isinstance(x, Counted) else (float(x),) for x in inputs]
+        names = [id(x) if isinstance(x, Counted) else (x,) for x in inputs]
         key = (name, *(sorted(names, key=str) if name in COMMUTATIVE else names))
         if key not in self._known:
             operands = tuple(x for x in inputs if isinstance(x, Counted))

@@ -52,7 +52,7 @@ class Row(NamedTuple):
         if self.ratio_goal is not None:
             return f"{self.ratio_goal:.2g}"
         if self.limit_goal is not None:
-            return f"{self.limit_goal:g} x limit"
+            return f"{self.limit_goal:g} x"
         return "-" if self.time_goal is None else readable(self.time_goal)
 
     def cells(self) -> list[str]:
@@ -61,9 +61,9 @@ class Row(NamedTuple):
             self.what if self.peer_name is None else f"{self.what}; {self.peer_name}",
             readable(self.timing.ours),
             "-" if self.timing.peer is None else readable(self.timing.peer),
-            "-" if self.timing.ratio is None else f"{self.timing.ratio:.3g}",
+            "-" if self.timing.ratio is None else rounded(self.timing.ratio),
             "-" if self.limit is None else readable(self.limit),
-            "-" if self.of_limit is None else _rounded(self.of_limit),
+            "-" if self.of_limit is None else rounded(self.of_limit, 2),
             self.goal,
             {True: "yes", False: "no", None: "-"}[self.met],
         ]
@@ -85,16 +85,17 @@ class Row(NamedTuple):
         }
 
 
-def _rounded(ratio: float) -> str:
-    return f"{ratio:.2g}" if ratio < 99.5 else f"{ratio:.0f}"
+def rounded(number: float, figures: int = 3) -> str:
+    """A number with so many figures, or all those before the point."""
+    return f"{number:.0f}" if number >= 10**figures - 0.5 else f"{number:.{figures}g}"
 
 
 def readable(seconds: float) -> str:
     """A time with three figures in the unit that suits it."""
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
         if seconds >= size:
-            return f"{seconds / size:.3g} {unit}"
-    return f"{seconds / 1e-9:.3g} ns"
+            return f"{rounded(seconds / size)} {unit}"
+    return f"{rounded(seconds / 1e-9)} ns"
 
 
 def machine() -> dict[str, str | int]:

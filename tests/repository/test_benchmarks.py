@@ -69,12 +69,12 @@ def test_the_filter_written_for_jax_is_ours_given_our_random_numbers(process_noi
     ("row", "shown"),
     [
         (
-            Row("a", "b", Timing(1e-6, 4e-6, 0.25), ratio_goal=1 / 3, limit=8e-9),
-            ["a; b", "1 us", "4 us", "0.25", "8 ns", "125", "0.33", "yes"],
+            Row("a", "b", Timing(1234.5, 4938.0, 0.25), ratio_goal=1 / 3, limit=10.0),
+            ["a; b", "1234 s", "4938 s", "0.25", "10 s", "123", "0.33", "yes"],
         ),
         (
             Row("a", None, Timing(2.5e-9, None, None), limit=1e-9, limit_goal=2),
-            ["a", "2.5 ns", "-", "-", "1 ns", "2.5", "2 x limit", "no"],
+            ["a", "2.5 ns", "-", "-", "1 ns", "2.5", "2 x", "no"],
         ),
         (
             Row("a", "b", Timing(0.5, 0.1, 5.0), time_goal=0.6),
