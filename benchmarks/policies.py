@@ -8,9 +8,10 @@ from time import perf_counter
 import gymnasium as gym
 import numpy as np
 
+from benchmarks.networks import network_limit
 from benchmarks.rates import arithmetic_limit
 from benchmarks.rows import Row
-from benchmarks.timing import Measure, alone, seconds_a_call, side_by_side
+from benchmarks.timing import Measure, alone, side_by_side
 from benchmarks.workloads import step_of_env, step_of_filtered
 from numerics.threads import cores
 from tuning.problems.seeds import training_seeds
@@ -18,42 +19,37 @@ from tuning.thruster.find import find_scenario
 
 COPIES = 64
 GOAL, ACTING_GOAL = 0.6, 0.12  # of the time that PPO, or the envs alone, take with DummyVecEnv
-PASSES = 3  # of the network in a step of gradient descent: its output, and slopes over weights and over inputs
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
     """Measure, one row after the other."""
     rounds, rollouts = (1, 1) if quick else (9, 2)
-    ours, peer = (ppo(seed, native) for native in (True, False))
-    timing = side_by_side(learning(ours, rollouts), learning(peer, rollouts), rounds)
-    what, limit = f"a step of PPO on an EKF, {COPIES} copies", network_limit(ours)
-    yield Row(what, "DummyVecEnv", timing, ratio_goal=GOAL, limit=limit)
-    stepping = side_by_side(*(acting(seed, "ekf", native) for native in (True, False)), rounds)
+    ours, peer = (learning(seed, native, rollouts) for native in (True, False))
+    timing = side_by_side(ours, peer, rounds)
     env = gym.make("filters:BowThruster-EKF-v0")
+    limit = network_limit(_setup("ekf", seed))
+    yield Row(f"a step of PPO on an EKF, {COPIES} copies", "DummyVecEnv", timing, ratio_goal=GOAL, limit=limit)
+    stepping = side_by_side(*(acting(seed, "ekf", native) for native in (True, False)), rounds)
     limit = arithmetic_limit(step_of_filtered(env), cores=cores())
     yield Row("of it env and EKF", "DummyVecEnv", stepping, ratio_goal=ACTING_GOAL, limit=limit)
     limit = arithmetic_limit(step_of_env(env), cores=cores())
     yield Row("of it env alone", None, alone(acting(seed, "raw", True), rounds), limit=limit)
 
 
-def ppo(seed: int, native: bool):
-    """The algorithm with its envs, before it learns."""
+def learning(seed: int, native: bool, rollouts: int) -> Measure:
+    """Seconds a step of a short training."""
     from stable_baselines3.common.vec_env import VecNormalize
 
     from training.algorithms import find_algorithm
     from training.environments import make_environments
-
-    setup = _setup("ekf", seed)
-    envs = VecNormalize(make_environments(setup, training_seeds(seed, COPIES), native=native))
-    algorithm = find_algorithm("ppo")
-    return algorithm.load_class()(algorithm.policy, envs, seed=seed, device="cpu", **dict(setup.hyperparameters))
-
-
-def learning(model, rollouts: int) -> Measure:
-    """Seconds a step of a short training."""
     from training.learn import one_thread
 
-    steps = rollouts * COPIES * model.n_steps
+    setup = _setup("ekf", seed)
+    numbers = dict(setup.hyperparameters)
+    steps = rollouts * COPIES * numbers["n_steps"]
+    envs = VecNormalize(make_environments(setup, training_seeds(seed, COPIES), native=native))
+    algorithm = find_algorithm("ppo")
+    model = algorithm.load_class()(algorithm.policy, envs, seed=seed, device="cpu", **numbers)
 
     def measure() -> float:
         with one_thread():
@@ -62,21 +58,6 @@ def learning(model, rollouts: int) -> Measure:
             return (perf_counter() - begin) / steps
 
     return measure
-
-
-def network_limit(model) -> float:
-    """Seconds a step of the products with the networks' weights alone, at torch's rate in one thread."""
-    import torch
-
-    from training.learn import one_thread
-
-    layers = [layer for layer in model.policy.modules() if isinstance(layer, torch.nn.Linear)]
-    width = max(layer.out_features for layer in layers)
-    batch, weights = torch.ones(model.batch_size, width), torch.ones(width, width)
-    multiply = seconds_a_call(torch.mm, 50 * [(batch, weights)])
-    with one_thread(), torch.no_grad():
-        seconds = alone(multiply, 100).ours / (batch.numel() * width)
-    return seconds * sum(layer.weight.numel() for layer in layers) * (1 + PASSES * model.n_epochs)
 
 
 def acting(seed: int, observe: str, native: bool, steps: int = 200) -> Measure:

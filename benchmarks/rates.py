@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.counting import ADD, DIVIDE, INTEGER, MULTIPLY, PRODUCT, RECIPROCAL_ROOT, ROOT
-from numerics.compiled import compiled, when_compiling
+from numerics.compiled import compiled
 from numerics.threads import spread
 
 FUSED, ROUND = "fused multiply-add", "product, shift and two exclusive ors"
@@ -49,31 +49,7 @@ def arithmetic_limit(count: Counter[str], *, cores: int = 1) -> float:
     )
 
 
-def wide_vectors():
-    """In compiled code, the caller uses the widest vectors that the processor has: some prefer narrower ones."""
-
-
-@when_compiling
-def _teach_wide_vectors():
-    from numba.core import types
-    from numba.extending import intrinsic, overload
-
-    @intrinsic
-    def widened(_):
-        def generate(context, builder, signature, arguments):
-            # A set of the attributes that llvmlite knows, to which any others can be added.
-            set.add(builder.function.attributes, '"prefer-vector-width"="512"')
-            return context.get_dummy_value()
-
-        return types.none(), generate
-
-    @overload(wide_vectors, inline="always")
-    def _wide_vectors():
-        return lambda: widened()
-
-
 def _fused(data, repeats):
-    wide_vectors()
     for _ in range(repeats):
         for j in range(data.shape[0]):
             c = data[j]
@@ -87,28 +63,24 @@ def _fused(data, repeats):
 
 
 def _divided(data, repeats):
-    wide_vectors()
     for _ in range(repeats):
         for j in range(data.shape[0]):
             data[j] = 1.0 / (data[j] + 1.0)
 
 
 def _root(data, repeats):
-    wide_vectors()
     for _ in range(repeats):
         for j in range(data.shape[0]):
             data[j] = (data[j] + 1.0) ** 0.5
 
 
 def _reciprocal_root(data, repeats):
-    wide_vectors()
     for _ in range(repeats):
         for j in range(data.shape[0]):
             data[j] = 1.0 / (data[j] + 1.0) ** 0.5
 
 
 def _newtons_root(data, repeats):  # the same to 1e-15
-    wide_vectors()
     for _ in range(repeats):
         for j in range(data.shape[0]):
             x = data[j] + 1.0
@@ -120,7 +92,6 @@ def _newtons_root(data, repeats):  # the same to 1e-15
 
 
 def _rounds(data, repeats):
-    wide_vectors()
     for _ in range(repeats):
         for j in range(data.shape[0]):
             c0 = c1 = c2 = c3 = data[j]
@@ -132,7 +103,6 @@ def _rounds(data, repeats):
 
 
 def _shifts(data, repeats):
-    wide_vectors()
     for _ in range(repeats):
         for j in range(data.shape[0]):
             x = data[j]
@@ -191,3 +161,18 @@ def _seconds(loop: Loop, cores: int) -> float:
 @cache
 def _compiled(function: Callable) -> Callable:
     return compiled(function)
+
+
+def vector_bits() -> int:
+    """Bits in the vectors of which the compiler makes our loops, as its assembly shows."""
+    from numba.core.caching import NullCache
+
+    def scale(values):
+        for j in range(values.shape[0]):
+            values[j] *= 2.0
+
+    run = compiled(scale)
+    run._cache = NullCache()  # there is no assembly of code that was read from a file
+    run(np.ones(1))
+    (code,) = run.inspect_asm().values()
+    return 512 if "%zmm" in code else 256 if "%ymm" in code else 128

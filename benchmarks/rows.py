@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
+from benchmarks.rates import vector_bits
 from benchmarks.timing import Timing
 
 COLUMNS = ["what; peer", "ours", "peer", "ratio", "limit", "x limit", "goal", "met?"]
@@ -98,14 +99,17 @@ def readable(seconds: float) -> str:
     return f"{rounded(seconds / 1e-9)} ns"
 
 
-def machine() -> dict[str, str | int]:
+def machine() -> dict[str, str | int | bool]:
     """What the times depend on beside the code."""
+    from llvmlite import binding  # comes with numba
+
     return {
         "cpu": _cpu(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
         "system": f"{platform.system()} {platform.machine()}",
+        "architecture": binding.get_host_cpu_name(),
+        "avx512": binding.get_host_cpu_features().get("avx512f", False),
         "vector_bits": vector_bits(),
-        "avx512": _has_avx512(),
         "python": platform.python_version(),
         **{package: version(package) for package in PACKAGES if find_spec(package)},
     }
@@ -126,18 +130,6 @@ def _has_avx512() -> bool:
     return bool(llvmlite.binding.get_host_cpu_features().get("avx512f", False))
 
 
-def vector_bits() -> int:
-    """Bits in the vectors of which the compiler makes loops by itself: fewer than there are on some processors."""
-    import numba
-
-    def scale(values):
-        for j in range(values.shape[0]):
-            values[j] *= 2.0
-
-    (code,) = numba.njit("void(float64[::1])")(scale).inspect_asm().values()
-    return 512 if "%zmm" in code else 256 if "%ymm" in code else 128
-
-
 def machine_name(facts: dict) -> str:
     """Processor and cores: what tells machines apart."""
     return f"{facts['cpu']}, {facts['cores']} cores"
@@ -146,8 +138,9 @@ def machine_name(facts: dict) -> str:
 def machine_lines(facts: dict) -> list[str]:
     """The machine in two lines of text."""
     packages = ", ".join(f"{name} {facts[name]}" for name in PACKAGES if name in facts)
-    avx512 = "AVX-512" if facts["avx512"] else "no AVX-512"
+    avx512 = " with AVX-512" if facts["avx512"] else ""
+    vectors = f"{facts['architecture']}{avx512}, compiled to vectors of {facts['vector_bits']} bits"
     return [
-        f"Machine: {machine_name(facts)}, {facts['system']}, vectors of {facts['vector_bits']} bits, {avx512}.",
+        f"Machine: {machine_name(facts)}, {facts['system']}; {vectors}.",
         f"Python {facts['python']}, {packages}.",
     ]
