@@ -21,11 +21,17 @@ from numerics.compiled import interpreted
 ADD, MULTIPLY, DIVIDE, ROOT, RECIPROCAL_ROOT = "add", "multiply", "divide", "root", "reciprocal root"
 PRODUCT, INTEGER = "integer product", "integer"  # of 32 bits by 32, and shifts, sums and exclusive ors
 
-FREE = (np.absolute, np.negative, np.positive, np.bitwise_and, np.floor, np.ceil, np.remainder)
-LIBRARY = (np.sin, np.cos, np.arctan2)  # of the mathematical library, whose own operations are not counted
-COMPARISONS = (np.less, np.less_equal, np.greater, np.greater_equal, np.equal, np.not_equal)
-COMMUTATIVE = ("add", "multiply", "bitwise_xor")
-NEUTRAL = {np.add: 0.0, np.multiply: 1.0}  # operands that change nothing
+KINDS = {  # of operations; None for those that are free beside others, and for the mathematical library's
+    **dict.fromkeys(("add", "subtract"), ADD),
+    **{"multiply": MULTIPLY, "square": MULTIPLY, "divide": DIVIDE, "sqrt": ROOT},
+    **dict.fromkeys(("right_shift", "left_shift", "bitwise_xor", "bitwise_or"), INTEGER),
+    **dict.fromkeys(("absolute", "negative", "positive", "bitwise_and", "minimum", "maximum")),
+    **dict.fromkeys(("floor", "ceil", "rint", "remainder")),
+    **dict.fromkeys(("sin", "cos", "tan", "arctan2", "exp", "log")),
+}
+COMPARISONS = "less", "less_equal", "greater", "greater_equal", "equal", "not_equal"
+COMMUTATIVE = "add", "multiply", "bitwise_xor", "bitwise_or"
+NEUTRAL = {"add": 0.0, "multiply": 1.0}  # operands that change nothing
 POWERS = {0.5: ROOT, -0.5: RECIPROCAL_ROOT, 2: MULTIPLY}
 
 
@@ -38,13 +44,13 @@ class Counted(NDArrayOperatorsMixin):
         self.graph, self.value, self.kind, self.operands = graph, value, kind, operands
 
     def __array_ufunc__(self, ufunc, method, *inputs, out=None):
-        value = ufunc(*(x.value if isinstance(x, Counted) else x for x in inputs))
-        if ufunc in COMPARISONS:
+        name, value = ufunc.__name__, ufunc(*(x.value if isinstance(x, Counted) else x for x in inputs))
+        if name in COMPARISONS:
             return value
-        for x, other in (inputs, inputs[::-1]) if ufunc in NEUTRAL else ():
-            if not isinstance(other, Counted) and other == NEUTRAL[ufunc]:
+        for x, other in (inputs, inputs[::-1]) if name in NEUTRAL else ():
+            if not isinstance(other, Counted) and other == NEUTRAL[name]:
                 return x
-        return self.graph.number(ufunc.__name__, inputs, value, _kind(ufunc, inputs, value))
+        return self.graph.number(name, inputs, value, _kind(name, inputs, value))
 
     def __float__(self) -> float:
         """For functions of the mathematical library, whose result is then taken for a constant."""
@@ -102,21 +108,16 @@ class Graph:
         return count
 
 
-def _kind(ufunc: np.ufunc, inputs: tuple, value) -> str | None:
-    if ufunc in FREE or ufunc in LIBRARY:
-        return None
-    whole = isinstance(value, int | np.integer)
-    if ufunc in (np.add, np.subtract):
-        return INTEGER if whole else ADD
-    if ufunc is np.multiply:
-        return PRODUCT if whole else MULTIPLY
-    if ufunc is np.true_divide:
-        return DIVIDE if isinstance(inputs[1], Counted) else MULTIPLY  # by the reciprocal of a constant
-    if ufunc is np.power and inputs[1] in POWERS:
+def _kind(name: str, inputs: tuple, value) -> str | None:
+    if name == "divide" and not isinstance(inputs[1], Counted):
+        return MULTIPLY  # by the reciprocal of a constant
+    if name == "power" and inputs[1] in POWERS:
         return POWERS[inputs[1]]
-    if ufunc in (np.right_shift, np.left_shift, np.bitwise_xor):
-        return INTEGER
-    raise TypeError(f"operations to be counted must be some of arithmetic, but got {ufunc.__name__}")
+    if name not in KINDS:
+        raise TypeError(f"operations that are counted must be among {', '.join(KINDS)}, but got {name}")
+    if isinstance(value, int | np.integer):
+        return {ADD: INTEGER, MULTIPLY: PRODUCT}.get(KINDS[name], KINDS[name])
+    return KINDS[name]
 
 
 class _Converter:
