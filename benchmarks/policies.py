@@ -13,7 +13,6 @@ from benchmarks.rates import arithmetic_limit
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, alone, side_by_side
 from benchmarks.workloads import step_of_env, step_of_filtered
-from numerics.threads import cores
 from tuning.problems.seeds import training_seeds
 from tuning.thruster.find import find_scenario
 
@@ -30,9 +29,9 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     limit = network_limit(_setup("ekf", seed))
     yield Row(f"a step of PPO on an EKF, {COPIES} copies", "DummyVecEnv", timing, ratio_goal=GOAL, limit=limit)
     stepping = side_by_side(*(acting(seed, "ekf", native) for native in (True, False)), rounds)
-    limit = arithmetic_limit(step_of_filtered(env), cores=cores())
+    limit = arithmetic_limit(step_of_filtered(env))
     yield Row("of it env and EKF", "DummyVecEnv", stepping, ratio_goal=ACTING_GOAL, limit=limit)
-    limit = arithmetic_limit(step_of_env(env), cores=cores())
+    limit = arithmetic_limit(step_of_env(env))
     yield Row("of it env alone", None, alone(acting(seed, "raw", True), rounds), limit=limit)
 
 
