@@ -39,7 +39,7 @@ def command(
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Measure the speed of env, filters and evaluation beside Gymnasium's, FilterPy's and JAX's, in two minutes.
+    """Measure the speed of env, filters and evaluation beside Gymnasium's, FilterPy's and JAX's, in some minutes.
 
     All is measured in this run, ours and the peer in turns, on an otherwise idle machine if the times are to
     mean much. A goal that is missed prints "no" and fails nothing: times are the machine's as well.
