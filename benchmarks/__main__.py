@@ -9,8 +9,10 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.rates import rates
 from benchmarks.rows import COLUMNS, machine, machine_lines
 from benchmarks.speed_page import check_page, write_page
+from numerics.threads import cores
 from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
 from training.extras import check_installed
 
@@ -18,7 +20,9 @@ CAPTION = (
     "A step's time counts env, filter and fresh info arrays; FilterPy's, one predict and update and no env. "
     "Ensembles in evaluate and in batches: time a member and step, 500 steps, on all cores; batches are of 256 "
     "trajectories. On copies of a vector env: time a copy and step, env and filter. Times are the best of many "
-    "rounds, ratios the median over rounds that measure both in turn. Goals are upper limits."
+    "rounds, ratios the median over rounds that measure both in turn. Limit: the operations of the same work, "
+    "each kind at the best rate of this machine in this run; of PPO, the products with its networks' weights. "
+    "Goals are the most that a ratio, a multiple of the limit, or a time may be."
 )
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
@@ -35,7 +39,7 @@ def command(
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Measure the speed of env, filters and evaluation beside Gymnasium's, FilterPy's and JAX's, in two minutes.
+    """Measure the speed of env, filters and evaluation beside Gymnasium's, FilterPy's and JAX's, in some minutes.
 
     All is measured in this run, ours and the peer in turns, on an otherwise idle machine if the times are to
     mean much. A goal that is missed prints "no" and fails nothing: times are the machine's as well.
@@ -63,7 +67,8 @@ def command(
 
     announce_compilation()
     rows = []
-    with progress_console.status("measuring ...") as status:
+    with progress_console.status("measuring the machine's arithmetic ...") as status:
+        seconds_an_operation = {"one core": rates(1), "all cores": rates(cores())}
         for part in (
             steps,
             vectors,
@@ -92,6 +97,7 @@ def command(
             "rows": [row.as_json() for row in rows],
             "study_resident_megabytes": resident,
             "machine": facts,
+            "seconds_an_operation": seconds_an_operation,
             "seed": seed,
             "quick": quick,
         },

@@ -15,9 +15,13 @@ from unittest import mock
 
 import numpy as np
 
+from benchmarks.rates import arithmetic_limit
 from benchmarks.rows import Row
 from benchmarks.timing import Timing
+from benchmarks.workloads import step_by_size, times
 from filters.engine.batch import run
+from filters.filter import Filter
+from numerics.threads import cores
 from studies.lorenz96 import STEPS, problem
 from tuning.problems import in_parts
 from tuning.search import plan as plans
@@ -27,6 +31,7 @@ from tuning.search.study import open_study, quiet_optuna, run_study
 
 INTERPRETER = "DAPPER_PYTHON"
 TRIALS, SEEDS, LARGEST = 100, 8, 60
+FEW = 2, 4  # members that are counted: each has forty states, and takes a second
 PEER_SIZES = (10, 35, 60)  # its time a run is a line over N
 GOAL = 1 / 20
 PEER = """
@@ -54,24 +59,27 @@ print(json.dumps(seconds[1:]))
 def rows(seed: int, quick: bool) -> Iterator[Row]:
     """The study, and what DAPPER would take for its runs."""
     count, seeds = (3, 2) if quick else (TRIALS, SEEDS)
-    ours, sizes = study_seconds(seed, count, seeds)
-    what = f"a study on Lorenz-96: {count} trials, EnKF, N up to {LARGEST}, {seeds} seeds, {STEPS} steps"
+    ours, sizes, filter_ = study_seconds(seed, count, seeds)
+    limit = filters_limit(filter_, sizes)
+    what = f"study on Lorenz-96, {count} trials of an EnKF"
     if os.environ.get(INTERPRETER):
         peer = float(np.polyval(peer_line(100 if quick else STEPS), sizes).sum())
-        yield Row(what, "DAPPER, extrapolated", Timing(ours, peer, ours / peer), ratio_goal=GOAL)
+        yield Row(what, "DAPPER, extrapolated", Timing(ours, peer, ours / peer), ratio_goal=GOAL, limit=limit)
     else:
-        yield Row(what, f"no DAPPER: {INTERPRETER} is not set", Timing(ours, None, None))
+        yield Row(what, f"no DAPPER, {INTERPRETER} not set", Timing(ours, None, None), limit=limit)
 
 
-def study_seconds(seed: int, count: int, seeds: int) -> tuple[float, list[int]]:
-    """Seconds of a study of so many trials on so many seeds, without pruning, and the N of each of its runs."""
+def study_seconds(seed: int, count: int, seeds: int) -> tuple[float, list[int], Filter]:
+    """Seconds of a study of so many trials on so many seeds, without pruning; the N of its runs; one filter."""
     quiet_optuna()
     few = mock.patch.multiple(plans, TRAINING_SEEDS=seeds, SIZE_SEEDS=seeds)
     limits = mock.patch.object(space, "KALMAN_SIZES", space.Sizes(30, 5, LARGEST))
     sizes: list[int] = []
+    filters: list[Filter] = []
 
     def counting(filter_, keys, *data, **noise):
         sizes.extend([filter_.size] * len(keys))
+        filters.append(filter_)
         return run(filter_, keys, *data, **noise)
 
     with few, limits, mock.patch.object(in_parts, "run", counting):
@@ -80,7 +88,14 @@ def study_seconds(seed: int, count: int, seeds: int) -> tuple[float, list[int]]:
         plan.training_data()  # drawing the truth is no part of the study, nor of the peer's runs
         begin = perf_counter()
         run_study(study, plan, count)
-        return perf_counter() - begin, sizes
+        return perf_counter() - begin, sizes, filters[0]
+
+
+def filters_limit(filter_: Filter, sizes: list[int]) -> float:
+    """Seconds of runs of a filter with so many members on the arithmetic limit of all cores."""
+    fixed, a_member = step_by_size(filter_, FEW)
+    a_step = times(fixed, len(sizes)) + times(a_member, sum(sizes))
+    return STEPS * arithmetic_limit(a_step, cores=cores())
 
 
 def peer_line(steps: int) -> np.ndarray:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import cache
 from time import perf_counter
 
 import numpy as np
 
+from benchmarks.counting import operations_of
+from benchmarks.rates import arithmetic_limit
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, alone, side_by_side
+from benchmarks.workloads import normals, step_of_filter, times
 from filters import run
 from numerics.compiled import compiled, function_fingerprint
 from numerics.streams import FILTER_PROCESS, fill_normals
-from numerics.threads import spread
+from numerics.threads import cores, spread
 from numerics.tuples import column_reader, column_writer, vector_reader
 from thruster_env.dynamics import Constants, substep
 from thruster_env.plant import Plant
@@ -23,6 +27,7 @@ from tuning.search.space import Choice, oracle_choice
 from tuning.thruster.find import find_scenario
 
 SEEDS, ENSEMBLE_SIZE = 64, 50
+EVALUATE_GOAL, RUN_GOAL = 2.1, 1.8  # of the floor's time
 NORMALS = 3  # a member and step: one for each state, one for the measurement
 WIDTH = 64  # members in one block of the floor: whole vector registers, and all in the fastest cache
 BLOCKS = SEEDS * ENSEMBLE_SIZE // WIDTH
@@ -42,15 +47,18 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     def judge():
         evaluate(choice.filter(scenario), data, scenario.scale)
 
+    a_step = times(step_of_filter(choice.filter(scenario)), 1 / ENSEMBLE_SIZE)
+    limit = arithmetic_limit(a_step, cores=cores())
     floor = floor_measures(scenario.plant, scenario.steps)
     whole_floor = _sum(*floor.values())
     workload = f"{SEEDS} seeds, N = {ENSEMBLE_SIZE}"
     timing = side_by_side(shared(judge, count), whole_floor, rounds)
-    yield Row(f"evaluate, {workload}", "floor", timing, time_goal=15e-9)
+    yield Row(f"evaluate, {workload}", "floor", timing, ratio_goal=EVALUATE_GOAL, limit=limit)
     timing = side_by_side(shared(lambda: _run(choice, scenario, data), count), whole_floor, rounds)
-    yield Row("the same without metrics", "floor", timing, time_goal=15e-9)
-    for name, measure in floor.items():
-        yield Row(f"floor: {name}", None, alone(measure, rounds))
+    yield Row("the same without metrics", "floor", timing, ratio_goal=RUN_GOAL, limit=limit)
+    for (name, measure), count in zip(floor.items(), floor_operations(scenario.plant), strict=True):
+        limit = arithmetic_limit(count, cores=cores())
+        yield Row(f"floor: {name}", None, alone(measure, rounds), limit=limit)
 
 
 def _run(choice: Choice, scenario, data) -> None:
@@ -96,6 +104,12 @@ def floor_measures(plant: Plant, steps: int) -> dict[str, Measure]:
         f"{plant.substeps} Runge-Kutta steps": shared(lambda: spread(motion, BLOCKS), count),
         f"{NORMALS} normals": shared(lambda: spread(noise, BLOCKS), count),
     }
+
+
+def floor_operations(plant: Plant) -> tuple[Counter[str], Counter[str]]:
+    """Operations of the same: of the motion, and of the noise."""
+    motion = operations_of(substep, np.zeros(2), (12.0, plant.ambient_velocity), plant.constants)
+    return times(motion, plant.substeps), normals(NORMALS)
 
 
 @cache

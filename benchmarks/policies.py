@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from time import perf_counter
 
+import gymnasium as gym
 import numpy as np
 
+from benchmarks.networks import network_limit
+from benchmarks.rates import arithmetic_limit
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, alone, side_by_side
+from benchmarks.workloads import step_of_env, step_of_filtered
 from tuning.problems.seeds import training_seeds
 from tuning.thruster.find import find_scenario
 
 COPIES = 64
 GOAL = 0.60  # of the time that Stable-Baselines3 by itself takes
+ACTING_GOAL = 0.12  # of the time that the envs alone take with DummyVecEnv
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
@@ -25,12 +30,18 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
         by_hand(seed, rollouts),
     )
     timing = side_by_side(ours, peer, rounds)
-    yield Row(f"a step of PPO on an EKF, {COPIES} copies", "Stable-Baselines3", timing, ratio_goal=GOAL)
+    env = gym.make("filters:BowThruster-EKF-v0")
+    limit = network_limit(_setup("ekf", seed))
+    yield Row(
+        f"a step of PPO on an EKF, {COPIES} copies", "Stable-Baselines3", timing, ratio_goal=GOAL, limit=limit
+    )
     timing = side_by_side(ours, one_by_one, rounds)
-    yield Row("the same, all but the VecEnv equal", "DummyVecEnv", timing)
+    yield Row("the same, all but the VecEnv equal", "DummyVecEnv", timing, limit=limit)
     stepping = side_by_side(*(acting(seed, "ekf", native) for native in (True, False)), rounds)
-    yield Row("of it env and EKF", "DummyVecEnv", stepping)
-    yield Row("of it env alone", None, alone(acting(seed, "raw", True), rounds))
+    limit = arithmetic_limit(step_of_filtered(env))
+    yield Row("of it env and EKF", "DummyVecEnv", stepping, ratio_goal=ACTING_GOAL, limit=limit)
+    limit = arithmetic_limit(step_of_env(env))
+    yield Row("of it env alone", None, alone(acting(seed, "raw", True), rounds), limit=limit)
 
 
 def training(seed: int, native: bool, rollouts: int) -> Measure:

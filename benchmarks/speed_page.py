@@ -1,17 +1,18 @@
-"""The computed parts of docs/speed.md: the table of all rows, and the machine that they were measured on."""
+"""The computed parts of docs/speed.md: a section for each machine, with the table of all rows."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.rows import Row, machine_lines
+from benchmarks.rows import Row, machine_lines, machine_name
 from numerics.checks import shown
 from numerics.files import write_whole
 from numerics.markdown import table, with_tables
 
-HEADER = ("what", "beside", "ours", "theirs", "ratio", "goal", "met")
-MARK = "<!-- table speed -->"
+HEADER = ("what", "beside", "ours", "theirs", "ratio", "limit", "x limit", "goal", "met")
+MARK, END = "<!-- table speed: ", "<!-- end -->"
 
 
 def check_page(path: Path) -> None:
@@ -21,13 +22,23 @@ def check_page(path: Path) -> None:
     except (OSError, UnicodeDecodeError):
         raise ValueError(f"--page must be a page that can be read, but got {shown(str(path))}") from None
     if MARK not in found:
-        raise ValueError(f"--page must be a page with {MARK}, but {path} has none")
+        raise ValueError(f"--page must be a page with {MARK}PROCESSOR, N cores -->, but {path} has none")
 
 
 def write_page(path: Path, rows: Sequence[Row], facts: dict, memory: Sequence[str]) -> None:
-    """Write the tables of a page anew: `speed`, and `machine`, which says on what and with what memory."""
-    tables = {"speed": lambda: speed_table(rows), "machine": lambda: " ".join([*machine_lines(facts), *memory])}
-    write_whole(path, with_tables(path.read_text(), tables))
+    """Write the section of this machine anew, or behind those of the others; theirs stay."""
+    page, name = path.read_text(), f"speed: {machine_name(facts)}"
+    mark = f"<!-- table {name} -->"
+    if mark not in page:
+        last = [found.end() for found in re.finditer(f"{MARK}.*?{END}", page, flags=re.DOTALL)][-1]
+        page = f"{page[:last]}\n\n{mark}\n{END}{page[last:]}"
+    write_whole(path, with_tables(page, {name: lambda: machine_section(rows, facts, memory)}))
+
+
+def machine_section(rows: Sequence[Row], facts: dict, memory: Sequence[str]) -> str:
+    """The machine's name as a heading, its table, and what else there is to say of it."""
+    lines = " ".join([*machine_lines(facts), *memory])
+    return f"\n## On {machine_name(facts)}\n\n{speed_table(rows)}\n\n{lines}\n"
 
 
 def speed_table(rows: Sequence[Row]) -> str:

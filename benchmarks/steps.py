@@ -9,8 +9,10 @@ import numpy as np
 
 import thruster_env  # noqa: F401 - registers BowThruster-v0
 from benchmarks.peers import EnsembleStep, KalmanStep, UnscentedStep, compiled_model, python_model
+from benchmarks.rates import arithmetic_limit
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, seconds_a_call, side_by_side
+from benchmarks.workloads import step_of_env, step_of_filtered
 from filters.wrappers.single import EstimateState
 from thruster_env.plant import Plant
 
@@ -26,7 +28,8 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
 
     ours, peer = episode(gym.make("BowThruster-v0"), seed), episode(gym.make("Pendulum-v1"), seed)
     timing = side_by_side(ours, peer, 20 if quick else 600)
-    yield Row("env step", "Pendulum-v1", timing, ratio_goal=0.35)
+    limit = arithmetic_limit(step_of_env(gym.make("BowThruster-v0")))
+    yield Row("env step", "Pendulum-v1", timing, ratio_goal=0.29, limit=limit)
 
     for model, peer_name, goal in (
         (python_model, "FilterPy", 1 / 40),
@@ -35,7 +38,8 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
         wrapped = EstimateState(gym.make("BowThruster-v0"), filter="enkf", ensemble_size=ENSEMBLE_SIZE)
         peer = peer_ensemble(plant, model, voltages, measurements, seed)
         timing = side_by_side(episode(wrapped, seed), peer, 4 if quick else 60)
-        yield Row(f"EnKF step, N = {ENSEMBLE_SIZE}", peer_name, timing, ratio_goal=goal)
+        limit = arithmetic_limit(step_of_filtered(wrapped))
+        yield Row(f"EnKF step, N = {ENSEMBLE_SIZE}", peer_name, timing, ratio_goal=goal, limit=limit)
 
     for name in ("kf", "ekf"):
         wrapped = EstimateState(gym.make("BowThruster-v0"), filter=name)
@@ -43,7 +47,8 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
         inputs = np.column_stack([voltages, np.ones_like(voltages)])
         peer = seconds_a_call(step, zip(inputs, measurements, strict=True), step.reset)
         timing = side_by_side(episode(wrapped, seed), peer, 10 if quick else 200)
-        yield Row(f"{name.upper()} step", "FilterPy's KF", timing, ratio_goal=1 / 3)
+        limit = arithmetic_limit(step_of_filtered(wrapped))
+        yield Row(f"{name.upper()} step", "FilterPy's KF", timing, ratio_goal=0.31, limit=limit)
 
     wrapped = EstimateState(gym.make("BowThruster-v0"), filter="ukf")
     points = wrapped.filter.alpha, wrapped.filter.beta, wrapped.filter.kappa
@@ -51,7 +56,8 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     given = zip(voltages[:PEER_STEPS].tolist(), measurements[:PEER_STEPS], strict=True)
     peer = seconds_a_call(step, given, step.reset)
     timing = side_by_side(episode(wrapped, seed), peer, 10 if quick else 100)
-    yield Row("UKF step", "FilterPy's UKF", timing, ratio_goal=1 / 10)
+    limit = arithmetic_limit(step_of_filtered(wrapped))
+    yield Row("UKF step", "FilterPy's UKF", timing, ratio_goal=1 / 10, limit=limit)
 
 
 def recorded_episode(seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,7 @@
-"""Thousands of thrusters at once: the native vector env, and what its equations of motion cost at least."""
+"""Thousands of thrusters at once: the native vector env, and a Runge-Kutta step of its equations of motion."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import cache
 from time import perf_counter
@@ -11,10 +10,13 @@ import gymnasium as gym
 import numpy as np
 
 import thruster_env  # noqa: F401 - registers BowThruster-v0
+from benchmarks.counting import operations_of
+from benchmarks.rates import arithmetic_limit
 from benchmarks.rows import Row
-from benchmarks.timing import Measure, side_by_side
+from benchmarks.timing import Measure, alone, side_by_side
+from benchmarks.workloads import step_of_env
 from numerics.compiled import compiled, function_fingerprint
-from numerics.threads import spread
+from numerics.threads import cores, spread
 from plants.memory import set_row
 from thruster_env.dynamics import substep
 from thruster_env.engine.copies import Copies
@@ -25,7 +27,7 @@ from thruster_env.task import Task
 
 COPIES, STEPS = 8192, 200
 PROPAGATED = 65536
-WIDTH, REPEATS = 1024, 200  # of the loops that measure the machine's arithmetic
+LIMIT_GOAL = 1.8
 
 
 def rows(seed: int, quick: bool) -> Iterator[Row]:
@@ -33,11 +35,12 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     rounds = 5 if quick else 40
     ours, peer = vector_steps("BowThruster-v0", seed), vector_steps("CartPole-v1", seed)
     timing = side_by_side(ours, peer, rounds)
-    yield Row(f"vector env, {COPIES} copies", "CartPole-v1", timing, ratio_goal=1 / 2.5)
+    limit = arithmetic_limit(step_of_env(gym.make("BowThruster-v0")), cores=cores())
+    yield Row(f"vector env, {COPIES} copies", "CartPole-v1", timing, ratio_goal=0.4, limit=limit)
 
-    motion, limit = propagation(), arithmetic_limit()
-    timing = side_by_side(motion, limit, rounds)
-    yield Row(f"Runge-Kutta step, {PROPAGATED} copies", "arithmetic limit", timing, time_goal=1 / 400e6)
+    count = operations_of(substep, np.zeros(2), (12.0, 0.0), make_plant().constants)
+    limit, timing = arithmetic_limit(count, cores=cores()), alone(propagation(), rounds)
+    yield Row(f"Runge-Kutta step, {PROPAGATED} copies", None, timing, limit=limit, limit_goal=LIMIT_GOAL)
 
 
 def memory_line() -> str:
@@ -91,91 +94,3 @@ def _propagate() -> Callable:
                 move_thruster(memory, b, numbers)
 
     return compiled(propagate)
-
-
-class Counted:
-    """A number that counts the operations done with it, by kind."""
-
-    def __init__(self, count: Counter):
-        """Take the counter that all of a computation share."""
-        self.count = count
-
-    def _note(self, kind: str) -> Counted:
-        self.count[kind] += 1
-        return self
-
-    def __add__(self, other):
-        return self._note("+")
-
-    def __mul__(self, other):
-        return self._note("*")
-
-    def __truediv__(self, other):
-        return self._note("/")
-
-    def __pow__(self, power):
-        return self._note("root")
-
-    def __abs__(self):
-        return self  # a mask; free beside the others
-
-    __radd__ = __sub__ = __rsub__ = __add__
-    __rmul__ = __mul__
-    __rtruediv__ = __truediv__
-
-
-def operations() -> Counter:
-    """Operations of one Runge-Kutta step, counted by running the very source on numbers that count."""
-    count = Counter()
-    substep((Counted(count), Counted(count)), (12.0, 0.0), make_plant().constants)
-    return count
-
-
-def arithmetic_limit() -> Measure:
-    """A measure of the time that a step's operations would take, each kind at the machine's best rate.
-
-    Additions and multiplications come in pairs, a fused instruction for both; each rate is that of a vector loop
-    on all cores in the fastest cache.
-    """
-    count = operations()
-    fused, root = _arithmetic()
-    data = np.linspace(1.0, 2.0, WIDTH)
-
-    def seconds(work: Callable, per_call: int) -> float:
-        def part(first, last):
-            for _ in range(first, last):
-                work(data.copy(), REPEATS)
-
-        begin = perf_counter()
-        spread(part, 8)
-        return (perf_counter() - begin) / (8 * REPEATS * WIDTH * per_call)
-
-    def measure() -> float:
-        pairs = max(count["+"], count["*"])
-        return pairs * seconds(fused, 32) + count["root"] * seconds(root, 4)
-
-    return measure
-
-
-@cache
-def _arithmetic() -> tuple[Callable, Callable]:
-    def fused(data, repeats):
-        for _ in range(repeats):
-            for j in range(data.shape[0]):
-                x = y = z = w = data[j]
-                for _ in range(8):
-                    x = x * 0.9 + 0.1
-                    y = y * 0.8 + 0.2
-                    z = z * 0.7 + 0.3
-                    w = w * 0.6 + 0.4
-                data[j] = 0.25 * (x + y + z + w)
-
-    def root(data, repeats):
-        for _ in range(repeats):
-            for j in range(data.shape[0]):
-                x = data[j]
-                for _ in range(4):
-                    x = 1.0 / (x + 1.0) ** 0.5
-                data[j] = x
-
-    return compiled(fused), compiled(root)

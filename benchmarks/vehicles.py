@@ -7,24 +7,33 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from time import perf_counter
 
+import gymnasium as gym
 import numpy as np
 
 from auv_env.dynamics import motion_substep
 from auv_env.engine.motion import read_constants
 from auv_env.plant import make_plant
 from benchmarks.batches import shared
+from benchmarks.counting import operations_of
+from benchmarks.rates import arithmetic_limit
 from benchmarks.rows import Row
 from benchmarks.timing import Measure, alone, side_by_side
 from benchmarks.vectors import vector_steps
+from benchmarks.workloads import step_of_filter, step_of_filtered, times
 from filters import make_filter, run
+from filters.filter import Filter
 from numerics.compiled import compiled, function_fingerprint
+from numerics.threads import cores
 from numerics.tuples import tuple_of, written_out
 from tuning.auv.find import find_scenario
+from tuning.auv.scenario import Scenario
 from tuning.problems.seeds import training_seeds
 
 MEMBERS, STEPS = 256, 200
 COPIES, VECTOR_STEPS = 1024, 50
 PAPER_SIZE, PAPER_SECONDS = 300, 25.0
+EKF_GOAL, PAPER_GOAL = 34, 2.3  # of the limit
+CRUISE = (2.845, -0.01707, 0.0, 0.0)  # propeller's force [N] and torque [N m], both rudders [rad]
 N = 8  # states of the model "motion"
 PAIRS = 8  # of a sine and a cosine in a Runge-Kutta step: four rates of roll and pitch
 
@@ -36,16 +45,24 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     """Measure, one row after the other."""
     step, sines = member_steps(), library_sines()
     timing = side_by_side(step, sines, 20 if quick else 200)  # milliseconds each
-    yield Row(f"vehicle, {N} states: member's step", "its library sines alone, one core", timing, time_goal=60e-9)
+    limit = arithmetic_limit(operations_of(motion_substep, np.full(N, 0.1), CRUISE, make_plant().constants))
+    what = f"vehicle, {N} states: member's step"
+    yield Row(what, "library sines alone", timing, ratio_goal=0.27, limit=limit)
 
     sensors = {"sensors": "motion"}
     filtered = vector_steps("filters:SegorogeniAUV-EKF-v0", seed, COPIES, VECTOR_STEPS, **sensors)
     bare = vector_steps("SegorogeniAUV-v0", seed, COPIES, VECTOR_STEPS, **sensors)
     timing = side_by_side(filtered, bare, 3 if quick else 20)
-    yield Row(f"EKF of {N} states on {COPIES} vehicles", "vehicles alone", timing, time_goal=6e-6)
+    env = gym.make("filters:SegorogeniAUV-EKF-v0", **sensors)
+    limit = arithmetic_limit(step_of_filtered(env), cores=cores())
+    what = f"EKF of {N} states on {COPIES} vehicles"
+    yield Row(what, "vehicles alone", timing, limit=limit, limit_goal=EKF_GOAL)
 
+    filter_, scenario = papers_filter()
     timing = alone(papers_ensemble(seed), 1 if quick else 5, warm_up=False)
-    yield Row(f"EnKF, {N} states, N = {PAPER_SIZE}, 25 s at 1 kHz", None, timing, time_goal=2.5)
+    limit = arithmetic_limit(times(step_of_filter(filter_), scenario.steps))
+    what = f"EnKF, {N} states, N = {PAPER_SIZE}, 25 s at 1 kHz"
+    yield Row(what, None, timing, limit=limit, limit_goal=PAPER_GOAL)
 
 
 def member_steps() -> Measure:
@@ -63,13 +80,18 @@ def library_sines() -> Measure:
     return shared(lambda: evaluate(angles, STEPS), STEPS * MEMBERS)
 
 
+def papers_filter() -> tuple[Filter, Scenario]:
+    """The papers' ensemble and its scenario."""
+    scenario = find_scenario("auv:papers").replace(steps=round(PAPER_SECONDS / 0.001))
+    return make_filter("enkf", scenario.model(**scenario.true), ensemble_size=PAPER_SIZE), scenario
+
+
 def papers_ensemble(seed: int) -> Measure:
     """A measure of one run of an ensemble over 25 s of path IV at 1 kHz; the truth is made before."""
-    scenario = find_scenario("auv:papers").replace(steps=round(PAPER_SECONDS / 0.001))
+    filter_, scenario = papers_filter()
     data = scenario.data(training_seeds(seed, 2))
     first = (data.filter_keys[:1], data.inputs[:1], data.measurements[:1])
     begin = (first[0], first[1][:, :10], first[2][:, :11])
-    filter_ = make_filter("enkf", scenario.model(**scenario.true), ensemble_size=PAPER_SIZE)
     run(filter_, *begin)  # compiles
 
     def measure() -> float:
@@ -89,7 +111,7 @@ def _propagate() -> Callable:
         c = read_constants(numbers)
         for _ in range(steps):
             for j in range(table.shape[1]):
-                _store(table, j, motion_substep(_column(table, j), (2.845, -0.01707, 0.0, 0.0), c))
+                _store(table, j, motion_substep(_column(table, j), CRUISE, c))
 
     return compiled(propagate)
 

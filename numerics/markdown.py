@@ -23,4 +23,4 @@ def with_tables(page: str, tables: Mapping[str, Callable[[], str]]) -> str:
             return match[0]
         return f"{match[1]}\n{tables[match[2]]()}\n{match[3]}"
 
-    return re.sub(r"(<!-- table (\w+) -->).*?(<!-- end -->)", anew, page, flags=re.DOTALL)
+    return re.sub(r"(<!-- table ([^\n]+?) -->).*?(<!-- end -->)", anew, page, flags=re.DOTALL)

@@ -29,6 +29,8 @@ def test_the_quick_benchmark_measures_every_row():
     rows = found["rows"]
     assert len(rows) >= 20
     assert all(row["ours_seconds"] > 0 for row in rows)
+    limits = [row["limit_seconds"] for row in rows if row["limit_seconds"] is not None]
+    assert len(limits) >= 20 and all(limit > 0 for limit in limits)
     assert {"FilterPy", "FilterPy's UKF", "FilterPy's KF"} < {row["peer"] for row in rows}
     assert found["study_resident_megabytes"] is None or 50 < found["study_resident_megabytes"] < 500
     (outside,) = [row["ratio"] for row in rows if "outside filters" in row["what"]]
@@ -67,39 +69,61 @@ def test_the_filter_written_for_jax_is_ours_given_our_random_numbers(process_noi
     ("row", "shown"),
     [
         (
-            Row("a", "b", Timing(1e-6, 4e-6, 0.25), ratio_goal=1 / 3),
-            ["a; b", "1 us", "4 us", "0.25", "0.33", "yes"],
+            Row("a", "b", Timing(1234.5, 4938.0, 0.25), ratio_goal=1 / 3, limit=10.0),
+            ["a; b", "1234 s", "4938 s", "0.25", "10 s", "123", "0.33", "yes"],
         ),
-        (Row("a", None, Timing(2e-9, None, None), time_goal=1e-9), ["a", "2 ns", "-", "-", "1 ns", "no"]),
-        (Row("a", "b is not installed", Timing(0.5, None, None)), ["a; b is not installed", "500 ms", *"----"]),
+        (
+            Row("a", None, Timing(2.5e-9, None, None), limit=1e-9, limit_goal=2),
+            ["a", "2.5 ns", "-", "-", "1 ns", "2.5", "2 x", "no"],
+        ),
+        (
+            Row("a", "b", Timing(0.5, 0.1, 5.0), time_goal=0.6),
+            ["a; b", "500 ms", "100 ms", "5", "-", "-", "600 ms", "yes"],
+        ),
+        (Row("a", "b is not installed", Timing(0.5, None, None)), ["a; b is not installed", "500 ms", *"------"]),
     ],
 )
 def test_a_row_says_whether_its_goal_is_met(row, shown):
     assert row.cells() == shown
 
 
-def test_rows_and_machine_are_written_into_the_page_on_speed_and_its_words_stay(tmp_path):
+FACTS = {
+    **{"cpu": "a processor", "cores": 2, "system": "Linux", "architecture": "znver9", "avx512": True},
+    **{"vector_bits": 256, "python": "3.11.7", "numba": "0.68.1"},
+}
+MACHINE = (
+    "Machine: a processor, 2 cores, Linux; znver9 with AVX-512, compiled to vectors of 256 bits. "
+    "Python 3.11.7, numba 0.68.1."
+)
+
+
+def test_each_machine_has_its_table_on_the_page_on_speed(tmp_path):
     page = tmp_path / "speed.md"
     page.write_text((Path(__file__).parents[2] / "docs" / "speed.md").read_text())
-    before = page.read_text().splitlines()
+    before = page.read_text()
     check_page(page)
     rows = [
         Row("a step", "b", Timing(1e-6, 4e-6, 0.25), ratio_goal=1 / 3),
-        Row("c", None, Timing(2e-9, None, None)),
+        Row("c", None, Timing(2e-9, None, None), limit=1e-9),
     ]
-    facts = {"cpu": "a processor", "cores": 2, "system": "Linux", "python": "3.11.7", "numba": "0.68.1"}
-    write_page(page, rows, facts, ["Memory: 8 bytes."])
-    after = page.read_text().splitlines()
-    table = after[after.index("<!-- table speed -->") + 1 :][:4]
-    assert table[0] == "| " + " | ".join(HEADER) + " |" and table[0] in before
-    assert table[2:] == ["| a step | b | 1 us | 4 us | 0.25 | 0.33 | yes |", "| c | | 2 ns | | | | |"]
-    machine = after[after.index("<!-- table machine -->") + 1]
-    assert machine == "Machine: a processor, 2 cores, Linux. Python 3.11.7, numba 0.68.1. Memory: 8 bytes."
-    assert {*before, *table, machine} > set(after) and "## What is compared with what" in after
+    write_page(page, rows, FACTS, ["Memory: 8 bytes."])
+    first = page.read_text()
+    write_page(page, rows[1:], FACTS, [])
+    second = page.read_text()
+    a, b, c = (
+        "## On a processor, 2 cores",
+        "| a step | b | 1 us | 4 us | 0.25 | | | 0.33 | yes |",
+        "| c | | 2 ns | | | 1 ns | 2 | | |",
+    )
+    header = "| " + " | ".join(HEADER) + " |"
+    assert header in before and {a, header, b, c, f"{MACHINE} Memory: 8 bytes."} <= {*first.splitlines()}
+    assert first.index(c) < first.index("## What is compared with what")
+    assert {*before.splitlines()} < {*first.splitlines()}
+    assert second == first.replace(f"{b}\n", "").replace(f"{MACHINE} Memory: 8 bytes.", MACHINE)
 
 
 def test_a_page_without_a_place_for_the_table_is_refused(tmp_path):
     (tmp_path / "other.md").write_text("# Other")
-    for name, rule in (("other.md", "with <!-- table speed -->"), ("none.md", "that can be read")):
+    for name, rule in (("other.md", "with <!-- table speed: PROCESSOR"), ("none.md", "that can be read")):
         with pytest.raises(ValueError, match=rule):
             check_page(tmp_path / name)
