@@ -81,6 +81,7 @@ def command(
             policies,
             processes,
         ):
+            rates.cache_clear()  # measured again: others may have come to use the machine, or gone
             for row in part.rows(seed, quick):
                 rows.append(row)
                 status.update(f"measured: {row.what} ...")

@@ -26,7 +26,7 @@ from tuning.thruster.scenario import Scenario
 
 TRIALS = 200
 SIZES, PEER_STEPS = (20, 200), 200  # FilterPy's time a step is a straight line over N
-OUTSIDE_GOAL, RUNS_GOAL, STUDY_GOAL = 0.45, 1 / 55, 1 / 500
+OUTSIDE_GOAL, RUNS_GOAL, STUDY_GOAL = 0.45, 1 / 100, 1 / 500
 MEMORY_GOAL = 500.0  # [MB]
 IN_A_PROCESS = """
 from tuning.search.plan import Plan
