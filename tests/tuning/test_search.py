@@ -168,8 +168,8 @@ def test_from_a_bad_start_a_study_of_a_perfect_model_comes_within_half_a_per_cen
 
 
 def test_a_trial_whose_nis_is_not_finite_is_inconsistent_and_has_no_twin(monkeypatch):
-    def lost(filter_, runs, data, scale, judge=trials.compute_metrics):
-        evaluation = judge(filter_, runs, data, scale)
+    def lost(*given, judge=trials.compute_metrics):
+        evaluation = judge(*given)
         return evaluation._replace(nis=evaluation.nis._replace(value=np.nan))
 
     monkeypatch.setattr(trials, "compute_metrics", lost)
