@@ -63,8 +63,9 @@ def test_one_trial_has_the_most_likely_noise_and_finds_what_sampling_finds_late(
     assert most_likely.values[0] < 1.005 * true.score.value
 
 
-def test_with_r_held_no_trial_has_the_most_likely_noise():
-    result = studied(Plan("ekf", (NOMINAL,), hold_r=True), MAXIMUM_LIKELIHOOD_AFTER + 2)
+@pytest.mark.parametrize("plan", [Plan("ekf", (NOMINAL,), hold_r=True), Plan("low-pass", (NOMINAL,))])
+def test_with_r_held_or_without_a_covariance_no_trial_has_the_most_likely_noise(plan):
+    result = studied(plan, MAXIMUM_LIKELIHOOD_AFTER + 2)
     assert not any(MAXIMUM_LIKELIHOOD in trial.user_attrs for trial in result.trials)
 
 
