@@ -68,10 +68,10 @@ def _enqueue_untuned(study: optuna.Study, plan: Plan) -> None:
     """
     trials = study.get_trials(deepcopy=False)
     begun = [trial.user_attrs.get(UNTUNED) for trial in trials]
-    if begun[:1] == [None] or any(trial.state == TrialState.WAITING for trial in trials):
+    if begun[:1] == [None]:
         return  # a study that begins with something else has enqueued all at once
     name = next((name for name in plan.filter_types if name not in begun), None)
-    if name is not None:
+    if name is not None and not any(trial.state == TrialState.WAITING for trial in trials):
         choice = untuned_choice(name, plan.scenarios[0])
         study.enqueue_trial(trial_parameters(choice, plan.space()), user_attrs={UNTUNED: name})
 

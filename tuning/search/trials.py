@@ -6,11 +6,12 @@ NEES is the normalised estimation error squared, NIS the normalised innovation s
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from statistics import geometric_mean
 
 import numpy as np
 import optuna
+from optuna.distributions import BaseDistribution
 
 from tuning.evaluation.evaluate import Evaluation, compute_metrics, run_scores
 from tuning.evaluation.runs import RunMetrics, joined, metrics_of_all
@@ -34,15 +35,23 @@ def run_trial(
     trial: optuna.Trial,
     plan: Plan,
     data: Sequence[Data],
+    space: Mapping[str, BaseDistribution],
     on_choice: Callable[[Choice], None] = lambda choice: None,
 ) -> list[float]:
-    """Values of a trial, one for each objective; `on_choice` is called with its choice.
+    """Values of a trial, one for each objective.
+
+    Args:
+        trial: from Optuna.
+        plan: of the study.
+        data: the plan's training data.
+        space: the plan's space.
+        on_choice: called with the choice of the trial.
 
     Raises:
         optuna.TrialPruned: if it is over the plan's budget, or significantly worse than the best one on the seeds
             so far.
     """
-    choice = suggest(trial, plan.filter, plan.scenarios[0], plan.space())
+    choice = suggest(trial, plan.filter, plan.scenarios[0], space)
     on_choice(choice)
     microseconds = math.nan
     if plan.asks_for_cost:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from filters.posterior import has_bound, posterior_variances
+from filters.tuned_file import NOISE
 from numerics.checks import positive, shown, vector
 from numerics.streams import episode_keys, filter_keys
 from plants.state_space import StateSpaceModel
@@ -108,7 +109,22 @@ class Scenario(BaseScenario):
 
     def model(self, **changes) -> StateSpaceModel:
         """What the filter assumes; changes are arguments of `thruster_env.model.model_of_plant`."""
-        return model_of_plant(self.plant, **{"parameter_factors": dict(self.parameter_factors), **changes})
+        if not self._are_noise(changes):
+            return model_of_plant(self.plant, **{"parameter_factors": dict(self.parameter_factors), **changes})
+        return self._assumed.replace(**{name: cov for name, cov in changes.items() if cov is not None})
+
+    def _are_noise(self, changes: Mapping) -> bool:
+        """Whether changes are Q and R as a study chooses them, on which no function of the model depends."""
+        r, channels = changes.get("measurement_noise_cov"), len(self.plant.channels)
+        fits = (
+            channels == 1 if isinstance(r, float) else r is None or (isinstance(r, tuple) and len(r) == channels)
+        )
+        return fits and changes.keys() <= set(NOISE)
+
+    @cached_property
+    def _assumed(self) -> StateSpaceModel:
+        """The model without changes; a trial changes its covariances."""
+        return model_of_plant(self.plant, parameter_factors=dict(self.parameter_factors))
 
     @property
     def untuned(self) -> dict:
