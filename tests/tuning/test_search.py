@@ -5,13 +5,14 @@ import importlib.util
 import numpy as np
 import optuna
 import pytest
+from optuna.distributions import FloatDistribution, IntDistribution
 from optuna.trial import TrialState
 
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.likelihood.gradient import BAD_START, maximise_likelihood
 from tuning.search import trials
-from tuning.search.enqueued import MAXIMUM_LIKELIHOOD, MAXIMUM_LIKELIHOOD_AFTER, RESCALED
+from tuning.search.enqueued import MAXIMUM_LIKELIHOOD, MAXIMUM_LIKELIHOOD_AFTER, RESCALED, enqueue_new
 from tuning.search.objectives import LARGEST, NIS_BAND, nis_violation
 from tuning.search.outcome import best_trial, violation
 from tuning.search.plan import Plan
@@ -177,6 +178,20 @@ def test_a_trial_whose_nis_is_not_finite_is_inconsistent_and_has_no_twin(monkeyp
     result = studied(PLAN, 3)
     assert len(result.trials) == 3 and all(violation(trial) == LARGEST for trial in result.trials)
     assert not any(RESCALED in trial.user_attrs for trial in result.trials)
+
+
+def test_a_trial_that_there_is_already_is_not_enqueued_again():
+    study = optuna.create_study()
+    study.add_trial(
+        optuna.trial.create_trial(
+            params={"R": 0.25, "N": 30},
+            distributions={"R": FloatDistribution(0.01, 1.0), "N": IntDistribution(5, 200)},
+            value=1.0,
+        )
+    )
+    for r, size, count in ((0.25, 30, 1), (0.25 + 1e-7, 30, 1), (0.2501, 30, 2), (0.25, 31, 3), (0.2501, 30, 3)):
+        enqueue_new(study, {"R": r, "N": size}, {})
+        assert len(study.trials) == count
 
 
 def test_r_may_be_held_at_the_sensor_s_sheet():

@@ -9,7 +9,7 @@ from functools import cache
 from itertools import accumulate
 
 import optuna
-from optuna.trial import FrozenTrial
+from optuna.trial import FrozenTrial, TrialState
 
 BLOCK = 8  # seeds between two decisions whether to prune
 P_THRESHOLD = 0.1  # p-value of Wilcoxon's signed-rank test below which a trial is pruned
@@ -31,11 +31,12 @@ class PairedPruner(optuna.pruners.WilcoxonPruner):
 
     def prune(self, study: optuna.Study, trial: FrozenTrial) -> bool:
         """Whether a trial of a study that minimises is significantly worse than its best one, and in the mean."""
-        try:
-            best = study.best_trial.intermediate_values
-        except ValueError:  # no trial is complete, or none is feasible
+        complete = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+        complete.sort(key=lambda one: one.values[0])  # so that few are asked for their constraints
+        found = next(filter(_is_feasible, complete), None)
+        if found is None:
             return False
-        own = trial.intermediate_values
+        own, best = trial.intermediate_values, found.intermediate_values
         if not own or not best or not own.keys() <= best.keys() or not _all_finite(own, best):
             return super().prune(study, trial)
         if len(own) >= BLOCK and _mean(best) >= _mean(own):
@@ -66,6 +67,10 @@ def critical_rank_sum(count: int, threshold: float) -> int:
         subsets = [n + (longer[r - rank] if r >= rank else 0) for r, n in enumerate(longer)]
     beyond = accumulate(reversed(subsets))  # number with this sum or a larger one, from the largest sum downwards
     return len(subsets) - sum(number < threshold * 2**count for number in beyond)
+
+
+def _is_feasible(trial: FrozenTrial) -> bool:
+    return all(value <= 0 for value in trial.constraints.values())
 
 
 def _all_finite(*values: dict[int, float]) -> bool:
