@@ -185,3 +185,21 @@ def test_a_model_of_another_q_and_r_is_the_one_that_is_made_of_them(name):
     for wrong in ({"process_noise_cov": (1.0, -1.0)}, {"measurement_noise_cov": 0.0}):
         with pytest.raises(ValueError, match=f"{next(iter(wrong))} must be positive"):
             scenario.model(**wrong)
+
+
+def test_a_bound_is_computed_once_for_the_same_inputs(monkeypatch):
+    import tuning.thruster.scenario as module
+
+    asked, computed = [], module.posterior_variances
+    monkeypatch.setattr(
+        module, "posterior_variances", lambda *given, **named: asked.append(1) or computed(*given, **named)
+    )
+    scenario = find_scenario("nominal").replace(about="a plant of this test")
+    one, other = scenario.data([1]), scenario.data([2])
+    first = scenario.bound(one, truths=3)
+    kept = first.copy()
+    first[:] = 0.0  # of the caller alone
+    assert np.array_equal(scenario.bound(one, truths=3), kept) and len(asked) == 1
+    assert not np.array_equal(scenario.bound(other, truths=3), kept) and len(asked) == 2
+    noisier = scenario.replace(process_noise_cov=(4.0, 1.6e-3))
+    assert (noisier.bound(one, truths=3) > kept).all() and len(asked) == 3
