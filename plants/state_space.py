@@ -21,6 +21,8 @@ from plants.model_digest import digest_of
 from plants.quantities import Quantities, outputs, quantities
 from plants.shape import Functions, Shape, constants_are_array, constants_form
 
+NOISE = {"process_noise_cov", "measurement_noise_cov", "prior_cov"}  # fields that no function depends on
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StateSpaceModel:
@@ -99,7 +101,7 @@ class StateSpaceModel:
         """Check shapes and signs, and try the functions; raise ValueError that states the rule and the value."""
         mean = vector("prior_mean", self.prior_mean)
         n, r = len(mean), self.measurement_noise_cov
-        m = len(r) if isinstance(r, (list, tuple, np.ndarray)) and np.ndim(r) else 1
+        m = _channels(r)
         checked: dict[str, Any] = {
             "prior_mean": mean,
             "prior_cov": covariance("prior_cov", self.prior_cov, n),
@@ -171,7 +173,22 @@ class StateSpaceModel:
 
     def replace(self, **changes) -> Self:
         """A copy of the model with some fields changed; ValueError as for a new model."""
+        if (
+            changes.keys() <= NOISE
+            and _channels(changes.get("measurement_noise_cov", self.measurement_noise_cov)) == self.m
+        ):
+            return self._with_noise(changes)
         return dataclasses.replace(self, **changes)
+
+    def _with_noise(self, changes: Mapping[str, Any]) -> Self:
+        """`replace` of covariances, on which no function depends: so these are not tried again."""
+        model, sizes = object.__new__(type(self)), {"measurement_noise_cov": self.m}
+        vars(model).update({one.name: getattr(self, one.name) for one in dataclasses.fields(self)})
+        for name, value in changes.items():
+            definite = name in sizes
+            checked = covariance(name, value, sizes.get(name, self.n), positive_definite=definite)
+            object.__setattr__(model, name, checked)
+        return model
 
     @property
     def quantities(self) -> Quantities:
@@ -215,3 +232,8 @@ class StateSpaceModel:
         """
         spread = np.sqrt(np.diag(self.prior_cov) + np.diag(self.process_noise_cov))
         return np.where(spread > 0, spread, 1.0)
+
+
+def _channels(r) -> int:
+    """Number m of measurements for which a measurement noise covariance is given: of a plain number one."""
+    return len(r) if isinstance(r, (list, tuple, np.ndarray)) and np.ndim(r) else 1

@@ -40,14 +40,20 @@ def interval(value: float, resampled: np.ndarray) -> Interval:
     return Interval(float(value), float(low), float(high))
 
 
-def mean_interval(values: np.ndarray) -> Interval:
-    """Mean of some numbers a run, (B,) or (B, T), with its interval; NaN entries count as not there."""
+def without_interval(value: float) -> Interval:
+    """A value whose interval nobody asks for, which takes longer than the value."""
+    return Interval(float(value), np.nan, np.nan)
+
+
+def mean_interval(values: np.ndarray, resample: bool = True) -> Interval:
+    """Mean of some numbers a run, (B,) or (B, T), with its interval if asked for; NaN entries are not there."""
     values = np.reshape(values, (len(values), -1))
     present = ~np.isnan(values)
     if not present.any():
         return Interval(np.nan, np.nan, np.nan)
     totals, counts = np.where(present, values, 0.0).sum(axis=1), present.sum(axis=1).astype(np.float64)
-    return interval(totals.sum() / counts.sum(), ratio_of_resampled(totals, counts))
+    value = totals.sum() / counts.sum()
+    return interval(value, ratio_of_resampled(totals, counts)) if resample else without_interval(value)
 
 
 def ratio_of_resampled(totals: np.ndarray, counts: np.ndarray) -> np.ndarray:
@@ -60,9 +66,12 @@ def ratio_of_resampled(totals: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return above[some] / below[some]
 
 
-def rmse_intervals(mean_squares: np.ndarray) -> tuple[Interval, ...]:
-    """RMSE of every state with its interval, from mean square errors of runs (B, n)."""
-    resampled, rmse = np.sqrt(resampled_means(mean_squares)), np.sqrt(mean_squares.mean(axis=0))
+def rmse_intervals(mean_squares: np.ndarray, resample: bool = True) -> tuple[Interval, ...]:
+    """RMSE of every state with its interval if asked for, from mean square errors of runs (B, n)."""
+    rmse = np.sqrt(mean_squares.mean(axis=0))
+    if not resample:
+        return tuple(map(without_interval, rmse))
+    resampled = np.sqrt(resampled_means(mean_squares))
     return tuple(interval(rmse[i], resampled[:, i]) for i in range(len(rmse)))
 
 

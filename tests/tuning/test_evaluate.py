@@ -10,6 +10,7 @@ from filters.posterior import posterior_bound
 from numerics.compiled import interpreted
 from plants import simulate
 from tuning.evaluation.evaluate import check_consistency, evaluate, score_ratio
+from tuning.evaluation.runs import _means_over_steps
 from tuning.evaluation.tuned import summary
 from tuning.problems import in_parts
 from tuning.problems.seeds import held_out_seeds
@@ -210,3 +211,9 @@ def test_many_states_are_whitened_as_few_are():
     errors[2], covs[2] = 1e200, 1e300 * covs[2]
     found = normalized_squares(errors, covs)
     assert np.isnan(found[1, 2]) and np.isfinite(found[:2]).sum() == 7
+
+
+@pytest.mark.parametrize("shape", [(5, 7, 1), (5, 451, 2), (3, 40, 12), (1, 9, 2)])
+def test_means_over_steps_are_numpys_to_the_last_bit(shape):
+    values = np.random.default_rng(0).lognormal(sigma=3.0, size=shape)
+    assert np.array_equal(_means_over_steps(values), values.mean(axis=1))

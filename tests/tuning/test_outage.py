@@ -5,9 +5,10 @@ import types
 import optuna
 import pytest
 
-from tuning.search import storage as storages
+from tuning.search import database
+from tuning.search.database import PATIENCE_SECONDS
 from tuning.search.plan import Plan
-from tuning.search.storage import PATIENCE_SECONDS, open_storage
+from tuning.search.storage import open_storage
 from tuning.search.study import open_study, run_trials
 from tuning.thruster.find import find_scenario
 
@@ -33,7 +34,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch):
     clock = Clock()
-    monkeypatch.setattr(storages, "time", types.SimpleNamespace(monotonic=clock.monotonic, sleep=clock.sleep))
+    monkeypatch.setattr(database, "time", types.SimpleNamespace(monotonic=clock.monotonic, sleep=clock.sleep))
     return clock
 
 

@@ -66,12 +66,12 @@ def test_where_there_is_no_scaled_default_it_says_why():
 def test_a_nis_that_jumps_over_one_has_no_factor_either(monkeypatch):
     import tuning.evaluation.baselines as module
 
-    def jumps(filter_, data, scale, evaluate=module.evaluate):
+    def jumps(filter_, data, scale, evaluate=module.values_of):
         nis = 0.5 if filter_.model.process_noise_cov[0, 0] > 1.0 else 2.0
         found = evaluate(filter_, data, scale)
         return found._replace(nis=found.nis._replace(value=nis))
 
-    monkeypatch.setattr(module, "evaluate", jumps)
+    monkeypatch.setattr(module, "values_of", jumps)
     assert "it jumps to" in scaled_default.__wrapped__("ekf", MISMATCH, 0).reason
 
 

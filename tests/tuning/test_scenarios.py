@@ -8,6 +8,7 @@ import pytest
 import thruster_env  # noqa: F401 - registers the env
 from filters import EstimateState, run
 from filters.bounds import riccati_covariances
+from thruster_env.model import model_of_plant
 from tuning.problems.seeds import held_out_seeds, training_seeds
 from tuning.search.space import untuned_choice
 from tuning.thruster.find import find_scenario
@@ -170,3 +171,35 @@ def test_voltages_are_cut_off_as_the_env_does():
 def test_bad_arguments_name_rule_and_value(call, rule):
     with pytest.raises(ValueError, match=rule):
         call()
+
+
+@pytest.mark.parametrize("name", ["mismatch", "published_tunnel", "deadband"])
+def test_a_model_of_another_q_and_r_is_the_one_that_is_made_of_them(name):
+    scenario = find_scenario(name)
+    noise = {"process_noise_cov": (0.3, 1e-3), "measurement_noise_cov": 0.7}
+    made = model_of_plant(scenario.plant, parameter_factors=dict(scenario.parameter_factors), **noise)
+    found = scenario.model(**noise)
+    assert found.digest == made.digest and np.array_equal(found.numbers, made.numbers)
+    assert found.functions == made.functions and found.shape == made.shape
+    assert scenario.model().process_noise_cov == pytest.approx(np.diag(scenario.process_noise_cov))
+    for wrong in ({"process_noise_cov": (1.0, -1.0)}, {"measurement_noise_cov": 0.0}):
+        with pytest.raises(ValueError, match=f"{next(iter(wrong))} must be positive"):
+            scenario.model(**wrong)
+
+
+def test_a_bound_is_computed_once_for_the_same_inputs(monkeypatch):
+    import tuning.thruster.scenario as module
+
+    asked, computed = [], module.posterior_variances
+    monkeypatch.setattr(
+        module, "posterior_variances", lambda *given, **named: asked.append(1) or computed(*given, **named)
+    )
+    scenario = find_scenario("nominal").replace(about="a plant of this test")
+    one, other = scenario.data([1]), scenario.data([2])
+    first = scenario.bound(one, truths=3)
+    kept = first.copy()
+    first[:] = 0.0  # of the caller alone
+    assert np.array_equal(scenario.bound(one, truths=3), kept) and len(asked) == 1
+    assert not np.array_equal(scenario.bound(other, truths=3), kept) and len(asked) == 2
+    noisier = scenario.replace(process_noise_cov=(4.0, 1.6e-3))
+    assert (noisier.bound(one, truths=3) > kept).all() and len(asked) == 3

@@ -5,13 +5,14 @@ import importlib.util
 import numpy as np
 import optuna
 import pytest
+from optuna.distributions import FloatDistribution, IntDistribution
 from optuna.trial import TrialState
 
 from tuning.evaluation.evaluate import evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.likelihood.gradient import BAD_START, maximise_likelihood
 from tuning.search import trials
-from tuning.search.enqueued import MAXIMUM_LIKELIHOOD, MAXIMUM_LIKELIHOOD_AFTER, RESCALED
+from tuning.search.enqueued import MAXIMUM_LIKELIHOOD, MAXIMUM_LIKELIHOOD_AFTER, RESCALED, enqueue_new
 from tuning.search.objectives import LARGEST, NIS_BAND, nis_violation
 from tuning.search.outcome import best_trial, violation
 from tuning.search.plan import Plan
@@ -63,8 +64,9 @@ def test_one_trial_has_the_most_likely_noise_and_finds_what_sampling_finds_late(
     assert most_likely.values[0] < 1.005 * true.score.value
 
 
-def test_with_r_held_no_trial_has_the_most_likely_noise():
-    result = studied(Plan("ekf", (NOMINAL,), hold_r=True), MAXIMUM_LIKELIHOOD_AFTER + 2)
+@pytest.mark.parametrize("plan", [Plan("ekf", (NOMINAL,), hold_r=True), Plan("low-pass", (NOMINAL,))])
+def test_with_r_held_or_without_a_covariance_no_trial_has_the_most_likely_noise(plan):
+    result = studied(plan, MAXIMUM_LIKELIHOOD_AFTER + 2)
     assert not any(MAXIMUM_LIKELIHOOD in trial.user_attrs for trial in result.trials)
 
 
@@ -168,14 +170,28 @@ def test_from_a_bad_start_a_study_of_a_perfect_model_comes_within_half_a_per_cen
 
 
 def test_a_trial_whose_nis_is_not_finite_is_inconsistent_and_has_no_twin(monkeypatch):
-    def lost(filter_, runs, data, scale, judge=trials.compute_metrics):
-        evaluation = judge(filter_, runs, data, scale)
+    def lost(*given, judge=trials.compute_metrics):
+        evaluation = judge(*given)
         return evaluation._replace(nis=evaluation.nis._replace(value=np.nan))
 
     monkeypatch.setattr(trials, "compute_metrics", lost)
     result = studied(PLAN, 3)
     assert len(result.trials) == 3 and all(violation(trial) == LARGEST for trial in result.trials)
     assert not any(RESCALED in trial.user_attrs for trial in result.trials)
+
+
+def test_a_trial_that_there_is_already_is_not_enqueued_again():
+    study = optuna.create_study()
+    study.add_trial(
+        optuna.trial.create_trial(
+            params={"R": 0.25, "N": 30},
+            distributions={"R": FloatDistribution(0.01, 1.0), "N": IntDistribution(5, 200)},
+            value=1.0,
+        )
+    )
+    for r, size, count in ((0.25, 30, 1), (0.25 + 1e-7, 30, 1), (0.2501, 30, 2), (0.25, 31, 3), (0.2501, 30, 3)):
+        enqueue_new(study, {"R": r, "N": size}, {})
+        assert len(study.trials) == count
 
 
 def test_r_may_be_held_at_the_sensor_s_sheet():

@@ -10,7 +10,7 @@ import pytest
 import sqlalchemy
 from optuna.trial import TrialState
 
-from tuning.search import storage as storages
+from tuning.search import database
 from tuning.search.plan import Plan
 from tuning.search.space import distributions
 from tuning.search.storage import PROCESS, RETRY_OF, open_storage
@@ -27,8 +27,8 @@ def quiet():
 
 @pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed to be used with Study.optimize")
 def test_a_trial_without_a_heartbeat_is_lost_and_tried_once_more(tmp_path, monkeypatch):
-    monkeypatch.setattr(storages, "HEARTBEAT_SECONDS", 1)
-    monkeypatch.setattr(storages, "GRACE_SECONDS", 1)
+    monkeypatch.setattr(database, "HEARTBEAT_SECONDS", 1)
+    monkeypatch.setattr(database, "GRACE_SECONDS", 1)
     storage = open_storage(f"sqlite:///{tmp_path}/s.db")
     study = open_study("s", PLAN, storage)
     trial = study.ask(distributions("ekf", PLAN.scenarios[0]))
@@ -41,15 +41,15 @@ def test_a_trial_without_a_heartbeat_is_lost_and_tried_once_more(tmp_path, monke
 
 
 def test_tables_that_another_host_is_making_are_found_in_the_end(tmp_path, monkeypatch):
-    url, connected, tries = f"sqlite:///{tmp_path}/s.db", storages._connected, []
+    url, connected, tries = f"sqlite:///{tmp_path}/s.db", database._connected, []
 
-    def half_made(url):
+    def half_made(url, on_lost):
         tries.append(url)
         if len(tries) < 3:
             raise sqlalchemy.exc.OperationalError("CREATE", {}, Exception("Table 'studies' already exists"))
-        return connected(url)
+        return connected(url, on_lost)
 
-    monkeypatch.setattr(storages, "_connected", half_made)
+    monkeypatch.setattr(database, "_connected", half_made)
     assert not open_study("s", PLAN, open_storage(url)).trials[0].params
     assert len(tries) == 3
 
@@ -88,7 +88,7 @@ def test_an_answer_that_gets_lost_is_asked_for_again(flaky):
 def test_patience_has_an_end(flaky, monkeypatch):
     storage, fail = flaky
     study = optuna.create_study(storage=storage)
-    monkeypatch.setattr(storages, "PATIENCE_SECONDS", 1)
+    monkeypatch.setattr(database, "PATIENCE_SECONDS", 1)
     fail("set_study_user_attr", 100)
     with (
         pytest.warns(UserWarning, match="no answer from the database, trying for 1 s: connection lost"),
@@ -107,7 +107,7 @@ def test_a_proxy_stands_between_a_study_and_its_database(tmp_path, monkeypatch):
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = free.getsockname()[1]
-    monkeypatch.setattr(storages, "PROXY_SECONDS", 0.1)
+    monkeypatch.setattr(database, "PROXY_SECONDS", 0.1)
     with pytest.raises(ValueError, match="storage must be a database that can be reached, but got grpc:"):
         open_storage(f"grpc://localhost:{port}")
     program = "import sys, optuna; optuna.storages.run_grpc_proxy_server("
@@ -115,7 +115,7 @@ def test_a_proxy_stands_between_a_study_and_its_database(tmp_path, monkeypatch):
     url = f"sqlite:///{tmp_path}/s.db"
     server = subprocess.Popen([sys.executable, "-c", program, url, str(port)], stderr=subprocess.DEVNULL)
     try:
-        monkeypatch.setattr(storages, "PROXY_SECONDS", 30)
+        monkeypatch.setattr(database, "PROXY_SECONDS", 30)
         result = run_study(open_study("s", PLAN, open_storage(f"grpc://localhost:{port}")), PLAN, 3)
         assert [trial.state for trial in result.trials] == [TrialState.COMPLETE] * 3
     finally:

@@ -7,7 +7,7 @@ import pytest
 import sqlalchemy
 
 from tuning.reporting.subject import find_subject
-from tuning.search import storage as storages
+from tuning.search import database
 from tuning.search.storage import open_storage
 from tuning.search.storage_url import shown_storage, without_secrets
 
@@ -87,7 +87,7 @@ def test_a_storage_that_cannot_be_reached_tells_no_password(url, tmp_path, monke
     pytest.importorskip("psycopg2")
     pytest.importorskip("grpc")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(storages, "PROXY_SECONDS", 0.01)
+    monkeypatch.setattr(database, "PROXY_SECONDS", 0.01)
     with pytest.raises(
         ValueError, match=f"storage must be .* but got {url.partition(':')[0].replace('+', '.')}:"
     ) as e:
@@ -97,7 +97,7 @@ def test_a_storage_that_cannot_be_reached_tells_no_password(url, tmp_path, monke
 
 
 def test_an_outage_tells_no_password(tmp_path, monkeypatch):
-    monkeypatch.setattr(storages, "PATIENCE_SECONDS", 0.6)
+    monkeypatch.setattr(database, "PATIENCE_SECONDS", 0.6)
     storage, url = open_storage(f"sqlite:///{tmp_path}/s.db"), "postgresql://tuner:secret@host/s"
     study = optuna.create_study(storage=storage)
 

@@ -10,9 +10,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 
-from tuning.evaluation.evaluate import evaluate
+from tuning.evaluation.evaluate import values_of
 from tuning.problems.assumed import rows_argument
 from tuning.problems.problem import Problem
 from tuning.search.objectives import LARGEST, nis_ratio
@@ -77,7 +76,7 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
     start = _with_q(rule_of_thumb(name, scenario), scenario)
 
     def nis_at(factor: float) -> float:
-        ratio = nis_ratio(evaluate(scaled(start, factor).filter(scenario), data, scenario.scale))
+        ratio = nis_ratio(values_of(scaled(start, factor).filter(scenario), data, scenario.scale))
         return ratio if 0.0 < ratio < LARGEST else LARGEST
 
     def excess(exponent: float) -> float:
@@ -95,6 +94,8 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
     if last * first > 0:
         ends = f"{math.exp(first):.3g} with a factor of 1 and {math.exp(last):.3g} with {10.0**exponent:g}"
         return Scaled(None, None, None, f"no factor on Q brings the mean NIS of {name} to 1: it is {ends}")
+    from scipy.optimize import brentq  # loads half of SciPy, for this line
+
     root = brentq(excess, *sorted((exponent - step, exponent)), xtol=1e-3, rtol=1e-3) if exponent else 0.0
     factor = float(f"{10.0**root:.{DIGITS}g}")
     nis = nis_at(factor)

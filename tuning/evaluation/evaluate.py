@@ -11,7 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.consistency.intervals import Interval, interval, mean_interval, resampled_means, rmse_intervals
+from filters.consistency.intervals import (
+    Interval,
+    interval,
+    mean_interval,
+    resampled_means,
+    rmse_intervals,
+    without_interval,
+)
 from filters.consistency.report import ConsistencyReport, findings, joined, report_of
 from filters.ensembles.recording import record_members
 from filters.filter import Filter
@@ -73,12 +80,20 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
     return compute_metrics(filter_, metrics_of_all(filter_, data), data, scale)
 
 
-def compute_metrics(filter_: Filter, runs: RunMetrics, data: Data, scale) -> Evaluation:
-    """Metrics of a filter from those of its runs; other arguments and errors are those of `evaluate`."""
+def values_of(filter_: Filter, data: Data, scale) -> Evaluation:
+    """What `evaluate` gives, faster: values without intervals, without NEES and derived outputs."""
+    return compute_metrics(filter_, metrics_of_all(filter_, data, False, False), data, scale, False)
+
+
+def compute_metrics(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: bool = True) -> Evaluation:
+    """Metrics of a filter from those of its runs; other arguments and errors are those of `evaluate`.
+
+    Without intervals their ends are NaN: a trial of a study needs none, and they take longer than the values.
+    """
     some = runs.present[runs.present > 0]
     return Evaluation(
-        **_errors(filter_, runs, data, scale),
-        nis=mean_interval(runs.nis),
+        **_errors(filter_, runs, data, scale, intervals),
+        nis=mean_interval(runs.nis, intervals),
         expected_nis=float(some.mean()) if some.size else np.nan,
         channels=data.measurements.shape[-1],
         log_likelihood=float(runs.log_likelihoods.mean()),
@@ -87,7 +102,7 @@ def compute_metrics(filter_: Filter, runs: RunMetrics, data: Data, scale) -> Eva
     )
 
 
-def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale) -> dict:
+def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: bool) -> dict:
     """The fields of an `Evaluation` that need the truth; NaN without it."""
     mean_squares, nees, start_up = runs.mean_squares, runs.nees, runs.start_up_squares
     if data.states is None or mean_squares is None or nees is None or start_up is None:
@@ -105,16 +120,19 @@ def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale) -> dict:
             "scale": np.full(n, np.nan),
         }
     n, scale = data.states.shape[-1], _checked(scale, data.states.shape[-1])
-    resampled = np.sqrt(resampled_means(mean_squares))  # (resamples, n)
-    outputs = {symbol: rmse_intervals(squares)[0] for symbol, squares in runs.output_mean_squares.items()}
+    found = without_interval(score(mean_squares, scale))
+    if intervals:
+        found = interval(found.value, _scores(np.sqrt(resampled_means(mean_squares)), scale))
+    squares_of = runs.output_mean_squares.items()
+    outputs = {symbol: rmse_intervals(squares, intervals)[0] for symbol, squares in squares_of}
     return {
         "states": filter_.model.states[:n],
         "outputs": {symbol: filter_.model.outputs[symbol].quantity for symbol in outputs},
-        "rmse": rmse_intervals(mean_squares),
+        "rmse": rmse_intervals(mean_squares, intervals),
         "start_up_rmse": np.sqrt(start_up.mean(axis=(0, 1))),
-        "score": interval(score(mean_squares, scale), _scores(resampled, scale)),
+        "score": found,
         "output_rmse": outputs,
-        "nees": mean_interval(nees),
+        "nees": mean_interval(nees, intervals),
         "median_nees": float(np.nanmedian(nees)) if np.isfinite(nees).any() else np.nan,
         "mean_squares": mean_squares,
         "scale": scale,

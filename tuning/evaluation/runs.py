@@ -33,10 +33,13 @@ class RunMetrics(NamedTuple):
     output_mean_squares: Mapping[str, np.ndarray]  # (B, 1) each, by symbol
 
 
-def metrics_by_run(filter_: Filter, estimates: Estimates, data: Data, nees: bool = True) -> RunMetrics:
+def metrics_by_run(
+    filter_: Filter, estimates: Estimates, data: Data, nees: bool = True, outputs: bool = True
+) -> RunMetrics:
     """Metrics of a filter's estimates on some data, run by run, for the states that the plant has.
 
-    The NEES is NaN unless it is wanted: for forty states it takes a tenth of the filter's own time.
+    The NEES is NaN unless it is wanted: for forty states it takes a tenth of the filter's own time. Errors of
+    derived outputs are left out unless they are wanted.
     """
     late, measurements = data.scored, data.measurements
     present = (~np.isnan(measurements[:, late])).sum(axis=-1)
@@ -48,13 +51,14 @@ def metrics_by_run(filter_: Filter, estimates: Estimates, data: Data, nees: bool
     found = RunMetrics(nis, present, likelihoods, estimates.divergences, None, None, None, {})
     if data.states is None:
         return found
-    return found._replace(**_against_truth(filter_, estimates, data, data.states, nees))
+    found = found._replace(**_against_truth(filter_, estimates, data, data.states, nees))
+    return found._replace(output_mean_squares=_output_mean_squares(filter_, estimates, data)) if outputs else found
 
 
-def metrics_of_all(filter_: Filter, data: Data, nees: bool = True) -> RunMetrics:
+def metrics_of_all(filter_: Filter, data: Data, nees: bool = True, outputs: bool = True) -> RunMetrics:
     """`metrics_by_run` of a filter on all runs of some data, in parts: the same as for all at once."""
     parts = estimates_in_parts(filter_, data)
-    return joined([metrics_by_run(filter_, found, some, nees) for some, found in parts])
+    return joined([metrics_by_run(filter_, found, some, nees, outputs) for some, found in parts])
 
 
 def joined(parts: Sequence[RunMetrics]) -> RunMetrics:
@@ -91,21 +95,26 @@ def _errors(filter_: Filter, estimates: Estimates, states: np.ndarray) -> np.nda
 
 
 def _against_truth(filter_: Filter, estimates: Estimates, data: Data, states: np.ndarray, wanted: bool) -> dict:
-    """The fields of `RunMetrics` that need the truth."""
+    """The fields of `RunMetrics` that need the true states."""
     n, late = states.shape[-1], data.scored
     errors = _errors(filter_, estimates, states)
     late_errors = errors[:, late]
     nees = np.full(late_errors.shape[:2], np.nan)
     if wanted:
         nees = normalized_squares(late_errors, estimates.covs[:, late, :n, :n])
-    mean_squares, start_up = (errors[:, late] ** 2).mean(axis=1), errors[:, :FIRST_SCORED_STEP] ** 2
-    outputs = _output_mean_squares(filter_, estimates, data)
+    mean_squares, start_up = _means_over_steps(late_errors**2), errors[:, :FIRST_SCORED_STEP] ** 2
     return {
         "mean_squares": mean_squares,
         "start_up_squares": start_up,
         "nees": nees,
-        "output_mean_squares": outputs,
     }
+
+
+def _means_over_steps(values: np.ndarray) -> np.ndarray:
+    """Means (B, n) of values (B, T, n), the sums of all runs side by side: twice as fast, and the same bits."""
+    if values.shape[-1] == 1:  # these NumPy adds up pairwise
+        return values.mean(axis=1)
+    return np.ascontiguousarray(np.swapaxes(values, 0, 1)).mean(axis=0)
 
 
 def _output_mean_squares(filter_: Filter, estimates: Estimates, data: Data) -> dict[str, np.ndarray]:

@@ -13,7 +13,7 @@ import numpy as np
 from filters.consistency.intervals import Interval
 from filters.posterior import ALL_UP_TO
 from numerics.progress import told
-from tuning.evaluation.evaluate import Evaluation, evaluate, resampled_ratios, score_ratio
+from tuning.evaluation.evaluate import Evaluation, evaluate, resampled_ratios, score_ratio, values_of
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.problem import Problem
@@ -215,8 +215,9 @@ def _on(scenario: Problem, data: Data, choice: Choice, sizes: Sequence[int]) -> 
 
 
 def _outside(choice: Choice, plan: Plan, training: Sequence[Data]) -> float:
+    """The mean NIS of a choice outside its band on the training data; the largest of several scenarios."""
     pairs = zip(plan.scenarios, training, strict=True)
-    return max(nis_violation(evaluate(choice.filter(one), data, one.scale)) for one, data in pairs)
+    return max(nis_violation(values_of(choice.filter(one), data, one.scale)) for one, data in pairs)
 
 
 def _over_the_best(found: Sequence[Evaluation], among: Sequence[int]) -> list[Interval]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -108,7 +109,7 @@ class Problem(ABC):
         """
         raise ValueError(f"make_env must be of a problem that has an env, but {self.name} has none")
 
-    @property
+    @cached_property  # every trial asks for them, and a model takes half a millisecond
     def quantities(self) -> Quantities:
         """Names, symbols and units of states, inputs and measurements."""
         return self.model().quantities

@@ -5,6 +5,9 @@ NIS is the normalised innovation squared.
 
 from __future__ import annotations
 
+import math
+from numbers import Real
+
 import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
@@ -23,6 +26,7 @@ RESCALED = "consistent twin"  # how often the trial's Q and R have been rescaled
 SMALLER = "smaller ensemble of"  # number of the trial that was over the budget
 TRANSFERRED = "noise of"  # number of the trial of another filter type that Q and R are from
 MAXIMUM_LIKELIHOOD = "likeliest noise"  # Q and R have maximum likelihood
+NEAR = 2e-5  # relative difference of parameters, above which trials are certainly not equal
 MOST_RESCALINGS = 2  # nonlinear filters may need a second one
 FIRST_ROUND = 3  # trials for each filter type, after which the noise of the best trial is tried with all types
 ROOM = 0.9  # part of the budget that a smaller ensemble shall take
@@ -68,10 +72,10 @@ def _enqueue_untuned(study: optuna.Study, plan: Plan) -> None:
     """
     trials = study.get_trials(deepcopy=False)
     begun = [trial.user_attrs.get(UNTUNED) for trial in trials]
-    if begun[:1] == [None] or any(trial.state == TrialState.WAITING for trial in trials):
+    if begun[:1] == [None]:
         return  # a study that begins with something else has enqueued all at once
     name = next((name for name in plan.filter_types if name not in begun), None)
-    if name is not None:
+    if name is not None and not any(trial.state == TrialState.WAITING for trial in trials):
         choice = untuned_choice(name, plan.scenarios[0])
         study.enqueue_trial(trial_parameters(choice, plan.space()), user_attrs={UNTUNED: name})
 
@@ -100,7 +104,28 @@ def _enqueue_rescaled(study: optuna.Study, plan: Plan, last: FrozenTrial) -> Non
         if name in parameters and parameters[name].place.is_variance
     }
     attributes = {RESCALED: last.user_attrs.get(RESCALED, 0) + 1, f"{RESCALED} of": last.number}
-    study.enqueue_trial({**last.params, **scaled}, user_attrs=attributes, skip_if_exists=True)
+    enqueue_new(study, {**last.params, **scaled}, attributes)
+
+
+def enqueue_new(study: optuna.Study, parameters: dict, attributes: dict) -> None:
+    """Enqueue a trial unless there is one with these parameters.
+
+    Optuna compares it with all trials, one parameter at a time by NumPy: so it is asked only where one is near.
+    """
+    trials = study.get_trials(deepcopy=False)
+    near = any(not one.state.is_finished() or _is_near(one.params, parameters) for one in trials)
+    study.enqueue_trial(parameters, user_attrs=attributes, skip_if_exists=near)
+
+
+def _is_near(one: dict, other: dict) -> bool:
+    """Whether no parameter that both have differs by more than what Optuna takes as equal, 1e-5."""
+    for name, value in other.items():
+        if isinstance(value, Real) and isinstance(one.get(name, ""), Real):
+            if not math.isclose(value, one[name], rel_tol=NEAR):
+                return False
+        elif name in one and one[name] != value:
+            return False
+    return True
 
 
 def _enqueue_smaller_ensemble(study: optuna.Study, plan: Plan, last: FrozenTrial, budget: float) -> None:
@@ -141,7 +166,7 @@ def _enqueue_maximum_likelihood(study: optuna.Study, plan: Plan) -> None:
     if any(problem.leads_in for problem in plan.scenarios):  # recorded runs, whose likelihood is all there is
         filter_type = best.params.get(FILTER_TYPE, plan.filter)
         plain = trial_parameters(untuned_choice(filter_type, plan.scenarios[0]), space)
-        study.enqueue_trial({**plain, **noise}, user_attrs={MAXIMUM_LIKELIHOOD: True}, skip_if_exists=True)
+        enqueue_new(study, {**plain, **noise}, {MAXIMUM_LIKELIHOOD: True})
 
 
 def _ends_a_round(trials: int, filter_types: int) -> bool:

@@ -5,18 +5,30 @@ from __future__ import annotations
 import json
 import os
 import warnings
+from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 
+INTERMEDIATE = "intermediate_value"  # key of an entry of Optuna's with the value of a seed
+
 
 class JournalFile(JournalFileBackend):
-    """Optuna's journal file, to which a line is added as a whole or not at all."""
+    """Optuna's journal file, to which entries are added as a whole or not at all.
+
+    A disk takes a millisecond to keep what it was given for good, more than a trial of a cheap filter. So the file
+    is synchronised at what has to outlive the machine: a finished trial, with all before it, and what a study
+    knows. Of a running trial, which would be repeated anyway, nobody else needs the value of each seed at once:
+    these wait for the next entry of another kind, or the next reader in this process.
+    """
 
     def __init__(self, path: Path, lock: JournalFileOpenLock):
         """Take its path, and the lock of its writers."""
         super().__init__(str(path), lock_obj=lock)
         self._path, self._writers = path, lock
+        self._waiting: list[dict] = []
+        self._was_put_off = False
 
     def append_logs(self, logs: list[dict]) -> None:
         """Add a line for each entry.
@@ -24,6 +36,24 @@ class JournalFile(JournalFileBackend):
         Raises:
             OSError: if there is no room; the file is then as it was, and others can go on with it.
         """
+        self._was_put_off = all(INTERMEDIATE in log for log in logs)
+        if self._was_put_off:
+            self._waiting += logs
+        else:
+            self._write(logs)
+
+    def read_logs(self, log_number_from: int) -> Generator[dict[str, Any], None, None]:
+        """Entries from a number on; none right after one that waits, when Optuna reads what it has just added."""
+        if self._was_put_off:
+            self._was_put_off = False
+            return
+        if self._waiting:
+            self._write([])
+        yield from super().read_logs(log_number_from)
+
+    def _write(self, logs: list[dict]) -> None:
+        """Add what waits and some entries; what waits is of a trial that fails if there is no room for it."""
+        logs, self._waiting = self._waiting + logs, []
         lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
         self._writers.acquire()
         try:
@@ -32,7 +62,8 @@ class JournalFile(JournalFileBackend):
                 with self._path.open("ab") as stream:
                     stream.write(lines.encode())
                     stream.flush()
-                    os.fsync(stream.fileno())
+                    if not all(map(_is_of_running_trial, logs)):
+                        os.fsync(stream.fileno())
             except BaseException:
                 os.truncate(self._path, size)
                 raise
@@ -40,6 +71,11 @@ class JournalFile(JournalFileBackend):
             raise OSError(error.errno, error.strerror, str(self._path)) from None
         finally:
             self._writers.release()
+
+
+def _is_of_running_trial(log: dict) -> bool:
+    """Whether an entry is of a trial that is not finished: which one it is, or when it began, but not its end."""
+    return ("trial_id" in log or "datetime_start" in log) and "datetime_complete" not in log
 
 
 def cut_unfinished_line(path: Path) -> None:

@@ -20,7 +20,8 @@ def best_trial(trials: Sequence[FrozenTrial]) -> FrozenTrial | None:
     band does not matter: an estimate that is many times worse can be closer to it.
     """
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
-    return min(complete, key=lambda trial: (not is_consistent(trial), trial.values[0]), default=None)
+    complete.sort(key=lambda trial: trial.values[0])  # so that few are asked for their constraints
+    return next(filter(is_consistent, complete), complete[0] if complete else None)
 
 
 def is_consistent(trial: FrozenTrial) -> bool:

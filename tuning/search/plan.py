@@ -139,8 +139,8 @@ class Plan(NamedTuple):
 
     @property
     def tunes_noise(self) -> bool:
-        """Whether the variances of Q and R are tuned, and no parameters of the problem's own."""
-        return self.scenarios[0].parameters is None
+        """Whether Q and R are tuned: the problem has no parameters of its own, the filters a covariance."""
+        return self.scenarios[0].parameters is None and self._has_covariance
 
     @property
     def _options(self) -> dict:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 
 import numpy as np
 import optuna
@@ -54,14 +55,25 @@ def make_sampler(
         values = {key: _grid(distribution) for key, distribution in distributions.items()}
         return optuna.samplers.GridSampler(values, seed=seed)
     seed = int(np.random.SeedSequence([seed, present, worker]).generate_state(1)[0])
-    makers = {
-        "tpe": optuna.samplers.TPESampler,
+    makers: dict[str, Callable[..., optuna.samplers.BaseSampler]] = {
+        "tpe": _tpe,
         "gp": optuna.samplers.GPSampler,
         "cma-es": CmaEsSampler,
         "nsga-ii": optuna.samplers.NSGAIISampler,
         "random": optuna.samplers.RandomSampler,
     }
     return makers[name](seed=seed)
+
+
+def _tpe(seed: int) -> optuna.samplers.TPESampler:
+    """Optuna's sampler, which evaluates its densities as arrays where its version is known."""
+    sampler = optuna.samplers.TPESampler(seed=seed)
+    with suppress(ImportError):  # of another version
+        from tuning.search.parzen import ParzenEstimator, is_optunas
+
+        if is_optunas():
+            sampler._parzen_estimator_cls = ParzenEstimator
+    return sampler
 
 
 def give_sampler(study: optuna.Study, make: Callable[[int], optuna.samplers.BaseSampler], present: int) -> None:

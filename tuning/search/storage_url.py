@@ -65,3 +65,8 @@ def without_secrets(text: str, storage: str) -> str:
     for secret in sorted(secrets - {""}, key=len, reverse=True):
         text = re.sub(rf"(?<!\w){re.escape(secret)}(?!\w)", HIDDEN, text)
     return text
+
+
+def first_line(error: BaseException) -> str:
+    """What an error says first, or what it is called."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]

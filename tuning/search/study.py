@@ -240,9 +240,11 @@ def run_trials(
     if stop() or finished_trials(study) >= trials:
         return False
 
+    space = plan.space()
+
     def objective(trial: optuna.Trial) -> list[float]:
         trial.set_user_attr(PROCESS, this_process())
-        return run_trial(trial, plan, data, on_choice)
+        return run_trial(trial, plan, data, space, on_choice)
 
     def after(study: optuna.Study, trial: FrozenTrial) -> None:
         _note_best(study, trial)

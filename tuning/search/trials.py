@@ -6,12 +6,12 @@ NEES is the normalised estimation error squared, NIS the normalised innovation s
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from statistics import geometric_mean
 
 import numpy as np
 import optuna
+from optuna.distributions import BaseDistribution
 
 from tuning.evaluation.evaluate import Evaluation, compute_metrics, run_scores
 from tuning.evaluation.runs import RunMetrics, joined, metrics_of_all
@@ -19,36 +19,39 @@ from tuning.problems.data import Data
 from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
 from tuning.search.objectives import LARGEST, nis_ratio, nis_violation, penalised
 from tuning.search.plan import Plan
+from tuning.search.pruning import BLOCK, PairedPruner
 from tuning.search.space import Choice, suggest
 
-BLOCK = 8  # seeds between two decisions whether to prune
 CONSISTENCY = "mean NIS outside its band"  # name of the constraint; at most zero is inside
 NIS = "mean NIS over the number of channels"
-P_THRESHOLD = 0.1  # p-value of Wilcoxon's signed-rank test below which a trial is pruned
 
 
 def make_pruner(plan: Plan) -> optuna.pruners.BasePruner:
-    """Wilcoxon's signed-rank test over seeds, paired with the best trial; or no pruning."""
-    if not plan.prune or len(plan.objectives) > 1:
-        return optuna.pruners.NopPruner()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        return optuna.pruners.WilcoxonPruner(p_threshold=P_THRESHOLD, n_startup_steps=BLOCK)
+    """A paired test over seeds; or no pruning, also of two objectives."""
+    return PairedPruner() if plan.prune and len(plan.objectives) == 1 else optuna.pruners.NopPruner()
 
 
 def run_trial(
     trial: optuna.Trial,
     plan: Plan,
     data: Sequence[Data],
+    space: Mapping[str, BaseDistribution],
     on_choice: Callable[[Choice], None] = lambda choice: None,
 ) -> list[float]:
-    """Values of a trial, one for each objective; `on_choice` is called with its choice.
+    """Values of a trial, one for each objective.
+
+    Args:
+        trial: from Optuna.
+        plan: of the study.
+        data: the plan's training data.
+        space: the plan's space.
+        on_choice: called with the choice of the trial.
 
     Raises:
         optuna.TrialPruned: if it is over the plan's budget, or significantly worse than the best one on the seeds
             so far.
     """
-    choice = suggest(trial, plan.filter, plan.scenarios[0], plan.space())
+    choice = suggest(trial, plan.filter, plan.scenarios[0], space)
     on_choice(choice)
     microseconds = math.nan
     if plan.asks_for_cost:
@@ -82,9 +85,10 @@ def measure(
 ) -> list[Evaluation]:
     """Run a choice on all data; with a trial, report each seed's score to it and stop if it should be pruned.
 
-    The NEES is computed where an objective needs it.
+    The NEES and errors of outputs are computed where an objective needs them, and no interval.
     """
-    nees = any(objective.needs_nees for objective in plan.found_objectives())
+    objectives = plan.found_objectives()
+    nees, outputs = any(one.needs_nees for one in objectives), any(one.output for one in objectives)
     filters = [choice.filter(scenario) for scenario in plan.scenarios]
     count = len(data[0].seeds)
     size = count if trial is None else BLOCK
@@ -92,13 +96,13 @@ def measure(
     for first in range(0, count, size):
         block = [one.slice(first, first + size) for one in data]
         for runs, filter_, one in zip(parts, filters, block, strict=True):
-            runs.append(metrics_of_all(filter_, one, nees))
+            runs.append(metrics_of_all(filter_, one, nees, outputs))
         if trial is not None:
             _report(trial, first, [runs[-1] for runs in parts], plan)
             if first + size < count and trial.should_prune():
                 raise optuna.TrialPruned
     rows = zip(filters, map(joined, parts), data, plan.scenarios, strict=True)
-    return [compute_metrics(filter_, runs, one, scenario.scale) for filter_, runs, one, scenario in rows]
+    return [compute_metrics(filter_, runs, one, scenario.scale, False) for filter_, runs, one, scenario in rows]
 
 
 def _report(trial: optuna.Trial, first: int, parts: list[RunMetrics], plan: Plan) -> None:

@@ -1,0 +1,84 @@
+"""A journal is synchronised where a trial ends, and what the running one reports waits for others."""
+
+import os
+
+import optuna
+import pytest
+from optuna.trial import TrialState
+
+from tuning.search.journal import JournalFile
+from tuning.search.storage import open_storage
+
+
+@pytest.fixture
+def path(tmp_path):
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    return str(tmp_path / "studies.journal")
+
+
+def reporting(trial):
+    """Reports two seeds in a block; every other trial is pruned after it."""
+    x = trial.suggest_float("x", 0.0, 1.0)
+    for step in range(2):
+        trial.report(x + step, step)
+    if trial.number % 2:
+        raise optuna.TrialPruned
+    trial.report(x + 2, 2)
+    return x
+
+
+def test_another_process_finds_every_value_of_finished_trials(path):
+    study = optuna.create_study(study_name="s", storage=open_storage(path))
+    study.optimize(reporting, n_trials=4)
+    trials = optuna.load_study(study_name="s", storage=open_storage(path)).trials
+    assert [trial.state for trial in trials] == 2 * [TrialState.COMPLETE, TrialState.PRUNED]
+    for trial in trials:
+        x = trial.params["x"]
+        pruned = trial.state == TrialState.PRUNED
+        assert trial.intermediate_values == {step: x + step for step in range(2 if pruned else 3)}
+        assert trial.value == (x + 1 if pruned else x)
+    assert trials == study.trials
+
+
+def test_a_reader_in_the_same_process_finds_what_was_reported(path):
+    study = optuna.create_study(study_name="s", storage=open_storage(path))
+    trial = study.ask()
+    trial.report(3.0, 0)
+    trial.report(4.0, 1)
+    assert study.trials[0].intermediate_values == {0: 3.0, 1: 4.0}
+    (found,) = optuna.load_study(study_name="s", storage=open_storage(path)).trials
+    assert found.intermediate_values == {0: 3.0, 1: 4.0}
+
+
+def test_the_file_is_synchronised_once_a_trial_and_seeds_are_added_together(path, monkeypatch):
+    study = optuna.create_study(study_name="s", storage=open_storage(path))
+    synchronised, added, fsync, write = [], [], os.fsync, JournalFile._write
+
+    def written(self, logs):
+        added.append(len(self._waiting))
+        write(self, logs)
+
+    monkeypatch.setattr(os, "fsync", lambda number: (synchronised.append(number), fsync(number)))
+    monkeypatch.setattr(JournalFile, "_write", written)
+    study.optimize(reporting, n_trials=4)
+    assert len(synchronised) == 4
+    assert sorted(count for count in added if count) == [2, 2, 3, 3]
+    study.set_user_attr("best", 1)
+    assert len(synchronised) == 5
+
+
+def test_what_waits_is_gone_if_it_finds_no_room(path, monkeypatch):
+    study = optuna.create_study(study_name="s", storage=open_storage(path))
+    trial = study.ask()
+    trial.report(3.0, 0)
+
+    def full(self, *arguments):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pathlib.Path.open", full)
+        with pytest.raises(OSError, match="No space left"):
+            study.trials  # noqa: B018 - reads
+    study.tell(trial, 1.0)
+    (found,) = optuna.load_study(study_name="s", storage=open_storage(path)).trials
+    assert found.intermediate_values == {} and found.value == 1.0
