@@ -50,8 +50,16 @@ def spread(part: Callable[[int, int], None], count: int) -> None:
     loads code imports modules, and would wait for ever for one in whose import its caller is.
     """
     part(0, 0)
-    edges = np.linspace(0, count, 1 + min(count, 4 * cores())).astype(int)
-    list(_pool().map(part, edges[:-1], edges[1:]))
+    edges = np.linspace(0, count, 1 + min(count, 4 * cores())).astype(int).tolist()
+    parts = iter(list(itertools.pairwise(edges)))  # of all threads: what one has taken no other gets
+
+    def work() -> None:
+        for first, last in parts:
+            part(first, last)
+
+    # One job for each thread: a job for each part would take longer to hand over than short parts take.
+    for job in [_pool().submit(work) for _ in range(min(cores(), count))]:
+        job.result()
 
 
 @cache
