@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from time import perf_counter
 from unittest import mock
@@ -17,6 +18,8 @@ from benchmarks.rows import Row
 from benchmarks.timing import Timing
 from benchmarks.workloads import step_by_size, times
 from numerics.threads import cores
+from tuning.evaluation import sizes
+from tuning.likelihood import gradient
 from tuning.search import trials
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.space import oracle_choice
@@ -28,6 +31,12 @@ TRIALS = 200
 SIZES, PEER_STEPS = (20, 200), 200  # FilterPy's time a step is a straight line over N
 OUTSIDE_GOAL, RUNS_GOAL, STUDY_GOAL = 0.45, 1 / 100, 1 / 500
 MEMORY_GOAL = 500.0  # [MB]
+FILTERS_AND_SCORES = {  # what runs filters or rates their runs, where a study calls it; none calls another
+    trials: ("metrics_of_all", "compute_metrics"),
+    sizes: ("evaluate", "values_of"),
+    gradient: ("likelihood",),
+}
+WARM_UP = 25  # trials, with the first search of the likeliest Q and R
 IN_A_PROCESS = """
 from tuning.search.plan import Plan
 from tuning.thruster.find import find_scenario
@@ -44,7 +53,7 @@ def rows(seed: int, quick: bool) -> Iterator[Row]:
     """Measure a study, then the share of it that is Optuna's, then what FilterPy would take for its runs."""
     count = _trials(quick)
     plan = Plan("enkf", (find_scenario("nominal"),), seed)
-    _study(plan, 2)  # compiles
+    _study(plan, min(WARM_UP, count))  # compiles
     total, own, result = _timed(plan, count)
     what = f"study, {count} trials of an EnKF"
     peer, limit = filterpy_seconds(plan.scenarios[0], result), filters_limit(plan.scenarios[0], result)
@@ -88,20 +97,25 @@ def _study(plan: Plan, count: int) -> StudyResult:
 
 
 def _timed(plan: Plan, count: int) -> tuple[float, float, StudyResult]:
-    """Seconds of a study, seconds of it in our filters and scores, and what it found."""
+    """Seconds of a study, seconds of it in our filters and scores, and what it found.
+
+    Filters run in trials, in the search of the likeliest Q and R, and where the ensemble's size is chosen.
+    """
     spent = [0.0]
 
     def clocked(function: Callable) -> Callable:
-        def call(*arguments):
+        def call(*arguments, **named):
             begin = perf_counter()
-            result = function(*arguments)
+            result = function(*arguments, **named)
             spent[0] += perf_counter() - begin
             return result
 
         return call
 
-    ours = {name: clocked(getattr(trials, name)) for name in ("metrics_of_all", "compute_metrics")}
-    with mock.patch.multiple(trials, **ours):
+    with ExitStack() as patches:
+        for room, names in FILTERS_AND_SCORES.items():
+            clocks = {name: clocked(getattr(room, name)) for name in names}
+            patches.enter_context(mock.patch.multiple(room, **clocks))
         begin = perf_counter()
         result = _study(plan, count)
         return perf_counter() - begin, spent[0], result
