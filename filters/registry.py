@@ -29,6 +29,7 @@ from filters.particles.particle import ParticleFilter
 from numerics.checks import one_of
 from plants.state_space import StateSpaceModel
 
+LISTED = "thruster filters"  # the command that lists all
 FILTERS: dict[str, type[Filter]] = {
     kind.name: kind
     for kind in (
@@ -61,7 +62,7 @@ def filter_class(name: str) -> type[Filter]:
     """The class of a filter by name, `ForeignFilter` for estimators; ValueError for an unknown name."""
     if is_foreign(name):
         return ForeignFilter
-    return FILTERS[one_of("filter", name, tuple(FILTERS))]
+    return FILTERS[one_of("filter", name, tuple(FILTERS), LISTED)]
 
 
 def tunable_numbers(name: str) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from filters.registry import FILTERS, tunable_numbers
+from filters.registry import FILTERS, LISTED, tunable_numbers
 from filters.tuned_model import check_model_data
 from numerics.checks import finite, one_of, positive, shown
 
@@ -106,7 +106,7 @@ def _check_filter(entry, known: tuple[str, ...] | None) -> None:
     """
     if not isinstance(entry, dict) or set(entry) != {"name", "numbers", "model"}:
         raise ValueError(f"a tuned file must have a filter with name, numbers and model, but got {shown(entry)}")
-    name = one_of("the filter of a tuned file", entry["name"], tuple(FILTERS))
+    name = one_of("the filter of a tuned file", entry["name"], tuple(FILTERS), LISTED)
     numbers = tunable_numbers(name)
     for key, value in _mapping("numbers", entry["numbers"]).items():
         one_of(f"a number of filter {name!r}", key, numbers)

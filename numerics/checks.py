@@ -9,6 +9,8 @@ from types import NoneType
 
 import numpy as np
 
+FEW, MANY = 4, 8  # choices that a message names of more than so many
+
 
 def shown(value) -> str:
     """A value for an error message, on one line and not too long."""
@@ -105,11 +107,17 @@ def options(value) -> Mapping:
     return {} if value is None else value
 
 
-def one_of(name: str, value, choices: Iterable[str]) -> str:
-    """Return value; raise ValueError, with the name that comes nearest, unless it is one of the choices."""
+def one_of(name: str, value, choices: Iterable[str], listed: str | None = None) -> str:
+    """Return value; raise ValueError, with the name that comes nearest, unless it is one of the choices.
+
+    Of many choices, where one comes near, the message has the first only, and `listed`, the command that has all.
+    """
     known = tuple(choices)
     if not isinstance(value, str) or value not in known:
-        raise ValueError(f"{name} must be one of {', '.join(known)}, but got {shown(value)}{meant(value, known)}")
+        near, told = meant(value, known), ", ".join(known)
+        if listed is not None and near and len(known) > MANY:
+            told = f"{', '.join(known[:FEW])} and {len(known) - FEW} more ({listed} lists all)"
+        raise ValueError(f"{name} must be one of {told}, but got {shown(value)}{near}")
     return value
 
 

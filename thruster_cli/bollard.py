@@ -58,7 +58,7 @@ def identify_bollard(
         raise ValueError(f"give either logs or --bollard TABLE.csv, but got both, {logs[0]} and {path}")
     if not is_file(out):
         raise ValueError(f"a preset file must end in .toml, but got {str(out)!r}")
-    check_targets((out,), json, read=(path, step))
+    check_targets((out,), json, read=(path, step, preset))
     read = read_table(path)
     supplies = np.unique(read.supply).tolist()
     held_out = supplies[2:-1:2] or supplies[1:2]  # between others, so that nothing is extrapolated

@@ -10,6 +10,7 @@ from filters.consistency.report import ConsistencyReport
 from filters.consistency.verdicts import MOST_STATES, comparison_sentence, sentences
 from filters.filter import Filter
 from numerics.files import check_target
+from thruster_cli.output import check_picture
 from tuning.evaluation.baselines import ORACLE
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison
@@ -20,8 +21,7 @@ from tuning.search.space import Choice
 
 def check_request(path: Path, filter_: Filter) -> None:
     """Raise ValueError if a filter has no covariance to check, or its picture not be written there."""
-    if path.suffix != ".png":
-        raise ValueError(f"--consistency must end in .png, but got {str(path)!r}")
+    check_picture(path, "--consistency")
     if not filter_.has_covariance:
         raise ValueError(f"--consistency must be for a filter with a covariance, but got {filter_.name!r}")
     check_target(path)

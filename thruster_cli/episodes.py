@@ -78,6 +78,7 @@ def estimated_env(
     steps: int = 500,
     filter: str | None = None,
     tuned: Path | None = None,
+    size: tuple[int, int] | None = None,
 ) -> Iterator[gym.Env]:
     """A thruster that is drawn with what a filter believes of it.
 
@@ -87,10 +88,11 @@ def estimated_env(
         steps: of an episode.
         filter: by name; "ekf" if None and no tuned file.
         tuned: path of a tuned file.
+        size: of pictures, (width, height) [px]; None for the env's own.
     """
     at_least("steps", steps, 1, MOST_STEPS)
     mode = "human" if film is None else "rgb_array"
-    env = gym.make(ENV, preset=preset, render_mode=mode, max_episode_steps=steps)
+    env = gym.make(ENV, preset=preset, render_mode=mode, render_size=size, max_episode_steps=steps)
     try:
         given = {"filter": filter} if tuned is None else {"tuned": str(tuned)}
         yield EstimateState(env, observation="measurement+estimate", **given)
@@ -123,6 +125,7 @@ def play_log(
     *,
     filter: str | None = None,
     tuned: Path | None = None,
+    size: tuple[int, int] | None = None,
     seed: int = 0,
 ) -> Played:
     """A recorded run of a thruster: its voltage and measurements, what else was recorded, and a filter's estimate.
@@ -134,13 +137,15 @@ def play_log(
         on_step: called after each row.
         filter: by name; "ekf" if None and no tuned file.
         tuned: path of a tuned file.
+        size: of pictures, (width, height) [px]; None for the env's own.
         seed: of the filter's random numbers.
     """
     found = estimate_log(log, filter, offer, tuned=tuned, seed=seed)
     every = steps_a_frame(film, log.dt)
     largest = float(np.abs(log.inputs).max())
     plant = offer.plant._replace(max_voltage=max(offer.plant.max_voltage, largest), dt=log.dt)
-    renderer = renderer_of(plant, "human" if film is None else "rgb_array", max(1, round(1 / log.dt)))
+    mode = "human" if film is None else "rgb_array"
+    renderer = renderer_of(plant, mode, max(1, round(1 / log.dt)), size)
     frames: list[np.ndarray] = []
     try:
         for row, (moment, overlay) in enumerate(zip(moments(log), overlays(found), strict=True)):

@@ -29,7 +29,7 @@ from thruster_cli.options import (
     filter_option,
     one_file,
 )
-from thruster_cli.output import announce_compilation, check_targets, emit, table
+from thruster_cli.output import announce_compilation, check_picture, check_targets, emit, table
 from tuning.logs.read import read_named
 
 ALPHA = 0.05  # below which a p-value speaks against white innovations
@@ -75,9 +75,7 @@ def command(
     ] = None,
     plot: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE.png", help="Picture of all over time, .png, .svg or .pdf.", rich_help_panel=OUTPUT
-        ),
+        typer.Option(metavar="FILE", help="Picture of all over time, .png, .svg or .pdf.", rich_help_panel=OUTPUT),
     ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
@@ -98,7 +96,7 @@ def command(
     if tuned is not None and filter_name is not None:
         raise ValueError(f"give either a tuned file or --filter NAME, but got both, {tuned} and {filter_name}")
     if plot is not None:
-        check_suffix(plot, "--plot", (".png", ".svg", ".pdf"))
+        check_picture(plot, "--plot")
     if out is not None:
         check_suffix(out)
     recorded, offer = read_named(log, preset, model, sensor, column, clock_offset, dt)

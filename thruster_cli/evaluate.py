@@ -56,7 +56,7 @@ def command(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Also say whether the filter's covariance is consistent, and draw that: a .png file.",
+            help="Also say whether the filter's covariance is consistent, and draw that: .png, .svg or .pdf.",
             rich_help_panel=OUTPUT,
         ),
     ] = None,

@@ -25,7 +25,7 @@ from thruster_cli.options import (
     SensorOption,
     filter_option,
 )
-from thruster_cli.output import announce_compilation, check_targets, emit, progress_console
+from thruster_cli.output import announce_compilation, check_picture, check_targets, emit, progress_console
 from thruster_cli.to_identify import names_of, numbers_of, ranges_of
 from thruster_env.preset_file import is_file
 from tuning.api.identify import identified
@@ -130,7 +130,8 @@ def command(
         ),
     ] = None,
     plot: Annotated[
-        Path | None, typer.Option(metavar="FILE.png", help="Profile likelihoods.", rich_help_panel=OUTPUT)
+        Path | None,
+        typer.Option(metavar="FILE", help="Profile likelihoods, .png, .svg or .pdf.", rich_help_panel=OUTPUT),
     ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
@@ -151,8 +152,8 @@ def command(
 
     Example: thruster identify run.csv --model my_module:model --free stiffness,damping --range damping=0:2
     """
-    if plot is not None and plot.suffix != ".png":
-        raise ValueError(f"--plot must end in .png, but got {str(plot)!r}")
+    if plot is not None:
+        check_picture(plot, "--plot")
     if bollard is not None:
         from thruster_cli.bollard import check_of_table, identify_bollard
 
@@ -179,7 +180,7 @@ def command(
     numbers, ranges = numbers_of("--start", pairs("--start", start)), ranges_of(pairs("--range", range_))
     if out is not None and not is_file(out):
         raise ValueError(f"--out must end in .toml, but got {str(out)!r}")
-    check_targets((out, plot), json, read=(*logs, *(held_out or [])))
+    check_targets((out, plot), json, read=(*logs, *(held_out or []), preset))
     announce_compilation()
     search: dict[str, Any] = {"gate": gate, "degrees": degrees, "predicted": predicted or (), "starts": starts}
     whole = identified(

@@ -10,7 +10,7 @@ import typer
 
 from numerics.checks import within
 from thruster_cli.options import INPUT, OUTPUT, JsonOption, PresetOption
-from thruster_cli.output import emit, table, warn_beyond
+from thruster_cli.output import check_picture, emit, table, warn_beyond
 from thruster_env.linear.analysis import (
     GAIN_UNITS,
     INPUTS,
@@ -45,7 +45,7 @@ def command(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Bode plot and step response, a .png file.",
+            help="Bode plot and step response, .png, .svg or .pdf.",
             show_default="out/inspect-PRESET-VOLTAGE.png",
             rich_help_panel=OUTPUT,
         ),
@@ -56,8 +56,8 @@ def command(
 
     Example: thruster inspect --preset tunnel --voltage 12 --out tunnel.png
     """
-    if out is not None and out.suffix != ".png":
-        raise ValueError(f"--out must end in .png, but got {str(out)!r}")
+    if out is not None:
+        check_picture(out, "--out")
     plant = make_plant(preset, dt, max_voltage, ambient_velocity)
     voltage = within("voltage", voltage, max_voltage)
     warn_beyond(preset, voltage)

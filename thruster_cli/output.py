@@ -19,9 +19,11 @@ from numerics.progress import listening
 from numerics.text_tables import BEST as BEST
 from numerics.text_tables import console
 from numerics.text_tables import table as table  # for the commands, beside what follows
+from plants.logs.write import check_suffix
 from thruster_cli.options import JsonOption, SeedOption  # noqa: F401 - for `demo`
 from thruster_env.plant import largest_known_voltage
 
+PICTURES = (".png", ".svg", ".pdf")  # which figures are written as
 progress_console = Console(stderr=True, markup=False, highlight=False)
 
 
@@ -34,6 +36,11 @@ def emit(shown: Sequence[RenderableType], data: dict, json_target: str | None) -
         write_whole(json_target, as_text(data))
     for part in shown:
         console.print(part)
+
+
+def check_picture(path: Path, option: str) -> None:
+    """Raise ValueError unless the name of a figure's file ends in one of PICTURES."""
+    check_suffix(path, option, PICTURES)
 
 
 def check_targets(targets: Iterable[str | Path | None], json_target: str | None, read: Iterable = ()) -> None:

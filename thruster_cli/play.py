@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from numerics.checks import one_of
+from numerics.checks import at_least, one_of, shown
+from plants.rendered import LARGEST, SMALLEST
 from plants.rendering.film import Played, check_drawing
 from thruster_cli.options import (
     FILTER,
@@ -75,6 +77,14 @@ def command(
         bool,
         typer.Option("--window", help="Show it in a window instead, at true speed.", rich_help_panel=OUTPUT),
     ] = False,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WIDTHxHEIGHT",
+            help="Of the picture in pixels, 640x400 by default; not of MODEL.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
     json: JsonOption = None,
 ) -> None:
     """Show an episode: what the thruster does, and what a filter believes of its hidden state.
@@ -100,17 +110,19 @@ def command(
     if all(value is None for value in chosen.values()):
         chosen["--policy"] = "pi"
     what = one_given(chosen)
+    picture = None if size is None else size_of(size)
     _check_options(what, {"--sensor": sensor, "--column": column}, ("--log",))
     _check_options(what, {"--steps": steps}, ("--policy", "--voltage", "--excitation"))
     if model is not None:  # then it is what is played
-        given = {"--preset": preset, "--filter": filter_name, "--tuned": tuned}
+        given = {"--preset": preset, "--filter": filter_name, "--tuned": tuned, "--size": size}
         _check_options(what, given, tuple(name for name in chosen if name != "MODEL"))
         played, shown, film = _of_policy(model, out, window, seed, json)
     else:
         film = None if window else out or Path("out") / f"play-{_name(chosen[what])}.mp4"
         check_drawing(film)
+        _check_even(film, picture)
         check_targets((film,), json, read=(log, tuned, preset))
-        options = {"filter": filter_name, "tuned": tuned}
+        options = {"filter": filter_name, "tuned": tuned, "size": picture}
         played, shown = _without_policy(
             what, chosen[what], film, seed or 0, preset, steps, sensor, column, options
         )
@@ -127,6 +139,26 @@ def one_given(chosen: dict) -> str:
         rule = f"play must be given one of {', '.join(chosen)}"
         raise ValueError(f"{rule}, but got {' and '.join(given) or 'none'}")
     return given[0]
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """A picture's (width, height) [px] from a text such as 640x400; ValueError for any other."""
+    found = re.fullmatch(r"(\d+)x(\d+)", text.strip().lower(), re.ASCII)
+    if found is None:
+        raise ValueError(f"--size must be WIDTHxHEIGHT in pixels, as 640x400, but got {shown(text)}")
+    width, height = (
+        at_least(f"the {side} of --size", int(value), SMALLEST, LARGEST)
+        for side, value in zip(("width", "height"), found.groups(), strict=True)
+    )
+    return width, height
+
+
+def _check_even(film: Path | None, size: tuple[int, int] | None) -> None:
+    """Raise ValueError for an .mp4 of an odd size, whose colours would be coded as browsers do not show them."""
+    if film is not None and film.suffix == ".mp4" and size is not None:
+        for side, value in zip(("width", "height"), size, strict=True):
+            if value % 2:
+                raise ValueError(f"the {side} of --size must be even for an .mp4, but got {value}")
 
 
 def _check_options(what: str, given: dict, fitting: tuple[str, ...]) -> None:

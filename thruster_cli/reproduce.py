@@ -21,7 +21,7 @@ from studies.vehicle.printed import RUNS as VEHICLE_RUNS
 from thruster_cli import options
 from thruster_cli.benchmark import fitted, list_of, reproduce_benchmark
 from thruster_cli.options import JsonOption, SeedOption
-from thruster_cli.output import announce_compilation, emit, progress_console, table
+from thruster_cli.output import announce_compilation, check_picture, emit, progress_console, table
 from thruster_cli.vehicle import reproduce_vehicle
 
 ALL = "all"
@@ -56,9 +56,9 @@ def command(
     series: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE.png",
-            help="Also draw one run over time for each system and q, as the papers do, or the vehicle's paths; "
-            "into --json, too.",
+            metavar="FILE",
+            help="Also draw one run over time for each system and q, as the papers do, or the vehicle's paths: "
+            ".png, .svg or .pdf; into --json, too.",
             rich_help_panel=options.OUTPUT,
         ),
     ] = None,
@@ -110,8 +110,7 @@ def command(
         emit(*reproduce_benchmark(study, BENCHMARK_RUNS if runs is None else runs, seed), json)
         return
     if series is not None:
-        if series.suffix != ".png":
-            raise ValueError(f"--series must end in .png, but got {str(series)!r}")
+        check_picture(series, "--series")
         check_target(series)
     if study in VEHICLE_STUDIES:
         runs = at_least("runs", VEHICLE_RUNS if runs is None else runs, 2, MOST_VEHICLE_RUNS)

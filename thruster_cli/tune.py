@@ -158,7 +158,7 @@ def command(
     of_logs: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensor, "columns": column}
     of_logs |= {"clock_offset": clock_offset, "dt": dt, "held_out": held_out, "blocks": blocks, "lead": lead}
     scenarios = problems_of(scenario, log, of_logs, "mismatch")
-    check_targets((out,), json, read=(*(log or []), *(held_out or [])))
+    check_targets((out,), json, read=(*(log or []), *(held_out or []), *(scenario or []), preset))
     objectives = tuple(objective or ["score" if scenarios[0].scale is not None else "likelihood"])
     plan = Plan(
         filter_name,

@@ -234,7 +234,7 @@ def test_a_paper_is_reproduced_at_the_command_line(quick, monkeypatch, capsys, t
         (("lorenz63", "--series", "a.png"), "--series must come with a paper, but got 'lorenz63'"),
         (("ngatini2017", "--runs", "1"), "runs must be a whole number of at least 2"),
         (("ngatini2017", "--steps", "1"), "steps must be a whole number of at least 2"),
-        (("ngatini2017", "--series", "a.pdf"), "--series must end in .png"),
+        (("ngatini2017", "--series", "a.tex"), "--series must end in .png, .svg or .pdf"),
     ],
 )
 def test_a_wrong_argument_is_one_line(monkeypatch, capsys, arguments, rule):

@@ -50,8 +50,13 @@ def test_identified_numbers_go_into_a_preset_that_everything_takes(thruster, as_
     assert model.n == 3 and model.constants.bias_0 == found["values"]["bias_thrust"]
     r = [found["values"][name] for name in ("R11", "R22")]
     assert np.diag(model.measurement_noise_cov).tolist() == pytest.approx(r, rel=1e-12)
-    inside = as_json("inspect", "--preset", "mine.toml", "--out", "x.png")
-    assert inside["preset"] == "mine.toml"
+    inside = as_json("inspect", "--preset", "mine.toml", "--out", "x.pdf")
+    assert inside["preset"] == "mine.toml" and (tmp_path / "x.pdf").read_bytes().startswith(b"%PDF")
+    before = (tmp_path / "mine.toml").read_text()
+    for command in (("identify", *logs), ("identify", "--bollard", "t.csv"), ("tune", "--scenario", "nominal")):
+        done = thruster(*command, "--preset", "mine.toml", "--out", "mine.toml")
+        assert done.returncode == 2 and "must not replace what is read, but got mine.toml for both" in done.stderr
+    assert (tmp_path / "mine.toml").read_text() == before
     assert thruster("simulate", "--preset", "mine.toml", "--steps", 20, "--out", "sim.csv").returncode == 0
     env = gym.make("BowThruster-v0", preset="mine.toml").unwrapped
     assert env.plant.parameters == kept.parameters
@@ -85,6 +90,7 @@ WITH_LOG = [
     (("--filter", "kf"), "a thruster must be identified with the ekf, but got filter kf"),
     (("--held-out", "run0.csv"), "at least one log must be left to learn from"),
     (("--out", "x.json"), "--out must end in .toml"),
+    (("--plot", "x.tex"), "--plot must end in .png, .svg or .pdf, but got 'x.tex'"),
 ]
 MISTAKES = [
     *((("identify", *arguments), message) for arguments, message in WITHOUT_LOG),

@@ -45,6 +45,13 @@ def test_voltages_drive_the_thruster(as_json, frames, monkeypatch, option):  # n
     assert env.unwrapped.moment_of([0.0] * 40).reference is None
 
 
+def test_a_picture_has_the_size_that_is_asked_for(thruster, as_json, frames):  # noqa: F811
+    as_json("play", "--steps", 4, "--size", "160X90", "--out", "x.mp4")
+    thruster("simulate", "--out", "run.csv", "--steps", 3)
+    as_json("play", "--log", "run.csv", "--size", "99x81", "--out", "x.gif")
+    assert [pictures[0].shape for _, pictures, _ in frames] == [(90, 160, 3), (81, 99, 3)]
+
+
 def spy(function, seen):
     def called(env, *arguments):
         seen.append(env)
@@ -93,6 +100,11 @@ def test_where_a_log_has_no_truth_the_estimate_moves_the_propeller(thruster, tmp
         (("--voltage", 3, "--out", "x.avi"), "--out must end in .mp4 or .gif, but got 'x.avi'"),
         (("--voltage", 3, "--steps", 0), "steps must be a whole number of at least 1"),
         (("--policy", "pi", "--column", "thrust=x"), "--column must come with --log, but got it with --policy"),
+        (("--size", "640"), "--size must be WIDTHxHEIGHT in pixels, as 640x400, but got '640'"),
+        (("--size", "640x10"), "the height of --size must be a whole number of at least 64, but got 10"),
+        (("--size", "9000x400"), "the width of --size must be at most 4096, but got 9000"),
+        (("--size", "640x401"), "the height of --size must be even for an .mp4, but got 401"),
+        (("some/folder", "--size", "64x64"), "--size must come with --policy or --voltage or"),
         (("some/folder", "--filter", "ekf"), "--filter must come with --policy or --voltage or"),
         (("--voltage", 3, "--filter", "ekf", "--tuned", "t.json"), "but got both, t.json and ekf"),
     ],

@@ -3,6 +3,7 @@
 import importlib.metadata
 import io
 import os
+import re
 import signal
 import sys
 from types import SimpleNamespace
@@ -67,7 +68,10 @@ def test_names_are_taken_in_any_case(as_json):  # noqa: F811
 @pytest.mark.parametrize(
     ("arguments", "end"),
     [
-        (("evaluate", "--filter", "EFK"), "but got 'EFK'; did you mean 'ekf'?"),
+        (
+            ("evaluate", "--filter", "EFK"),
+            "and 17 more (thruster filters lists all), but got 'EFK'; did you mean 'ekf'?",
+        ),
         (("compare", "--scenario", "mismach"), "but got 'mismach'; did you mean 'mismatch'?"),
         (("inspect", "--preset", "tunel"), "but got 'tunel'; did you mean 'tunnel'?"),
         (("reproduce", "lorenz36"), "but got 'lorenz36'; did you mean 'lorenz96'?"),
@@ -88,6 +92,23 @@ def test_names_in_python_are_told_apart_by_case():
         one_of("filter", "EKF", iter(["kf", "ekf"]))
     assert meant(3, ["ekf"]) == meant("", ["ekf"]) == ""
     assert any_case("EKF", ["kf", "ekf"]) == "ekf" and any_case("module:EKF", ["ekf"]) == "module:EKF"
+
+
+def test_a_long_list_is_cut_where_a_name_comes_near():
+    many = [f"name{place}" for place in range(9)]
+    told = (
+        "filter must be one of name0, name1, name2, name3 and 5 more (thruster filters lists all), but got 'nam8'"
+    )
+    with pytest.raises(ValueError, match=f"^{re.escape(told)}; did you mean 'name8'"):
+        one_of("filter", "nam8", many, "thruster filters")
+    # It is whole where no name is near, no command lists all, or it is short.
+    for value, choices, command in (
+        ("xyz", many, "thruster"),
+        ("nam8", many, None),
+        ("nam7", many[:8], "thruster"),
+    ):
+        with pytest.raises(ValueError, match=f"one of {', '.join(choices)}, but got '{value}'"):
+            one_of("filter", value, choices, command)
 
 
 ROWS = [["rule of thumb", "5.887 ±0.069", "0.1229 ±0.0018", "7.0", "0.21"]] * 2

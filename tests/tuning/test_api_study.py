@@ -177,6 +177,23 @@ def test_a_report_of_a_value_is_that_of_its_file_and_storage(study, tmp_path, mo
     assert page.with_suffix(".md").read_text() == (folder / "ekf-mismatch-seed0.md").read_text()
 
 
+def test_a_report_of_two_is_that_of_the_command(study, thruster, monkeypatch, tmp_path):  # noqa: F811
+    drawn = "<svg></svg>", ""  # pictures take most of a page's time
+    monkeypatch.setattr("tuning.reporting.sketchbook.figure_svg", lambda figure, name: drawn)
+    monkeypatch.setattr("tuning.reporting.report.run_sections", lambda *_: [])
+    other = tuning.tune("mismatch", filter="kf", trials=1, progress=False)
+    study.save("a.json")
+    other.save("b.json")
+    done = thruster("report", "a.json", "b.json", "--out", "theirs")
+    assert done.returncode == 0, done.stderr
+    mine = tuning.report(["a.json", "b.json"], "mine.html", progress=False)
+    theirs = tmp_path / "theirs" / "a-beside-b.html"
+    assert mine.read_text() == theirs.read_text()
+    assert mine.with_suffix(".md").read_text() == theirs.with_suffix(".md").read_text()
+    values = tuning.report((study, "b.json"), progress=False)  # what is no file goes into the folder out
+    assert values.as_posix() == "out/ekf-mismatch-seed0-beside-b.html" and "a.json" in values.read_text()
+
+
 def test_ctrl_c_keeps_what_is_finished(monkeypatch):
     from tuning.search import study as module
 
@@ -227,6 +244,8 @@ WRONG = [
     (lambda: tuning.evaluate(3), "a filter must be a name, a tuned file, a Study or an estimator, but got 3"),
     (lambda: tuning.tune("mismatch", len), "filter must be a name or 'module:object', by which trials keep it"),
     (lambda: tuning.report(3), "a report must be of a Study, a tuned file or the name of a study, but got 3"),
+    (lambda: tuning.report([]), "a report side by side must be of two studies, but got 0"),
+    (lambda: tuning.report("a.json", "b.json"), "two studies go into one list, but got out='b.json'"),
     (lambda: tuning.report("no such study"), "a report must be of a tuned file or of a study in"),
     (
         lambda: tuning.tune(SHORT, trials=1).plot_sizes(),

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from tuning.api.run import quiet_optuna
 from tuning.api.study import Study
 from tuning.evaluation.kept import sizes_as_data
 from tuning.problems.problem import Problem
+from tuning.reporting.beside import Source, write_beside
 from tuning.reporting.report import write_report
 from tuning.reporting.subject import is_file
 from tuning.search.storage import open_storage
@@ -28,7 +28,7 @@ STUDIES = "out/studies.journal"  # where studies are unless it is told
 
 
 def report(
-    source: str | Path | Study,
+    source: str | Path | Study | Sequence[str | Path | Study],
     out: str | Path | None = None,
     *,
     storage: str | Path = STUDIES,
@@ -38,12 +38,14 @@ def report(
 ) -> Path:
     """Write a page on a tuned filter, its study and its evaluation on held-out seeds; return the page's path.
 
-    Beside the page its tables are written as Markdown. The page needs nothing else, no network either.
+    Beside the page its tables are written as Markdown. The page needs nothing else, no network either. Of a list
+    of two it has both side by side and, where they are of the same problem, the paired ratio of their scores.
 
         tuning.report("tuned.json", out="report.html")
+        tuning.report(["ekf.json", "ukf.json"], out="both.html")
 
     Args:
-        source: a `Study`, a tuned file, or the name of a study in the storage.
+        source: a `Study`, a tuned file, or the name of a study in the storage; or a list of two of them.
         out: the page, a file that ends in .html, or a folder for it; by default it is beside the tuned file, or in
             the folder out.
         storage: where the study is, of a file or a name; without it the page on a file leaves the search out.
@@ -55,18 +57,28 @@ def report(
         ValueError: if the source is refused, or the page cannot be written.
     """
     console = console_for(progress)
+    several: list[Any] = list(source) if isinstance(source, list | tuple) else [source]
+    if out is not None and Path(out).suffix == ".json":
+        rule = "a page must be a file that ends in .html, or a folder for it, and two studies go into one list"
+        raise ValueError(f"{rule}, but got out={str(out)!r}")
     page = None if out is None or Path(out).suffix != ".html" else Path(out)
     if page is not None:
         check_target(page)
     with quiet_optuna(), working("reporting", console), tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "page" if page is not None else None if out is None else Path(out)
-        if isinstance(source, Study):
-            folder = Path("out") if folder is None else folder
-            with _as_files(source, Path(scratch)) as (file, journal):
-                saved = source.tuning.file
-                made = write_report(file, journal, folder, source.problems, str(saved) if saved else "")
+        if folder is None and several and isinstance(several[0], Study):
+            folder = Path("out")  # beside its scratch file the page would be lost
+        found = [
+            _of_value(one, Path(scratch) / str(place))
+            if isinstance(one, Study)
+            else Source(one, str(storage), _given(one, problem, model))
+            for place, one in enumerate(several)
+        ]
+        if len(found) == 1:
+            one = found[0]
+            made = write_report(one.name, one.storage, folder, one.problems, one.file)
         else:
-            made = write_report(source, str(storage), folder, _given(source, problem, model))
+            made = write_beside(found, folder)
         if page is None:
             return made.page
         write_whole(page, made.page.read_bytes())
@@ -85,9 +97,9 @@ def _given(source: str | Path, problem: Any, model: str | None) -> Sequence[Prob
     return [] if problem is None else problems_of(problem)
 
 
-@contextmanager
-def _as_files(study: Study, folder: Path) -> Iterator[tuple[Path, str]]:
-    """A study's tuned file, and a journal that holds its trials."""
+def _of_value(study: Study, folder: Path) -> Source:
+    """A study as a tuned file and a journal that holds its trials, in a folder of its own."""
+    folder.mkdir()
     journal, tuning = str(folder / "study.journal"), study.tuning
     plan, sizes = tuning.plan, tuning.result.sizes
     directions = [StudyDirection.MINIMIZE] * len(plan.objectives)
@@ -98,4 +110,4 @@ def _as_files(study: Study, folder: Path) -> Iterator[tuple[Path, str]]:
     kept.add_trials(study.trials)
     file = folder / f"{study.name}.json"
     tuning.write(file)
-    yield file, journal
+    return Source(file, journal, study.problems, str(tuning.file) if tuning.file else "")

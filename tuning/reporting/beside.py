@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from itertools import zip_longest
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import rounded
@@ -18,35 +18,41 @@ from tuning.reporting.report import Pages, Report, pages_of, report_files
 from tuning.reporting.subject import find_subject, is_file
 
 
-def write_beside(
-    sources: Sequence[str | Path], storage: str, out: str | Path | None = None, problems: Sequence[Problem] = ()
-) -> Report:
+class Source(NamedTuple):
+    """One side of a page: a tuned file or a study, and where it is found."""
+
+    name: str | Path  # a tuned file, or the name of a study
+    storage: str  # where the study is
+    problems: Sequence[Problem] = ()  # what it is of, where that is code
+    file: str | None = None  # what the page calls the tuned file, as in `write_report`
+
+
+def write_beside(sources: Sequence[Source], out: str | Path | None = None) -> Report:
     """Write a page, A-beside-B.html, and its tables, A-beside-B.md, on two tuned files or studies.
 
     Where both are of the same problem a table has the ratio of their scores, paired on the same held-out seeds.
 
     Args:
-        sources: two tuned files, or names of studies.
-        storage: where the studies are.
+        sources: two tuned files or studies.
         out: folder of the two files, by default that of the first tuned file, or `out`.
-        problems: what they are of, where that is code.
 
     Raises:
         ValueError: as `write_report`, or if these are not two.
     """
     if len(sources) != 2:
         raise ValueError(f"a report side by side must be of two studies, but got {len(sources)}")
-    subjects = [find_subject(source, storage, problems) for source in sources]
+    subjects = [find_subject(one.name, one.storage, one.problems) for one in sources]
     names = [
-        Path(source).stem if is_file(source) else subject.name
-        for source, subject in zip(sources, subjects, strict=True)
+        Path(one.name).stem if is_file(one.name) else subject.name
+        for one, subject in zip(sources, subjects, strict=True)
     ]
     names = (
         names if names[0] != names[1] else [f"{name} ({which})" for name, which in zip(names, "12", strict=True)]
     )
-    page, tables = report_files(sources[0], "-beside-".join(names), out)
+    page, tables = report_files(sources[0].name, "-beside-".join(names), out)
     found = [
-        pages_of(source, subject, prefix) for source, subject, prefix in zip(sources, subjects, "ab", strict=True)
+        pages_of(one.name, subject, prefix, one.file)
+        for one, subject, prefix in zip(sources, subjects, "ab", strict=True)
     ]
     title = " beside ".join(names)
     told = [f"{name}: {one.advice}" for name, one in zip(names, found, strict=True)]
