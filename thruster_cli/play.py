@@ -81,7 +81,7 @@ def command(
         str | None,
         typer.Option(
             metavar="WIDTHxHEIGHT",
-            help="Of the picture in pixels, 640x400 by default; not of MODEL.",
+            help="Of the picture in pixels; 640x400 by default.",
             rich_help_panel=OUTPUT,
         ),
     ] = None,
@@ -114,9 +114,9 @@ def command(
     _check_options(what, {"--sensor": sensor, "--column": column}, ("--log",))
     _check_options(what, {"--steps": steps}, ("--policy", "--voltage", "--excitation"))
     if model is not None:  # then it is what is played
-        given = {"--preset": preset, "--filter": filter_name, "--tuned": tuned, "--size": size}
+        given = {"--preset": preset, "--filter": filter_name, "--tuned": tuned}
         _check_options(what, given, tuple(name for name in chosen if name != "MODEL"))
-        played, shown, film = _of_policy(model, out, window, seed, json)
+        played, shown, film = _of_policy(model, out, window, seed, picture, json)
     else:
         film = None if window else out or Path("out") / f"play-{_name(chosen[what])}.mp4"
         check_drawing(film)
@@ -172,7 +172,14 @@ def _name(chosen) -> str:
     return chosen.stem if isinstance(chosen, Path) else f"{chosen:g}V" if isinstance(chosen, float) else chosen
 
 
-def _of_policy(model: Path, out: Path | None, window: bool, seed: int | None, json: str | None) -> tuple:
+def _of_policy(
+    model: Path,
+    out: Path | None,
+    window: bool,
+    seed: int | None,
+    size: tuple[int, int] | None,
+    json: str | None,
+) -> tuple:
     from training.extras import check_installed
 
     check_installed()
@@ -183,9 +190,10 @@ def _of_policy(model: Path, out: Path | None, window: bool, seed: int | None, js
     seed = held_out_seeds(read_configuration(folder).seed, 2)[0] if seed is None else seed
     film = None if window else out or model / f"episode-seed{seed}.mp4"
     check_drawing(film)
+    _check_even(film, size)
     check_targets((film,), json)
     announce_compilation()
-    played = _drawn(lambda on_step: play(folder, film, seed, on_step))
+    played = _drawn(lambda on_step: play(folder, film, seed, on_step, size))
     said = f"Episode {seed}: return {played.total_reward:.3f} in {played.steps} steps, {played.seconds:.1f} s."
     return played, [said], film
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,13 @@ from training.environments import episode_steps, make_environments
 from training.saved import load, read_configuration
 
 
-def play(folder: Path, video: Path | None, seed: int, on_step: OnStep = lambda steps, count: None) -> Played:
+def play(
+    folder: Path,
+    video: Path | None,
+    seed: int,
+    on_step: OnStep = lambda steps, count: None,
+    size: tuple[int, int] | None = None,
+) -> Played:
     """Run one episode of a saved policy and record it; without a video, show it in a window in real time.
 
     Args:
@@ -20,12 +27,15 @@ def play(folder: Path, video: Path | None, seed: int, on_step: OnStep = lambda s
         video: an .mp4 or .gif file, which is written completely or not at all.
         seed: seed of the episode.
         on_step: called after each step.
+        size: of the pictures, (width, height) [px]; the env's own if None.
 
     Raises:
         ValueError: as `check_drawing` and `saved.load`.
     """
     check_drawing(video)
     setup = read_configuration(folder)
+    if size is not None:
+        setup = replace(setup, env_arguments={**setup.env_arguments, "render_size": size})
     # A window is drawn at each step, an array on request.
     venv = make_environments(setup, [seed], native=False, render_mode="human" if video is None else "rgb_array")
     base: Any = venv.unwrapped  # single envs side by side

@@ -104,7 +104,6 @@ def test_where_a_log_has_no_truth_the_estimate_moves_the_propeller(thruster, tmp
         (("--size", "640x10"), "the height of --size must be a whole number of at least 64, but got 10"),
         (("--size", "9000x400"), "the width of --size must be at most 4096, but got 9000"),
         (("--size", "640x401"), "the height of --size must be even for an .mp4, but got 401"),
-        (("some/folder", "--size", "64x64"), "--size must come with --policy or --voltage or"),
         (("some/folder", "--filter", "ekf"), "--filter must come with --policy or --voltage or"),
         (("--voltage", 3, "--filter", "ekf", "--tuned", "t.json"), "but got both, t.json and ekf"),
     ],

@@ -22,18 +22,18 @@ from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario
 
 
-@pytest.mark.parametrize("suffix", ["mp4", "gif"])
-def test_a_film_is_of_the_episode_that_is_scored(suffix, trained, tmp_path):
+@pytest.mark.parametrize(("suffix", "size"), [("mp4", None), ("gif", (96, 64))])
+def test_a_film_is_of_the_episode_that_is_scored(suffix, size, trained, tmp_path):
     pytest.importorskip("pygame")
     moviepy = pytest.importorskip("moviepy")
     setup, seeds = setup_of(), held_out_seeds(0, 2)
-    played = play(trained / FINAL, tmp_path / f"film.{suffix}", seeds[0])
+    played = play(trained / FINAL, tmp_path / f"film.{suffix}", seeds[0], size=size)
     policy = load(trained / FINAL, make_environments(setup, seeds))
     assert played.total_reward == pytest.approx(score(policy, setup, seeds).returns[0], rel=1e-4)
     assert played.steps == LIMIT and played.seconds == pytest.approx(LIMIT / 100)
     assert [path.name for path in tmp_path.iterdir()] == [f"film.{suffix}"]
     with moviepy.VideoFileClip(str(tmp_path / f"film.{suffix}")) as clip:
-        assert tuple(clip.size) == (640, 400)
+        assert tuple(clip.size) == (size or (640, 400))
         frames = [frame.astype(int) for frame in clip.iter_frames()]
     assert len(frames) >= 7 and np.abs(frames[-1] - frames[0]).mean() > 0.5
 
