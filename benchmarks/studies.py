@@ -145,5 +145,6 @@ def filters_limit(scenario: Scenario, result: StudyResult) -> float:
 
 
 def _runs(result: StudyResult) -> list[tuple[int, int]]:
-    """Seeds and members of each trial."""
-    return [(len(t.intermediate_values) or TRAINING_SEEDS, t.params["N"]) for t in result.trials]
+    """Seeds and members of each trial, then of each size among which the study chose: training and fresh seeds."""
+    tried = [(len(one.intermediate_values) or TRAINING_SEEDS, one.params["N"]) for one in result.trials]
+    return tried + [(TRAINING_SEEDS + row.seeds, row.size) for row in result.sizes]
