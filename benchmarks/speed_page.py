@@ -12,6 +12,7 @@ from numerics.files import write_whole
 from numerics.markdown import table, with_tables
 
 HEADER = ("what", "beside", "ours", "theirs", "ratio", "limit", "x limit", "goal", "met")
+NO_BREAK = "\N{NO-BREAK SPACE}"  # between a number and its unit
 MARK, END = "<!-- table speed: ", "<!-- end -->"
 
 
@@ -46,5 +47,6 @@ def speed_table(rows: Sequence[Row]) -> str:
     lines = []
     for row in rows:
         _, *cells = row.cells()
-        lines.append([row.what, row.peer_name or "", *("" if cell == "-" else cell for cell in cells)])
+        numbers = ("" if cell == "-" else cell.replace(" ", NO_BREAK) for cell in cells)
+        lines.append([row.what, row.peer_name or "", *numbers])
     return table(HEADER, lines)
