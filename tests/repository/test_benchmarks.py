@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.jax_enkf import NORMALS, array_filter
 from benchmarks.rows import Row
-from benchmarks.speed_page import HEADER, check_page, write_page
+from benchmarks.speed_page import HEADER, NO_BREAK, check_page, write_page
 from benchmarks.timing import Timing
 from filters import EnsembleKalmanFilter, thruster_model
 from numerics.compiled import interpreted
@@ -112,8 +112,8 @@ def test_each_machine_has_its_table_on_the_page_on_speed(tmp_path):
     second = page.read_text()
     a, b, c = (
         "## On a processor, 2 cores",
-        "| a step | b | 1 us | 4 us | 0.25 | | | 0.33 | yes |",
-        "| c | | 2 ns | | | 1 ns | 2 | | |",
+        f"| a step | b | 1{NO_BREAK}us | 4{NO_BREAK}us | 0.25 | | | 0.33 | yes |",
+        f"| c | | 2{NO_BREAK}ns | | | 1{NO_BREAK}ns | 2 | | |",
     )
     header = "| " + " | ".join(HEADER) + " |"
     assert header in before and {a, header, b, c, f"{MACHINE} Memory: 8 bytes."} <= {*first.splitlines()}
