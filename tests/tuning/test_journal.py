@@ -82,3 +82,17 @@ def test_what_waits_is_gone_if_it_finds_no_room(path, monkeypatch):
     study.tell(trial, 1.0)
     (found,) = optuna.load_study(study_name="s", storage=open_storage(path)).trials
     assert found.intermediate_values == {} and found.value == 1.0
+
+
+def test_a_trial_that_another_process_has_ended_is_an_error_once(path):
+    study = optuna.create_study(study_name="s", storage=open_storage(path))
+
+    def ended_elsewhere(trial):
+        for step in range(3):
+            trial.report(0.0, step)
+        optuna.load_study(study_name="s", storage=open_storage(path)).tell(0, state=TrialState.FAIL)
+        trial.should_prune()
+
+    with pytest.raises(ValueError, match="Cannot tell a FAIL trial"):
+        study.optimize(ended_elsewhere, n_trials=1)
+    assert [trial.state for trial in study.trials] == [TrialState.FAIL]
