@@ -46,6 +46,10 @@ class JournalFile(JournalFileBackend):
         self._waiting: list[dict] = []
         self._was_put_off = False
 
+    def __getstate__(self) -> dict:
+        """All but what waits, which this one will write: of a copy it would be there twice, or after the end."""
+        return {**vars(self), "_waiting": [], "_was_put_off": False}
+
     def append_logs(self, logs: list[dict]) -> None:
         """Add a line for each entry.
 
