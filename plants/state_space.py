@@ -175,15 +175,25 @@ class StateSpaceModel:
         """A copy of the model with some fields changed; ValueError as for a new model."""
         if (
             changes.keys() <= NOISE
+            and not self._has_more
             and _channels(changes.get("measurement_noise_cov", self.measurement_noise_cov)) == self.m
         ):
             return self._with_noise(changes)
         return dataclasses.replace(self, **changes)
 
+    @property
+    def _has_more(self) -> bool:
+        """Whether a subclass checks or keeps more than the fields: it may depend on covariances, too."""
+        own = {one.name for one in dataclasses.fields(self)} | {"digest"}
+        return type(self).__post_init__ is not StateSpaceModel.__post_init__ or not vars(self).keys() <= own
+
     def _with_noise(self, changes: Mapping[str, Any]) -> Self:
         """`replace` of covariances, on which no function depends: so these are not tried again."""
         model, sizes = object.__new__(type(self)), {"measurement_noise_cov": self.m}
-        vars(model).update({one.name: getattr(self, one.name) for one in dataclasses.fields(self)})
+        for one in dataclasses.fields(self):
+            value = getattr(self, one.name)  # arrays and outputs could be changed: each model has its own
+            own = value.copy() if isinstance(value, np.ndarray | dict) else value
+            object.__setattr__(model, one.name, own)
         for name, value in changes.items():
             definite = name in sizes
             checked = covariance(name, value, sizes.get(name, self.n), positive_definite=definite)

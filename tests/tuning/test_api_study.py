@@ -190,6 +190,8 @@ def test_a_report_of_two_is_that_of_the_command(study, thruster, monkeypatch, tm
     theirs = tmp_path / "theirs" / "a-beside-b.html"
     assert mine.read_text() == theirs.read_text()
     assert mine.with_suffix(".md").read_text() == theirs.with_suffix(".md").read_text()
+    with pytest.raises(ValueError, match=r"two studies go into one list, but got out=Study\(ekf on mismatch"):
+        tuning.report("b.json", study)
     values = tuning.report((study, "b.json"), progress=False)  # what is no file goes into the folder out
     assert values.as_posix() == "out/ekf-mismatch-seed0-beside-b.html" and "a.json" in values.read_text()
 

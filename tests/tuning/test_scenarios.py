@@ -185,6 +185,8 @@ def test_a_model_of_another_q_and_r_is_the_one_that_is_made_of_them(name):
     for wrong in ({"process_noise_cov": (1.0, -1.0)}, {"measurement_noise_cov": 0.0}):
         with pytest.raises(ValueError, match=f"{next(iter(wrong))} must be positive"):
             scenario.model(**wrong)
+    found.prior_mean[:] = found.measurement_noise_cov[:] = 7.0  # of the caller alone
+    assert np.array_equal(scenario.model(**noise).numbers, made.numbers)
 
 
 def test_a_bound_is_computed_once_for_the_same_inputs(monkeypatch):

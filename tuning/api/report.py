@@ -58,9 +58,9 @@ def report(
     """
     console = console_for(progress)
     several: list[Any] = list(source) if isinstance(source, list | tuple) else [source]
-    if out is not None and Path(out).suffix == ".json":
+    if isinstance(out, Study) or (out is not None and Path(out).suffix == ".json"):
         rule = "a page must be a file that ends in .html, or a folder for it, and two studies go into one list"
-        raise ValueError(f"{rule}, but got out={str(out)!r}")
+        raise ValueError(f"{rule}, but got out={shown(out if isinstance(out, Study) else str(out))}")
     page = None if out is None or Path(out).suffix != ".html" else Path(out)
     if page is not None:
         check_target(page)

@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable
 from functools import wraps
 from itertools import count
+from typing import Any
 from urllib.parse import urlsplit
 
 import optuna
@@ -31,7 +32,7 @@ WITH_TIMEOUT = re.compile(r"(postgresql(\+psycopg2?)?|(mysql|mariadb)(\+(pymysql
 HEARTBEAT_SECONDS = 10  # between two signs of life of a running trial in a database
 GRACE_SECONDS = 180  # without one, after which it counts as lost; an outage is shorter
 PROXY_PORT, PROXY_SECONDS = 13000, 10  # the default port of a proxy, and the time in which it has to answer
-OnLost = Callable[[optuna.Study, FrozenTrial], object]
+OnLost = Callable[[optuna.Study, FrozenTrial], Any]  # of a module: storages are pickled
 
 
 def open_database(url: str, on_lost: OnLost) -> BaseStorage:
@@ -57,9 +58,6 @@ def _database(url: str, on_lost: OnLost) -> RDBStorage:
 
 
 def _connected(url: str, on_lost: OnLost) -> RDBStorage:
-    def lost(study: optuna.Study, trial: FrozenTrial) -> None:
-        on_lost(study, trial)
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         return RDBStorage(
@@ -69,7 +67,7 @@ def _connected(url: str, on_lost: OnLost) -> RDBStorage:
             engine_kwargs={"connect_args": {"connect_timeout": CONNECT_SECONDS}}
             if WITH_TIMEOUT.match(url)
             else None,
-            heartbeat_stale_trial_callback=lost,
+            heartbeat_stale_trial_callback=on_lost,
         )
 
 

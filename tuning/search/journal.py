@@ -6,12 +6,28 @@ import json
 import os
 import warnings
 from collections.abc import Generator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from optuna.exceptions import UpdateFinishedTrialError
+from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 
 INTERMEDIATE = "intermediate_value"  # key of an entry of Optuna's with the value of a seed
+
+
+class Journal(JournalStorage):
+    """Optuna's storage of a journal, to which a trial that another process has ended is an error once."""
+
+    def _sync_with_backend(self) -> None:
+        """Read what is new; each value that waited would raise the error anew, in calls that others make."""
+        try:
+            super()._sync_with_backend()
+        except UpdateFinishedTrialError:
+            with suppress(UpdateFinishedTrialError):
+                self._sync_with_backend()
+            raise
 
 
 class JournalFile(JournalFileBackend):
@@ -29,6 +45,10 @@ class JournalFile(JournalFileBackend):
         self._path, self._writers = path, lock
         self._waiting: list[dict] = []
         self._was_put_off = False
+
+    def __getstate__(self) -> dict:
+        """All but what waits, which this one will write: of a copy it would be there twice, or after the end."""
+        return {**vars(self), "_waiting": [], "_was_put_off": False}
 
     def append_logs(self, logs: list[dict]) -> None:
         """Add a line for each entry.

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import optuna
 from optuna.exceptions import UpdateFinishedTrialError
-from optuna.storages import BaseStorage, JournalStorage
+from optuna.storages import BaseStorage
 from optuna.storages.journal import JournalFileOpenLock
 from optuna.trial import FrozenTrial, TrialState
 
-from tuning.search.journal import JournalFile, cut_unfinished_line
+from tuning.search.journal import Journal, JournalFile, cut_unfinished_line
 from tuning.search.storage_url import first_line, is_misspelt, shown_storage, without_secrets
 
 LOCK_SECONDS = 5  # after which a lock counts as left behind
@@ -58,7 +58,7 @@ def open_storage(storage: str) -> BaseStorage:
                 cut_unfinished_line(path)
         finally:
             lock.release()
-        return JournalStorage(JournalFile(path, lock))
+        return Journal(JournalFile(path, lock))
     except (OSError, ValueError, KeyError) as error:
         raise ValueError(
             f"storage must be a journal file that can be written, but got {shown_storage(storage)}: {error}"
