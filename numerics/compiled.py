@@ -12,6 +12,7 @@ import functools
 import hashlib
 import importlib.util
 import inspect
+import os
 import threading
 import types
 import warnings
@@ -36,7 +37,7 @@ _apart: set[Callable] = set()  # of these, functions of which there is one copy
 _narrow: set[Callable] = set()  # functions whose vectors are as wide as LLVM prefers
 _asked: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions that `compiled` has been given
 _lessons: list[Callable[[], None]] = [lambda: optimise_once(_which())]
-_interpreting = False
+_interpreting = os.environ.get("NUMBA_DISABLE_JIT", "").strip() not in ("", "0")
 
 
 def inlined(function: Callable, *, into_callers: bool = True) -> Callable:

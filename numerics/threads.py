@@ -46,6 +46,8 @@ def cores() -> int:
 def spread(part: Callable[[int, int], None], count: int) -> None:
     """Call part(first, last) on all cores until it has covered 0 ... count; part releases the lock.
 
+    After an exception, such as Ctrl-C, no further part begins.
+
     The caller makes a call of nothing first, part(0, 0). What part compiles or loads is then there. A worker that
     loads code imports modules, and would wait for ever for one in whose import its caller is.
     """
@@ -54,12 +56,18 @@ def spread(part: Callable[[int, int], None], count: int) -> None:
     parts = iter(list(itertools.pairwise(edges)))  # of all threads: what one has taken no other gets
 
     def work() -> None:
-        for first, last in parts:
-            part(first, last)
+        try:
+            for first, last in parts:
+                part(first, last)
+        finally:
+            list(parts)  # takes those that are left after an exception
 
-    # One job for each thread: a job for each part would take longer to hand over than short parts take.
-    for job in [_pool().submit(work) for _ in range(min(cores(), count))]:
-        job.result()
+    try:
+        # One job for each thread: a job for each part would take longer to hand over than short parts take.
+        for job in [_pool().submit(work) for _ in range(min(cores(), count))]:
+            job.result()
+    finally:
+        list(parts)
 
 
 @cache

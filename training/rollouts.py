@@ -21,7 +21,7 @@ class EpochBuffer(RolloutBuffer):
     def get(self, batch_size: int | None = None) -> Generator[RolloutBufferSamples, None, None]:
         """The minibatches of one epoch; all samples in one without `batch_size`."""
         (epoch,) = super().get()
-        size = len(epoch.actions) if batch_size is None else batch_size
+        size = len(epoch.actions) if batch_size is None else int(batch_size)  # torch refuses NumPy's integers
         for parts in zip(*(tensor.split(size) for tensor in epoch), strict=True):
             yield RolloutBufferSamples(*parts)
 

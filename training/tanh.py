@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+TAKEN = torch.float32, torch.float64
+
 
 class _Tanh(torch.autograd.Function):
     """y = tanh(x), dy/dx = 1 - y^2."""
@@ -30,10 +32,12 @@ class _Tanh(torch.autograd.Function):
 
 
 class NumpyTanh(nn.Module):
-    """tanh(x) of tensors on the CPU, equal to `torch.nn.Tanh` but for rounding."""
+    """tanh(x), equal to `torch.nn.Tanh` but for rounding; of what NumPy cannot hold, torch's own."""
 
     def forward(self, x: Tensor) -> Tensor:
         """Return tanh(x)."""
+        if x.dtype not in TAKEN or not x.is_cpu or not x.ndim:
+            return torch.tanh(x)
         return _Tanh.apply(x) if x.requires_grad else _evaluate(x)
 
 

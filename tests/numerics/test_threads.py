@@ -6,6 +6,7 @@ import os
 import sys
 import threading
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib import import_module
 from queue import SimpleQueue
@@ -211,6 +212,32 @@ def test_spread_covers_everything_once():
     values = np.zeros(COUNT)
     spread(lambda first, last: add_index(first, last, values), COUNT)
     assert np.array_equal(values, np.arange(COUNT))
+
+
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_after_an_exception_no_further_part_of_spread_begins(error, monkeypatch):
+    pool, begun, raised = ThreadPoolExecutor(2), [], threading.Event()
+    monkeypatch.setattr("numerics.threads._pool", lambda: pool)
+    monkeypatch.setattr("numerics.threads.cores", lambda: 50)
+
+    def fail(*_):
+        raised.set()
+        raise error
+
+    def part(first, last):
+        begun.append(first)
+        if first == 0 < last and error is ValueError:
+            fail()
+        if last:
+            raised.wait(10)  # a guard, not a measurement
+            time.sleep(0.01)  # what was raised gets to the caller
+
+    if error is KeyboardInterrupt:  # it comes to the caller, while that waits
+        monkeypatch.setattr(Future, "result", fail)
+    with pytest.raises(error):
+        spread(part, 200)
+    pool.shutdown()
+    assert len(begun) < 100
 
 
 def test_work_that_is_spread_while_a_module_is_imported_may_import_it(tmp_path, monkeypatch):

@@ -23,7 +23,7 @@ from training.torch_settings import learning
 SEEDS = range(4)
 
 
-@pytest.mark.parametrize("size", [None, 5, 6, 100])
+@pytest.mark.parametrize("size", [None, 5, np.int64(6), 100])
 def test_minibatches_are_those_of_stable_baselines3_to_the_bit(size):
     found = []
     for kind in (RolloutBuffer, EpochBuffer):
@@ -72,6 +72,15 @@ def test_tanh_and_its_derivative_are_those_of_torch():
         torch.testing.assert_close(quick(x), torch.tanh(x), rtol=3e-7, atol=0)
     quickly, usual = (torch.autograd.grad(f(x).sum(), x)[0] for f in (quick, torch.tanh))
     torch.testing.assert_close(quickly, usual, rtol=1e-6, atol=3e-7)
+
+
+@pytest.mark.parametrize("kind", [{"dtype": torch.bfloat16}, {"dtype": torch.int64}, {"device": "meta"}])
+@pytest.mark.parametrize("shape", [(), (3,)])
+def test_of_what_numpy_cannot_hold_tanh_is_torchs(kind, shape):
+    x = torch.ones(shape, **kind)
+    found, usual = NumpyTanh()(x), torch.tanh(x)
+    assert (found.dtype, found.device, found.shape) == (usual.dtype, usual.device, usual.shape)
+    assert found.is_meta or torch.equal(found, usual)
 
 
 @pytest.mark.parametrize("algo", ["ppo", "recurrent-ppo", "sac"])
