@@ -241,7 +241,7 @@ def test_tables_fit_the_terminal(tmp_path, width):
         ("all", "--runs", "1"),
         ("all", "--members", "1"),
         ("all", "--runs", "many"),
-        ("all", "--series", "series.pdf"),
+        ("all", "--series", "series.txt"),
         (),
     ],
 )
