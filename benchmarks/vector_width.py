@@ -30,7 +30,7 @@ from tuning.thruster.find import find_scenario
 TARGET = "emeraldrapids"
 ROUNDS, REPEATS = 3, 15  # processes of each width, and measurements in each of which the best counts
 SEEDS = 64
-FILTERS = {"ekf": None, "ukf": None, "enkf": 100, "etkf": 100, "pf": 1000}  # with their ensembles
+FILTERS = {"EKF": None, "UKF": None, "EnKF": 100, "ETKF": 100, "PF": 1000}  # with their ensembles
 AGREEMENT = 1e-9  # of the estimates of a whole episode
 
 
@@ -40,9 +40,9 @@ def measures() -> tuple[dict[str, Measure], dict[str, float]]:
     data, on_vehicles = scenario.data(training_seeds(0, SEEDS)), vehicles.data(training_seeds(0, 2))
     found, results = dict(floor_measures(scenario.plant, scenario.steps)), {}
     for name, size in FILTERS.items():
-        choice = oracle_choice(name, scenario)
+        choice = oracle_choice(name.lower(), scenario)
         filter_ = (choice.with_size(size) if size else choice).filter(scenario)
-        label = f"{name.upper()} batch" + (f", N = {size}" if size else "")
+        label = f"{name} batch" + (f", N = {size}" if size else "")
         found[label] = shared(partial(estimates, filter_, data), SEEDS * scenario.steps * (size or 1))
         results[label] = float(np.sum(np.abs(estimates(filter_, data))))
     found["vector env, 8192 copies"] = vector_steps("BowThruster-v0", 0)
