@@ -203,5 +203,9 @@ def test_a_bound_is_computed_once_for_the_same_inputs(monkeypatch):
     first[:] = 0.0  # of the caller alone
     assert np.array_equal(scenario.bound(one, truths=3), kept) and len(asked) == 1
     assert not np.array_equal(scenario.bound(other, truths=3), kept) and len(asked) == 2
+    whole = one._replace(inputs=np.round(one.inputs))  # whatever type its numbers are of
+    of_integers = whole._replace(inputs=whole.inputs.astype(np.int64))
+    assert np.array_equal(scenario.bound(of_integers, truths=3), scenario.bound(whole, truths=3))
+    assert len(asked) == 3
     noisier = scenario.replace(process_noise_cov=(4.0, 1.6e-3))
-    assert (noisier.bound(one, truths=3) > kept).all() and len(asked) == 3
+    assert (noisier.bound(one, truths=3) > kept).all() and len(asked) == 4

@@ -165,7 +165,8 @@ class Scenario(BaseScenario):
         """
         if not self.has_bound:
             return np.full(2, np.nan)
-        return _bound(self, truths, data.inputs.shape, data.inputs.tobytes()).copy()
+        inputs = np.asarray(data.inputs, dtype=np.float64)
+        return _bound(self, truths, inputs.shape, inputs.tobytes()).copy()
 
     def make(self, seeds: tuple[int, ...]) -> Data:
         """Truth and measurements under the excitation's voltages."""
