@@ -13,7 +13,15 @@ from benchmarks.rates import rates
 from benchmarks.rows import COLUMNS, machine, machine_lines
 from benchmarks.speed_page import check_page, write_page
 from numerics.threads import cores
-from thruster_cli.output import JsonOption, SeedOption, announce_compilation, emit, progress_console, table
+from thruster_cli.output import (
+    JsonOption,
+    SeedOption,
+    announce_compilation,
+    check_targets,
+    emit,
+    progress_console,
+    table,
+)
 from training.extras import check_installed
 
 CAPTION = (
@@ -51,6 +59,7 @@ def command(
     check_installed()
     if page is not None:
         check_page(page)
+    check_targets([page], json)
     # After the checks: they import FilterPy, or Stable-Baselines3.
     from benchmarks import (
         assimilation,

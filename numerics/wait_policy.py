@@ -50,6 +50,6 @@ def waiting(policy: str) -> Iterator[None]:
     finally:
         _policy = before
         if inherited is None:
-            del os.environ[VARIABLE]
+            os.environ.pop(VARIABLE, None)
         else:
             os.environ[VARIABLE] = inherited

@@ -30,6 +30,13 @@ def test_the_environment_counts_then_the_context_and_afterwards_all_is_as_it_was
     assert wait_policy.wait_policy() == usual and os.environ.get(VARIABLE) == inherited
 
 
+def test_an_error_within_the_context_is_not_hidden_by_a_variable_that_is_gone(inherited, monkeypatch):
+    with pytest.raises(KeyboardInterrupt), waiting("passive"):
+        monkeypatch.delenv(VARIABLE)
+        raise KeyboardInterrupt
+    assert os.environ.get(VARIABLE) == inherited
+
+
 def test_a_process_that_is_started_within_the_context_waits_as_it_says(inherited, monkeypatch):
     with waiting("passive"):
         monkeypatch.setattr(wait_policy, "_policy", None)  # as it is in a new process, which has this environment

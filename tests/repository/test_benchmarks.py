@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.__main__ import command
 from benchmarks.jax_enkf import NORMALS, array_filter
 from benchmarks.rows import Row
 from benchmarks.speed_page import HEADER, NO_BREAK, check_page, write_page
@@ -127,3 +128,12 @@ def test_a_page_without_a_place_for_the_table_is_refused(tmp_path):
     for name, rule in (("other.md", "with <!-- table speed: PROCESSOR"), ("none.md", "that can be read")):
         with pytest.raises(ValueError, match=rule):
             check_page(tmp_path / name)
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_anything_is_measured(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr("benchmarks.__main__.importlib.util.find_spec", lambda name: True)
+    monkeypatch.setattr("benchmarks.__main__.check_installed", lambda: None)
+    monkeypatch.setattr("benchmarks.__main__.announce_compilation", lambda: pytest.fail("about to measure"))
+    with pytest.raises(ValueError, match="file"):
+        command(json=str(tmp_path / "file" / "speed.json"))
