@@ -40,6 +40,15 @@ def test_the_densities_are_optunas(count):
         assert mine.log_pdf(samples) == pytest.approx(own.log_pdf(samples), rel=1e-12, abs=1e-12)
 
 
+def test_far_outside_a_range_they_are_optunas_too():
+    space, given = {"inflation": SPACE["inflation"]}, {"inflation": np.array([1.1, 301.0])}
+    parameters = optuna.samplers.TPESampler()._parzen_estimator_parameters
+    mine, own = (kind(given, space, parameters) for kind in (ParzenEstimator, _ParzenEstimator))
+    samples = {"inflation": np.linspace(1.0, 1.3, 7)}
+    expected = own.log_pdf(samples)
+    assert np.isfinite(expected).all() and np.array_equal(mine.log_pdf(samples), expected)
+
+
 def test_a_study_takes_them_from_this_version_of_optuna():
     assert parzen.is_optunas()
     assert make_sampler("tpe", 0, 0, {})._parzen_estimator_cls is ParzenEstimator

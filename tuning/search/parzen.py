@@ -57,6 +57,8 @@ class ParzenEstimator(_ParzenEstimator):
                 constants += np.log(precision) - HALF_LOG_TWO_PI
         total += constants
         largest = total.max(axis=1)
+        if not np.isfinite(largest).all():  # a kernel of an enqueued trial, so far outside that no mass is left
+            return super().log_pdf(samples_dict)
         return np.log(np.exp(total - largest[:, None]).sum(axis=1)) + largest
 
 
