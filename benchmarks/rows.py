@@ -124,12 +124,6 @@ def _cpu() -> str:
     return models[0] if models else platform.processor() or "unknown processor"
 
 
-def _has_avx512() -> bool:
-    import llvmlite.binding  # comes with numba
-
-    return bool(llvmlite.binding.get_host_cpu_features().get("avx512f", False))
-
-
 def machine_name(facts: dict) -> str:
     """Processor and cores: what tells machines apart."""
     return f"{facts['cpu']}, {facts['cores']} cores"

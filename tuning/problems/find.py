@@ -7,14 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from numerics.checks import any_case, meant, shown
+from numerics.checks import FEW, any_case, meant, shown
 from numerics.modules import is_code, object_named, said
 from tuning.problems.check import checked_problem
 from tuning.problems.files import read_scenario
 from tuning.problems.problem import Problem
 from tuning.problems.rooms import built_in
-
-FEW = 4  # names of problems in a message
 
 
 def find_problem(name: str) -> Problem:
