@@ -189,15 +189,15 @@ class StateSpaceModel:
 
     def _with_noise(self, changes: Mapping[str, Any]) -> Self:
         """`replace` of covariances, on which no function depends: so these are not tried again."""
-        model, sizes = object.__new__(type(self)), {"measurement_noise_cov": self.m}
+        model = object.__new__(type(self))
         for one in dataclasses.fields(self):
             value = getattr(self, one.name)  # arrays and outputs could be changed: each model has its own
             own = value.copy() if isinstance(value, np.ndarray | dict) else value
             object.__setattr__(model, one.name, own)
         for name, value in changes.items():
-            definite = name in sizes
-            checked = covariance(name, value, sizes.get(name, self.n), positive_definite=definite)
-            object.__setattr__(model, name, checked)
+            measured = name == "measurement_noise_cov"
+            size = self.m if measured else self.n
+            object.__setattr__(model, name, covariance(name, value, size, positive_definite=measured))
         return model
 
     @property
