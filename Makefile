@@ -18,17 +18,29 @@ TEST := $(VENV)/.test
 BENCH := $(VENV)/.bench
 DOCS := $(VENV)/.docs
 
-.PHONY: help demo test bench docs fuzz lint clean
+# A `pip install .` of somebody's puts a copy in place of this folder: then nothing here is installed any more. And older
+# versions kept machine code beside such a copy, which outlives it as an empty package and hides ours: away with that.
+ifneq ($(wildcard $(MADE)),)
+ifeq ($(wildcard $(VENV)/[Ll]ib*/python*/site-packages/__editable__.thruster_env-*),)
+$(shell rm -f $(BASE) $(TEST) $(BENCH) $(DOCS))
+endif
+endif
+TIDY := $(BIN)/python -m numerics.leftovers
+
+.PHONY: help demo test test-slow bench docs fuzz lint clean
 .NOTPARALLEL:
 
 help: ## this list
-	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1 - \2/p' Makefile
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1 - \2/p' Makefile
 
 demo: $(BASE) ## install what is needed (once), tune a filter, prove it, draw it, report it
 	@$(BIN)/thruster demo $(ARGS)
 
-test: $(TEST) ## install what tests need (once) and run all tests; ARGS="-k name" picks some
-	@$(BIN)/python -m pytest $(ARGS)
+test: $(TEST) ## install what tests need (once) and run all but the slow tests; ARGS="-k name" picks some
+	@$(BIN)/python -m pytest -m "not slow" $(ARGS)
+
+test-slow: $(TEST) ## run the slow tests: whole studies, whole pages, the benchmark
+	@$(BIN)/python -m pytest -m slow $(ARGS)
 
 bench: $(BENCH) ## install what benchmarks need (once) and time it against other packages, side by side
 	@$(BIN)/python -m benchmarks $(ARGS)
@@ -61,6 +73,7 @@ $(BASE): pyproject.toml $(CONSTRAINTS) | $(MADE)
 	@rm -f $(BASE) $(TEST) $(BENCH) $(DOCS)
 	@$(PIP) setuptools
 	@$(PIP) --no-build-isolation -e .
+	@$(TIDY)
 	@touch $(BASE)
 
 $(TEST): EXTRAS := $(TEST_EXTRAS)
@@ -71,4 +84,5 @@ $(TEST) $(BENCH) $(DOCS): pyproject.toml $(CONSTRAINTS) | $(MADE)
 	@rm -f $(BASE) $@
 	@$(PIP) setuptools
 	@$(PIP) --no-build-isolation -e ".[$(EXTRAS)]"
+	@$(TIDY)
 	@touch $(BASE) $@

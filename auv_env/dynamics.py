@@ -1,7 +1,8 @@
 """The motion of an underwater vehicle with six, eight or twelve states, its integration and its Jacobians.
 
-Six velocities nu = (u, v, w, p, q, r) are moved by `forces`. With roll and pitch, of which weight and buoyancy
-depend, they are the smallest closed system; with yaw and position, to the north, to the east and down, everything.
+Six velocities nu = (u, v, w, p, q, r) are moved by `forces`. With roll and pitch, on which weight and buoyancy
+depend, they are the smallest closed system; yaw and position, to the north, to the east and down, complete the
+state.
 
     nu' = M^-1 F(nu, phi, theta, u)
     (phi, theta, psi)' = T(phi, theta) (p, q, r)

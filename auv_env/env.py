@@ -29,8 +29,8 @@ class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
     | 1 | stern plane delta_s, clipped; positive pitches the nose down | -max_plane | max_plane | rad |
     | 2 | rudder delta_r, clipped; positive turns to port | -max_plane | max_plane | rad |
 
-    The propeller's torque is propeller_torque times its thrust. Where propeller_torque is None, the torque K_prop
-    [N m] is an action of its own, after the thrust.
+    The propeller's torque is propeller_torque times its thrust. If propeller_torque is None, the torque K_prop
+    [N m] is a separate action, after the thrust.
 
     ## Observation space
     One entry a channel of the `sensors` in their order, then, for each channel that may be missing, 1 where the
@@ -61,7 +61,7 @@ class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):
     | -((u - speed) [m/s])^2 | speed_weight | 0.1 |
     | -(delta_s^2 + delta_r^2)/max_plane^2 | plane_weight | 0.01 |
 
-    Errors are those of the true state after the step, whatever the sensors say.
+    Errors are those of the true state after the step, independent of the sensors.
 
     ## Info
     `state` (12,), `measurement` (m,) in float64, `inputs` (4,) X_prop, K_prop, delta_s, delta_r that act, after

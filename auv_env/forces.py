@@ -21,7 +21,7 @@ from numerics.compiled import inlined
 
 
 class Constants(NamedTuple):
-    """What the equations need of a vehicle; `parameters.derive_constants` makes it.
+    """The constants of the equations; `parameters.derive_constants` computes them from a vehicle.
 
     `y_ur` is the factor of u r in the sway force, the rigid body's m u r included; `u_of_X` is an entry of the
     inverse mass matrix, the surge acceleration by a unit of surge force.

@@ -1,4 +1,4 @@
-"""Five manoeuvres in place of the papers' paths, which are named there but not defined.
+"""Five manoeuvres instead of the papers' paths, which are named there but not defined.
 
 All begin at rest at the origin, at the depth 0. Path IV has constant inputs that end where the papers' does, 10 m
 to the north, 18 m to the east, 6 m down; the dynamic one switches planes and propeller to and fro.

@@ -91,7 +91,7 @@ def transition_of(states: str, method: str, torque_is_input: bool, attitude: str
 
 @inlined
 def no_outputs(x, c):
-    """Nothing: what is measured of a vehicle are its states."""
+    """Nothing: the measurements of a vehicle are its states."""
     return ()
 
 
@@ -152,7 +152,7 @@ def auv_model(
             "motion", or "navigation" if a sensor asks for it.
         sensors: as `auv_env.plant.make_plant` takes them; None for those of the suite "default" that the states
             predict.
-        integration: "runge-kutta", or "euler" as the papers have it.
+        integration: "runge-kutta", or "euler" as in the papers.
         attitude: of "velocities" alone: "input" for phi and theta as two further inputs, "measured" for these as
             the sensors measure them, see `auv_env.measured_attitude`, "level" for zeros.
         parameter_factors: factors on fields of `VehicleParameters`, by which the assumed vehicle differs.

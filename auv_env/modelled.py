@@ -48,7 +48,7 @@ class ModelledVehicle(ModelledEnv):
         return check_same_plant(tuned_for, self.plant, file)
 
     def overlay(self, label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
-        """What a rendered vehicle shows of a belief beside the truth: states that it has, by their symbols."""
+        """The belief that a rendered vehicle shows beside the truth: the states it has, by their symbols."""
         from auv_env.rendering import Overlay
 
         names = {state.symbol: i for i, state in enumerate(model.states)}

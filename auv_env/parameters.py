@@ -21,9 +21,9 @@ class VehicleParameters(NamedTuple):
     dv/dt, `Yuudr` that of u^2 times the rudder's angle. Velocities are u, v, w [m/s] ahead, to starboard and down,
     p, q, r [rad/s] in roll, pitch and yaw. The centre of buoyancy is the origin of the body's axes.
 
-    Those of one velocity alone, such as `Yv`, are zero in the papers and in what the recipe makes; `Kup` is ours:
-    see `recipe`. Source of the names: Prestero (2001), "Verification of a six-degree of freedom simulation model
-    for the REMUS autonomous underwater vehicle".
+    Those of one velocity alone, such as `Yv`, are zero in the papers and in the recipe's results; `Kup` is our
+    addition: see `recipe`. Source of the names: Prestero (2001), "Verification of a six-degree of freedom
+    simulation model for the REMUS autonomous underwater vehicle".
     """
 
     m: float  # mass [kg]

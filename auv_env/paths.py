@@ -24,7 +24,7 @@ class Errors(NamedTuple):
 
 
 class Path(NamedTuple):
-    """A path of straight pieces, by arc length; beyond its ends it goes on straight."""
+    """A path of straight pieces, by arc length; beyond its ends it continues straight."""
 
     starts: np.ndarray  # (K, 3) where each piece begins: north, east, down [m]
     directions: np.ndarray  # (K, 3), of length one
@@ -43,7 +43,7 @@ class Path(NamedTuple):
     def piece(self, position: np.ndarray, piece: np.ndarray) -> np.ndarray:
         """The piece (...) that positions (..., 3) have got to, from the one (...) that they were at.
 
-        It is the first whose end is not behind the position; progress is never lost, and no bend is cut.
+        It is the first whose end is not behind the position; progress is never lost, and no corner is cut.
         """
         piece = np.array(piece, dtype=np.int64)
         while True:

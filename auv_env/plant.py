@@ -72,7 +72,7 @@ class Plant(NamedTuple):
 
     @property
     def input_limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest inputs (p,), in their order: what is beyond is cut off."""
+        """Lowest and highest inputs (p,), in their order, at which inputs are clipped."""
         torque = [] if self.propeller_torque is not None else [self.max_torque]
         high = np.array([self.max_thrust, *torque, self.max_plane, self.max_plane])
         return np.concatenate([[0.0], -high[1:]]), high

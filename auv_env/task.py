@@ -1,4 +1,4 @@
-"""What an env asks of a vehicle: a path, a speed, steps of the depth, and the weights of the reward's terms."""
+"""The task of a vehicle: a path, a speed, steps of the depth, and the weights of the reward's terms."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def make_task(
 
     Args:
         path: "I", "II", "III", "IV" or "dynamic", the courses of `manoeuvres.MANOEUVRES`; or points (north, east,
-            down) [m] that straight lines join. It goes on straight beyond its ends. By default straight north.
+            down) [m] that straight lines join. It continues straight beyond its ends. By default straight north.
         depth: of the path's origin [m].
         speed: u to keep [m/s].
         cross_track_weight: of the squared distance to starboard or port of the path [1/m^2].

@@ -13,10 +13,10 @@ from plants.arguments import arguments_of, takes_arguments_of
 class SegorogeniAUVPathEnv(SegorogeniAUVEnv):
     """An autonomous underwater vehicle: follow a path in three dimensions at a speed.
 
-    As `SegorogeniAUVEnv`, but for these:
+    As `SegorogeniAUVEnv`, except for these:
 
     ## Observation space
-    Channels and validity flags, then what tells of the path:
+    Channels and validity flags, then the path:
 
     | num | observation | min | max | unit |
     |---|---|---|---|---|
@@ -28,15 +28,15 @@ class SegorogeniAUVPathEnv(SegorogeniAUVEnv):
     | -1 | u less the speed to keep | -inf | inf | m/s |
 
     These compare the path with what the vehicle itself can know, never with the true state: yaw, depth and speed
-    as they are measured, noise and all, and a position by dead reckoning from measured velocities and attitude,
-    from the start that is told. So they drift as the vehicle's own navigation does, by decimetres in half a
-    minute with the default sensors, and more with others. `info["path_errors"]` and the reward have the true
-    ones. Where a filter's estimate is in the observation, `control.depth_and_course` compares that with the path
-    in their place, and with the depth.
+    as measured, with noise, and a position by dead reckoning from measured velocities and attitude, from the known
+    start. So they drift as the vehicle's own navigation does, by decimetres in half a minute with the default
+    sensors, and more with others. `info["path_errors"]` and the reward have the true ones. Where a filter's
+    estimate is in the observation, `control.depth_and_course` compares that with the path in their place, and with
+    the depth.
 
     ## Reward
-    The path's place is the one abreast of the vehicle: it is followed, not caught up with, so the time does not
-    matter; the speed has a term of its own.
+    Errors are measured to the point of the path abreast of the vehicle, so the time does not matter; the speed has
+    its own term.
 
     ## Arguments
     `path` is "IV" by default; see `auv_env.task.make_task`. Episodes are truncated after 600 steps (30 s).

@@ -58,6 +58,8 @@ def command(
         )
     check_installed()
     if page is not None:
+        if quick:
+            raise ValueError(f"--quick must go without --page, for its times are rough, but got --page {page}")
         check_page(page)
     check_targets([page], json)
     # After the checks: they import FilterPy, or Stable-Baselines3.

@@ -14,6 +14,7 @@ from benchmarks.rows import Row
 from benchmarks.timing import Measure, seconds_a_call, side_by_side
 from benchmarks.workloads import step_of_env, step_of_filtered
 from filters.wrappers.single import EstimateState
+from numerics.streams import ACTION_SPACE, derived_seed
 from thruster_env.plant import Plant
 
 ENSEMBLE_SIZE = 50
@@ -76,7 +77,7 @@ def episode(env: gym.Env, seed: int) -> Measure:
 
 
 def _actions(env: gym.Env, seed: int) -> list[np.ndarray]:
-    env.action_space.seed(seed)
+    env.action_space.seed(derived_seed(seed, ACTION_SPACE))
     return [env.action_space.sample() for _ in range(env.spec.max_episode_steps)]
 
 

@@ -16,6 +16,7 @@ from benchmarks.rows import Row
 from benchmarks.timing import Measure, alone, side_by_side
 from benchmarks.workloads import step_of_env
 from numerics.compiled import compiled, function_fingerprint
+from numerics.streams import ACTION_SPACE, derived_seed
 from numerics.threads import cores, spread
 from plants.memory import set_row
 from thruster_env.dynamics import substep
@@ -52,7 +53,7 @@ def memory_line() -> str:
 def vector_steps(name: str, seed: int, copies: int = COPIES, steps: int = STEPS, **arguments) -> Measure:
     """A measure of one copy's step in a vector env of many copies under random actions."""
     env = gym.make_vec(name, num_envs=copies, **arguments)
-    env.action_space.seed(seed)
+    env.action_space.seed(derived_seed(seed, ACTION_SPACE))
     actions = env.action_space.sample()
 
     def measure() -> float:

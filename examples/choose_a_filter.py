@@ -2,17 +2,17 @@
 Choose a filter
 ===============
 
-Which of two dozen filters, for which plant? All of them meet the same runs, and differences are counted only
-where they hold on the same seeds.
+Which of two dozen filters, for which plant? All of them see the same runs, and only paired differences on the same
+seeds count.
 """
 
 # %%
 # Side by side
 # ------------
 #
-# A scenario is a plant with its inputs, sensors and disturbances. On ``nominal`` the model is right and the
-# noise is Gaussian. Each filter knows the plant's own Q and R here, so that it is the filters that are compared
-# and not their tuning.
+# A scenario is a plant with its inputs, sensors and disturbances. On ``nominal`` the model is right and the noise
+# is Gaussian. Each filter knows the plant's own Q and R here, so that the comparison is between filters and not
+# between tunings.
 
 import tuning
 from filters import FILTERS, make_filter
@@ -29,15 +29,15 @@ tuning.compare(["ekf", "kf", "ukf", "enkf", "pf", "open-loop"], "nominal", seeds
 # innovation squared) is given over the number of measurements, so that 1 is right. The verdict is
 # :term:`paired`, against the first filter.
 #
-# The Kalman filter is linearised about one operating point, and lost as soon as the voltage leaves it. The
+# The Kalman filter is linearised at one operating point, and diverges as soon as the voltage leaves it. The
 # extended Kalman filter is at the bound. Nothing can be better, and particles reach the same at several hundred
 # times the cost.
 #
 # Where it matters
 # ----------------
 #
-# With outliers in the sensor the ranking is another one. No filter is told of them; ``ekf-robust`` expects that
-# there may be some, and weighs a measurement less the less likely it is.
+# With outliers in the sensor the ranking changes. No filter knows them; ``ekf-robust`` allows for some, and gives
+# an unlikely measurement less weight.
 
 comparison = tuning.compare(
     ["ekf", "ekf-robust", "enkf", "pf"], "outliers", seeds=SEEDS
@@ -49,15 +49,15 @@ comparison
 figure = comparison.plot_scores()
 
 # %%
-# What else there is
+# Further parameters
 # ------------------
 #
-# Every filter takes numbers of its own beside the model. ``thruster filters enkf`` prints them with the filter's
+# Besides the model every filter has its own parameters. ``thruster filters enkf`` prints them with the filter's
 # equations, and so does ``help``.
 
 enkf = make_filter("enkf", thruster_model(), ensemble_size=50, inflation=1.02)
 print(enkf.ensemble_size, enkf.init().members.shape)
 
 # %%
-# Reasons to take one filter or another, with pictures of where each works and fails: :doc:`/filters`. All
-# scenarios with all filters: :doc:`/ranking`. Next: :doc:`tune`.
+# Reasons to choose a filter, with pictures of where each works and fails: :doc:`/filters`. All scenarios with all
+# filters: :doc:`/ranking`. Next: :doc:`tune`.

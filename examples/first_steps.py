@@ -2,7 +2,7 @@
 First steps
 ===========
 
-A thruster, a filter around it, and what the filter says of its own estimate. Nothing is trained or tuned here.
+A thruster, a filter, and the uncertainty of the filter's estimate. Nothing is trained or tuned here.
 """
 
 # %%
@@ -10,10 +10,10 @@ A thruster, a filter around it, and what the filter says of its own estimate. No
 # -------
 #
 # The action is a voltage. The observation is the measured thrust. Motor speed and flow velocity are hidden:
-# ``info["state"]`` holds them, for us to compare with.
+# ``info["state"]`` contains them, for comparison.
 #
-# ``EstimateState`` runs a filter beside any such env. Here it is an extended Kalman filter. What the agent
-# observes is now the estimate of the two hidden states.
+# ``EstimateState`` runs a filter beside any such env, here an extended Kalman filter. The agent now observes the
+# estimate of the two hidden states.
 
 import gymnasium as gym
 import matplotlib.pyplot as plt
@@ -35,7 +35,7 @@ print("true state       ", info["state"])
 # -----------
 #
 # The voltage changes at random four times a second. In each step we keep the truth, the estimate, its covariance
-# and the innovation: what the measurement said beyond the prediction.
+# and the innovation, the measurement minus its prediction.
 
 voltages = np.repeat(
     np.random.default_rng(0).uniform(-24.0, 24.0, STEPS // 25 + 1), 25
@@ -51,8 +51,8 @@ for voltage in voltages:
 truth, estimate, deviation = np.array(truth), np.array(estimate), np.sqrt(variance)
 
 # %%
-# Does it know how good it is?
-# ----------------------------
+# Is the covariance right?
+# ------------------------
 #
 # A filter's covariance is a claim about its errors: about 95 % of them should lie within 1.96 standard
 # deviations. Motor speed is hardly visible in the thrust, yet the band is right.
@@ -84,8 +84,8 @@ inside = np.mean(np.abs(estimate - truth) < 1.96 * deviation, axis=0)
 print(f"inside the band: motor speed {inside[0]:.0%}, flow velocity {inside[1]:.0%}")
 
 # %%
-# Without a true state the innovations alone tell it. The NIS (normalised innovation squared) is the innovation
-# over its standard deviation, squared; its mean is 1 for a filter that is :term:`consistent`.
+# Without a true state the innovations show it. The NIS (normalised innovation squared) is the innovation over its
+# standard deviation, squared; its mean is 1 for a filter that is :term:`consistent`.
 
 nis = np.square(innovation) / innovation_variance
 print(f"mean NIS: {nis.mean():.2f}")

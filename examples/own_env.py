@@ -2,15 +2,15 @@
 An env of your own
 ==================
 
-Any Gymnasium env can be a problem: it makes the data, and you say what filters assume of it. Here Gymnasium's
-pendulum, of which noisy sensors measure cosine, sine and rate.
+Any Gymnasium env can be a problem: it generates the data, and you define what filters assume of it. Here
+Gymnasium's pendulum, of which noisy sensors measure cosine, sine and rate.
 """
 
 # %%
 # What filters assume
 # -------------------
 #
-# The env has its own equations; the filter has these. Q holds what the model leaves out.
+# The env has its own equations; the filter has these. Q covers what the model leaves out.
 
 import math
 
@@ -48,13 +48,13 @@ def pendulum():
 
 
 # %%
-# ``True`` beside the angle says that it wraps: errors are the short way round.
+# ``True`` marks the angle: it wraps, and errors are taken the short way round.
 #
 # The problem
 # -----------
 #
-# The env is rolled out once a seed under a policy, here random torques, and the true state is kept to compare
-# with.
+# The env is rolled out once per seed under a policy, here random torques, and the true state is recorded for
+# comparison.
 
 
 def true_state(env):
@@ -78,10 +78,10 @@ study
 figure = study.plot_errors()
 
 # %%
-# Around the env
-# --------------
+# With the env
+# ------------
 #
-# ``make_env`` is the env that the study ran. What the agent observes is now the estimate of angle and rate.
+# ``make_env`` returns the env that the study ran. The agent now observes the estimate of angle and rate.
 
 env = EstimateState(problem.make_env(), filter=study.filter)
 observation, info = env.reset(seed=0)
@@ -92,5 +92,5 @@ for _ in range(20):
 print(info["estimate"], info["estimate_cov"].diagonal())
 
 # %%
-# What a problem may have besides, and how it is given to the command line: :doc:`/problems`. What a filter's
-# estimate is worth to a policy: :doc:`policies`.
+# Other parts of a problem, and its use on the command line: :doc:`/problems`. How much a filter's estimate
+# improves a policy: :doc:`policies`.

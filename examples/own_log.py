@@ -10,10 +10,9 @@ the innovations, and estimate the hidden state.
 # The log
 # -------
 #
-# A CSV or Parquet file, a pandas table or a mapping from headers to arrays. Row k has what was measured at time
-# k dt and the input that acts from then on; headers name quantities and units. Here four runs of a thruster are
-# recorded whose voltage gain is a tenth below its data sheet's. Motor speed and flow velocity are not in the
-# table.
+# A CSV or Parquet file, a pandas table or a mapping from headers to arrays. Row k has what was measured at time k
+# dt and the input that acts from then on; headers name quantities and units. Here they are four runs of a thruster
+# whose voltage gain is a tenth below its data sheet's. Motor speed and flow velocity are not in the table.
 
 import tempfile
 from pathlib import Path
@@ -56,15 +55,15 @@ for header, column in runs[0].items():
 # What the data sheet gets wrong
 # ------------------------------
 #
-# A first estimate, with the data sheet's model: the innovations are larger than the filter believes, for the
-# mean NIS (normalised innovation squared) lies above its band.
+# A first estimate, with the data sheet's model: the innovations are larger than the filter assumes, as the mean
+# NIS (normalised innovation squared) above its band shows.
 
 before = tuning.estimate(runs[3], preset="tunnel_physical")
 before
 
 # %%
-# ``identify`` finds the parameters under which the runs are most likely, with standard errors, and says which of
-# them the runs do not determine.
+# ``identify`` finds the maximum-likelihood parameters with standard errors, and reports which of them the runs do
+# not determine.
 
 found = tuning.identify(runs[:3], ["voltage_gain"], preset="tunnel_physical")
 print(f"true voltage gain {TRUE_GAIN:.4g}")
@@ -74,27 +73,27 @@ found
 # Q and R
 # -------
 #
-# For an EKF, the Q and R that ``identify`` found are the answer, and ``mine`` below holds them. A study is for
-# other filters, other criteria, or logs with true states. It is shown on the EKF, for that is the quickest filter.
+# For an EKF, use the Q and R of ``identify``; ``mine`` below contains them. A study is for other filters, other
+# criteria, or logs with true states. It is shown with the EKF, because that is the fastest filter.
 #
-# Without a true state the innovations judge: the study looks for the Q and R under which they are most likely,
-# with their NIS (normalised innovation squared) held in its band, and proves the choice on runs that it did not
-# learn from. Of three runs every third is :term:`held-out`.
+# Without a true state the study maximises the likelihood of the innovations over Q and R, with their NIS
+# (normalised innovation squared) kept in its band, and evaluates the choice on other runs. Of three runs every
+# third is :term:`held-out`.
 
 mine = found.save(Path(tempfile.mkdtemp()) / "mine.toml")
 study = tuning.tune((mine, runs[:3]), filter="ekf", trials=TRIALS)
 study
 
 # %%
-# What is found lies near the Q = diag(1, 4e-4) and R = 0.25 by which the runs were made. The :term:`scaled
-# default` ties with it here, for identification has found R already; the :term:`rule of thumb` is far behind.
+# The result is near the Q = diag(1, 4e-4) and R = 0.25 that generated the runs. The :term:`scaled default` ties
+# with it here, because identification has found R already; the :term:`rule of thumb` is far behind.
 #
-# **Covariances are per step and do not scale with dt**: what is found is for the log's sample time.
+# **Covariances are per step and do not scale with dt**: the result is for the log's sample time.
 #
 # Estimate
 # --------
 #
-# The tuned filter on a run that nobody has seen so far. Its innovations are what it expects them to be.
+# The tuned filter on a new run. Its innovations agree with their predicted covariance.
 
 after = tuning.estimate(runs[3], study, preset=mine)
 after

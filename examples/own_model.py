@@ -2,7 +2,7 @@
 A model of your own
 ===================
 
-Filters and studies take any plant of which you can write down how it moves and what is measured. Here: two water
+Filters and studies work with any plant if you can write down its motion and its measurements. Here: two water
 tanks in a row, a pump, and one level sensor at the lower tank.
 """
 
@@ -10,9 +10,8 @@ tanks in a row, a pump, and one level sensor at the lower tank.
 # The model
 # ---------
 #
-# Two functions: where the state goes in one step, and what is measured. They work on tuples of numbers with
-# arithmetic and ``math``, so that they compile. Q and R come beside them, and names with units, which all tables
-# and pictures use.
+# Two functions: the next state, and the measurement. They work on tuples of numbers with arithmetic and ``math``,
+# so that they compile. Add Q and R, and names with units, which all tables and pictures use.
 #
 # .. math::
 #
@@ -68,12 +67,12 @@ def tanks(outflow=0.05):
 
 
 # %%
-# **Covariances are per step and do not scale with dt**: the numbers above are for steps of one second.
+# **Covariances are per step and do not scale with dt**: the values above are for steps of one second.
 #
-# A filter by itself
-# ------------------
+# A filter without an env
+# -----------------------
 #
-# A filter needs nothing but the model. The upper level is not measured; the lower one tells of it, later.
+# A filter needs only the model. The upper level is not measured, but affects the lower one later.
 
 ekf = make_filter("ekf", tanks())
 belief = ekf.init()
@@ -91,8 +90,8 @@ print(
 # A problem
 # ---------
 #
-# A :term:`problem` is a pair: the model that makes the data, and the model that filters assume. Here they
-# differ, as they always do: the filter believes in an outflow that is a tenth too small.
+# A :term:`problem` is a pair: the model that generates the data, and the model that filters assume. Here they
+# differ, as they always do: the filter assumes an outflow that is a tenth too small.
 
 problem = ModelProblem(
     tanks(0.055),
@@ -109,8 +108,8 @@ study
 figure = study.plot_run()
 
 # %%
-# The study puts the model's error where it is: in the upper level, which nobody measures. Errors are a third
-# smaller than with the :term:`scaled default`, on the same held-out seeds.
+# The study attributes the model's error to the right state, the unmeasured upper level. Errors are a third smaller
+# than with the :term:`scaled default`, on the same held-out seeds.
 #
 # The best answer to a wrong constant is not noise, though. ``augmented_model`` makes it a state, and the filter
 # finds it.
@@ -127,6 +126,5 @@ more = ModelProblem(
 tuning.evaluate("ekf", more, seeds=SEEDS)
 
 # %%
-# In a module of its own, the same problem serves the command line: ``thruster tune --problem my_tanks:problem``.
-# Models as functions of parameters, several inputs, angles: :doc:`/problems`; models of many states:
-# :doc:`/size`.
+# In its own module, the same problem works on the command line: ``thruster tune --problem my_tanks:problem``.
+# Models as functions of parameters, several inputs, angles: :doc:`/problems`; models of many states: :doc:`/size`.

@@ -2,8 +2,8 @@
 Policies on an estimate
 =======================
 
-Reinforcement learning from the raw sensor, or from what a filter makes of it? Both are trained in a script of
-your own, with Stable-Baselines3 (``pip install '.[rl]'``), for some seconds each.
+Reinforcement learning from the raw sensor, or from a filter's estimate? Both are trained in a script of your own,
+with Stable-Baselines3 (``pip install '.[rl]'``), for some seconds each.
 """
 
 # %%
@@ -12,7 +12,7 @@ your own, with Stable-Baselines3 (``pip install '.[rl]'``), for some seconds eac
 #
 # ``BowThrusterTracking-v0`` asks for a thrust that changes. ``gym.make_vec`` steps all copies in one compiled
 # call; ``filters:BowThrusterTracking-EKF-v0`` is the same env with an extended Kalman filter beside each copy.
-# ``NativeVecEnv`` hands either to Stable-Baselines3, with actions in [-1, 1] for voltages in [-24, 24].
+# ``NativeVecEnv`` passes either to Stable-Baselines3, with actions in [-1, 1] for voltages in [-24, 24].
 
 import gymnasium as gym
 import numpy as np
@@ -42,9 +42,8 @@ def make(env_id, copies):
 # Train and score
 # ---------------
 #
-# The same algorithm and the same numbers for both. The discount is small because the thruster answers within
-# some ten steps. Scores are on episodes that training never saw, the same ones for both: a comparison that is
-# :term:`paired`.
+# The same algorithm and the same hyperparameters for both. The discount is small because the thruster responds
+# within some ten steps. Scores are on the same held-out episodes for both: a :term:`paired` comparison.
 
 
 def train(env_id, seed=0):
@@ -88,8 +87,8 @@ raw = score(RAW, *train(RAW))
 filtered = score(FILTERED, *train(FILTERED))
 
 # %%
-# What came out
-# -------------
+# Results
+# -------
 #
 # The return is minus the mean squared error of the thrust over the range, summed; nearer to zero is better.
 
@@ -99,6 +98,6 @@ print(f"return on the estimate:    {filtered.mean():.2f}")
 print(f"better on {np.mean(difference > 0):.0%} of {EPISODES} held-out episodes")
 
 # %%
-# One training seed says little about an algorithm. :doc:`/policies` has five for each case, all observations
-# from raw to true state, and MPC beside them; ``thruster train``, ``thruster score`` and ``thruster study
-# policies`` do all of that.
+# One training seed says little about an algorithm. :doc:`/policies` has five for each case, all observations from
+# raw to true state, and MPC for comparison; ``thruster train``, ``thruster score`` and ``thruster study policies``
+# compute them.

@@ -8,7 +8,8 @@ steps that ``thruster train`` takes; with all of them::
 
     python examples/ppo.py --steps 401408 --out ppo_thruster
 
-This page is not run while the site is built: learning takes a minute or so. What it printed stands at its end.
+This page is not run while the site is built, because training takes about a minute. Its recorded output is at the
+end.
 """
 
 import argparse
@@ -41,9 +42,9 @@ PPO_NUMBERS = {
 # The envs
 # --------
 #
-# To learn, all copies of the thruster and their filters are stepped together. ``NativeVecEnv`` hands them to
-# Stable-Baselines3, and takes actions in [-1, 1] for the range of the voltage, as PPO's Gaussian policy likes
-# them. Observations and rewards are normalised, which matters: states are of very different size.
+# For training, all copies of the thruster and their filters are stepped together. ``NativeVecEnv`` passes them to
+# Stable-Baselines3, and takes actions in [-1, 1] for the range of the voltage, as PPO's Gaussian policy requires.
+# Observations and rewards are normalised, which matters because the states differ widely in magnitude.
 
 
 def make_training(copies=COPIES, seed=0):
@@ -57,7 +58,7 @@ def make_training(copies=COPIES, seed=0):
 
 
 # %%
-# To use what was learnt there is one thruster. ``RescaleAction`` gives it the same actions in [-1, 1].
+# The trained policy is used on one thruster. ``RescaleAction`` gives it the same actions in [-1, 1].
 
 
 def make_single():
@@ -92,7 +93,7 @@ def learn(steps, copies=COPIES, seed=0):
 # Use it
 # ------
 #
-# The policy saw normalised observations, and has to see them here, too.
+# The policy was trained on normalised observations and needs them here, too.
 
 
 def episode_return(model, venv, seed):

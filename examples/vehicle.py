@@ -10,7 +10,7 @@ Doppler log, gyros, a depth sensor and a compass.
 # A filter of twelve states
 # -------------------------
 #
-# Nothing but the name of the env has changed. The filter's model comes from the env, with names and units.
+# Only the name of the env has changed. The filter's model comes from the env, with names and units.
 
 import gymnasium as gym
 import matplotlib.pyplot as plt
@@ -31,8 +31,8 @@ print(", ".join(f"{quantity.name} [{quantity.unit}]" for quantity in states))
 # Along a path, on the estimate
 # -----------------------------
 #
-# ``DepthAndCourse`` steers along a line of sight with PD on pitch and course. It sees what the filter estimates.
-# The sensors have rates of their own, so some measurements are missing in most steps; the filter knows.
+# ``DepthAndCourse`` steers along a line of sight with PD on pitch and course. It uses the filter's estimate. The
+# sensors have different rates, so some measurements are missing in most steps; the filter handles them.
 
 controller, memory = DepthAndCourse.for_env(env, seen="navigation"), None
 truth, estimate, deviation, distances = [], [], [], []
@@ -52,8 +52,8 @@ print(
 )
 
 # %%
-# What it does not know
-# ---------------------
+# What is not observable
+# ----------------------
 #
 # Depth is measured, the horizontal position is not: its error is a random walk, and the band grows as it should.
 

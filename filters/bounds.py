@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from filters.engine.batch import run
-from filters.gaussian.extended import ExtendedKalmanFilter
+from filters.engine.belief import Kernels
+from filters.gaussian.extended import ExtendedKalmanFilter, kernels_of
+from filters.gaussian.square_root import square_root_kernels
+from numerics.checks import as_floats
 from plants.affine import AffineModel
 from plants.simulate import simulate
 from plants.state_space import StateSpaceModel
+
+STIFF = 1e8  # S over R, from which an update of covariances loses half of their digits: roots keep them
 
 
 def riccati_covariances(model: AffineModel) -> tuple[np.ndarray, np.ndarray]:
@@ -45,9 +52,10 @@ def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray |
         missing: whether each measurement is missing, (B, K + 1, m); none if None.
 
     Returns:
-        P_k for every sequence and step, (B, K + 1, n, n); index 0 is after the first measurement.
+        P_k for every sequence and step, (B, K + 1, n, n); index 0 is after the first measurement. NaN for a
+        sequence along which it is too large for float64.
     """
-    inputs = np.ascontiguousarray(inputs, dtype=np.float64)
+    inputs = np.ascontiguousarray(as_floats(inputs))
     keys, nothing = np.zeros((len(inputs), 2)), np.zeros((model.n, model.n))
     rounding = 1e-30 * model.measurement_noise_cov  # none at all is no covariance of a measurement
     calm = model.replace(process_noise_cov=nothing, prior_cov=nothing, measurement_noise_cov=rounding)
@@ -55,4 +63,18 @@ def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray |
     if missing is not None:
         measured = np.where(missing, np.nan, measured)
     # Measurements that are right leave the estimate on the path.
-    return run(ExtendedKalmanFilter(model=model), keys, inputs, measured).covs
+    found = run(ExtendedKalmanFilter(model=model), keys, inputs, measured)
+    expected = np.einsum("bkii->bki", found.innovation_covs) / np.diag(model.measurement_noise_cov)
+    if (expected < STIFF).all() and not found.divergences.any():
+        return found.covs
+    found = run(_SquareRootFilter(model=model), keys, inputs, measured)
+    return np.where((found.divergences > 0)[:, None, None, None], np.nan, found.covs)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _SquareRootFilter(ExtendedKalmanFilter):
+    """The extended Kalman filter with roots of covariances."""
+
+    def kernels(self) -> Kernels:
+        """Those of the square-root form."""
+        return kernels_of(self.kernel_model, square_root_kernels)

@@ -13,8 +13,12 @@ from typing import ClassVar
 import numpy as np
 
 from filters.engine.belief import Belief, Innovation, Kernels
+from filters.engine.gated import GatedSession
 from filters.engine.session import Running, Session
+from numerics.compiled import is_interpreting
 from plants.state_space import StateSpaceModel
+
+SPARE, SPARE_IN_PYTHON = "_spare", "_spare_in_python"  # attributes: sessions that are not in use
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,10 +64,12 @@ class Filter:
 
         Raises ValueError for another key.
         """
-        session = Session(self)
+        session = self._borrowed()
         session.set_key(key)
         session.run("start")
-        return session.belief()
+        found = session.belief()
+        self._put_back(session)
+        return found
 
     def predict(self, belief: Belief, u, *, process_noise_cov=None) -> Belief:
         """Predict the belief one step ahead under input u (p,), in the units of the model's inputs.
@@ -74,12 +80,15 @@ class Filter:
         Raises ValueError for an input that is not p finite numbers, and for a belief of another filter type, not
         finite, or with a covariance that is not positive semidefinite.
         """
-        session = Session(self)
+        session = self._borrowed()
         session.load(belief)
-        self.check_noise(process_noise_cov)
-        session.set_noise(process_noise_cov=process_noise_cov)
+        if process_noise_cov is not None:
+            self.check_noise(process_noise_cov)
+            session.set_noise(process_noise_cov=process_noise_cov)
         session.run("predict", u=u)
-        return session.belief()
+        found = session.belief()
+        self._put_back(session)
+        return found
 
     def update(self, belief: Belief, z, *, measurement_noise_cov=None) -> tuple[Belief, Innovation]:
         """Update the belief with measurement z (m,); return it and the innovation. NaN marks a missing channel.
@@ -88,12 +97,49 @@ class Filter:
 
         Raises ValueError for a measurement that is not m numbers, finite or NaN, and as `predict` for a belief.
         """
-        session = Session(self)
+        session = self._borrowed()
         session.load(belief)
-        self.check_noise(measurement_noise_cov)
-        session.set_noise(measurement_noise_cov=measurement_noise_cov)
+        if measurement_noise_cov is not None:
+            self.check_noise(measurement_noise_cov)
+            session.set_noise(measurement_noise_cov=measurement_noise_cov)
         session.run("update", z=z)
-        return session.belief(), session.innovation_copy()
+        found = session.belief(), session.innovation_copy()
+        self._put_back(session)
+        return found
+
+    def _borrowed(self) -> Session:
+        """A session as if it were new, whose memory nobody else uses: to make one takes longer than a step.
+
+        It is put back with `_put_back`, but after an error.
+        """
+        kept = self._kept_sessions()
+        source = self.kernel_model.numbers_from, self.own_numbers
+        if kept:
+            try:
+                was, session = kept.pop()  # which no other thread has then
+            except IndexError:
+                was, session = None, None
+            if session is not None and was == source:
+                session.clear()
+                return session
+        session = Session(self)
+        session.source = source
+        return session
+
+    def _put_back(self, session: Session) -> None:
+        kept = self._kept_sessions()
+        if not kept:
+            kept.append((session.source, session))
+
+    def _kept_sessions(self) -> list:
+        """Sessions that are not in use: one at most, unless threads have put back theirs at the same moment."""
+        held = vars(self)
+        name = SPARE_IN_PYTHON if is_interpreting() else SPARE
+        return held.get(name) or held.setdefault(name, [])
+
+    def __getstate__(self) -> dict:
+        """The fields, without memory that is kept for the next call."""
+        return {name: value for name, value in vars(self).items() if name not in (SPARE, SPARE_IN_PYTHON)}
 
     def check_noise(self, given) -> None:
         """Raise ValueError for a covariance of one step, if the filter cannot take one."""
@@ -102,6 +148,12 @@ class Filter:
                 f"Q and R of the filter {self.name!r} cannot vary from step to step, but got one that does"
             )
 
-    def session(self) -> Running:
-        """A session: this filter running in place on one belief, which is faster than `predict` and `update`."""
-        return Session(self)
+    def session(self, gate: float | None = None) -> Running:
+        """A session: this filter running in place on one belief, which is faster than `predict` and `update`.
+
+        With a gate, a channel whose innovation is beyond so many standard deviations of S is left out of a step,
+        as if it were missing; `rejected` counts these, (m,).
+
+        Raises ValueError for a gate that is not a positive number.
+        """
+        return Session(self) if gate is None else GatedSession(self, gate)

@@ -1,8 +1,8 @@
 """How each filter is drawn: one colour and one dash, the same in every picture.
 
-The hues are near those of Okabe and Ito, with a wine red: colour-blind people tell them apart. Filters that are
-often drawn together differ in hue, and no two share both hue and dash. Truth is a
-wide grey line below all, measurements are pale.
+The hues are near those of Okabe and Ito, with a wine red: colour-blind people can distinguish them. Filters that
+are often drawn together differ in hue, and no two share both hue and dash. Truth is a wide grey line below all,
+measurements are pale.
 
 Source: Okabe, Ito (2008), "Color universal design".
 """

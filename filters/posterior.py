@@ -6,23 +6,29 @@ from functools import cache, partial
 
 import numpy as np
 
-from numerics.checks import at_least
+from filters.wrapped import wrapped_variances
+from numerics.checks import as_floats, at_least, correlations, covariance_root
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from numerics.derivatives import RELATIVE_STEP
 from numerics.matrices import multiplier, quadratic_form
 from numerics.progress import told
 from numerics.sources import Source, entrywise
 from numerics.streams import GROUP
 from numerics.threads import cores, spread
-from numerics.tuples import matrix_reader, vector_reader
+from numerics.tuples import matrix_reader, vector_reader, vector_writer
 from plants.layout import constants_reader, number_places, padded
 from plants.shape import Functions, Shape, observation_slopes, transition_slopes
-from plants.simulate import truth_steps
+from plants.simulate import noise_step, truth_steps
 from plants.state_space import StateSpaceModel
 
-ALL_UP_TO = 12  # states, for which the bound is that of every sequence
+ALL_UP_TO = 12  # states, for which the matrices of every sequence cost nothing that counts
 MOST_WORK = 2e10  # truths x steps x n^3, of all sequences of a larger model together
+MOST_STEPS = 3e7  # truths x steps x substeps, of all sequences of any model together
 WORK_AT_ONCE = 2e9  # of the same, some seconds: Ctrl-C is heard in between
-SINGULAR, STIFF = 1e-13, 1e-4  # least eigenvalue of Q with unit variances: of none within rounding; of few digits
+SINGULAR = 1e-13  # least eigenvalue of Q with unit variances, within rounding: Q has no inverse
+ROUNDING = (
+    8 * 2.0**-52 / RELATIVE_STEP
+)  # of slopes by central differences, relative to (|x_i| + s_i)/(|x_j| + s_j)
 MOST_BYTES, MATRICES = 2**28, 8  # of so many matrices (n, n) a sequence and step at once
 
 
@@ -34,8 +40,13 @@ def posterior_bound(model: StateSpaceModel, inputs: np.ndarray, *, truths: int =
         J_0 = P_0^-1 + E[H' R^-1 H],  D11 = E[F' Q^-1 F],  D12 = -E[F'] Q^-1,
         J_{k+1} = Q^-1 + E[H' R^-1 H] - D12' (J_k + D11)^-1 D12
 
-    written with P in place of J, so that P_0 may be singular. Expectations are over truths of one sequence: with
-    Jacobians pooled over different inputs, the result would not be a bound.
+    written with P in place of J, so that P_0 may be singular, and with C = E[(F - E[F])' Q^-1 (F - E[F])]:
+
+        P_{k+1} = (G_k^-1 + E[H' R^-1 H])^-1,  G_k = Q + E[F] (P_k^-1 + C)^-1 E[F]'
+
+    which loses no digits where Q is small beside F P F'. Expectations are over truths of one sequence: with
+    Jacobians pooled over different inputs, the result would not be a bound. It bounds squares of plain errors: of
+    a state that is an angle, `filters.wrapped.wrapped_variances` of it bounds those of wrapped ones.
 
     Args:
         model: the model that draws the truth; Q must be positive definite.
@@ -44,7 +55,8 @@ def posterior_bound(model: StateSpaceModel, inputs: np.ndarray, *, truths: int =
         seed: of the truths.
 
     Returns:
-        Bound P_k for every sequence and step, (B, K + 1, n, n); index 0 is after the first measurement.
+        Bound P_k for every sequence and step, (B, K + 1, n, n); index 0 is after the first measurement. It is
+        not finite from the step on at which numbers are too large for float64.
 
     Raises:
         ValueError: if Q is singular: then the recursion's Q^-1 does not exist.
@@ -52,18 +64,20 @@ def posterior_bound(model: StateSpaceModel, inputs: np.ndarray, *, truths: int =
     Source: Tichavsky, Muravchik, Nehorai (1998), "Posterior Cramer-Rao bounds for discrete-time nonlinear
     filtering", IEEE Trans. Signal Processing 46(5), eqs. 21 and 34-36.
     """
-    inputs = np.ascontiguousarray(inputs, dtype=np.float64)
+    inputs = np.ascontiguousarray(as_floats(inputs))
     return _posterior_bound(model, inputs, _truth_keys(len(inputs), truths, seed))
 
 
 def posterior_variances(
     model: StateSpaceModel, inputs: np.ndarray, *, truths: int = 100, seed: int = 0
 ) -> np.ndarray:
-    """Diagonals of `posterior_bound` without its matrices of every step, and of a large model for fewer sequences.
+    """Diagonals of `posterior_bound` without its matrices; fewer sequences for large or long models.
 
-    Up to twelve states they are those of all sequences. Beyond, a sequence is truths x steps x n^3 of work, and
-    as many sequences are taken, spread evenly over those given, as 2e10 of it allow: at least one, and one alone
-    where all are the same, for its bound is that of all. Truths are never fewer.
+    Those of angles are bounds on the squares of wrapped errors (`filters.wrapped.wrapped_variances`).
+
+    As many sequences are taken, spread evenly over those given, as 3e7 substeps of truths allow, and of a model
+    with more than twelve states no more than 2e10 of truths x steps x n^3 allow: at least one, and one alone where
+    all are the same, for its bound is that of all. The number of truths is never reduced.
 
     Args:
         model: the model that draws the truth; Q must be positive definite.
@@ -77,8 +91,8 @@ def posterior_variances(
     Raises:
         ValueError: if Q is singular.
     """
-    keys = _truth_keys(len(inputs), truths, seed)
-    some = _taken(np.asarray(inputs, dtype=np.float64), truths, model.n)
+    inputs, keys = as_floats(inputs), _truth_keys(len(inputs), truths, seed)
+    some = sequences_taken(inputs, truths, model)
     inputs, keys = np.ascontiguousarray(inputs[some], dtype=np.float64), np.ascontiguousarray(keys[some])
     count, steps = inputs.shape[:2]
     most = max(MOST_BYTES // (8 * MATRICES * (steps + 1) * model.n**2), cores())
@@ -86,18 +100,27 @@ def posterior_variances(
     parts = [slice(first, min(first + most, count)) for first in range(0, count, most)]
     for part in told("posterior bound", parts, [len(inputs[part]) for part in parts]):
         variances[part] = np.einsum("bkii->bki", _posterior_bound(model, inputs[part], keys[part]))
-    return variances
+    return wrapped_variances(variances, model.shape.state_angles)
 
 
-def _taken(inputs: np.ndarray, truths: int, n: int) -> np.ndarray:
-    """Places of the sequences of which `posterior_variances` are made."""
+def gathering_code(model: StateSpaceModel) -> tuple[CompiledOrPython, str]:
+    """What sums up Jacobians for the bound of a model, and a hash of all code that determines the bound."""
+    functions = model.functions
+    fingerprint = function_fingerprint(*functions, within=__name__)
+    return _gatherer(functions, model.shape, is_interpreting()), fingerprint
+
+
+def sequences_taken(inputs: np.ndarray, truths: int, model: StateSpaceModel) -> np.ndarray:
+    """Indices of the sequences that `posterior_variances` of a model uses."""
     count, steps, _ = inputs.shape
-    if n <= ALL_UP_TO or not count:
-        return np.arange(count)
-    if (inputs == inputs[:1]).all():
+    large = model.n > ALL_UP_TO
+    if large and count and (inputs == inputs[:1]).all():
         return np.arange(1)
-    most = min(max(int(MOST_WORK / (truths * steps * n**3)), 1), count)
-    return np.arange(most) * count // most
+    most = MOST_STEPS / (truths * steps * model.substeps)
+    if large:
+        most = min(most, MOST_WORK / (truths * steps * model.n**3))
+    most = min(max(int(most), 1), count)
+    return np.arange(most) * count // most if count else np.arange(0)
 
 
 def _truth_keys(count: int, truths: int, seed: int) -> np.ndarray:
@@ -107,50 +130,33 @@ def _truth_keys(count: int, truths: int, seed: int) -> np.ndarray:
 
 
 def _posterior_bound(model: StateSpaceModel, inputs: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    """The bound of `posterior_bound` from the truths of these keys.
-
-    Where Q is nearly singular, Q^-1 - D12' (J + D11)^-1 D12 loses all its digits. Then D11 is summed about the
-    mean, C = E[(F - E[F])' Q^-1 (F - E[F])], and the same is (Q + E[F] (J + C)^-1 E[F]')^-1.
-    """
+    """The bound of `posterior_bound` from the truths of these keys, by square roots S S' = P."""
     if not has_bound(model.process_noise_cov):
         raise ValueError(f"the bound needs a positive definite Q, but got {model.process_noise_cov.tolist()}")
-    (count, steps, _), (_, truths, _) = inputs.shape, keys.shape
-    n = model.n
-    q_inverse = np.linalg.inv(model.process_noise_cov)  # enters the recursion itself, as a weight
-    r_inverse = np.linalg.inv(model.measurement_noise_cov)
-    f_mean, d11, information = (np.zeros((count, steps + 1, n, n)) for _ in range(3))
-    fixed = inputs, model.numbers, q_inverse.ravel(), r_inverse.ravel()
-    sums = f_mean, d11, information
+    (count, steps, _), n = inputs.shape, model.n
+    f_mean, spread_of_f, information = (np.zeros((count, steps + 1, n, n)) for _ in range(3))
+    q_inverse, r_inverse = _inverse(model.process_noise_cov), _inverse(model.measurement_noise_cov)
+    fixed = inputs, model.numbers, q_inverse.ravel(), r_inverse.ravel(), f_mean, spread_of_f, information
+    add, done = _gatherer(model.functions, model.shape, is_interpreting()), 0
     # Some truths at a time, in the same order: Ctrl-C is heard in between.
     size = max(int(WORK_AT_ONCE / (max(count, 1) * (steps + 1) * n**3)), 1)
-    parts = [np.ascontiguousarray(keys[:, first : first + size]) for first in range(0, truths, size)]
-
-    def gather(about_mean: bool) -> None:
-        add = _gatherer(model.functions, model.shape, about_mean, is_interpreting())
-        for some in told("truths", parts, [part.shape[1] for part in parts]):
-            spread(partial(add, some, *fixed, *sums), count)
-
-    gather(False)
-    for part in sums:
-        part /= truths
-    stiff = _least_direction(model.process_noise_cov) < STIFF
-    if stiff:
-        d11[:] = 0.0
-        gather(True)
-        d11 /= truths
+    parts = [np.ascontiguousarray(keys[:, first : first + size]) for first in range(0, keys.shape[1], size)]
+    for some in told("truths", parts, [part.shape[1] for part in parts]):
+        spread(partial(add, some, done, *fixed), count)
+        done += some.shape[1]
+    spread_of_f /= done
+    information /= done
 
     bound = np.empty((count, steps + 1, n, n))
-    prior = np.broadcast_to(model.prior_cov, (count, n, n))
-    bound[:, 0] = _less_information(prior, information[:, 0])
+    prior, noise = (covariance_root(cov) for cov in (model.prior_cov, model.process_noise_cov))
+    noises = np.broadcast_to(noise.T, (count, n, n))
+    root = _informed(np.broadcast_to(prior, (count, n, n)), information[:, 0])
+    bound[:, 0] = _square(root)
     for k in range(steps):
-        if stiff:
-            moved = f_mean[:, k] @ _less_information(bound[:, k], d11[:, k]) @ np.swapaxes(f_mean[:, k], -1, -2)
-            bound[:, k + 1] = _less_information(model.process_noise_cov + moved, information[:, k + 1])
-            continue
-        d12 = -np.swapaxes(f_mean[:, k], -1, -2) @ q_inverse
-        kept = _less_information(bound[:, k], d11[:, k])  # (J_k + D11)^-1
-        j = q_inverse + information[:, k + 1] - np.swapaxes(d12, -1, -2) @ kept @ d12
-        bound[:, k + 1] = np.linalg.inv((j + np.swapaxes(j, -1, -2)) / 2)
+        moved = f_mean[:, k] @ _informed(root, spread_of_f[:, k])
+        rows = np.concatenate([np.swapaxes(moved, -1, -2), noises], axis=-2)
+        root = _informed(np.swapaxes(np.linalg.qr(rows, mode="r"), -1, -2), information[:, k + 1])
+        bound[:, k + 1] = _square(root)
     return bound
 
 
@@ -161,75 +167,107 @@ def has_bound(process_noise_cov: np.ndarray) -> bool:
 
 def _least_direction(q: np.ndarray) -> float:
     """The least eigenvalue of Q, its variances scaled to 1; 0 if one of these is 0."""
-    deviations = np.sqrt(np.diag(q))
-    return float(np.linalg.eigvalsh(q / np.outer(deviations, deviations))[0]) if deviations.all() else 0.0
+    return float(np.linalg.eigvalsh(correlations(q)[0])[0]) if np.diag(q).all() else 0.0
 
 
-def _less_information(p: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """(P^-1 + information)^-1 for a P that may be singular: (I + P information)^-1 P."""
-    result = np.linalg.solve(np.eye(p.shape[-1]) + p @ information, p)
-    return (result + np.swapaxes(result, -1, -2)) / 2
+def _inverse(cov: np.ndarray) -> np.ndarray:
+    """The inverse of a covariance, of whatever variances: it enters the recursion itself, as a weight."""
+    scaled, deviations = correlations(cov)
+    return np.linalg.inv(scaled) / deviations / deviations[:, None]
+
+
+@np.errstate(all="ignore")  # numbers too large for float64 are NaN in the end
+def _informed(root: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """A root of (P^-1 + information)^-1, P = root root' of any rank: root (I + root' information root)^-1/2."""
+    gained = np.swapaxes(root, -1, -2) @ information @ root
+    lost = ~np.isfinite(gained).all(axis=(-1, -2), keepdims=True)
+    gained = np.where(lost, 0.0, (gained + np.swapaxes(gained, -1, -2)) / 2)
+    lower = np.linalg.cholesky(np.eye(root.shape[-1]) + gained)
+    return np.where(lost, np.nan, np.swapaxes(np.linalg.solve(lower, np.swapaxes(root, -1, -2)), -1, -2))
+
+
+@np.errstate(all="ignore")
+def _square(root: np.ndarray) -> np.ndarray:
+    return root @ np.swapaxes(root, -1, -2)
 
 
 @cache
-def _gatherer(functions: Functions, shape: Shape, about_mean: bool, interpreting: bool):
+def _gatherer(functions: Functions, shape: Shape, interpreting: bool):
     n, m, transition = shape.n, shape.m, functions.transition
     transition_matrix, observation_matrix = (
         transition_slopes(functions, shape),
         observation_slopes(functions, shape),
     )
-    begin, advance, _ = truth_steps(functions, shape)
-    state, control, constants = vector_reader(n), vector_reader(shape.inputs), constants_reader(shape)
+    (begin, _, _), disturb = truth_steps(functions, shape), noise_step(n, m)
+    state, store_state = vector_reader(n), vector_writer(n)
+    control, constants = vector_reader(shape.inputs), constants_reader(shape)
     scales = vector_reader(n, number_places(n, m).scales)
     substeps, room = number_places(n, m).substeps, padded(max(n, m), GROUP)
     times, identity = multiplier(n, n, n), matrix_reader(n, n)
     read_weight_n, read_weight_m = matrix_reader(n, n), matrix_reader(m, m)
     quadratic_n, quadratic_m = quadratic_form(n, n), quadratic_form(m, n)
-    adder = Source("accumulate", "out, b, k, a", a=(n, n))
-    for i in adder.range(n):
-        for j in adder.range(n):
-            adder.line(f"out[b, k, {i}, {j}] += a[{i}][{j}]")
-    accumulate = adder.function()
-    less_mean = entrywise(
-        "less_mean", "f, means, b, k", (n, n), lambda i, j: f"f[{i}][{j}] - means[b, k, {i}, {j}]", f=(n, n)
+    accumulate, move_mean = (
+        _into("out[b, k, {i}, {j}] += weight * a[{i}][{j}]", n),
+        _into("out[b, k, {i}, {j}] += weight * (a[{i}][{j}] - out[b, k, {i}, {j}])", n),
     )
+    less_mean = _from_mean(n, functions.transition_jacobian is None)
     fingerprint = function_fingerprint(transition, transition_matrix, observation_matrix, within=__name__)
 
     @inlined
-    def whole_step_matrix(x, u, numbers, c, eye):
+    def whole_step(x, u, numbers, c, eye):
         f = identity(eye)
         for _ in range(int(numbers[substeps])):
             f = times(transition_matrix(x, scales(numbers), u, c), f)
             x = transition(x, u, c)
-        return f
+        return f, x
 
-    def gather(keys, inputs, numbers, q_inverse, r_inverse, f_mean, d11, information, first, last):
+    def gather(keys, before, inputs, numbers, q_inverse, r_inverse, f_mean, spread_of_f, information, first, last):
         fingerprint  # noqa: B018 - part of the cache's key
         x, u, draws, eye = np.zeros(n), np.zeros(inputs.shape[2]), np.zeros(room), np.eye(n).ravel()
-        c = constants(numbers)
+        c, s = constants(numbers), scales(numbers)
         weight_q, weight_r = read_weight_n(q_inverse), read_weight_m(r_inverse)
         for b in range(first, last):
             for truth in range(keys.shape[1]):
                 key_0, key_1 = keys[b, truth, 0], keys[b, truth, 1]
+                share = 1.0 / (before + truth + 1.0)  # of this truth in the mean, as Welford (1962) has it
                 begin(x, draws, key_0, key_1, numbers)
                 for k in range(f_mean.shape[1]):
-                    if not about_mean:
-                        accumulate(
-                            information,
-                            b,
-                            k,
-                            quadratic_m(observation_matrix(state(x), scales(numbers), c), weight_r),
-                        )
+                    seen = quadratic_m(observation_matrix(state(x), s, c), weight_r)
+                    accumulate(information, b, k, seen, 1.0)
                     if k == inputs.shape[1]:
                         break
                     for i in range(u.shape[0]):
                         u[i] = inputs[b, k, i]
-                    f = whole_step_matrix(state(x), control(u), numbers, c, eye)
-                    if about_mean:
-                        accumulate(d11, b, k, quadratic_n(less_mean(f, f_mean, b, k), weight_q))
-                    else:
-                        accumulate(d11, b, k, quadratic_n(f, weight_q))
-                        accumulate(f_mean, b, k, f)
-                    advance(x, u, draws, k + 1, key_0, key_1, numbers)
+                    f, moved = whole_step(state(x), control(u), numbers, c, eye)
+                    apart = quadratic_n(less_mean(f, f_mean, b, k, state(x), s), weight_q)
+                    accumulate(spread_of_f, b, k, apart, 1.0 - share)
+                    move_mean(f_mean, b, k, f, share)
+                    store_state(x, moved)
+                    disturb(x, draws, k + 1, key_0, key_1, numbers)
 
     return CompiledOrPython(gather)
+
+
+def _into(line: str, n: int):
+    """Return `add(out, b, k, a, weight)`, the line for each entry i, j of a matrix a (n, n)."""
+    source = Source("add", "out, b, k, a, weight", a=(n, n))
+    for i in source.range(n):
+        for j in source.range(n):
+            source.line(line.format(i=i, j=j))
+    return source.function()
+
+
+def _from_mean(n: int, by_differences: bool):
+    """Return `less_mean(f, means, b, k, x, s)`: F - E[F]; 0 where that is rounding of differences.
+
+    A tiny Q would take that for information.
+    """
+
+    def entry(i, j):
+        apart = f"f[{i}][{j}] - means[b, k, {i}, {j}]"
+        if not by_differences:
+            return apart
+        noise = f"{ROUNDING} * (abs(x[{i}]) + s[{i}]) / (abs(x[{j}]) + s[{j}])"
+        return f"({apart} if abs({apart}) > {noise} else 0.0)"
+
+    return entrywise("less_mean", "f, means, b, k, x, s", (n, n), entry, f=(n, n), x=(n,), s=(n,))

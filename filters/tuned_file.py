@@ -43,7 +43,7 @@ def read_tuned_file(path: str | Path) -> dict[str, Any]:
 
     Of `numbers` only the filter's own numbers are known, and of `model` only MODEL_KEYS where the file is for a
     plant that it holds as data; of others it holds what their model takes. All are finite, Q and R among them.
-    Whatever its version, "problem" names what it was tuned on, and "problems" holds problems as data.
+    In every version "problem" names the problem it was tuned on, and "problems" holds problems as data.
 
     Raises:
         ValueError: if the file cannot be read, is damaged, was edited, was written by a later version, or holds

@@ -1,4 +1,4 @@
-"""What model a tuned file is for, as data, and whether another one is the same."""
+"""The model of a tuned file, as data, and its comparison with another one."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def check_same_quantities(tuned_for: Mapping, model: StateSpaceModel, dt: float 
     Args:
         tuned_for: the file's `model_data`.
         model: on which it is to be used.
-        dt: its sample time [s]; None if nobody knows, which is not compared.
+        dt: its sample time [s]; None if unknown, which is not compared.
         file: its path.
     """
     here = {key: [list(one) for one in getattr(model, name)] for key, name in VECTORS.items()}

@@ -80,6 +80,26 @@ def difference(a: np.ndarray, b: np.ndarray, angles: Sequence[bool]) -> np.ndarr
     return wrapped_where(np.subtract(a, b), angles)
 
 
+def on_one_branch(rows: np.ndarray, angles: Sequence[bool]) -> np.ndarray:
+    """Samples (N, d), each angle within half a turn of the circular mean of its column; NaN counts for nothing.
+
+    What spread they have, as a standard deviation or a range, is then that of ordinary numbers.
+    """
+    if not any(angles):
+        return rows
+    rows = wrapped_where(rows, angles)
+    for i in np.flatnonzero(angles):
+        middle = np.arctan2(np.nansum(np.sin(rows[:, i])), np.nansum(np.cos(rows[:, i])))
+        rows[:, i] -= whole_turns(rows[:, i] - middle)
+    return rows
+
+
+def with_breaks(x: np.ndarray, *lines: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Points x (N,) and lines over them (N,), NaN put in where the first line jumps by more than half a turn."""
+    jumps = np.flatnonzero(abs(np.diff(lines[0])) > math.pi) + 1
+    return np.insert(x, jumps, x[jumps]), *(np.insert(line, jumps, np.nan) for line in lines)
+
+
 @cache
 def kept(function: Callable, arguments: str, angles: tuple[bool, ...]) -> Callable:
     """A function of the arguments that returns a vector, with its angles in (-pi, pi]."""

@@ -9,6 +9,7 @@ import unicodedata
 HANDLER = "thruster: other characters"  # name among Python's error handlers of encodings
 OTHERS = {"±": "+-", "×": "x", "µ": "u", "ω": "w", "–": "-", "—": "-", "−": "-", "•": "*", "‘": "'", "’": "'"}
 OTHERS |= {"“": '"', "”": '"', "≤": "<=", "≥": ">=", "→": "->", "·": "*", "✓": "x"}
+TITLE = 90  # characters for which a figure has room
 STRAIGHT = {"HORIZONTAL": "-", "LEFT": "-", "RIGHT": "-", "VERTICAL": "|"}  # ends of names of box drawings
 
 
@@ -26,6 +27,13 @@ def showable(text: str, encoding: str) -> str:
         return text
     codecs.register_error(HANDLER, _replace)
     return text.encode(encoding, HANDLER).decode(encoding)
+
+
+def verbatim(text: str, most: int | None = None) -> str:
+    """Text of a user's for a figure: dollars begin no formula, and the middle of a long one is left out."""
+    if most is not None and len(text) > most:
+        text = f"{text[: most // 2]}...{text[-(most // 2) :]}"
+    return "".join(one if one.isprintable() else "?" for one in text).replace("$", r"\$")
 
 
 def _replace(error: UnicodeError) -> tuple[str, int]:

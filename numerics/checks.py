@@ -10,6 +10,7 @@ from types import NoneType
 import numpy as np
 
 FEW, MANY = 4, 8  # choices that a message names of more than so many
+MOST_LISTED, LONG = 24, 80  # names that a message has, and characters of each
 
 
 def shown(value) -> str:
@@ -24,9 +25,12 @@ def shown(value) -> str:
 def as_floats(value) -> np.ndarray:
     """Return value as a float64 array, NaN and infinity included; raise ValueError unless it is real numbers.
 
-    Text that looks like a number is none, and neither are None and complex numbers.
+    Text that looks like a number is none, and neither are None and complex numbers. What a masked array masks is
+    missing, NaN.
     """
     try:
+        if isinstance(value, np.ma.MaskedArray):
+            value = np.ma.asarray(value, dtype=np.float64).filled(np.nan) if value.dtype.kind in "biuf" else None
         array = np.asarray(value)
         if array.dtype == object and any(isinstance(entry, (str, bytes, NoneType)) for entry in array.flat):
             raise TypeError
@@ -121,6 +125,14 @@ def one_of(name: str, value, choices: Iterable[str], listed: str | None = None) 
     return value
 
 
+def listed(names: Iterable[str]) -> str:
+    """Names for a message, with commas between; of many the first, and how many there are more."""
+    told = [one if len(one) <= LONG else f"{one[: LONG - 3]}..." for one in names]
+    if len(told) <= MOST_LISTED:
+        return ", ".join(told)
+    return f"{', '.join(told[:MANY])} and {len(told) - MANY} more"
+
+
 def any_case(value, choices: Iterable[str]):
     """The choice that differs from a value in its case at most; the value itself where there is none."""
     if isinstance(value, str):
@@ -183,10 +195,21 @@ def covariance(
     return (array + array.T) / 2
 
 
+def correlations(cov: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A covariance in units of about its deviations, and these units (d,), powers of two: nothing is rounded.
+
+    What is computed of it does not depend on the units of what varies; of a variance of 0 the unit is 1.
+    """
+    variances = np.diag(cov)
+    units = np.ldexp(1.0, np.where(variances > 0, np.frexp(np.sqrt(variances))[1], 0))
+    return cov / units / units[:, None], units
+
+
 def covariance_root(cov: np.ndarray) -> np.ndarray:
     """A lower triangular L with L L' = cov for a positive semidefinite covariance, zero variances allowed."""
-    eigenvalues, vectors = np.linalg.eigh(cov)
+    scaled, units = correlations(cov)
+    eigenvalues, vectors = np.linalg.eigh(scaled)
     root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
     lower = np.linalg.qr(root.T).R.T
     signs = np.where(np.diag(lower) < 0, -1.0, 1.0)
-    return lower * signs
+    return lower * signs * units[:, None]

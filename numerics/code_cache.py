@@ -1,5 +1,8 @@
 """Where machine code is kept: beside the sources, in the user's cache, or, where both refuse it, a private folder.
 
+Beside sources that pip installed nothing is kept: what pip does not know outlives an uninstallation, and a folder
+of machine code alone is, to Python, a package that hides the one of a checkout.
+
 numba itself gives up where it cannot write. Here what is there already is read, and what is new goes to a folder
 of the user's own among the temporary ones, or lasts as long as the process; one warning says so.
 """
@@ -17,7 +20,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 RULE = "machine code must be kept where it can be written: set NUMBA_CACHE_DIR to a folder of yours; "
+INSTALLED = {"site-packages", "dist-packages"}  # folders of what pip installs
 _changing_config = threading.Lock()
 
 
@@ -27,7 +33,9 @@ def keep_code(dispatcher):
 
     function = dispatcher.py_func
     try:
-        dispatcher._cache = Stores([], FunctionCache(function))
+        dispatcher._cache = Stores(
+            [], _elsewhere(function) if _is_installed(function) else FunctionCache(function)
+        )
     except RuntimeError:  # "no locator available"
         folder = _told_folder()
         dispatcher._cache = Stores(_readable(function), folder and _in_folder(function, folder))
@@ -79,6 +87,15 @@ class Stores:
 
 
 @cache
+def made_by() -> str:
+    """The versions and the processor for which machine code is made: others may compute other last digits."""
+    import numba
+    from numba.core.registry import cpu_target
+
+    return f"{numba.__version__} {np.__version__} {cpu_target.target_context.codegen().magic_tuple()}"
+
+
+@cache
 def _tell(where: str) -> None:
     warnings.warn(f"{RULE}{where}", stacklevel=2)
 
@@ -109,6 +126,31 @@ def private_folder() -> str | None:
         return None
 
 
+def _is_installed(function) -> bool:
+    """Whether a function's file is among those that pip has installed, and will one day remove."""
+    return not INSTALLED.isdisjoint(Path(function.__code__.co_filename).parts)
+
+
+def _elsewhere(function):
+    """The cache of a function where the user says, or in the user's folder; RuntimeError if neither takes it."""
+    return _cache_by(function, [one for one in _locators() if not one.__name__.startswith("InTree")])
+
+
+def _locators() -> list:
+    """Where numba looks for a place, in its order."""
+    from numba.core.caching import FunctionCache
+
+    return list(FunctionCache._impl_class._locator_classes)
+
+
+def _cache_by(function, locators: list):
+    """The cache of a function in the first place of some that will have it."""
+    from numba.core.caching import FunctionCache
+
+    implementation = type("Placed", (FunctionCache._impl_class,), {"_locator_classes": locators})
+    return type("PlacedCache", (FunctionCache,), {"_impl_class": implementation})(function)
+
+
 def _in_folder(function, folder: str):
     """The cache of a function below a folder."""
     import numba
@@ -127,14 +169,11 @@ def _in_folder(function, folder: str):
 
 def _readable(function) -> list:
     """All caches of a function that are there, whether or not they can be written."""
-    from numba.core.caching import FunctionCache
-
     found = []
-    for locator in FunctionCache._impl_class._locator_classes:
+    for locator in _locators():
         reading = type(locator.__name__, (locator,), {"ensure_cache_path": _must_be_there})
-        implementation = type("Reading", (FunctionCache._impl_class,), {"_locator_classes": [reading]})
         try:
-            found.append(type("ReadOnly", (FunctionCache,), {"_impl_class": implementation})(function))
+            found.append(_cache_by(function, [reading]))
         except (RuntimeError, OSError, ImportError):  # not in such a place
             continue
     return found

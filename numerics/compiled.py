@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from numerics.code_cache import keep_code
+from numerics.code_text import code_text
 from numerics.optimising import Which, optimise_once
 
 # No "nnan" and "ninf": with them isfinite and isnan are compiled away, and failures would pass unseen.
@@ -191,8 +192,9 @@ def _package_hash(package: str) -> str:
 def function_fingerprint(*functions: Callable | None, within: str) -> str:
     """Hash of what a compiled function inlines; numba's cache itself looks at the outermost function only.
 
-    It covers the byte code of `functions` and of all that they call by name, and the source files of their
-    packages, of this package, and of the package of the module `within` which the compiled function is written.
+    It covers the byte code of `functions` and of all that they call by name, the values that these read by name
+    (from other files, too), and the source files of their packages, of this package, and of the package of the
+    module `within` which the compiled function is written.
     """
     digest = hashlib.sha256()
     packages = {_package(__name__), _package(within)}
@@ -203,7 +205,7 @@ def function_fingerprint(*functions: Callable | None, within: str) -> str:
         if function in seen:
             continue
         seen.add(function)
-        digest.update(_code_text(function.__code__).encode())
+        digest.update(code_text(function).encode())
         waiting += _callees(function)
         package = _package(function.__module__ or "")
         if package in _packages:
@@ -220,11 +222,6 @@ def function_fingerprint(*functions: Callable | None, within: str) -> str:
 
 def _package(module: str) -> str:
     return module.partition(".")[0]
-
-
-def _code_text(code: types.CodeType) -> str:
-    constants = [_code_text(c) if isinstance(c, types.CodeType) else repr(c) for c in code.co_consts]
-    return " ".join([code.co_name, code.co_code.hex(), *constants, *code.co_names])
 
 
 class CompiledOrPython:
@@ -250,6 +247,11 @@ class CompiledOrPython:
     def in_python(self) -> bool:
         """Whether calls run as Python, as far as is known before the first."""
         return self._run is self._python
+
+    @property
+    def folder(self) -> str | None:
+        """Where its machine code is kept; None where none is."""
+        return getattr(getattr(self._run, "_cache", None), "cache_path", None)
 
     @property
     def direct(self) -> Callable:

@@ -12,10 +12,12 @@ from numerics.sources import is_array, matrix_of, tuple_of, written_out
 from numerics.tuples import scaled_sum
 
 
+@makes_functions
 def runge_kutta(rates: Callable, count: int) -> Callable:
     """Return `step(x, u, c)`, one classical fourth-order Runge-Kutta step of length c.substep [s].
 
-    `rates(x, u, c)` takes and returns tuples of `count` components; u is held over the step.
+    `rates(x, u, c)` takes and returns tuples of `count` components; u is held over the step. The same arguments
+    give the same function, so that a model made anew for each candidate needs no compilation.
     """
     add = scaled_sum(count)
 
@@ -31,6 +33,7 @@ def runge_kutta(rates: Callable, count: int) -> Callable:
     return step
 
 
+@makes_functions
 def euler(rates: Callable, count: int) -> Callable:
     """Return `step(x, u, c)`, one step of Euler's method, x + h rates(x, u, c), of length h = c.substep [s]."""
     add = scaled_sum(count)

@@ -5,7 +5,12 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from types import ModuleType
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.machinery import ModuleSpec, PathFinder
+from types import FrameType, ModuleType
+
+SAFE_PATH = "PYTHONSAFEPATH"  # which Python reads as its option -P
 
 
 def is_code(name) -> bool:
@@ -61,11 +66,82 @@ def said(error: BaseException) -> str:
 
 def _module(name: str) -> ModuleType:
     """A module, which may lie in the working folder, as the user's own do."""
+    with working_folder_last():
+        return importlib.import_module(name)
+
+
+@contextmanager
+def working_folder_last() -> Iterator[None]:
+    """Within this context modules are looked for in the working folder, too, where nobody else has them.
+
+    So what a user names is found, and what that imports beside it, now and when it is called; but a `struct.py`
+    beside the data takes the place of no module of Python's, of ours or of another package.
+    """
     folder = os.getcwd()
     if folder in sys.path or "" in sys.path:
-        return importlib.import_module(name)
-    sys.path.append(folder)
+        yield
+        return
+    _BESIDE.folders.add(folder)
+    if _BESIDE not in sys.meta_path:
+        sys.meta_path.append(_BESIDE)  # after all others
+    _BESIDE.open.append(folder)
     try:
-        return importlib.import_module(name)
+        yield
     finally:
-        sys.path.remove(folder)
+        _BESIDE.open.pop()
+
+
+class _Beside:
+    """Finds modules in a user's folder: within `working_folder_last`, and later for modules of the same folder."""
+
+    def __init__(self):
+        self.folders: set[str] = set()
+        self.open: list[str] = []
+
+    def find_spec(self, name: str, path=None, target=None) -> ModuleSpec | None:
+        """The module, if it may be asked for, and lies there."""
+        if path is not None:
+            return None
+        if self.open:
+            return PathFinder.find_spec(name, self.open[-1:])
+        frame: FrameType | None = sys._getframe(1)
+        while frame is not None and frame.f_globals.get("__name__", "").startswith("importlib."):
+            frame = frame.f_back
+        folder = None if frame is None else _folder_of(frame.f_globals.get("__name__", ""))
+        return PathFinder.find_spec(name, [folder]) if folder is not None and folder in self.folders else None
+
+
+_BESIDE = _Beside()
+
+
+def _folder_of(name: str) -> str | None:
+    """The folder in which a module lies, or the package of which it is a part."""
+    file = getattr(sys.modules.get(name.partition(".")[0]), "__file__", None)
+    if not file:
+        return None
+    folder, base = os.path.split(os.path.abspath(file))
+    return os.path.dirname(folder) if base.startswith("__init__.") else folder
+
+
+@contextmanager
+def safe_paths() -> Iterator[None]:
+    """Within this context processes that are started do not look for modules in the working folder first."""
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SAFE_PATH]
+        else:
+            os.environ[SAFE_PATH] = before
+
+
+def as_module(name: str) -> list[str]:
+    """The command that runs the main program of a module of ours, which no file in the working folder can replace.
+
+    Where our packages are not installed, the folder that holds them comes last on the path.
+    """
+    home = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    run = f"import runpy, sys; sys.path.append({home!r}); runpy.run_module({name!r}, run_name='__main__')"
+    return [sys.executable, "-P", "-c", run]

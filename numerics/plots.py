@@ -64,11 +64,14 @@ def thinned(x: np.ndarray, y: np.ndarray, keep: np.ufunc | None = None) -> tuple
     """
     if len(x) <= MOST_POINTS:
         return x, y
-    parts = np.array_split(np.arange(len(x)), MOST_POINTS // 2)
+    points = 3 if keep is None and np.isnan(y).any() else 2  # of a stretch: a gap is one more
+    parts = np.array_split(np.arange(len(x)), MOST_POINTS // points)
     if keep is not None:
         return np.array([x[part].mean() for part in parts]), np.array([keep.reduce(y[part]) for part in parts])
     low, high = np.where(np.isfinite(y), y, np.inf), np.where(np.isfinite(y), y, -np.inf)
-    places = np.unique([part[place] for part in parts for place in (low[part].argmin(), high[part].argmax())])
+    ends = [part[place] for part in parts for place in (low[part].argmin(), high[part].argmax())]
+    gaps = [part[np.isnan(y[part])][:1] for part in parts]
+    places = np.unique(np.concatenate([ends, *gaps])).astype(np.int64)
     return x[places], y[places]
 
 

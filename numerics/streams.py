@@ -8,16 +8,37 @@ numbers: as easy as 1, 2, 3"; normals by Box and Muller (1958).
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import Any
+
 import numpy as np
 
-from numerics.compiled import inlined
+from numerics.compiled import inlined, overloaded, when_compiling
 from numerics.trigonometry import cosine_and_sine_of_turns
 
 # Streams: what a draw is for. Two streams of one key are independent.
 PROCESS, MEASUREMENT, INITIAL, EXCITATION, FILTER_PROCESS, FILTER_MEASUREMENT, FILTER_PRIOR = range(1, 8)
 DISTURBANCE, CHANCE, REFERENCE_SIGNAL, PARAMETERS, FILTER_ROTATION, FILTER_KERNEL = range(8, 14)
+ADDED_NOISE = 14  # of a problem, to measurements whose own noise an env may have drawn from the same key
+
+# Spawn keys: what a generator of a seed is for. An env's own is that without one, `default_rng(seed)`, and so is
+# that of the list [seed, 0]. They go on where streams end, for the keys of filters have the number of theirs.
+RANDOM_ACTIONS, ACTION_SPACE, POLICY, GLOBAL_GENERATORS, HELD_GENERATORS = range(15, 20)
+START_POINTS, COMPARISON_STUDY, LOCAL_TRIALS = range(20, 23)
+SPAWN_KEYS = {
+    "filter": FILTER_PRIOR,
+    "random actions": RANDOM_ACTIONS,
+    "action space": ACTION_SPACE,
+    "policy": POLICY,
+    "global generators": GLOBAL_GENERATORS,
+    "held generators": HELD_GENERATORS,
+    "start points": START_POINTS,
+    "comparison study": COMPARISON_STUDY,
+    "local trials": LOCAL_TRIALS,
+}
 
 GROUP = 32  # normals that one pass of vector code makes: four from each of eight blocks
+AT_ONCE = 512  # blocks that Python draws in one pass
 
 _MULTIPLIER_0, _MULTIPLIER_1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
 _WEYL_0, _WEYL_1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
@@ -109,18 +130,46 @@ def normal_block(block, step, stream, key_0, key_1):
     return radius_0 * cosine_0, radius_0 * sine_0, radius_1 * cosine_1, radius_1 * sine_1
 
 
-@inlined
+@overloaded
 def fill_normals(out, count, step, stream, key_0, key_1):
     """Fill a vector with the normals of channels 0, 1, 2, ..., at least `count` of them.
 
-    It fills whole groups of GROUP, so that the compiled loop has no remainder; out must have room for them.
+    It fills whole groups of GROUP, so that the compiled loop has no remainder; out must have room for them. As
+    Python it draws those of several steps at once, which takes about as long as those of one.
     """
+    if out.dtype != np.float64:  # numbers that count what is done to them
+        return _fill_in_loop(out, count, step, stream, key_0, key_1)
+    blocks = (count + GROUP - 1) // GROUP * (GROUP // 4)
+    together = max(AT_ONCE // max(blocks, 1), 1)
+    rows = _normals_of_steps(blocks, step // together, together, stream, key_0, key_1)
+    out[: 4 * blocks] = rows[int(step % together)]
+
+
+@lru_cache(maxsize=32)
+def _normals_of_steps(blocks, begin, together, stream, key_0, key_1):
+    """Rows of normals, (together, 4 blocks), of the steps from begin * together on."""
+    steps = begin * together + np.arange(together)[:, None]
+    return np.stack(normal_block(np.arange(blocks), steps, stream, key_0, key_1), axis=-1).reshape(together, -1)
+
+
+def _fill_in_loop(out, count, step, stream, key_0, key_1):
     for block in range((count + GROUP - 1) // GROUP * (GROUP // 4)):
         z0, z1, z2, z3 = normal_block(block, step, stream, key_0, key_1)
         out[4 * block] = z0
         out[4 * block + 1] = z1
         out[4 * block + 2] = z2
         out[4 * block + 3] = z3
+
+
+@when_compiling
+def _teach_fill_normals():
+    from numba.extending import overload
+
+    options: Any = {"forceinline": True, "no_cfunc_wrapper": True}  # those of `inlined`
+
+    @overload(fill_normals, jit_options=options, strict=False)
+    def _of_arrays(out, count, step, stream, key_0, key_1):
+        return overloaded(_fill_in_loop)
 
 
 def draw_key(generator: np.random.Generator) -> np.ndarray:
@@ -140,9 +189,30 @@ def episode_keys(seeds) -> np.ndarray:
     return np.array([draw_key(np_random(int(seed))[0]) for seed in seeds])
 
 
+def derived_sequence(seed: int | None, purpose: int, *numbers: int) -> np.random.SeedSequence:
+    """The seed sequence of one purpose: independent of the env's own, and of that of every other purpose.
+
+    Args:
+        seed: of the env, the problem or the study.
+        purpose: one of SPAWN_KEYS.
+        *numbers: which of several it is, such as the number of a case.
+    """
+    return np.random.SeedSequence(seed, spawn_key=(purpose, *numbers))
+
+
+def derived_generator(seed: int | None, purpose: int, *numbers: int) -> np.random.Generator:
+    """A generator of one purpose; see `derived_sequence`."""
+    return np.random.default_rng(derived_sequence(seed, purpose, *numbers))
+
+
+def derived_seed(seed: int | None, purpose: int, *numbers: int) -> int:
+    """A whole number below 2^32 for what takes no generator; see `derived_sequence`."""
+    return int(derived_sequence(seed, purpose, *numbers).generate_state(1)[0])
+
+
 def filter_generator(seed: int | None) -> np.random.Generator:
     """Generator of the keys that a filter wrapper draws, one an episode, after `reset(seed=seed)`."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(FILTER_PRIOR,)))
+    return derived_generator(seed, FILTER_PRIOR)
 
 
 def filter_keys(seeds) -> np.ndarray:

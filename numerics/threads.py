@@ -34,6 +34,7 @@ from numerics.compiled import CompiledOrPython, function_fingerprint, inlined
 from numerics.wait_policy import ACTIVE, wait_policy
 
 CALLER = 0  # place of the thread that makes a call; helpers are 1, 2, ...
+_of_thread = threading.local()  # whether a thread of the pool is at work on a part
 BEHIND = 2  # calls that wait for a helper, with which it gets no more
 
 
@@ -46,16 +47,21 @@ def cores() -> int:
 def spread(part: Callable[[int, int], None], count: int) -> None:
     """Call part(first, last) on all cores until it has covered 0 ... count; part releases the lock.
 
-    After an exception, such as Ctrl-C, no further part begins.
+    After an exception, such as Ctrl-C, no further part begins. A part that calls `spread` itself does that work on
+    its own core, for the others may all be waiting for it.
 
     The caller makes a call of nothing first, part(0, 0). What part compiles or loads is then there. A worker that
     loads code imports modules, and would wait for ever for one in whose import its caller is.
     """
     part(0, 0)
+    if getattr(_of_thread, "is_working", False):
+        part(0, count)
+        return
     edges = np.linspace(0, count, 1 + min(count, 4 * cores())).astype(int).tolist()
     parts = iter(list(itertools.pairwise(edges)))  # of all threads: what one has taken no other gets
 
     def work() -> None:
+        _of_thread.is_working = True
         try:
             for first, last in parts:
                 part(first, last)

@@ -89,7 +89,7 @@ FAST_CURES = [
 
 
 def filters_motion() -> str:
-    """Filters of eight states, a row a scenario and filter."""
+    """Filters of eight states, a row per scenario and filter."""
     return by_scenario(MOTION, FILTERS)
 
 

@@ -20,7 +20,7 @@ from pages.page import digits, table
 
 
 class Words(NamedTuple):
-    """What no computation tells of a filter."""
+    """Properties of a filter that are not computed."""
 
     assumes: str  # beyond known Q and R
     belief: str
@@ -29,22 +29,28 @@ class Words(NamedTuple):
 
 
 WORDS = {
-    "kf": Words("affine f and h, or nearly so about an operating point", "mean, P", "1", "away from that point"),
+    "kf": Words("affine f and h, or nearly so around an operating point", "mean, P", "1", "away from that point"),
     "kf-steady": Words("the same, and gaps are rare", "mean; P is for reports", "1", "as `kf`; start-up"),
-    "ekf": Words("f and h bend little within P", "mean, P", "1", "where h bends within P: far too sure of itself"),
-    "iekf": Words("f bends little; one mode", "mean, P", "1", "two modes; full steps may overshoot"),
-    "ukf": Words("belief nearly Gaussian", "mean, P", "2", "strong bends: the gain is that of a wide average"),
+    "ekf": Words("f and h nearly linear within P", "mean, P", "1", "h nonlinear within P: badly overconfident"),
+    "iekf": Words("f nearly linear; one mode", "mean, P", "1", "two modes; full steps may overshoot"),
+    "ukf": Words(
+        "belief nearly Gaussian", "mean, P", "2", "strong nonlinearity: the gain is that of a wide average"
+    ),
     "ckf": Words("belief nearly Gaussian", "mean, P", "1", "as `ukf`"),
-    "enkf": Words("belief nearly Gaussian", "N members", "30", "small N: too sure; sampling noise"),
-    "etkf": Words("belief nearly Gaussian", "N members", "30", "small N: too sure"),
-    "ensrf": Words("belief nearly Gaussian", "N members", "20", "small N: too sure"),
+    "enkf": Words("belief nearly Gaussian", "N members", "30", "small N: overconfident; sampling noise"),
+    "etkf": Words("belief nearly Gaussian", "N members", "30", "small N: overconfident"),
+    "ensrf": Words("belief nearly Gaussian", "N members", "20", "small N: overconfident"),
     "denkf": Words("good models, poor measurements", "N members", "30", "accurate sensors: P too wide"),
-    "ienkf": Words("one mode", "N members", "30", "two modes; large N at strong bends"),
+    "ienkf": Words("one mode", "N members", "30", "two modes; large N at strong nonlinearity"),
     "pf": Words("none on shape", "N weighted particles", "400", "few particles: one takes all the weight"),
     "apf": Words("none on shape", "N weighted particles", "600", "as `pf`, later"),
-    "gsf": Words("one component of the state makes h bend", "mean, P between updates", "20", "bends in others"),
+    "gsf": Words(
+        "h nonlinear in one component of the state", "mean, P between updates", "20", "nonlinearity in others"
+    ),
     "fuzzy": Words("the state stays within a narrow range", "mean, P of 2^n rules", "3", "a wide range"),
-    "sage-husa": Words("R (and Q) unknown, steady", "mean, P, R, Q", "3", "where `ekf` fails: learns the bend"),
+    "sage-husa": Words(
+        "R (and Q) unknown, steady", "mean, P, R, Q", "3", "where `ekf` fails: takes nonlinearity for noise"
+    ),
     "vb": Words("R unknown, steady", "mean, P, distribution of R", "5", "R that changes faster than it forgets"),
     "ekf-robust": Words("heavy-tailed v", "mean, P, last weight", "5", "a noisy sensor looks like many outliers"),
     "open-loop": Words("a perfect model", "a point", "2", "any disturbance or wrong parameter"),
@@ -62,7 +68,7 @@ class Situation(NamedTuple):
 
 
 def kinds() -> str:
-    """All filters: what they assume and believe, what a step asks for, and when they fail."""
+    """All filters: assumptions, belief, calls of the model in a step, and when they fail."""
     header = ["name", "class", "assumes", "belief", "P", "likelihood", "f, h a step", "time", "fails"]
     rows = []
     for name, kind in FILTERS.items():
@@ -104,7 +110,7 @@ def calls(name: str) -> str:
 
 
 def advice() -> str:
-    """The decision list in numbers."""
+    """The decision list as measured."""
     rows = []
     for situation in situations():
         runs = situation.runs()
@@ -147,7 +153,7 @@ def situations() -> list[Situation]:
             named(published, "ekf", "iekf", "ukf", "ckf", "enkf", "ienkf", "pf", "gsf", "vb", "sage-husa"),
         ),
         Situation(
-            "the magnitude of the speed alone is measured, within 0.3 V of 0",
+            "only the magnitude of the speed is measured, within 0.3 V of 0",
             partial(signless_runs, 40),
             named(signless, "ekf", "ukf", "enkf")
             | {"`gsf`, component 0": make_filter("gsf", signless, component=0)}
@@ -159,7 +165,7 @@ def situations() -> list[Situation]:
             named(quiet, "ekf", "vb", "sage-husa", "ekf-robust"),
         ),
         Situation(
-            "R is 16 times what the filter believes",
+            "R is 16 times the assumed one",
             partial(held_runs, measurement_noise_cov=LOUD**2),
             named(quiet, "ekf", "ekf-robust", "sage-husa", "vb") | {"`ekf`, right R": make_filter("ekf", loud)},
         ),
@@ -170,12 +176,12 @@ def situations() -> list[Situation]:
             | {f"`{name}`, flow a state": make_filter(name, flow) for name in ("ekf", "enkf", "pf")},
         ),
         Situation(
-            "voltage gain believed 5 % low",
+            "voltage gain assumed 5 % low",
             held_runs,
             named(wrong, "ekf") | {"`ekf`, gain a state": make_filter("ekf", augmented_model(wrong, gain))},
         ),
         Situation(
-            "and lift believed 15 % high",
+            "and lift assumed 15 % high",
             held_runs,
             named(wrong_twice, "ekf")
             | {"`ekf`, gain a state": make_filter("ekf", augmented_model(wrong_twice, gain))},

@@ -93,7 +93,7 @@ class _Made(NamedTuple):
 
 
 def _learning(scenario: Scenario) -> Filter:
-    return tuned_augmented(scenario, UNKNOWNS["lift and K2"], _tuned("ekf", scenario.name), 2 * TRIALS)
+    return tuned_augmented(scenario, UNKNOWNS["lift and K2"], [_tuned("ekf", scenario.name)], 2 * TRIALS)
 
 
 # What a filter does that is told the plant's parameters, or that two of them are uncertain.

@@ -82,7 +82,7 @@ def startup() -> str:
 
 
 def scores() -> str:
-    """Scores over that of the EKF, a row a scenario."""
+    """Scores over that of the EKF, a row per scenario."""
     filters = [EKF, ROBUST, IEKF, UKF, ENKF, GSF, PF]
     boards = [leaderboard(scenario, filters) for scenario in SCENARIOS.values()]
     labels = [one.label for one in filters[1:]]
@@ -114,7 +114,7 @@ def leaderboard(scenario: Scenario, filters: Sequence[Contender], seeds: int = S
 
 
 def table_of(board: Leaderboard) -> str:
-    """RMSE by state with its distance from the bound, the paired ratio, and consistency, a row a filter."""
+    """RMSE by state with its distance from the bound, the paired ratio, and consistency, a row per filter."""
     lines = [f"| filter | {' | '.join(COLUMNS).format(board.rows[0].label)} |", "|---" * 8 + "|"]
     for row in board.rows:
         cells = [row.label]

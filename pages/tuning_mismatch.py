@@ -24,6 +24,7 @@ from tuning.evaluation.baselines import scaled_default
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.search.objectives import nis_violation, penalised
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
+from tuning.search.samplers import make_sampler
 from tuning.search.space import Choice, distributions, suggest, trial_parameters
 from tuning.search.study import open_study, quiet_optuna, run_study
 from tuning.thruster.find import find_scenario
@@ -88,13 +89,14 @@ def augmented(choice: Choice, scenario: Scenario, beliefs: Mapping[str, tuple[fl
     return make_filter("ekf", augmented_model(model, unknown))
 
 
-def tuned_augmented(scenario: Scenario, names: Sequence[str], start: Choice, trials: int) -> Filter:
+def tuned_augmented(scenario: Scenario, names: Sequence[str], starts: Sequence[Choice], trials: int) -> Filter:
     """An EKF with constants as states: a study of Q, R, and of the prior and the walk of each constant.
 
-    Its first trial has the Q and R of `start`. The value is the score, with a penalty where the mean NIS is
+    Its first trials have the Q and R of `starts`. The value is the score, with a penalty where the mean NIS is
     outside its band.
     """
-    data = Plan("ekf", (scenario,), SEED).training_data()[0]
+    plan = Plan("ekf", (scenario,), SEED)
+    data = plan.training_data()[0]
     space = distributions("ekf", scenario)
 
     def made(trial) -> Filter:
@@ -111,10 +113,11 @@ def tuned_augmented(scenario: Scenario, names: Sequence[str], start: Choice, tri
         found = evaluate(made(trial), data, scenario.scale)
         return penalised(found.score.value, found) + OUTSIDE * max(0.0, nis_violation(found))
 
-    study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=SEED, multivariate=True))
+    study = optuna.create_study(sampler=make_sampler("tpe", SEED, 0, {}, first=plan.first_ranges()))
     first = dict(zip(("prior", "walk"), START, strict=True))
     beliefs = {f"{name} {part}": number for name in names for part, number in first.items()}
-    study.enqueue_trial({**trial_parameters(start, space), **beliefs})
+    for start in starts:
+        study.enqueue_trial({**trial_parameters(start, space), **beliefs})
     study.optimize(value, n_trials=trials)
     return made(optuna.trial.FixedTrial(study.best_params))
 
@@ -135,9 +138,9 @@ def bought(trials: int = TRIALS, rows: Sequence[str] | None = None, seeds: int =
     made: dict[str, Callable[[], Filter]] = {
         name: lambda plan=plan: _studied(plan, trials).filter(scenario) for name, plan in plans().items()
     }
-    start = _studied(plans()["`ekf`, Q and R"], trials)
+    starts = _studied(plans()["`ekf`, Q and R"], trials), default
     made |= {
-        f"`ekf` + {name}": lambda names=names: tuned_augmented(scenario, names, start, 2 * trials)
+        f"`ekf` + {name}": lambda names=names: tuned_augmented(scenario, names, starts, 2 * trials)
         for name, names in UNKNOWNS.items()
     }
     made[RIGHT] = lambda: scaled_default("ekf", known, SEED).choice.filter(known)

@@ -78,7 +78,7 @@ def over_studies(ratios: Sequence[float]) -> Interval:
 
 
 def pruning() -> str:
-    """With pruning over without, a row a filter and scenario."""
+    """With pruning over without, a row per filter and scenario."""
     quiet_optuna()
     rows = []
     for name, kind in CASES:

@@ -16,7 +16,7 @@ def takes_arguments_of(
     """Return a decorator: a function of (self, **arguments) takes those of other functions, names and defaults.
 
     It is called with all of them, and has the signature that `inspect.signature` and `help` then show. A method's
-    first argument may be given by position, the others by name; arguments of its own by name come last.
+    first argument may be given by position, the others by name; its own named arguments come last.
 
     Args:
         definitions: where the arguments stand; none may stand in two.

@@ -18,7 +18,7 @@ class Channel(NamedTuple):
     depend on u has slopes: the state alone predicts it, so that a state-space model may contain it.
 
     Attributes:
-        quantity: what is measured, with its unit.
+        quantity: the measured quantity, with its unit.
         variance: default variance of the channel's Gaussian noise [unit^2].
         code: unique integer that identifies the channel in compiled code; it never changes, so that the order in
             which channels are listed has no meaning.
@@ -40,9 +40,9 @@ def reader_of(channels: Sequence[Channel], of_copy: Callable[[Callable], Callabl
     """Return `read(code, *arguments)`, which reads the channel of a code for one copy of a plant.
 
     Args:
-        channels: what compiled code has to know.
+        channels: data for compiled code.
         of_copy: `of_copy(read)` makes a function of the arguments that finds what a channel's `read` takes of a
-            copy, and reads it; so compiled code finds nothing that the channel at hand does not need.
+            copy, and reads it; so compiled code finds nothing that this channel does not need.
         arguments: their names, "memory, b, j".
 
     Raises:
@@ -66,7 +66,7 @@ def functions_of(
     """`observe(x, c)` of a model that has these channels, and its Jacobian by rows.
 
     Args:
-        channels: what is measured, in order; each with slopes.
+        channels: the measured channels, in order; each with slopes.
         outputs: `outputs(x, c)`, the plant's outputs y.
         outputs_jacobian: `outputs_jacobian(x, c)`, their derivatives by rows.
         states: number of components of x.

@@ -56,7 +56,7 @@ class PlantCopies:
         raise NotImplementedError
 
     def prepare(self, memory: np.ndarray, keys: np.ndarray) -> None:
-        """Write what else episodes with keys (count, 2) begin with, such as parameters that are drawn."""
+        """Write further initial values of episodes with keys (count, 2), such as random parameters."""
 
     def _find_machine_code(self) -> None:
         self.advance, self._advance_in_parts = self.machine_code()

@@ -31,7 +31,7 @@ class PlantEnv(RenderedEnv):
     lines, see `plants.vector_env`.
 
     Attributes:
-        inputs: what the p entries of an action are.
+        inputs: the quantities of the p entries of an action.
         plant: the plant; it has `dt`, its sample time [s].
         task: what the env rewards and how episodes end, if that is a value.
     """
@@ -87,7 +87,7 @@ class PlantEnv(RenderedEnv):
         self._views, self._info = views_of(self._report, self._rows), info_maker(self._rows)
 
     def __getstate__(self) -> dict:
-        """The state without its views, for copies and pickles, which go on with the same numbers."""
+        """The state without its views, for copies and pickles, which continue with the same numbers."""
         return {key: value for key, value in vars(self).items() if key not in VIEWS}
 
     def __setstate__(self, state: dict) -> None:
@@ -101,7 +101,7 @@ class PlantEnv(RenderedEnv):
 
     @property
     def report_rows(self) -> ReportRows:
-        """What a report holds, and which of it makes observation and info."""
+        """The contents of a report, and its rows for observation and info."""
         return self._rows
 
     @property

@@ -27,7 +27,7 @@ def row(memory: np.ndarray, index: int, copies: int) -> np.ndarray:
 
 
 def set_row(memory: np.ndarray, index: int, values: np.ndarray) -> None:
-    """Write one value a copy, (copies,), into a row."""
+    """Write one value per copy, (copies,), into a row."""
     blocks, _, width = memory.shape
     full = len(values) // width
     memory[:full, index] = values[: full * width].reshape(full, width)
@@ -36,7 +36,7 @@ def set_row(memory: np.ndarray, index: int, values: np.ndarray) -> None:
 
 
 def gathered(memory: np.ndarray, which: np.ndarray) -> np.ndarray:
-    """Memory of some copies, named by their numbers (count,), in blocks of their own."""
+    """Memory of some copies, given by their numbers (count,), in separate blocks."""
     part = np.zeros((-(-len(which) // min(len(which), WIDTH)), memory.shape[1], min(len(which), WIDTH)))
     block, column = np.divmod(which, memory.shape[2])
     own_block, own_column = np.divmod(np.arange(len(which)), part.shape[2])

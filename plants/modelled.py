@@ -47,7 +47,7 @@ class ModelledEnv:
     def check_tuned_for(self, tuned_for: Mapping | None, file: str) -> None:
         """Raise ValueError if a tuned file is for another plant than the env's; warn where it is for other noise.
 
-        A file that does not tell (None) is not compared.
+        A file without this entry (None) is not compared.
         """
         if tuned_for is not None:
             others = self.tuned_differences(tuned_for, file)

@@ -24,7 +24,7 @@ def noise_adder(size: int, first: int, root: int, stream: int) -> Callable:
         size: number of rows.
         first: the first of them.
         root: where the lower triangular L (size, size) lies in numbers, by rows.
-        stream: what the noise is for, of `numerics.streams`.
+        stream: the purpose of the noise, from `numerics.streams`.
     """
     of_copy = "memory[b, KEY_0, j], memory[b, KEY_1, j]"
     lines = ["for j in range(memory.shape[2]):"]

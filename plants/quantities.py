@@ -6,7 +6,10 @@ import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from numerics.characters import verbatim
 from numerics.checks import shown
+
+LONG = 60  # characters of a name that an axis has room for
 
 
 class Quantity(NamedTuple):
@@ -27,25 +30,25 @@ class Quantity(NamedTuple):
 
     @property
     def label(self) -> str:
-        """Name and unit, as tables have it."""
+        """Name and unit, for tables."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
     @property
     def short_label(self) -> str:
-        """Symbol and unit, as columns of tables and of files have it."""
+        """Symbol and unit, for columns of tables and of files."""
         return f"{self.symbol} [{self.unit}]" if self.unit else self.symbol
 
     @property
     def text_symbol(self) -> str:
-        """The symbol with Greek letters as such, as pages have it: omega_m is "ω_m"."""
+        """The symbol with Greek letters, for pages: omega_m is "ω_m"."""
         letter, underscore, index = self.symbol.partition("_")
         return (_greek(letter) or letter) + underscore + index
 
     @property
     def plot_label(self) -> str:
-        """Name, symbol and unit, as axes of figures have it."""
+        """Name, symbol and unit, for axes of figures."""
         symbol = "" if self.symbol == self.name else f" ${_mathtext(self.symbol)}$"
-        return f"{self.name}{symbol}" + (f" [{self.unit}]" if self.unit else "")
+        return f"{verbatim(self.name, most=LONG)}{symbol}" + (f" [{verbatim(self.unit)}]" if self.unit else "")
 
 
 class Output(NamedTuple):
@@ -66,27 +69,37 @@ class Quantities(NamedTuple):
     measurements: tuple[Quantity, ...]
 
 
-def quantities(kind: str, given: Any, count: int, letter: str) -> tuple[Quantity, ...]:
+def count_of(given: Any) -> int:
+    """The number of components for some quantities or names; one by default."""
+    return len(given) if _are_several(given) else 1
+
+
+def quantities(kind: str, given: Any, count: int, letter: str, counted: str) -> tuple[Quantity, ...]:
     """Make quantities from `Quantity` values, tuples of their fields, or names; letter_1, letter_2, ... if None.
 
     Args:
-        kind: what they are, for messages: "states".
+        kind: their kind, for messages: "states".
         given: a sequence with `count` entries, or None.
         count: number of components.
         letter: default symbol of components without names.
+        counted: the argument that says how many there are, for messages: "prior_mean".
 
     Raises:
         ValueError: if there are not `count` of them, symbols are equal, or a name, symbol, unit or angle is wrong.
     """
     if given is None:
         return tuple(Quantity(f"{letter}_{i}", f"{letter}_{i}") for i in range(1, count + 1))
-    if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != count:
-        raise ValueError(f"{kind} must be {count} quantities or names, but got {shown(given)}")
+    if not _are_several(given) or len(given) != count:
+        raise ValueError(f"{kind} must be {count} quantities or names, as {counted} says, but got {shown(given)}")
     found = tuple(_quantity(kind, one) for one in given)
     symbols = [one.symbol for one in found]
     if len(set(symbols)) < count:
         raise ValueError(f"symbols of {kind} must differ from one another, but got {', '.join(symbols)}")
     return found
+
+
+def _are_several(given: Any) -> bool:
+    return isinstance(given, Sequence) and not isinstance(given, str)
 
 
 def _quantity(kind: str, given) -> Quantity:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from numerics.checks import as_floats
 from plants.copies import PlantCopies
 
 
@@ -18,20 +19,20 @@ def record(
         copies_of: `copies_of(count)` makes that many copies.
         keys: of their episodes, (B, 2).
         inputs: (B, K, p), or (B, K) where p is 1.
-        name: what the inputs are called, for messages.
+        name: the name of the inputs, for messages.
         count: their number p.
 
     Raises:
         ValueError: if shapes do not fit or a number is not finite.
     """
-    keys, inputs = (np.ascontiguousarray(a, dtype=np.float64) for a in (keys, inputs))
+    keys, inputs = (np.ascontiguousarray(as_floats(a)) for a in (keys, inputs))
     if keys.ndim != 2 or keys.shape[1] != 2 or not np.isfinite(keys).all():
         raise ValueError(f"keys must be finite and of shape (B, 2), but got shape {keys.shape}")
     rest = () if count == 1 else (count,)
     fits = inputs.ndim == 2 + len(rest) and len(inputs) == len(keys) and inputs.shape[2:] == rest
     if not fits or np.isnan(inputs).any():
         shape = f"({len(keys)}, K{''.join(f', {size}' for size in rest)})"
-        rule = f"{name} must be without NaN and of shape {shape}, one row a key"
+        rule = f"{name} must be without NaN and of shape {shape}, one row per key"
         raise ValueError(f"{rule}, but got shape {inputs.shape}")
     copies = copies_of(len(keys))
     reports = np.empty((inputs.shape[1] + 1, copies.reported, len(keys)))
@@ -47,5 +48,5 @@ def check_finite(what: str, *parts: np.ndarray) -> None:
     if not finite.all():
         raise ValueError(
             f"{what} must stay finite, but it is not from step {np.argmin(finite)} of {len(finite) - 1} on: "
-            "mind dt and the noise covariances"
+            "check dt and the noise covariances"
         )

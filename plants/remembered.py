@@ -6,7 +6,7 @@ import numpy as np
 
 
 def remembered(state, episode_start, at_start: np.ndarray) -> np.ndarray:
-    """The state (..., k) of the last call; where an episode starts, what it is at the start."""
+    """The state (..., k) of the last call, or its initial value where an episode starts."""
     if state is None:
         return at_start
     if episode_start is None:

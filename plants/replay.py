@@ -25,7 +25,7 @@ ANY_DT = 0.01  # [s], of a model that is asked for its quantities before the sam
 
 
 class ReplayEnv(gym.Env):
-    """A log as an env: step k returns the measurement of row k, whatever the action; an episode is the whole log.
+    """A log as an env: step k returns the measurement of row k for any action; an episode is the whole log.
 
     The inputs come from the log, too: `info["recorded_input"]` (p,) is the input of the step, and filter wrappers
     predict with it instead of the action. Where a measurement is missing, the observation repeats the last value
@@ -34,7 +34,7 @@ class ReplayEnv(gym.Env):
 
     Args:
         log: a `Log`, or the path of a file that `plants.logs.read.read_log` reads.
-        model: what the log's columns are, and what `state_space_model` offers to filters: a `StateSpaceModel`; a
+        model: defines the log's columns and is the `state_space_model` offered to filters: a `StateSpaceModel`; a
             function that makes one, of the log's sample time where it takes `dt`; an object that offers
             `state_space_model`, such as an env; or "module:object" for any of these.
         columns: headers by quantity, as `read_log` takes them.
@@ -126,7 +126,7 @@ def _maker(offer: Any, dt: float) -> Callable[..., StateSpaceModel]:
             takes_dt = False
         return partial(offer, dt=dt) if takes_dt else offer
     raise ValueError(
-        f"the model of a log must be a StateSpaceModel, a function that makes one, or what offers "
+        "the model of a log must be a StateSpaceModel, a function that makes one, or an object with "
         f"state_space_model, but got {shown(offer)}"
     )
 

@@ -1,4 +1,4 @@
-"""What an env shows of a step's report: which of its rows make the observation and the info."""
+"""The parts of a step's report that an env shows: its rows for the observation and the info."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def views_of(report: np.ndarray, rows: ReportRows) -> tuple[np.ndarray, ...]:
 
 
 def info_maker(rows: ReportRows) -> Callable[[np.ndarray, tuple[np.ndarray, ...]], dict]:
-    """Return `info(report, views)`: the info of one copy, in arrays of its own.
+    """Return `info(report, views)`: the info of one copy, in separate arrays.
 
     It is generated for the plant's entries, because a step has to be quick. Numbers are NumPy scalars, as clients
     ask every value for its dtype.
@@ -86,7 +86,7 @@ def _info_maker(places: tuple[tuple[str, int | None], ...], drops: bool) -> Call
 
 
 def infos_of(report: np.ndarray, rows: ReportRows, mask: np.ndarray) -> dict[str, np.ndarray]:
-    """The same of N copies: arrays with one row a copy, and the mask (N,) as `_key` for each key."""
+    """The same of N copies: arrays with one row per copy, and the mask (N,) as `_key` for each key."""
     info = {name: report[place].T for name, place in rows.info.items()}
     if rows.dropping:
         info["measurement_valid"] = report[rows.valid].T > 0.0

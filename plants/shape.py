@@ -13,7 +13,7 @@ MOST_CONSTANTS = 96  # in a tuple that compiled functions pass on
 
 
 class Shape(NamedTuple):
-    """Sizes of a model, and what else must be known when its code is compiled."""
+    """Sizes of a model, and other data needed to compile its code."""
 
     n: int  # states
     m: int  # measurements
@@ -43,7 +43,7 @@ def innovation_of(shape: Shape, first: int = 0) -> Callable:
 
 
 def constants_form(constants: tuple) -> type | int:
-    """What a `Shape` tells of a model's constants."""
+    """The description of a model's constants in a `Shape`."""
     return type(constants) if hasattr(constants, "_fields") else len(constants)
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from numerics.checks import as_floats
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from numerics.streams import GROUP, INITIAL, MEASUREMENT, PROCESS, fill_normals
 from numerics.tuples import vector_reader, vector_writer
@@ -36,6 +37,19 @@ def add_correlated(out, numbers, root, count, draws):
 
 
 @cache
+def noise_step(n: int, m: int):
+    """Function disturb(x, draws, step, key, numbers), which adds a step's process noise to an array x (n,)."""
+    q_root = number_places(n, m).q_root
+
+    @inlined
+    def disturb(x, draws, step, key_0, key_1, numbers):
+        fill_normals(draws, n, step, PROCESS, key_0, key_1)
+        add_correlated(x, numbers, q_root, n, draws)
+
+    return disturb
+
+
+@cache
 def truth_steps(functions: Functions, shape: Shape):
     """Functions begin(x, draws, key, numbers), advance(x, u, draws, step, key, numbers), measure(z, x, ...).
 
@@ -44,7 +58,7 @@ def truth_steps(functions: Functions, shape: Shape):
     n, m, transition, observe = shape.n, shape.m, functions.transition, functions.observe
     source = number_places(n, m)
     prior_mean, prior_root, substeps = source.prior_mean, source.prior_root, source.substeps
-    q_root, r_root = source.q_root, source.r_root
+    r_root, disturb = source.r_root, noise_step(n, m)
     state, store_state, store_measurement = vector_reader(n), vector_writer(n), vector_writer(m)
     control, constants = vector_reader(shape.inputs), constants_reader(shape)
 
@@ -60,8 +74,7 @@ def truth_steps(functions: Functions, shape: Shape):
         v, c = control(u), constants(numbers)
         for _ in range(int(numbers[substeps])):
             store_state(x, transition(state(x), v, c))
-        fill_normals(draws, n, step, PROCESS, key_0, key_1)
-        add_correlated(x, numbers, q_root, n, draws)
+        disturb(x, draws, step, key_0, key_1, numbers)
 
     @inlined
     def measure(z, x, draws, step, key_0, key_1, numbers):
@@ -121,8 +134,7 @@ def simulate(model: StateSpaceModel, keys: np.ndarray, inputs: np.ndarray) -> Tr
     Raises:
         ValueError: if shapes do not fit.
     """
-    inputs = np.ascontiguousarray(inputs, dtype=np.float64)
-    keys = np.ascontiguousarray(keys, dtype=np.float64)
+    inputs, keys = (np.ascontiguousarray(as_floats(a)) for a in (inputs, keys))
     if inputs.ndim != 3 or inputs.shape[2] != model.inputs or keys.shape != (len(inputs), 2):
         raise ValueError(
             f"keys and inputs must have shapes (B, 2) and (B, K, {model.inputs}), "

@@ -18,7 +18,7 @@ from numerics.results import array_valued
 from numerics.sources import is_array
 from plants.model_check import check_functions, checked_constants
 from plants.model_digest import digest_of
-from plants.quantities import Quantities, outputs, quantities
+from plants.quantities import Quantities, count_of, outputs, quantities
 from plants.shape import Functions, Shape, constants_are_array, constants_form
 
 NOISE = {"process_noise_cov", "measurement_noise_cov", "prior_cov"}  # fields that no function depends on
@@ -52,7 +52,7 @@ class StateSpaceModel:
         measurement_noise_cov: R, (m, m) or m variances, of each measurement; positive definite.
         prior_mean: mean of the initial state, (n,).
         prior_cov: covariance of the initial state, (n, n) or n variances; zero allowed.
-        inputs: number p of inputs.
+        inputs: number p of inputs; as many as `input_quantities` if None, or one.
         constants: a NamedTuple (or tuple) of floats that is passed to every function.
         transition_jacobian: df/dx(x, u, c) of one application; central differences if None.
         observe_jacobian: dh/dx(x, c); central differences if None.
@@ -81,7 +81,7 @@ class StateSpaceModel:
     measurement_noise_cov: Any
     prior_mean: Any
     prior_cov: Any
-    inputs: int = 1
+    inputs: Any = None
     constants: tuple = ()
     transition_jacobian: Callable | None = None
     observe_jacobian: Callable | None = None
@@ -108,7 +108,9 @@ class StateSpaceModel:
             "process_noise_cov": covariance("process_noise_cov", self.process_noise_cov, n),
             "measurement_noise_cov": covariance("measurement_noise_cov", r, m, positive_definite=True),
             "substeps": at_least("substeps", self.substeps, 1, 10_000),
-            "inputs": at_least("inputs", self.inputs, 0),
+            "inputs": at_least(
+                "inputs", count_of(self.input_quantities) if self.inputs is None else self.inputs, 0
+            ),
             "constants": checked_constants(self.constants),
         }
         sizes = {"operating_state": n, "operating_input": checked["inputs"], "state_low": n, "state_high": n}
@@ -118,20 +120,21 @@ class StateSpaceModel:
         if self.analytic:
             checked["transition_jacobian"] = self._exact("transition", n, n, "u, c")
             checked["observe_jacobian"] = self._exact("observe", len(checked["measurement_noise_cov"]), n, "c")
-        checked["states"] = quantities("states", self.states, n, "x")
-        checked["input_quantities"] = quantities("input_quantities", self.input_quantities, checked["inputs"], "u")
-        checked["measurements"] = quantities("measurements", self.measurements, m, "z")
+        checked["states"] = quantities("states", self.states, n, "x", "prior_mean")
+        inputs = quantities("input_quantities", self.input_quantities, checked["inputs"], "u", "inputs, or b,")
+        checked["input_quantities"] = inputs
+        checked["measurements"] = quantities("measurements", self.measurements, m, "z", "measurement_noise_cov")
         checked["outputs"] = outputs(self.outputs)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         check_functions(self)
 
     def __getstate__(self) -> dict:
-        """The fields, with how to make functions that this package wrote out in place of these."""
-        return {name: as_made(value) for name, value in vars(self).items()}
+        """The fields, with recipes in place of functions that this package generated."""
+        return {name: as_made(value) for name, value in vars(self).items() if name != "_packed"}
 
     def __setstate__(self, state: dict) -> None:
-        """The fields, functions made anew."""
+        """The fields, with functions generated again."""
         vars(self).update({name: as_function(value) for name, value in state.items()})
 
     def _exact(self, name: str, rows: int, columns: int, arguments: str) -> Callable:
@@ -153,13 +156,13 @@ class StateSpaceModel:
 
     @property
     def shape(self) -> Shape:
-        """Sizes of the model, and what else compiled code is made for."""
+        """Sizes of the model, and other data needed to compile its code."""
         angles = (tuple(one.angle for one in part) for part in (self.states, self.measurements))
         return Shape(self.n, self.m, self.inputs, constants_form(self.constants), *angles)
 
     @property
     def functions(self) -> Functions:
-        """The model's functions, ready for compiled code: large results are arrays, whatever they return."""
+        """The model's functions, ready for compiled code: large results are always arrays."""
         n, m, slopes = self.n, self.m, (self.transition_jacobian, self.observe_jacobian)
         f = array_valued(inlined(self.transition), "x, u, c", n)
         h = array_valued(inlined(self.observe), "x, c", m)
@@ -220,6 +223,19 @@ class StateSpaceModel:
     @property
     def numbers(self) -> np.ndarray:
         """Constants, noise, prior and substeps as one float64 row, the form that compiled functions take."""
+        packed, source = vars(self).get("_packed"), self.numbers_from
+        if packed is None or packed[0] != source:  # roots of covariances take long
+            packed = source, self._pack()
+            object.__setattr__(self, "_packed", packed)
+        return packed[1].copy()
+
+    @property
+    def numbers_from(self) -> tuple:
+        """What `numbers` follow from, as a value that can be compared: arrays may have been written to."""
+        q, r, mean, cov = self.process_noise_cov, self.measurement_noise_cov, self.prior_mean, self.prior_cov
+        return q.tobytes(), r.tobytes(), mean.tobytes(), cov.tobytes(), self.substeps, self.constants
+
+    def _pack(self) -> np.ndarray:
         matrices = (
             self.process_noise_cov,
             covariance_root(self.process_noise_cov),

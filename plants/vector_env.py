@@ -25,7 +25,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
     """N copies of an env in one compiled step: copy i after `reset(seed=s)` equals a single env with seed s + i.
 
     Its j-th later episode equals that env's j-th unseeded reset, in all three autoreset modes. Random parameters
-    of an episode are drawn for each copy. Info holds arrays with one row a copy, and a mask `_key` for each key,
+    of an episode are drawn for each copy. Info holds arrays with one row per copy, and a mask `_key` for each key,
     as Gymnasium's own vector envs do. Actions of copies that are about to be reset are ignored.
 
     Args:
@@ -73,7 +73,7 @@ class PlantVectorEnv(gym.vector.VectorEnv):
 
     @property
     def report_rows(self) -> ReportRows:
-        """What a report holds, and which of it makes observation and info."""
+        """The contents of a report, and its rows for observation and info."""
         return self._rows
 
     @property

@@ -54,11 +54,11 @@ class Row(NamedTuple):
     def why(self) -> str:
         """The column "why different"."""
         if abs(self.ratio - 1.0) <= CLOSE:
-            return f"the same to {100 * CLOSE:.0f} %"
+            return f"agrees within {100 * CLOSE:.0f} %"
         if self.known:
             return self.known
         if abs(self.run_median / self.theirs - 1.0) <= CLOSE:
-            return f"the median run is the same to {100 * CLOSE:.0f} %, few lose the truth for a time"
+            return f"the median run agrees within {100 * CLOSE:.0f} %; few runs lose the truth for a time"
         scatters = abs(self.ours.value - self.theirs) < 2.0 * self.run_std
         return "within the scatter of a single run" if scatters else "no reason known to us"
 
@@ -146,7 +146,7 @@ def against_published(
         for one in published:
             filter_ = make_filter(one.filter, model(**one.model), **one.numbers)
             estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
-            errors = state_errors(filter_, estimates, data)[:, data.scored]
+            errors = state_errors(filter_, estimates, data)[:, data.late]
             pooled, lost = np.sqrt(np.square(errors).mean()), estimates.divergences.sum()
             scores = mean_of_roots(errors)
             runs = float(np.median(scores)), float(scores.std(ddof=1))

@@ -24,6 +24,7 @@ from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.filter import Filter
 from numerics.checks import at_least, one_of, positive
 from numerics.linear_systems import zero_order_hold
+from numerics.streams import COMPARISON_STUDY, derived_generator
 from plants.affine import AffineModel
 from plants.simulate import Truth, simulate
 from studies.published import NOISE_LEVELS, STEPS, SYSTEMS, H
@@ -126,7 +127,7 @@ def compare(case: str, q: float, *, runs: int = RUNS, members: int = MEMBERS, se
 
 def keys_of(case: str, q: float, runs: int, seed: int) -> tuple[np.ndarray, np.random.Generator]:
     """The keys (runs, 2) of the runs of one case at one noise level, and the generator of all other draws."""
-    generator = np.random.default_rng([seed, tuple(SYSTEMS).index(case), round(1000 * q)])
+    generator = derived_generator(seed, COMPARISON_STUDY, tuple(SYSTEMS).index(case), round(1000 * q))
     return generator.integers(0, 2**32, size=(runs, 2)).astype(np.float64), generator
 
 

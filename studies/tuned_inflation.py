@@ -38,5 +38,5 @@ def tune_inflation(filter_name: str, problem: ModelProblem, trials: int, runs: i
     choice = run_study(study, plan, trials).choice
     data, filter_ = problem.data(held_out_seeds(seed, runs)), choice.filter(problem)
     estimates = run(filter_, data.filter_keys, data.inputs, data.measurements)
-    errors = state_errors(filter_, estimates, data)[:, data.scored]
+    errors = state_errors(filter_, estimates, data)[:, data.late]
     return Tuned(choice, mean_interval(mean_of_roots(errors)))

@@ -1,1 +1,1 @@
-"""The console command `thruster`; one file a sub-command, each on top of a Python function."""
+"""The console command `thruster`; one file per sub-command, each on top of a Python function."""

@@ -17,7 +17,7 @@ from typer.main import get_command
 PANELS = {
     "First steps": ("demo", "inspect", "simulate", "filters", "new"),
     "Tune and evaluate a filter": ("tune", "evaluate", "report", "verify", "compare"),
-    "Recorded logs": ("identify", "estimate"),
+    "Recorded logs": ("log", "identify", "estimate"),
     "Policies": ("train", "score", "play"),
     "Published results and long studies": ("reproduce", "study"),
 }
@@ -101,8 +101,8 @@ def _version(wanted: bool) -> None:
 
 app = typer.Typer(
     cls=Commands,
-    help="A ship's bow thruster, the filters that estimate its hidden state, and the tuning that makes them good; "
-    "filters and tuning also for any model, env or log of yours.",
+    help="A ship's bow thruster, the filters that estimate its hidden state, and tuning for these filters; "
+    "both also work with your own model, env or log.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=MARKUP,

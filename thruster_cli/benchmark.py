@@ -1,4 +1,4 @@
-"""Standard problems on the terminal: what others have found beside ours, and why it differs."""
+"""Standard problems on the terminal: published results beside ours, and why they differ."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from thruster_cli.output import announce_compilation, console, progress_console,
 
 
 def reproduce_benchmark(name: str, runs: int, seed: int) -> tuple[list[RenderableType], dict]:
-    """Solve a standard problem; return what to show, a list, and it as plain data."""
+    """Solve a standard problem; return what to show, as a list and as plain data."""
     announce_compilation()
     benchmark = find_benchmark(name)
     with progress_console.status("...") as status:
@@ -37,7 +37,7 @@ def _table(benchmark: Benchmark, rows: list[Row], runs: int) -> Table:
     cells = [row.cells() for row in rows]
     for row in cells:
         row[2] = row[2].replace(" [", "\n[")
-    compared = f"Compared is {benchmark.score}, ours with its 95 % interval."
+    compared = f"The table compares {benchmark.score}, ours with its 95 % interval."
     caption = f"{compared} Median run: of the scores of single runs. Pooled: the RMSE of our tables."
     out = fitted(table(benchmark.about, columns, cells, caption=caption), cells, flexible=WHY)
     out.columns[0].width = None

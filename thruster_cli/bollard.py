@@ -39,8 +39,8 @@ def identify_bollard(
 ) -> None:
     """Identify a thruster from a bollard table, write its preset file, and say how well it fits.
 
-    The table has thrust, torque and speed in steady state; a step response, where there is one, how fast motor
-    and flow follow. All else is that of a preset.
+    The table gives thrust, torque and speed in steady state; an optional step response how fast motor and flow
+    follow. Everything else is taken from a preset.
 
     Args:
         path: the table, with the columns pwm_us, rpm, current_A, voltage_V, force_kgf.
@@ -48,7 +48,7 @@ def identify_bollard(
         logs: must be none.
         preset: whose other parameters are taken.
         out: the preset file.
-        json: where the result goes as JSON.
+        json: file for the result as JSON.
         **options: how the step response is read, as `read_named` takes them.
 
     Raises:
@@ -85,7 +85,7 @@ def identify_bollard(
 
 
 def check_of_table(for_logs: Mapping[str, Any]) -> None:
-    """Raise ValueError for an option that only logs can follow, where a table is given in their place.
+    """Raise ValueError for an option of logs if a table is given in their place.
 
     Args:
         for_logs: values of such options by name, empty or false where they are not given.
@@ -93,7 +93,7 @@ def check_of_table(for_logs: Mapping[str, Any]) -> None:
     for name, value in for_logs.items():
         if value:
             got = "" if value is True else f" {', '.join(map(str, value)) if isinstance(value, list) else value}"
-            raise ValueError(f"{name} must come with logs, for --bollard fits a table, but got {name}{got}")
+            raise ValueError(f"{name} must come with logs, because --bollard fits a table, but got {name}{got}")
 
 
 def from_step(
@@ -147,7 +147,7 @@ def _report(
         part += [table("From the step response", ["", "value", "standard error"], rows), *timed.sentences()]
     else:
         part.append(
-            "A static table does not determine time constants: those of the preset stay. --step LOG finds them, "
-            "of a log of voltage and motor speed."
+            "A static table does not determine time constants: those of the preset are kept. --step LOG "
+            "finds them from a log of voltage and motor speed."
         )
     return [*part, f"wrote {out}"]

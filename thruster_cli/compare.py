@@ -1,4 +1,4 @@
-"""`thruster compare`: filters side by side on scenarios, on seeds that no study saw."""
+"""`thruster compare`: filters side by side on scenarios, on held-out seeds."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def command(
     filters: Annotated[
         list[str] | None,
         filter_option(
-            f"{', '.join(FILTERS)}, or module:object for somebody else's estimator; may be repeated. Without any, "
-            f"or a file: {', '.join(DEFAULT_FILTERS)}."
+            f"{', '.join(FILTERS)}, or module:object for an estimator of another package; may be repeated. "
+            f"Without a filter or a file: {', '.join(DEFAULT_FILTERS)}."
         ),
     ] = None,
     scenarios: Annotated[
@@ -46,8 +46,8 @@ def command(
     knows: Annotated[
         str | None,
         typer.Option(
-            help="What a filter named by --filter knows of the plant's noise: true (oracle), scaled (scaled "
-            "default) or untuned (rule of thumb). By default true, or scaled if the plant's Q and R are unknown.",
+            help="The Q and R of filters named by --filter: true (oracle), scaled (scaled default), untuned (rule "
+            "of thumb) or given (the model's own). By default true, or scaled if the plant's Q and R are unknown.",
             rich_help_panel=FILTER,
         ),
     ] = None,
@@ -55,8 +55,8 @@ def command(
         list[str] | None,
         typer.Option(
             metavar="NAME[:STD[:WALK]]",
-            help="Give each --filter a second row, where it also estimates this constant of its model, such as "
-            "ambient_velocity, believed to within STD at first and to change by WALK a step.",
+            help="Give each --filter a second row that also estimates this constant of its model, such as "
+            "ambient_velocity, with prior deviation STD and a random walk of WALK per step.",
             rich_help_panel=FILTER,
         ),
     ] = None,
@@ -71,11 +71,11 @@ def command(
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Rank filters on scenarios: errors, consistency, cost, and which beat the first one on the same seeds.
+    """Rank filters on scenarios by errors, consistency and cost, paired with the first one on the same seeds.
 
-    All filters meet the same truth, inputs and measurements. A filter is better or worse than the first one if
-    the paired 95 % interval of the ratio of their scores leaves out 1; where there is no truth, if that of the
-    difference of their log-likelihoods leaves out 0. Ctrl-C keeps the rows that are done.
+    All filters see the same truth, inputs and measurements. A filter is better or worse than the first one if the
+    paired 95 % interval of the ratio of their scores excludes 1; without truth, if that of the difference of their
+    log-likelihoods excludes 0. Ctrl-C keeps finished rows.
 
     Example: thruster compare --filter ekf --filter ekf-robust --filter pf --scenario outliers --scenario ambient
 
@@ -106,7 +106,7 @@ def command(
 
 
 def _default(files: list[Path]) -> Problem:
-    """The problem where none is named: that of the first file, or nominal."""
+    """The default problem: that of the first file, or nominal."""
     return [read_tuned(file)[1] for file in files][0] if files else find_problem("nominal")
 
 

@@ -1,4 +1,4 @@
-"""Whether a filter's covariance is consistent, as `thruster evaluate --consistency` tells it."""
+"""Whether a filter's covariance is consistent: the output of `thruster evaluate --consistency`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tuning.search.space import Choice
 
 
 def check_request(path: Path, filter_: Filter) -> None:
-    """Raise ValueError if a filter has no covariance to check, or its picture not be written there."""
+    """Raise ValueError if a filter has no covariance to check, or its picture cannot be written."""
     check_picture(path, "--consistency")
     if not filter_.has_covariance:
         raise ValueError(f"--consistency must be for a filter with a covariance, but got {filter_.name!r}")
@@ -30,11 +30,11 @@ def check_request(path: Path, filter_: Filter) -> None:
 def check_covariance(
     choice: Choice, name: str, scenario: Problem, proof: Comparison, path: Path
 ) -> tuple[list[str], dict]:
-    """Draw the checks of a choice, called `name`; return what is to be said and the numbers behind it."""
-    report = check_consistency(choice.filter(scenario), scenario.data(proof.seeds))
+    """Draw the checks of a choice, called `name`; return the text to print and the numbers behind it."""
+    report = check_consistency(choice.filter(scenario), scenario.data(proof.seeds), scenario.dt)
     said, against, ratios = sentences(report), {}, None
     if report.has_truth and proof.true is not None:
-        ratios = rmse_ratios(proof.tuned.mean_squares, proof.true.mean_squares)
+        ratios = rmse_ratios(proof.tuned.mean_squares, proof.true.mean_squares, proof.tuned.weights)
         against[f"{name}\nover {ORACLE}"] = ratios
         named = list(zip(report.states, ratios, strict=True))
         said += [comparison_sentence(state, name, ORACLE, ratio) for state, ratio in named[:MOST_STATES]]

@@ -1,4 +1,4 @@
-"""`thruster demo`: tune a filter, prove it on data that the study never saw, draw it, report it."""
+"""`thruster demo`: tune a filter, evaluate it on held-out data, draw it, report it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from filters.filter import Filter
 from thruster_cli.output import JsonOption, SeedOption, emit, table, working
 from thruster_cli.tune import tune
 from thruster_cli.tuning_report import Tuning, as_json
-from tuning.evaluation.baselines import ORACLE, TUNED, baselines
+from tuning.evaluation.baselines import NOISE, ORACLE, TUNED, baselines, same_filter
 from tuning.problems.problem import score_label
 from tuning.reporting.error_tables import above_bound, consistency_cells
 from tuning.reporting.figures import comparison_figure, history_figure
@@ -26,24 +26,24 @@ from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.thruster.find import find_scenario
 
 FILTER, SCENARIO = "ekf", "outliers"  # where tuning Q and R is worth most: docs/tuning.md
-LEGEND = """\
-RMSE, by how much it exceeds its lower bound (posterior Cramér-Rao), normalised
-estimation error squared (NEES) and normalised innovation squared (NIS). Score:
-mean RMSE over bound. The oracle is told the plant's own Q and R."""
+LEGEND = (
+    "Above bound: excess of RMSE over the posterior Cramér-Rao bound.\nScore: mean RMSE over bound. NEES, "
+    "NIS: normalised errors, innovations squared."
+)
 
 
 def command(
     out: Annotated[Path, typer.Option(help="Folder of the pictures, the report and the tuned file.")] = Path(
         "out"
     ),
-    trials: Annotated[int, typer.Option(help="Finished trials that the study shall have in total.")] = 50,
+    trials: Annotated[int, typer.Option(help="Total number of finished trials of the study.")] = 50,
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Tune an extended Kalman filter, prove it on held-out seeds, draw it before and after, and make its report.
+    """Tune an extended Kalman filter, evaluate it on held-out seeds, draw it before and after, write its report.
 
-    One thrust in twenty is off by some 10 N, of which the sensor's data sheet says nothing. Table, pictures and
-    page hold the tuned filter against three others on the same 200 runs, none of which the study saw.
+    One thrust in twenty is off by some 10 N, which the sensor's data sheet does not mention. Table, pictures and
+    page compare the tuned filter with four others on the same 200 held-out runs.
     """
     started = time.perf_counter()
     storage = str(out / "studies.journal")
@@ -67,12 +67,12 @@ def command(
 
 
 def result(tuning: Tuning, report: Report, seconds: float) -> list[str | Table]:
-    """What was tuned on what, the errors before and after, and one sentence on what it was worth."""
+    """What was tuned on what, the errors before and after, and one sentence on the gain."""
     found, seeds = tuning.result, len(tuning.proof.seeds)
     stopped = ", interrupted," if found.interrupted else ""
     return [
         f"An extended Kalman filter (EKF) where {tuning.scenario.about}: {found.finished} trials{stopped} on "
-        f"{TRAINING_SEEDS} runs, proved on {seeds} others, in {seconds:.0f} s.",
+        f"{TRAINING_SEEDS} runs, evaluated on {seeds} others, in {seconds:.0f} s.",
         report.advice,
         "",
         error_table(tuning),
@@ -87,6 +87,8 @@ def error_table(tuning: Tuning) -> Table:
     choices = {TUNED: tuning.result.choice, **baselines(FILTER, scenario, tuning.plan.seed)}
     rows = []
     for name, found in proof.evaluations.items():
+        if name != TUNED and same_filter(choices[name], choices[TUNED]):
+            continue  # its numbers stand in the row "tuned"
         pairs = zip(found.rmse, above_bound(found, proof.bound), strict=True)
         errors = [cell for rmse, above in pairs for cell in (f"{rmse.value:#.3g}", f"{above:+.0f} %")]
         ((variance,),) = choices[name].filter(scenario).model.measurement_noise_cov
@@ -104,7 +106,7 @@ def error_table(tuning: Tuning) -> Table:
 
 
 def draw(tuning: Tuning, out: Path) -> dict[Path, str]:
-    """Draw the tuned filter before and after, errors and search; return what each picture shows, by its file."""
+    """Draw the tuned filter before and after, errors and search; return a caption for each file."""
     proof, scenario = tuning.proof, tuning.scenario
     label, data = f"{tuning.result.choice.name} on {scenario.name}", scenario.data(proof.seeds[:1])
     run = estimates_figure(out / "estimates.png", before_and_after(tuning), data, 0, scenario.dt)
@@ -120,7 +122,7 @@ def draw(tuning: Tuning, out: Path) -> dict[Path, str]:
 
 
 def before_and_after(tuning: Tuning) -> dict[str, Filter]:
-    """The best baseline and the tuned filter, by what stands above their pictures."""
+    """The best baseline and the tuned filter, by the titles of their pictures."""
     before = best_baseline(tuning)
     choices = {before: baselines(FILTER, tuning.scenario, tuning.plan.seed)[before], TUNED: tuning.result.choice}
     words = (f"before: {before}", f"after: {TUNED}")
@@ -128,13 +130,15 @@ def before_and_after(tuning: Tuning) -> dict[str, Filter]:
 
 
 def best_baseline(tuning: Tuning) -> str:
-    """The baseline with the least score, of those that anybody can have: not the oracle."""
+    """The baseline with the lowest score among those that need no truth."""
     found = tuning.proof.evaluations
-    return min((name for name in found if name not in (TUNED, ORACLE)), key=lambda name: found[name].score.value)
+    return min(
+        (name for name in found if name not in (TUNED, NOISE, ORACLE)), key=lambda name: found[name].score.value
+    )
 
 
 def files(tuned: Path, pictures: dict[Path, str], report: Report) -> list[str]:
-    """Where all that was made is."""
+    """The paths of all files."""
     about = {
         **pictures,
         report.page: "the report: open it in a browser",
@@ -145,7 +149,7 @@ def files(tuned: Path, pictures: dict[Path, str], report: Report) -> list[str]:
 
 
 def next_steps() -> list[str]:
-    """What to do next, for each thing that a user may have come for."""
+    """The next command for each purpose."""
     steps = {
         "others": f"thruster compare --filter ekf --filter ekf-robust --scenario {SCENARIO}",
         "my plant": "thruster new problem NAME                     (docs/problems.md)",
@@ -153,4 +157,4 @@ def next_steps() -> list[str]:
         "policies": "thruster train --observe ekf                  (docs/policies.md)",
     }
     where = "" if shutil.which("thruster") else f" (the command is {os.path.relpath(sys.argv[0])})"
-    return ["", f"Next{where}:", *(f"  {what:9}{step}" for what, step in steps.items())]
+    return [f"Next{where}:", *(f"  {what:9}{step}" for what, step in steps.items())]

@@ -80,7 +80,7 @@ def estimated_env(
     tuned: Path | None = None,
     size: tuple[int, int] | None = None,
 ) -> Iterator[gym.Env]:
-    """A thruster that is drawn with what a filter believes of it.
+    """A thruster drawn with a filter's estimate.
 
     Args:
         film: None for a window.
@@ -163,7 +163,7 @@ def play_log(
 
 
 def moments(log: Log) -> Iterator[Moment]:
-    """What was recorded, row by row; NaN where it was not."""
+    """The recorded values, row by row; NaN where there are none."""
     columns: Mapping[str, np.ndarray] = {
         **{one.symbol: log.measurements[:, i] for i, one in enumerate(log.measured)},
         **{channel.rpartition(":")[2]: values for channel, values in log.references.items()},
@@ -177,7 +177,7 @@ def moments(log: Log) -> Iterator[Moment]:
 
 
 def overlays(found: LogEstimate) -> Iterator[Overlay]:
-    """What the filter believes, row by row."""
+    """The filter's estimates, row by row."""
     thrusts, stds = found.output("T")
     for mean, std, thrust, thrust_std in zip(found.means, found.stds, thrusts, stds, strict=True):
         pairs = [number for pair in zip(mean[:2], std[:2], strict=True) for number in pair]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from math import isnan
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +13,7 @@ from rich.console import RenderableType
 from filters.logs.columns import columns_of
 from filters.logs.estimate import LogEstimate, estimate
 from filters.logs.findings import LogFindings, Residual, findings
+from filters.logs.verdict import ALPHA, verdict
 from plants.logs.write import check_suffix, write_columns
 from thruster_cli.options import (
     FILTER,
@@ -32,14 +34,10 @@ from thruster_cli.options import (
 from thruster_cli.output import announce_compilation, check_picture, check_targets, emit, table
 from tuning.logs.read import read_named
 
-ALPHA = 0.05  # below which a p-value speaks against white innovations
-
 
 def command(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="A .csv, .parquet or .npz file with a header.")],
-    file: Annotated[
-        Path | None, typer.Argument(metavar="FILE", help="Tuned file: filter, Q, R and the like.")
-    ] = None,
+    file: Annotated[Path | None, typer.Argument(metavar="FILE", help="Tuned file, with filter, Q and R.")] = None,
     filter_name: Annotated[
         str | None,
         filter_option(f"Without a tuned file; ekf by default. {FILTER_HELP}"),
@@ -55,18 +53,21 @@ def command(
     dt: DtOption = None,
     ensemble_size: Annotated[
         int | None,
-        typer.Option(help="Of a filter with an ensemble; 100 by default, particles 1000.", rich_help_panel=FILTER),
+        typer.Option(
+            help="For a filter with an ensemble; 100 by default, particles 1000.", rich_help_panel=FILTER
+        ),
     ] = None,
     smoother: Annotated[
-        bool, typer.Option("--smoother", help="Correct estimates by later measurements.", rich_help_panel=FILTER)
+        bool, typer.Option("--smoother", help="Also use later measurements.", rich_help_panel=FILTER)
     ] = False,
     lag: Annotated[
-        int | None, typer.Option(help="How many later ones; all by default.", rich_help_panel=FILTER)
+        int | None, typer.Option(help="The number of later measurements; all by default.", rich_help_panel=FILTER)
     ] = None,
     skip: Annotated[
         int | None,
         typer.Option(
-            help="First rows that do not count; 50, a quarter of a short log, by default.", rich_help_panel=RUNS
+            help="Number of first rows that are not scored; 50, or a quarter of a short log, by default.",
+            rich_help_panel=RUNS,
         ),
     ] = None,
     out: Annotated[
@@ -75,16 +76,18 @@ def command(
     ] = None,
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Picture of all over time, .png, .svg or .pdf.", rich_help_panel=OUTPUT),
+        typer.Option(
+            metavar="FILE", help="Picture of everything over time, .png, .svg or .pdf.", rich_help_panel=OUTPUT
+        ),
     ] = None,
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Estimate the state of a recorded run, and say what the innovations tell of filter and model.
+    """Estimate the state of a recorded run, and report what the innovations say about filter and model.
 
-    The log has the model's inputs and measurements, found by the headers of its columns or told by --column. What
-    it has of the model's states and outputs beside these, such as the thrust of a load cell where the filter sees
-    the tachometer, is held against the estimate. docs/logs.md has the rules.
+    The log has the model's inputs and measurements, found by the headers of its columns or given by --column. If
+    it also has states or outputs of the model, such as the thrust of a load cell where the filter sees the
+    tachometer, they are compared with the estimate. docs/logs.md has the rules.
 
     Example: thruster estimate run.csv --tuned out/ekf-run-seed0.json --out est.csv --plot est.png
 
@@ -107,7 +110,7 @@ def command(
     found = estimate(recorded, filter_name, offer, **options)
     told = findings(found, skip)
     if out is not None:
-        write_columns(out, columns_of(found))
+        write_columns(out, columns_of(found), again=True)
     if plot is not None:
         from filters.logs.figure import log_figure
 
@@ -122,7 +125,7 @@ def _title(found: LogEstimate) -> str:
 def _shown(found: LogEstimate, told: LogFindings, out: Path | None, plot: Path | None) -> list[RenderableType]:
     log = found.log
     about = f"{log.steps + 1} rows, dt {log.dt:g} s" + (", put on a grid" if log.irregular else "")
-    title = f"{_title(found)} on {log.name} ({about}); rows {told.first} to {log.steps} count"
+    title = f"{_title(found)} on {log.name} ({about}); scored: rows {told.first} to {log.steps}"
     rows = [
         ["mean NIS over channels", f"{told.mean_nis:.3g}", f"{told.nis_band[0]:.3g} to {told.nis_band[1]:.3g}"],
         ["log-likelihood", f"{told.log_likelihood:.6g}", ""],
@@ -139,24 +142,8 @@ def _shown(found: LogEstimate, told: LogFindings, out: Path | None, plot: Path |
     if told.references:
         what = "Smoother" if found.smoothed else "Estimate"
         shown.append(table(f"{what} less reference, not seen", columns, list(map(_row, told.references))))
-    shown += _sentences(told)
+    shown += verdict(found, told)
     return shown + [f"wrote {path}" for path in (out, plot) if path is not None]
-
-
-def _sentences(told: LogFindings) -> list[str]:
-    if not told.rows:
-        return [f"Nothing was measured in the rows that count, from {told.first} on: there are no innovations."]
-    if isnan(told.mean_nis):
-        return ["This filter gives no covariance, so there is no NIS and no likelihood."]
-    low, high = told.nis_band
-    said = "The mean NIS is in its 95 % band."
-    if told.mean_nis > high:
-        said = "The innovations are larger than the filter expects: its Q or R is too small, or the model is off."
-    elif told.mean_nis < low:
-        said = "The innovations are smaller than the filter expects: its Q or R is too large."
-    if told.whiteness is not None and told.whiteness.p_value < ALPHA:
-        said += " They are not white: the filter could have known some of them."
-    return [said]
 
 
 def _row(one: Residual) -> list[str]:
@@ -181,5 +168,7 @@ def _as_json(found: LogEstimate, told: LogFindings, out: Path | None, plot: Path
         "divergences": found.divergences,
         "one_step_ahead": {one.quantity.symbol: one._asdict() for one in told.predictions},
         "references": {one.quantity.symbol: one._asdict() for one in told.references},
+        "findings": [asdict(one) for one in log.findings],
+        "sentences": verdict(found, told),
         "files": [str(path) for path in (out, plot) if path is not None],
     }

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.console import RenderableType
 
+from filters.registry import filter_class
 from thruster_cli.consistency import check_covariance, check_request
 from thruster_cli.options import (
     FILTER,
@@ -27,20 +28,31 @@ from thruster_cli.problems import PROBLEMS
 from thruster_cli.tables import choice_table
 from tuning.api.evaluate import subject_of
 from tuning.api.held_out import on_held_out
-from tuning.evaluation.baselines import TUNED
+from tuning.api.own_numbers import DEFAULT_FILTER
+from tuning.evaluation.baselines import GIVEN, TUNED, given
+from tuning.problems.problem import Problem
 from tuning.reporting.error_tables import comparison_table
 from tuning.search.plan import HELD_OUT_SEEDS
+from tuning.search.space import Choice
 
 
 def command(
     file: Annotated[
         Path | None,
-        typer.Argument(metavar="FILE", help="Tuned file; it names filter, numbers and scenario."),
+        typer.Argument(metavar="FILE", help="Tuned file; it names filter, parameters and scenario."),
     ] = None,
     tuned: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The same as the argument.", rich_help_panel=FILTER)
     ] = None,
     filter_name: Annotated[str | None, filter_option(f"Without a tuned file. {FILTER_HELP}")] = None,
+    own: Annotated[
+        bool,
+        typer.Option(
+            "--given",
+            help="Use the Q and R of the problem's model instead of the rule of thumb.",
+            rich_help_panel=FILTER,
+        ),
+    ] = False,
     scenario: Annotated[
         str | None,
         typer.Option(
@@ -56,7 +68,7 @@ def command(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Also say whether the filter's covariance is consistent, and draw that: .png, .svg or .pdf.",
+            help="Also check whether the filter's covariance is consistent, and draw it: .png, .svg or .pdf.",
             rich_help_panel=OUTPUT,
         ),
     ] = None,
@@ -64,39 +76,55 @@ def command(
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Run a filter on held-out seeds of a scenario, beside its baselines: scaled default, rule of thumb, oracle.
+    """Run a filter on held-out seeds of a scenario and compare it with its baselines.
 
     The rule of thumb takes R from the sensor's data sheet and Q from 1 % of each state's range. The scaled default
     is the same with one factor on Q that brings the mean NIS (normalised innovation squared) to 1. The oracle has
     the plant's own Q and R.
 
-    With --consistency a filter's errors and innovations are held against its own covariances: NEES, NIS,
-    whiteness, coverage, CRPS and, for ensembles, ranks; a sentence each, and a picture of all.
+    With --given it is the filter with the model's own Q and R, an ekf unless --filter names another.
+
+    With --consistency a filter's errors and innovations are compared with its own covariances: NEES, NIS,
+    whiteness, coverage, CRPS and, for ensembles, rank histograms; with a sentence on each and one picture.
 
     Example: thruster evaluate out/enkf-mismatch-seed0.json
 
     Example: thruster evaluate --filter enkf --scenario mismatch --consistency calibrated.png
     """
     tuned = one_file(file, tuned)
+    if own and tuned is not None:
+        raise ValueError(f"--given must come without a tuned file, but got both, with {tuned}")
+    filter_name = filter_name or (DEFAULT_FILTER if own else None)
     if (tuned is None) == (filter_name is None):
         got = "none" if tuned is None else f"both, {tuned} and {filter_name}"
         raise ValueError(f"give either a tuned file or --filter NAME, but got {got}")
     choice, chosen, _ = subject_of(tuned or filter_name, scenario, preset, model)
+    if own:
+        choice = _given(choice.name, chosen)
     if consistency is not None:
         check_request(consistency, choice.filter(chosen))
     announce_compilation()
     found = on_held_out(choice, chosen, seed, seeds, is_tuned=tuned is not None, console=progress_console)
     proof, data = found.proof, found.to_dict()
     where = f"held-out {chosen.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}, scenario {chosen.name}"
-    shown: list[RenderableType] = [
-        choice_table({proof.label(name): one for name, one in found.choices.items()}, chosen)
-    ]
-    evaluations = {proof.label(name): one for name, one in found.evaluations.items()}
-    shown.append(comparison_table(evaluations, proof.bound, where, chosen.scale_about))
+    shown: list[RenderableType] = [choice_table(found.choices, chosen)]
+    shown.append(comparison_table(found.evaluations, proof.bound, where, chosen.scale_about))
     shown += found.sentences()
     if consistency is not None:
-        name = proof.rule if tuned is None else TUNED
+        name = TUNED if tuned is not None else GIVEN if own else proof.rule
         with working("checking the covariance"):
             words, data["consistency"] = check_covariance(choice, name, chosen, proof, consistency)
         shown += words
     emit(shown, data, json)
+
+
+def _given(name: str, problem: Problem) -> Choice:
+    """The filter with the given Q and R of the problem's model; ValueError if there are none."""
+    if not filter_class(name).has_covariance:
+        raise ValueError(f"--given must be used with a filter that has a Q and R, but got {name}")
+    found = given(name, problem)
+    if found is None:
+        raise ValueError(
+            f"--given must be used with a problem whose model has a given Q and R, but got {problem.name}"
+        )
+    return found

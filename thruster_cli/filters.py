@@ -1,4 +1,4 @@
-"""`thruster filters`: the filters there are, and the numbers that each can be given."""
+"""`thruster filters`: the available filters and the parameters of each."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ OWNERS_WIDTH = 27  # of the longest number, so that the names of filters take no
 
 
 class Number(NamedTuple):
-    """A number that a filter can be given."""
+    """A parameter of a filter."""
 
     name: str
     default: Any
@@ -37,7 +37,7 @@ class Number(NamedTuple):
 
 
 class Entry(NamedTuple):
-    """What is said of a filter."""
+    """The description of a filter."""
 
     name: str
     about: str
@@ -48,20 +48,18 @@ class Entry(NamedTuple):
 
 
 def command(
-    name: Annotated[
-        str | None, typer.Argument(help="A filter, to be shown in full.", callback=spelt(FILTERS))
-    ] = None,
+    name: Annotated[str | None, typer.Argument(help="A filter to show in full.", callback=spelt(FILTERS))] = None,
     problem: Annotated[
         str | None,
         typer.Option(
-            "--problem", "--scenario", help=f"Tell which filters fit its model. {PROBLEMS}", rich_help_panel=INPUT
+            "--problem", "--scenario", help=f"Show which filters fit its model. {PROBLEMS}", rich_help_panel=INPUT
         ),
     ] = None,
     json: JsonOption = None,
 ) -> None:
-    """List the filters, their numbers and what these mean; or show one filter with its equations and sources.
+    """List the filters and their parameters; or show one filter with its equations and sources.
 
-    Every name can be given to --filter of other commands, to EstimateState and to make_filter.
+    Other commands take these names for --filter; so do EstimateState and make_filter.
 
     Example: thruster filters ukf
 
@@ -80,7 +78,7 @@ def command(
 
 
 def entry(name: str) -> Entry:
-    """What the class of a filter says of it."""
+    """The description in a filter's class."""
     kind = filter_class(name)
     text, meaning = cleandoc(kind.__doc__ or ""), _meanings(kind)
     defaults = {field.name: field.default for field in dataclasses.fields(kind)}
@@ -89,7 +87,7 @@ def entry(name: str) -> Entry:
 
 
 def overview(entries: list[Entry]) -> list[RenderableType]:
-    """All filters in one table and all their numbers in another, each number once for all who share it."""
+    """All filters in one table and all their parameters in another, each shared one once."""
     filters = [[one.name, one.about, _yes(one.covariance), _yes(one.ensemble)] for one in entries]
     owners: dict[Number, list[str]] = {}
     for one in entries:
@@ -101,17 +99,17 @@ def overview(entries: list[Entry]) -> list[RenderableType]:
         numbers += [[f"  {number.name}", number.default, first_sentence(number.meaning)] for number in group]
     return [
         table("Filters", ["filter", "what it is", "cov.", "ens."], filters, words=True),
-        table("Their own numbers, beside the model's", ["of; number", "default", "meaning"], numbers, words=True),
-        "cov.: it has a covariance, which says how far the estimate may be off. ens.: it has an ensemble.",
-        f"ensemble_size: {MADE} members where you make a filter or estimate from a log; the rule of thumb, from "
-        f"which tune, evaluate and compare start, has {KALMAN_SIZES.untuned} (particles: "
+        table("Parameters of the filters themselves", ["of; number", "default", "meaning"], numbers, words=True),
+        "cov.: it has a covariance, the uncertainty of the estimate. ens.: it has an ensemble.",
+        f"ensemble_size: {MADE} members if you make a filter or estimate from a log; {KALMAN_SIZES.untuned} "
+        "in the rule of thumb, from which tune, evaluate and compare start (particles: "
         f"{PARTICLE_SIZES.untuned} in both); a tuned file has its own.",
         "thruster filters NAME shows one in full, with its equations and sources.",
     ]
 
 
 def in_full(one: Entry, width: int) -> list[RenderableType]:
-    """One filter: its documentation, fitted to a width, and a table of its numbers."""
+    """One filter: its documentation, fitted to a width, and a table of its parameters."""
     kind = filter_class(one.name)
     has = f"covariance: {_yes(one.covariance)}, ensemble: {_yes(one.ensemble)}"
     shown: list[RenderableType] = [Text(one.name, style="bold"), f"{kind.__module__}.{kind.__name__}", has, ""]
@@ -154,7 +152,7 @@ def _fitted_equations(line: str, width: int) -> str:
 
 
 def _meanings(kind: type[Filter]) -> dict[str, str]:
-    """What the docstrings of a class and of its bases say of each attribute."""
+    """The descriptions of attributes in the docstrings of a class and of its bases."""
     found = {}
     for base in reversed(kind.__mro__):
         text = cleandoc(base.__doc__ or "")

@@ -1,4 +1,4 @@
-"""Which filters fit a problem's model, and what a belief of each takes: `thruster filters --problem`."""
+"""Which filters fit a problem's model, and the memory of a belief of each: `thruster filters --problem`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Fit(NamedTuple):
 
 
 def fits_of(problem: Problem, names: tuple[str, ...] = tuple(FILTERS)) -> list[Fit]:
-    """Each filter with the numbers of the rule of thumb on a problem's model; nothing is compiled."""
+    """Each filter with the rule of thumb's parameters on a problem's model; nothing is compiled."""
     found = []
     for name in names:
         try:
@@ -55,7 +55,7 @@ def fit_table(problem: Problem, fits: list[Fit]) -> list[RenderableType]:
     title = f"Filters on {problem.name}: {sizes}"
     return [
         table(title, ["filter", "fits", "N", "kB", "why not"], rows, words=True),
-        "N: members or particles of the rule of thumb. kB: memory of one belief.",
+        "N: members or particles in the rule of thumb. kB: memory of one belief.",
     ]
 
 

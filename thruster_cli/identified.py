@@ -1,4 +1,4 @@
-"""What `thruster identify` says and writes."""
+"""What `thruster identify` prints and writes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from thruster_cli.output import table
 from tuning.identification.profiles import Profile, profile_figure
 from tuning.identification.result import Identification
 from tuning.identification.validation import Validation
-from tuning.logs.identify import write_found
+from tuning.logs.identify import remarks, write_found
 
 
 def report(
@@ -29,11 +29,18 @@ def report(
     for name in found.names:
         known = "yes" if found.determined[name] else "at the end" if found.at_end[name] else "no"
         numbers = found.start[name], found.values[name], found.standard_errors[name]
-        rows.append([f"{name} [{units[name]}]" if units[name] else name, *(f"{v:.5g}" for v in numbers), known])
+        test = found.null_tests.get(name)
+        without = ["-", "-"] if test is None else [f"{test.at:.4g}", test.said]
+        label = f"{name} [{units[name]}]" if units[name] else name
+        rows.append([label, *(f"{v:.5g}" for v in numbers), known, *without])
     count, steps = len(runs), sum(log.steps for log in runs)
     title = f"Identified on {count} run{'' if count == 1 else 's'}, {steps} steps"
-    shown = [table(title, ["", "start", "value", "standard\nerror", "determined"], rows)]
-    where = f"Validation on {', '.join(log.name for log in proving)}" if proving else "On the runs it has seen"
+    shown = [table(title, ["", "start", "value", "standard\nerror", "determined", "if left\nout, at", "p"], rows)]
+    where = (
+        f"Validation on {', '.join(log.name for log in proving)}"
+        if proving
+        else "On the runs used for identification"
+    )
     rows = []
     for symbol in checked["start"].one_step:
         for what, part in (("one step", "one_step"), ("simulation", "simulation")):
@@ -44,7 +51,12 @@ def report(
     rows.append(["mean NIS over channels", *(f"{v.nis:.3g}" for v in checked.values())])
     rows.append(["log-likelihood", *(f"{v.log_likelihood:.6g}" for v in checked.values())])
     shown.append(table(where, ["", *checked], rows))
-    return [*shown, *found.sentences(), *(f"wrote {path}" for path in files)]
+    return [
+        *shown,
+        *found.sentences(),
+        *remarks(runs, proving, found),
+        *(f"wrote {path}" for path in files),
+    ]
 
 
 def write_files(
@@ -83,6 +95,8 @@ def as_json(
         "standard_errors": found.standard_errors,
         "determined": found.determined,
         "at_end": found.at_end,
+        "left_out": {name: one._asdict() for name, one in found.null_tests.items()},
+        "begun_elsewhere": [runs[place].name for place in found.begun_elsewhere],
         "correlations": {"names": found.names, "matrix": found.correlations},
         "trade_off": found.traded,
         "least_known_direction": found.least_determined,
@@ -95,6 +109,6 @@ def as_json(
         "interrupted": found.interrupted,
         "validation": {name: one._asdict() for name, one in checked.items()},
         "profiles": [{**one._asdict(), "interval": one.interval} for one in made],
-        "sentences": found.sentences(),
+        "sentences": [*found.sentences(), *remarks(runs, proving, found)],
         "files": list(files),
     }

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.text import Text
 
 from thruster_cli.identified import as_json, report, write_files
 from thruster_cli.options import (
@@ -18,6 +19,7 @@ from thruster_cli.options import (
     ClockOption,
     ColumnOption,
     DtOption,
+    HoldGapsOption,
     JsonOption,
     LogPresetOption,
     ModelOption,
@@ -45,7 +47,7 @@ def command(
     free: Annotated[
         str | None,
         typer.Option(
-            help="Names of what is to be found, with commas between; a wrong one lists those known.",
+            help="Names of the free parameters, separated by commas; a wrong name lists the known ones.",
             rich_help_panel=SEARCH,
         ),
     ] = None,
@@ -60,7 +62,7 @@ def command(
         typer.Option(
             "--range",
             metavar="NAME=LOW:HIGH",
-            help="Within which one is looked for; may be repeated.",
+            help="Range of a parameter; may be repeated.",
             rich_help_panel=SEARCH,
         ),
     ] = None,
@@ -72,7 +74,7 @@ def command(
         bool,
         typer.Option(
             "--hold-noise",
-            help="Leave Q and R as they are; else their variances are found, too.",
+            help="Keep Q and R fixed; by default their variances are free, too.",
             rich_help_panel=SEARCH,
         ),
     ] = False,
@@ -80,24 +82,25 @@ def command(
         list[Path] | None,
         typer.Option(
             "--held-out",
-            help="Run that only validates; by default every third of three or more.",
+            help="Run used only for validation; by default every third of three or more.",
             rich_help_panel=INPUT,
         ),
     ] = None,
-    use_all: Annotated[bool, typer.Option("--use-all", help="Hold no run out.", rich_help_panel=INPUT)] = False,
+    use_all: Annotated[bool, typer.Option("--use-all", help="Hold out no run.", rich_help_panel=INPUT)] = False,
+    hold_gaps: HoldGapsOption = False,
     filter_name: Annotated[str, filter_option("ekf, or kf for affine models.")] = "ekf",
     predicted: Annotated[
         list[str] | None,
         typer.Option(
             metavar="CHANNEL",
-            help="The filter predicts it but never sees it, such as a load cell's thrust.",
+            help="A channel that the filter predicts but never sees, such as a load cell's thrust.",
             rich_help_panel=FILTER,
         ),
     ] = None,
     degrees: Annotated[
         float,
         typer.Option(
-            help="Of freedom of Student-t errors, such as 20, of predicted channels, if there are any.",
+            help="Degrees of freedom of Student-t errors, such as 20; of the predicted channels, if any.",
             rich_help_panel=SEARCH,
         ),
     ] = math.inf,
@@ -108,7 +111,7 @@ def command(
             rich_help_panel=SEARCH,
         ),
     ] = math.inf,
-    starts: Annotated[int, typer.Option(help="Searches from so many starts.", rich_help_panel=SEARCH)] = STARTS,
+    starts: Annotated[int, typer.Option(help="Number of starts of the search.", rich_help_panel=SEARCH)] = STARTS,
     bollard: Annotated[
         Path | None,
         typer.Option(
@@ -126,7 +129,7 @@ def command(
     out: Annotated[
         Path | None,
         typer.Option(
-            help=f"File of what is found, for --preset of other commands; {DEFAULT_OUT}.", rich_help_panel=OUTPUT
+            help=f"File for the result, a --preset for other commands; {DEFAULT_OUT}.", rich_help_panel=OUTPUT
         ),
     ] = None,
     plot: Annotated[
@@ -138,15 +141,16 @@ def command(
 ) -> None:
     """Find the parameters under which recorded runs are most likely, and say which of them the runs determine.
 
-    Of a thruster may be free: its parameters (motor_damping, voltage_gain, ...), dead_band or dead_band_low and
-    dead_band_high, thrust_asymmetry, ambient_velocity, bias_CHANNEL, lag_CHANNEL, clock_offset_CHANNEL, and the
-    variances of Q and R. Of a --model, the arguments that have numbers for defaults, and its named constants.
+    The free parameters of a thruster may be its constants (motor_damping, voltage_gain, ...), dead_band or
+    dead_band_low and dead_band_high, thrust_asymmetry, ambient_velocity, bias_CHANNEL, lag_CHANNEL,
+    clock_offset_CHANNEL, and the variances of Q and R; of a --model, the arguments with numeric defaults and its
+    named constants.
 
-    With --predicted what is found is what predicts that channel best for a filter that does not have it: --sensor
-    speed --sensor thrust --predicted thrust identifies on a stand what will estimate thrust on the ship.
+    With --predicted the result predicts that channel best for a filter that does not see it: --sensor speed
+    --sensor thrust --predicted thrust identifies on a test stand a model that will estimate thrust on the ship.
 
-    The file that comes out is the --preset of other commands, of a thruster also of gym.make(preset=...); with
-    --model it holds the numbers of that model. Ctrl-C keeps the best so far.
+    The file written is a --preset for other commands, for a thruster also for gym.make(preset=...); with --model
+    it contains the values of that model. Ctrl-C keeps the best so far.
 
     Example: thruster identify run*.csv --preset tunnel --free motor_damping,voltage_gain,dead_band
 
@@ -175,7 +179,7 @@ def command(
     if not logs:
         raise ValueError("identify must have at least one log, or --bollard TABLE.csv, but got none")
     out = out or DEFAULT_OUT
-    runs, proving = split_runs(logs, held_out, use_all=use_all, **options)
+    runs, proving = split_runs(logs, held_out, use_all=use_all, hold_gaps=hold_gaps, **options)
     family = family_of(runs, names_of(free), **whose, noise=not hold_noise, filter=filter_name)
     numbers, ranges = numbers_of("--start", pairs("--start", start)), ranges_of(pairs("--range", range_))
     if out is not None and not is_file(out):
@@ -189,7 +193,7 @@ def command(
     found, checked, made = whole.found, whole.validation, []
     if plot is not None and not found.interrupted:
         with progress_console.status("profiles ...") as status:
-            made = profiles(found, progress=lambda name: status.update(f"profile of {name} ..."))
+            made = profiles(found, progress=lambda name: status.update(Text(f"profile of {name} ...")))
     files = write_files(found, family, made, out, plot, [log.name for log in runs])
     data = as_json(found, checked, made, runs, proving, files)
     emit(report(found, checked, runs, proving, files), data, json)

@@ -1,4 +1,4 @@
-"""`thruster inspect`: a thruster at an operating point, beside the linear model that was published of it."""
+"""`thruster inspect`: a thruster at an operating point, beside its published linear model."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 
 from numerics.checks import within
 from thruster_cli.options import INPUT, OUTPUT, JsonOption, PresetOption
-from thruster_cli.output import check_picture, emit, table, warn_beyond
+from thruster_cli.output import check_picture, check_targets, emit, table, warn_beyond
 from thruster_env.linear.analysis import (
     GAIN_UNITS,
     INPUTS,
@@ -58,6 +58,7 @@ def command(
     """
     if out is not None:
         check_picture(out, "--out")
+    check_targets((out,), json, read=(preset,))
     plant = make_plant(preset, dt, max_voltage, ambient_velocity)
     voltage = within("voltage", voltage, max_voltage)
     warn_beyond(preset, voltage)
@@ -121,7 +122,7 @@ def _model_table(columns: dict[str, Analysis]):
         *(f"settled T/{name} [{GAIN_UNITS[name]}]" for name in INPUTS),
     ]
     rows = [list(row) for row in zip(labels, *map(_model_cells, columns.values()), strict=True)]
-    caption = "* rank, condition number of the sampled pair, each state counted in its range"
+    caption = "* rank, condition number of the sampled pair, each state scaled by its range"
     return table("Linear model in rad/s, m/s, V, N, s", ["quantity", *columns], rows, caption=caption)
 
 

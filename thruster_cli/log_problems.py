@@ -15,7 +15,7 @@ from tuning.thruster.logs import of_preset
 def problems_of(
     names: Sequence[str] | None, logs: Sequence[Path] | None, options: Mapping, default: str
 ) -> tuple[Problem, ...]:
-    """What a study is for: logs with their options, or problems by name."""
+    """The problems of a study: logs with their options, or problems by name."""
     given = {name: value for name, value in options.items() if value is not None}
     if logs:
         if names:

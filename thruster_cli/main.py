@@ -1,7 +1,7 @@
-"""The `thruster` command: how it starts and how it ends, whatever happens.
+"""The `thruster` command: how it starts, and how it ends in every case.
 
-Exit codes: 0 done; 1 a file that `verify` does not find to hold; 2 what is asked for cannot be done, one line says
-why; 130 Ctrl-C; 141 nobody reads the output any more, as a shell reports of other programs.
+Exit codes: 0 done; 1 a file whose metrics do not hold (`verify`); 2 the request cannot be carried out, one line
+says why; 130 Ctrl-C; 141 nobody reads the output any more, as a shell reports of other programs.
 
 No package is imported before Ctrl-C has its one line.
 """
@@ -17,7 +17,7 @@ INTERRUPTED, BROKEN_PIPE = 130, 141
 
 
 def run() -> None:
-    """Run the command line as a process of its own."""
+    """Run the command line as its own process."""
     signal(SIGINT, leave)
     try:
         _open_standard_streams()
@@ -31,7 +31,7 @@ def run() -> None:
 def main() -> None:
     """Run the command line; a user's mistake is one line and exit code 2, never a traceback.
 
-    The first Ctrl-C is a KeyboardInterrupt, so that what is done can be kept; the next one ends the process.
+    The first Ctrl-C is a KeyboardInterrupt, so that finished work can be kept; the next one ends the process.
     """
     caught: list[int] = []
     before, unraisable = getsignal(SIGINT), sys.unraisablehook
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def _outcome(app, caught: list) -> tuple[int, str]:
-    """Exit code of the command line, and what there is to say about it."""
+    """Exit code of the command line, and its message."""
     import typer
 
     try:
@@ -83,8 +83,8 @@ def _outcome(app, caught: list) -> tuple[int, str]:
         return code, message
     except (KeyboardInterrupt, typer.Abort):
         return INTERRUPTED, "interrupted"
-    except typer.TyperException as error:  # without a command its message is empty: the help has been shown
-        return 2, " ".join(error.format_message().split())
+    except typer.TyperException as error:
+        return 2, " ".join(error.format_message().split()) or _no_command(error)
     except Exception as error:
         if caught:  # a package that was interrupted says so in ways of its own
             return INTERRUPTED, "interrupted"
@@ -95,8 +95,15 @@ def _outcome(app, caught: list) -> tuple[int, str]:
         raise
 
 
+def _no_command(error) -> str:
+    """The message if the help was shown in place of a command."""
+    context = getattr(error, "ctx", None)
+    path = "thruster" + ("" if context is None else context.command_path.rpartition("thruster")[2])
+    return f"a command must follow {path}, but got none ({path} --help lists them)"
+
+
 def _system_says(error: OSError) -> tuple[int, str]:
-    """Exit code and message for what the system refuses, such as room on a disk."""
+    """Exit code and message for what the system refuses, such as disk space."""
     if isinstance(error, BrokenPipeError):
         return BROKEN_PIPE, ""
     reason = error.strerror or str(error)
@@ -135,7 +142,7 @@ def _open_standard_streams() -> None:
 
 
 def _leave_full_disks_to_the_main_thread() -> None:
-    """Say nothing of an OSError in a thread that writes a log: who fills the log finds out, and says it."""
+    """Ignore an OSError in a thread that writes a log: the thread that fills the log reports it."""
     import threading
 
     before = threading.excepthook
@@ -150,7 +157,7 @@ def _leave_full_disks_to_the_main_thread() -> None:
 def _as_one_line(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None
 ) -> str:
-    """A warning, without the line of code that gave it."""
+    """A warning, without the line of code that raised it."""
     return f"thruster: {message}\n" if category is UserWarning else f"thruster: {category.__name__}: {message}\n"
 
 

@@ -30,15 +30,15 @@ def command(
         str, typer.Argument(metavar="KIND", help=f"{', '.join(FILES)}.", callback=spelt(FILES), show_default=False)
     ],
     name: Annotated[
-        Path, typer.Argument(metavar="NAME", help="Of the file, .py or, of a preset, .toml; it must not exist.")
+        Path, typer.Argument(metavar="NAME", help="Name of the new file, .py or, for a preset, .toml.")
     ],
     json: JsonOption = None,
 ) -> None:
-    """Write a commented file to change into a problem, model, env or thruster of yours; it works as it stands.
+    """Write a commented, working template of a problem, model, env or thruster of your own.
 
-    problem: a plant that makes data and what filters assume of it, for tune, evaluate and compare. model: a
+    problem: a plant that generates data and what filters assume of it, for tune, evaluate and compare. model: a
     state-space model, for estimate, tune --log and identify. env: a Gymnasium env with a filter around it. preset:
-    a thruster's numbers, for --preset of every command.
+    a thruster's parameters, for --preset of every command.
 
     Example: thruster new problem pendulum
     """
@@ -52,10 +52,10 @@ def command(
 
 
 def target(kind: str, name: Path) -> Path:
-    """The file that a template goes to.
+    """The file for a template.
 
     Raises:
-        ValueError: for an unknown kind, a file that is there, or a name by which Python could not import it.
+        ValueError: for an unknown kind, an existing file, or a name that Python could not import.
     """
     suffix = Path(FILES[one_of("what is new", kind, FILES)]).suffix
     if name.suffix not in ("", suffix):

@@ -1,4 +1,4 @@
-"""Options that several commands share, and the panels in which `--help` groups all of them."""
+"""Options that several commands share, and the panels that group them in `--help`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from filters.registry import FILTERS
+from filters.starts import STARTS
 from numerics.checks import any_case
 from thruster_env.channels import CHANNELS
 from thruster_env.parameters import PRESETS
@@ -18,14 +19,14 @@ INPUT, FILTER, SEARCH, LEARNING, RUNS, OUTPUT = "Input", "Filter", "Search", "Le
 
 
 def one_file(argument: Path | None, option: Path | None) -> Path | None:
-    """The tuned file, which may be given as an argument or by --tuned; ValueError where two are."""
+    """The tuned file, given as an argument or by --tuned; ValueError if both are."""
     if argument is not None and option is not None:
         raise ValueError(f"a tuned file must be one, but got {argument} and --tuned {option}")
     return argument or option
 
 
 def spelt(choices: Iterable[str]) -> Callable:
-    """A callback of an option or argument that takes names of choices in upper or lower case."""
+    """A callback for an option or argument that accepts names of choices in upper or lower case."""
     known = tuple(choices)
 
     def callback(value):
@@ -45,7 +46,9 @@ JsonOption = Annotated[
 ]
 SeedOption = Annotated[
     int,
-    typer.Option("--seed", min=0, help="Seed of all randomness; the same seed repeats all.", rich_help_panel=RUNS),
+    typer.Option(
+        "--seed", min=0, help="Seed of all randomness; the same seed gives the same results.", rich_help_panel=RUNS
+    ),
 ]
 A_PRESET = f"{', '.join(PRESETS)}, or a FILE.toml of `thruster new preset` or `thruster identify`."
 PresetOption = Annotated[
@@ -65,7 +68,7 @@ CodeOption = Annotated[
     typer.Option(
         "--problem",
         metavar="MODULE:OBJECT",
-        help="What it was tuned on, where that is code: nothing that a file or a study names is imported.",
+        help="The problem it was tuned on, if that is code: nothing that a file or a study names is imported.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -81,7 +84,7 @@ def filter_option(help_text: str):
 LogPresetOption = Annotated[
     str | None,
     typer.Option(
-        "--preset", help=f"The thruster that it is of: {A_PRESET}", callback=spelt(PRESETS), rich_help_panel=INPUT
+        "--preset", help=f"The thruster of the log: {A_PRESET}", callback=spelt(PRESETS), rich_help_panel=INPUT
     ),
 ]
 ModelOption = Annotated[
@@ -89,7 +92,8 @@ ModelOption = Annotated[
     typer.Option(
         "--model",
         metavar="MODULE:OBJECT",
-        help="In place of a thruster: a StateSpaceModel, or a function that makes one (of dt, if it takes it).",
+        help="In place of a thruster: a StateSpaceModel, or a function that returns one (called with dt, if "
+        "it takes it).",
         rich_help_panel=INPUT,
     ),
 ]
@@ -97,7 +101,7 @@ SensorOption = Annotated[
     list[str] | None,
     typer.Option(
         "--sensor",
-        help=f"What the filter sees of a thruster, thrust by default: {', '.join(CHANNELS)}.",
+        help=f"A thruster's sensor that the filter sees, thrust by default: {', '.join(CHANNELS)}.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -106,7 +110,7 @@ ColumnOption = Annotated[
     typer.Option(
         "--column",
         metavar="NAME=HEADER[UNIT]",
-        help="Which column is which input, measurement, state or output; may be repeated.",
+        help="The column of an input, measurement, state or output; may be repeated.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -123,7 +127,8 @@ DtOption = Annotated[
     float | None,
     typer.Option(
         "--dt",
-        help="Sample time [s]: of a log without times, or to put it on. Variances are per step of it.",
+        help="Sample time [s] of a log without times, or of the grid for irregular ones. Variances are per "
+        "step of it.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -139,7 +144,7 @@ HeldOutOption = Annotated[
     list[Path] | None,
     typer.Option(
         "--held-out",
-        help="Recorded run that the study never sees; by default every third one.",
+        help="Held-out recorded run, never used by the study; by default every third one.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -147,7 +152,7 @@ BlocksOption = Annotated[
     int | None,
     typer.Option(
         "--blocks",
-        help="How many blocks a run is cut into; about 24 in all by default.",
+        help="Number of blocks per run; about 24 in total by default.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -155,7 +160,24 @@ LeadOption = Annotated[
     int | None,
     typer.Option(
         "--lead",
-        help="Rows at the beginning of a block that do not count; 50 by default.",
+        help="Number of rows at the beginning of a block that are not scored; 50 by default.",
+        rich_help_panel=INPUT,
+    ),
+]
+HoldGapsOption = Annotated[
+    bool,
+    typer.Option(
+        "--hold-gaps",
+        help="Hold the last input over gaps of a log; by default runs are cut there.",
+        rich_help_panel=INPUT,
+    ),
+]
+StartOption = Annotated[
+    str | None,
+    typer.Option(
+        "--start",
+        help="Initial state of blocks: prior, or measurement, from their first measurement.",
+        callback=spelt(STARTS),
         rich_help_panel=INPUT,
     ),
 ]
@@ -164,7 +186,7 @@ LogModelOption = Annotated[
     typer.Option(
         "--model",
         metavar="MODULE:OBJECT",
-        help="The model of the logs that it was tuned on, where that is code.",
+        help="The model of the logs that it was tuned on, if that is code.",
         rich_help_panel=INPUT,
     ),
 ]

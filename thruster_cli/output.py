@@ -1,4 +1,4 @@
-"""What every command shares: tables on the terminal, JSON for programs."""
+"""Shared output of commands: tables on the terminal, JSON for programs."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console, RenderableType
+from rich.text import Text
 
 from numerics.compiled import tell_when_compiling
 from numerics.files import check_not_read, check_target, write_whole
@@ -19,7 +20,8 @@ from numerics.progress import listening
 from numerics.text_tables import BEST as BEST
 from numerics.text_tables import console
 from numerics.text_tables import table as table  # for the commands, beside what follows
-from plants.logs.write import check_suffix
+from plants.logs.table import SUFFIXES
+from plants.logs.write import check_not_beside, check_suffix
 from thruster_cli.options import JsonOption, SeedOption  # noqa: F401 - for `demo`
 from thruster_env.plant import largest_known_voltage
 
@@ -32,10 +34,17 @@ def emit(shown: Sequence[RenderableType], data: dict, json_target: str | None) -
     if json_target == "-":
         sys.stdout.write(as_text(data))
         return
+    _check_json(json_target)
     if json_target is not None:  # first: there may be nobody left who reads what is printed
         write_whole(json_target, as_text(data))
     for part in shown:
         console.print(part)
+
+
+def _check_json(target: str | None) -> None:
+    """Raise ValueError for a path that would be a log, or the description of one."""
+    if target is not None and Path(target).suffix in (*SUFFIXES, ".toml"):
+        raise ValueError(f"--json must be no log, nor what is said of one, but got {target!r}")
 
 
 def check_picture(path: Path, option: str) -> None:
@@ -47,23 +56,25 @@ def check_targets(targets: Iterable[str | Path | None], json_target: str | None,
     """Raise ValueError unless all files can be written, before long work, and none of those read is among them.
 
     Args:
-        targets: paths of what is to be written, None for those that nobody asked for.
+        targets: paths to be written, None for those not requested.
         json_target: of `--json`.
-        read: paths of what is read, None for those that nobody gave.
+        read: paths to be read, None for those not given.
     """
     named = [one for one in (*targets, None if json_target == "-" else json_target) if one is not None]
     given = [one for one in read if one is not None]
     for target in named:
         check_not_read(target, given)
     for target in named:
+        check_not_beside(target)
         check_target(target)
+    _check_json(json_target)
 
 
 def warn_beyond(preset: str, voltage: float) -> None:
-    """Say on standard error that a preset is driven by a larger voltage [V] than is known of it."""
+    """Say on standard error that a preset is driven by a larger voltage [V] than it is valid for."""
     known = largest_known_voltage(preset)
     if abs(voltage) > known:
-        said = f"{preset} is known up to {known:g} V, but is driven by {abs(voltage):g} V: this is extrapolated"
+        said = f"{preset} is valid up to {known:g} V, but is driven by {abs(voltage):g} V: this is extrapolated"
         progress_console.print(f"thruster: warning: {said}")
 
 
@@ -71,15 +82,16 @@ def warn_beyond(preset: str, voltage: float) -> None:
 def announce_compilation() -> None:
     """Say on standard error when this process has to compile; later ones find the result in a cache."""
     tell_when_compiling(
-        lambda: progress_console.print("compiling numerical code: the first run only, some seconds a filter ...")
+        lambda: progress_console.print("compiling numerical code: the first run only, some seconds per filter ...")
     )
 
 
 @contextmanager
 def working(text: str) -> Iterator[None]:
-    """Say on standard error what goes on, with how far it is where that is told."""
-    with progress_console.status(f"{text} ...") as status, listening(lambda far: status.update(f"{text}: {far}")):
-        yield
+    """Say on standard error what is running, with its progress if known."""
+    with progress_console.status(Text(f"{text} ...")) as status:  # names are a user's, and no markup
+        with listening(lambda far: status.update(Text(f"{text}: {far}"))):
+            yield
 
 
 def as_text(data) -> str:

@@ -1,4 +1,4 @@
-"""`thruster play`: watch a policy, a sequence of voltages or a log, as a video or in a window."""
+"""`thruster play`: show a policy, a sequence of voltages or a log, as a video or in a window."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def command(
     sensor: SensorOption = None,
     column: ColumnOption = None,
     filter_name: Annotated[
-        str | None, filter_option(f"Its estimate is drawn; ekf by default. {FILTER_HELP}")
+        str | None, filter_option(f"Filter whose estimate is drawn; ekf by default. {FILTER_HELP}")
     ] = None,
     tuned: Annotated[
         Path | None, typer.Option(help="Tuned file, in place of --filter.", rich_help_panel=FILTER)
@@ -62,7 +62,7 @@ def command(
     seed: Annotated[
         int | None,
         typer.Option(
-            min=0, help="Seed of the episode; of a policy by default one that is held out.", rich_help_panel=RUNS
+            min=0, help="Seed of the episode; for a policy a held-out one by default.", rich_help_panel=RUNS
         ),
     ] = None,
     out: Annotated[
@@ -75,26 +75,27 @@ def command(
     ] = None,
     window: Annotated[
         bool,
-        typer.Option("--window", help="Show it in a window instead, at true speed.", rich_help_panel=OUTPUT),
+        typer.Option("--window", help="Show it in a window instead, in real time.", rich_help_panel=OUTPUT),
     ] = False,
     size: Annotated[
         str | None,
         typer.Option(
             metavar="WIDTHxHEIGHT",
-            help="Of the picture in pixels; 640x400 by default.",
+            help="Size of the picture in pixels; 640x400 by default.",
             rich_help_panel=OUTPUT,
         ),
     ] = None,
     json: JsonOption = None,
 ) -> None:
-    """Show an episode: what the thruster does, and what a filter believes of its hidden state.
+    """Show an episode: the motion of the thruster, and a filter's estimate of its hidden state.
 
     Without MODEL there is no policy to load, and torch is not needed: a PI controller follows a reference, a
     constant voltage or a sequence drives the thruster, or a log is shown as it was recorded, with the estimate in
-    the place of the truth where the log has none.
+    place of the truth if the log has none.
 
-    A policy sees what it was trained on: the same measurements, filter and scaling. The strip charts show the
-    thrust, its reference and its measurement, and the filter's estimate with a band of two standard deviations.
+    A policy gets the observations of its training: the same measurements, filter and scaling. The strip charts
+    show the thrust, its reference and its measurement, and the filter's estimate with a band of two standard
+    deviations.
 
     Needs the extra render, for MODEL also rl: pip install '.[rl,render]' in the project's folder
 
@@ -133,7 +134,7 @@ def command(
 
 
 def one_given(chosen: dict) -> str:
-    """The one name whose value is given; ValueError unless there is exactly one."""
+    """The only name with a value; ValueError unless there is exactly one."""
     given = [name for name, value in chosen.items() if value is not None]
     if len(given) != 1:
         rule = f"play must be given one of {', '.join(chosen)}"
@@ -162,7 +163,7 @@ def _check_even(film: Path | None, size: tuple[int, int] | None) -> None:
 
 
 def _check_options(what: str, given: dict, fitting: tuple[str, ...]) -> None:
-    """Raise ValueError for an option that does not go with what is played."""
+    """Raise ValueError for an option that does not apply to what is played."""
     for name, value in given.items():
         if value is not None and what not in fitting:
             raise ValueError(f"{name} must come with {' or '.join(fitting)}, but got it with {what}")

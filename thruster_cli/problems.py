@@ -1,10 +1,10 @@
-"""How commands name the problems that come with the package, and where others come from."""
+"""How commands name built-in and other problems."""
 
 from __future__ import annotations
 
 from tuning.problems.rooms import built_in
 
 PROBLEMS = (
-    f"{', '.join(built_in())}, a .toml file, or module:object: a tuning.problems.problem.Problem, or a function "
-    "that gives one."
+    f"{', '.join(built_in())}, a .toml file, or module:object: a tuning.problems.problem.Problem, or a "
+    "function that returns one."
 )

@@ -27,23 +27,24 @@ def command(
         bool,
         typer.Option(
             "--identify",
-            help="Find all numbers anew, of nine structures, with and without each run: a quarter of an hour.",
+            help="Identify all parameters again, of nine structures, with and without each run: a quarter of "
+            "an hour.",
             rich_help_panel=RUNS,
         ),
     ] = False,
     out: Annotated[
         Path,
         typer.Option(
-            help="With --identify: file of results; what is there is not done again.", rich_help_panel=OUTPUT
+            help="With --identify: file of results; existing ones are not recomputed.", rich_help_panel=OUTPUT
         ),
     ] = RESULTS,
     json: JsonOption = None,
 ) -> None:
     """Compare estimates of a recorded thruster's thrust with its load cell, and with the recorder's own estimate.
 
-    The filter sees command and tachometer. Without --identify its numbers are those that the project has from six
-    runs; with it, each run is estimated with numbers that were found without that run. The recordings are those of
-    J. A. Boehm (University of Maryland, 2019), which are no part of this project: docs/real_data.md says more.
+    The filter sees command and tachometer. By default its parameters are the project's, identified from six runs;
+    with --identify, each run is estimated with parameters identified without that run. The recordings are those of
+    J. A. Boehm (University of Maryland, 2019), which are not part of this project: see docs/real_data.md.
 
     Example: thruster study recordings --data rov_thruster
     """
@@ -70,15 +71,15 @@ def command(
                     ),
                 )
         except KeyboardInterrupt:
-            progress_console.print(f"Interrupted: what is done is in {out}, and the same command goes on.")
+            progress_console.print(f"Interrupted: finished work is in {out}, and the same command continues.")
             raise
     estimates = estimates_of(runs, tasks)
-    which = "numbers found without the run" if identify else "the project's numbers"
+    which = "parameters identified without the run" if identify else "the project's parameters"
     titles = {
         "ratios": f"RMSE of thrust over 0.2 s; {which}",
         "estimators": "RMSE over 0.2 s, N: all rows / settled",
         "clocks": "how far the load cell's clock is ahead",
-        "structures": "what each effect is worth",
+        "structures": "the contribution of each effect",
         "numbers": "numbers found",
     }
     made = tables_of(runs, estimates, tasks)

@@ -21,28 +21,33 @@ from tuning.search.study import quiet_optuna
 def command(
     sources: Annotated[
         list[str],
-        typer.Argument(metavar="FILE_OR_STUDY...", help="Tuned file, or name of a study; of two: side by side."),
+        typer.Argument(
+            metavar="FILE_OR_STUDY...", help="Tuned file, or name of a study; two are shown side by side."
+        ),
     ],
     storage: Annotated[
         str,
-        typer.Option(help="Where the study is: a journal file, or an Optuna storage URL.", rich_help_panel=INPUT),
+        typer.Option(
+            help="Storage of the study: a journal file, or an Optuna storage URL.", rich_help_panel=INPUT
+        ),
     ] = DEFAULT_STORAGE,
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="FOLDER", help="Where to write; by default beside the tuned file.", rich_help_panel=OUTPUT
+            metavar="FOLDER", help="Page to write; by default beside the tuned file.", rich_help_panel=OUTPUT
         ),
     ] = None,
     problem: CodeOption = None,
     model: LogModelOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Write a page on a tuned filter that any browser shows without a network, and its tables as Markdown.
+    """Write a report page on a tuned filter, for any browser without a network, and its tables as Markdown.
 
-    It has errors and consistency before and after on held-out seeds, the convergence of the study, which numbers
-    matter, the error against ensemble size, one run over time with 95 % bands, and a sentence of advice.
+    It has errors and consistency before and after on held-out seeds, the convergence of the study, the importance
+    of parameters, the error against ensemble size, one run over time with 95 % bands, and a sentence of advice.
 
-    Of two it has both side by side and, where they are of the same problem, the paired ratio of their scores.
+    With two files it shows both side by side and, if they are of the same problem, the paired ratio of their
+    scores.
 
     Example: thruster report out/enkf-mismatch-seed0.json
 

@@ -1,4 +1,4 @@
-"""`thruster reproduce`: published tables, and those of standard problems, against many runs of our own."""
+"""`thruster reproduce`: published tables, and those of standard problems, compared with many runs of ours."""
 
 from __future__ import annotations
 
@@ -78,20 +78,16 @@ def command(
     (EnKF) on two linear bow thrusters, tunnel and open-bladed, at Q = R = q I
     for four values of q, by the RMSE of one run, it seems.
 
-    Here both filters see the same many runs. Three more columns tell what to
-    expect: the Riccati optimum, which no filter can beat; the start from
-    P_0 = I; and a wrong filter, whose ensemble is never updated, which gives
-    the published open-bladed EnKF. Every published value comes with its
-    distances in standard deviations of a single run, and a word on why it
-    differs.
+    Here both filters see the same runs. Three more columns show what to expect: the Riccati optimum, which no
+    filter can beat; the start from P_0 = I; and a wrong filter, whose ensemble is never updated, which gives the
+    published open-bladed EnKF. Every published value comes with its distances in standard deviations of a single
+    run, and the reason for the difference.
 
     The papers on the underwater vehicle compare ensemble and fuzzy Kalman
-    filters at 1 kHz by the RMSE of its path. Beside them stand other filters
-    and the bare measurements, on the same runs, by the papers' transformation
-    and by the right one.
+    filters at 1 kHz by the RMSE of its path. The tables add other filters and the bare measurements, on the same
+    runs, with the papers' transformation and with the right one.
 
-    A standard problem shows our filters beside what is published of it, or
-    beside another package on the same data.
+    A standard problem compares our filters with published results, or with another package on the same data.
 
     Example: thruster reproduce nurhadi2022 --series series.png --json table.json
 
@@ -128,7 +124,7 @@ def command(
 
 
 def reproduce(names: tuple[str, ...], runs: int = RUNS, members: int = MEMBERS, seed: int = 0):
-    """Run the published experiments of some studies; return what to show, a list, and it as plain data."""
+    """Run the published experiments of some studies; return what to show, as a list and as plain data."""
     comparisons = _compare(runs, members, seed)
     blank = Text()
     shown, general = [], general_statements(comparisons)
@@ -153,7 +149,7 @@ def reproduce(names: tuple[str, ...], runs: int = RUNS, members: int = MEMBERS, 
             "rows": [_plain_finding(f) for f in found],
             "statements": statements,
         }
-    return [*shown, Text("What the runs say"), list_of(general)], data
+    return [*shown, Text("Conclusions from the runs"), list_of(general)], data
 
 
 def _compare(runs: int, members: int, seed: int):
@@ -199,8 +195,8 @@ def _published_table(name: str, case: str, found: list):
     why = "why they differ"
     columns = ["q", "filter", "published", "ours", "optimum (sd)", "un-updated ensemble (sd)", why]
     caption = (
-        f"{LINES} (sd): how many standard deviations of a single run's RMSE the published value lies above. "
-        "Un-updated ensemble: a wrong filter, see below."
+        f"{LINES} (sd): distance of the published value above ours, in standard deviations of a single run's "
+        "RMSE. Un-updated ensemble: a wrong filter, see below."
     )
     out = table(f"{name}, {case}: published RMSE against ours", columns, rows, caption=caption)
     return fitted(out, rows, flexible=why)

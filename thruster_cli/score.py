@@ -1,4 +1,4 @@
-"""`thruster score`: trained policies, and classical ones beside them, on held-out episodes."""
+"""`thruster score`: trained and classical policies on held-out episodes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 from rich.console import RenderableType
+from rich.text import Text
 
 from filters.consistency.intervals import mean_interval
 from numerics.checks import one_of
@@ -32,7 +33,7 @@ SEEN = "seen"  # heads the column of what the policy is shown
 
 
 class Scored(NamedTuple):
-    """A policy and how it did."""
+    """A policy and its scores."""
 
     label: str
     folder: Path | None  # of a learnt policy
@@ -45,15 +46,15 @@ def command(
     scenario: Annotated[
         str | None,
         typer.Option(
-            help=f"Another plant than that of training: {LEARNABLE}, or a .toml file.", rich_help_panel=INPUT
+            help=f"A plant other than that of training: {LEARNABLE}, or a .toml file.", rich_help_panel=INPUT
         ),
     ] = None,
     preset: OfPresetOption = None,
     classical: Annotated[
         list[str] | None,
         typer.Option(
-            help="pi, lqr, one-step or mpc; may be repeated. A controller that observes what each policy does; "
-            "all but pi a state only.",
+            help="pi, lqr, one-step or mpc; may be repeated. A controller with the observations of each "
+            "policy; all but pi need a state.",
             rich_help_panel=INPUT,
         ),
     ] = None,
@@ -69,8 +70,9 @@ def command(
     within 0.15 s of its steps, elsewhere, and within 0.15 s of changes of its sign. Several policies are compared
     with the first one episode by episode.
 
-    With --scenario the plant changes, its noise and sensors too, and nobody is told: a filter goes on assuming the
-    plant of training, a classical controller keeps its gains. What a scenario says of filters is left out.
+    With --scenario the plant changes, including its noise and sensors, but filters and controllers do not know: a
+    filter still assumes the plant of training, a classical controller keeps its gains. Settings of a scenario for
+    filters are ignored.
 
     Needs the extra rl: pip install '.[rl]' in the project's folder
 
@@ -95,13 +97,13 @@ def command(
     scored = []
     with progress_console.status("scoring ...") as status:
         for model, folder in folders.items():
-            status.update(f"scoring {model} on {seeds} episodes ...")
+            status.update(Text(f"scoring {model} on {seeds} episodes ..."))
             scored.append(_learnt(model, folder, setups[model], plant, held_out))
         for name in classical or []:
             for setup in _each_arm(setups.values()):
                 if name in kind.of_states and not find_observation_set(setup.observe).shows_state:
                     continue
-                status.update(f"scoring {name} on {setup.observe} ...")
+                status.update(Text(f"scoring {name} on {setup.observe} ..."))
                 scored.append(_classical(name, setup, plant, held_out))
     emit(report(scored, held_out), as_json(scored, held_out), json)
 
@@ -151,7 +153,7 @@ def _each_arm(setups) -> list[TrainingConfiguration]:
 
 
 def report(scored: Sequence[Scored], seeds: range) -> list[RenderableType]:
-    """A table of policies, and where the learnt ones lie."""
+    """A table of policies, and the folders of the learned ones."""
     kind = plant_of(scored[0].setup.task)
     rows, first, shown_parts = [], scored[0].scores.returns, [part for part in kind.parts if part != "all"]
     for number, (label, _, _, scores) in enumerate(scored, start=1):
@@ -161,7 +163,10 @@ def report(scored: Sequence[Scored], seeds: range) -> list[RenderableType]:
     headers = [f"{SEEN if part == 'observed' else part}\n[{kind.parts[part]}]" for part in shown_parts]
     columns = ["policy", "mean return", "over the\nfirst", *headers]
     title = f"Held-out episodes {seeds.start} to {seeds.stop - 1}, {scored[0].setup.task}"
-    caption = f"±: half of the 95 % interval. Then root mean square errors: {kind.errors}; blank: no such step."
+    caption = (
+        f"±: half of the 95 % interval. The other columns are root mean square errors: {kind.errors}; blank: "
+        "no such step."
+    )
     shown: list[RenderableType] = [table(title, columns, rows, caption=caption)]
     learnt = [(number, one) for number, one in enumerate(scored, start=1) if one.folder is not None]
     return shown + [f"{number} {one.label}: {one.folder}" for number, one in learnt]

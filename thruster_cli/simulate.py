@@ -12,7 +12,7 @@ from numerics.checks import at_least, positive, within
 from numerics.streams import episode_keys
 from plants.logs.write import check_suffix, header_of, write_columns
 from thruster_cli.options import INPUT, OUTPUT, RUNS, JsonOption, PresetOption, SeedOption
-from thruster_cli.output import announce_compilation, emit, warn_beyond
+from thruster_cli.output import announce_compilation, check_targets, emit, warn_beyond
 from thruster_env.channels import CHANNELS
 from thruster_env.plant import (
     DEFAULT_DT,
@@ -39,21 +39,21 @@ def command(
         ),
     ] = DEFAULT_DT,
     voltage: Annotated[
-        float | None, typer.Option(help="Constant voltage [V]; else random levels.", rich_help_panel=RUNS)
+        float | None, typer.Option(help="Constant voltage [V]; random levels by default.", rich_help_panel=RUNS)
     ] = None,
     amplitude: Annotated[
         float, typer.Option(help="Random levels lie within plus and minus this [V] ...", rich_help_panel=RUNS)
     ] = 12.0,
     hold: Annotated[int, typer.Option(help="... and are held for so many steps.", rich_help_panel=RUNS)] = 25,
     process_noise: Annotated[
-        tuple[float, float], typer.Option(help="Variances a step of omega_m and U_a.", rich_help_panel=INPUT)
+        tuple[float, float], typer.Option(help="Variances per step of omega_m and U_a.", rich_help_panel=INPUT)
     ] = DEFAULT_PROCESS_NOISE,
     measurement_noise: Annotated[
         float, typer.Option(help="Variance of the thrust [N^2].", rich_help_panel=INPUT)
     ] = DEFAULT_MEASUREMENT_NOISE,
     sensor: Annotated[
         list[str] | None,
-        typer.Option(help=f"What is measured, thrust by default: {', '.join(CHANNELS)}.", rich_help_panel=INPUT),
+        typer.Option(help=f"A measured channel, thrust by default: {', '.join(CHANNELS)}.", rich_help_panel=INPUT),
     ] = None,
     seed: SeedOption = 0,
     measured_only: Annotated[
@@ -74,13 +74,14 @@ def command(
 ) -> None:
     """Simulate a thruster and write time, voltage, true state, true thrust and measurements to a log.
 
-    With --measured-only the log is one as of a real thruster: whatever reads it has no truth to go by.
+    With --measured-only the log looks like one of a real thruster, without the truth.
 
     Row k holds the state at time k dt and the voltage that acts from then on; the last row has none. The
     numbers are those of BowThruster-v0 after reset(seed=SEED) under the same voltages. A simulation that does not
     stay finite is refused, and nothing is written.
     """
     check_suffix(out)
+    check_targets((out,), json)
     steps = at_least("steps", steps, 1, MOST_STEPS)
     sensors = sensor or ["thrust"]
     variances = {**{name: one.variance for name, one in CHANNELS.items()}, "thrust": measurement_noise}

@@ -1,4 +1,4 @@
-"""`thruster study`: comparisons that take their time."""
+"""`thruster study`: long comparisons."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from thruster_cli import recordings
+from thruster_cli import recordings, users
 from thruster_cli.options import OUTPUT, RUNS, JsonOption
 from thruster_cli.output import announce_compilation, emit, progress_console, table
 
@@ -30,6 +30,7 @@ def _callback() -> None:
 
 
 app.command("recordings")(recordings.command)
+app.command("users")(users.command)
 
 
 @app.command("policies")
@@ -38,20 +39,22 @@ def policies(
         bool,
         typer.Option(
             "--quick",
-            help="One noise, two seeds, few steps: whether it works, not what it says.",
+            help="One noise, two seeds, few steps: a test run without meaningful results.",
             rich_help_panel=RUNS,
         ),
     ] = False,
     seeds: Annotated[
         int | None,
-        typer.Option(min=1, max=1000, help="Training seeds of each learnt policy; 5.", rich_help_panel=RUNS),
+        typer.Option(
+            min=1, max=1000, help="Number of training seeds of each learned policy; 5.", rich_help_panel=RUNS
+        ),
     ] = None,
     steps: Annotated[
         int | None,
         typer.Option(
             min=1,
             max=10**12,
-            help="Steps that each learns from; as many as `thruster train` takes.",
+            help="Training steps of each policy; by default those of `thruster train`.",
             rich_help_panel=RUNS,
         ),
     ] = None,
@@ -62,16 +65,17 @@ def policies(
         ),
     ] = False,
     jobs: Annotated[
-        int | None, typer.Option(min=1, max=1000, help="Processes; as many as cores.", rich_help_panel=RUNS)
+        int | None,
+        typer.Option(min=1, max=1000, help="Number of processes; as many as cores.", rich_help_panel=RUNS),
     ] = None,
     out: Annotated[
-        Path, typer.Option(help="Folder of results; what is there is not done again.", rich_help_panel=OUTPUT)
+        Path, typer.Option(help="Folder of results; existing ones are not recomputed.", rich_help_panel=OUTPUT)
     ] = RESULTS,
     page: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE.md",
-            help="Page whose tables are written anew, with the pictures beside it.",
+            help="Page whose tables are rewritten, with the pictures beside it.",
             rich_help_panel=OUTPUT,
         ),
     ] = None,
@@ -80,8 +84,8 @@ def policies(
     """Train policies on raw, filtered and true state, and compare them with model-predictive control, PI and LQG.
 
     PPO at three noises of the thrust sensor, SAC and policies that correct the controller; the same held-out
-    episodes for all. Writes a page with tables and two pictures. Ctrl-C keeps what is done, and the same command
-    goes on. On two cores it takes an hour or more.
+    episodes for all. Writes a page with tables and two pictures. Ctrl-C keeps finished work, and the same command
+    continues. On two cores it takes an hour or more.
 
     Example: thruster study policies --quick
     """
@@ -101,7 +105,7 @@ def policies(
     check_page(target)
     announce_compilation()
     columns = [
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
@@ -117,9 +121,9 @@ def policies(
                 lambda run, done, count: progress.update(task, description=run.name, completed=done, total=count),
             )
     except KeyboardInterrupt:
-        progress_console.print(f"Interrupted: what is done is in {out}, and the same command goes on.")
+        progress_console.print(f"Interrupted: finished work is in {out}, and the same command continues.")
         raise
-    written = write_report(results, comparison, target)
+    written = write_report(results, comparison, target, rough=quick)
     rows = {noise: rows_of(results, noise) for noise in comparison.noises}
     said, files = answers(results), [str(path) for path in written]
     summary = summary_rows(results)

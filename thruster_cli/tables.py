@@ -1,4 +1,4 @@
-"""Tables of choices and of what they achieve, shared by several commands."""
+"""Tables of choices and their results, shared by several commands."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tuning.search.space import Choice
 
 
 def choice_table(choices: Mapping[str, Choice], scenario: Problem) -> Table:
-    """The numbers of filters of one kind, a column each."""
+    """The parameters of filters of one type, a column each."""
     kind, caption = next(iter(choices.values())).name, None
     model = scenario.model()
     rows = number_rows(list(choices.values()), kind, scenario, _number)
@@ -25,7 +25,7 @@ def choice_table(choices: Mapping[str, Choice], scenario: Problem) -> Table:
         pairs = zip(model.operating_input, model.input_quantities, strict=True)
         about = ", ".join(f"{value:g} {quantity.unit}".rstrip() for value, quantity in pairs)
         caption = f"kf: on the affine approximation about {about}"
-    return table(f"Numbers of the {kind} filter", ["", *choices], rows, caption=caption)
+    return table(f"Parameters of the {kind} filter", ["", *choices], rows, caption=caption)
 
 
 def _number(value) -> str:
@@ -33,14 +33,14 @@ def _number(value) -> str:
 
 
 def front_table(plan: Plan, front: Sequence) -> Table:
-    """Trials that no other beats in both objectives, the best in the first objective first."""
+    """The Pareto front of trials, the best in the first objective first."""
     names = list(dict.fromkeys(name for trial in front for name in trial.params))
     rows = [
         [str(trial.number + 1), *(f"{v:.4g}" for v in trial.values)]
         + [_number(trial.params.get(name, "")) for name in names]
         for trial in sorted(front, key=lambda trial: trial.values)
     ]
-    caption = "No trial is better in both. The first one is the tuned filter."
+    caption = "No other trial is better in both objectives. The first one is the tuned filter."
     return table(
         f"Pareto front on the training {plan.scenarios[0].seed_word}",
         ["trial", *plan.objectives, *names],
@@ -50,14 +50,14 @@ def front_table(plan: Plan, front: Sequence) -> Table:
 
 
 def kinds_table(kinds: Sequence[FilterType], plan: Plan) -> Table:
-    """Kinds of filters that a study tried, the best first."""
+    """Filter types that a study tried, the best first."""
     rows = [
         [kind.name, str(kind.trials), str(kind.pruned), str(kind.over_budget), _best(kind)]
         + ["" if kind.microseconds is None else f"{kind.microseconds:.3g}"]
         for kind in kinds
     ]
     columns = ["filter", "trials", "pruned", "over\nbudget", f"best\n{plan.objectives[0]}", "us/step"]
-    caption = "us/step: of the best trial; of the cheapest where none is complete. *: mean NIS outside its band."
+    caption = "us/step: of the best trial, or of the cheapest if none is complete. *: mean NIS outside its band."
     best = [0] if len(rows) > 1 else []
     title = f"Filters that were tried, on the training {plan.scenarios[0].seed_word}"
     return table(title, columns, rows, caption=caption, best=best)
@@ -68,7 +68,7 @@ def _best(kind: FilterType) -> str:
 
 
 def gradient_table(found: GradientResult, seed_word: str = "seeds") -> Table:
-    """Where each start led, and how well the data determine the maximum."""
+    """The result of each start, and how well the data determine the maximum."""
     rows = [
         ["x ".join(f"{factor:g}" for factor in optimum.start)]
         + [f"{variance:.4g}" for variance in optimum.variances]

@@ -1,4 +1,4 @@
-"""What is to be identified, from the texts of a command line: ranges, starts and names."""
+"""Options of an identification from the command line: ranges, starts and names."""
 
 from __future__ import annotations
 
@@ -24,5 +24,5 @@ def numbers_of(option: str, given: Mapping[str, str]) -> dict[str, float]:
 
 
 def names_of(text: str | None) -> list[str]:
-    """Names from a text with commas between."""
+    """Names from a text separated by commas."""
     return [name.strip() for name in (text or "").split(",") if name.strip()]

@@ -1,4 +1,4 @@
-"""`thruster train`: a policy that learns on raw, filtered or true state, with progress and a way to go on."""
+"""`thruster train`: train a policy on raw, filtered or true state, with progress and resumption."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def command(
         int | None,
         typer.Option(
             metavar="N",
-            help=f"Steps of the env to learn from; by default {FEWEST_STEPS}.",
+            help=f"Training steps of the env; by default {FEWEST_STEPS}.",
             rich_help_panel=LEARNING,
         ),
     ] = None,
@@ -80,14 +80,14 @@ def command(
         bool,
         typer.Option(
             "--untuned",
-            help="Give the filter R by the sensor's data sheet and Q by a rule of thumb.",
+            help="Give the filter R from the sensor's data sheet and Q from a rule of thumb.",
             rich_help_panel=FILTER,
         ),
     ] = False,
     controller: Annotated[
         str | None,
         typer.Option(
-            help=f"Let the policy correct one of {CORRECTABLE}, in place of acting alone.",
+            help=f"Let the policy correct one of {CORRECTABLE} instead of acting alone.",
             rich_help_panel=LEARNING,
         ),
     ] = None,
@@ -97,18 +97,22 @@ def command(
     ] = None,
     evaluations: Annotated[
         int,
-        typer.Option(metavar="N", help="How often the policy is tried out meanwhile.", rich_help_panel=LEARNING),
+        typer.Option(
+            metavar="N", help="Number of validations of the policy during training.", rich_help_panel=LEARNING
+        ),
     ] = 20,
     checkpoints: Annotated[
-        int, typer.Option(metavar="N", help="How often it is saved meanwhile.", rich_help_panel=OUTPUT)
+        int, typer.Option(metavar="N", help="Number of checkpoints during training.", rich_help_panel=OUTPUT)
     ] = 10,
     no_tensorboard: Annotated[
-        bool, typer.Option("--no-tensorboard", help="Do not write what it shows.", rich_help_panel=OUTPUT)
+        bool, typer.Option("--no-tensorboard", help="Do not write logs for TensorBoard.", rich_help_panel=OUTPUT)
     ] = False,
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="FOLDER", help="By default one in out/policies, named after all these.", rich_help_panel=OUTPUT
+            metavar="FOLDER",
+            help="By default one in out/policies, named after these options.",
+            rich_help_panel=OUTPUT,
         ),
     ] = None,
     seed: Annotated[
@@ -118,17 +122,17 @@ def command(
 ) -> None:
     """Train a policy on raw, filtered or true state, with Stable-Baselines3.
 
-    The reward is that of the true thrust, whatever the policy sees. A filter knows the plant's Q and R, unless
-    --tuned or --untuned says otherwise. The return that is shown is that of 32 episodes, the same each time and
-    none of them held out; `thruster score` has those.
+    The reward depends on the true thrust, whatever the policy sees. A filter knows the plant's Q and R, unless
+    --tuned or --untuned is given. The return shown is that of 32 validation episodes, the same each time; for
+    held-out ones use `thruster score`.
 
-    Whole rollouts are learnt, so it may end some steps later. In FOLDER, final/ is the policy that score and play
-    take (before it is there, the latest checkpoint), best/ the one with the highest return on the way.
+    Training uses whole rollouts, so it may end some steps later. In FOLDER, final/ is the policy for score and
+    play (until it exists, the latest checkpoint), best/ the one with the highest return so far.
 
-    With --controller the policy adds up to a fifth of the maximum voltage to what a predictive controller does,
-    which it is shown. It needs an estimate, or the true state.
+    With --controller the policy sees the action of a controller and adds up to a fifth of the maximum voltage to
+    it. The controller needs an estimate, or the true state.
 
-    Ctrl-C saves a checkpoint, and the same command goes on from it; so it does after a crash, or with more steps.
+    Ctrl-C saves a checkpoint, and the same command continues from it; also after a crash, or with more steps.
 
     Needs the extra rl: pip install '.[rl]' in the project's folder. To watch it learn:
     tensorboard --logdir out/policies
@@ -159,7 +163,9 @@ def command(
     check_installed()
     folder = out or POLICIES / name_of(setup, tuned, untuned)
     if tuned is not None and (meant := read_tuned_file(tuned)["problem"]) != chosen.name:
-        progress_console.print(f"{tuned} was tuned on {meant}, and its filter assumes what it did there.")
+        progress_console.print(
+            f"{tuned} was tuned on {meant}, and its filter keeps the assumptions of that scenario."
+        )
     with progress_console.status("loading torch ..."):
         from training.learn import train
     announce_compilation()
@@ -178,7 +184,7 @@ def command(
 
 
 def name_of(setup: TrainingConfiguration, tuned: Path | None = None, untuned: bool = False) -> str:
-    """Name of the folder of a training: what it learns, from what, by what."""
+    """Name of the folder of a training: task, observation set, algorithm."""
     parts = [setup.task, file_name(setup.scenario), setup.observe]
     parts += ["untuned"] * untuned + ([] if tuned is None else [tuned.stem])
     parts += [] if setup.controller is None else [setup.controller]
@@ -186,19 +192,21 @@ def name_of(setup: TrainingConfiguration, tuned: Path | None = None, untuned: bo
 
 
 def report(setup: TrainingConfiguration, trained: Trained) -> list[RenderableType]:
-    """What to print of a training: returns in its course, its speed, and what to do next."""
+    """What to print about a training: the course of the return, the speed, and the next commands."""
     curve, title = trained.curve, f"{setup.algo} on {setup.observe}, {setup.task}, scenario {setup.scenario}"
     last = len(curve) - 1
     picked = sorted({round(i * last / (SHOWN_EVALUATIONS - 1)) for i in range(SHOWN_EVALUATIONS)}) if curve else []
     rows = [[curve[i][0], f"{curve[i][1]:.3f}"] for i in picked]
-    speed = f"{trained.learnt / trained.seconds:.0f} steps/s" if trained.learnt else "nothing was left to learn"
+    speed = (
+        f"{trained.learnt / trained.seconds:.0f} steps/s" if trained.learnt else "training was already complete"
+    )
     shown: list[RenderableType] = []
     if rows:
         shown += [title, table("", ["steps", "mean return"], rows, caption="0 is perfect.")]
     shown.append(f"{trained.steps} steps, {trained.learnt} of them now in {trained.seconds:.1f} s: {speed}.")
     shown.append(f"Policy: {trained.folder}")
     if trained.interrupted:
-        return [*shown, "Interrupted: a checkpoint is saved, and the same command goes on from it."]
+        return [*shown, "Interrupted: a checkpoint is saved, and the same command continues from it."]
     return [*shown, f"Watch it: thruster play {trained.folder}", f"Score it: thruster score {trained.folder}"]
 
 
@@ -218,10 +226,10 @@ def as_json(setup: TrainingConfiguration, trained: Trained) -> dict:
 @contextmanager
 def _bar(title: str, total: int) -> Iterator[Callable[[int, float], None]]:
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("{task.fields[speed]} steps/s  return {task.fields[mean_return]}"),
+        TextColumn("{task.fields[speed]} steps/s  return {task.fields[mean_return]}", markup=False),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=progress_console) as progress:

@@ -1,4 +1,4 @@
-"""`thruster tune`: an Optuna study of a filter's noise covariances and ensemble size, with its proof."""
+"""`thruster tune`: an Optuna study of a filter's noise covariances and ensemble size, with held-out evaluation."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from thruster_cli.options import (
     ColumnOption,
     DtOption,
     HeldOutOption,
+    HoldGapsOption,
     JsonOption,
     LeadOption,
     LogOption,
@@ -29,6 +30,7 @@ from thruster_cli.options import (
     ModelOption,
     SeedOption,
     SensorOption,
+    StartOption,
     filter_option,
     spelt,
 )
@@ -50,10 +52,12 @@ def command(
     filter_name: Annotated[str, filter_option(TUNED_FILTER_HELP)] = "enkf",
     scenario: Annotated[
         list[str] | None,
-        typer.Option("--problem", "--scenario", help=f"{PROBLEMS} Several are averaged.", rich_help_panel=INPUT),
+        typer.Option(
+            "--problem", "--scenario", help=f"{PROBLEMS} Several: their mean, or --worst.", rich_help_panel=INPUT
+        ),
     ] = None,
     trials: Annotated[
-        int, typer.Option(help="Finished trials that the study shall have in total.", rich_help_panel=SEARCH)
+        int, typer.Option(help="Total number of finished trials of the study.", rich_help_panel=SEARCH)
     ] = 50,
     objective: Annotated[
         list[str] | None,
@@ -62,17 +66,23 @@ def command(
             rich_help_panel=SEARCH,
         ),
     ] = None,
+    worst: Annotated[
+        bool,
+        typer.Option(
+            "--worst", help="Of several problems minimise the worst one's, not the mean.", rich_help_panel=SEARCH
+        ),
+    ] = False,
     any_nis: Annotated[
         bool,
         typer.Option(
             "--no-consistency",
-            help="Do not hold the mean NIS between 0.8 and 1.25 of its expected value.",
+            help="Do not keep the mean NIS between 0.8 and 1.25 of its expected value.",
             rich_help_panel=SEARCH,
         ),
     ] = False,
     hold_r: Annotated[
         bool,
-        typer.Option("--hold-r", help="Keep R of the sensor's data sheet, tune Q alone.", rich_help_panel=SEARCH),
+        typer.Option("--hold-r", help="Keep R of the sensor's data sheet, tune only Q.", rich_help_panel=SEARCH),
     ] = False,
     full_q: Annotated[
         bool, typer.Option("--full-q", help="Tune the correlations of Q, too.", rich_help_panel=SEARCH)
@@ -81,7 +91,7 @@ def command(
         float | None,
         typer.Option(
             metavar="MICROSECONDS",
-            help="What a step of the filter may cost, in time of one core.",
+            help="Time limit of a step of the filter on one core.",
             rich_help_panel=FILTER,
         ),
     ] = None,
@@ -109,7 +119,7 @@ def command(
     storage: Annotated[
         str,
         typer.Option(
-            help="Journal file for one host; for several, a database as docs/workers.md tells.",
+            help="Journal file for one host; for several, a database (docs/workers.md).",
             rich_help_panel=OUTPUT,
         ),
     ] = DEFAULT_STORAGE,
@@ -117,6 +127,8 @@ def command(
     held_out: HeldOutOption = None,
     blocks: BlocksOption = None,
     lead: LeadOption = None,
+    hold_gaps: HoldGapsOption = False,
+    start: StartOption = None,
     preset: LogPresetOption = None,
     model: ModelOption = None,
     sensor: SensorOption = None,
@@ -124,7 +136,8 @@ def command(
     clock_offset: ClockOption = None,
     dt: DtOption = None,
     study: Annotated[
-        str | None, typer.Option(help="Name of the study; by default from the above.", rich_help_panel=OUTPUT)
+        str | None,
+        typer.Option(help="Name of the study; by default from the options above.", rich_help_panel=OUTPUT),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Tuned file; out/STUDY.json by default.", rich_help_panel=OUTPUT)
@@ -132,20 +145,27 @@ def command(
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Find the Q, R and ensemble size that make a filter's estimate best, and prove it on held-out seeds.
+    """Find the Q, R and ensemble size that give a filter's best estimate, and evaluate it on held-out seeds.
 
     The score is the mean over states of RMSE over its scale, on 32 training seeds that every trial shares. The
     first trial is the rule of thumb: R from the sensor's data sheet, Q from 1 % of each state's range. Ctrl-C
-    keeps all finished trials: the same command goes on with the study. The report is on 200 seeds that no trial
-    saw, against the scaled default first: the rule of thumb with one factor on its Q that brings the mean NIS
-    (normalised innovation squared) on the training runs to 1.
+    keeps all finished trials: the same command continues the study. The report compares the filter with its
+    baselines on 200 seeds that no trial saw, first with the Q and R given with your model.
 
-    RMSE alone hardly determines Q and R: only their ratio matters to the estimate. So the mean NIS is held in a
-    band unless --no-consistency is given, and the report says what that costs. Where no trial is in the band, the
-    one with the least error is written, the report and the file say so, and the exit code is 3.
+    Q's variances and R are searched from 1e-10 to 1e4 times the rule of thumb, on logarithmic scales, beginning
+    from 1e-5 to 1e2 (R: 1e-2 to 1e3) and ten times beyond the best trial; given values lie inside, and the report
+    flags a parameter at an end of its range. Besides sampled trials the study tries the baselines (given, rule of
+    thumb, scaled default, noise estimation) and the maximum-likelihood values. At the end the best trials meet the
+    baselines on 100 validation seeds, and a trial that is not significantly better there gives way to the best
+    baseline.
 
-    With --log it learns from recorded runs instead, cut into blocks of which every third is held out. What is
-    minimised is the negative log-likelihood of the innovations, unless the logs hold the true states.
+    RMSE alone hardly determines Q and R: only their ratio matters to the estimate. The mean NIS is therefore kept
+    in a band, unless --no-consistency is given, as long as that costs at most 5 % of the score; if it costs more,
+    the trial with the best log score among the best ones is taken. If no trial is in the band, the one with the
+    least error is taken, the report and the file say so, and the exit code is 3.
+
+    With --log it uses recorded runs instead, cut into blocks of which every third is held out. It minimises the
+    negative log-likelihood of the innovations, unless the logs contain the true states.
 
     Example: thruster tune --filter ekf --scenario mismatch --scenario outliers --trials 100
 
@@ -157,6 +177,7 @@ def command(
     check_keepable(filter_name)
     of_logs: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensor, "columns": column}
     of_logs |= {"clock_offset": clock_offset, "dt": dt, "held_out": held_out, "blocks": blocks, "lead": lead}
+    of_logs |= {"hold_gaps": hold_gaps or None, "start": start}
     scenarios = problems_of(scenario, log, of_logs, "mismatch")
     check_targets((out,), json, read=(*(log or []), *(held_out or []), *(scenario or []), preset))
     objectives = tuple(objective or ["score" if scenarios[0].scale is not None else "likelihood"])
@@ -171,6 +192,7 @@ def command(
         prune=not no_pruning,
         budget=budget,
         full_q=full_q,
+        worst=worst,
     )
     tuning = tune(plan, trials, storage, study, out, by_gradient=method == "gradient", workers=workers)
     emit(report(tuning), as_json(tuning), json)
@@ -190,7 +212,7 @@ def tune(
     by_gradient: bool = False,
     workers: int = 1,
 ) -> Tuning:
-    """Run or resume a study with a progress bar, prove its choice and write the tuned file."""
+    """Run or resume a study with a progress bar, evaluate its choice and write the tuned file."""
     name = study_name or name_of(plan, by_gradient)
     file = out or Path("out") / f"{name}.json"
     announce_compilation()

@@ -1,62 +1,64 @@
-"""What `thruster tune` says of a study: tables and sentences, or plain data."""
+"""What `thruster tune` reports on a study: tables and sentences, or plain data."""
 
 from __future__ import annotations
 
 from math import isfinite
+from shlex import quote
 
-from numpy import isnan
 from rich.console import RenderableType
 
-from filters.consistency.intervals import slightly
+from filters.consistency.intervals import slightly, span
 from filters.consistency.verdicts import mean_sentence
 from numerics.modules import is_code
 from thruster_cli.tables import choice_table, front_table, gradient_table, kinds_table
 from tuning.api.run import Tuning
-from tuning.evaluation.baselines import ORACLE, RULE, SCALED, TUNED, baselines
+from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED, baselines
+from tuning.evaluation.blow_up import blow_up_on
 from tuning.evaluation.evaluate import Evaluation, likelihood_gain, score_ratio
 from tuning.evaluation.held_out import Comparison
-from tuning.evaluation.sizes import SIZE_TOLERANCE
+from tuning.evaluation.sizes import SIZE_TOLERANCE, left_out
 from tuning.evaluation.tuned import consistency, metrics
-from tuning.likelihood.gradient import GradientResult
+from tuning.likelihood.gradient import DIFFERENTIABLE, GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
+from tuning.logs.problem import model_named_in
 from tuning.problems.rooms import built_in
-from tuning.reporting.error_tables import comparison_table, span
+from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.gains import gains
+from tuning.reporting.units import apart
 from tuning.search.filter_types import filter_types_tried
 from tuning.search.objectives import NIS_BAND
 from tuning.search.outcome import is_over_budget
 from tuning.search.plan import Plan
+from tuning.search.ranges import at_ends, range_words
 from tuning.search.space import size_ladder
 from tuning.search.study import StudyResult
+from tuning.search.validation import as_data as as_data_of_choice
 
 
 def report(tuning: Tuning) -> list[RenderableType]:
-    """What a tuning is worth, where its filter is and what to do next; then tables and sentences on it all."""
+    """The gain of a tuning, the path of its filter and the next command; then tables and sentences."""
     result, plan = tuning.result, tuning.plan
-    shown: list[RenderableType] = []
+    shown: list[RenderableType] = [*tuning.chosen]
     for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True):
         where = f"{scenario.name}: " if len(tuning.proofs) > 1 else ""
         first, *others = gains(proof, scenario.seed_word)
         shown += [f"{where}{first}", *others]
     if result.consistent is False:
         shown.append(_none_consistent(result, plan))
-    shown += [*way_out(tuning), *next_steps(tuning), ""]
+    shown += [*(blown_up(tuning) or way_out(tuning)), *next_steps(tuning), ""]
+    shown += [one for scenario in plan.scenarios for one in scenario.remarks]
     for scenario, proof in zip(plan.scenarios, tuning.proofs, strict=True):
         found = {TUNED: result.choice, **baselines(result.choice.name, scenario, plan.seed)}
         evaluations = proof.evaluations
-        choices = {proof.label(name): found[name] for name in evaluations}
+        choices = {name: found[name] for name in evaluations}
         span_of_seeds = f"{scenario.seed_word} {proof.seeds.start} to {proof.seeds.stop - 1}"
         where = f"held-out {span_of_seeds}, scenario {scenario.name}"
         shown += [
             choice_table(choices, scenario),
-            comparison_table(proof.labelled, proof.bound, where, scenario.scale_about),
+            comparison_table(proof.evaluations, proof.bound, where, scenario.scale_about),
         ]
         shown.append(_consistency_sentence(proof.tuned))
-        if proof.tuned.has_truth and isnan(proof.bound).all():
-            shown.append(
-                f"{scenario.name} has no bound: there is none for a singular Q, or if the plant is no model. Its "
-                f"score is RMSE over {scenario.scale_about}."
-            )
+    shown += at_ends(result.choice, plan)
     shown += sentences(tuning.known) if tuning.known else too_many(result.choice, plan.space())
     shown += _search_sentences(tuning)
     trained = f"{result.finished} trials, {result.pruned} of them pruned, {result.seconds:.1f} s in this run"
@@ -65,31 +67,43 @@ def report(tuning: Tuning) -> list[RenderableType]:
     return [*shown, f"Study {tuning.study!r}: {trained}."]
 
 
+def blown_up(tuning: Tuning) -> list[str]:
+    """Advice on a model that diverges between samples, where no Q and R help; empty if it does not."""
+    found = []
+    for scenario, proof in zip(tuning.plan.scenarios, tuning.proofs, strict=True):
+        data = scenario.data(proof.seeds)
+        found.append(blow_up_on(tuning.result.choice.filter(scenario), data, scenario.dt))
+    return [one for one in dict.fromkeys(found) if one]
+
+
 def way_out(tuning: Tuning) -> list[str]:
-    """What to do where the tuned filter is worse than the best of what anybody has; empty where it is not."""
+    """Advice if the tuned filter is worse than the best baseline; empty otherwise."""
     ratios = [next(iter(proof.ratios.items())) for proof in tuning.proofs if proof.tuned.has_truth]
     worse = [name for name, ratio in ratios if ratio.low > 1 and not slightly(ratio)]
     if not worse or tuning.gradient is not None:
         return []
     pruning = ", or without pruning (--no-pruning)" if tuning.plan.prune else ""
+    pruning += ", or maximum likelihood (--method gradient)" if tuning.plan.filter in DIFFERENTIABLE else ""
     return [
-        f"What may help: more trials (--trials {2 * tuning.result.finished}){pruning}. The file below holds the "
-        f"tuned filter all the same; Q and R of the {worse[0]} are in the table."
+        f"What may help: more trials (--trials {2 * tuning.result.finished}){pruning}. The file below still "
+        f"contains the tuned filter; Q and R of the {worse[0]} are in the table."
     ]
 
 
 def next_steps(tuning: Tuning) -> list[str]:
-    """Where the tuned filter is, and the command that shows more of it; of an interrupted study how it goes on."""
+    """The path of the tuned filter, and the next command; for an interrupted study how to continue it."""
     shown = [f"Tuned filter: {tuning.file}"]
-    names = [one.name for one in tuning.plan.scenarios if is_code(one.name) and one.name not in built_in()]
-    shown.append(f"Next: thruster report {tuning.file}{''.join(f' --problem {name}' for name in names)}")
+    problems = tuning.plan.scenarios
+    given = [f"--problem {one.name}" for one in problems if is_code(one.name) and one.name not in built_in()]
+    given += [f"--model {name}" for name in dict.fromkeys(map(model_named_in, problems)) if name is not None]
+    shown.append(" ".join([f"Next: thruster report {quote(str(tuning.file))}", *given]))
     if tuning.result.interrupted:
-        shown.append("Interrupted: this is on the trials that were finished; the same command goes on.")
+        shown.append("Interrupted: this is the result of the finished trials; the same command continues.")
     return shown
 
 
 def _search_sentences(tuning: Tuning) -> list[RenderableType]:
-    """What the search itself has to say: sizes, the price of consistency, optimism, a front, a maximum."""
+    """Results of the search: sizes, the price of consistency, optimism, a front, a maximum."""
     result, plan, word = tuning.result, tuning.plan, tuning.scenario.seed_word
     if tuning.gradient is not None and tuning.rival is not None:  # which come together
         said = _gradient_sentences(tuning, tuning.gradient, tuning.rival)
@@ -109,21 +123,26 @@ def _search_sentences(tuning: Tuning) -> list[RenderableType]:
             f"{r.size}: {r.ratio.value:.3f} [{r.ratio.high:.3f}]" for r in result.sizes if r.size in ladder
         )
         shown.append(
-            f"Score over the best by ensemble size, on {word} that chose neither Q nor R, with the upper end of "
-            f"its 95 % interval: {ratios}. {_size_sentence(kept, result)}{_seeds_sentence(result, word)}"
+            f"Score relative to the best, by ensemble size, on {word} that chose neither Q nor R, with the "
+            f"upper end of its 95 % interval: {ratios}. "
+            f"{_size_sentence(kept, result)}{_seeds_sentence(result, word)}"
         )
-    if result.consistent is not False and result.free_value is not None:
+    met = result.validation
+    in_band = met is None or (not met.gave_way and met.named(met.chosen).consistent)
+    if result.consistent is not False and result.free_value is not None and in_band:
         price = 100 * (result.best_value / result.free_value - 1)
+        free, held = apart(result.free_value, result.best_value)
         shown.append(
             f"Consistency, a mean NIS (normalised innovation squared) in its band, costs {price:.1f} % of the "
-            f"score on the training {word}: the best trial has {result.free_value:.3f} whatever its NIS, "
-            f"{result.best_value:.3f} with it in the band."
+            f"score on the training {word}: the best trial has {free} with any NIS, {held} with the NIS in "
+            "its band."
         )
     if plan.objectives == ("score",):  # which needs truth
         found = sum(proof.tuned.score.value for proof in tuning.proofs) / len(tuning.proofs)
+        trained, proved = apart(result.best_value, found)
         shown.append(
-            f"Optimism, by how much the score flatters on the {word} that chose the filter: the best trial has "
-            f"{result.best_value:.3f} on the training {word}, the tuned filter {found:.3f} on the held-out ones."
+            f"Optimism, the bias of the score on the {word} that chose the filter: the tuned filter has "
+            f"{trained} on the training {word}, {proved} on the held-out ones."
         )
     if result.front:
         shown.append(front_table(plan, result.front))
@@ -131,13 +150,20 @@ def _search_sentences(tuning: Tuning) -> list[RenderableType]:
 
 
 def _none_consistent(result: StudyResult, plan: Plan) -> str:
-    word = plan.scenarios[0].seed_word
-    ratios = [f"{ratio:.3g}" if isfinite(ratio) else "beyond all numbers" for ratio in result.nis]
+    word, channels = plan.scenarios[0].seed_word, len(plan.scenarios[0].quantities.measurements)
+    found = [f"{channels * ratio:.3g}" if isfinite(ratio) else "beyond all numbers" for ratio in result.nis]
+    low, high = (channels * end for end in NIS_BAND)
+    which = "the baseline above" if gave_way(result) else f"the trial with the least {plan.objectives[0]}"
     return (
-        f"No trial was consistent: a mean NIS must lie between {NIS_BAND[0]:g} and {NIS_BAND[1]:g} of its "
-        f"expected value, but the tuned filter's is {' and '.join(ratios)} on the training {word}. It is the "
-        f"trial with the least {plan.objectives[0]}; do not rely on its covariance."
+        f"No trial was consistent: a mean NIS must lie between {low:g} and {high:g}, where {channels} is right, "
+        f"but the tuned filter's is {' and '.join(found)} on the training {word}. It is {which}; do not rely on "
+        "its covariance."
     )
+
+
+def gave_way(result: StudyResult) -> bool:
+    """Whether the trials gave way to a baseline."""
+    return result.validation is not None and result.validation.gave_way
 
 
 def _gradient_sentences(tuning: Tuning, gradient: GradientResult, rival: Comparison) -> list[str]:
@@ -146,11 +172,11 @@ def _gradient_sentences(tuning: Tuning, gradient: GradientResult, rival: Compari
     words = []
     if loose:
         words.append(
-            f"The data do not determine {', '.join(loose)}: the 95 % interval reaches beyond a factor of ten, or "
-            "the maximum lies at the end of the range."
+            f"The data do not determine {', '.join(loose)}: the 95 % interval exceeds a factor of ten, or the "
+            "maximum lies at the end of the range."
         )
     agree = (
-        "All starts lead to one maximum."
+        "All starts lead to the same maximum."
         if gradient.agree
         else "Starts lead to different maxima: the best is kept."
     )
@@ -181,9 +207,13 @@ def as_json(tuning: Tuning) -> dict:
         "pruned": result.pruned,
         "microseconds_a_step": result.microseconds,
         "kinds": [kind._asdict() for kind in filter_types_tried(result.trials)],
+        "at_ends": at_ends(result.choice, plan),
+        "ranges": range_words(plan),
+        "choice": as_data_of_choice(result.validation),
         "best_training_value": result.best_value,
         "best_training_value_without_consistency": result.free_value,
         **consistency(result),
+        "blows_up": blown_up(tuning),
         "interrupted": result.interrupted,
         "sizes": [
             {
@@ -216,30 +246,38 @@ def as_json(tuning: Tuning) -> dict:
 
 def ratios_as_json(proof: Comparison) -> dict:
     """Score of the tuned filter over that of each baseline; None where there is no such baseline."""
-    ratios, names = proof.ratios, {"scaled": SCALED, "untuned": RULE, "true": ORACLE}
+    ratios, rule = proof.ratios, RULE if proof.rule == RULE else GIVEN
+    names = {"given": GIVEN, "scaled": SCALED, "untuned": rule, "noise": NOISE, "true": ORACLE}
     return {f"tuned_over_{key}": ratios.get(name) for key, name in names.items()}
 
 
 def _size_sentence(kept: int, result: StudyResult) -> str:
-    ends = {row.size: row.ratio.high for row in result.sizes}
+    ends, without = {row.size: row.ratio.high for row in result.sizes}, left_out(result.sizes, kept)
+    among = ""
+    if without:
+        some = f"N = {', '.join(map(str, without))}"
+        among = f" among those whose mean NIS is in its band (that of {some} is not)"
+    if gave_way(result):
+        return f"N = {kept} is the larger of the baseline's and the smallest sufficient one{among}."
     if ends[kept] < 1 + SIZE_TOLERANCE:
-        return f"N = {kept} is the smallest whose upper end is below {1 + SIZE_TOLERANCE:g}."
+        return f"N = {kept} is the smallest whose upper end is below {1 + SIZE_TOLERANCE:g}{among}."
     return f"No N has its upper end below {1 + SIZE_TOLERANCE:g} on all scenarios; N = {kept} is a compromise."
 
 
 def _seeds_sentence(result: StudyResult, word: str) -> str:
-    """Which sizes few runs left out; empty where all were run on all of them."""
+    """Which sizes were excluded after few runs; empty if all were run on all of them."""
     counts = {row.seeds for row in result.sizes}
     if len(counts) < 2:
         return ""
     whole = ", ".join(str(row.size) for row in result.sizes if row.seeds == max(counts))
-    return f" The first {min(counts)} {word} left out the others before N = {whole} were run on {max(counts)}."
+    return (
+        f" The others were excluded on the first {min(counts)} {word} before N = {whole} were run on "
+        f"{max(counts)}."
+    )
 
 
 def _consistency_sentence(evaluation: Evaluation) -> str:
     if not evaluation.has_truth:
         return mean_sentence("NIS", evaluation.nis, evaluation.expected_nis)
     said = mean_sentence("NEES", evaluation.nees, len(evaluation.rmse))
-    return (
-        said if said.startswith("Consistent") else f"{said} RMSE and NIS alone do not see all of the covariance."
-    )
+    return said if said.startswith("Consistent") else f"{said} RMSE and NIS do not show all of the covariance."

@@ -1,4 +1,4 @@
-"""The papers on the underwater vehicle on the terminal: their tables beside ours, and what the runs say."""
+"""The papers on the underwater vehicle on the terminal: their tables beside ours, and conclusions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from thruster_cli.vehicle_tables import (
 def reproduce_vehicle(
     paper: str, runs: int = RUNS, seed: int = 0, steps: int | None = None, series: Path | None = None
 ) -> tuple[list[RenderableType], dict]:
-    """Run a paper's filters on its paths; return what to show, a list, and it as plain data."""
+    """Run a paper's filters on its paths; return what to show, as a list and as plain data."""
     results = _run(paper, runs, seed, steps)
     found, said = findings(paper, results), statements(paper, results)
     shown: list[RenderableType] = [] if paper == "ngatini2017" else [particulars_table(), Text()]
@@ -42,7 +42,7 @@ def reproduce_vehicle(
     if paper == "ngatini2017":
         shown += [end_table(results), Text(), outside_table(results), Text()]
     source = PAPERS[paper].source
-    shown += [Text("What the runs say"), list_of(said), Text(), Text(f"{paper}: {source}")]
+    shown += [Text("Conclusions from the runs"), list_of(said), Text(), Text(f"{paper}: {source}")]
     shown.append(list_of(PAPERS[paper].remarks))
     data = {
         "settings": {"runs": runs, "seed": seed, "steps": steps},

@@ -25,7 +25,7 @@ FIELDS = {"planar": "by yaw alone", "planar_both": "both by yaw", "full": "full"
 
 
 def particulars_table() -> Table:
-    """Table I, beside what our vehicle has."""
+    """Table I, beside the values of our vehicle."""
     ours = {"mass": "15", "length": "0.98", "beam": "0.188", "speed": "1.94 (1 m/s) at 2.85 N"}
     rows = [
         [f"{name} [{unit}]", f"{value:g}", ours.get(name, "not in the equations")]
@@ -57,16 +57,16 @@ def published_table(paper: str, result: PathResult, found: list[Finding]) -> Tab
     rows.append(["bound", "", "", "", bound, "", ""])
     columns = ["filter", "published", *FIELDS.values(), "s", WHY]
     caption = (
-        f"{POSES} By yaw alone: the papers' transformation, against the true path. Both by yaw: against the path "
-        "that true velocities give by yaw alone. Full: with roll and pitch. s: seconds of a run, published above "
-        "ours, of one core. Of a size: within a factor of 3."
+        f"{POSES} By yaw alone: the papers' transformation, against the true path. Both by yaw: against the "
+        "path that true velocities give by yaw alone. Full: with roll and pitch. s: seconds of a run, "
+        'published above ours, of one core. "Of a size" means within a factor of 3.'
     )
     title = f"{paper}, path {_name(result)}: published RMSE against ours"
     return fitted(table(title, columns, rows, caption=caption), rows, flexible=WHY)
 
 
 def velocity_table(result: PathResult) -> Table:
-    """What each filter makes of velocities and attitude, and whether its covariance is right."""
+    """Each filter's errors of velocities and attitude, and whether its covariance is right."""
     rows = []
     for label, scores in result.scores.items():
         errors = np.concatenate([scores.rmse("velocities"), scores.rmse("attitude")])
@@ -75,8 +75,8 @@ def velocity_table(result: PathResult) -> Table:
     rows.append(["bound", *(digits(1e3 * value) for value in bound), ""])
     columns = ["filter", "u", "v", "w", "p", "q", "r", "phi", "theta", "NEES"]
     caption = (
-        "In mm/s, mrad/s and mrad, from 2 s on. NEES: right is the number of states. Bound: Riccati along the "
-        "noise-free path."
+        "In mm/s, mrad/s and mrad, from 2 s on. The expected NEES is the number of states. Bound: Riccati "
+        "along the noise-free path."
     )
     return table(f"path {_name(result)}: RMSE of velocities and attitude", columns, rows, caption=caption)
 
@@ -118,14 +118,14 @@ def end_table(results: list[PathResult]) -> Table:
     columns = ["path", "filter", "", "published", "by yaw alone", "full"]
     caption = (
         "Ours: mean distance at the end over the end value of the path without noise; published without a "
-        "definition. An end value near zero makes a percent that says nothing."
+        "definition. Near zero end values the percentage is meaningless."
     )
     title = "ngatini2017: error at the end in percent"
     return fitted(table(title, columns, rows, caption=caption), rows)
 
 
 def outside_table(results: list[PathResult]) -> Table:
-    """How long each velocity is outside the fuzzy filter's bounds."""
+    """The time that each velocity is outside the fuzzy filter's bounds."""
     rows = [
         [result.path, *(f"{100 * share:.0f}" for share in result.outside)]
         for result in results

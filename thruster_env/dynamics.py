@@ -22,7 +22,7 @@ _REST = 1e-200
 
 
 class Constants(NamedTuple):
-    """What the equations need of a preset; `parameters.derive_constants` makes it.
+    """The constants of the equations; `parameters.derive_constants` computes them from a preset.
 
     With V^2 = U_p^2 + U_a^2, lift and drag are quadratic in (omega_m, U_a), and cos(theta) and sin(theta) are
     linear in them over V. So V T and V Q are cubic: `thrust_21` is the factor of omega_m^2 U_a in V T.
@@ -129,7 +129,7 @@ def variational_rates(y, u, c):
 
 @inlined
 def driven_rates(y, u, c):
-    """Rates of the state and of what a change dV of the voltage makes of it, y = (.., d omega_m, d U_a, dV)."""
+    """Rates of the state and of its response to a change dV of the voltage, y = (.., d omega_m, d U_a, dV)."""
     d_omega, d_flow = rates_tangent((y[0], y[1]), (y[2], y[3]), u, c)
     return rates((y[0], y[1]), u, c) + (d_omega + c.voltage_gain * y[4], d_flow, 0.0 * y[4])
 

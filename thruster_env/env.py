@@ -38,8 +38,8 @@ class BowThrusterEnv(ModelledThruster, RenderedThruster, PlantEnv):
     |---|---|---|---|---|
     | 0 | measured thrust T + v | -inf | inf | N |
 
-    With other `sensors`, one entry a channel in their order; then, for each channel that may drop out, 1 where the
-    measurement is valid and 0 where the last one is repeated.
+    With other `sensors`, one entry per channel in their order; then, for each channel that may drop out, 1 where
+    the measurement is valid and 0 where the last one is repeated.
 
     ## State (hidden; in `info["state"]`)
     | num | state | unit |
@@ -54,7 +54,7 @@ class BowThrusterEnv(ModelledThruster, RenderedThruster, PlantEnv):
     | -(V_s/max_voltage)^2 | energy_weight | 0 |
     | -(change of V_s/max_voltage)^2 | voltage_rate_weight | 0.01 |
 
-    T is the true thrust after the step, whatever the sensors say; T_max is the steady thrust at max_voltage.
+    T is the true thrust after the step, independent of the sensors; T_max is the steady thrust at max_voltage.
 
     ## Info
     `state` (2,), `thrust` [N], `measurement` (m,) in float64, `reference` [N] that the reward compares with,

@@ -3,6 +3,9 @@
     V = V_s behind the dead band (low, high),  low <= 0 <= high
     z_i = h_i(x) + bias_i + v_i,  or, for a sensor with lag tau,  z_i = y + bias_i + v_i with y' = (h_i(x) - y)/tau
 
+A lagging reading is y = (1 - w) r + w h(x), with the state x as process noise left it. The sensor's memory, r, is
+a state; as tau goes to 0 so does 1 - w, and the model tends to that without a lag.
+
 A thrust that differs ahead and astern is the parameter `thrust_asymmetry`. Without all of these the model is that
 of `thruster_env.model`.
 """
@@ -19,6 +22,7 @@ from numerics.checks import covariance, finite, positive, shown
 from numerics.compiled import inlined
 from numerics.pickling import makes_functions
 from numerics.tuples import matrix_of, tuple_of, written_out
+from plants.diffusion import noise_for_dt, same_dt
 from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
 from thruster_env.channels import MAX_CHANNELS
@@ -34,8 +38,8 @@ _FURTHER = (
     "dead_band_low",  # [V], not positive
     "dead_band_high",  # [V], not negative
     *(f"bias_{place}" for place in range(MAX_CHANNELS)),  # by the channel's place, in its unit
-    *(f"kept_{place}" for place in range(MAX_CHANNELS)),  # what a lagging sensor keeps over a substep,
-    *(f"after_{place}" for place in range(MAX_CHANNELS)),  # and what it takes of the value behind it
+    *(f"kept_{place}" for place in range(MAX_CHANNELS)),  # a: the reading's share in what a lagging sensor holds,
+    *(f"after_{place}" for place in range(MAX_CHANNELS)),  # w: the share of the present value in the reading
 )
 _named_tuple: Any = NamedTuple  # type checkers know fields only where they are written out
 LoggedConstants = _named_tuple("LoggedConstants", [(name, float) for name in (*Constants._fields, *_FURTHER)])
@@ -43,6 +47,7 @@ LoggedConstants = _named_tuple("LoggedConstants", [(name, float) for name in (*C
 
 
 NO_BAND = 0.0, 0.0
+LONGEST_LAGS = 700.0  # time constants in a step, beyond which nothing is left of the last reading
 
 
 class Shown(NamedTuple):
@@ -89,9 +94,10 @@ def logged_model(
 ) -> StateSpaceModel:
     """`thruster_model` with a dead band, biases and lags.
 
-    Each sensor with a lag adds a state behind the two of the thruster: its reading without bias and noise. From a
-    preset file the recorder is taken, too: bias, lag, ambient flow, Q and R, unless arguments say otherwise.
-    Covariances are per step and do not scale with dt.
+    Each sensor with a lag adds a state after the two of the thruster: its memory (above). From a preset file the
+    recorder is taken, too: bias, lag, ambient flow, Q and R, unless arguments say otherwise. Covariances are per
+    step and do not scale with dt; but Q of a preset file, which has the sample time that it belongs to, is that of
+    another one by `plants.diffusion.noise_for_dt`.
 
     Args:
         dead_band: ends (low, high) of the dead band [V], or half the width of a symmetric one.
@@ -112,12 +118,13 @@ def logged_model(
 
 
 def logged_plant(*, dead_band=None, bias=None, lag=None, **plant_arguments) -> tuple[Plant, Shown]:
-    """A plant, and what logs show beside, as `logged_model` takes both."""
+    """A plant and the properties of its recorder, arguments of `logged_model`."""
     preset = plant_arguments.get("preset")
     recorder = read_preset(preset).recorder if preset is not None and is_file(preset) else {}
     own = {name: value for name, value in recorder.items() if name not in BY_CHANNEL}
-    if plant_arguments.get("dt", own.get("dt")) != own.get("dt"):  # of which Q is
-        own.pop("process_noise_cov", None)
+    of, dt = own.get("dt"), plant_arguments.get("dt")
+    if of is not None and dt is not None and "process_noise_cov" in own and not same_dt(of, dt):
+        own["process_noise_cov"] = noise_for_dt(own["process_noise_cov"], of, positive("dt", dt)).tolist()
     plant = make_plant(**{**own, **plant_arguments})
     variances = [recorder.get("measurement_noise_cov", {}).get(channel) for channel in plant.channels]
     if None not in variances and plant_arguments.get("measurement_noise_cov") is None:
@@ -132,7 +139,7 @@ def logged_plant(*, dead_band=None, bias=None, lag=None, **plant_arguments) -> t
 
 
 def with_shown(base: StateSpaceModel, plant: Plant, seen: Shown, *, always: bool = False) -> StateSpaceModel:
-    """A plant's model with what logs show; the model itself where that is nothing, unless `always`."""
+    """A plant's model with its recorder's properties; without any the model itself, unless `always`."""
     if seen == Shown() and not always:
         return base
     channels, lags, biases = plant.channels, dict(seen.lag), dict(seen.bias)
@@ -151,7 +158,7 @@ def with_shown(base: StateSpaceModel, plant: Plant, seen: Shown, *, always: bool
     read = channel_functions(channels)[0]
 
     def extended(state) -> np.ndarray:
-        """A state with what the sensors show of it."""
+        """A state with the measurements of the sensors."""
         shows = read(tuple(state), base.constants)
         return np.array([*state, *(shows[i] for i, lags_behind in enumerate(lagging) if lags_behind)])
 
@@ -187,19 +194,23 @@ def _thrust(x, c):
 
 
 def lag_weights(lag: float, step: float) -> tuple[float, float]:
-    """What a first-order lag keeps over a step, and its weight of the value behind it.
+    """The share a of the last reading in what a first-order lag holds, and the share w of the present value.
 
-    With tau y' = h - y and h linear over the step, y_1 = a y_0 + (r - a) h_0 + (1 - r) h_1, a = exp(-step/tau),
-    r = tau/step (1 - a).
+    With tau y' = h - y and h linear over the step, q = step/tau,
+
+        y_1 = (1 - w) r_1 + w h_1,  r_1 = a y_0 + (1 - a) h_0,
+        a = q/(exp(q) - 1),  w = 1 - (1 - exp(-q))/q.
+
+    Both are continuous at tau = 0, where a = 0, w = 1 and so y_1 = h_1.
 
     Args:
         lag: time constant tau [s]; zero for none.
         step: [s].
     """
-    if lag == 0:
-        return 0.0, 1.0
-    kept = math.exp(-step / lag)
-    return kept, 1.0 + lag / step * math.expm1(-step / lag)
+    if lag == 0 or step / lag > LONGEST_LAGS:
+        return 0.0, 1.0 - lag / step
+    ratio = step / lag
+    return ratio / math.expm1(ratio), 1.0 + math.expm1(-ratio) / ratio
 
 
 def _by_place(values) -> tuple[float, ...]:
@@ -230,39 +241,39 @@ def _functions(channels: tuple[str, ...], lagging: tuple[bool, ...]) -> tuple[Ca
     }
     drive = "v = outside(u[0], c.dead_band_low, c.dead_band_high), c.ambient_velocity"
     move = drive, "s = substep((x[0], x[1]), v, c)"
-    reads = ("y = read((x[0], x[1]), c)", "z = read(s, c)") if places else ()
-    lags = [
-        f"c.kept_{i} * x[{state_of[i]}] + (1.0 - c.kept_{i} - c.after_{i}) * y[{i}] + c.after_{i} * z[{i}]"
-        for i in places
-    ]
+    reads = ("y = read((x[0], x[1]), c)",) if places else ()
+    shown = {i: f"((1.0 - c.after_{i}) * x[{state_of[i]}] + c.after_{i} * y[{i}])" for i in places}
+    lags = [f"c.kept_{i} * {shown[i]} + (1.0 - c.kept_{i}) * y[{i}]" for i in places]
     transition = written_out("transition", "x, u, c", *move, *reads, tuple_of(["s[0]", "s[1]", *lags]), **names)
     lines = [*move, "a = substep_jacobian((x[0], x[1]), v, c)"]
-    lines += ["b = read_slopes((x[0], x[1]), c)", "d = read_slopes(s, c)"] if places else []
+    lines += ["b = read_slopes((x[0], x[1]), c)"] if places else []
 
     def slope(i, j):
         if i < 2:
             return f"a[{i}][{j}]" if j < 2 else "0.0"
         channel = places[i - 2]
         if j < 2:
-            before = f"(1.0 - c.kept_{channel} - c.after_{channel}) * b[{channel}][{j}]"
-            return f"{before} + c.after_{channel} * (d[{channel}][0] * a[0][{j}] + d[{channel}][1] * a[1][{j}])"
-        return f"c.kept_{channel}" if i == j else "0.0"
+            return f"(1.0 - c.kept_{channel} * (1.0 - c.after_{channel})) * b[{channel}][{j}]"
+        return f"c.kept_{channel} * (1.0 - c.after_{channel})" if i == j else "0.0"
 
     transition_jacobian = written_out("transition_jacobian", "x, u, c", *lines, matrix_of(n, n, slope), **names)
-    shows = [f"x[{state_of[i]}]" if i in state_of else f"y[{i}]" for i in range(len(channels))]
-    direct = len(places) < len(channels)
-    look = ("y = read((x[0], x[1]), c)",) if direct else ()
-    reading = tuple_of(f"{one} + c.bias_{i}" for i, one in enumerate(shows))
-    look_along = ("b = read_slopes((x[0], x[1]), c)",) if direct else ()
+    reading = tuple_of(f"{shown.get(i, f'y[{i}]')} + c.bias_{i}" for i in range(len(channels)))
 
     def row(i, j):
-        if i in state_of:
-            return "1.0" if j == state_of[i] else "0.0"
-        return f"b[{i}][{j}]" if j < 2 else "0.0"
+        share = f"c.after_{i} * " if i in state_of else ""
+        if j < 2:
+            return f"{share}b[{i}][{j}]"
+        return f"1.0 - c.after_{i}" if state_of.get(i) == j else "0.0"
 
     return (
         transition,
         transition_jacobian,
-        written_out("observe", "x, c", *look, reading, **names),
-        written_out("observe_jacobian", "x, c", *look_along, matrix_of(len(channels), n, row), **names),
+        written_out("observe", "x, c", "y = read((x[0], x[1]), c)", reading, **names),
+        written_out(
+            "observe_jacobian",
+            "x, c",
+            "b = read_slopes((x[0], x[1]), c)",
+            matrix_of(len(channels), n, row),
+            **names,
+        ),
     )

@@ -34,7 +34,7 @@ class ModelledThruster(ModelledEnv):
         return check_same_plant(tuned_for, self.plant, file)
 
     def overlay(self, label: str, model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> Overlay:
-        """What a rendered thruster shows of a belief beside the truth."""
+        """The belief that a rendered thruster shows beside the truth."""
         from thruster_env.model import overlay_of
 
         return overlay_of(label, model, mean, cov)

@@ -185,7 +185,7 @@ LARGEST_VOLTAGE = {
 def preset_parameters(preset: str | Mapping | ThrusterParameters) -> ThrusterParameters:
     """Parameters from a preset's name, a preset FILE.toml, a mapping of all fields, or parameters.
 
-    Raises ValueError for others. See `preset_and_dead_band` for what else a file may say.
+    Raises ValueError for others. See `preset_and_dead_band` for other entries of a file.
     """
     return preset_and_dead_band(preset)[0]
 

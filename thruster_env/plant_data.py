@@ -1,4 +1,4 @@
-"""A thruster as data that JSON can hold, for files that have to say what plant they are for."""
+"""A thruster as data for JSON, for files that record their plant."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def plant_data(plant: Plant) -> dict:
 
 
 def check_same_plant(tuned_for: Mapping, plant: Plant, file: str | Path) -> list[str]:
-    """Raise ValueError, with what differs, if a tuned file is for another plant; return what else differs.
+    """Raise ValueError, with the differences, if a tuned file is for another plant; return other differences.
 
     Args:
         tuned_for: the file's data of a plant, from `plant_data`.

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 from numerics.checks import finite, one_of, positive, shown
 from numerics.files import write_whole
 from numerics.toml import as_toml, read_toml
+from plants.logs.write import check_not_beside
 from thruster_env.channels import CHANNELS
 from thruster_env.parameters import ThrusterParameters, checked
 
@@ -30,7 +31,7 @@ RECORDER = ("dt", "sensors", "ambient_velocity", "process_noise_cov", *BY_CHANNE
 
 
 class PresetFile(NamedTuple):
-    """What a preset file holds."""
+    """The contents of a preset file."""
 
     parameters: ThrusterParameters
     dead_band: tuple[float, float] = (0.0, 0.0)  # [V]
@@ -57,7 +58,7 @@ def read_preset(path: str | Path) -> PresetFile:
 
 
 def preset_mapping(path: str | Path) -> dict[str, Any]:
-    """What a preset file says of the thruster, as a mapping that `make_plant` takes as its preset."""
+    """The thruster in a preset file, as a mapping that `make_plant` takes as its preset."""
     read = read_preset(path)
     band = {} if read.dead_band == (0.0, 0.0) else {"dead_band": list(read.dead_band)}
     return {**read.parameters._asdict(), **band}
@@ -131,14 +132,15 @@ def write_preset(path: str | Path, preset: PresetFile, about: str = "") -> None:
 
     Args:
         path: ends in .toml.
-        preset: what it holds.
+        preset: its contents.
         about: a line of comment.
 
     Raises:
-        ValueError: if the path does not end in .toml, or cannot be written.
+        ValueError: if the path does not end in .toml, lies beside a log of its name, or cannot be written.
     """
     if not is_file(path):
         raise ValueError(f"a preset file must end in .toml, but got {str(path)!r}")
+    check_not_beside(path)
     low, high = preset.dead_band
     tables = {
         "thruster": preset.parameters._asdict(),

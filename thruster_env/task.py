@@ -20,7 +20,7 @@ ABSURD = 100.0  # a state this many times its range away from rest ends the epis
 
 
 class Task(NamedTuple):
-    """A reference, and a reward from the true thrust T after the step, whatever the sensors say.
+    """A reference, and a reward from the true thrust T after the step, independent of the sensors.
 
     -(tracking ((T - r)/T_max)^2 + energy (V_s/V_max)^2 + voltage_rate (change of V_s/V_max)^2), see `step_cost`
     """
@@ -44,8 +44,8 @@ def make_task(
     """Make a task from plain arguments, the same ones that the env takes.
 
     Args:
-        reference: signals of `reference.REFERENCE_SIGNALS`, which are added; none if None. (An env has a default
-            of its own; `BowThruster-v0` takes a thrust [N].)
+        reference: signals of `reference.REFERENCE_SIGNALS`, which are added; none if None. (Each env has its own
+            default; `BowThruster-v0` takes a thrust [N].)
         tracking_weight: of the squared thrust error over T_max.
         energy_weight: of the squared voltage over max_voltage.
         voltage_rate_weight: of the squared change of voltage over max_voltage.

@@ -13,7 +13,7 @@ from thruster_env.task import make_task
 class BowThrusterTrackingEnv(BowThrusterEnv):
     """A ship's bow thruster: follow a reference thrust that changes, ahead.
 
-    As `BowThrusterEnv`, but for these:
+    As `BowThrusterEnv`, except for these:
 
     ## Observation space
     | num | observation | min | max | unit |

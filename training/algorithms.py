@@ -98,7 +98,7 @@ ALGORITHMS: dict[str, Algorithm] = {
         {**OFF_POLICY, "noise_std": 0.1},  # of actions: its only exploration
     ),
     "recurrent-ppo": Algorithm(
-        "PPO with an LSTM, which may learn its own filter; very slow",
+        "PPO with an LSTM, which can learn its own filter; very slow",
         "sb3_contrib:RecurrentPPO",
         "MlpLstmPolicy",
         PPO_STEPS,

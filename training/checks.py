@@ -1,6 +1,6 @@
 """Checks of a training configuration: known names, and known arguments of env, filter and algorithm, all data.
 
-It is read from a policy's folder, which somebody else may have written. So every entry is checked here before it
+It is read from a policy's folder, which may come from another person. So every entry is checked here before it
 reaches Gymnasium, a filter or Stable-Baselines3, and before any other file is opened.
 """
 

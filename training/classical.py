@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from numerics.checks import one_of
 from training.controllers import ClassicalPolicy
+from training.environments import make_single
 from training.plants.find import plant_of
+from training.score import score
 from training.setup import TrainingConfiguration
+from tuning.problems.seeds import training_seeds
 
 
 def classical_policy(name: str, setup: TrainingConfiguration) -> ClassicalPolicy:
@@ -17,4 +22,9 @@ def classical_policy(name: str, setup: TrainingConfiguration) -> ClassicalPolicy
     plant = plant_of(setup.task)
     one_of("controller", name, plant.controllers)
     plant.check_observes(name, setup.observe)
-    return plant.classical(name, setup)
+
+    def training_returns(policy: ClassicalPolicy, copies: int, episodes: int) -> np.ndarray:
+        seeds = list(training_seeds(setup.seed, episodes)) * copies
+        return score(policy, setup, seeds).returns.reshape(copies, episodes)
+
+    return plant.classical(name, make_single(setup), training_returns)

@@ -79,7 +79,7 @@ def train(
         on_progress: called after each step of the envs.
 
     Raises:
-        ValueError: if the folder holds something else, or a checkpoint in it is damaged.
+        ValueError: if the folder contains something else, or a checkpoint in it is damaged.
     """
     folder = Path(folder)
     start = _start(folder, setup)
@@ -121,10 +121,10 @@ def _start(folder: Path, setup: TrainingConfiguration) -> Path | None:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return None
     if not (folder / SETUP).is_file():
-        raise ValueError(f"the folder must be new, empty or that of a training, but {folder} holds other things")
+        raise ValueError(f"the folder must be new, empty or that of a training, but {folder} contains other files")
     differences = read_configuration(folder).differences(setup)
     if differences:
-        rule = f"{folder} must hold a training of the same configuration to go on with, but differs in"
+        rule = f"{folder} must contain a training of the same configuration to continue, but differs in"
         raise ValueError(f"{rule} {', '.join(differences)}: give another folder")
     latest = latest_checkpoint(folder)
     return folder / FINAL if (folder / FINAL / POLICY).is_file() else latest

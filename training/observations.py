@@ -1,4 +1,4 @@
-"""Observation sets: what a policy may observe.
+"""Observation sets: the choices of a policy's observation.
 
 Every observation ends with the reference thrust of the next step. What comes before it is, in float32,
 

@@ -2,8 +2,8 @@
 
     setup.json  policy.zip  normalisation.pkl  [replay.pkl]
 
-Such a folder is written under another name and then renamed, so that a reader never finds a part of it. What a
-killed process leaves has a name that begins with a dot; `mend` removes it. Do not load files of unknown origin:
+Such a folder is written under another name and then renamed, so that a reader never finds a part of it. Files left
+by a killed process have names that begin with a dot; `mend` removes them. Do not load files of unknown origin:
 Stable-Baselines3 and this module use pickle.
 """
 
@@ -103,7 +103,7 @@ def mend(folder: Path) -> None:
 
 
 def find_saved(path: str | Path) -> Path:
-    """The folder of a saved policy: itself, or the final policy of a training, else its latest checkpoint.
+    """The folder of a saved policy: the given one, or a training's final policy, else its latest checkpoint.
 
     Raises:
         ValueError: if there is none.
@@ -143,7 +143,7 @@ def read_configuration(folder: Path) -> TrainingConfiguration:
 
 
 def load(folder: Path, venv: VecEnv, training: bool = False) -> SavedPolicy:
-    """Load a saved policy for envs that observe what it was trained on.
+    """Load a saved policy for envs with the observations of its training.
 
     Args:
         folder: from `find_saved`.

@@ -32,7 +32,7 @@ class _Tanh(torch.autograd.Function):
 
 
 class NumpyTanh(nn.Module):
-    """tanh(x), equal to `torch.nn.Tanh` but for rounding; of what NumPy cannot hold, torch's own."""
+    """tanh(x), equal to `torch.nn.Tanh` except for rounding; torch's own for types that NumPy does not have."""
 
     def forward(self, x: Tensor) -> Tensor:
         """Return tanh(x)."""
@@ -47,7 +47,7 @@ def _evaluate(x: Tensor) -> Tensor:
 
 @contextmanager
 def numpys_tanh(network: nn.Module) -> Iterator[None]:
-    """Within this context each `torch.nn.Tanh` of a network is NumPy's; what is saved does not know of it."""
+    """Within this context each `torch.nn.Tanh` of a network is NumPy's; saved files do not record it."""
     found = [
         (parent, name, child)
         for parent in network.modules()

@@ -1,4 +1,4 @@
-"""How torch works while a policy learns: what is quickest for networks as small as these, on a CPU."""
+"""Settings of torch while a policy learns: the fastest for such small networks on a CPU."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def fuse_optimizers(model: BaseAlgorithm) -> None:
 def learning(model: BaseAlgorithm) -> Iterator[None]:
     """Within this context a model of Stable-Baselines3 learns as quickly as it can on one core.
 
-    What it learns is the same but for rounding, of its optimizers and of tanh. torch has one thread and checks no
+    The result is the same except for rounding, of its optimizers and of tanh. torch has one thread and checks no
     arguments of distributions, minibatches are parts of an epoch's samples, and worker threads of vector envs
     sleep while torch works.
 

@@ -1,10 +1,10 @@
-"""Tune state estimators, and show what that is worth: problems, studies, held-out evaluation, identification.
+"""Tune state estimators and evaluate the gain: problems, studies, held-out evaluation, identification.
 
-    tune        find the Q, R and other numbers that make a filter good, and prove them on held-out seeds
-    evaluate    a filter, tuned or not, beside its baselines on seeds that no study saw
+    tune        find a filter's Q, R and other parameters, and evaluate them on held-out seeds
+    evaluate    a filter, tuned or not, and its baselines, on seeds that no study saw
     compare     several filters on the same seeds, with paired intervals
     estimate    a filter or a smoother over a recorded log
-    identify    a model's parameters from recorded runs, and which of them these determine
+    identify    a model's parameters from recorded runs, and which of them the runs determine
     report      a page on a tuned filter that any browser shows
 
 Each does what the command of its name does, in one call. A problem is a name, such as "mismatch" or "auv:motion",

@@ -1,7 +1,7 @@
 """PD on depth and course as a policy: from the measurements, from an estimate or from the true state.
 
 It has Stable-Baselines3's `predict(observation, state, episode_start, deterministic) -> (action, state)`, for one
-observation (d,) or one of each env (n, d). What it remembers is in `state`: give None at first, then what the last
+observation (d,) or one of each env (n, d). Its memory is `state`: pass None at first, then the state that the last
 call returned. Rows where `episode_start` is true forget. (Where a vector env resets on the next step, an episode
 starts one step after the last one was done.)
 """
@@ -32,9 +32,8 @@ class DepthAndCourse:
         X_prop = X(u_ref) - K_u (u - u_ref),   where X(u) holds the speed u straight ahead
 
     e_y, e_z are the distances to starboard of the path and below it, L the distance ahead at which it is aimed at
-    (line-of-sight guidance, Fossen 2011, section 10.3). Actions are cut off at the action space. The integral is
-    what holds a depth against a trim, and a path against its slope; it stands still while the pitch is at its
-    limit.
+    (line-of-sight guidance, Fossen 2011, section 10.3). Actions are cut off at the action space. The integral
+    holds a depth against a trim, and a path against its slope; it is frozen while the pitch is at its limit.
 
     The gains were found by hand on `segorogeni` at 1 m/s: at small angles one radian of the rudder turns it with
     3.7 rad/s, one of the stern plane pitches it by 3 rad. They are the same for all tasks.

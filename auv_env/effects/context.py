@@ -1,4 +1,4 @@
-"""What the effects on a vehicle need to know of it."""
+"""The context of effects on a vehicle."""
 
 from __future__ import annotations
 
@@ -9,6 +9,6 @@ from plants.disturbances.effects import Context
 
 @dataclass(frozen=True)
 class VehicleContext(Context):
-    """What an effect on a vehicle may need to turn its arguments into numbers."""
+    """The data with which an effect on a vehicle computes its parameters."""
 
     depth_row: int  # of the memory: the true depth [m]

@@ -66,7 +66,7 @@ def encode(plant: Plant, task: Task) -> tuple[np.ndarray, int]:
 
 
 def decay(dt: float, time_constant: float) -> float:
-    """What is left after a step of the distance to a command that is held: exp(-dt/T), 0 for T = 0."""
+    """The remaining fraction of the distance to a held command after a step: exp(-dt/T), 0 for T = 0."""
     return math.exp(-dt / time_constant) if time_constant > 0.0 else 0.0
 
 

@@ -1,9 +1,9 @@
 """Where vehicles are on their path: truly, for the reward, and by their own reckoning, for the observation.
 
-A vehicle reckons its position from the start that it was told, by what it measures: velocities over ground are
-turned into the earth's axes by the measured attitude and summed up (dead reckoning), and depth and yaw are those
-measured. What it has no sensor for it takes as zero, and yaw follows from the measured rates. Fixes of the
-position, by sound or satellites, do not enter: to weigh them is what filters are for.
+A vehicle computes its position by dead reckoning from its known start: measured velocities over ground are turned
+into the earth's axes by the measured attitude and summed, and depth and yaw are those measured. Quantities without
+a sensor are taken as zero, and yaw follows from the measured rates. Position fixes, acoustic or from satellites,
+are not used: weighing them is a filter's task.
 """
 
 from __future__ import annotations

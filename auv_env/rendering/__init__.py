@@ -3,7 +3,7 @@
 Above, the last 500 steps of its path in three dimensions beside the path to follow, and its attitude seen from
 port, from astern and from above; below, strip charts of depth and speed, and gauges of thrust and planes. An
 estimate is blue, with its band of two standard deviations; a filter without a position shows in charts and
-attitude only. What pictures of all plants have, and how a filter shows its estimate in them, is in
+attitude only. The common parts of all plants' pictures, and how a filter shows its estimate, are in
 `plants.rendering`.
 """
 

@@ -1,4 +1,4 @@
-"""Right of path and charts: the attitude on three dials, and what propeller and planes do."""
+"""Right of path and charts: the attitude on three dials, and the action of propeller and planes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a picture shows: moments, and what a filter believes of them."""
+"""The contents of a picture: moments, and a filter's estimates of them."""
 
 from __future__ import annotations
 

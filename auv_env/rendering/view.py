@@ -1,7 +1,7 @@
 """The path in three dimensions: one looks north-east and down, at a box of water with a grid on its bottom.
 
 North runs to the upper right, east to the lower right. The grid lies below everything shown; a plumb line and
-shadows on it tell how deep things are. The box grows by round steps as the vehicle leaves it.
+shadows on it show the depth. The box grows by round steps as the vehicle leaves it.
 """
 
 from __future__ import annotations

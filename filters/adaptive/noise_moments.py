@@ -1,4 +1,4 @@
-"""What a measurement says of the noise in it: the second moment that adaptive and robust filters learn from."""
+"""The second moment of the measurement noise, from which adaptive and robust filters estimate R."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def measurement_noise_moment(shape: Shape) -> Callable:
     With S = H P H' + R and G = R S^-1: E[v | z] = G innovation, and in Joseph's form cov(v | z) is
     (I - G) R (I - G)' + G H P H' G'; the moment is positive definite whatever is measured. With the residual
     e = innovation - H K innovation and the covariance P after the update it is e e' + H P H'. Channels that are
-    NaN in z tell nothing; their part of the moment is what R makes of the others.
+    NaN in z carry no information; their part of the moment follows from the others through R.
     """
     n, m = shape.n, shape.m
     mask, factor, solve = matrices.masked(m), matrices.cholesky_factor(m), matrices.row_solver(m, m)

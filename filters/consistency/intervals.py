@@ -9,6 +9,7 @@ import numpy as np
 
 RESAMPLES = 2000  # bootstrap resamples of whole runs
 SLIGHT = 0.005  # difference of a ratio from 1 that makes practically none
+MORE_DIGITS = 3  # for an interval whose ends would else be the same number
 
 
 class Interval(NamedTuple):
@@ -34,6 +35,23 @@ def slightly(ratio: Interval) -> str:
     return f"{percent:.1g} %" if percent >= 1e-4 else "less than 0.0001 %"
 
 
+def span(value: Interval, digits: int, unit: str = "") -> str:
+    """A value with its 95 % interval in brackets, such as "26 % [25, 27]".
+
+    Where both ends would be the same number it has up to three more digits, and beyond these no brackets.
+
+    Args:
+        value: with its ends.
+        digits: decimals.
+        unit: after the value, with its space.
+    """
+    for places in range(digits, digits + MORE_DIGITS + 1):
+        middle, low, high = (f"{round(part, places) + 0.0:.{places}f}" for part in value)  # no -0.00
+        if low != high:
+            return f"{middle}{unit} [{low}, {high}]"
+    return f"{value.value:.{digits}f}{unit}"
+
+
 def interval(value: float, resampled: np.ndarray) -> Interval:
     """A value with the middle 95 % of its bootstrap resamples."""
     low, high = np.quantile(resampled, [0.025, 0.975])
@@ -41,7 +59,7 @@ def interval(value: float, resampled: np.ndarray) -> Interval:
 
 
 def without_interval(value: float) -> Interval:
-    """A value whose interval nobody asks for, which takes longer than the value."""
+    """A value without its interval, which takes longer to compute than the value."""
     return Interval(float(value), np.nan, np.nan)
 
 
@@ -66,19 +84,25 @@ def ratio_of_resampled(totals: np.ndarray, counts: np.ndarray) -> np.ndarray:
     return above[some] / below[some]
 
 
-def rmse_intervals(mean_squares: np.ndarray, resample: bool = True) -> tuple[Interval, ...]:
-    """RMSE of every state with its interval if asked for, from mean square errors of runs (B, n)."""
-    rmse = np.sqrt(mean_squares.mean(axis=0))
+def rmse_intervals(
+    mean_squares: np.ndarray, resample: bool = True, weights: np.ndarray | None = None
+) -> tuple[Interval, ...]:
+    """RMSE of every state with its interval if asked for, from mean square errors of runs (B, n).
+
+    Runs of different lengths are pooled by their weights (B,), the numbers of their steps.
+    """
+    rmse = np.sqrt(pooled_mean(mean_squares, weights))
     if not resample:
         return tuple(map(without_interval, rmse))
-    resampled = np.sqrt(resampled_means(mean_squares))
+    resampled = np.sqrt(resampled_means(mean_squares, weights))
     return tuple(interval(rmse[i], resampled[:, i]) for i in range(len(rmse)))
 
 
-def rmse_ratios(a: np.ndarray, b: np.ndarray) -> tuple[Interval, ...]:
+def rmse_ratios(a: np.ndarray, b: np.ndarray, weights: np.ndarray | None = None) -> tuple[Interval, ...]:
     """RMSE of filter a over that of filter b by state, paired by run, from mean square errors (B, n).
 
-    Both are resampled by the same runs, so what makes a run hard for both cancels.
+    Both are resampled by the same runs, so what makes a run hard for both cancels. Weights (B,) are those of the
+    runs, as `rmse_intervals` takes them.
 
     Raises:
         ValueError: if the two have not the same number of runs and states.
@@ -87,14 +111,22 @@ def rmse_ratios(a: np.ndarray, b: np.ndarray) -> tuple[Interval, ...]:
         raise ValueError(
             f"a paired comparison needs the same runs and states, but got {np.shape(a)}, {np.shape(b)}"
         )
-    ratios = np.sqrt(resampled_means(a) / resampled_means(b))
-    values = np.sqrt(a.mean(axis=0) / b.mean(axis=0))
+    ratios = np.sqrt(resampled_means(a, weights) / resampled_means(b, weights))
+    values = np.sqrt(pooled_mean(a, weights) / pooled_mean(b, weights))
     return tuple(interval(values[i], ratios[:, i]) for i in range(len(values)))
 
 
-def resampled_means(values: np.ndarray) -> np.ndarray:
-    """Means over runs of values (B, ...) for every resample, (RESAMPLES, ...)."""
-    return _weights(len(values)) @ values
+def pooled_mean(values: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """Mean over runs of values (B, n), (n,): of runs with weights (B,) sum w v / sum w."""
+    return values.mean(axis=0) if weights is None else weights @ values / weights.sum()
+
+
+def resampled_means(values: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """Means over runs of values (B, ...) for every resample, (RESAMPLES, ...); weights as for `pooled_mean`."""
+    picks = _weights(len(values))
+    if weights is None:
+        return picks @ values
+    return (picks @ (values * weights[:, None])) / (picks @ weights)[:, None]
 
 
 @lru_cache(maxsize=8)

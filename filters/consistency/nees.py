@@ -119,7 +119,7 @@ def check_whitened(name: str, errors: np.ndarray, present: np.ndarray | None = N
     Args:
         name: "NEES" or "NIS", for reports.
         errors: estimation errors or innovations, `whitened`, (B, T, d).
-        present: which components are there, (B, T, d); all if None.
+        present: which components are present, (B, T, d); all if None.
     """
     squares = sums_of_squares(errors)
     freedom = np.full(squares.shape, float(errors.shape[-1])) if present is None else present.sum(axis=-1) * 1.0

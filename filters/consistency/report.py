@@ -57,7 +57,10 @@ class ConsistencyReport(NamedTuple):
     innovation_coverage: tuple[Interval, ...]  # share of each channel's innovations within 1.96 deviations of S
     innovation_coverage_by_level: np.ndarray  # (levels, m)
     has_truth: bool  # without it only the innovations are looked at
+    tails: tuple[float, ...] = ()  # kurtosis of each channel's whitened innovations; 3 of normal ones
+    repeats: tuple[int, ...] = ()  # longest stretch of equal readings of each channel; empty if unknown
     constants: tuple[str, ...] = ()  # names of the model's constants, which may be estimated as states
+    blown: str = ""  # what `blow_up.blow_up_sentence` says of the model
 
 
 class Residuals(NamedTuple):
@@ -69,12 +72,13 @@ class Residuals(NamedTuple):
 
 
 class Findings(NamedTuple):
-    """All that a `ConsistencyReport` is made of: without the covariances of every step."""
+    """The inputs of a `ConsistencyReport`, without the covariances of every step."""
 
     errors: Residuals
     innovations: Residuals
     present: np.ndarray | None  # (B, T, m), which measurements were there; None for all
     divergences: np.ndarray  # (B,), restarts from the prior
+    repeats: np.ndarray | None = None  # (B, m), longest stretch of equal readings
 
 
 def findings(
@@ -83,17 +87,41 @@ def findings(
     measurements: np.ndarray | None,
     first_step: int = 0,
     angles: Sequence[bool] = (),
+    counted: np.ndarray | None = None,
 ) -> Findings:
     """Errors and innovations of a filter's estimates; arguments are those of `consistency_report`."""
     late = slice(first_step, None)
     truth = np.full(estimates.means.shape, np.nan) if states is None else states
     errors = difference(estimates.means, truth, angles)[:, late]
+    there = None if counted is None else counted[:, late]
+    present = None if measurements is None else ~np.isnan(measurements[:, late])
+    if there is not None:
+        everything = np.ones(estimates.innovations[:, late].shape, dtype=bool)
+        present = (everything if present is None else present) & there[..., None]
     return Findings(
-        _residuals(errors, estimates.covs[:, late]),
-        _residuals(estimates.innovations[:, late], estimates.innovation_covs[:, late]),
-        None if measurements is None else ~np.isnan(measurements[:, late]),
+        _residuals(errors, estimates.covs[:, late], there),
+        _residuals(estimates.innovations[:, late], estimates.innovation_covs[:, late], there),
+        present,
         estimates.divergences,
+        None if measurements is None else longest_stretches(_without_padding(measurements, counted)[:, late]),
     )
+
+
+def _without_padding(measurements: np.ndarray, counted: np.ndarray | None) -> np.ndarray:
+    """Measurements (B, K + 1, m), NaN after each run's last step that counts."""
+    if counted is None:
+        return measurements
+    exists = np.logical_or.accumulate(counted[:, ::-1], axis=1)[:, ::-1]
+    return np.where(exists[..., None], measurements, np.nan)
+
+
+def longest_stretches(measurements: np.ndarray) -> np.ndarray:
+    """Number of steps of the longest stretch of equal readings of each run and channel, (B, m) of (B, T, m)."""
+    longest = current = np.ones((len(measurements), measurements.shape[-1]), dtype=int)
+    for k in range(1, measurements.shape[1]):
+        current = np.where(measurements[:, k] == measurements[:, k - 1], current + 1, 1)
+        longest = np.maximum(longest, current)
+    return longest
 
 
 def joined(parts: Sequence[Findings]) -> Findings:
@@ -104,6 +132,7 @@ def joined(parts: Sequence[Findings]) -> Findings:
         _joined([one.innovations for one in parts]),
         np.concatenate(present) if present else None,
         np.concatenate([one.divergences for one in parts]),
+        None if any(one.repeats is None for one in parts) else np.concatenate([one.repeats for one in parts]),
     )
 
 
@@ -112,8 +141,10 @@ def _joined(parts: Sequence[Residuals]) -> Residuals:
     return Residuals(values, whitened_ones, deviations)
 
 
-def _residuals(values: np.ndarray, covs: np.ndarray) -> Residuals:
-    return Residuals(values, whitened(values, covs), _deviations(covs))
+def _residuals(values: np.ndarray, covs: np.ndarray, there: np.ndarray | None) -> Residuals:
+    """Residuals of all steps; NaN where a step is not there, (B, T) bool, if that is given."""
+    found = Residuals(values, whitened(values, covs), _deviations(covs))
+    return found if there is None else Residuals(*(np.where(there[..., None], one, np.nan) for one in found))
 
 
 def consistency_report(
@@ -123,6 +154,7 @@ def consistency_report(
     *,
     first_step: int = 0,
     angles: Sequence[bool] = (),
+    counted: np.ndarray | None = None,
     **options,
 ) -> ConsistencyReport:
     """Compare a filter's estimates with the truth, and its innovations with their expected covariance.
@@ -133,6 +165,8 @@ def consistency_report(
         measurements: (B, K + 1, m); needed only where some are missing (NaN).
         first_step: first step that counts; steps before it are start-up.
         angles: (n,), which states are angles, as the filter's `model.shape.state_angles`; none if empty.
+        counted: (B, K + 1) bool, which steps count, of runs of different lengths or with a truth here and there;
+            all if None.
         **options: members, names, channels and lags, as `report_of` takes them.
 
     Raises:
@@ -142,7 +176,9 @@ def consistency_report(
         raise ValueError(
             f"states must have the shape of the estimates, {estimates.means.shape}, but got {np.shape(states)}"
         )
-    found = findings(estimates, states, measurements, first_step, angles)
+    found = findings(estimates, states, measurements, first_step, angles, counted)
+    if states is not None and counted is not None:
+        states = np.where(counted[..., None], states, np.nan)
     return report_of(found, states, first_step=first_step, angles=angles, **options)
 
 
@@ -167,7 +203,7 @@ def report_of(
         names: of the states, with units.
         angles: (n,), which states are angles.
         channels: names of the measurements, with units.
-        lags: of the innovations' correlation.
+        lags: of the innovations' correlation; of as few steps as these one less than there are steps.
     """
     errors, whitened_errors, deviations = found.errors
     innovations, whitened_innovations, expected_deviations = found.innovations
@@ -185,12 +221,14 @@ def report_of(
         states=names,
         nees=check_whitened("NEES", whitened_errors),
         nis=check_whitened("NIS", whitened_innovations, present),
-        whiteness=whiteness_of(whitened_innovations, present, lags),
+        whiteness=_whiteness(whitened_innovations, present, lags),
         coverage=tuple(mean_interval(covered(errors[..., i], deviations[..., i])) for i in range(n)),
         coverage_by_level=np.array([_mean(covered(errors, deviations, level), (0, 1)) for level in LEVELS]),
         crps=tuple(mean_interval(crps[..., i]) for i in range(n)),
         crps_expected=_mean(expected, (0, 1)),
         crps_ratio=_mean(crps, 0) / _mean(expected, 0),
+        tails=_kurtosis(whitened_innovations, present),
+        repeats=() if found.repeats is None else tuple(found.repeats.max(axis=0).tolist()),
         divergences=int(found.divergences.sum()),
         diverged_runs=int((found.divergences > 0).sum()),
         ensemble=None if members is None or states is None else check_ensemble(members, states, angles),
@@ -203,6 +241,13 @@ def report_of(
         ),
         has_truth=states is not None,
     )
+
+
+def _whiteness(e: np.ndarray, present: np.ndarray | None, lags: int) -> Whiteness:
+    """`whiteness_of` with fewer lags where there are not more steps; of a single step it says nothing."""
+    if e.shape[1] == 1:
+        return whiteness_of(np.full((len(e), 2, e.shape[-1]), np.nan), lags=1)
+    return whiteness_of(e, present, min(lags, e.shape[1] - 1))
 
 
 def check_ensemble(members: Members, states: np.ndarray, angles: Sequence[bool] = ()) -> EnsembleCheck:
@@ -239,3 +284,11 @@ def _mean(values: np.ndarray, axes) -> np.ndarray:
     """Mean of the entries that are not NaN; NaN where there is none."""
     counts = (~np.isnan(values)).sum(axis=axes)
     return np.where(counts > 0, np.nansum(values, axis=axes) / np.maximum(counts, 1), np.nan)
+
+
+def _kurtosis(whitened_ones: np.ndarray, present: np.ndarray | None) -> tuple[float, ...]:
+    """E v^4 / (E v^2)^2 of each channel's whitened innovations (B, T, m), NaN without any."""
+    seen = whitened_ones if present is None else np.where(present, whitened_ones, np.nan)
+    with np.errstate(all="ignore"):
+        fourth, second = (_mean(seen**power, (0, 1)) for power in (4, 2))
+        return tuple((fourth / second**2).tolist())

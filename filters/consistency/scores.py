@@ -73,10 +73,11 @@ def ensemble_ranks(truth: np.ndarray, members: np.ndarray, weights: np.ndarray |
     """Where the truth (...,) stands among members (..., N), as (rank + 1/2)/(N + 1) in 0 ... 1.
 
     The rank is the number of members below the truth, 0 ... N; with weights (..., N) it is N times their weight.
+    NaN where there is no truth.
     For a consistent ensemble all ranks are equally likely. Source: Hamill (2001), "Interpretation of rank
     histograms for verifying ensemble forecasts".
     """
     size = members.shape[-1]
     below = members < truth[..., None]
     rank = below.sum(axis=-1) if weights is None else size * (weights * below).sum(axis=-1)
-    return (rank + 0.5) / (size + 1.0)
+    return np.where(np.isnan(truth), np.nan, (rank + 0.5) / (size + 1.0))

@@ -12,6 +12,7 @@ import numpy as np
 from filters.consistency.intervals import Interval
 from filters.consistency.nees import SquaresCheck
 from filters.consistency.report import ConsistencyReport
+from filters.consistency.symptoms import symptoms
 from filters.consistency.uniformity import FEWEST_RUNS, Uniformity
 from filters.consistency.whiteness import Whiteness
 
@@ -19,14 +20,15 @@ SLIGHT_FACTOR = 1.2  # a mean NEES or NIS this close to the right one is off by 
 SLIGHT_DISTANCE = 0.02  # so are distributions this close
 SLIGHT_CORRELATION = 0.05  # and correlations this small
 SIGNIFICANT = 0.05
+NEVER = ("dt", "time_step")  # constants that are no quantity of the plant
 EVEN = "even, as far as these runs show"
 MOST_CONSTANTS = 8  # of a model, that are named
 MOST_STATES = 6  # of which there are sentences
-NO_TRUTH = "These data come without truth: what follows is from the innovations alone."
+NO_TRUTH = "These data have no truth: the following is based on the innovations alone."
 
 
 def sentences(report: ConsistencyReport) -> list[str]:
-    """What a report says, one check a sentence, a remedy last; of many states those with the worst coverage."""
+    """A report in sentences, one per check, a remedy last; of many states those with the worst coverage."""
     said = [] if report.has_truth else [NO_TRUTH]
     for check in (report.nees, report.nis) if report.has_truth else (report.nis,):
         said.append(squares_sentence(check, report.runs))
@@ -73,7 +75,7 @@ def confidence(mean: Interval, dimension: float) -> str:
 
 
 def mean_sentence(name: str, mean: Interval, dimension: float) -> str:
-    """What a mean NEES or NIS says of the covariance."""
+    """What a mean NEES or NIS says about the covariance."""
     if np.isnan(mean.value):
         return f"No {name}: the filter gives no covariance, or a singular one."
     return f"{_capital(confidence(mean, dimension))}: mean {name} {_span(mean)} where {dimension:.3g} is right."
@@ -130,24 +132,25 @@ def whiteness_sentence(found: Whiteness, channels: Sequence[str] = ()) -> str:
 
 
 def coverage_sentence(name: str, coverage: Interval, held: str = "the truth") -> str:
-    """Whether a 95 % interval holds the truth, or a measurement, as often as it says."""
+    """Whether a 95 % interval contains the truth, or a measurement, as often as stated."""
     if np.isnan(coverage.value):
         return ""
     low, value, high = 100 * coverage.low, 100 * coverage.value, 100 * coverage.high
-    amiss = "too rarely" if value < 95 else "more often than it says"
+    amiss = "too rarely" if value < 95 else "more often than stated"
     return (
-        f"The 95 % interval of {name} holds {held} in {value:.1f} % [{low:.1f}, {high:.1f}] of cases: "
+        f"The 95 % interval of {name} contains {held} in {value:.1f} % [{low:.1f}, {high:.1f}] of cases: "
         f"{'as it should' if coverage.covers(0.95) else amiss}."
     )
 
 
 def crps_sentence(name: str, crps: Interval, expected: float, of_members: Interval | None = None) -> str:
-    """A state's CRPS, and what it is in units of what the covariance promises."""
+    """A state's CRPS, also relative to its expectation under the covariance."""
     if np.isnan(crps.value):
         return ""
     members = "" if of_members is None else f"; that of the members themselves is {_span(of_members)}"
     return (
-        f"CRPS of {name}: {_span(crps)}, {crps.value / expected:.3g} times what the covariance promises{members}."
+        f"CRPS of {name}: {_span(crps)}, {crps.value / expected:.3g} times its expected value under the "
+        f"covariance{members}."
     )
 
 
@@ -156,7 +159,7 @@ def ranks_sentence(name: str, ranks: Uniformity, size: int) -> str:
     low, high = ranks.frequencies[0], ranks.frequencies[-1]
     return (
         f"Ranks of the truth among the {size} members, {name}: {ranks_verdict(ranks)}; the outermost bars of the "
-        f"histogram are {low:.2g} and {high:.2g} times the right height ({_test(ranks)})."
+        f"histogram are {low:.2g} and {high:.2g} times the expected height ({_test(ranks)})."
     )
 
 
@@ -191,12 +194,16 @@ def comparison_sentence(name: str, first: str, second: str, ratio: Interval) -> 
 
 
 def remedy_sentence(report: ConsistencyReport) -> str:
-    """What to try: from NIS and the innovations' correlation, else from NEES; empty where nothing is to be done.
+    """What to try: from NIS and the innovations' correlation, else from NEES; empty if nothing needs to be done.
+
+    Where the model blows up between samples, that alone: no Q and R mend it.
 
     Source: Mehra (1970), "On the identification of variances and adaptive Kalman filtering": with too small a gain
     innovations are correlated positively, with too large a gain negatively.
     """
     nees, nis = report.nees, report.nis
+    if report.blown:
+        return report.blown
     if np.isnan(nis.mean.value):
         return ""
     over = nis.mean.value > SLIGHT_FACTOR * nis.dimension
@@ -222,10 +229,12 @@ def remedy_sentence(report: ConsistencyReport) -> str:
         what = "lower Q where nothing is measured" + ("; the innovations are consistent" if white else "")
     else:
         what = ""
-    if lasting:
+    shown = symptoms(report)
+    if lasting and not shown:
         first, second = what or "raise Q", _augment(report.constants)
         what = f"{first}; or {second}" if over or under or slow else f"{second}; or {first}"
-    return f"To try: {what}." if what else ""
+    tried = "; ".join([*shown, *([what] if what else [])])
+    return f"To try: {tried}." if tried else ""
 
 
 def is_white(found: Whiteness) -> bool:
@@ -235,6 +244,7 @@ def is_white(found: Whiteness) -> bool:
 
 def _augment(constants: Sequence[str]) -> str:
     """What to do about a model whose errors last: a constant that is off becomes a state."""
+    constants = [name for name in constants if name not in NEVER]
     some = ", ".join(constants[:MOST_CONSTANTS])
     more = f" and {len(constants) - MOST_CONSTANTS} more" if len(constants) > MOST_CONSTANTS else ""
     of_it = f" (it has {some}{more})" if constants else ""

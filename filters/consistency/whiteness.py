@@ -1,4 +1,4 @@
-"""Do innovations tell the filter something that it could have known? Their correlation over time."""
+"""Do innovations contain anything that the filter could have predicted? Their correlation over time."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Whiteness(NamedTuple):
     correlations: np.ndarray  # (lags, m, m): of channel i with channel j so many steps later; lags 1, 2, ...
     half_widths: np.ndarray  # (lags, m, m): a correlation lies within plus and minus this with 95 % probability
     share_inside: float  # of correlations within these; 0.95 is right
-    statistic: float  # of the portmanteau test, chi-squared with lags m^2 degrees of freedom
-    p_value: float  # probability of a statistic as large if the innovations were white
+    statistic: float  # of the portmanteau test, chi-squared with lags m^2 degrees of freedom; 0 of no values
+    p_value: float  # probability of a statistic as large if the innovations were white; NaN of no values
 
 
 def whiteness(
@@ -51,7 +51,7 @@ def whiteness_of(e: np.ndarray, present: np.ndarray | None = None, lags: int = L
     Source: Ljung, Box (1978), "On a measure of lack of fit in time series models"; Hosking (1980), "The
     multivariate portmanteau statistic"; Bar-Shalom, Li, Kirubarajan (2001), section 5.4.
     """
-    _, steps, m = e.shape
+    steps = e.shape[1]
     lags = at_least("lags", lags, 1)
     if steps <= lags:
         raise ValueError(f"there must be more steps than lags, but got {steps} steps and {lags} lags")
@@ -60,6 +60,7 @@ def whiteness_of(e: np.ndarray, present: np.ndarray | None = None, lags: int = L
     values = np.maximum(there.sum(axis=(0, 1)), 1.0)
     e /= np.sqrt(np.maximum((e**2).sum(axis=(0, 1)) / values, 1e-300))
     sums, pairs = (np.array([_lagged(x, lag) for lag in range(1, lags + 1)]) for x in (e, there))
+    known = pairs > 0  # a channel that never was measured is no white one
     pairs = np.maximum(pairs, 1.0)
     correlations = sums / pairs
     size = np.sqrt(np.outer(values, values))
@@ -68,9 +69,9 @@ def whiteness_of(e: np.ndarray, present: np.ndarray | None = None, lags: int = L
     return Whiteness(
         correlations,
         1.96 * np.sqrt(size / (size + 2.0) / pairs),
-        float((squares <= 1.96**2).mean()),
+        float((squares[known] <= 1.96**2).mean()) if known.any() else np.nan,
         statistic,
-        float(chdtrc(lags * m * m, statistic)),
+        float(chdtrc(known.sum(), statistic)) if known.any() else np.nan,
     )
 
 

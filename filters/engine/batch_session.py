@@ -32,11 +32,11 @@ class Beliefs:
         self._operate = _operation(self._kernels, is_interpreting())
 
     def __getstate__(self) -> tuple:
-        """The filter and the beliefs; machine code is found anew."""
+        """The filter and the beliefs; machine code is looked up again."""
         return self._filter, self._rows, self._tables
 
     def __setstate__(self, state: tuple) -> None:
-        """Go on where the beliefs were."""
+        """Continue from the beliefs."""
         filter_, rows, tables = state
         type(self).__init__(self, filter_, len(rows))
         self._rows[:], self._tables[:] = rows, tables

@@ -56,9 +56,9 @@ class Kernels(NamedTuple):
 
     `row` is laid out by `filters.engine.layout`, `numbers` by `plants.layout`; `table` is (table_rows, padded
     size), its first n rows the members, without columns for filters without an ensemble; `draws` has room for
-    `draws_per_member` normals a member. What a belief keeps beside mean and covariance are the first `kept_rows`
-    rows of the table and `extras` numbers of the row, from `memory_places(n, m).extras` on; `scratch` numbers that
-    nothing keeps follow.
+    `draws_per_member` normals a member. Besides mean and covariance a belief keeps the first `kept_rows` rows of
+    the table and `extras` values of the row, from `memory_places(n, m).extras` on; `scratch` values that are not
+    kept follow.
 
     `stages`, where given, are what `predict` does before its substeps, in each of them, and after them, as
     functions of the same arguments: batches then run every stage over many beliefs at once (`engine.simd`).

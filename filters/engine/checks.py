@@ -1,12 +1,15 @@
-"""Checks of what filters are given: beliefs, keys, inputs and measurements."""
+"""Checks of the arguments of filters: beliefs, keys, inputs and measurements."""
 
 from __future__ import annotations
+
+from math import inf, isfinite, sqrt
 
 import numpy as np
 
 from filters.engine.belief import Belief, LostBelief
 from numerics.checks import as_floats, at_least, covariance, shown
 
+FEW = 4  # states, up to which a belief is looked at in Python
 ROUNDING = 1e-9  # of a covariance's largest variance: what filters leave of a negative one is below that
 
 
@@ -26,6 +29,8 @@ def vector_like(name: str, value, like: np.ndarray, *, missing_allowed: bool) ->
 
 def checked_key(key) -> tuple[int, int]:
     """Return a key as two integers; raise ValueError unless they are whole numbers below 2^32."""
+    if type(key) is tuple and len(key) == 2 and all(type(word) is int and 0 <= word < 2**32 for word in key):
+        return key
     try:
         words = [int(word) for word in as_floats(key)] if np.shape(key) == (2,) else []
         if len(words) == 2 and words == list(key) and min(words) >= 0 and max(words) < 2**32:
@@ -38,7 +43,7 @@ def checked_key(key) -> tuple[int, int]:
 def checked_actions(actions, count: int, size: int, ignored=False) -> np.ndarray:
     """Return the actions of `count` envs as (count, size); raise ValueError unless they are numbers, none NaN.
 
-    What is in the rows where `ignored` (count,) is true does not matter.
+    Rows where `ignored` (count,) is true are not checked.
     """
     try:
         array = as_floats(actions)
@@ -57,8 +62,10 @@ def checked_actions(actions, count: int, size: int, ignored=False) -> np.ndarray
 def check_belief(belief: Belief) -> None:
     """Raise ValueError unless a belief's numbers are finite and its covariance is one.
 
-    A `LostBelief`, which says of itself that it is not finite, is let through.
+    A `LostBelief`, which declares that it is not finite, is accepted.
     """
+    if _is_surely_one(belief):
+        return
     at_least("step of a belief", belief.step, 0)
     at_least("divergences of a belief", belief.divergences, 0)
     if isinstance(belief, LostBelief):
@@ -72,3 +79,63 @@ def check_belief(belief: Belief) -> None:
         if np.isnan(as_floats(getattr(belief, name))).any():
             raise ValueError(f"{name} of a belief must not be NaN, but got {shown(getattr(belief, name))}")
     covariance("cov of a belief", belief.cov, len(belief.mean), rounding=ROUNDING)
+
+
+def _is_surely_one(belief: Belief) -> bool:
+    """Whether a belief passes all checks, by a quick look; if not, the thorough one says what is amiss.
+
+    P + r v I = L L' with L real, where v is the largest variance and r the tolerance, so that no eigenvalue of P
+    is below -r v.
+    """
+    mean, cov, members, extras = belief.mean, belief.cov, belief.members, belief.extras
+    if not all(type(one) is np.ndarray and one.dtype == np.float64 for one in (mean, cov, members, extras)):
+        return False
+    if type(belief.step) is not int or type(belief.divergences) is not int or min(belief[4:6]) < 0:
+        return False
+    n = len(mean)
+    if members.size:
+        if not np.abs(members[:n]).sum() < np.inf or np.isnan(members[n:]).any():
+            return False
+    if extras.size and np.isnan(extras).any():
+        return False
+    return _few(mean.tolist(), cov.tolist()) if n <= FEW else _many(mean, cov)
+
+
+def _few(mean: list[float], cov: list[list[float]]) -> bool:
+    """`_many` for a few states, for which NumPy's calls take longer than their arithmetic."""
+    largest = max(cov[i][i] for i in range(len(mean)))
+    if not isfinite(sum(mean)) or not isfinite(largest):
+        return False
+    shift = ROUNDING * largest
+    root: list[list[float]] = []
+    for i, row in enumerate(cov):
+        new: list[float] = []
+        for j in range(i):
+            if row[j] != cov[j][i]:
+                return False
+            rest = row[j]
+            for k in range(j):
+                rest -= new[k] * root[j][k]
+            new.append(rest / root[j][j])
+        pivot = row[i] + shift
+        for one in new:
+            pivot -= one * one
+        if not (row[i] >= 0.0 and 0.0 < pivot < inf):
+            return False
+        new.append(sqrt(pivot))
+        root.append(new)
+    return True
+
+
+def _many(mean: np.ndarray, cov: np.ndarray) -> bool:
+    """Whether a mean is finite and a covariance symmetric and positive semidefinite, by its Cholesky factor."""
+    variances = cov.diagonal()
+    if not np.abs(mean).sum() + np.abs(cov).sum() < np.inf or not (cov == cov.T).all() or variances.min() < 0:
+        return False
+    shifted = cov.copy()
+    shifted.ravel()[:: len(mean) + 1] += ROUNDING * variances.max()
+    try:
+        np.linalg.cholesky(shifted)
+    except np.linalg.LinAlgError:
+        return False
+    return True

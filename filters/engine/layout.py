@@ -1,6 +1,6 @@
 """Layout of the memory of a filter.
 
-A filter's memory is a row of small parts (belief, innovation, scratch), a table with one column an ensemble
+A filter's memory is a row of small parts (belief, innovation, scratch), a table with one column per ensemble
 member, and a vector of random draws. Rows are cheap to hand to compiled code, to copy and to stack. The row of a
 model's numbers, behind which a filter has its own, is laid out by `plants.layout`.
 """

@@ -39,7 +39,7 @@ def row_magnitude(n: int, m: int) -> Callable:
 
 @cache
 def restart_if_lost(kernels: Kernels) -> Callable:
-    """Return `restart(memory, numbers, size)`: put the prior in place of a belief that is lost, and count."""
+    """Return `restart(memory, numbers, size)`: replace a diverged belief by the prior, and count."""
     n, m, start, summarise = kernels.n, kernels.m, kernels.start, kernels.summarise
     places, r_place = memory_places(n, m), number_places(n, m).r
     innovation, s_place, log_likelihood = places.innovation, places.innovation_cov, places.log_likelihood

@@ -6,12 +6,13 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from numpy.ma import MaskedArray
 
 from filters.engine.belief import Belief, Innovation, LostBelief
 from filters.engine.checks import check_belief, checked_key, vector_like
 from filters.engine.compile import PREDICT, START, UPDATE, new_memory, operation
 from filters.engine.layout import memory_places
-from numerics.checks import covariance
+from numerics.checks import as_floats, covariance, positive
 from numerics.direct import direct
 from plants.layout import number_places, with_root
 
@@ -67,6 +68,9 @@ class Session:
         values = np.append(np.zeros(model.inputs), np.full(m, np.nan))
         self._u, self._z, self._values = values[: model.inputs], values[model.inputs :], values
         self._scalar = len(self._u) == m == 1
+        self._first_values, self._is_direct = values.copy(), False
+        self._noise_was: np.ndarray | None = None  # numbers before another Q or R
+        self.source: tuple = ()  # what the numbers follow from, where the session is kept
         self.divergences = 0
         self._given = (*self._memory, size, values, self._numbers)
         self.mean = self._row[places.mean : places.mean + n]
@@ -75,13 +79,16 @@ class Session:
         self.innovation_cov = self._row[places.innovation_cov : places.innovation_cov + m * m].reshape(m, m)
 
     def __getstate__(self) -> tuple:
-        """The filter and all numbers; machine code and views are made anew from these."""
+        """The filter and its memory; machine code and views are rebuilt from these."""
         return self._filter, self.divergences, (*self._memory, self._values, self._numbers)
 
     def __setstate__(self, state: tuple) -> None:
-        """Go on where the belief was."""
+        """Continue from the belief."""
         filter_, divergences, arrays = state
         type(self).__init__(self, filter_)
+        self._go_on(divergences, arrays)
+
+    def _go_on(self, divergences: int, arrays: tuple) -> None:
         for own, kept in zip((*self._memory, self._values, self._numbers), arrays, strict=True):
             own[...] = kept
         self.divergences = divergences
@@ -89,17 +96,29 @@ class Session:
 
     def _call_directly(self) -> None:
         self._operate = direct(operation(self._kernels), *self._given, STEP)  # `step` has to be quick
+        self._is_direct = True
 
     def _do(self, task: int) -> None:
         self.divergences = self._operate(*self._given, task)
+
+    def clear(self) -> None:
+        """Make the memory as it was when it was new."""
+        for part in self._memory:
+            part.fill(0.0)
+        self._values[:] = self._first_values
+        if self._noise_was is not None:
+            self._numbers[:] = self._noise_was
+            self._noise_was = None
+        self.divergences = 0
 
     def set_key(self, key) -> None:
         """Set the key (2,) on which the belief's randomness depends: two whole numbers below 2^32."""
         self._row[self._places.key_0], self._row[self._places.key_1] = checked_key(key)
 
     def set_noise(self, *, process_noise_cov=None, measurement_noise_cov=None) -> None:
-        """Put another Q or R, with its root, in place of the model's."""
+        """Replace the model's Q or R, with its root."""
         n, m, at = len(self.mean), len(self.innovation), self._noise_places
+        self._noise_was = self._numbers.copy()
         if process_noise_cov is not None:
             q = covariance("process_noise_cov", process_noise_cov, n)
             self._numbers[at.q : at.q + 2 * n * n] = with_root(q)
@@ -107,24 +126,44 @@ class Session:
             r = covariance("measurement_noise_cov", measurement_noise_cov, m, positive_definite=True)
             self._numbers[at.r : at.r + 2 * m * m] = with_root(r)
 
+    def set_dt(self, dt: float) -> None:
+        """Use another sample time from here on, for a model that has a constant named "dt".
+
+        Q does not change: covariances are per step and do not scale with dt; `set_noise` sets another.
+
+        Raises ValueError for a model without such a constant, or if it is not a positive number.
+        """
+        names = getattr(self._filter.kernel_model.constants, "_fields", ())
+        if "dt" not in names:
+            raise ValueError(
+                f"set_dt must be called on a model with a constant dt, but got {', '.join(names) or 'none'}"
+            )
+        place = self._noise_places.constants + names.index("dt")
+        self._numbers[place] = positive("dt", dt)
+
     def start(self, key, z) -> None:
         """Set the prior with a random key (2,) and update it with a first measurement z (m,)."""
         self.set_key(key)
-        self._z[:] = z
+        self._z[:] = as_floats(z)
         self._do(START + UPDATE)
         self._call_directly()
 
     def step(self, u, z) -> None:
         """Predict with input u (p,), then update with measurement z (m,); NaN marks a missing channel."""
-        try:
+        try:  # what `_set` does, whose call would take a tenth of the step
+            if type(z) is MaskedArray or type(u) is MaskedArray:  # whose numbers behind the mask are none
+                raise TypeError
             if self._scalar:  # the frequent case: an assignment to a slice takes twice as long
                 self._values[0], self._values[1] = u[0], z[0]
             else:
                 self._u[:], self._z[:] = u, z
         except (TypeError, ValueError, LookupError):  # they are not looked at before: a step has to be quick
-            self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
-            self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
+            self._set(u, z)
         self.divergences = self._operate(*self._given, STEP)
+
+    def _set(self, u, z) -> None:
+        self._u[:] = vector_like("u", u, self._u, missing_allowed=False)
+        self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
 
     def run(self, operation: str, u=None, z=None) -> None:
         """Do one of "start", "predict" or "update" alone, arguments checked."""
@@ -133,6 +172,8 @@ class Session:
         if operation == "update":
             self._z[:] = vector_like("z", z, self._z, missing_allowed=True)
         self._do(TASKS[operation])
+        if not self._is_direct:
+            self._call_directly()
 
     def load(self, belief: Belief) -> None:
         """Put a belief into the memory; ValueError for one of another model or kind of filter, or none at all."""
@@ -143,7 +184,8 @@ class Session:
             "extras": self._extras.shape,
         }
         for name, shape in shapes.items():
-            given = np.shape(getattr(belief, name))
+            given = getattr(belief, name)
+            given = given.shape if type(given) is np.ndarray else np.shape(given)
             if given != shape:
                 whose = f"a belief that the filter {self._name!r} can take"
                 raise ValueError(f"{name} of {whose} must have shape {shape}, but got {given}")
@@ -164,11 +206,13 @@ class Session:
         members = self._table[: self._kept_rows, : self._size].copy()
         step, extras = int(row[places.step]), self._extras.copy()
         # Compared with the sum: it is NaN or infinite where one of the numbers is.
-        total = np.abs(row[: places.key_0]).sum() + np.abs(members[: len(self.mean)]).sum()
+        total = np.add.reduce(np.abs(row[: places.key_0]))
+        if self._size:
+            total += np.abs(members[: len(self.mean)]).sum()
         kind = Belief if total < np.inf else LostBelief
         return kind(self.mean.copy(), self.cov.copy(), members, key, step, self.divergences, extras)
 
     def innovation_copy(self) -> Innovation:
-        """A copy of what the last update found."""
+        """A copy of the last update's innovation."""
         log_likelihood = float(self._row[self._places.log_likelihood])
         return Innovation(self.innovation.copy(), self.innovation_cov.copy(), log_likelihood)

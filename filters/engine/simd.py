@@ -1,8 +1,8 @@
 """SIMD batches: trajectories of filters without an ensemble, side by side in vectorised code.
 
 Number i of all beliefs of a block lies in one line of memory. Each stage of a step is a loop over the block with
-no other loop in it, of which the compiler makes vector code: an extended Kalman step of the thruster takes a
-quarter of the time. What cannot be vectorised still runs, at the speed of single trajectories.
+no inner loop, which the compiler vectorises: an extended Kalman step of the thruster takes a quarter of the time.
+What cannot be vectorised still runs, at the speed of single trajectories.
 """
 
 from __future__ import annotations

@@ -134,8 +134,8 @@ class DeterministicEnsembleKalmanFilter(DeterministicUpdateFilter):
                  mean += K innovation,  x_j - mean(x) -= K (y_j - mean(y))/2;  sample covariances, divisor N - 1
 
     With a linear h the update leaves P - K H P + K H P H'K'/4, more than the Kalman filter's P - K H P, by little
-    where measurements are poor. The update draws nothing: the process noise of the members is all that is random,
-    and the error of its sample mean and covariance enters the estimate. Attributes are those of
+    where measurements are poor. The update draws nothing: only the process noise of the members is random, and the
+    error of its sample mean and covariance enters the estimate. Attributes are those of
     `DeterministicUpdateFilter`.
 
     Source: Sakov, Oke (2008), "A deterministic formulation of the ensemble Kalman filter".

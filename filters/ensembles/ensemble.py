@@ -79,7 +79,7 @@ def measurement_moments(observe: Callable, shape: Shape) -> Callable:
 def silencer(first: int, angles: tuple[bool, ...], weights: int | None = None) -> Callable:
     """Return `silence(table, z, size)`, for rows first, first + 1, ... of what the members expect to be measured.
 
-    They become 0 where z is NaN: what is constant has no covariance with anything. Angles are put on one branch.
+    They become 0 where z is NaN: a constant has no covariance with anything. Angles are put on one branch.
     """
 
     @inlined

@@ -133,10 +133,10 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     iteration is the `EnsembleTransformFilter`; where h is linear, further ones change nothing. T and its inverse
     are symmetric and N x N, and never formed. The innovation and its covariance are those of the first iteration.
 
-    What it does not do: the motion f is not run again, as where the last state is estimated anew together with
-    this one (Sakov, Oliver and Bertino do so, without process noise). Steps are not damped: where the measurement
-    fits several states, iterations may jump between them. Where a measurement is far more accurate than the
-    forecast, T^-1 magnifies any nonlinearity of h along unobserved directions, and iterations gain little.
+    The motion f is not run again, unlike in methods that re-estimate the last state together with this one (Sakov,
+    Oliver and Bertino do so, without process noise). Steps are not damped: where the measurement fits several
+    states, iterations may jump between them. Where a measurement is far more accurate than the forecast, T^-1
+    magnifies any nonlinearity of h along unobserved directions, and iterations gain little.
 
     Attributes:
         iterations: evaluations of h by all members in an update, at least 1. The others are those of

@@ -1,4 +1,4 @@
-"""An ensemble as a table with one column a member: its prior, its motion, its noise and its moments."""
+"""An ensemble as a table with one column per member: its prior, its motion, its noise and its moments."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def drawer(n: int, m: int) -> Callable:
 def centre(draws, count, width, size):
     """Give each of `count` rows of draws, of `width` each, the mean zero over the first N = `size` of its entries.
 
-    What is left is scaled by (N/(N - 1))^1/2, so that the variance stays 1.
+    The rest is scaled by (N/(N - 1))^1/2, so that the variance stays 1.
     """
     factor = (size / (size - 1.0)) ** 0.5
     for i in range(count):
@@ -109,7 +109,7 @@ def _aligned(start: Callable, predict: Callable, align: Callable) -> tuple[Calla
 
 
 class Motion(NamedTuple):
-    """What all ensembles do alike, for one shape of model."""
+    """Functions common to all ensembles, for one shape of model."""
 
     start: Callable  # start(memory, numbers, size): members drawn from the prior
     predict: Callable  # predict(memory, u, numbers, size): members moved, then process noise added

@@ -50,9 +50,8 @@ class SerialSquareRootFilter(DeterministicUpdateFilter):
     For all channels together that is x_j += K innovation - K L (L + M)^-1 (h(x_j) - mean(h)), with L the lower
     triangular root of S = cov(h, h) + R: Andrews' square root, for taking the channels in turn is the elimination
     that makes L. So it is computed. The covariance after an update is exactly P - K S K', where the stochastic
-    filter's is so on average only; the mean moves as the Kalman filter's. The update draws nothing: the process
-    noise of the members is all that is random, and the error of its sample mean and covariance enters the
-    estimate.
+    filter's is so on average only; the mean moves as the Kalman filter's. The update draws nothing: only the
+    process noise of the members is random, and the error of its sample mean and covariance enters the estimate.
 
     With one channel it is the `EnsembleTransformFilter`. Close relatives go by the name of EnKF-SR in the
     literature on ships. Attributes are those of `DeterministicUpdateFilter`.

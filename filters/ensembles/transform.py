@@ -91,9 +91,9 @@ class EnsembleTransformFilter(DeterministicUpdateFilter):
     of R S for one channel, T = I - Y' (S + R # S)^-1 Y/(N - 1) and X T = X - cov(x, y) (S + R # S)^-1 Y.
 
     The covariance after an update is exactly P - K S K', where the stochastic filter's is so on average only; the
-    mean moves as the Kalman filter's. The update draws nothing: the process noise of the members is all that
-    is random, and the error of its sample mean and covariance enters the estimate. Attributes are
-    those of `DeterministicUpdateFilter`.
+    mean moves as the Kalman filter's. The update draws nothing: only the process noise of the members is random,
+    and the error of its sample mean and covariance enters the estimate. Attributes are those of
+    `DeterministicUpdateFilter`.
 
     Source: Bishop, Etherton, Majumdar (2001), "Adaptive sampling with the ensemble transform Kalman filter", part
     I; the symmetric root: Hunt, Kostelich, Szunyogh (2007), "Efficient data assimilation for spatiotemporal chaos:

@@ -20,7 +20,7 @@ ROUNDING = 1e-6  # of a covariance, as part of its largest entry: single precisi
 
 
 class Checks:
-    """Checks of what one estimator gives, whose messages name it.
+    """Checks of an estimator's outputs, with messages that name it.
 
     Args:
         name: of the estimator.
@@ -97,6 +97,11 @@ class Checks:
         return covs
 
 
+def absent(is_cov: bool) -> float:
+    """The substitute for a missing output of an estimator: 0 for a covariance, NaN for innovations."""
+    return 0.0 if is_cov else np.nan
+
+
 def _first(wrong: np.ndarray, leading: tuple[int, ...]) -> str:
     """Where the first wrong entry of many runs is; empty of a single step."""
     if not leading:
@@ -108,9 +113,9 @@ def _first(wrong: np.ndarray, leading: tuple[int, ...]) -> str:
 def log_likelihoods(
     innovations: np.ndarray, covs: np.ndarray, measurements: np.ndarray, gaussian: bool
 ) -> np.ndarray:
-    """Log-likelihood of measurements, log N(innovation; 0, S) over the channels that are there, (B, K + 1).
+    """Log-likelihood of measurements, log N(innovation; 0, S) over the channels present, (B, K + 1).
 
-    It is 0 where nothing was measured, and NaN where something was, but S is not given (all zero), not positive
+    It is 0 where nothing was measured, and NaN where something was, but it or S is not given (NaN), not positive
     definite, or not the covariance of a Gaussian.
 
     Args:
@@ -123,7 +128,9 @@ def log_likelihoods(
     pairs = there[..., :, None] & there[..., None, :]
     s = np.where(pairs, covs, np.eye(covs.shape[-1]))
     v = np.where(there, innovations, 0.0)
-    definite = np.linalg.eigvalsh(s)[..., 0] > 0.0
+    told = np.asarray(np.isfinite(s).all(axis=(-1, -2)) & np.isfinite(v).all(axis=-1))
+    s = np.where(told[..., None, None], s, np.eye(covs.shape[-1]))
+    definite = (np.linalg.eigvalsh(s)[..., 0] > 0.0) & told
     s = np.where(definite[..., None, None], s, np.eye(covs.shape[-1]))
     squares = (v * np.linalg.solve(s, v[..., None])[..., 0]).sum(axis=-1)
     found = -0.5 * (squares + np.linalg.slogdet(s).logabsdet + there.sum(axis=-1) * math.log(2.0 * math.pi))

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 
 class Output(NamedTuple):
-    """What an estimator gives after a measurement."""
+    """The output of an estimator after a measurement."""
 
     mean: Any  # of the state, (n,)
     cov: Any = None  # (n, n) or n variances; None of an estimator that has none
@@ -18,11 +18,12 @@ class Output(NamedTuple):
 class Estimator:
     """An estimator of one trajectory at a time; it keeps its own state, and its random draws follow from the key.
 
-    Runs and envs work on deep copies of it.
+    Each run begins with a deep copy of it. Generators of Python and NumPy that it holds are seeded by the key, and
+    so are the global ones, with that of torch.
 
-    A subclass gives `reset` and `step`; any other object that has both does as well, and what it leaves out of the
-    rest is as here. Each may return an `Output`, a tuple of the first of its parts, such as (mean, cov), or an
-    array, which is a mean alone. A method `run(keys, inputs, measurements)`, of keys (B, 2), inputs (B, K, p) and
+    A subclass defines `reset` and `step`; any other object with both is accepted too, and the rest defaults to
+    what is here. Each may return an `Output`, a tuple of the first of its parts, such as (mean, cov), or an array,
+    which is a mean alone. A method `run(keys, inputs, measurements)`, of keys (B, 2), inputs (B, K, p) and
     measurements (B, K + 1, m), may take the place of both in evaluations: it returns the same for all trajectories
     and steps, means (B, K + 1, n), covariances (B, K + 1, n, n) and so on.
 
@@ -37,6 +38,9 @@ class Estimator:
     has_covariance: bool = True
     gaussian_likelihood: bool = True
     parameters: Sequence = ()
+
+    def check_model(self, model: Any) -> None:
+        """Raise ValueError if the estimator cannot handle a property of a model, such as an angle."""
 
     def reset(self, key: tuple[int, int], z) -> Output | tuple | Any:
         """Begin a trajectory: the estimate at its first measurement z (m,), NaN where missing.

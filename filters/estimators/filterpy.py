@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from filters.estimators.estimator import Estimator, Output
+from numerics.angles import difference, wrapped_where
 from plants.state_space import StateSpaceModel
 
 
@@ -18,6 +19,9 @@ class FilterPyEstimator(Estimator):
     Each trajectory begins with a copy of the filter as it is given, whose x and P are the prior. It predicts with
     the input, then updates with the measurement. Where some channels are missing it updates with the others, by
     the `R`, and the `H` or `hx`, that FilterPy's `update` takes; where all are, it predicts only.
+
+    Of a model with angles it must know how to subtract and average them: an unscented filter by `residual_x` and
+    `x_mean_fn`, `residual_z` and `z_mean_fn`, an extended one by `residual` among the arguments of its update.
 
     Args:
         filter: of FilterPy, x, P, Q and R set.
@@ -41,6 +45,24 @@ class FilterPyEstimator(Estimator):
         self._arguments = dict(update_arguments or {})
         self.filter = copy.deepcopy(filter)
 
+    def check_model(self, model: StateSpaceModel) -> None:
+        """Raise ValueError unless the filter subtracts and averages the angles of a model as angles."""
+        own, lacks = self._given, []
+        for kind, angles in (("x", model.shape.state_angles), ("z", model.shape.measurement_angles)):
+            if not any(angles):
+                continue
+            if hasattr(own, "points_fn"):
+                plain = getattr(own, f"residual_{kind}", np.subtract) is np.subtract
+                lacks += [f"residual_{kind}"] * plain
+                lacks += [f"{kind}_mean_fn"] * (getattr(own, f"{kind}_mean", None) is None)
+            elif kind == "z" and "residual" not in self._arguments:
+                lacks.append("residual")
+        if lacks:
+            raise ValueError(
+                f"the estimator {self.name!r} must treat angles as such on a model with angles, "
+                f"but has no {', '.join(lacks)}"
+            )
+
     def reset(self, key, z) -> Output:
         """The prior, updated with the first measurement; FilterPy's filters take no key."""
         self.filter = copy.deepcopy(self._given)
@@ -62,10 +84,24 @@ class FilterPyEstimator(Estimator):
         innovation, s = np.zeros(len(z)), np.array(own.R, dtype=np.float64)
         if there.any():
             measured = z[there, None] if np.ndim(own.x) == 2 else z[there]
-            own.update(measured, **self._arguments, **({} if there.all() else self._of_some(there)))
+            if there.all():
+                own.update(measured, **self._arguments)
+            else:
+                self._update_some(measured, there)
             innovation[there] = np.ravel(own.y)
             s[np.ix_(there, there)] = own.S
         return Output(np.ravel(own.x).copy(), np.array(own.P), innovation, s)
+
+    def _update_some(self, measured: np.ndarray, there: np.ndarray) -> None:
+        """An update with some channels alone, whose angles are subtracted and averaged as if all were there."""
+        own, given = self.filter, dict(self._arguments)
+        if "residual" in given:
+            given["residual"] = _for_some(given["residual"], there)
+        kept = {name: getattr(own, name, None) for name in ("residual_z", "z_mean")}
+        found = {name: _for_some(one, there) for name, one in kept.items() if one not in (None, np.subtract)}
+        vars(own).update(found)
+        own.update(measured, **{**given, **self._of_some(there)})
+        vars(own).update({name: kept[name] for name in found})
 
     def _of_some(self, there: np.ndarray) -> dict:
         """Arguments of an update with some channels alone."""
@@ -81,6 +117,21 @@ class FilterPyEstimator(Estimator):
         return found | {"hx": lambda x, **rest: np.asarray(own.hx(x, **rest))[there]}
 
 
+def _for_some(function: Callable, there: np.ndarray) -> Callable:
+    """A function of vectors of all channels as one of those that are there, the others zero."""
+
+    def whole(part):
+        out = np.zeros((*np.shape(part)[:-1], len(there)))
+        out[..., there] = part
+        return out
+
+    def of_some(first, second):
+        weights = np.ndim(first) == 2  # a mean, of sigma points and their weights
+        return np.asarray(function(whole(first), second if weights else whole(second)))[..., there]
+
+    return of_some
+
+
 def _predict(filter: Any, u: np.ndarray) -> None:
     filter.predict(u=u)
 
@@ -91,7 +142,7 @@ def unscented(model: StateSpaceModel, alpha=1.0, beta=2.0, kappa=0.0) -> FilterP
     Args:
         model: f, h, Q, R and the prior.
         alpha: how far out the scaled sigma points lie; these three are those of the filter `ukf` by default.
-        beta: what is known of the distribution beyond its moments.
+        beta: prior knowledge of the distribution beyond its moments.
         kappa: moves the points further out.
     """
     from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
@@ -105,8 +156,20 @@ def unscented(model: StateSpaceModel, alpha=1.0, beta=2.0, kappa=0.0) -> FilterP
     def look(x):
         return np.array(model.observe(tuple(x), model.constants))
 
-    points = MerweScaledSigmaPoints(model.n, alpha, beta, kappa)
-    found = UnscentedKalmanFilter(model.n, model.m, 1.0, hx=look, fx=advance, points=points)
+    def functions(kind: str, angles: tuple[bool, ...]) -> dict:
+        if not any(angles):
+            return {}
+
+        def mean(points, weights):  # of numbers on the branch of the first point
+            return wrapped_where(points[0] + weights @ difference(points, points[0], angles), angles)
+
+        return {f"{kind}_mean_fn": mean, f"residual_{kind}": lambda a, b: difference(a, b, angles)}
+
+    points, shape = MerweScaledSigmaPoints(model.n, alpha, beta, kappa), model.shape
+    of_angles = functions("x", shape.state_angles) | functions("z", shape.measurement_angles)
+    if any(shape.state_angles):
+        of_angles["state_add"] = lambda x, change: wrapped_where(x + change, shape.state_angles)
+    found = UnscentedKalmanFilter(model.n, model.m, 1.0, hx=look, fx=advance, points=points, **of_angles)
     found.x, found.P = model.prior_mean.copy(), model.prior_cov.copy()
     found.Q, found.R = model.process_noise_cov.copy(), model.measurement_noise_cov.copy()
     return FilterPyEstimator(found, name="filterpy ukf")

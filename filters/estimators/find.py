@@ -18,7 +18,7 @@ def is_foreign(given) -> bool:
 
 
 def label_of(given) -> str:
-    """What an estimator that a user gives is called: "module:object", its own name, or that of what makes it."""
+    """The label of a user's estimator: "module:object", its own name, or the name of its factory."""
     if isinstance(given, str):
         return given
     for name in (getattr(given, "name", None), getattr(given, "__name__", None)):
@@ -28,8 +28,8 @@ def label_of(given) -> str:
 
 
 def parameters_of(given) -> tuple:
-    """What an estimator says that it is tuned by, `Parameter`s; none where it says nothing."""
-    found = getattr(_found(given), "parameters", ())
+    """The tunable parameters that an estimator declares, `Parameter`s; none by default."""
+    found = getattr(estimator_named(given), "parameters", ())
     return tuple(found) if isinstance(found, list | tuple) else ()  # of a network in torch it is a method
 
 
@@ -45,7 +45,7 @@ def foreign_filter(given, model: StateSpaceModel, **numbers) -> Filter:
     Raises:
         ValueError: if there is no such object, or it is not an estimator.
     """
-    found, label = _found(given), label_of(given)
+    found, label = estimator_named(given), label_of(given)
     if not is_estimator(found):
         found = _made(found, label, model, numbers)
     elif numbers:
@@ -55,7 +55,8 @@ def foreign_filter(given, model: StateSpaceModel, **numbers) -> Filter:
     return found if isinstance(found, Filter) else ForeignFilter(model=model, estimator=found, label=label)
 
 
-def _found(given) -> Any:
+def estimator_named(given) -> Any:
+    """A user's estimator argument: the object of "module:object", or the object itself."""
     return object_named(given, "estimator") if isinstance(given, str) else given
 
 
@@ -70,8 +71,8 @@ def _made(make, label: str, model: StateSpaceModel, numbers: dict) -> Any:
         raise ValueError(f"{what} must be made of {wanted}, but raised {said(error)}") from error
     if not isinstance(found, Filter) and not is_estimator(found):
         raise ValueError(
-            f"{what} must make what has reset(key, z) and step(u, z), or run(keys, inputs, measurements), "
-            f"but made {shown(found)}"
+            f"{what} must make an object with reset(key, z) and step(u, z), or run(keys, inputs, "
+            f"measurements), but made {shown(found)}"
         )
     return found
 

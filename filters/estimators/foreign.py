@@ -8,12 +8,16 @@ from typing import Any, ClassVar
 import numpy as np
 
 from filters.engine.belief import Belief, Innovation, Kernels
-from filters.estimators.checked import Checks, log_likelihoods, without_missing
+from filters.estimators.checked import Checks, absent, log_likelihoods, without_missing
 from filters.estimators.estimator import Output, is_estimator
-from filters.estimators.session import EstimatorSession
+from filters.estimators.session import EstimatorSession, seed_of
 from filters.filter import Filter
 from numerics.checks import shown
+from numerics.global_generators import GlobalGenerators, seeded_copy
 from numerics.modules import said
+from numerics.streams import GLOBAL_GENERATORS, derived_seed
+
+DIFFERENCE = 1e-6  # of two runs of a key, as part of the largest number: threads leave less
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -29,7 +33,7 @@ class ForeignFilter(Filter):
         label: its name in tables if it does not name itself.
 
     Raises:
-        ValueError: if it is no estimator.
+        ValueError: if it is no estimator, or one that refuses the model.
     """
 
     name: ClassVar[str] = "estimator"  # of the class; each has its own
@@ -38,13 +42,16 @@ class ForeignFilter(Filter):
     label: str = ""
 
     def __post_init__(self):
-        """Take from the estimator what it says of itself."""
+        """Read the estimator's declarations."""
         found = self.estimator
         if not is_estimator(found):
             raise ValueError(
                 f"an estimator must have reset(key, z) and step(u, z), or run(keys, inputs, measurements), "
                 f"but got {shown(found)}"
             )
+        check = getattr(found, "check_model", None)
+        if callable(check):
+            check(self.model)
         own = getattr(found, "name", None)
         name = own if isinstance(own, str) and own else self.label or type(found).__name__
         object.__setattr__(self, "name", name)
@@ -52,7 +59,7 @@ class ForeignFilter(Filter):
             object.__setattr__(self, fact, bool(getattr(found, fact, True)))
 
     def kernels(self) -> Kernels:
-        """Raise ValueError: what somebody else's estimator computes cannot be compiled."""
+        """Raise ValueError: another package's estimator cannot be compiled."""
         raise self._no_filter()
 
     def init(self, key: tuple[int, int] = (0, 0)) -> Belief:
@@ -70,8 +77,10 @@ class ForeignFilter(Filter):
     def _no_filter(self) -> ValueError:
         return ValueError(f"this needs a filter of filters.FILTERS, but got the estimator {self.name!r}")
 
-    def session(self) -> EstimatorSession:
-        """The estimator at work on one trajectory."""
+    def session(self, gate: float | None = None) -> EstimatorSession:
+        """The estimator at work on one trajectory; ValueError for a gate, which it would have to have itself."""
+        if gate is not None:
+            raise ValueError(f"a gate must be that of a filter of filters.FILTERS, but got one of {self.name!r}")
         return EstimatorSession(self)
 
     def fill(self, keys: np.ndarray, inputs: np.ndarray, measurements: np.ndarray, out: tuple) -> None:
@@ -87,8 +96,12 @@ class ForeignFilter(Filter):
         likelihoods[:] = log_likelihoods(innovations, innovation_covs, measurements, self.gaussian_likelihood)
 
     def _at_once(self, keys: np.ndarray, inputs: np.ndarray, z: np.ndarray, out: tuple) -> None:
+        generators, given = GlobalGenerators(), (keys.astype(np.int64), inputs.copy(), z.copy())
+        seed = seed_of(given[0][0]) if len(keys) else 0
+        generators.seed(derived_seed(seed, GLOBAL_GENERATORS))
         try:
-            returned = self.estimator.run(keys.astype(np.int64), inputs.copy(), z.copy())
+            with generators.used():
+                returned = _copied(self.estimator, seed).run(*given)
         except Exception as error:
             raise ValueError(
                 f"the estimator {self.name!r} must not raise, but its run raised {said(error)}"
@@ -97,19 +110,48 @@ class ForeignFilter(Filter):
         found = checks.output(returned, "run", z.shape[:2])
         innovation, s = without_missing(found, z)
         for part, values in zip(out, Output(found.mean, found.cov, innovation, s), strict=True):
-            part[...] = 0.0 if values is None else values
+            part[...] = absent(part is out[1]) if values is None else values
 
     def _one_by_one(self, keys: np.ndarray, inputs: np.ndarray, z: np.ndarray, out: tuple) -> None:
-        session = self.session()
-        for b, key in enumerate(keys):
-            for k in range(z.shape[1]):
-                try:
-                    if k:
-                        session.step(inputs[b, k - 1], z[b, k])
-                    else:
-                        session.start(tuple(int(word) for word in key), z[b, k])
-                except ValueError as error:
-                    raise ValueError(f"{error} of run {b}") from error
-                now = session.mean, session.cov, session.innovation, session.innovation_cov
-                for part, values in zip(out, now, strict=True):
-                    part[b, k] = values
+        session, again = self.session(), np.empty(out[0].shape[1:])
+        for b in range(len(keys)):
+            _run(session, b, (keys, inputs, z), tuple(part[b] for part in out))
+        if len(keys) and not self.__dict__.get("_repeats"):
+            _run(session, 0, (keys, inputs, z), (again,))
+            room = DIFFERENCE * np.abs(again).max(initial=0.0)
+            same = (np.abs(again - out[0][0]) <= room).all(axis=-1)
+            if not same.all():
+                raise ValueError(
+                    f"the estimator {self.name!r} must give the same for the same key and data, but when run "
+                    f"0 is repeated, its mean differs from step {int(np.argmin(same))} on: reset must seed "
+                    "all random numbers"
+                )
+            object.__setattr__(self, "_repeats", True)
+
+
+def _run(session: EstimatorSession, b: int, given: tuple, out: tuple) -> None:
+    """Put run b into arrays: (K + 1, n) of means, and more of the session's parts if there are more arrays."""
+    keys, inputs, z = given
+
+    def keep(k: int) -> None:
+        now = session.mean, session.cov, session.innovation, session.innovation_cov
+        for part, values in zip(out, now, strict=False):
+            part[k] = values
+
+    try:
+        session.start(tuple(int(word) for word in keys[b]), z[b, 0])
+        keep(0)
+        with session.generators.used():  # once a run, for it takes some ten microseconds
+            for k in range(1, z.shape[1]):
+                session.step(inputs[b, k - 1], z[b, k])
+                keep(k)
+    except ValueError as error:
+        raise ValueError(f"{error} of run {b}") from error
+
+
+def _copied(estimator: Any, seed: int) -> Any:
+    """A copy, so that no run begins where another one ended; of what cannot be copied itself."""
+    try:
+        return seeded_copy(estimator, seed)
+    except Exception:
+        return estimator

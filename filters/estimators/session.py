@@ -7,17 +7,23 @@ import copy
 import numpy as np
 
 from filters.engine.checks import checked_key, vector_like
-from filters.estimators.checked import Checks, without_missing
+from filters.estimators.checked import Checks, absent, without_missing
 from filters.estimators.estimator import steps_alone
+from numerics.global_generators import GlobalGenerators, seeded_copy
 from numerics.modules import said
+from numerics.streams import GLOBAL_GENERATORS, derived_seed
 
 
 class EstimatorSession:
-    """What a `Session` is to a filter: an estimator on one trajectory, on a copy of its own, outputs checked.
+    """The counterpart of a filter's `Session`: an own copy of an estimator on one trajectory, outputs checked.
+
+    Each trajectory begins with the estimator as it was given; generators that it holds, and the global ones of
+    Python, NumPy and torch, follow from the key. So what was before changes nothing.
 
     Attributes:
-        mean, cov, innovation, innovation_cov: (n,), (n, n), (m,), (m, m), of the last output; zero in the parts
-            that the estimator does not give.
+        generators: the estimator's global generators.
+        mean, cov, innovation, innovation_cov: (n,), (n, n), (m,), (m, m), of the last output; without a covariance
+            that is zero, and an innovation and its covariance that the estimator does not give are NaN.
         divergences: 0: an estimator whose numbers are not finite is an error.
     """
 
@@ -30,7 +36,8 @@ class EstimatorSession:
             )
         model = filter_.model
         n, m = model.n, model.m
-        self._estimator = copy.deepcopy(filter_.estimator)
+        self._given = copy.deepcopy(filter_.estimator)
+        self._estimator, self.generators = self._given, GlobalGenerators()
         self._checks = Checks(filter_.name, n, m, filter_.has_covariance)
         self._like = np.zeros(model.inputs), np.zeros(m)
         self._steps = 0
@@ -42,20 +49,24 @@ class EstimatorSession:
         """Begin with a random key (2,) and a first measurement z (m,)."""
         z = vector_like("z", z, self._like[1], missing_allowed=True)
         self._steps = 0
-        self._take("reset", checked_key(key), z)
+        key = checked_key(key)
+        self._estimator = seeded_copy(self._given, seed_of(key))
+        self.generators.seed(derived_seed(seed_of(key), GLOBAL_GENERATORS))
+        self._take("reset", key, z)
 
     def step(self, u, z) -> None:
         """One step later, after input u (p,) and measurement z (m,); NaN marks a missing channel."""
         u = vector_like("u", u, self._like[0], missing_allowed=False)
         z = vector_like("z", z, self._like[1], missing_allowed=True)
         self._steps += 1
-        self._take("step", u, z)
+        self._take("step", u.copy(), z)
 
     def _take(self, method: str, first, z: np.ndarray) -> None:
         where = f"step {self._steps}"
-        given = z.copy()  # an estimator may write into it
+        given = z.copy()  # an estimator may write into it, or keep it
         try:
-            returned = getattr(self._estimator, method)(first, given)
+            with self.generators.used():
+                returned = getattr(self._estimator, method)(first, given)
         except Exception as error:
             raise ValueError(
                 f"the estimator {self._checks.name!r} must not raise, but its {method} raised {said(error)} "
@@ -69,11 +80,16 @@ class EstimatorSession:
             (self.innovation, innovation),
             (self.innovation_cov, s),
         ):
-            own[...] = 0.0 if found is None else found
+            own[...] = absent(own is self.cov) if found is None else found
+
+
+def seed_of(key) -> int:
+    """The seed of what an estimator draws from, in the run of a key."""
+    return int(key[0]) << 32 | int(key[1])
 
 
 class EstimatorBeliefs:
-    """An estimator on N copies of a vector env, each on a copy of its own; see `batch_session.Beliefs`."""
+    """An estimator on N copies of a vector env, a copy of it for each; see `batch_session.Beliefs`."""
 
     def __init__(self, filter_, count: int):
         """Of a `ForeignFilter`; `start` comes next."""

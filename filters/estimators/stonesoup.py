@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from filters.estimators.estimator import Estimator, Output
+from plants.state_space import StateSpaceModel
 
 START = datetime(2000, 1, 1)  # of every trajectory: states carry a time, and only differences of it count
 
@@ -40,11 +41,26 @@ class StoneSoupEstimator(Estimator):
         set_input: Callable | None = None,
         name: str | None = None,
     ):
-        """Keep what is given; see the class."""
+        """Keep the arguments; see the class."""
         self.name = name or f"stonesoup {type(updater).__name__}"
         self._predictor, self._updater, self._prior = predictor, updater, prior
         self._dt, self._set_input = dt, set_input
         self._state, self._now = prior, START
+
+    def check_model(self, model: StateSpaceModel) -> None:
+        """Raise ValueError unless measurements that are angles are Stone Soup's, which go the short way round."""
+        if not any(model.shape.measurement_angles):
+            return
+        from stonesoup.types.angle import Angle
+
+        foreseen = np.ravel(self._updater.measurement_model.function(self._prior, noise=False))
+        pairs = zip(model.measurements, foreseen, strict=True)
+        plain = [one.symbol for one, value in pairs if one.angle and not isinstance(value, Angle)]
+        if plain:
+            raise ValueError(
+                f"the estimator {self.name!r} must have a measurement model that gives angles as such "
+                f"(stonesoup.types.angle), but gives numbers of {', '.join(plain)}"
+            )
 
     def reset(self, key, z) -> Output:
         """The prior, updated with the first measurement; Stone Soup's Gaussian filters take no key."""

@@ -43,7 +43,7 @@ def nothing_to_summarise(memory, size):
 
 @lru_cache(maxsize=64)
 def gaussian_innovation(shape: Shape) -> Callable:
-    """Return `compare(p, z, predicted, h, r)`: what a measurement says, and how sure it is.
+    """Return `compare(p, z, predicted, h, r)`: the innovation, its covariance and likelihood.
 
     It returns innovation = z - predicted, S = H P H' + R, the lower triangular root of S, P H', and H and R as
     they are without the channels that are NaN in z: zeros in the innovation and in H, no correlations in R.

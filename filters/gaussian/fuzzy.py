@@ -178,12 +178,12 @@ class FuzzyKalmanFilter(Filter):
         update:  the Kalman filter's of each rule, from its mean_r and P_r, with a gain of its own (Joseph's form)
         blend:   mean = sum of w_r mean_r,  P = sum of w_r P_r: the belief after each of the two
 
-    `blending` "weights" is this, the recursion of the sources. It leaves out that the rules' means differ, so P is
-    too small. "moments" is the same with P = sum of w_r (P_r + (mean_r - mean)(mean_r - mean)'): the first-order
-    generalised pseudo-Bayesian filter, GPB1, with memberships in place of the models' probabilities. "output" has
-    autonomous filters: each rule goes on from a mean_r and P_r of its own, which are blended, by moments, for
-    output only. Innovation and S are blended as mean and P are. With equal rules, as an affine model has them, all
-    three are the Kalman filter.
+    `blending` "weights" is this, the recursion of the sources. It ignores the differences between the rules'
+    means, so P is too small. "moments" is the same with P = sum of w_r (P_r + (mean_r - mean)(mean_r - mean)'):
+    the first-order generalised pseudo-Bayesian filter, GPB1, with memberships in place of the models'
+    probabilities. "output" has autonomous filters: each rule continues from its own mean_r and P_r, which are
+    blended, by moments, for output only. Innovation and S are blended as mean and P are. With equal rules, as an
+    affine model has them, all three are the Kalman filter.
 
     A blend of linearisations at the corners approximates a model only if the range is narrow: on the thruster the
     extended filter, which linearises at the estimate, is far better.

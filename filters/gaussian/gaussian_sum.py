@@ -122,10 +122,10 @@ class GaussianSumFilter(Filter):
                  its weight becomes a_k N(z; h(x_k), S_k)/L,  L = sum of a_k N(z; h(x_k), S_k)
         merge:   mean and P of the weighted parts: P within the parts and between them
 
-    So a measurement may have several solutions in component i, of which one linearisation at the mean sees one.
-    The log-likelihood is log L; innovation and S are those of the mixture before the measurement. On an affine
-    model this is the Kalman filter to some thousandths of a standard deviation, for the sum has thinner tails than
-    a Gaussian.
+    A measurement may thus have several solutions in component i; one linearisation at the mean finds only one. The
+    log-likelihood is log L; innovation and S are those of the mixture before the measurement. On an affine model
+    this is the Kalman filter to some thousandths of a standard deviation, for the sum has thinner tails than a
+    Gaussian.
 
     `Belief.extras` holds what the last update made of each part: mean, covariance, weight, innovation, its
     covariance and its log-likelihood; `part_estimates` takes the first three apart.

@@ -32,7 +32,7 @@ class UnscentedKalmanFilter(Filter):
     Attributes:
         alpha: distance of the points; 1 puts them sqrt(n + kappa) standard deviations from the mean, where the
             nonlinearity of f and h shows. With the common 0.001 the filter is hardly more than an extended one.
-        beta: what is known of the distribution beyond its moments; 2 is best for Gaussian ones.
+        beta: prior knowledge of the distribution beyond its moments; 2 is best for Gaussian ones.
         kappa: moves the points further out and gives the centre a larger weight; above -n.
 
     Raises:

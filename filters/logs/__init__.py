@@ -1,1 +1,1 @@
-"""Filters and smoothers over recorded runs, and what the innovations show of their consistency."""
+"""Filters and smoothers over recorded runs, and their consistency as the innovations show it."""

@@ -12,7 +12,7 @@ from plants.quantities import Quantity
 
 
 def columns_of(found: LogEstimate) -> dict[str, np.ndarray]:
-    """Columns (K + 1,) by header: time, inputs and measurements, then what the filter says, all by symbol.
+    """Columns (K + 1,) by header: time, inputs and measurements, then the filter's output, all by symbol.
 
     Of a state or output "omega_m" it is "omega_m_rad_per_s" and "omega_m_std_rad_per_s"; of a channel "thrust"
     "measured_thrust_N", "innovation_thrust_N" and "innovation_std_thrust_N"; of a reference "reference_T_N".

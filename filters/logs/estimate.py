@@ -26,7 +26,7 @@ STEP = 1e-4  # of the slopes of outputs, in standard deviations
 
 
 class LogEstimate(NamedTuple):
-    """What a filter makes of a log of K steps; of a smoother, means and covariances are the smoother's."""
+    """Estimates of a filter on a log of K steps; with a smoother, means and covariances are the smoother's."""
 
     log: Log
     filter: Filter
@@ -91,7 +91,7 @@ def estimate(
         columns: headers by quantity, as `plants.logs.read.read_log` takes them.
         clock_offset: clock offsets [s] by quantity, as `read_log` takes them.
         dt: sample time [s], as `read_log` takes it. Covariances are per step and do not scale with dt.
-        model_arguments: what the model's maker takes, such as `process_noise_cov`.
+        model_arguments: arguments of the function that makes the model, such as `process_noise_cov`.
         seed: of the filter's random numbers.
         **numbers: the filter's own parameters, such as `ensemble_size`.
 

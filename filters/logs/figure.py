@@ -10,7 +10,10 @@ import numpy as np
 from filters.logs.estimate import SKIPPED, LogEstimate
 from filters.logs.findings import compared, estimated
 from filters.looks import TRUTH, colour_of
+from numerics.angles import with_breaks, wrapped
+from numerics.characters import TITLE, verbatim
 from numerics.plots import new_figure, save_figure, tidy
+from numerics.sources import is_array
 from plants.logs.columns import OUTPUT, STATE
 
 if TYPE_CHECKING:
@@ -21,6 +24,7 @@ MOST_PANELS = 6  # of states and outputs
 TALL, LOW, WIDTH = 1.5, 1.1, 9.0  # [inch]
 ROOM = 0.6  # for title and legend [inch]
 MARGIN = 0.06  # of an axis above and below what it shows
+DOTS: dict[str, Any] = {"color": "0.5", "s": 4.0, "linewidths": 0, "label": "measurement", "zorder": 1.5}
 
 
 def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
@@ -31,8 +35,9 @@ def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
 def draw_log(found: LogEstimate, title: str, *, states: bool = True) -> Figure:
     """Estimates beside the reference channels, and the innovations below; without `states` these alone.
 
-    References come first; of many states and outputs the first six are drawn. Bands of the first rows, in which a
-    filter settles from its prior, do not widen the axes.
+    A measurement of a state or an output stands there as dots. References come first; of many states and outputs
+    the first six are drawn. Bands of the first rows, in which a filter settles from its prior, do not widen the
+    axes.
     """
     model, references, colour = found.model, compared(found), colour_of(found.filter.name)
     values = [f"{STATE}:{one.symbol}" for one in model.states] + [f"{OUTPUT}:{symbol}" for symbol in model.outputs]
@@ -47,19 +52,25 @@ def draw_log(found: LogEstimate, title: str, *, states: bool = True) -> Figure:
     labels |= {f"{OUTPUT}:{symbol}": one.quantity for symbol, one in model.outputs.items()}
     for axis, key in zip(axes, shown, strict=False):
         mean, std = estimated(found, key)
-        _band(axis, times, mean, std, colour)
-        _limit(axis, mean, std, found.log.references[key] if key in references else mean)
+        line = found.log.references[key] if key in references else mean
+        line = wrapped(line) if labels[key].angle else line
+        _limit(axis, mean, std, line)
+        breaks = with_breaks if labels[key].angle else lambda *lines: lines
         if key in references:
-            axis.plot(times, found.log.references[key], label="reference, not seen", **TRUTH)
-        axis.plot(times, mean, color=colour, linewidth=1.0, label="smoother" if found.smoothed else "estimate")
+            axis.plot(*breaks(times, line), label="reference, not seen", **TRUTH)
+        for seen in _measurements_of(found, mean):
+            axis.scatter(times, wrapped(seen) if labels[key].angle else seen, **DOTS)
+        own_times, mean, std = breaks(times, mean, std)
+        _band(axis, own_times, mean, std, colour)
+        axis.plot(own_times, mean, color=colour, linewidth=1.0, label="smoother" if found.smoothed else "estimate")
         axis.set_ylabel(labels[key].plot_label.replace(" $", "\n$"))
     for j, (axis, one) in enumerate(zip(axes[len(shown) :], found.log.measured, strict=True)):
         std = np.sqrt(np.maximum(found.innovation_covs[:, j, j], 0.0))
         _band(axis, times, np.zeros_like(std), std, colour)
         _limit(axis, np.zeros_like(std), std, found.innovations[:, j])
         axis.plot(times, found.innovations[:, j], color=colour, linewidth=0.8, label="innovation")
-        axis.set_ylabel(f"innovation of\n{one.symbol}" + (f"\n[{one.unit}]" if one.unit else ""))
-    axes[0].set_title(title, fontsize=11)
+        axis.set_ylabel(f"innovation of\n{one.symbol}" + (f"\n[{verbatim(one.unit)}]" if one.unit else ""))
+    axes[0].set_title(verbatim(title, most=TITLE), fontsize=11)
     axes[-1].set_xlabel("time [s]")
     figure.align_ylabels(axes)
     named: dict[str, Any] = {}
@@ -68,6 +79,18 @@ def draw_log(found: LogEstimate, title: str, *, states: bool = True) -> Figure:
         named |= dict(zip(texts, handles, strict=True))
     figure.legend(named.values(), named, loc="outside lower center", ncols=len(named), frameon=False)
     return figure
+
+
+def _measurements_of(found: LogEstimate, values: np.ndarray) -> list[np.ndarray]:
+    """The measured channels whose part of h(x) is a state or an output with these values, by some estimates."""
+    model, some = found.model, np.linspace(0, len(values) - 1, 40).astype(int)
+    states = found.means[some] if is_array(model.n) else [tuple(row) for row in found.means[some].tolist()]
+    try:
+        expected = np.array([model.functions.observe(x, model.given_constants) for x in states])
+    except (ValueError, ArithmeticError):  # of estimates at which h has no value, where Python raises
+        return []
+    same = np.isclose(expected, values[some, None], rtol=1e-9, atol=1e-12, equal_nan=True).all(axis=0)
+    return [found.log.measurements[:, j] for j in np.flatnonzero(same)]
 
 
 def _band(axis, times: np.ndarray, middle: np.ndarray, std: np.ndarray, colour: str) -> None:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
+from filters.consistency.blow_up import root_mean_square
 from filters.consistency.nees import whitened
 from filters.consistency.whiteness import LAGS, Whiteness, whiteness_of
 from filters.logs.estimate import SKIPPED, LogEstimate
@@ -29,7 +30,7 @@ class Residual(NamedTuple):
 
 
 class LogFindings(NamedTuple):
-    """Results over the rows that count; NaN where a filter has no covariance, or nothing was measured."""
+    """Results over the rows that count; NaN without covariance or innovation, or where nothing was measured."""
 
     first: int  # the first row that counts
     rows: int  # that count, and in which something was measured
@@ -59,9 +60,9 @@ def findings(found: LogEstimate, skip: int | None = None) -> LogFindings:
     first = at_least("skip", min(SKIPPED, rows // 4) if skip is None else skip, 0, rows - 1)
     innovations, covs = found.innovations[first:], found.innovation_covs[first:]
     present = ~np.isnan(innovations)
-    some, count = present.any(axis=1), int(present.sum())
+    some, count = (~np.isnan(log.measurements[first:])).any(axis=1), int(present.sum())
     nis, band, white = np.nan, (np.nan, np.nan), None
-    if found.filter.has_covariance and count:
+    if found.filter.has_covariance and np.isfinite(covs[present.any(axis=1)]).any():
         e = whitened(np.where(present, innovations, 0.0), covs)
         nis = float((np.where(present, e, 0.0) ** 2).sum() / count)
         band = float(chdtri(count, 0.975) / count), float(chdtri(count, 0.025) / count)
@@ -108,4 +109,5 @@ def _residual(quantity: Quantity, errors: np.ndarray) -> Residual:
     there = errors[~np.isnan(errors)]
     if not there.size:
         return Residual(quantity, np.nan, np.nan, 0)
-    return Residual(quantity, float(np.sqrt((there**2).mean())), float(there.mean()), there.size)
+    largest = float(abs(there).max()) or 1.0  # by which sums stay finite where a model blows up
+    return Residual(quantity, root_mean_square(there), float((there / largest).mean() * largest), there.size)

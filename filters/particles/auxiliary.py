@@ -141,10 +141,10 @@ class AuxiliaryParticleFilter(WeightedFilter):
                  L = (sum of lambda_j) (mean of w_j before normalisation)
         belief:  mean = sum of w_j x_j,  cov = sum of w_j (x_j - mean)(x_j - mean)'/(1 - sum of w_j^2)
 
-    The look-ahead needs the measurement, which is known in the update only. So the prediction keeps each
+    The look-ahead needs the measurement, which is known in the update only. The prediction therefore keeps each
     particle's noise; the update removes it, draws parents by mu, and adds it again: the noise does not depend on
-    the draw, which is all that the method requires. Before an update a belief equals the bootstrap filter's.
-    Directly after the prior or another update there is no noise, and parents are drawn by exact weights.
+    the draw, as the method requires. Before an update a belief equals the bootstrap filter's. Directly after the
+    prior or another update there is no noise, and parents are drawn by exact weights.
 
     V, the covariance that the noise causes in the measurement, keeps the weights w_j bounded where the noise is
     large: with V = 0, the textbook choice, a few particles that mu had ruled out would take all the weight.

@@ -77,7 +77,7 @@ def particle_kernels(functions: Functions, shape: Shape, regularised: bool) -> K
 class ParticleFilter(WeightedFilter):
     """Bootstrap particle filter: importance sampling from the prediction, with systematic resampling.
 
-        predict: if ESS < threshold N, draw the particles anew by weight (systematic), and all w_j = 1/N;
+        predict: if ESS < threshold N, resample the particles by weight (systematic), and all w_j = 1/N;
                  regularised: x_j += c h e_j,  e_j ~ N(0, cov),  h = (4/(n + 2))^(1/(n + 4)) N^(-1/(n + 4));
                  x_j = f(x_j, u) + noise_j,  noise_j ~ N(0, Q)
         update:  w_j = w_j p(z | x_j)/L,  L = sum of w_j p(z | x_j),  p(z | x) = N(z; h(x), R)

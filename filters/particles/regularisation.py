@@ -1,4 +1,4 @@
-"""Regularisation of particles that were drawn anew: copies of one are spread by a Gaussian kernel."""
+"""Regularisation of resampled particles: copies of one are spread by a Gaussian kernel."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from plants.shape import Shape, innovation_of
 
 
 class ParticleParts(NamedTuple):
-    """What particle filters do alike.
+    """Functions common to all particle filters.
 
     Rows of the table: n of particles, one of log weights, those of a kind, one of weights, scratch.
     """
@@ -128,7 +128,7 @@ def aligned_moments(means: Callable, covariances: Callable, align: Callable) -> 
 
 @inlined
 def anything_measured(z):
-    """Whether a channel of z is there."""
+    """Whether a channel of z is present."""
     for i in range(z.shape[0]):
         if z[i] == z[i]:
             return True
@@ -141,9 +141,9 @@ class WeightedFilter(Filter):
 
     Attributes:
         ensemble_size: number N of particles, from 2 to a million.
-        regularisation: factor on the width of the Gaussian kernel by which particles are spread when they were
-            drawn anew; 0 for none, 1 for the width that is best for a Gaussian belief. Where there is little or
-            no process noise, copies of a particle part by nothing else.
+        regularisation: factor on the width of the Gaussian kernel that spreads resampled particles; 0 for none, 1
+            for the best width for a Gaussian belief. With little or no process noise, nothing else separates the
+            copies of a particle.
     """
 
     gaussian_likelihood: ClassVar[bool] = False
@@ -171,5 +171,5 @@ class WeightedFilter(Filter):
 
     @staticmethod
     def effective_sample_size(belief: Belief) -> float:
-        """How many equally weighted particles would tell as much, from 1 to N."""
+        """The effective number of equally weighted particles, from 1 to N."""
         return float(belief.extras[0])

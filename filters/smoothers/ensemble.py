@@ -27,11 +27,11 @@ def smooth_ensembles(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Means (B, K + 1, n) and covariances of an ensemble filter's members given `lag` later measurements.
 
-    The analysis of measurement k is done again for each pair (x_k, x_l) of the members now and at an earlier step
-    l >= k - lag, as one of a state of twice the size of which the first half is measured. The members of step l so
-    get the analysis that they would get as part of one long state: with perturbed measurements
-    x_lj += cov(x_l, y) S^-1 (z - v_j - y_j). Relaxation is for the members of now only, and steps before a restart
-    from the prior are left as they are.
+    The analysis of measurement k is repeated for each pair (x_k, x_l) of the members now and at an earlier step l
+    >= k - lag, for a state of twice the size whose first half is measured. The members of step l so get the
+    analysis that they would get as part of one long state: with perturbed measurements x_lj += cov(x_l, y) S^-1 (z
+    - v_j - y_j). Relaxation is for the members of now only, and steps before a restart from the prior are left as
+    they are.
 
     Raises ValueError for a filter with rotations, which would part the members of different steps.
     """

@@ -64,7 +64,7 @@ def careful_factor(size: int) -> Callable:
     """Return `factor(a)`: the lower triangular L of a positive semidefinite a, for `matrices.row_solver`.
 
     Where a pivot is zero the diagonal of L is infinite, so that solving gives zero there. For a right-hand side in
-    the range of a that is a solution: what is known exactly has no share in a gain.
+    the range of a that is a solution: components known exactly have no share in a gain.
     """
     return matrices.pivoted_factor(
         size, f"{{d}} ** 0.5 if {{d}} > {NEGLIGIBLE} * {{a}} else infinity", infinity=np.inf

@@ -23,7 +23,7 @@ APPENDED = "appended_entries"  # attribute of an env: entries of its observation
 def given_filter(filter, tuned) -> tuple:
     """The arguments `filter` and `tuned` as a wrapper keeps them: what has a filter, as a study, is that filter.
 
-    Raises ValueError if either is something else than the wrapper's class says, or both are given.
+    Raises ValueError if either does not have the type that the wrapper documents, or both are given.
     """
     if isinstance(tuned, PathLike):
         tuned = fspath(tuned)
@@ -80,7 +80,7 @@ def model_for(env, model: str | StateSpaceModel | None, arguments: Mapping) -> S
 
 
 class ModelInSpec:
-    """A model as an env's spec keeps it. JSON refuses it by its class's name, which says what to do."""
+    """A model as an env's spec keeps it. JSON refuses it with its class's name, which says what to do."""
 
     def __init__(self, content):
         self.content = content

@@ -34,7 +34,7 @@ class WithMeasuredInputs:
         self._last: np.ndarray | None = None
 
     def __getattr__(self, name: str):
-        """The estimate and all else are those of the session or the beliefs."""
+        """The estimate and everything else are those of the session or the beliefs."""
         if name.startswith("_"):
             raise AttributeError(name)
         return getattr(self._runs, name)

@@ -13,7 +13,7 @@ from plants.state_space import StateSpaceModel
 
 
 def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | StateSpaceModel]:
-    """What a model is called in messages, and what makes it: the env, or the "module:factory" named; or itself.
+    """A model's name in messages, and its source: the env, the "module:factory" named, or itself.
 
     Raises ValueError if there is none.
     """

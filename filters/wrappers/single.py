@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.ma import MaskedArray
 
 from filters.engine.checks import checked_actions
 from filters.estimators.estimator import Estimator
@@ -21,7 +22,7 @@ from filters.wrappers.arguments import (
     given_filter,
 )
 from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
-from numerics.checks import one_of, shown
+from numerics.checks import as_floats, one_of, shown
 from numerics.checks import seed as checked_seed
 from numerics.streams import draw_key, filter_generator
 from plants.state_space import StateSpaceModel
@@ -47,15 +48,16 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     are in the units of the model. The measurement is `info["measurement"]` if the env reports it (missing where
     `measurement_valid` is false), else the observation. Where a measurement is missing, the observation repeats
     the last one (0 at first). The filter predicts with the action clipped to the action space or, if an env
-    replays a log, with `info["recorded_input"]`. The filter's random numbers come from the reset seed by a stream
-    of their own; the env's generator is never used.
+    replays a log, with `info["recorded_input"]`. The filter's random numbers come from the reset seed through a
+    separate stream; the env's generator is never used.
 
     Args:
         env: any env with Box actions and observations.
         filter: name of a filter in `filters.FILTERS`, which `thruster filters` lists; "ekf" if None. Or a filter
             that is made already, such as `tuning.tune(...).filter`, which brings its model; or an estimator of
             another package, as `filters.estimators.estimator.Estimator`, a function that makes one
-            from a model, or "module:object" for either; covariances or innovations that it does not give are zero.
+            from a model, or "module:object" for either; a covariance that it does not give is zero,
+            an innovation NaN.
         observation: one of the three forms above.
         model: None for the model that the env, or a wrapper around it, offers by `state_space_model(**arguments)`,
             as a bow thruster does; "module:factory" of a function that returns a `StateSpaceModel`; or a
@@ -135,7 +137,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         if "recorded_input" in info:
             u = info["recorded_input"].tolist()
         z = info.get("measurement")
-        if z is None or "measurement_valid" in info:
+        if z is None or "measurement_valid" in info or type(z) is MaskedArray:
             z = _measurement(observation, info)
         self._session.step(u, z)
         return self._observe(observation, z, info), reward, terminated, truncated, info
@@ -177,6 +179,6 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
 def _measurement(observation, info) -> np.ndarray:
     z = info.get("measurement")
     if z is None:
-        return np.asarray(observation, dtype=np.float64).ravel()
-    valid = info.get("measurement_valid")
+        return as_floats(observation).ravel()
+    z, valid = as_floats(z), info.get("measurement_valid")
     return z if valid is None else np.where(valid, z, np.nan)

@@ -16,7 +16,7 @@ from plants.state_space import StateSpaceModel
 def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:
     """Make the filter of a tuned file, for a model that takes the tuned Q, R and parameters.
 
-    Nothing is imported that the file names: the model is the env's own, or what the caller gives. It has to be the
+    Nothing that the file names is imported: the model is the env's own, or given by the caller. It has to be the
     one that the file is for. A file that holds its plant as data is compared with the env's plant, if no model is
     given, and by states, inputs and sensors; others by these, dt and the model's digest. Files of before version 4
     are compared by the plant alone.

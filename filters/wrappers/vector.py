@@ -18,7 +18,7 @@ from filters.estimators.session import EstimatorBeliefs
 from filters.filter import Filter
 from filters.wrappers.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for, given_filter
 from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
-from numerics.checks import one_of, shown
+from numerics.checks import as_floats, one_of, shown
 from numerics.keys import EpisodeKeys, reset_mask
 from numerics.streams import filter_generator
 from plants.state_space import StateSpaceModel
@@ -140,7 +140,8 @@ class EstimateStates(gym.vector.VectorWrapper):
     def _measurements(self, observations, info) -> np.ndarray:
         z = info.get("measurement")
         if z is None:
-            z = np.asarray(observations, dtype=np.float64).reshape(self.num_envs, -1)
+            z = observations.reshape(self.num_envs, -1)
+        z = as_floats(z)
         if z.shape != (self.num_envs, self._m):
             raise ValueError(
                 f"measurements must have shape {(self.num_envs, self._m)}, but got {shown(np.shape(z))}"

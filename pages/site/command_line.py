@@ -22,6 +22,7 @@ KINDS = {
 }
 ITEM = re.compile(r"^\* `([^`<]+) (<[^`]+)`(: Folder)?", re.MULTILINE)
 EXAMPLES = re.compile(r"^Example: thruster .*(?:\n\nExample: thruster .*)*$", re.MULTILINE)
+SUMMARY = re.compile(r"^(\* `(\w+)`: ).*\.\.\.$", re.MULTILINE)
 GIVEN_BY_NAME = re.compile(r"\[default: \(([^()]*)\)")
 
 
@@ -35,9 +36,19 @@ def commands() -> str:
     command = typer.main.get_command(app)
     context = typer.Context(command, info_name="thruster")
     text = get_docs_for_click(obj=command, ctx=context, name="thruster", indent=1)
+    helps = dict(_helps(command, context))
+    text = SUMMARY.sub(lambda found: f"{found[1]}{helps[found[2]]}", text)
     text = EXAMPLES.sub(_copied, text)
     text = ITEM.sub(_in_capitals, text)
     return GIVEN_BY_NAME.sub(r"[default: \1", text)
+
+
+def _helps(group, context: typer.Context):
+    """Names of all commands, and what each does in one paragraph: typer itself cuts it after 45 letters."""
+    for name in group.list_commands(context) if hasattr(group, "list_commands") else ():
+        command = group.get_command(context, name)
+        yield name, " ".join((command.help or "").split("\n\n")[0].split())
+        yield from _helps(command, context)
 
 
 def _copied(found: re.Match[str]) -> str:

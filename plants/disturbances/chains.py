@@ -31,7 +31,7 @@ def chain_of(effects: tuple[type[Effect], ...], count: int) -> Callable:
     It returns the place where they end.
 
     Args:
-        effects: the kinds of effects that it knows, as `encoded` had them.
+        effects: the known types of effects, as `encoded` had them.
         count: the place in numbers where their number stands.
     """
     dispatch = _dispatch(effects)

@@ -31,7 +31,7 @@ LONGEST = 1e9  # [s], and in steps: what an effect may hold
 
 @dataclasses.dataclass(frozen=True)
 class Context:
-    """What an effect may need to compute its parameters; a plant may add to it, in a class of its own."""
+    """The context from which an effect computes its parameters; a plant may extend it in a subclass."""
 
     dt: float  # sample time [s]
     valid_offset: int  # from the row of a measured channel to the one that says whether it is valid
@@ -57,7 +57,7 @@ class Effect:
         return 0
 
     def largest(self) -> float:
-        """Largest magnitude that a signal comes to, at four standard deviations of what is random."""
+        """Largest magnitude of a signal, at four standard deviations of its random part."""
         return 0.0
 
     def as_mapping(self) -> dict:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from numerics.checks import shown
+from numerics.checks import listed, shown
 from plants.logs.units import parted
 from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
@@ -24,7 +24,7 @@ class Wanted(NamedTuple):
 
     @property
     def key(self) -> str:
-        """What tells it from all others: "input:V_s"."""
+        """Its unique name: "input:V_s"."""
         return f"{self.kind}:{self.quantity.symbol}"
 
 
@@ -44,7 +44,7 @@ def quantities_of(model: StateSpaceModel) -> list[Wanted]:
 
 
 def plain(name: str) -> str:
-    """A name as headers have it: "measured_speed" of "measured speed"."""
+    """A name as used in headers: "measured_speed" for "measured speed"."""
     return name.replace(" ", "_").replace("-", "_")
 
 
@@ -67,7 +67,7 @@ def column_of(text: str, headers: Sequence[str], units: Mapping[str, str], what:
         same = [header for header in headers if parted(header)[0] == bare]
         bare = same[0] if len(same) == 1 else bare
     if bare not in headers:
-        raise ValueError(f"the column for {what} must be one of {', '.join(headers)}, but got {bare!r} ({file})")
+        raise ValueError(f"the column for {what} must be one of {listed(headers)}, but got {shown(bare)} ({file})")
     return Column(bare, unit or units.get(bare) or parted(bare)[1])
 
 
@@ -82,8 +82,8 @@ def find_columns(
     """Find the column of each quantity that the file has, and of "time", by key.
 
     Quantities that are not given are found by headers: a header without its unit is the quantity's name or symbol.
-    A header that is a symbol as it stands, such as "V_s", has no unit. Names are tried before symbols, and inputs,
-    measurements, states and outputs in this order; a column is used once.
+    A header that is a symbol as it stands, such as "V_s", has no unit. Inputs and measurements come before states
+    and outputs, names before symbols; a column is used once.
 
     Args:
         wanted: from `quantities_of`.
@@ -110,9 +110,10 @@ def find_columns(
                 f"a column must be given once for {name}, but got {found[key].header} and {text} ({file})"
             )
         found[key] = column_of(text, headers, units, name, file)
+    known_headers = set(headers)
     for header in units:
-        if header not in headers:
-            raise ValueError(f"units must be of columns {', '.join(headers)}, but got {header!r} ({file})")
+        if header not in known_headers:
+            raise ValueError(f"units must be of columns {listed(headers)}, but got {shown(header)} ({file})")
     _by_headers(found, wanted, headers, units)
     _check_found(found, wanted, headers, needs_time, file)
     return found
@@ -126,39 +127,46 @@ def _check_found(
     if not missing:
         return
     said = [
-        f"the {one.kind} {one.quantity.label} (say --column {one.quantity.symbol}=HEADER, or call it "
+        f"the {one.kind} {one.quantity.label} (use --column {one.quantity.symbol}=HEADER, or call it "
         f"{plain(one.quantity.name)})"
         for one in missing
     ]
     if needs_time and TIME not in found:
-        said.append("times (say --column time=HEADER, or --dt)")
+        said.append("times (use --column time=HEADER, or --dt)")
     python = f"in Python columns={{{missing[0].quantity.symbol!r}: 'HEADER'}}"
     raise ValueError(
-        f"a log must have a column for {' and for '.join(said)}, but {file} has {', '.join(headers)}; {python}"
+        f"a log must have a column for {' and for '.join(said)}, but {file} has {listed(headers)}; {python}"
     )
 
 
 def _by_headers(found: dict, wanted: Sequence[Wanted], headers: Sequence[str], units: Mapping[str, str]) -> None:
     """Add the columns whose headers tell what they are."""
     used = {column.header for column in found.values()}
-    bare = {header: parted(header) for header in headers if header not in used}
+    left = [header for header in headers if header not in used]
+    bare = {header: parted(header) for header in left}
+    whole: dict[str, list[str]] = {}
+    bases: dict[str, list[str]] = {}
+    for header in left:
+        whole.setdefault(plain(header), []).append(header)
+        base = plain(bare[header][0])
+        for name in dict.fromkeys((base, base.lower())):
+            bases.setdefault(name, []).append(header)
 
-    def take(key: str, fits) -> None:
-        header = None if key in found else next((one for one in bare if fits(bare[one][0])), None)
+    def take(key: str, fitting: Sequence[str], without_unit: bool = True) -> None:
+        header = None if key in found else next((one for one in fitting if one in bare), None)
         if header is not None:
-            found[key] = Column(header, units.get(header) or bare.pop(header)[1])
-            bare.pop(header, None)
-
-    take(TIME, lambda name: name in TIME_NAMES)
-    take(TIME, lambda name: name.lower() in DATE_NAMES)
-    for one in wanted:
-        name = plain(one.quantity.name).lower()
-        take(one.key, lambda base, name=name: plain(base).lower() == name)
-    for one in wanted:  # the whole header: what stands behind the line of "V_s" is no unit
-        header = next((header for header in bare if plain(header) == plain(one.quantity.symbol)), None)
-        if header is not None and one.key not in found:
+            found[key] = Column(header, units.get(header) or (bare[header][1] if without_unit else None))
             del bare[header]
-            found[one.key] = Column(header, units.get(header))
-    for one in wanted:
-        symbol = plain(one.quantity.symbol)
-        take(one.key, lambda base, symbol=symbol: plain(base) == symbol)
+
+    times = [header for header in left if bare[header][0] in TIME_NAMES]
+    take(TIME, times or [header for header in left if bare[header][0].lower() in DATE_NAMES])
+    for kinds in ((INPUT, MEASUREMENT), (STATE, OUTPUT)):
+        some = [one for one in wanted if one.kind in kinds]
+        for one in some:
+            name = plain(one.quantity.name).lower()
+            take(one.key, [header for header in bases.get(name, []) if plain(parted(header)[0]).lower() == name])
+        for one in some:  # the whole header: what stands behind the line of "V_s" is no unit
+            take(one.key, whole.get(plain(one.quantity.symbol), []), without_unit=False)
+        for one in some:
+            symbol = plain(one.quantity.symbol)
+            take(one.key, [header for header in bases.get(symbol, []) if plain(parted(header)[0]) == symbol])

@@ -1,12 +1,15 @@
 """Times of samples and the regular grid on which a log lies: the rules, all in one place.
 
-Grid. Time stamps that lie within a tenth of a sample time of its multiples are put on these multiples: a missing
-row leaves a gap. Otherwise the log is irregular, and the sample time is the one given, or the median interval.
+Grid. The sample time is the one given, or the slope of the stamps over their numbers, between pauses. After a
+pause stamps may lie between two times of the grid: all up to the next pause are shifted by the same part of a
+step. Stamps that then lie within a tenth of a sample time of its multiples are put on these multiples: a missing
+row leaves a gap. Otherwise the log is irregular.
 
 Measurements. A sample is moved to the nearest grid time, at most half a step away; if several belong to one time,
 the nearest is used; a grid time without a sample has NaN. A channel with a clock offset is interpolated linearly
 between samples that are at most 1.5 steps apart, so that estimates depend continuously on the offset, as a search
-for it needs; this averages some of the noise. Samples further apart are moved to the nearest grid time.
+for it needs; this averages some of the noise. Samples further apart are moved to the nearest grid time. Between
+angles it is the short way round, on the branch of the earlier sample; so it is for the mean of an input.
 
 Inputs. They are held from sample to sample (before the first sample at its value); the input of a step is the mean
 of the held value over the step.
@@ -21,9 +24,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from numerics.angles import wrapped
+
 TOLERANCE = 0.1  # of the sample time: stamps so close to a multiple of it are it
 CLOSE = 1e-9  # in steps: rounding
 MOST_DIGITS = 9  # of a sample time
+MOST_HELD = 5  # missing rows in a row over which an input is held; more are a gap
+SURE = 4.0  # standard errors of a sample time within which it is rounded
+SAME_RATE = 0.25  # of a step, over a piece: a sample time that is given is that of the stamps
 NEIGHBOURS = 1.5  # steps: samples that are farther apart are not interpolated
 
 
@@ -39,35 +47,88 @@ class Grid(NamedTuple):
 
     dt: float  # [s]
     rows: int
-    times: np.ndarray  # (rows of the file,) [s] since the first one
+    times: np.ndarray  # (rows of the file,) [s] since row 0
     irregular: bool
+    moved: np.ndarray = np.empty(0)  # (rows of the file,) [s], how far stamps were from the grid
 
 
 def grid_of(stamps: np.ndarray, dt: float | None = None) -> Grid:
-    """The grid of increasing stamps [s], by the sample time that is asked for or the one that they tell."""
-    since, steps = stamps - stamps[0], np.diff(stamps)
-    usual = float(np.median(steps)) if dt is None else dt
-    numbers = np.append(0.0, np.cumsum(np.maximum(np.round(steps / usual), 1.0)))
-    found = _rounded(numbers, since) if dt is None else dt
-    if (abs(since - found * numbers) <= TOLERANCE * found).all():
-        return Grid(found, int(numbers[-1]) + 1, found * numbers, False)
-    found = float(f"{usual:.3g}") if dt is None else dt
-    return Grid(found, int(since[-1] / found + 0.5) + 1, since, True)
+    """The grid of non-decreasing stamps [s], with the requested sample time or the one of the stamps."""
+    since, place = np.unique(stamps - stamps[0], return_inverse=True)
+    usual = _usual(since)
+    pieces = _pieces(since, usual)
+    found, spread = _slope(since, pieces, usual)
+    if dt is None:
+        dt = _rounded(found, spread)
+    longest = max(len(piece) for piece in pieces)
+    times = since
+    if (
+        abs(dt - found) * longest <= SAME_RATE * dt + SURE * spread * longest
+    ):  # else a piece has no place of its own
+        times = _shifted(since, pieces, dt)
+    numbers = np.floor(times / dt + 0.5)
+    regular = bool((abs(times - dt * numbers) <= TOLERANCE * dt).all() and (np.diff(numbers) > 0).all())
+    moved = abs(since - dt * numbers)[place]
+    if regular:
+        return Grid(dt, int(numbers[-1]) + 1, (dt * numbers)[place], False, moved)
+    return Grid(dt, int(numbers[-1]) + 1, times[place], True, moved)
 
 
-def _rounded(numbers: np.ndarray, since: np.ndarray) -> float:
-    """The sample time that stamps since the first one tell, with no more digits than they are good for."""
-    found = float(numbers @ since / (numbers @ numbers))
-    least = abs(since - found * numbers).max()
-    for digits in range(2, MOST_DIGITS):
+def _usual(since: np.ndarray) -> float:
+    """About the sample time: the median interval, of stamps 1, 2, 4, ... apart, for jitter counts less there."""
+    usual, lag = float(np.median(np.diff(since))), 2
+    while lag <= len(since) // 4:
+        apart = since[lag:] - since[:-lag]
+        usual = float(np.median(apart / np.maximum(np.round(apart / usual), 1.0)))
+        lag *= 2
+    return usual
+
+
+def _pieces(since: np.ndarray, dt: float) -> list[np.ndarray]:
+    """Places of the stamps between pauses."""
+    return np.split(np.arange(len(since)), np.flatnonzero(np.diff(since) > (MOST_HELD + 1.5) * dt) + 1)
+
+
+def _slope(since: np.ndarray, pieces: list[np.ndarray], dt: float) -> tuple[float, float]:
+    """The sample time by least squares with a beginning for each piece, and its standard error."""
+    products = squares = errors = 0.0
+    centred = []
+    for piece in pieces:
+        times = since[piece] - since[piece[0]]
+        phase = float(np.median(times - dt * np.round(times / dt)))
+        numbers = np.round((times - phase) / dt)
+        centred.append((numbers - numbers.mean(), times - times.mean()))
+        products += float(centred[-1][0] @ centred[-1][1])
+        squares += float(centred[-1][0] @ centred[-1][0])
+    if squares == 0.0:
+        return dt, 0.0
+    found = products / squares
+    errors = sum(float(((t - found * k) ** 2).sum()) for k, t in centred)
+    return found, float(np.sqrt(errors / max(len(since) - len(pieces) - 1, 1) / squares))
+
+
+def _rounded(found: float, spread: float) -> float:
+    """A sample time with no more digits than it is known to."""
+    for digits in range(1, MOST_DIGITS):
         short = float(f"{found:.{digits}g}")
-        if abs(since - short * numbers).max() <= 2.0 * least + CLOSE * found:
+        if abs(short - found) <= SURE * spread + CLOSE * found:
             return short
     return float(f"{found:.{MOST_DIGITS}g}")
 
 
-def sampled(series: Series, dt: float, rows: int, offset: float = 0.0) -> np.ndarray:
-    """A measured channel on the grid, (rows,), NaN where there is no sample."""
+def _shifted(since: np.ndarray, pieces: list[np.ndarray], dt: float) -> np.ndarray:
+    """Stamps of each piece, shifted by the same part of a step onto the grid; the first time is on row 0."""
+    times = since.copy()
+    for piece in pieces:
+        own = times[piece]
+        about = own[0] - dt * np.round(own[0] / dt)
+        off = own - about
+        times[piece] = own - about - float(np.median(off - dt * np.round(off / dt)))
+    return times - dt * np.floor(times[0] / dt + 0.5)
+
+
+def sampled(series: Series, dt: float, rows: int, offset: float = 0.0, angle: bool = False) -> np.ndarray:
+    """A measured channel, maybe an angle [rad], on the grid, (rows,), NaN where there is no sample."""
     times = (series.times - offset) / dt
     out = np.full(rows, np.nan)
     if not len(times):
@@ -84,22 +145,27 @@ def sampled(series: Series, dt: float, rows: int, offset: float = 0.0) -> np.nda
     near = (high - low <= NEIGHBOURS) & (low <= grid) & (grid <= high)
     apart = np.where(high > low, high - low, 1.0)
     share = (grid - low) / apart
-    between = (1.0 - share) * series.values[after - 1] + share * series.values[after]
+    one, other = series.values[after - 1], series.values[after]
+    between = one + share * wrapped(other - one) if angle else (1.0 - share) * one + share * other
     return np.where(near, between, out)
 
 
-def held(series: Series, dt: float, steps: int, offset: float = 0.0) -> np.ndarray:
-    """An input on the grid, (steps,): its mean over each step, held from sample to sample."""
+def held(series: Series, dt: float, steps: int, offset: float = 0.0, angle: bool = False) -> np.ndarray:
+    """An input, maybe an angle, on the grid, (steps,): its mean over each step, held from sample to sample."""
     times, values = (series.times - offset) / dt, series.values
     starts = np.arange(steps + 1, dtype=np.float64)
     if _lies_on_grid(times):
         place = np.searchsorted(np.round(times), starts[:-1], side="right") - 1
         return values[np.maximum(place, 0)]
+    places = np.maximum(np.searchsorted(times, starts[:-1], side="right") - 1, 0)
+    if angle:
+        values = np.unwrap(values)
     ends = np.append(times[1:], max(times[-1], steps) + 1.0)
     knots = np.append(min(times[0], 0.0) - 1.0, np.append(times, ends[-1]))
     heights = np.append(values[0], values)
     integral = np.append(0.0, np.cumsum(heights * np.diff(knots)))
-    return np.diff(np.interp(starts, knots, integral))
+    means = np.diff(np.interp(starts, knots, integral))
+    return means - (values - series.values)[places] if angle else means
 
 
 def _lies_on_grid(times: np.ndarray) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 
 from numerics.checks import as_floats, finite, positive, shown
 from plants.logs.columns import INPUT, MEASUREMENT, STATE
+from plants.logs.findings import Finding, Recording, found_in
 from plants.logs.grid import Series, held, sampled
 from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
@@ -40,6 +41,8 @@ class Log:
             rows themselves.
         offsets: how far the clock of a channel is ahead [s], by channel; it is subtracted from its times.
         irregular: whether the time stamps of the file lay on no grid.
+        recording: what became of the file's rows on the grid; empty where the log is not from a file.
+        whole: the log that this one is a piece of, between gaps; None for one that is no piece.
     """
 
     name: str
@@ -54,6 +57,8 @@ class Log:
     source: Mapping[str, Series] = field(default_factory=dict)
     offsets: Mapping[str, float] = field(default_factory=dict)
     irregular: bool = False
+    recording: Recording = Recording()
+    whole: Log | None = None
 
     def __post_init__(self):
         """Check shapes and numbers, and make the arrays read-only."""
@@ -89,6 +94,19 @@ class Log:
         """Times of the rows [s], (K + 1,), 0 at row 0."""
         return self.dt * np.arange(self.steps + 1)
 
+    @property
+    def pieces(self) -> tuple[tuple[int, int], ...]:
+        """First row and number of rows of what lies between gaps; one piece where there is none."""
+        ends = [(first, first + count) for first, count in self.recording.gaps]
+        starts = [0, *(end for _, end in ends)]
+        lasts = [*(first for first, _ in ends), self.steps + 1]
+        return tuple((first, last - first) for first, last in zip(starts, lasts, strict=True))
+
+    @cached_property
+    def findings(self) -> tuple[Finding, ...]:
+        """Findings in the log: `plants.logs.findings.found_in`."""
+        return found_in(self)
+
     @cached_property
     def digest(self) -> str:
         """A short hash of all numbers, dt and units; not of the name."""
@@ -106,10 +124,14 @@ class Log:
         return (*inputs, *(f"{MEASUREMENT}:{one.symbol}" for one in self.measured), *self.references)
 
     def true_states(self, model: StateSpaceModel) -> np.ndarray | None:
-        """The states of a model where the log has all of them without a gap, (K + 1, n); else None."""
+        """The states of a model, (K + 1, n), NaN in rows without one; None where no row has all."""
         found = [self.references.get(f"{STATE}:{one.symbol}") for one in model.states]
-        whole = [one for one in found if one is not None and not np.isnan(one).any()]
-        return np.column_stack(whole) if len(whole) == len(found) else None
+        there = [one for one in found if one is not None]
+        if len(there) < len(found):
+            return None
+        states = np.column_stack(there)
+        known = ~np.isnan(states).any(axis=1)
+        return np.where(known[:, None], states, np.nan) if known.any() else None
 
     def series(self, channel: str) -> Series:
         """Samples of a channel, at times [s] by its own clock, since row 0."""
@@ -140,7 +162,7 @@ class Log:
 
 
 def at_offset(log: Log, channel: str, seconds: float) -> Log:
-    """A log with another clock offset of one channel, put on the grid anew from the channel's own samples.
+    """A log with another clock offset of one channel, which is put on the grid again from its own samples.
 
     The result is continuous in the offset: see `plants.logs.grid` for how samples are interpolated.
 
@@ -155,16 +177,47 @@ def at_offset(log: Log, channel: str, seconds: float) -> Log:
     seconds, series = finite(f"the clock offset of {channel}", seconds), log.series(channel)
     changes: dict = {"offsets": {**log.offsets, channel: seconds}, "source": {**log.source, channel: series}}
     kind, _, symbol = channel.partition(":")
+    given = series, log.dt, log.steps + 1, seconds
     if channel in log.references:
-        changes["references"] = {**log.references, channel: sampled(series, log.dt, log.steps + 1, seconds)}
+        changes["references"] = {**log.references, channel: sampled(*given, log.referred[channel].angle)}
     elif kind == INPUT:
         place = [one.symbol for one in log.input_quantities].index(symbol)
-        changes["inputs"] = _with_column(log.inputs, place, held(series, log.dt, log.steps, seconds))
+        values = held(series, log.dt, log.steps, seconds, log.input_quantities[place].angle)
+        changes["inputs"] = _with_column(log.inputs, place, values)
     else:
         place = [one.symbol for one in log.measured].index(symbol)
-        values = sampled(series, log.dt, log.steps + 1, seconds)
+        values = sampled(*given, log.measured[place].angle)
         changes["measurements"] = _with_column(log.measurements, place, values)
     return replace(log, **changes)
+
+
+def cut_at_gaps(log: Log, shortest: int = FEWEST_STEPS + 1) -> list[Log]:
+    """The pieces of a log between its gaps that have so many rows, each a log; the log itself without gaps."""
+    long = [(first, rows) for first, rows in log.pieces if rows >= max(shortest, FEWEST_STEPS + 1)]
+    return [log] if len(log.pieces) == 1 else [_piece(log, first, rows) for first, rows in long]
+
+
+def _piece(log: Log, first: int, rows: int) -> Log:
+    some, since, source = slice(first, first + rows), first * log.dt, {}
+    for channel, series in log.source.items():
+        times = series.times - since
+        own = times - log.offsets.get(channel, 0.0)
+        low = max(int(np.searchsorted(own, -0.5 * log.dt)) - 1, 0)  # what is held at the first row
+        high = int(np.searchsorted(own, (rows - 0.5) * log.dt))
+        if channel.partition(":")[0] != INPUT:
+            low = int(np.searchsorted(own, -0.5 * log.dt))
+        source[channel] = Series(times[low:high], series.values[low:high])
+    return replace(
+        log,
+        name=f"{log.name}, rows {first} to {first + rows - 1}",
+        inputs=log.inputs[first : first + rows - 1],
+        measurements=log.measurements[some],
+        references={key: values[some] for key, values in log.references.items()},
+        start=log.start + since,
+        source=source,
+        recording=Recording(),
+        whole=log,
+    )
 
 
 def _with_column(rows: np.ndarray, place: int, values: np.ndarray) -> np.ndarray:

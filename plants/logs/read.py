@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from numerics.checks import finite, positive, shown
+from numerics.checks import finite, listed, positive, shown
 from numerics.toml import read_toml
 from plants.logs.columns import INPUT, MEASUREMENT, TIME, Column, Wanted, find_columns, find_wanted, quantities_of
-from plants.logs.grid import Grid, Series, grid_of, held, sampled
+from plants.logs.findings import Recording
+from plants.logs.grid import MOST_HELD, TOLERANCE, Grid, Series, grid_of, held, sampled
 from plants.logs.log import FEWEST_STEPS, Log
 from plants.logs.table import Table, read_table, table_of
 from plants.logs.units import converted
@@ -20,10 +21,11 @@ from plants.state_space import StateSpaceModel
 
 SECOND = "s"
 MOST_STEPS = 10_000_000
+MOST_DOUBLED = 0.1  # of the rows, with the time of the row before; of more the times are wrong
 
 
 class Description(NamedTuple):
-    """What is said of the columns of a file, beside what its header says."""
+    """A description of the columns of a file, in addition to its header."""
 
     columns: Mapping[str, str] = {}  # headers by quantity: {"thrust": "loadcell[kgf]"}
     units: Mapping[str, str] = {}  # by header
@@ -31,7 +33,7 @@ class Description(NamedTuple):
     dt: float | None = None  # sample time [s]: of rows without a time, or of the grid to put irregular ones on
 
     def updated(self, other: Description) -> Description:
-        """This one, but for what the other says."""
+        """This one, overridden by the other."""
         return Description(
             columns={**self.columns, **other.columns},
             units={**self.units, **other.units},
@@ -52,8 +54,8 @@ def read_log(
     """Read a log of a model's inputs and measurements from a file; columns of states and outputs are references.
 
     Columns are found by their headers (`plants.logs.columns.find_columns`), converted to the model's units
-    (`plants.logs.units`) and put on a grid (`plants.logs.grid`). Times are numbers, or dates as of ISO 8601, of
-    which the first is time 0. A file beside it, run.toml for run.csv, may say
+    (`plants.logs.units`) and put on a grid (`plants.logs.grid`). Times are numbers, or ISO 8601 dates, the first
+    of which is time 0. A file beside it, run.toml for run.csv, may say
 
         dt = 0.01
         [columns]
@@ -90,17 +92,21 @@ def read_log(
     grid, start = _grid(table, found.get(TIME), said.dt, file)
     offsets = _offsets(said.clock_offset, wanted, found, grid, file)
     source, parts, last = {}, {}, grid.rows - 1
+    rows, dropped = np.zeros(len(grid.times), bool), []
     for one in wanted:
         if one.key not in found:
             continue
-        series = _series(table, found[one.key], one, grid)
+        series, there = _series(table, found[one.key], one, grid)
+        rows |= there
         if len(series.values) < len(grid.times) or grid.irregular or one.key in offsets:
             source[one.key] = series  # elsewhere the rows tell the same
         offset = offsets.get(one.key, 0.0)
         if one.kind == INPUT:
-            parts[one.key] = held(series, grid.dt, last, offset)
+            parts[one.key] = held(series, grid.dt, last, offset, one.quantity.angle)
         else:
-            parts[one.key] = sampled(series, grid.dt, grid.rows, offset)
+            parts[one.key] = sampled(series, grid.dt, grid.rows, offset, one.quantity.angle)
+            lost = len(series.values) - int((~np.isnan(sampled(series, grid.dt, grid.rows))).sum())
+            dropped += [(one.key, lost)] if lost else []
 
     def those(kind: str, rows: int) -> np.ndarray:
         some = [parts[one.key] for one in wanted if one.kind == kind]
@@ -124,7 +130,22 @@ def read_log(
         source=source,
         offsets=offsets,
         irregular=grid.irregular,
+        recording=_recording(grid, rows, tuple(dropped)),
     )
+
+
+def _recording(grid: Grid, rows: np.ndarray, dropped: tuple[tuple[str, int], ...]) -> Recording:
+    """What became of a file's rows, of which some hold samples (rows,)."""
+    numbers = np.unique(np.floor(grid.times[rows] / grid.dt + 0.5).astype(int))
+    apart = np.diff(numbers)
+    usual = max(float(np.median(apart)), 1.0) if len(apart) else 1.0
+    is_gap = apart > (MOST_HELD + 1) * usual
+    gaps = tuple((int(numbers[i]) + 1, int(apart[i]) - 1) for i in np.flatnonzero(is_gap))
+    holes = np.maximum(np.round(apart[~is_gap] / usual).astype(int) - 1, 0)
+    moved = grid.moved[grid.moved > TOLERANCE * grid.dt]
+    farthest = float(moved.max()) if len(moved) else 0.0
+    doubled = int((np.diff(grid.times) == 0).sum())
+    return Recording(gaps, int(holes.sum()), int((holes > 0).sum()), len(moved), farthest, doubled, dropped)
 
 
 def _described(path: Path) -> Description:
@@ -154,9 +175,9 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str) -> t
     if column is None:
         if dt is None:
             raise ValueError(
-                f"a log must have a column of times (say --column time=HEADER, in Python "
+                f"a log must have a column of times (use --column time=HEADER, in Python "
                 f"columns={{'time': 'HEADER'}}) or a sample time (--dt, dt=), but "
-                f"{file} has {', '.join(table.names)}"
+                f"{file} has {listed(table.names)}"
             )
         return Grid(dt, count, dt * np.arange(count), False), 0.0
     stamps = table.dates(column.header)
@@ -168,17 +189,19 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str) -> t
         raise ValueError(f"every row must have a time, but there is none in {table.place(row, column.header)}")
     if count <= FEWEST_STEPS:
         raise ValueError(f"a log must have at least {FEWEST_STEPS + 1} rows, but {file} has {count}")
-    back = np.flatnonzero(np.diff(stamps) <= 0)
+    steps = np.diff(stamps)
+    doubled = (steps == 0).sum() > MOST_DOUBLED * len(steps) or len(steps) - (steps == 0).sum() < FEWEST_STEPS
+    back = np.flatnonzero(steps <= 0 if doubled else steps < 0)
     if len(back):
         row = int(back[0]) + 1
         raise ValueError(
             f"times must increase from row to row, but {stamps[row]:.10g} s follows {stamps[row - 1]:.10g} s in "
             f"{table.place(row, column.header)}"
         )
-    steps = (stamps[-1] - stamps[0]) / (float(np.median(np.diff(stamps))) if dt is None else dt)
-    if steps > MOST_STEPS:
+    count = (stamps[-1] - stamps[0]) / (float(np.median(steps[steps > 0])) if dt is None else dt)
+    if count > MOST_STEPS:
         raise ValueError(
-            f"a log must be at most {MOST_STEPS} steps long, but {file} has {steps:.3g} from first to last time"
+            f"a log must be at most {MOST_STEPS} steps long, but {file} has {count:.3g} from first to last time"
         )
     return grid_of(stamps, dt), float(stamps[0])
 
@@ -201,8 +224,12 @@ def _offsets(
     return offsets
 
 
-def _series(table: Table, column: Column, one: Wanted, grid: Grid) -> Series:
-    """The samples of a column in the model's unit; ValueError for a late input, or a stuck sensor."""
+def _series(table: Table, column: Column, one: Wanted, grid: Grid) -> tuple[Series, np.ndarray]:
+    """The samples of a column in the model's unit, and in which rows they are.
+
+    Raises:
+        ValueError: for a late input, or a sensor that never changes.
+    """
     where = f"column {column.header!r} of {table.file}"
     values = converted(table.numbers(column.header), column.unit, one.quantity.unit, where)
     there = ~np.isnan(values)
@@ -214,4 +241,4 @@ def _series(table: Table, column: Column, one: Wanted, grid: Grid) -> Series:
         )
     if one.kind == MEASUREMENT and there.sum() > 1 and np.ptp(values[there]) == 0.0:
         raise ValueError(f"a measurement must vary, but {where} is {values[there][0]:.10g} in all rows")
-    return Series(grid.times[there], values[there])
+    return Series(grid.times[there], values[there]), there

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
@@ -12,7 +13,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from numerics.checks import shown
+from numerics.checks import as_floats, shown
 from numerics.extras import to_install
 from plants.logs.stamps import MISSING as MISSING_TEXT
 from plants.logs.stamps import seconds_of, since_first
@@ -27,13 +28,13 @@ SUFFIXES = (".csv", ".parquet", ".npz")
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """The columns of a file; what is no number is found when a column is asked for.
+    """The columns of a file; entries that are not numbers are found when a column is requested.
 
     Attributes:
         file: its path, for messages.
         cells: of each column by name: texts, or an array.
         lines: of the file in which the rows are, counted from 1.
-        line_word: what a line is called.
+        line_word: the word for a line.
     """
 
     file: str
@@ -47,7 +48,7 @@ class Table:
         return tuple(self.cells)
 
     def place(self, row: int, column: str) -> str:
-        """Where a number stands, as messages have it."""
+        """The position of a number, for messages."""
         return f"{self.line_word} {self.lines[row]}, column {column!r} of {self.file}"
 
     def numbers(self, column: str) -> np.ndarray:
@@ -137,7 +138,7 @@ def _read_csv(path: Path) -> Table:
         raise ValueError(f"a log must have a header and rows, but {path} is empty")
     first = text.lstrip().splitlines()[0]
     delimiter = max(DELIMITERS, key=first.count)
-    reader = csv.reader(text.splitlines(), delimiter=delimiter, skipinitialspace=True)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
     try:
         numbered = [
             (reader.line_num, [cell.strip() for cell in row]) for row in reader if any(map(str.strip, row))
@@ -165,11 +166,12 @@ def _check_header(header: Sequence[str], line: int, path: Path) -> None:
         raise ValueError(
             f"the first line must name the columns, but line {line} of {path} has numbers: {shown(header)}"
         )
-    for place, name in enumerate(header):
-        if name and name in header[:place]:
-            raise ValueError(
-                f"names of columns must differ from one another, but line {line} of {path} has {name!r} twice"
-            )
+    seen = set()
+    for name in header:
+        if name and name in seen:
+            rule = "names of columns must differ from one another"
+            raise ValueError(f"{rule}, but line {line} of {path} has {shown(name)} twice")
+        seen.add(name)
 
 
 def _read_parquet(path: Path) -> Table:
@@ -213,7 +215,12 @@ def table_of(given: Any, name: str) -> Table:
     if not isinstance(given, Mapping) or not all(isinstance(header, str) for header in given):
         rule = "a log must be the path of a file, a pandas.DataFrame, a mapping from headers to arrays, or a Log"
         raise ValueError(f"{rule}, but got {shown(given)}")
-    return _of_arrays(name, {header: np.asarray(values) for header, values in given.items()})
+    return _of_arrays(name, {header: _unmasked(values) for header, values in given.items()})
+
+
+def _unmasked(values: Any) -> np.ndarray:
+    """Values of a column as an array; what a masked array masks is missing."""
+    return as_floats(values) if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
 
 
 def _with_index(frame: Any) -> dict:

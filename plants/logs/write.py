@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from numerics.checks import as_floats
 from numerics.extras import to_install
 from numerics.files import write_whole
 from plants.logs.columns import plain
 from plants.logs.log import Log
-from plants.logs.table import SUFFIXES
+from plants.logs.table import SUFFIXES, read_table
 from plants.logs.units import suffix
 from plants.quantities import Quantity
 
@@ -21,7 +23,7 @@ EXACT = "exact"  # every digit of a number
 
 
 def check_suffix(path: str | Path, option: str = "--out", suffixes: tuple[str, ...] = SUFFIXES) -> None:
-    """Raise ValueError unless a file's name ends so that it can be written, and what writes it is installed."""
+    """Raise ValueError unless a file's ending is known and the package that writes it is installed."""
     found = Path(path).suffix
     if found not in suffixes:
         known = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
@@ -30,36 +32,77 @@ def check_suffix(path: str | Path, option: str = "--out", suffixes: tuple[str, .
         _pyarrow()
 
 
-def write_columns(path: str | Path, columns: Mapping[str, np.ndarray], digits: str = "%.10g") -> None:
+def check_not_beside(path: str | Path) -> None:
+    """Raise ValueError if a file is, or would be, the description of a log, as run.toml is of run.csv."""
+    path = Path(path)
+    logs = [path.with_suffix(suffix) for suffix in SUFFIXES if path.suffix == ".toml"]
+    for log in logs:
+        if log.is_file():
+            raise ValueError(
+                f"a file must not take the name of the description of a log, but got {path} beside {log.name}"
+            )
+
+
+def write_columns(
+    path: str | Path, columns: Mapping[str, np.ndarray], digits: str = "%.10g", *, again: bool = False
+) -> None:
     """Write columns of equal length whole or not at all, in the form that the file's name ends in.
+
+    No log is ever overwritten: an existing file is kept, unless it has the same contents, or none.
 
     Args:
         path: that ends in .csv, .npz or .parquet.
         columns: numbers (rows,) by header.
         digits: of numbers in CSV, as `numpy.savetxt` takes them, or EXACT.
+        again: whether a file of the same columns is replaced, such as estimates by later ones.
 
     Raises:
-        ValueError: for another ending, or if the file cannot be written.
+        ValueError: for another ending, if the file cannot be written, or for an existing log.
     """
     check_suffix(path, "a file of columns")
-    names, values = list(columns), [np.asarray(one, dtype=np.float64) for one in columns.values()]
-    if Path(path).suffix == ".csv":
+    names, values = list(columns), [as_floats(one) for one in columns.values()]
+    content = _content(Path(path).suffix, dict(zip(names, values, strict=True)), digits)
+    _check_over(Path(path), content, names if again else None)
+    write_whole(path, content)
+
+
+def _content(suffix: str, columns: dict[str, Any], digits: str) -> bytes:
+    """A file's bytes."""
+    stream = io.BytesIO()
+    if suffix == ".csv":
         text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerow(columns)
         if digits == EXACT:
-            text.write(",".join(names) + "\n")
-            rows = zip(*(one.tolist() for one in values), strict=True)
+            rows = zip(*(one.tolist() for one in columns.values()), strict=True)
             text.writelines(",".join(map(repr, row)) + "\n" for row in rows)
         else:
-            table = np.column_stack(values)
-            np.savetxt(text, table, delimiter=",", header=",".join(names), comments="", fmt=digits)
-        write_whole(path, text.getvalue())
-    elif Path(path).suffix == ".npz":
-        arrays: dict[str, Any] = dict(zip(names, values, strict=True))
-        write_whole(path, lambda stream: np.savez(stream, **arrays))
+            table = np.column_stack(list(columns.values()))
+            np.savetxt(text, table, delimiter=",", fmt=digits)
+        stream.write(text.getvalue().encode())
+    elif suffix == ".npz":
+        np.savez(stream, **columns)
     else:
         pyarrow = _pyarrow()
-        table = pyarrow.table(dict(zip(names, values, strict=True)))
-        write_whole(path, lambda stream: pyarrow.parquet.write_table(table, stream))
+        pyarrow.parquet.write_table(pyarrow.table(columns), stream)
+    return stream.getvalue()
+
+
+def _check_over(path: Path, content: bytes, names: list[str] | None) -> None:
+    """Raise ValueError for a file that is there, unless it is empty, the same, or has columns of these names."""
+    if not path.is_file() or path.stat().st_size == 0:
+        return
+    there = path.read_bytes() if path.stat().st_size == len(content) else b""
+    if there == content or (names is not None and _names_in(path) == names):
+        return
+    raise ValueError(f"a log must be written to a new file, because logs are never overwritten, but {path} exists")
+
+
+def _names_in(path: Path) -> list[str]:
+    """The headers of a table that is there; none of what is no table."""
+    try:
+        return list(read_table(path).names)
+    except ValueError:
+        return []
 
 
 def write_log(path: str | Path, log: Log) -> None:

@@ -1,4 +1,4 @@
-"""What pictures of all plants are made of: 640 x 400 pixels, in a window (`human`) or as arrays (`rgb_array`).
+"""Common parts of the pictures of all plants: 640 x 400 pixels, in a window (`human`) or as arrays (`rgb_array`).
 
 **Overlay hook.** A plant knows no filter. The env holds `render_overlay`, None or a function without arguments
 that returns an overlay or None; a filter wrapper sets it: `env.unwrapped.render_overlay = ...`. A wrapper knows

@@ -121,7 +121,7 @@ class Canvas:
         self._background = self.large.copy()
 
     def finish(self) -> pygame.Surface:
-        """Average the drawing down to the picture's size, add what lies on top, and start anew."""
+        """Average the drawing down to the picture's size, add the top layer, and start again."""
         pygame.transform.smoothscale(self.large, self.small.get_size(), self.small)
         self.small.blits(self._on_top, False)
         self._on_top.clear()
@@ -161,7 +161,7 @@ def _font_file() -> str | None:
 
 
 def number(value: float, digits: int) -> str:
-    """A number with a true minus sign and no minus before zero; a dash for what is none."""
+    """A number with a true minus sign and no minus before zero; a dash if it is not finite."""
     if not math.isfinite(value):
         return "\u2013"
     return (f"{value:z.{digits}f}" if abs(value) < 1e6 else f"{value:.1e}").replace("-", "\u2212")

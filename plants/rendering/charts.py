@@ -51,7 +51,7 @@ class Charts:
         """Draw what never moves.
 
         Args:
-            canvas: what is drawn on.
+            canvas: to draw on.
             strips: the charts, from above.
             top: where the panel that holds them begins [px].
             dt: sample time [s].

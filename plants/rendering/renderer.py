@@ -77,7 +77,7 @@ class PlantRenderer:
         return self._made_with, {name: getattr(self, name) for name in ("_history", *self.remembered)}
 
     def __setstate__(self, state: tuple[dict, dict]) -> None:
-        """Make the pictures anew, for what was remembered."""
+        """Redraw the pictures from the history."""
         made_with, remembered = state
         type(self).__init__(self, **made_with)
         vars(self).update(remembered)

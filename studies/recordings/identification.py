@@ -85,10 +85,10 @@ CHOSEN = "flow and inertia"
 STRUCTURES = {
     "static": Structure("thrust by motor speed alone", STATIC, {"flow_factor": 0.0}),
     "flow": Structure("with axial flow", (*STATIC, *FLOW)),
-    CHOSEN: Structure("with axial flow and inertial force: the one that is taken", WHOLE),
+    CHOSEN: Structure("with axial flow and inertial force: the chosen one", WHOLE),
     "ambient": Structure("... and the measured ambient flow", (*WHOLE, *AMBIENT), ambient=True),
     "mount": Structure("... and the mount's swinging", (*WHOLE, *MOUNT)),
-    "no flow": Structure("the one that is taken, without axial flow", _without(FLOW), {"flow_factor": 0.0}),
+    "no flow": Structure("the chosen one, without axial flow", _without(FLOW), {"flow_factor": 0.0}),
     "no dead band": Structure(
         "... without the dead band", _without(BAND), {"dead_band_low": 0.0, "dead_band_high": 0.0}
     ),

@@ -15,6 +15,7 @@ from filters import run
 from filters.bounds import path_bound
 from filters.consistency.nees import normalized_squares
 from filters.filter import Filter
+from filters.wrapped import wrapped_variances
 from numerics.checks import at_least
 from plants.simulate import Truth, simulate
 from studies.vehicle.estimators import Estimator
@@ -204,8 +205,9 @@ def along_path(world: str, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     gap = pose_errors(planar_pose(states[None, :, :6], DT)[0], pose)
     beyond = (states[:, :6] < 0.0) | (states[:, :6] > 1.0)
     outside = np.append(beyond.mean(axis=0), beyond.any(axis=1).mean())
-    covs = path_bound(papers_model("navigation", world), inputs[None])[0]
-    variances = np.diagonal(covs, axis1=1, axis2=2)
+    model = papers_model("navigation", world)
+    covs = path_bound(model, inputs[None])[0]
+    variances = wrapped_variances(np.diagonal(covs, axis1=1, axis2=2), model.shape.state_angles)
     bound = Bound(
         np.sqrt(variances[steps, :6].mean(axis=0)),
         np.sqrt(variances[steps, 6:8].mean(axis=0)),

@@ -61,12 +61,12 @@ def _of_transformation(iv: PathResult) -> list[str]:
     ours = 100 * (by_yaw.max(axis=0) / by_yaw.min(axis=0) - 1.0).max()
     gap, full = iv.planar_gap, iv.scores["EKF8"].rmse("full")
     return [
-        f"The printed errors differ by {flat:.1f} % at most between 50 and 300 members: what they measure is "
-        "not the filter. So are ours by the papers' transformation, which turns by yaw alone: all filters, and "
+        f"The printed errors differ by {flat:.1f} % at most between 50 and 300 members: they do not measure the "
+        "filter. The same holds for ours by the papers' transformation, which uses yaw alone: all filters, and "
         f"the bare measurements, agree to {ours:.1f} %. The vehicle dives by pitching, which that "
-        f"transformation does not know: on true velocities without any noise its RMSE is {_pose(gap)}.",
+        f"transformation ignores: on true velocities without any noise its RMSE is {_pose(gap)}.",
         f"By the full transformation the EKF of the same velocities has {_pose(full)}. Path and transformation "
-        "decide; no filter does.",
+        "determine the error, not the filter.",
     ]
 
 
@@ -81,17 +81,17 @@ def _of_members(iv: PathResult) -> list[str]:
     theirs = ", ".join(f"{row.seconds:g}" for row in printed.values())
     return [
         f"A measured velocity with Q = R is estimated to sqrt(0.618 R) = {1e3 * GOLDEN:.3f} mm/s (or mrad/s), "
-        f"whatever the filter: extended and unscented ones of eight and of six states have {measured.min():.3f} "
-        f"to {measured.max():.3f} for u, v, w and r. Measured velocities tell nothing of a filter. What is not "
-        "measured does: p, q, roll, pitch.",
+        f"with any filter: extended and unscented ones of eight and of six states have {measured.min():.3f} "
+        f"to {measured.max():.3f} for u, v, w and r. Only the unmeasured states distinguish filters: p, q, roll, "
+        "pitch.",
         f"Seconds for N = {', '.join(map(str, printed))}: {seconds} on one core for {iv.steps} steps, printed "
         f"{theirs} for an unknown number. The NEES of the EnKF is {nees} for 8 states, that of the EKF "
-        f"{digits(scores['EKF8'].nees_interval.value)}: at 1 kHz each update takes a little of the spread of roll "
-        "and pitch by chance correlations, and nothing gives it back.",
-        "Equation (24) forgets the members, so its gain is 1/2 for what is measured: sqrt(2/3 R) = "
+        f"{digits(scores['EKF8'].nees_interval.value)}: at 1 kHz each update reduces the spread of roll and "
+        "pitch a little by chance correlations, and nothing restores it.",
+        "Equation (24) discards the members, so its gain is 1/2 for measured states: sqrt(2/3 R) = "
         f"{1e3 * MEAN_ONLY:.3f} mm/s in theory, {1e3 * mean_only.rmse('velocities')[0]:.3f} mm/s found with the "
-        f"sampling noise of its members. p and q are the model's alone, {_rates(mean_only)}; the right EnKF of "
-        f"as many members, which chance correlations disturb, has {_rates(ours[0])}.",
+        f"sampling noise of its members. p and q come only from the model, {_rates(mean_only)}; the correct EnKF "
+        f"with as many members, disturbed by chance correlations, has {_rates(ours[0])}.",
     ]
 
 
@@ -113,8 +113,8 @@ def _of_matrix() -> str:
     ours = np.linalg.eigvalsh(mass_matrix(SEGOROGENI))
     return (
         f"The inverse of the printed A^-1 has eigenvalues {', '.join(f'{one:.2f}' for one in printed)}: two are "
-        f"negative, so it is the mass matrix of no vehicle. Ours has {', '.join(f'{one:.3g}' for one in ours)}. "
-        "So no coefficients of the paper could be used; ours follow from the printed sizes."
+        f"negative, so no vehicle has this mass matrix. Ours has {', '.join(f'{one:.3g}' for one in ours)}. "
+        "The coefficients of the paper are therefore unusable; ours are derived from the printed sizes."
     )
 
 
@@ -136,15 +136,15 @@ def _of_paths(by_path: dict[str, PathResult]) -> list[str]:
     return [
         "Position RMSE of the fuzzy filter over that of the EnKF with 50 members, printed: "
         f"{', '.join(printed_worse)}. Ours, by the full transformation and paired by run: {', '.join(worse)}. "
-        "That the fuzzy filter wins on four paths does not come out: against a path that the vehicle's own "
-        f"model does not follow, errors say nothing of filters. By yaw alone it has {min(planar):.2f} to "
+        "We cannot reproduce that the fuzzy filter wins on four paths: errors from a path that the vehicle's own "
+        f"model does not follow say nothing about filters. By yaw alone it has {min(planar):.2f} to "
         f"{max(planar):.2f} times the error of the bare measurements.",
         "On the dynamic path 1.5 mm, 1.4 mm and 1.1 mrad are printed for the EnKF. Ours has "
         f"{_level_pose(dynamic.rmse('planar_both'))} with path and estimate both by yaw alone, and "
-        f"{_level_pose(dynamic.rmse('full'))} by the full transformation: millimetres are what such "
-        "measurements give. z, which is not printed, is worse, for pitch is not measured: "
+        f"{_level_pose(dynamic.rmse('full'))} by the full transformation: such measurements give "
+        "millimetres. z, which is not printed, is worse, because pitch is not measured: "
         f"{digits(dynamic.rmse('full')[2])} m.",
-        "That 50 members are quicker than 64 rules comes out: a run of the fuzzy filter takes "
+        "We can reproduce that 50 members are faster than 64 rules: a run of the fuzzy filter takes "
         f"{min(seconds):.0f} to {max(seconds):.0f} times as long. Printed are {_seconds_ratio()} times.",
     ]
 
@@ -153,9 +153,9 @@ def _of_bounds(by_path: dict[str, PathResult]) -> list[str]:
     outside = ", ".join(f"{name} {100 * result.outside[-1]:.0f} %" for name, result in by_path.items())
     count, growth = unstable_corners()
     return [
-        "The bounds 0..1 leave out every negative velocity. Without noise the share of time in which some "
-        f"velocity lies outside is {outside}. Corners such as v = w = 1 m/s are ten times what the vehicle "
-        f"does; {count} of the 64 tangents are unstable, the worst grows by {growth:.2f}/s.",
+        "The bounds 0..1 exclude every negative velocity. Without noise the share of time in which some "
+        f"velocity lies outside is {outside}. Corners such as v = w = 1 m/s are ten times the vehicle's "
+        f"velocities; {count} of the 64 tangents are unstable, the worst grows by {growth:.2f}/s.",
         NO_POSTERIOR_BOUND,
     ]
 
@@ -165,8 +165,8 @@ def _of_other_world(other: PathResult) -> list[str]:
     base = scores["EKF6 level"]
     words = {
         FKF: "bounds 0..1",
-        "fuzzy 0..1 own": "the same with an estimate of its own for each rule",
-        "fuzzy narrow offsets": "a range about the manoeuvre, with offsets",
+        "fuzzy 0..1 own": "the same with a separate estimate for each rule",
+        "fuzzy narrow offsets": "a range around the manoeuvre, with offsets",
     }
     said = []
     for label, what in words.items():
@@ -182,7 +182,7 @@ def _of_other_world(other: PathResult) -> list[str]:
         "On equal terms, in a world without restoring moments where six states are exact, the fuzzy filter's "
         f"RMSE over that of the EKF of six states: {'; '.join(said)}. The NEES of that EKF is "
         f"{digits(base.nees_interval.value)}, of the EnKF {ensembles} for N = 50, 100, 200, 300. Positions are "
-        "worse for all: without them roll and pitch drift unseen.",
+        "worse for all: without restoring moments roll and pitch drift unseen.",
     ]
 
 

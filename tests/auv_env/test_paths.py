@@ -138,7 +138,6 @@ def test_pd_on_measurements_beats_holding_the_planes_still(name, path, share):
     assert on_truth == pytest.approx(pd, rel=0.2, abs=3.0)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("name", "spread"), [(PATH, 0.34), (DEPTH, 0.72)])
 def test_the_reward_threshold_is_what_pd_on_measurements_has(name, spread):
     """The mean of 100 episodes has a standard error of `spread`."""

@@ -149,7 +149,7 @@ def test_an_estimator_stands_in_evaluation_and_comparison_beside_ours():
     found = evaluate(foreign_filter(AtOnce(), NOMINAL.model()), data, NOMINAL.scale)
     u = np.concatenate([np.zeros_like(data.inputs[:, :1]), data.inputs], axis=1)
     errors = np.concatenate([u, data.measurements], axis=-1) - data.states
-    expected = np.sqrt((errors[:, data.scored] ** 2).mean(axis=(0, 1)))
+    expected = np.sqrt((errors[:, data.late] ** 2).mean(axis=(0, 1)))
     np.testing.assert_allclose([one.value for one in found.rmse], expected, rtol=1e-12)
     assert math.isnan(found.nees.value) and math.isnan(found.nis.value) and math.isnan(found.log_likelihood)
     drawing = Drawing()
@@ -216,7 +216,7 @@ def test_what_an_estimator_gets_wrong_is_one_line_with_the_rule_and_where(estima
         ("math:nothing", "'math:nothing' is not: module 'math' has no attribute"),
         ("math:pi", "must be an estimator, or make one of a model, but it is 3.14"),
         ("math:sin", "must be made of a model, but raised TypeError"),
-        (lambda model: 3, "must make what has reset.* but made 3"),
+        (lambda model: 3, "must make an object with reset.* but made 3"),
         ("nobody", "filter must be one of kf"),
         (Estimator(), "its reset raised NotImplementedError: Estimator has no reset"),
     ],
@@ -287,12 +287,16 @@ def test_around_an_env_it_gives_what_ours_gives(form):
             np.testing.assert_allclose(info[name], other[name], rtol=1e-8, atol=1e-9)
 
 
-def test_what_it_does_not_give_is_zero_beside_an_env_and_copies_go_their_own_ways():
+def test_what_it_does_not_give_is_zero_or_nan_beside_an_env_and_copies_go_their_own_ways():
     env = EstimateState(gym.make("BowThruster-v0"), filter=f"{HERE}:Drawing", observation="belief")
     observation, info = env.reset(seed=4)
     assert (observation[2:] == 0).all() and np.isfinite(observation).all() and (observation[:2] != 0).all()
-    for name, shape in (("estimate_cov", (2, 2)), ("innovation", (1,)), ("innovation_cov", (1, 1))):
-        np.testing.assert_array_equal(info[name], np.zeros(shape))
+    for name, value, shape in (
+        ("estimate_cov", 0.0, (2, 2)),
+        ("innovation", np.nan, (1,)),
+        ("innovation_cov", np.nan, (1, 1)),
+    ):
+        np.testing.assert_array_equal(info[name], np.full(shape, value))
     assert info["estimate_divergences"] == 0 and env.spec.to_json()
     np.testing.assert_array_equal(env.reset(seed=4)[0], observation)
     other = copy.deepcopy(env)

@@ -6,7 +6,6 @@ import pytest
 from filters import ExtendedKalmanFilter, KalmanFilter, affine_model, run
 from filters.likelihood import information, likelihood
 from numerics.compiled import interpreted
-from numerics.formulas import formula
 from numerics.streams import episode_keys
 from plants import simulate
 from tuning.likelihood.gradient import BAD_START, maximise_likelihood
@@ -14,35 +13,6 @@ from tuning.problems.seeds import training_seeds
 from tuning.thruster.find import find_scenario
 
 RNG = np.random.default_rng(0)
-
-
-@pytest.mark.parametrize(
-    ("text", "shapes", "expected"),
-    [
-        ("A B' - C", {"A": (2, 3), "B": (4, 3), "C": (2, 4)}, lambda A, B, C: A @ B.T - C),
-        ("A' B A + B", {"A": (3, 3), "B": (3, 3)}, lambda A, B: A.T @ B @ A + B),
-        ("x + A y - A x", {"x": (2,), "A": (2, 2), "y": (2,)}, lambda x, A, y: x + A @ y - A @ x),
-        ("- A", {"A": (1, 2)}, lambda A: -A),
-    ],
-)
-def test_a_formula_is_what_it_says(text, shapes, expected):
-    values = {name: RNG.normal(size=shape) for name, shape in shapes.items()}
-    found = formula(text, **shapes)(*(value.tolist() for value in values.values()))
-    np.testing.assert_allclose(np.array(found), expected(**values), rtol=1e-13, atol=1e-13)
-
-
-@pytest.mark.parametrize(
-    ("text", "shapes", "rule"),
-    [
-        ("A B", {"A": (2, 3), "B": (2, 3)}, "shapes must fit in 'A B'"),
-        ("A + B", {"A": (2, 3), "B": (3, 2)}, "must have one shape"),
-        ("A + x", {"A": (2, 1), "x": (2,)}, "must have one shape"),
-        ("A B", {"A": (2, 2)}, "'B' has none"),
-    ],
-)
-def test_a_formula_that_does_not_fit_is_refused(text, shapes, rule):
-    with pytest.raises(ValueError, match=rule):
-        formula(text, **shapes)
 
 
 def two_channels():

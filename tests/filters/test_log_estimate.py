@@ -1,5 +1,7 @@
 """A filter over a log: what its innovations tell, errors against channels it did not see, smoothers, files."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy.stats import chi2, multivariate_normal
@@ -7,7 +9,7 @@ from scipy.stats import chi2, multivariate_normal
 from filters import make_filter, run, smooth
 from filters.logs.columns import columns_of
 from filters.logs.estimate import estimate
-from filters.logs.figure import log_figure
+from filters.logs.figure import draw_log, log_figure
 from filters.logs.findings import compared, findings
 from numerics.streams import filter_keys
 from plants.logs.log import Log
@@ -108,6 +110,25 @@ def test_columns_and_picture_hold_all_of_it(log, tmp_path):
     np.testing.assert_array_equal(columns["innovation_tach_rad_per_s"], found.innovations[:, 0])
     assert {"P_W", "std_P_W", "reference_P_W", "innovation_std_tach_rad_per_s"} <= set(columns)
     assert log_figure(tmp_path / "est.png", found, "kf on run").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_is_measured_stands_behind_the_state_or_output_that_it_measures(log):
+    drawn = [
+        [dots.get_offsets()[:, 1] for dots in axis.collections if dots.get_label() == "measurement"]
+        for axis in draw_log(estimate(log, "kf", SEEN), "kf on run").axes
+    ]
+    (speed,), *others = drawn  # h(x) = n
+    np.testing.assert_array_equal(speed.filled(np.nan), log.measurements[:, 0])
+    assert others == [[], []]  # the output P and the innovation
+
+
+def test_an_estimate_at_which_h_has_no_value_is_drawn_all_the_same(log):
+    def root(x, c):
+        return (math.sqrt(x[0]),)
+
+    own = make_filter("ekf", SEEN.replace(prior_mean=[1.0], observe=root, observe_jacobian=None))
+    axes = draw_log(estimate(log, "kf", SEEN)._replace(filter=own), "ekf").axes
+    assert not any(dots.get_label() == "measurement" for axis in axes for dots in axis.collections)
 
 
 def test_the_prior_s_band_does_not_widen_the_picture(log, tmp_path, monkeypatch):

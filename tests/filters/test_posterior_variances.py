@@ -1,5 +1,7 @@
 """The posterior bound's variances: the same in parts, and of how many sequences of a large model."""
 
+from collections import namedtuple
+
 import numpy as np
 import pytest
 
@@ -24,10 +26,13 @@ def test_in_parts_they_are_those_of_the_whole_bound_to_the_bit(monkeypatch, byte
 
 def test_of_a_large_model_the_work_limits_the_sequences_and_equal_ones_are_one(monkeypatch):
     inputs = np.arange(40.0)[:, None, None] * np.ones((40, 150, 2))
-    assert len(bounds._taken(inputs, 100, 12)) == 40
-    assert bounds._taken(inputs, 100, 40).tolist() == [2 * i for i in range(20)]
-    assert bounds._taken(inputs, 100, 500).tolist() == [0]
-    assert bounds._taken(inputs[:, :, :0], 100, 13).tolist() == bounds._taken(0 * inputs, 100, 13).tolist() == [0]
+    sized = namedtuple("Sized", "n substeps", defaults=(1,))
+    assert len(bounds.sequences_taken(inputs, 100, sized(12))) == 40
+    assert bounds.sequences_taken(inputs, 100, sized(40)).tolist() == [2 * i for i in range(20)]
+    assert bounds.sequences_taken(inputs, 100, sized(500)).tolist() == [0]
+    assert bounds.sequences_taken(inputs, 100, sized(2, 100)).tolist() == [2 * i for i in range(20)]
+    for same in (inputs[:, :, :0], 0 * inputs):
+        assert bounds.sequences_taken(same, 100, sized(13)).tolist() == [0]
     model, some = thruster_model(), [0, 2]
     monkeypatch.setattr(bounds, "ALL_UP_TO", 1)
     monkeypatch.setattr(bounds, "MOST_WORK", 2 * 7 * 12 * 8)
@@ -56,10 +61,3 @@ def test_a_nearly_singular_q_loses_no_digits_and_a_singular_one_has_no_bound():
     assert bounds.has_bound(np.diag([1e-9, 1e9])) and not bounds.has_bound(np.diag([0.0, 1.0]))
     with pytest.raises(ValueError, match="positive definite Q"):
         posterior_bound(tracker(1e-17), inputs)
-
-
-def test_about_the_mean_it_is_the_same_recursion(monkeypatch):
-    model = thruster_model()
-    expected = posterior_bound(model, INPUTS, truths=7)
-    monkeypatch.setattr(bounds, "STIFF", 2.0)
-    np.testing.assert_allclose(posterior_bound(model, INPUTS, truths=7), expected, rtol=1e-9)

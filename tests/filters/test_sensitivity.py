@@ -108,7 +108,7 @@ def case(name, count=2, steps=40):
     return make, values, sizes, inputs, measurements
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", ["pendulum", "thruster", pytest.param("eight", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("degrees", [math.inf, 5.0])
 def test_the_gradient_is_that_of_central_differences(name, degrees):
     make, values, sizes, inputs, measurements = case(name)

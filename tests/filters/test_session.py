@@ -1,9 +1,13 @@
 """A belief belongs to a kind of filter and a model; another one's is refused in one line."""
 
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
-from filters import affine_model, make_filter, thruster_model
+from filters import StateSpaceModel, affine_model, make_filter, thruster_model
 from filters.engine.session import Session
 from numerics.compiled import interpreted
 
@@ -56,3 +60,169 @@ def test_a_session_goes_on_from_a_belief_of_its_own_filter():
         session.step([5.0], [4.0])
         expected, _ = filter_.update(filter_.predict(belief, [5.0]), [4.0])
         np.testing.assert_array_equal(session.belief().members, expected.members)
+
+
+class Timed(NamedTuple):
+    """Constants of a model whose sample time may vary."""
+
+    dt: float
+    drag: float
+
+
+def roll(x, u, c):
+    return x[0] + c.dt * x[1], x[1] + c.dt * (u[0] - c.drag * x[1])
+
+
+def look(x, c):
+    return x[0], x[1]
+
+
+def cart(dt=0.1, q=0.01):
+    return StateSpaceModel(
+        transition=roll,
+        observe=look,
+        process_noise_cov=[q, q],
+        measurement_noise_cov=[0.04, 0.09],
+        prior_mean=[0.0, 0.0],
+        prior_cov=[1.0, 1.0],
+        inputs=1,
+        constants=Timed(dt, 0.3),
+    )
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", ["ekf", "enkf", "pf", "ukf"])
+def test_the_pure_functions_take_no_root_of_a_covariance_and_no_new_memory_at_each_call(name, monkeypatch):
+    filter_ = make_filter(name, cart(), **({"ensemble_size": 9} if name in ("enkf", "pf") else {}))
+    belief, _ = filter_.update(filter_.init((1, 2)), [0.1, 0.0])
+
+    def never(*arguments):
+        raise AssertionError("this takes longer than a step")
+
+    monkeypatch.setattr("plants.state_space.covariance_root", never)
+    monkeypatch.setattr("filters.engine.session.new_memory", never)
+    belief = filter_.predict(belief, [1.0])
+    belief, innovation = filter_.update(belief, [0.2, np.nan])
+    assert belief.step == 1 and np.isfinite(innovation.log_likelihood)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", ["ekf", "enkf", "pf", "sage-husa"])
+def test_what_was_done_before_with_a_filter_changes_no_later_result(name):
+    filter_, fresh = (made(name) for _ in range(2))
+    start, _ = filter_.update(filter_.init((1, 2)), [3.0])
+    expected = fresh.update(fresh.predict(start, [5.0]), [4.0])
+    other = filter_.init((9, 9))
+    for _ in range(3):
+        other = filter_.update(filter_.predict(other, [-20.0]), [1.0])[0]
+    if filter_.varying_noise:
+        filter_.predict(other, [1.0], process_noise_cov=[7.0, 7.0])
+        filter_.update(other, [1.0], measurement_noise_cov=[7.0])
+    with pytest.raises(ValueError, match="u must be 1 number"):
+        filter_.predict(start, [np.nan])
+    found = filter_.update(filter_.predict(start, [5.0]), [4.0])
+    for one, two in zip((*found[0], *found[1]), (*expected[0], *expected[1]), strict=True):
+        np.testing.assert_array_equal(one, two)
+    copied = pickle.loads(pickle.dumps(filter_))
+    assert not any(key.startswith("_spare") for key in vars(copied))
+    np.testing.assert_array_equal(copied.predict(start, [5.0]).cov, fresh.predict(start, [5.0]).cov)
+
+
+def test_threads_share_a_filter_and_not_its_memory():
+    with interpreted():
+        filter_ = made("ekf")
+        start = filter_.init()
+
+        def after(u):
+            with interpreted():
+                belief = start
+                for _ in range(20):
+                    belief, _ = filter_.update(filter_.predict(belief, [u]), [0.1 * u])
+            return belief.mean
+
+        expected = [after(u) for u in range(8)]
+        with ThreadPoolExecutor(8) as pool:
+            found = list(pool.map(after, range(8)))
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_numbers_follow_a_model_whose_arrays_are_written_to():
+    model = cart()
+    filter_ = make_filter("ekf", model)
+    belief = filter_.predict(filter_.init(), [0.0])
+    model.process_noise_cov[0, 0] += 5.0
+    assert filter_.predict(filter_.init(), [0.0]).cov[0, 0] == pytest.approx(belief.cov[0, 0] + 5.0)
+
+
+NO_COVARIANCE = {
+    "negative": ([[1.0, 0.0], [0.0, -0.1]], "positive semidefinite"),
+    "indefinite": ([[1.0, 2.0], [2.0, 1.0]], "positive semidefinite"),
+    "lopsided": ([[1.0, 0.5], [0.1, 1.0]], "symmetric"),
+    "NaN": ([[1.0, np.nan], [np.nan, 1.0]], "finite"),
+    "infinite": ([[np.inf, 0.0], [0.0, 1.0]], "finite"),
+}
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize(("cov", "rule"), NO_COVARIANCE.values(), ids=list(NO_COVARIANCE))
+def test_a_quick_look_at_a_belief_lets_none_through_that_is_off(cov, rule):
+    for count in (2, 7):  # few states are looked at in Python
+        model = cart() if count == 2 else wide_identity(count)
+        filter_ = make_filter("ekf", model)
+        whole = np.eye(count)
+        whole[:2, :2] = cov
+        belief = filter_.init()._replace(cov=whole)
+        with pytest.raises(ValueError, match=f"cov of a belief must be .*{rule}"):
+            filter_.predict(belief, [0.0])
+        for good in (np.zeros((count, count)), np.ones((count, count)), np.diag([0.0] + [1.0] * (count - 1))):
+            filter_.predict(belief._replace(cov=good), [0.0])
+        with pytest.raises(ValueError, match="mean of a belief must be finite"):
+            filter_.predict(belief._replace(cov=np.eye(count), mean=np.full(count, np.nan)), [0.0])
+
+
+def wide_identity(n):
+    return affine_model(
+        a=0.9 * np.eye(n), b=np.ones((n, 1)), c=np.eye(1, n), process_noise_cov=[0.1] * n,
+        measurement_noise_cov=[0.2], prior_mean=[0.0] * n, prior_cov=[1.0] * n,
+    )  # fmt: skip
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", ["ekf", "enkf"])
+def test_a_gate_leaves_out_channels_that_are_too_far(name):
+    filter_ = make_filter(name, cart())
+    session = filter_.session(gate=4.0)
+    session.start((3, 4), [0.0, 0.0])
+    belief, _ = filter_.update(filter_.init((3, 4)), [0.0, 0.0])
+    for z, seen in (([0.1, 0.2], [0.1, 0.2]), ([50.0, 0.1], [np.nan, 0.1]), ([0.1, np.nan], [0.1, np.nan])):
+        session.step([0.3], z)
+        belief, innovation = filter_.update(filter_.predict(belief, [0.3]), seen)
+        np.testing.assert_array_equal(session.mean, belief.mean)
+        np.testing.assert_array_equal(session.innovation, innovation.value)
+    assert session.rejected.tolist() == [1, 0]
+    other = pickle.loads(pickle.dumps(session))
+    for one in (session, other):
+        one.step([0.3], [0.2, 80.0])
+    np.testing.assert_array_equal(other.mean, session.mean)
+    assert other.rejected.tolist() == [1, 1]
+    with pytest.raises(ValueError, match="gate must be positive, but got 0"):
+        filter_.session(gate=0.0)
+    with pytest.raises(ValueError, match="a gate must be that of a filter with a covariance, but 'open-loop'"):
+        make_filter("open-loop", cart()).session(gate=3.0)
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_session_takes_another_sample_time_where_the_model_has_it():
+    session = make_filter("ekf", cart()).session()
+    session.start((0, 0), [0.0, 1.0])
+    belief = session.belief()
+    session.set_dt(0.25)
+    session.step([2.0], [0.1, 0.9])
+    other = make_filter("ekf", cart(dt=0.25))
+    expected, _ = other.update(other.predict(belief, [2.0]), [0.1, 0.9])
+    np.testing.assert_array_equal(session.mean, expected.mean)
+    with pytest.raises(ValueError, match="dt must be .*positive"):
+        session.set_dt(-1.0)
+    with pytest.raises(ValueError, match="must be called on a model with a constant dt, but got none"):
+        made("ekf", of_three_states).session().set_dt(0.1)

@@ -12,6 +12,7 @@ from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.search.enqueued import RESCALED
+from tuning.search.parameters import PRIOR_FACTORS
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 from tuning.search.study import open_study, run_study
@@ -78,8 +79,9 @@ def test_a_study_tunes_p0_and_the_number_survives(tmp_path):
     assert result.best_value < 0.9 * result.trials[0].values[0]
     for twin in (trial for trial in result.trials if RESCALED in trial.user_attrs and "P0" in trial.params):
         trial = result.trials[twin.user_attrs[f"{RESCALED} of"]]
-        ratios = [twin.params[name] / trial.params[name] for name in ("P0", "R")]
-        assert ratios[0] == pytest.approx(ratios[1], rel=1e-6)
+        factor_of_twin = twin.params["R"] / trial.params["R"]
+        wanted = np.clip(factor_of_twin * trial.params["P0"], *PRIOR_FACTORS)  # its range
+        assert twin.params["P0"] == pytest.approx(wanted, rel=1e-6)
     path = tmp_path / "t.json"
     write_tuned(path, PLAN, result, [evaluate_held_out(result.choice, STARTUP, 0, 4)], "s")
     assert read_tuned(path) == (result.choice, STARTUP, 0)

@@ -17,7 +17,17 @@ from typing import Annotated
 import numpy as np
 import typer
 
-ROOMS = ("python_interface", "files", "commands", "processes", "checkpoints")
+ROOMS = (
+    "python_interface",
+    "files",
+    "logs",
+    "commands",
+    "processes",
+    "checkpoints",
+    "streams",
+    "starts",
+    "angles_and_bounds",
+)
 
 
 def attacks() -> dict[str, Callable[[np.random.Generator, float], str]]:

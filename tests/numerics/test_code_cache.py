@@ -18,7 +18,9 @@ SOURCE = "def double(x):\n    return x + x\n"
 
 
 @pytest.fixture(autouse=True)
-def told_anew():
+def told_anew(monkeypatch):
+    """As if no warning had been given yet, and NUMBA_CACHE_DIR, which would come first, were not set."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     code_cache._tell.cache_clear()
     code_cache._told_folder.cache_clear()
 
@@ -117,3 +119,33 @@ def test_a_private_folder_is_nobody_else_s(temporary):
     folder.rmdir()
     os.symlink(other, folder)
     assert Path(private_folder()) not in (folder, other)
+
+
+@pytest.mark.parametrize("name", ["site-packages", "dist-packages"])
+def test_beside_what_pip_has_installed_no_machine_code_is_kept(tmp_path, name, monkeypatch):
+    """It would outlive an uninstallation, as a package that hides the checkout's."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setenv("HOME", str(tmp_path))
+    folder = tmp_path / name / "filters"
+    folder.mkdir(parents=True)
+    kept = keep_code(numba.njit(function_of(folder)))
+    assert hits(kept) == 0
+    assert not files(folder) and str(tmp_path / name) not in kept._cache.cache_path
+    assert hits(keep_code(numba.njit(function_of(folder)))) == 1  # and it is found again
+    assert files(kept._cache.cache_path) == [".nbc", ".nbi"]
+
+
+def test_a_folder_of_the_user_s_choice_comes_before_all(tmp_path, monkeypatch):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "mine"))
+    folder = tmp_path / "site-packages"
+    folder.mkdir()
+    assert hits(keep_code(numba.njit(function_of(folder)))) == 0
+    assert files(tmp_path / "mine") == [".nbc", ".nbi"]
+
+
+def test_without_a_cache_of_the_user_s_installed_code_goes_to_the_private_folder(tmp_path, read_only, temporary):
+    folder = tmp_path / "site-packages"
+    folder.mkdir()
+    with pytest.warns(UserWarning, match="it is in "):
+        assert hits(keep_code(numba.njit(function_of(folder)))) == 0
+    assert files(temporary) == [".nbc", ".nbi"]

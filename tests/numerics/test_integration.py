@@ -38,6 +38,11 @@ def test_the_jacobian_of_a_step_is_its_slope_and_of_small_models_a_tuple(step, j
     assert type(found) is tuple and type(found[0]) is tuple
 
 
+def test_the_same_rates_give_the_same_step_so_that_a_model_made_anew_is_not_compiled_anew():
+    assert runge_kutta(oscillators, 2) is runge_kutta(oscillators, 2)
+    assert euler(oscillators, 2) is euler(oscillators, 2)
+
+
 def test_euler_is_the_first_order_of_runge_kutta():
     assert euler(oscillators, 2)((1.0, 0.5), (0.0,), Step) == (1.05, 0.5 + 0.1 * (-1.0 - 0.25))
 

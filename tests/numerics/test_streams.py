@@ -1,4 +1,5 @@
 import math
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -144,12 +145,13 @@ def test_arrays_and_scalars_give_the_same_numbers():
         np.testing.assert_allclose(one, many[:, step], rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("step", [5, 64, 1000.0])
 @pytest.mark.parametrize("count", [1, 31, 32, 33, 64])
-def test_channels_are_filled_in_the_order_of_the_blocks(count):
+def test_channels_are_filled_in_the_order_of_the_blocks(count, step):
     out = np.full(96, np.nan)
-    streams.fill_normals(out, count, 5, streams.FILTER_PROCESS, *KEY)
+    streams.fill_normals(out, count, step, streams.FILTER_PROCESS, *KEY)
     filled = -(-count // streams.GROUP) * streams.GROUP
-    blocks = [streams.normal_block(block, 5, streams.FILTER_PROCESS, *KEY) for block in range(filled // 4)]
+    blocks = np.stack(streams.normal_block(np.arange(filled // 4), step, streams.FILTER_PROCESS, *KEY), axis=-1)
     np.testing.assert_array_equal(out[:filled], np.ravel(blocks))
     assert np.isnan(out[filled:]).all()
 
@@ -199,3 +201,65 @@ def test_filter_keys_are_reproducible_and_not_the_episodes():
 def test_without_a_seed_two_filters_draw_different_keys():
     first, second = (streams.draw_key(streams.filter_generator(None)) for _ in range(2))
     assert (first != second).all()
+
+
+def largest_correlation(parts):
+    """The largest correlation, without its sign, of two of some rows of draws."""
+    found = np.corrcoef(parts)
+    np.fill_diagonal(found, 0.0)
+    return np.abs(found).max()
+
+
+def test_each_pair_of_generators_of_a_seed_and_its_neighbours_is_uncorrelated():
+    """Level 1e-4 in all: some 400 pairs of 4000 draws. Copy i of a vector env has the seed s + i."""
+    seeds, count, rows = (3, 4), 4000, {}
+    for seed in seeds:
+        rows["env", seed] = np_random(seed)[0].uniform(size=count)
+        space = gym.spaces.Box(0.0, 1.0, (1,), np.float64)
+        space.seed(streams.derived_seed(seed, streams.ACTION_SPACE))
+        rows["sampled", seed] = np.array([space.sample()[0] for _ in range(count)])
+        for purpose, key in streams.SPAWN_KEYS.items():
+            rows[purpose, seed] = streams.derived_generator(seed, key).uniform(size=count)
+        rows["numbered", seed] = streams.derived_generator(seed, streams.COMPARISON_STUDY, 0).uniform(size=count)
+    assert len(set(streams.SPAWN_KEYS.values())) == len(streams.SPAWN_KEYS) == 9
+    assert largest_correlation(np.array(list(rows.values()))) < 5.1 / np.sqrt(count)
+
+
+def test_an_env_seeded_like_its_action_space_would_be_that_space():
+    """Why a stream has a spawn key: these are the same numbers."""
+    space = gym.spaces.Box(0.0, 1.0, (1,), np.float64)
+    space.seed(3)
+    assert space.sample()[0] == np_random(3)[0].uniform() == np.random.default_rng([3, 0]).uniform()
+
+
+def test_each_pair_of_philox_streams_of_a_key_is_uncorrelated():
+    names = [name for name in vars(streams) if name.isupper() and isinstance(getattr(streams, name), int)]
+    numbers = {getattr(streams, name) for name in names if 1 <= getattr(streams, name) <= streams.ADDED_NOISE}
+    assert numbers == set(range(1, 15))
+    steps = np.arange(1000)
+    rows = [np.ravel(streams.normal_block(0, steps, one, 12345.0, 678.0)) for one in sorted(numbers)]
+    assert largest_correlation(np.array(rows)) < 5.0 / np.sqrt(4000)
+
+
+def test_streams_of_a_seed_are_derived_in_one_place():
+    """No list of seed and index makes a generator but where a run has no other one of its seed.
+
+    These are the seeds of Optuna's samplers, which have generators of another kind, and the keys of the vehicle's
+    published paths.
+    """
+    root = Path(streams.__file__).parents[1]
+    rooms = (
+        "auv_env",
+        "filters",
+        "numerics",
+        "plants",
+        "studies",
+        "thruster_cli",
+        "thruster_env",
+        "training",
+        "tuning",
+    )
+    for path in (path for room in rooms for path in (root / room).rglob("*.py")):
+        if path.name not in ("streams.py", "samplers.py", "experiment.py"):
+            text = path.read_text(encoding="utf-8")
+            assert "SeedSequence(" not in text and "default_rng([" not in text, path

@@ -240,6 +240,25 @@ def test_after_an_exception_no_further_part_of_spread_begins(error, monkeypatch)
     assert len(begun) < 100
 
 
+def test_a_part_may_spread_work_itself():
+    found = np.zeros((40, 30))
+
+    def row(i):
+        def cells(first, last):
+            found[i, first:last] += 1.0
+
+        return cells
+
+    def rows(first, last):
+        for i in range(first, last):
+            spread(row(i), 30)
+
+    calling = threading.Thread(target=spread, args=(rows, 40), daemon=True)  # it once waited for ever
+    calling.start()
+    calling.join(timeout=20.0)
+    assert not calling.is_alive() and (found == 1.0).all()
+
+
 def test_work_that_is_spread_while_a_module_is_imported_may_import_it(tmp_path, monkeypatch):
     # A worker that loads compiled code of a model imports the model's module: it would wait for the end of
     # an import that waits for the worker.

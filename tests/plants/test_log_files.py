@@ -1,12 +1,12 @@
 """Logs in files: columns by name, units, what is said beside a file, and one line for what is wrong."""
 
-import sys
-
 import numpy as np
 import pytest
 
+from plants.logs import columns as columns_module
+from plants.logs import table as table_module
 from plants.logs.read import read_log
-from plants.logs.units import converted, parted
+from plants.logs.units import parted
 from plants.logs.write import write_columns, write_log
 from tests.plants.test_logs import MODEL, log_of
 from thruster_env.model import thruster_model
@@ -39,43 +39,6 @@ def test_a_log_comes_back_to_the_bit(tmp_path, suffix):
     again = read_log(tmp_path / f"again{suffix}", MODEL)
     assert again.digest == log.digest and again.dt == log.dt
     np.testing.assert_array_equal(again.references["state:n"], log.references["state:n"])
-
-
-@pytest.mark.parametrize(
-    ("header", "base", "unit"),
-    [
-        ("omega_m_rad_per_s", "omega_m", "rad/s"),
-        ("y_tach_abs_rad_s", "y_tach_abs", "rad/s"),
-        ("U_a_m_per_s", "U_a", "m/s"),
-        ("a_m_per_s2", "a", "m/s^2"),
-        ("time_s", "time", "s"),
-        ("load cell [kgf]", "load cell", "kgf"),
-        ("loadcell_N", "loadcell", "N"),
-        ("x_1", "x_1", None),
-        ("force_x", "force_x", None),
-        ("m_s", "m", "s"),
-    ],
-)
-def test_a_header_tells_its_unit(header, base, unit):
-    assert parted(header) == (base, unit)
-
-
-def test_units_are_converted(tmp_path):
-    pytest.importorskip("pint")
-    text = "t_ms,supply [mV],motor_rpm\n0,1000,60\n100,2000,120\n200,0,180\n"
-    columns = {"V_s": "supply [mV]", "tach": "motor_rpm"}
-    log = log_of(tmp_path / "run.csv", text, columns=columns)
-    assert log.dt == pytest.approx(0.1)
-    np.testing.assert_allclose(log.inputs[:, 0], [1.0, 2.0])
-    np.testing.assert_allclose(log.measurements[:, 0], 2 * np.pi * np.array([1, 2, 3]))
-    again = log_of(tmp_path / "b.csv", text.replace("_rpm", ""), columns=columns | {"tach": "motor[rpm]"})
-    np.testing.assert_array_equal(again.measurements, log.measurements)
-    for unit, said in (
-        ("kgf", "must be one that converts to rad/s, but got 'kgf'"),
-        ("furl", "must be one that pint knows"),
-    ):
-        with pytest.raises(ValueError, match=f"the unit of column 'motor' of .*b.csv {said}"):
-            read_log(tmp_path / "b.csv", MODEL, columns | {"tach": f"motor[{unit}]"})
 
 
 DATES = ["2026-05-01T12:00:00.900", "2026-05-01T12:00:01", "2026-05-01T12:00:01.100", "2026-05-01T12:00:01.200"]
@@ -120,37 +83,57 @@ def test_tables_of_pandas_have_dates_and_objects():
         read_log(column, MODEL, name="run")
 
 
-@pytest.mark.parametrize(
-    ("unit", "wanted", "factor"),
-    [
-        ("mV", "V", 1e-3),
-        ("ms", "s", 1e-3),
-        ("µA", "A", 1e-6),
-        ("min", "s", 60.0),
-        ("rpm", "rad/s", 2 * np.pi / 60),
-        ("deg/min", "rad/s", np.pi / 180 / 60),
-        ("rad/s", "rpm", 60 / (2 * np.pi)),
-        ("mm/s^2", "m/s^2", 1e-3),
-        ("kNm", "N*m", 1e3),
-        ("g", "kg", 1e-3),
-    ],
-)
-def test_simple_units_need_no_package(monkeypatch, unit, wanted, factor):
-    monkeypatch.setitem(sys.modules, "pint", None)
-    np.testing.assert_allclose(converted(np.array([3.0]), unit, wanted, "here"), [3.0 * factor], rtol=1e-15)
-    for other in ("degC", "kgf", "min"):
-        with pytest.raises(ValueError, match="units must be converted by pint, which is not installed"):
-            converted(np.array([3.0]), other, "K", "here")
+def test_a_measurement_goes_before_what_only_has_its_name(tmp_path):
+    model = thruster_model()  # measures the thrust, called thrust; its output T has the name "thrust", too
+    (tmp_path / "run.csv").write_text("time_s,voltage,thrust\n0,1,2\n1,2,3\n2,3,5\n")
+    log = read_log(tmp_path / "run.csv", model)
+    assert log.measurements[:, 0].tolist() == [2.0, 3.0, 5.0] and not log.references
+    (tmp_path / "run.csv").write_text("time_s,voltage,thrust,measured_thrust\n0,1,2,4\n1,2,3,5\n2,3,5,7\n")
+    log = read_log(tmp_path / "run.csv", model)
+    assert log.measurements[:, 0].tolist() == [4.0, 5.0, 7.0] and log.references["output:T"].tolist() == [2, 3, 5]
 
 
-def test_a_header_may_be_named_without_its_unit(tmp_path):
-    text = "t,U_mot [mV],n_mot (rpm)\n0,1000,60\n0.1,2000,120\n0.2,0,180\n"
-    log = log_of(tmp_path / "run.csv", text, columns={"V_s": "U_mot", "tach": "n_mot"})
-    np.testing.assert_allclose(log.inputs[:, 0], [1.0, 2.0])
-    np.testing.assert_allclose(log.measurements[:, 0], 2 * np.pi * np.array([1, 2, 3]))
-    two = text.replace("n_mot (rpm)", "U_mot [V]")
-    with pytest.raises(ValueError, match="the column for V_s must be one of t, U_mot"):
-        log_of(tmp_path / "run.csv", two, columns={"V_s": "U_mot"})
+class Names(list):
+    """Names that are counted where one after the other is looked at."""
+
+    looked = 0
+
+    def __contains__(self, one):
+        Names.looked += len(self)
+        return super().__contains__(one)
+
+    def __getitem__(self, place):
+        Names.looked += len(self) if isinstance(place, slice) else 1
+        return super().__getitem__(place)
+
+
+def test_the_columns_of_a_wide_table_are_looked_at_a_few_times_only(monkeypatch):
+    calls = []
+    monkeypatch.setattr(columns_module, "parted", lambda header: calls.append(0) or parted(header))
+    names = Names(f"column_{place}_V" for place in range(2000))
+    Names.looked = 0
+    table_module._check_header(names, 1, "run.csv")
+    headers = ["time_s", "voltage_V", "tach", *names]
+    found = columns_module.find_columns(columns_module.quantities_of(MODEL), headers, {}, {}, "run.csv")
+    assert len(found) == 3 and len(calls) < 2 * len(headers) and Names.looked < 2 * len(names)
+    with pytest.raises(ValueError, match="column_6_V and 1993 more") as error:
+        columns_module.find_columns(columns_module.quantities_of(MODEL), headers[2:], {}, {}, "run.csv")
+    assert len(str(error.value)) < 600
+
+
+@pytest.mark.parametrize("name", [r"$\frac$", "[/]", "a,b", 'say "V"', "x;y", "n" * 400, "two\nlines", " spaces"])
+def test_names_of_columns_are_quoted_where_they_have_to_be(tmp_path, name):
+    columns = {"t": np.arange(4.0), name: np.ones(4), "tach": np.arange(4.0)}
+    for digits in ("exact", "%.10g"):
+        (tmp_path / "run.csv").unlink(missing_ok=True)
+        write_columns(tmp_path / "run.csv", columns, digits)
+        log = read_log(tmp_path / "run.csv", MODEL, {"V_s": name.strip()})
+        assert log.inputs[:, 0].tolist() == [1.0] * 3
+    text = (tmp_path / "run.csv").read_text()
+    assert text.startswith("t,") and text.endswith("\n3,1,3\n")
+    for suffix in (".npz",):
+        write_columns(tmp_path / f"run{suffix}", columns)
+        assert read_log(tmp_path / f"run{suffix}", MODEL, {"V_s": name}).steps == 3
 
 
 def test_a_file_beside_tells_columns_units_and_clocks(tmp_path):
@@ -207,11 +190,11 @@ def test_a_file_beside_tells_columns_units_and_clocks(tmp_path):
         ),
         (
             "t,voltage,speed\n0,1,2\n",
-            r"a log must have a column for the measurement tachometer \[rad/s\] \(say --column",
+            r"a log must have a column for the measurement tachometer \[rad/s\] \(use --column",
         ),
         (
             "clock,u,speed\n0,1,2\n",
-            r"for the input voltage \[V\] .*and for the measurement tachometer .* and for times \(say --column "
+            r"for the input voltage \[V\] .*and for the measurement tachometer .* and for times \(use --column "
             r"time=HEADER, or --dt\), but .* has clock, u, speed; in Python columns=\{'V_s': 'HEADER'\}",
         ),
     ],
@@ -256,3 +239,19 @@ def test_columns_that_are_told_have_to_be_there(tmp_path):
         ValueError, match="a log must be a file that ends in .csv, .parquet, .npz, but got 'run.txt'"
     ):
         read_log("run.txt", MODEL)
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+def test_no_log_is_written_over_but_estimates_are_by_later_ones(tmp_path, suffix):
+    path, columns = tmp_path / f"run{suffix}", {"t_s": np.arange(4.0), "F_N": np.ones(4)}
+    path.touch()  # nothing is there yet
+    write_columns(path, columns)
+    before = path.read_bytes()
+    write_columns(path, columns)  # the very same
+    later = {**columns, "F_N": np.zeros(4)}
+    for changed, again in ((later, False), ({"t_s": np.arange(4.0), "x": np.ones(4)}, True)):
+        with pytest.raises(ValueError, match="because logs are never overwritten, but .* exists"):
+            write_columns(path, changed, again=again)
+        assert path.read_bytes() == before
+    write_columns(path, later, again=True)
+    assert path.read_bytes() != before

@@ -7,6 +7,7 @@ import pytest
 
 from plants.affine import affine_model, linearize
 from plants.quantities import Output, Quantity
+from plants.state_space import StateSpaceModel
 from thruster_env.linear.steady_state import steady_state
 from thruster_env.model import thruster_model
 from thruster_env.parameters import PRESETS
@@ -16,6 +17,13 @@ def turntable(**names):
     noise = {"process_noise_cov": [1e-4, 1e-4], "measurement_noise_cov": [0.1]}
     return affine_model(
         a=[[1, 0.1], [0, 1]], b=[[0], [0.1]], c=[[1, 0]], prior_mean=[0, 0], prior_cov=[1, 1], **noise, **names
+    )
+
+
+def decay(**inputs):
+    noise = {"process_noise_cov": [0.1], "measurement_noise_cov": [0.1], "prior_mean": [0.0], "prior_cov": [1.0]}
+    return StateSpaceModel(
+        transition=lambda x, u, c: (0.9 * x[0],), observe=lambda x, c: (x[0],), **noise, **inputs
     )
 
 
@@ -36,8 +44,13 @@ def test_names_may_be_words_tuples_or_quantities():
 @pytest.mark.parametrize(
     ("names", "rule"),
     [
-        ({"states": ["one"]}, "states must be 2 quantities or names, but got"),
-        ({"states": "ab"}, "states must be 2 quantities or names, but got 'ab'"),
+        ({"states": ["one"]}, "states must be 2 quantities or names, as prior_mean says, but got"),
+        ({"states": "ab"}, "states must be 2 quantities or names, as prior_mean says, but got 'ab'"),
+        (
+            {"input_quantities": ["a", "b"]},
+            "input_quantities must be 1 quantities or names, as inputs, or b, says",
+        ),
+        ({"input_quantities": "ab"}, "input_quantities must be 1 .*, but got 'ab'"),
         ({"states": ["a", "a"]}, "symbols of states must differ from one another, but got a, a"),
         ({"states": ["a", 3]}, "each of states must be a name, or have name, symbol"),
         ({"states": ["a", ("b", "b\n")]}, "each of states must be a name"),
@@ -47,6 +60,16 @@ def test_names_may_be_words_tuples_or_quantities():
 def test_wrong_names_are_refused(names, rule):
     with pytest.raises(ValueError, match=rule):
         turntable(**names)
+
+
+@pytest.mark.parametrize("names", [["left pump", "right pump"], ["pump"], []])
+def test_there_are_as_many_inputs_as_have_names(names):
+    model = decay(input_quantities=names)
+    assert model.inputs == len(names) and [one.name for one in model.input_quantities] == names
+    assert model.replace(prior_mean=[1.0]).inputs == len(names)
+    assert decay().inputs == 1
+    with pytest.raises(ValueError, match="input_quantities must be 3 quantities or names, as inputs, or b, says"):
+        decay(inputs=3, input_quantities=names)
 
 
 def test_a_thruster_s_components_and_outputs_have_names_and_units():

@@ -1,3 +1,5 @@
+import importlib
+import inspect
 import json
 import subprocess
 import sys
@@ -16,7 +18,23 @@ from numerics.compiled import interpreted
 from numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
 from thruster_env.plant import make_plant
 
+PARTS = (
+    *("vectors", "steps", "vector_filters", "batches", "vehicles", "trajectories", "studies", "assimilation"),
+    *("policies", "processes"),
+)
 
+
+def test_each_part_of_the_benchmark_can_be_measured_quickly():
+    """Some rows of one part; that all parts run is for the slow test."""
+    pytest.importorskip("filterpy")
+    for part in PARTS:
+        found = importlib.import_module(f"benchmarks.{part}")
+        assert list(inspect.signature(found.rows).parameters) == ["seed", "quick"]
+    row = next(importlib.import_module(f"benchmarks.{PARTS[0]}").rows(0, True))
+    assert row.timing.ours > 0 and row.as_json()["limit_seconds"] > 0
+
+
+@pytest.mark.slow
 def test_the_quick_benchmark_measures_every_row():
     pytest.importorskip("filterpy")
     done = subprocess.run(
@@ -137,3 +155,15 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_measured(tm
     monkeypatch.setattr("benchmarks.__main__.announce_compilation", lambda: pytest.fail("about to measure"))
     with pytest.raises(ValueError, match="file"):
         command(json=str(tmp_path / "file" / "speed.json"))
+
+
+def test_rough_times_are_not_written_into_a_page(tmp_path, monkeypatch):
+    monkeypatch.setattr("benchmarks.__main__.importlib.util.find_spec", lambda name: True)
+    monkeypatch.setattr("benchmarks.__main__.check_installed", lambda: None)
+    monkeypatch.setattr("benchmarks.__main__.announce_compilation", lambda: pytest.fail("about to measure"))
+    page = tmp_path / "speed.md"
+    page.write_text((Path(__file__).parents[2] / "docs" / "speed.md").read_text())
+    with pytest.raises(
+        ValueError, match="--quick must go without --page, for its times are rough, but got --page"
+    ):
+        command(quick=True, page=page)

@@ -80,7 +80,15 @@ def test_an_example_runs_and_json_holds_its_arguments(code, capsys):
 
 
 def test_every_section_on_what_can_be_chosen_has_an_example():
-    for section in (*KINDS, "Presets", "Linear plants", "In number", "Rendering", "Baselines", "The environments"):
+    for section in (
+        *KINDS,
+        "Presets",
+        "Linear plants",
+        "Vector environments",
+        "Rendering",
+        "Baselines",
+        "The environments",
+    ):
         text = PAGE.partition(f"# {section}\n")[2]
         assert "gym.make" in text.partition("```python")[2].partition("```")[0], section
 
@@ -162,7 +170,7 @@ def test_an_example_of_a_filter_runs(code, capsys, tmp_path, monkeypatch):
 
 def test_every_family_of_filters_has_an_example_and_a_picture():
     sections = re.split(r"^## ", FILTER_PAGE.partition("## All filters")[2], flags=re.MULTILINE)[1:]
-    families = sections[: [section.startswith("Around an env") for section in sections].index(True)]
+    families = sections[: [section.startswith("With an env") for section in sections].index(True)]
     assert len(families) == 11
     for section in families:
         assert "```python" in section and "](filters_" in section, section.partition("\n")[0]
@@ -206,6 +214,7 @@ def test_pictures_and_tables_are_those_of_the_code(page, tmp_path):
     assert all(path.stat().st_size < 150_000 for path in tmp_path.glob("*.png"))
 
 
+@pytest.mark.slow
 def test_the_page_on_tuning_holds_what_its_script_makes():
     import pages.tuning_figures as script
 

@@ -24,13 +24,16 @@ QUICK = {
     "vehicle": {"STEPS": 20},
 }
 DRAWING = set(QUICK) - {"policies"}
+LONG, SLOW = {"own_model", "own_env", "own_log", "vehicle"}, pytest.mark.slow  # they compile models of their own
 
 
 SHOWN = {  # what a page's code makes
     "export": {"content"},
     "missing": {"belief", "innovation"},
     "noise": {"env"},
+    "positive": {"session", "median"},
     "processes": {"rewards"},
+    "real_time": {"session", "cart"},
     "stable_baselines": {"model", "normalise", "action"},
     "unknown_constant": {"problem"},
 }
@@ -54,8 +57,7 @@ def test_every_example_is_run():
     assert sorted([*QUICK, *SHOWN_ONLY]) == sorted(path.stem for path in EXAMPLES.glob("*.py"))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW if name in LONG else ()) for name in QUICK])
 def test_an_example_runs(name, capsys, monkeypatch):
     """Under its own file's name, so that what it compiles is kept from run to run."""
     if name == "policies":

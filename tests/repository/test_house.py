@@ -1,9 +1,11 @@
 """Who may know whom, read from the imports of every file."""
 
 import ast
+import re
 import subprocess
 import sys
 from functools import cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -97,6 +99,16 @@ def test_rooms_of_tuning_know_those_of_plants_by_the_finder_alone():
     outside = [path for path in FILES if path.relative_to(ROOT).parent.as_posix() not in TUNING_OF_PLANTS]
     knowing = [path for path in outside if room_of(path) == "tuning" and imports_of(path) & rooms]
     assert not knowing and set(rooms_of_plants.ROOMS.values()) == {f"{room}.find" for room in rooms}
+
+
+def test_imports_of_training_go_in_no_circle_not_even_within_functions():
+    files = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in FILES}
+    code = {name: path.read_text() for name, path in files.items() if name.startswith("training.")}
+    for name, text in code.items():  # what only a type checker sees is left out
+        code[name] = re.sub(r"^if TYPE_CHECKING:\n(?:    .*\n|\n)+", "", text, flags=re.MULTILINE)
+    graph = {name: imports_of(files[name], text) & code.keys() - {name} for name, text in code.items()}
+    assert sum(map(len, graph.values())) > 50
+    TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 
 def test_only_tuning_imports_optuna():

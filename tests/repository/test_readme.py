@@ -63,5 +63,5 @@ def test_what_tuning_is_worth_is_what_the_page_on_tuning_says():
     ratios = [cell.split()[0] for cell in ekf["outliers"][2:5]]
     gains = [f"{100 * (1 - float(ratio)):.0f} %" for ratio in ratios]
     assert re.findall(r"^- (\d+ %) below that of the \*\*", README, flags=re.MULTILINE) == gains
-    assert f"is {float(ekf['outliers'][6]):.2g} where 2 is right" in README
+    assert f"(NEES) is {float(ekf['outliers'][6]):.3g}, where 2 is right" in README
     assert f"scaled default is {100 * (1 - float(ekf['mismatch'][2].split()[0])):.0f} %" in README

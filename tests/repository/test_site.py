@@ -100,4 +100,24 @@ def test_examples_of_the_command_line_page_can_be_copied():
         and "Example: thruster" not in text
     )
     assert "* `--json FILE`: " in text and "* `--seed INTEGER`: " in text
+    assert re.search(
+        r"^\* `verify`: Compute the held-out metrics .*, and say whether they hold\.$", text, re.MULTILINE
+    )
+    assert not re.search(r"^\* `\w+`: .*\.\.\.$", text, re.MULTILINE)  # no summary is cut
     assert not re.search(r"^\* `[^`]*<", text, re.MULTILINE) and "[default: (" not in text
+
+
+def test_no_line_to_install_is_cut():
+    page = (ROOT / "docs" / "index.md").read_text()
+    lines = re.findall(r"^    (pip .*)$", page, flags=re.MULTILINE)
+    assert len(lines) == 2 and max(map(len, lines)) <= 36  # letters in a block on a phone of 390 pixels
+
+
+@pytest.mark.parametrize(
+    "words", ["session", "positive", "real time", "restart", "gate", "missing", "overconfident"]
+)
+def test_a_search_leads_to_a_title_or_a_word_of_the_glossary(words):
+    pages = [page.read_text() for page in (ROOT / "docs").rglob("*.md") if "tutorials" not in page.parts]
+    titles = [line for page in pages for line in re.findall(r"^#+ (.*)$", page, flags=re.MULTILINE)]
+    terms = re.findall(r"^(\w.*)\n(?=\w|  )", (ROOT / "docs" / "glossary.md").read_text(), flags=re.MULTILINE)
+    assert any(re.search(rf"\b{words}\b", one, re.IGNORECASE) for one in [*titles, *terms])

@@ -97,6 +97,7 @@ def test_errors_are_averaged_and_shifted(runs):
     assert ratios(run.own, run) == (1.0, 1.0, 1.0)
 
 
+@pytest.mark.slow
 def test_numbers_found_from_runs_estimate_thrust_where_the_load_cell_is_not(runs):
     few = tuple(one for one in STRUCTURES[CHOSEN].free if one.name in ("thrust_factor", "dead_band_high", "R22"))
     fixed = {name: value for name, value in TRUTH.items() if name not in ("thrust_factor", "dead_band_high")}

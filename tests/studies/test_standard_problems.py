@@ -115,11 +115,11 @@ class TestReproduce:
         _, row = small().reproduce(2)
         far = row._replace(theirs=row.ours.value + 5.0, run_std=1.0)
         assert far.why == "no reason known to us"
-        assert row._replace(theirs=1.04 * row.ours.value).why == "the same to 5 %"
+        assert row._replace(theirs=1.04 * row.ours.value).why == "agrees within 5 %"
         near = row._replace(theirs=row.ours.value + 1.9, run_std=1.0)
         assert near.why == "within the scatter of a single run"
         alike = near._replace(run_median=1.01 * near.theirs)
-        assert alike.why.startswith("the median run is the same to 5 %")
+        assert alike.why.startswith("the median run agrees within 5 %")
 
     @pytest.mark.parametrize(
         ("arguments", "rule"),
@@ -156,6 +156,7 @@ def test_every_benchmark_is_found_and_its_problem_is_one():
         find_benchmark("lorenz84")
 
 
+@pytest.mark.slow
 def test_a_study_finds_the_acceleration_of_a_target():
     assert 0.1 < range_bearing.tuned_sigma(trials=8) < 0.4  # 0.2 is true, and 2 the guess that it starts from
 
@@ -167,6 +168,7 @@ def test_a_study_tunes_inflation_and_nothing_else():
     assert choice.model["process_noise_cov"] == (0.0, 0.0, 0.0) and 0.2 < score.value < 1.5
 
 
+@pytest.mark.slow
 def test_the_pendulum_goes_from_a_file_to_a_filter_around_the_env(tmp_path, thruster):  # noqa: F811
     plan = Plan("ekf", (checked_problem(find_problem("studies.pendulum:problem")),))
     result = run_study(open_study("pendulum", plan, optuna.storages.InMemoryStorage()), plan, 4)

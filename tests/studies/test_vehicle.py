@@ -210,7 +210,7 @@ def test_a_paper_is_reproduced_at_the_command_line(quick, monkeypatch, capsys, t
     shown = capsys.readouterr().out
     assert "…" not in shown and max(map(len, shown.splitlines())) <= 100
     words = " ".join(shown.split())
-    for said in ("0.082", "EnKF8", "What the runs say", "useless here", "H P H' + R", "Picture:"):
+    for said in ("0.082", "EnKF8", "Conclusions from the runs", "useless here", "H P H' + R", "Picture:"):
         assert said in words, said
     found = json.loads(table.read_text())
     assert found["settings"] == {"runs": 2, "seed": 0, "steps": 2} and picture.stat().st_size > 10_000

@@ -1,6 +1,7 @@
 """Logs at the command line: estimate, tune --log, and what follows; one line for what is wrong."""
 
 import json
+import shlex
 import subprocess
 import sys
 
@@ -124,7 +125,9 @@ def test_a_filter_tuned_on_logs_is_verified_reported_and_used(simulated, as_json
     assert wrapped.filter.name == "ekf"
     (tmp_path / "c.csv").write_text((tmp_path / "a.csv").read_text())
     changed = thruster("verify", "tuned.json")
-    assert changed.returncode == 2 and "must be what it was tuned on, a.csv and 2 more of digest" in changed.stderr
+    assert (
+        changed.returncode == 2 and "must be the one it was tuned on, a.csv and 2 more of digest" in changed.stderr
+    )
     done = thruster("estimate", "b.csv", "--tuned", "tuned.json", "--dt", "0.02", "--out", "est.csv")
     assert done.returncode == 2 and "was tuned for dt 0.01 (here 0.02)" in done.stderr
     assert not (tmp_path / "est.csv").exists()
@@ -144,10 +147,14 @@ def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  
     model = "--model", "pendulum_of_a_user:model"
     data = as_json("tune", "--log", "run.csv", *model, "--filter", "kf", "--trials", 3, "--out", "tuned.json")
     assert data["file"] == "tuned.json" and objectives_of(tmp_path / "tuned.json") == ["likelihood"]
+    logged = "--log", "run.csv", *model, "--filter", "kf", "--trials", "3", "--out", "a tuned.json"
+    said = [line for line in thruster("tune", *logged).stdout.splitlines() if line.startswith("Next: thruster ")]
+    assert said == ["Next: thruster report 'a tuned.json' --model pendulum_of_a_user:model"]
+    assert thruster(*shlex.split(said[0])[2:]).returncode == 0
     told = as_json("estimate", "run.csv", *model, "--tuned", "tuned.json", "--smoother")
     assert told["smoothed"] and told["dt"] == 0.05
     done = thruster("verify", "tuned.json")
-    assert done.returncode == 2 and "say --model pendulum_of_a_user:model, if you trust it" in done.stderr
+    assert done.returncode == 2 and "use --model pendulum_of_a_user:model, if you trust it" in done.stderr
     assert as_json("verify", "tuned.json", *model)["holds"]
 
 
@@ -191,7 +198,7 @@ def test_a_user_s_own_model_and_log(as_json, thruster, tmp_path, monkeypatch):  
             ("simulate", "--out", "new.csv", "--sensor", "torque"),
             "a channel of sensors must be one of thrust, speed",
         ),
-        (("tune", "--log", "run.csv"), "a log must have at least 75 rows"),
+        (("tune", "--log", "run.csv", "--lead", "60"), "a log must have at least 63 rows"),
         (("tune", "--log", "run.csv", "--problem", "nominal"), "must be of --log or of --problem, but got both"),
         (("tune", "--blocks", "3"), "--blocks must come with --log, but got --blocks 3 without one"),
     ],

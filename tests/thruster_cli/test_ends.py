@@ -55,7 +55,6 @@ def process(before, name, arguments="filters", **options):
     return subprocess.run(arguments, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True, **options)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "arguments"),
     [
@@ -71,7 +70,6 @@ def test_ctrl_c_while_a_package_loads_is_one_line(module, arguments, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
 def test_ctrl_c_while_code_is_compiled_is_one_line(tmp_path):
     cold = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cold")}
     done = process(AT_COMPILATION, "thruster", f"simulate --steps 3 --out {tmp_path}/run.csv", env=cold)
@@ -80,7 +78,6 @@ def test_ctrl_c_while_code_is_compiled_is_one_line(tmp_path):
     assert not (tmp_path / "run.csv").exists()
 
 
-@pytest.mark.slow
 def test_ctrl_c_when_all_is_done_is_one_line():
     done = process(AT_THE_END, "thruster", stdout=subprocess.DEVNULL)
     assert (done.returncode, done.stderr) == (130, INTERRUPTED)
@@ -178,7 +175,6 @@ def test_a_standard_output_that_is_full_is_said_and_json_is_written_first(monkey
     assert (tmp_path / "kf.json").stat().st_size > 100
 
 
-@pytest.mark.slow
 def test_a_standard_output_that_is_closed_is_said():
     command = [sys.executable, "-m", "thruster_cli", "filters", "kf"]
     done = subprocess.run(["sh", "-c", '"$@" >&-', "sh", *command], stderr=subprocess.PIPE, text=True)

@@ -13,17 +13,20 @@ from plants.logs.log import Log
 from plants.logs.write import write_log
 from plants.simulate import simulate
 from studies.identification import TRUTH, record
+from tests.models import scalar_model
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.thruster_env.test_t200 import OTHER, recorded_rows, write_table
 from thruster_env.logged import logged_model
 from thruster_env.model import thruster_model
 from thruster_env.parameters import TUNNEL_PHYSICAL
 from thruster_env.preset_file import PresetFile, read_preset, write_preset
+from tuning.identification.values import with_values
 from tuning.problems.files import scenario_of
 from tuning.problems.find import find_problem
 from tuning.thruster.logs import of_preset
 
 FREE = ",".join(name for name in TRUTH if not name.startswith(("Q", "R")))
+WHOSE = "--preset tunnel_physical --sensor thrust --sensor speed"
 OF_LOGS = ("--preset", "tunnel_physical", "--sensor", "thrust", "--sensor", "speed")
 
 
@@ -35,6 +38,7 @@ def logs(tmp_path):
     return [f"run{place}.csv" for place in range(len(recorded))]
 
 
+@pytest.mark.slow
 def test_identified_numbers_go_into_a_preset_that_everything_takes(thruster, as_json, logs, tmp_path):  # noqa: F811
     found = as_json("identify", *logs, *OF_LOGS, "--free", FREE, "--starts", 1, "--out", "mine.toml")
     assert found["held_out"] == ["run2.csv"] and found["files"] == ["mine.toml"]
@@ -170,3 +174,45 @@ def test_scenarios_are_of_another_thruster_by_its_preset_file(thruster, tmp_path
     )
     done = thruster("evaluate", "--tuned", "t.json", "--preset", "t200")
     assert done.returncode == 2 and "(--preset) must come with a problem" in done.stderr
+
+
+def test_no_command_writes_over_a_log_or_its_description(thruster, logs, tmp_path):  # noqa: F811
+    (tmp_path / "run0.toml").write_text("dt = 0.01\n")
+
+    def files():
+        return {path.name: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    before = files()
+    for line, message in [
+        (
+            f"identify run0.csv {WHOSE} --out run0.toml",
+            "beside run0.csv",
+        ),
+        (
+            f"identify run0.csv {WHOSE} --out run1.toml",
+            "beside run1.csv",
+        ),
+        ("new preset run1.toml", "beside run1.csv"),
+        ("simulate --steps 5 --out run1.csv", "logs are never overwritten, but run1.csv exists"),
+        (
+            f"estimate run0.csv {WHOSE} --out run1.csv",
+            "logs are never overwritten, but run1.csv exists",
+        ),
+        ("inspect --json run1.csv", "--json must be no log"),
+        ("simulate --steps 5 --out new.csv --json run0.toml", "beside run0.csv"),
+    ]:
+        done = thruster(*line.split())
+        assert done.returncode == 2 and message in done.stderr, line
+        assert done.stderr.count("thruster:") == 1 and "Traceback" not in done.stderr, line
+        assert files() == before, line
+
+
+def test_values_of_a_model_belong_to_a_sample_time(tmp_path):
+    (tmp_path / "mine.toml").write_text("[values]\nQ11 = 0.5\nR = 2.0\n[identified]\ndt = 0.01\n")
+    alone = with_values(scalar_model, tmp_path / "mine.toml")
+    assert alone(0.01).process_noise_cov.item() == pytest.approx(0.5, rel=1e-12)
+    with pytest.raises(ValueError, match=r"the dt of a log must be that of .*mine.toml, 0.01 s, .* but is 0.02 s"):
+        alone(0.02)
+    made = with_values(lambda dt=0.01: scalar_model(), tmp_path / "mine.toml")(0.02)
+    assert made.process_noise_cov.item() == pytest.approx(1.0, rel=1e-12)
+    assert made.measurement_noise_cov.item() == pytest.approx(2.0, rel=1e-12)

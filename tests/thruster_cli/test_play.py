@@ -119,7 +119,6 @@ def test_a_video_that_cannot_be_drawn_is_said(monkeypatch):
         film.check_drawing(None)
 
 
-@pytest.mark.slow
 def test_torch_is_not_imported():
     code = "import sys, thruster_cli.play, thruster_cli.episodes; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

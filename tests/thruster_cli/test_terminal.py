@@ -53,8 +53,8 @@ def test_every_option_is_in_a_panel(thruster, name):  # noqa: F811
 
 def test_what_is_random_has_a_seed_and_all_write_json(thruster):  # noqa: F811
     without = {name for name in COMMANDS if name != "study" and "--seed " not in thruster(name, "--help").stdout}
-    assert without == {"inspect", "filters", "new", "report", "verify"}
-    for name in (*set(COMMANDS) - {"study"}, "study policies", "study recordings"):
+    assert without == {"inspect", "filters", "new", "report", "verify", "log"}
+    for name in (*set(COMMANDS) - {"study"}, "study policies", "study recordings", "study users"):
         assert "--json " in thruster(*name.split(), "--help").stdout
 
 
@@ -166,10 +166,10 @@ def test_a_refused_study_leaves_no_journal(thruster, tmp_path):  # noqa: F811
 
 def test_a_preset_beyond_its_range_is_warned_about(thruster):  # noqa: F811
     done = thruster("inspect", "--preset", "t200", "--voltage", 20, "--out", "x.png")
-    assert done.returncode == 0 and "t200 is known up to 13.3 V, but is driven by 20 V" in done.stderr
+    assert done.returncode == 0 and "t200 is valid up to 13.3 V, but is driven by 20 V" in done.stderr
     assert "warning" not in thruster("inspect", "--preset", "t200", "--voltage", 13, "--out", "x.png").stderr
     done = thruster("inspect", "--voltage", 60, "--max-voltage", 60, "--out", "x.png")
-    assert "tunnel is known up to 24 V, but is driven by 60 V" in done.stderr
+    assert "tunnel is valid up to 24 V, but is driven by 60 V" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -191,7 +191,10 @@ def test_a_tuning_that_made_it_worse_says_what_to_do_next():
         tuned=SimpleNamespace(has_truth=True), ratios={"scaled default": Interval(1.2, 1.1, 1.3)}
     )
     tuning = SimpleNamespace(
-        proofs=[proof], gradient=None, plan=SimpleNamespace(prune=True), result=SimpleNamespace(finished=6)
+        proofs=[proof],
+        gradient=None,
+        plan=SimpleNamespace(prune=True, filter="enkf"),
+        result=SimpleNamespace(finished=6),
     )
     (said,) = way_out(tuning)
     assert "(--trials 12), or without pruning (--no-pruning)" in said and "Q and R of the scaled default" in said
@@ -204,7 +207,7 @@ def test_a_study_that_is_done_shows_its_best_and_no_time_left():
     plan = Plan("ekf", (find_problem("nominal"),))
     with trial_bar(plan, "nominal", 3, [create_trial(value=1.5)] * 3, Console(file=stream, width=90)):
         pass
-    assert "3/3 best 1.500 0:00:00" in stream.getvalue()
+    assert "3/3 best 1.5 0:00:00" in stream.getvalue()
 
 
 def test_trials_have_whole_numbers_in_pictures():

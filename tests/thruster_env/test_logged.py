@@ -5,6 +5,9 @@ import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the env
+from filters import ExtendedKalmanFilter, run
+from numerics.streams import episode_keys
+from plants.simulate import simulate
 from thruster_env.logged import Shown, lag_weights, logged_model, with_shown
 from thruster_env.model import model_of_plant, thruster_model
 from thruster_env.parameters import PRESETS, T200, preset_parameters
@@ -44,12 +47,15 @@ def test_dead_band_bias_and_lag_are_what_they_say():
     for given, driving in ((3.0, 2.2), (0.7, 0.0), (-0.4, 0.0), (-2.0, -1.5)):
         np.testing.assert_array_equal(stepped(model, x, (given,))[:2], stepped(base, x[:2], (driving,)))
     thrust, speed = model.observe(x, model.constants)
-    assert thrust == base.observe(x[:2], base.constants)[0] + 0.3 and speed == 40.0
+    _, share = lag_weights(0.05, 0.01 / 4)
+    assert thrust == base.observe(x[:2], base.constants)[0] + 0.3
+    assert speed == pytest.approx((1 - share) * 40.0 + share * 50.0, rel=1e-14)
     assert [one.symbol for one in model.states] == ["omega_m", "U_a", "speed_lag"]
     settled = (*base.operating_state, 0.0)
     for _ in range(20):
         settled = tuple(np.array(stepped(model, settled, (12.8,))))
-    assert settled[2] == pytest.approx(base.operating_state[0] * (1 - np.exp(-0.2 / 0.05)), rel=1e-3)
+    shown = model.observe(settled, model.constants)[1]
+    assert shown == pytest.approx(base.operating_state[0] * (1 - np.exp(-0.2 / 0.05)), rel=1e-3)
 
 
 def test_jacobians_are_those_of_differences():
@@ -72,8 +78,44 @@ def test_a_lag_is_exact_where_its_input_is_a_straight_line():
     h0, h1, y0 = 2.0, 3.0, 1.0
     slope = (h1 - h0) / step
     exact = h0 + slope * (step - lag) + (y0 - h0 + slope * lag) * np.exp(-step / lag)
-    assert kept * y0 + (1 - kept - after) * h0 + after * h1 == pytest.approx(exact, rel=1e-12)
+    held = kept * y0 + (1 - kept) * h0
+    assert (1 - after) * held + after * h1 == pytest.approx(exact, rel=1e-12)
     assert lag_weights(0.0, step) == (0.0, 1.0)
+    for small in (1e-3 * step, 1e-9 * step):  # continuous where the lag goes
+        np.testing.assert_allclose(lag_weights(small, step), (0.0, 1.0 - small / step), atol=1e-15)
+
+
+def test_a_lag_that_goes_to_zero_leaves_the_likelihood_of_the_model_without():
+    base, plant = thruster_model(**PLANT), make_plant(**PLANT)
+    inputs = np.repeat(np.random.default_rng(0).uniform(-9, 9, (4, 20, 1)), 10, axis=1)
+    runs = simulate(base, episode_keys(range(4)), inputs).measurements
+
+    def likelihood(model):
+        found = run(ExtendedKalmanFilter(model=model), inputs=inputs, measurements=runs)
+        return found.log_likelihoods.sum()
+
+    whole = likelihood(base)
+    for lag in (0.0, 1e-9, 1e-6):
+        lagging = with_shown(base, plant, Shown(lag=(("speed", lag), ("thrust", lag))))
+        assert likelihood(lagging) == pytest.approx(whole, abs=1e-6 + 1e5 * lag)
+
+
+def test_the_process_noise_of_a_preset_file_is_that_of_the_sample_time(tmp_path):
+    recorder = {"dt": 0.01, "sensors": ["speed"], "process_noise_cov": [2.0, 0.003]}
+    write_preset(tmp_path / "mine.toml", PresetFile(PRESETS["tunnel_physical"], (0.0, 0.0), recorder))
+    for dt, factor in ((None, 1.0), (0.01, 1.0), (0.01 * (1 + 1e-9), 1.0), (0.02, 2.0), (0.005, 0.5)):
+        given = {} if dt is None else {"dt": dt}
+        model = logged_model(preset=tmp_path / "mine.toml", **given)
+        np.testing.assert_allclose(np.diag(model.process_noise_cov), [2.0 * factor, 0.003 * factor], rtol=1e-12)
+
+
+def test_a_preset_file_does_not_become_the_description_of_a_log(tmp_path):
+    (tmp_path / "run.csv").write_text("t_s\n0\n")
+    with pytest.raises(
+        ValueError, match="must not take the name of the description of a log, but got .*run.toml beside"
+    ):
+        write_preset(tmp_path / "run.toml", PresetFile(T200, (0.0, 0.0)))
+    assert not (tmp_path / "run.toml").exists()
 
 
 def test_a_preset_file_comes_back_as_it_was_written(tmp_path):

@@ -110,7 +110,7 @@ def assert_copies_are_single_envs(name, count, mode, steps, limit, watched, exac
         assert_info(info, i, single.start[1])
     shape, ends = (steps, count) if inputs is None else (steps, count, inputs), np.zeros(2, dtype=int)
     for k, action in enumerate(np.random.default_rng(3).uniform(-30, 30, shape)):
-        rows = inputs is None and k % 2  # one number a copy will do
+        rows = inputs is None and k % 2  # one number per copy will do
         observation, reward, terminated, truncated, info = vector.step(action[:, None] if rows else action)
         assert observation.dtype == np.float32 and reward.dtype == np.float64
         assert terminated.dtype == truncated.dtype == bool

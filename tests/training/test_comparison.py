@@ -103,7 +103,7 @@ def test_the_table_tells_what_part_of_the_gap_to_the_best_controller_is_closed()
         "70 % is not reached by all, intervals counted."
     )
     assert "knowing the true state is worth +0.6000 [+0.6000, +0.6000]: better." in found[1]
-    assert found[2].startswith("PPO: true costs 1.500 [") and found[2].endswith("MPC does: not within 2 %.")
+    assert found[2].startswith("PPO: true costs 1.500 [") and found[2].endswith("as much as MPC: not within 2 %.")
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_near_the_best_controller_means_with_the_whole_interval(level, said):
     own = np.random.default_rng(2).normal(0.0, 0.003, 60)
     made = [result("true", level + noise + own), result("true", -1.0 + noise, kind=BEST)]
     (found,) = answers(made)
-    assert f"MPC does: {said}" in found
+    assert f"as much as MPC: {said}" in found
 
 
 def test_a_situation_that_the_model_does_not_know_is_judged_against_the_controller():
@@ -210,7 +210,6 @@ def test_the_plan_has_every_arm_at_every_noise_with_equal_networks_and_steps():
     assert [run.name for run in with_memory if run.kind == "recurrent-ppo"] == ["low-recurrent-ppo-raw-seed0"]
 
 
-@pytest.mark.slow
 def test_variants_change_what_the_filter_assumes_and_nothing_else():
     runs_there = runs_of(Comparison(noises=("medium",), observation_sets=("ekf",), seeds=1))
     planned = {run.label: run.setup for run in runs_there if run.kind == "ppo"}
@@ -227,7 +226,9 @@ def test_variants_change_what_the_filter_assumes_and_nothing_else():
     assert wrong.env_arguments == exact.env_arguments
     untuned, tuned = planned["ekf, untuned"].filter_arguments, planned["ekf, tuned"].filter_arguments
     assert untuned["process_noise_cov"] == list(MEDIUM.untuned["process_noise_cov"])
-    assert np.allclose(np.log(np.array(tuned["process_noise_cov"]) / [4.0, 0.01]), 0.0, atol=np.log(2))
+    found = np.asarray(tuned["process_noise_cov"])
+    variances = np.diag(found) if found.ndim == 2 else found
+    assert np.allclose(np.log(variances / [4.0, 0.01]), 0.0, atol=np.log(2))
     assert set(planned["ekf, wrong model tuned"].filter_arguments) == {"parameter_factors", *tuned}
 
 
@@ -277,7 +278,7 @@ def test_the_quick_form_compares_every_arm_and_writes_a_page(thruster, tmp_path)
     } < named
     text = page.read_text()
     assert text.startswith("Before.\n<!-- table policies_medium -->\n| policy") and text.endswith("\nAfter.\n")
-    assert "| PPO: belief | " in text and "old" not in text
+    assert "| PPO: belief | " in text and "old" not in text and "\n\n**Rough**, by `--quick`" in text
     for picture in ("policies_curves.png", "policies_errors.png"):
         assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
     times = {path: path.stat().st_mtime_ns for path in (tmp_path / "found" / "runs").glob("*.json")}

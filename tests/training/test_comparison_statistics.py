@@ -15,7 +15,7 @@ TRIALS = 1200
 
 
 def figure(returns, source="a"):
-    """The mean of returns (E, S), a column a training seed."""
+    """The mean of returns (E, S), a column per training seed."""
     without = (returns.sum(axis=0) - returns) / (len(returns) - 1)
     return mean_figure(returns.mean(axis=0), without, source)
 

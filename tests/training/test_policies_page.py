@@ -103,14 +103,13 @@ def test_where_the_model_is_wrong_a_policy_that_corrects_it_beats_the_controller
         assert f"PPO + MPC: ekf, {variant} returns +" in ANSWERS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "kind", "arm"),
     [
         ("LQG: ekf", "lqr", "ekf"),
         ("PI: raw", "pi", "raw"),
-        ("one step: ekf", "one-step", "ekf"),
-        ("MPC: true", "mpc", "true"),
+        pytest.param("one step: ekf", "one-step", "ekf", marks=pytest.mark.slow),
+        pytest.param("MPC: true", "mpc", "true", marks=pytest.mark.slow),
     ],
 )
 def test_classical_rows_are_those_of_the_code(name, kind, arm):

@@ -56,7 +56,7 @@ def test_the_commands_train_score_and_play(thruster, monkeypatch, tmp_path):
     data = json.loads((tmp_path / "train.json").read_text())
     assert data["steps"] == 128 and len(data["evaluations"]) == 2 and data["setup"]["observe"] == "ekf"
     assert (folder / "tensorboard").is_dir()
-    assert "nothing was left to learn" in thruster(*options).stdout
+    assert "training was already complete" in thruster(*options).stdout
     other = thruster("train", "--observe", "raw", "--steps", 128, "--envs", COPIES, "--no-tensorboard")
     assert other.returncode == 0, other.stderr
     before = contents(tmp_path / "out")

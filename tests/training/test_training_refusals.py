@@ -78,7 +78,7 @@ def test_damaged_evaluations_are_refused_and_left_alone(how, copied):
 )
 def test_a_folder_of_another_setup_is_left_alone(change, named, copied):
     before = contents(copied)
-    with pytest.raises(ValueError, match=f"to go on with, but differs in {named}: give another folder"):
+    with pytest.raises(ValueError, match=f"to continue, but differs in {named}: give another folder"):
         learn(setup_of(**change), copied)
     assert contents(copied) == before
 
@@ -87,7 +87,7 @@ def test_a_folder_of_other_things_is_left_alone(tmp_path):
     (tmp_path / "thesis.txt").write_text("precious")
     for folder in (tmp_path, tmp_path / "thesis.txt"):
         with pytest.raises(
-            ValueError, match="must be new, empty or that of a training, but .* holds other things"
+            ValueError, match="must be new, empty or that of a training, but .* contains other files"
         ):
             learn(setup_of(), folder)
     assert contents(tmp_path) == {(tmp_path / "thesis.txt").relative_to(tmp_path): b"precious"}
@@ -165,7 +165,7 @@ BAD = [
         ("train", "--observe", "raw", "--untuned"),
         "must come with an observation set that has a filter, but got 'raw'",
     ),
-    (("train", "--out", "full"), "must be new, empty or that of a training, but full holds other things"),
+    (("train", "--out", "full"), "must be new, empty or that of a training, but full contains other files"),
     (("play", "full"), "a policy must be a folder that `thruster train` made, but full holds none"),
     (("play", "ekf", "--out", "x.avi"), "--out must end in .mp4 or .gif, but got 'x.avi'"),
     (("play", "ekf", "--out", "x.gif", "--window"), "give either --window or --out FILE, but got both"),

@@ -92,7 +92,7 @@ def test_states_with_an_infinite_scale_do_not_count():
     assert found.score.value == pytest.approx((found.rmse[0].value / 0.5 + found.rmse[2].value / 0.25) / 2)
     assert found.scored == [0, 2]
     filter_, data = oracle_choice("kf", problem).filter(problem), problem.data(SEEDS)
-    for scale, rule in (((0.5, 0.5), "one number a state, 3"), ((np.inf,) * 3, "finite in some state")):
+    for scale, rule in (((0.5, 0.5), "one number per state, 3"), ((np.inf,) * 3, "finite in some state")):
         with interpreted(), pytest.raises(ValueError, match=f"scale must be {rule}"):
             evaluate(filter_, data, scale)
 
@@ -196,7 +196,8 @@ def test_consistency_without_truth_is_that_of_the_innovations(tmp_path):
         known = check_consistency(oracle_choice("kf", problem).filter(problem), LinearProblem().data(range(30)))
     said = sentences(report)
     assert said[0] == NO_TRUTH and not any("NEES" in one or "CRPS" in one for one in said)
-    assert any(one.startswith("The 95 % interval of the expected range [m] holds the measurement") for one in said)
+    start = "The 95 % interval of the expected range [m] contains the measurement"
+    assert any(one.startswith(start) for one in said)
     assert report.channels == ("range [m]", "speed [m/s]") and report.ensemble is None
     for coverage in known.innovation_coverage:
         assert coverage.covers(0.95)
@@ -214,7 +215,7 @@ def test_of_many_states_sentences_tell_the_worst():
     problem = LinearProblem(8)
     with interpreted():
         report = check_consistency(oracle_choice("kf", problem).filter(problem), problem.data(range(25)))
-    assert sum("holds the truth" in one for one in sentences(report)) == 6
+    assert sum("contains the truth" in one for one in sentences(report)) == 6
     assert any(
         one.startswith("Of 8 states these are the 6 whose coverage is furthest off") for one in sentences(report)
     )
@@ -249,14 +250,14 @@ def test_objectives_say_what_they_need(proofs):
     assert find_objective("output:E").value(proof.true, 0.0) == proof.true.output_rmse["E"].value
     assert find_objective("nis").value(proof.true, 0.0) == abs(np.log(nis_ratio(proof.true)))
     assert find_objective("thrust").output == "T" == find_objective("output:T").output
-    check_objectives(("likelihood", "nis", "cost"), blind)
-    for objective in ("score", "consistency", "output:E"):
-        with pytest.raises(ValueError, match="no truth, must be one of likelihood, nis, cost, but got"):
+    check_objectives(("likelihood", "nis", "c-nis", "cost"), blind)
+    for objective in ("score", "mse", "log-score", "nees", "c-nees", "consistency", "output:E"):
+        with pytest.raises(ValueError, match="no truth, must be one of likelihood, nis, c-nis, cost, but got"):
             Plan("kf", (blind,), objectives=(objective,)).checked()
     with pytest.raises(ValueError, match="derived output of linear-3 must be one of output:E, but got 'thrust'"):
         Plan("kf", (problem,), objectives=("thrust",)).checked()
     with pytest.raises(
-        ValueError, match="objective must be one of score, thrust, .*output:SYMBOL, but got 'output:'"
+        ValueError, match="objective must be one of score, mse, .*output:SYMBOL, but got 'output:'"
     ):
         find_objective("output:")
 
@@ -264,9 +265,7 @@ def test_objectives_say_what_they_need(proofs):
 def test_a_report_without_truth_says_so_and_has_no_errors(proofs):
     problem, proof = proofs[3, False]
     plan, choice = Plan("kf", (problem,), objectives=("likelihood",)), oracle_choice("kf", problem)
-    assert advice(choice, plan, [proof]).endswith(
-        "the covariance is consistent (mean NIS 1.76 where 1.81 is right)."
-    )
+    assert advice(choice, plan, [proof]).endswith("the covariance is consistent (mean NIS 1.76, expected 1.81).")
     said, table = held_out_section(None, Subject("s", plan, choice, None, 8, True), [proof]).parts
     assert said.sentences[0].startswith("linear-3 has no truth: filters are compared by how well they predict")
     assert table == errors_table(problem, proof)

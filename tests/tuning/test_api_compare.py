@@ -10,10 +10,14 @@ import pytest
 import tuning
 from filters.augmented import Unknown
 from tests import pendulum_problem
+from tests.models import wide_model
+from tests.small_problems import UNITS, pair
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuning.test_api_study import plain
+from tuning.evaluation.evaluate import evaluate
 from tuning.problems.find import find_problem
 from tuning.reporting.leaderboard import as_json as boards_as_json
+from tuning.search.space import given_choice
 
 SHORT = find_problem("nominal").replace(steps=70, name="short")
 
@@ -86,6 +90,16 @@ def test_where_nobody_knows_the_noise_filters_have_the_scaled_default():
     assert np.isfinite(found.to_frame()["log-likelihood"]).all() and found.plot_scores().axes
 
 
+def test_filters_with_what_a_model_came_with_are_those_of_the_baseline():
+    problem = pair(assumed=wide_model(**UNITS).replace(process_noise_cov=[0.5, 0.5, 0.5]))
+    rows = tuning.compare("kf", problem, seeds=4, knows="given", progress=False).boards[0].rows
+    choice = given_choice("kf", problem)
+    data = problem.data(problem.held_out_seeds(0, 4))
+    assert rows[0].evaluation.score == evaluate(choice.filter(problem), data, problem.scale).score
+    with pytest.raises(ValueError, match="come with a Q and R of its own, but short's has none"):
+        tuning.compare("ekf", SHORT, seeds=2, knows="given")
+
+
 WRONG = [
     (lambda: tuning.compare(["ekf", "ekf"], SHORT, seeds=2), "must be of different filters, but got ekf, ekf"),
     (lambda: tuning.compare([]), "a comparison must be of filters, but got none"),
@@ -102,7 +116,7 @@ WRONG = [
         lambda: tuning.compare("enkf", ensemble_size=1),
         "must be a whole number of at least 2, but got 1",
     ),
-    (lambda: tuning.compare("ekf", knows="all"), "knows must be one of true, scaled, untuned, but got 'all'"),
+    (lambda: tuning.compare("ekf", knows="all"), "one of true, scaled, untuned, given, but got 'all'"),
     (lambda: tuning.compare("ekf", trials=2, knows="true"), "knows must be left out where filters are tuned"),
     (lambda: tuning.compare("ekf", seeds=1), "held-out seeds must be a whole number of at least 2, but got 1"),
 ]

@@ -17,6 +17,7 @@ import tuning
 from filters import EstimateState
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_cli.tuning_report import as_json as tuning_as_json
+from thruster_cli.tuning_report import report
 from tuning.problems.find import find_problem
 from tuning.reporting.lines_parts import lines_section
 
@@ -70,10 +71,14 @@ def test_the_tuned_filter_is_ready_to_use(study, tmp_path):
 def test_what_is_printed_are_the_tables_of_the_command_line(study):
     found = study.held_out
     lines = str(found).splitlines()
-    assert lines[0].startswith("RMSE on held-out seeds") and "\x1b" not in str(found)
+    printed = report(study.tuning)
+    assert lines[0] in printed[0] and printed[0].startswith(lines[0]) and lines[0].startswith("Tuning gave way")
+    assert any(line.startswith("RMSE on held-out seeds") for line in lines) and "\x1b" not in str(found)
     assert any(line.startswith(" scaled ") or line.startswith(" scaled default") for line in lines)
     assert f"{found.evaluation.rmse[0].value:.2f}" in str(found) and "Score of the tuned filter" in str(found)
-    assert "\n" not in repr(found) and str(study).startswith(repr(study)) and str(found) in str(study)
+    assert "\n" not in repr(found) and repr(study) in str(study)
+    assert str(study).splitlines()[0] == lines[0] and str(study).count(lines[0]) == 1
+    assert all(line in str(study) for line in lines) and html.escape(printed[0]) in study._repr_html_()
 
 
 def lines_of(page):
@@ -113,7 +118,7 @@ def test_a_study_in_memory_is_that_of_a_storage_and_goes_on_there(tmp_path, caps
     options = {"storage": storage, "progress": True}
     short = tuning.tune(SHORT, trials=2, **options)
     whole = tuning.tune(SHORT, trials=TRIALS, **options)
-    assert "goes on after 2 finished trials" in capsys.readouterr().err
+    assert "continues after 2 finished trials" in capsys.readouterr().err
     alone = tuning.tune(SHORT, trials=2, progress=False)
     first = [trial.params for trial in alone.trials]
     assert first == [trial.params for trial in short.trials] == [trial.params for trial in whole.trials[:2]]
@@ -190,7 +195,7 @@ def test_a_report_of_two_is_that_of_the_command(study, thruster, monkeypatch, tm
     theirs = tmp_path / "theirs" / "a-beside-b.html"
     assert mine.read_text() == theirs.read_text()
     assert mine.with_suffix(".md").read_text() == theirs.with_suffix(".md").read_text()
-    with pytest.raises(ValueError, match=r"two studies go into one list, but got out=Study\(ekf on mismatch"):
+    with pytest.raises(ValueError, match=r"two studies must be in one list, but got out=Study\(ekf on mismatch"):
         tuning.report("b.json", study)
     values = tuning.report((study, "b.json"), progress=False)  # what is no file goes into the folder out
     assert values.as_posix() == "out/ekf-mismatch-seed0-beside-b.html" and "a.json" in values.read_text()
@@ -246,8 +251,8 @@ WRONG = [
     (lambda: tuning.evaluate(3), "a filter must be a name, a tuned file, a Study or an estimator, but got 3"),
     (lambda: tuning.tune("mismatch", len), "filter must be a name or 'module:object', by which trials keep it"),
     (lambda: tuning.report(3), "a report must be of a Study, a tuned file or the name of a study, but got 3"),
-    (lambda: tuning.report([]), "a report side by side must be of two studies, but got 0"),
-    (lambda: tuning.report("a.json", "b.json"), "two studies go into one list, but got out='b.json'"),
+    (lambda: tuning.report([]), "a side-by-side report must be of two studies, but got 0"),
+    (lambda: tuning.report("a.json", "b.json"), "two studies must be in one list, but got out='b.json'"),
     (lambda: tuning.report("no such study"), "a report must be of a tuned file or of a study in"),
     (
         lambda: tuning.tune(SHORT, trials=1).plot_sizes(),

@@ -143,12 +143,12 @@ def test_a_budget_holds_one_kind_too_and_no_size_goes_beyond_it(priced):
 
 
 def test_a_budget_that_nothing_keeps_is_one_clear_line(priced):
-    with pytest.raises(ValueError, match="budget must be at least what the cheapest trial takes, 0.07 mi.* 0.01"):
+    with pytest.raises(ValueError, match="budget must be at least the time of the cheapest trial, 0.07 mi.* 0.01"):
         studied(PLAN._replace(budget=0.01), 6)
 
 
 def test_without_a_budget_a_front_of_error_against_cost_tells_the_kinds(priced):
-    plan = PLAN._replace(budget=None, objectives=("score", "cost"))
+    plan = PLAN._replace(budget=None, consistent=False, objectives=("score", "cost"))
     result = studied(plan, 10)
     assert {trial.params[FILTER_TYPE] for trial in result.front} and result.choice.name in FEW
     assert min(trial.values[1] for trial in result.front) == 0.07

@@ -58,6 +58,7 @@ def test_what_one_instrument_measures_is_lost_together():
     assert 0.4 < (lost[:, 0] != lost[:, 1]).mean() < 0.6
 
 
+@pytest.mark.slow
 def test_scales_are_those_of_the_code():
     for name in ("auv:motion", "auv:navigation"):
         found = computed_scale(find_scenario(name), 6)
@@ -151,6 +152,7 @@ def test_a_tuned_file_keeps_which_states_its_model_has_and_goes_on_an_env(tmp_pa
         EstimateState(gym.make("BowThruster-v0"), tuned="tuned.json")
 
 
+@pytest.mark.slow
 def test_a_filter_that_estimates_the_current_is_consistent_where_one_without_it_is_lost():
     lost, told = (short(name).replace(steps=300) for name in ("auv:current", "auv:estimated_current"))
     nees = []

@@ -60,7 +60,7 @@ BAD = {
     "steps": (lambda: pair(steps=0), "steps must be a whole number of at least 2, but got 0"),
     "scale": (
         lambda: checked_problem(pair(scale=(1.0, -1.0, 1.0))),
-        "scale of problem a pair of models must be 3 positive numbers, infinite for states that do not count",
+        "scale of problem a pair of models must be 3 positive numbers, infinite for states that are not scored",
     ),
     "true NaN": (
         lambda: ModelProblem(line(nowhere_else), steps=60).data([5]),
@@ -78,7 +78,7 @@ BAD = {
     "study": (lambda: Plan("ekf", (3,)).checked(), "a study must be of .*problem.Problem, but got 3"),
     "mixed study": (
         lambda: Plan("ekf", (thruster(), pair())).checked(),
-        "problems of one study must have as many states and .* but nominal and a pair of models have",
+        "problems of one study must have the same numbers of states and .* but nominal and a pair of models do",
     ),
     "argument": (
         lambda: pair().model(sigma=3.0),
@@ -99,12 +99,12 @@ BAD = {
     "range": (lambda: Parameter("sigma", 0.0, 1.0), "low of sigma must be positive and below high, but got 0"),
     "env": (
         lambda: EnvProblem("Nowhere-v0", "random", pendulum_problem.model()),
-        "the env of problem an env must be one that can be made, but NameNotFound",
+        "it must be possible to make the env of problem an env, but NameNotFound",
     ),
     "policy": (lambda: EnvProblem("Pendulum-v1", 3, pendulum_problem.model()), "policy must be 'random', .*3"),
     "state": (
         lambda: pendulum_problem.problem(state_of=None).data([1]),
-        r'must show its state in info\["state"\], or state_of must tell it, but info has nothing',
+        r'must show its state in info\["state"\], or state_of must return it, but info has nothing',
     ),
     "short": (
         lambda: EnvProblem(

@@ -80,9 +80,9 @@ def test_beliefs_are_said_with_their_numbers():
     first, second = belief_sentences([SimpleNamespace(beliefs=found)])
     gain = constants.load_gain
     assert first.startswith(
-        f"load_gain is believed to be {gain:.4g} at first, with a standard deviation of {gain / 5:.3g},"
+        f"load_gain has a prior mean of {gain:.4g}, a standard deviation of {gain / 5:.3g} and"
     )
-    assert "believed to be 0 at first, with a standard deviation of 0.4, and to change by 0.01 a step" in second
+    assert "has a prior mean of 0, a standard deviation of 0.4 and a random walk of 0.01 per step" in second
 
 
 def scored(mean_squares, first=None):
@@ -121,7 +121,7 @@ def test_a_size_is_for_filters_that_have_an_ensemble():
         (lambda: compare([], [NOMINAL], SEEDS), "a comparison must be of different filters, but got none"),
         (lambda: compare([contender("ekf")] * 2, [NOMINAL], SEEDS), "different filters, but got ekf, ekf"),
         (lambda: contender("none"), "filter must be one of"),
-        (lambda: contender("ekf", "much"), "knows must be one of true, scaled, untuned, but got 'much'"),
+        (lambda: contender("ekf", "much"), "knows must be one of true, scaled, untuned, given, but got 'much'"),
         (lambda: contender("enkf", ensemble_size=1).filter(NOMINAL), "ensemble_size must be"),
         (
             lambda: contender("ekf", unknown={"colour": None}).filter(NOMINAL),
@@ -209,7 +209,7 @@ def test_the_command_takes_tuned_files(thruster, tmp_path):
     assert code == 0 and "mismatch:" in out and "Over mine, paired" in out
     assert "Q and R: of mine the tuned ones; of ekf the plant's own (oracle; --knows true)." in out
     code, out, _ = thruster("mine.json", "--seeds", 4, "--scenario", "nominal")
-    assert code == 0 and "On nominal there is nothing to compare mine with." in out
+    assert code == 0 and "On nominal no other filter can be compared with mine." in out
 
 
 def small_unknown():
@@ -236,7 +236,7 @@ def test_where_nobody_knows_the_plants_noise_filters_have_the_scaled_default(thr
         (("--filter", "none"), "filter must be one of kf, "),
         (("--scenario", "none"), "problem must be one of nominal, "),
         (("--scenario", "no.toml"), "a scenario file must be readable, but no.toml is not"),
-        (("--knows", "all"), "knows must be one of true, scaled, untuned, but got 'all'"),
+        (("--knows", "all"), "knows must be one of true, scaled, untuned, given, but got 'all'"),
         (("--seeds", "1"), "held-out seeds must be a whole number of at least 2, but got 1"),
         (("--ensemble-size", "many"), "--ensemble-size must be a finite number, but got 'many'"),
         (("--ensemble-size", "ekf=5"), "--ensemble-size must be for a filter with an ensemble, but got 'ekf=5'"),

@@ -188,9 +188,9 @@ def test_sentences_follow_their_numbers():
     )
     assert mean_sentence("NIS", Interval(np.nan, np.nan, np.nan), 1).startswith("No NIS")
     assert coverage_sentence("x", Interval(0.9, 0.89, 0.91)).endswith("90.0 % [89.0, 91.0] of cases: too rarely.")
-    assert coverage_sentence("x", Interval(0.98, 0.97, 0.99)).endswith("more often than it says.")
+    assert coverage_sentence("x", Interval(0.98, 0.97, 0.99)).endswith("more often than stated.")
     assert crps_sentence("x [m]", Interval(0.6, 0.5, 0.7), 0.3) == (
-        "CRPS of x [m]: 0.6 [0.5, 0.7], 2 times what the covariance promises."
+        "CRPS of x [m]: 0.6 [0.5, 0.7], 2 times its expected value under the covariance."
     )
     assert comparison_sentence("x", "ekf", "kf", Interval(0.9, 0.8, 0.95)).endswith("ekf is better.")
     assert comparison_sentence("x", "ekf", "kf", Interval(1.0, 0.9, 1.1)).endswith("a tie.")

@@ -59,8 +59,8 @@ def test_the_last_of_three_is_the_correlation_once_the_first_state_is_known():
     ("arguments", "rule"),
     [
         (((1.0, 0.0), [0.1]), "variances must be positive, but got"),
-        (((1.0, 1.0), [1.0]), "correlations must be 1 numbers within -1 and 1"),
-        (((1.0, 1.0), []), "correlations must be 1 numbers within -1 and 1"),
+        (((1.0, 1.0), [1.01]), "correlations must be 1 numbers from -1 to 1"),
+        (((1.0, 1.0), []), "correlations must be 1 numbers from -1 to 1"),
     ],
 )
 def test_other_numbers_are_refused(arguments, rule):
@@ -114,3 +114,14 @@ def test_the_gradient_refuses_it_with_one_clear_line(tmp_path):
         tune(PLAN, 1, out=tmp_path / "t.json", by_gradient=True)
     with pytest.raises(ValueError, match="must come without a budget, but got budget"):
         tune(PLAN._replace(full_q=False, budget=1.0), 1, out=tmp_path / "t.json", by_gradient=True)
+
+
+def test_correlations_of_a_singular_covariance_are_those_that_something_determines():
+    g = np.array([0.005, 0.1])  # one acceleration drives position and speed
+    assert correlations_of(np.outer(g, g)) == [pytest.approx(1.0, abs=1e-12)]
+    assert correlations_of(np.outer([1.0, -2.0], [1.0, -2.0])) == [pytest.approx(-1.0, abs=1e-12)]
+    assert correlations_of(np.zeros((3, 3))) == [0.0] * 3
+    third = np.array([[1.0, 0.0, 1.0], [0.0, 4.0, 2.0], [1.0, 2.0, 2.0]])  # first and half the second
+    assert correlations_of(third) == pytest.approx([0.0, np.sqrt(0.5), 1.0], abs=1e-12)
+    both = np.array([[4.0, 4.0, 1.0], [4.0, 4.0, 1.0], [1.0, 1.0, 9.0]])  # the second is the first
+    assert correlations_of(both) == pytest.approx([1.0, 1.0 / 6.0, 0.0], abs=1e-12)

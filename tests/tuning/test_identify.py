@@ -71,7 +71,7 @@ def test_an_end_at_zero_is_not_to_be_widened(found):
         at_end={**found.at_end, first.name: True, second.name: True},
     )
     assert ends._end_sentences() == [
-        f"At zero, where the range ends: {first.name}. The data ask for none of it.",
+        f"At zero, where the range ends: {first.name}. The data require none of them.",
         f"At an end of the range: {second.name}. A wider one may fit better.",
     ]
     assert found._end_sentences() == []

@@ -1,5 +1,6 @@
 """A journal is synchronised where a trial ends, and what the running one reports waits for others."""
 
+import json
 import os
 import pickle
 from pathlib import Path
@@ -115,3 +116,16 @@ def test_a_study_in_a_database_can_be_copied(tmp_path):
     study = optuna.create_study(storage=open_storage(f"sqlite:///{tmp_path}/studies.db"))
     study.add_trial(optuna.trial.create_trial(value=1.0))
     assert len(pickle.loads(pickle.dumps(study)).trials) == 1
+
+
+@pytest.mark.parametrize("distribution", ["[" * 100_000, 7, '{"name": 3}'])
+def test_a_journal_of_nonsense_is_refused_in_one_line(path, distribution):
+    study = optuna.create_study(storage=open_storage(path))
+    study.tell(study.ask({"Q11": optuna.distributions.FloatDistribution(0.0, 1.0)}), 1.0)
+    lines = [json.loads(line) for line in Path(path).read_text().splitlines()]
+    for line in lines:
+        if "distribution" in line:
+            line["distribution"] = distribution
+    Path(path).write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with pytest.raises(ValueError, match="storage must be a journal file that can be written, but got"):
+        open_storage(path)

@@ -92,15 +92,15 @@ def test_every_third_run_is_held_out_or_those_that_are_named():
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: LogProblem(logs_of(60), GUESS), "a log must have at least 75 rows.*but run0 has 61"),
-        (lambda: LogProblem(logs_of(100), GUESS), "at least 2 blocks held out, but run0 give 0"),
+        (lambda: LogProblem(logs_of(60), GUESS, lead=60), "a log must have at least 63 rows.*but run0 has 61"),
+        (lambda: LogProblem(logs_of(15), GUESS), "at least 2 blocks with measurements held out, but run0 give 1"),
         (lambda: LogProblem(logs_of(200), GUESS, held_out=["x"]), "held out must be among run0, but got 'x'"),
         (lambda: LogProblem([], GUESS), "logs must be some plants.logs.log.Log"),
         (lambda: LogProblem(logs_of(200) * 2, GUESS), "must have different names, but got run0, run0"),
         (lambda: LogProblem(logs_of(200), GUESS, scale=[1.0]), "a scale must come with logs of all true states"),
         (
             lambda: LogProblem([logs_of(200)[0], Log("b", 0.2, *_rows())], GUESS),
-            "must have the same sample time, but run0 has 0.1 s and b 0.2 s",
+            "must have the same sample time, but run0 has 0.1 s and b 0.2 s: put them on one grid with --dt 0.1",
         ),
     ],
 )
@@ -149,14 +149,15 @@ def test_the_noise_of_a_simulation_is_found_again_without_its_truth():
     assert found["measurement_noise_cov"] == pytest.approx(R, rel=0.15)
     proof = evaluate_held_out(result.choice, problem, 0)
     assert proof.seeds == problem.parts.held_out and not proof.tuned.has_truth
-    assert proof.likelihood_gains["rule of thumb"].low > 0
+    assert proof.likelihood_gains["given"].low > 0
     known = identify(result.choice, (problem,), plan.training_data(), plan.space())
     assert known.identified.all() and (known.factors < 3).all()  # the errors of blocks of two runs are finite
-    assert "The scaled default is the model's Q times" in scaling_sentence(proof)  # for the model has no ranges
-    assert "give the model state_low and state_high" in scaling_sentence(proof)
-    assert "against the model's Q" in worth(proof) and "rule of thumb" not in worth(proof)
-    assert [row[0] for row in errors_table(problem, proof).rows][:2] == ["model's Q", "scaled default"]
-    assert "model's Q" in numbers_table(result.choice, problem, 0, proof.default).columns
+    said = scaling_sentence(proof)
+    assert "The scaled default is the given Q and R with this Q times" in said
+    assert "give the model state_low and state_high" in said  # for the model has no ranges
+    assert "against the given numbers" in worth(proof) and "rule of thumb" not in worth(proof)
+    assert [row[0] for row in errors_table(problem, proof).rows][:2] == ["given", "scaled default"]
+    assert "given" in numbers_table(result.choice, problem, 0, proof.default).columns
 
 
 def test_what_has_ranges_has_a_rule_of_thumb():
@@ -172,9 +173,9 @@ def test_true_states_in_the_logs_give_a_scale_and_runs_of_their_own_for_the_ense
     logs = logs_of(600, 500, truth=True)
     problem = checked_problem(LogProblem(logs, MODEL, lead=LEAD))
     data = problem.data(problem.training_seeds(0, 32))
-    assert problem.scale[0] == pytest.approx(data.states[:, LEAD:].std(), rel=1e-12)
+    assert problem.scale[0] == pytest.approx(data.states[data.scored].std(), rel=1e-12)
     assert problem.parts.sizes and not {*problem.parts.sizes} & {*problem.parts.training, *problem.parts.held_out}
-    assert not np.isnan(data.measurements).any()
+    np.testing.assert_array_equal(np.isnan(data.measurements[..., 0]), ~data.counted)  # nothing but padding
     block = problem.parts.blocks[1]
     first = logs[block.run].references["state:x_1"][block.first]
     assert data.states[1, 0, 0] == first
@@ -192,7 +193,7 @@ def test_an_ensemble_without_a_truth_is_the_smallest_whose_estimates_are_close_t
     def means_of(size):
         filter_ = choice.with_size(size).filter(problem)
         found = run(filter_, data.filter_keys, data.inputs, data.measurements)
-        return found.means[:, data.scored, 0], found.covs[:, data.scored, 0, 0]
+        return found.means[:, data.late, 0], found.covs[:, data.late, 0, 0]
 
     size = close_size(choice, plan, [data])
     ladder = [n for n in size_ladder("enkf") if n < 200]

@@ -1,11 +1,14 @@
 """The tuned filter as a MATLAB function: its f and h are the model's, operation by operation."""
 
+import math
 import re
 from math import exp, sin
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import thruster_cli
 from plants.affine import AffineModel
 from plants.state_space import StateSpaceModel
 from tuning.problems.find import find_problem
@@ -17,7 +20,7 @@ from tuning.search.space import Choice, untuned_choice
 def value_of(lines, x, u):
     """What lines of MATLAB come to, by Python's operators."""
     named = {"x": lambda i: x[i - 1], "u": lambda i: u[i - 1], "abs": abs, "sin": sin, "exp": exp}
-    named["mod"] = lambda a, b: a % b
+    named |= {"mod": lambda a, b: a % b, **IN_PYTHON}
     for line in lines[:-1]:
         name, _, told = line.rstrip(";").partition(" = ")
         named[name] = eval(told.replace("^", "**"), named)
@@ -38,8 +41,71 @@ def test_traced_functions_are_those_of_the_model(name):
 def test_elementary_functions_are_traced_and_branches_are_not():
     lines = traced(lambda x, c: (np.sin(x[0]) - c[0] * np.exp(-x[1]), 2.0), [["x(1)", "x(2)"]], (3.0,))
     np.testing.assert_allclose(value_of(lines, [0.4, 0.5], []), [sin(0.4) - 3.0 * exp(-0.5), 2.0])
-    assert traced(lambda x, c: (x[0] if x[0] > 0 else 0.0,), [["x(1)"]], ()) is None
-    assert traced(lambda x, c: (sin(x[0]),), [["x(1)"]], ()) is None
+    with pytest.raises(ValueError, match="test_matlab.py, line .*'with pytest|compares a value"):
+        traced(lambda x, c: (x[0] if x[0] > 0 else 0.0,), [["x(1)"]], ())
+
+
+def helper(a, b):
+    return math.hypot(a, b) + sin(a)
+
+
+def scale_of(factor):
+    return lambda value: factor * math.tanh(value)
+
+
+def of_math(x, u, c):
+    double = scale_of(2.0)
+    first = math.exp(-x[0]) * math.log(x[1], 3) + math.atan2(x[0], x[1]) + exp(0.3) + math.pi
+    second = helper(x[0], x[1]) + double(x[0]) + min(x[0], x[1], 0.2) - max([x[1], u[0]]) + abs(-x[1])
+    third = math.fmod(-x[1], 0.3) + math.copysign(x[0], -x[1]) + math.floor(x[1]) + x[1] // 0.4 + (-x[1]) % 0.3
+    fourth = math.sqrt(x[1]) + math.pow(x[1], 1.5) + math.radians(x[0]) + math.log10(x[1]) + math.fabs(x[0])
+    return first, second, third, fourth, math.remainder(x[1], 0.9)
+
+
+def of_numpy(x, u, c):
+    first = np.arctan2(x[0], x[1]) + np.log1p(x[1]) + np.hypot(x[0], u[0]) + np.arcsin(x[0] / 3.0)
+    return first, np.minimum(x[0], x[1]) + np.maximum(x[0], 0.9), np.clip(x[1], 0.0, 1.0) + np.mod(-x[1], 0.9)
+
+
+IN_PYTHON = {
+    "log": math.log, "atan2": math.atan2, "hypot": math.hypot, "tanh": math.tanh, "min": min, "max": max,
+    "rem": math.fmod, "round": round, "floor": math.floor, "sqrt": math.sqrt, "log10": math.log10, "pi": math.pi,
+    "log1p": math.log1p, "asin": math.asin,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("function", [of_math, of_numpy])
+def test_functions_of_math_are_traced_as_those_of_numpy(function):
+    x, u = [0.7, 1.3], [0.2]
+    lines = traced(function, (["x(1)", "x(2)"], ["u(1)"]), ())
+    np.testing.assert_allclose(value_of(lines, x, u), function(tuple(x), tuple(u), ()), rtol=1e-14)
+
+
+def branching(x, u, c):
+    if x[0] == 0.0:  # this is the line
+        return (1.0,)
+    return (math.sin(x[0]) / x[0],)
+
+
+def truncating(x, u, c):
+    return (float(int(x[0])),)
+
+
+def test_what_cannot_be_written_out_says_where():
+    branch = "'if x.0. == 0.0:  # this is the line', compares a value"
+    for function, line in ((branching, branch), (truncating, "int")):
+        with pytest.raises(ValueError, match=rf"but test_matlab.py, line \d+, .*{line}") as caught:
+            traced(function, (["x(1)"], []), ())
+        assert "\n" not in str(caught.value)
+
+
+def test_the_template_that_thruster_new_writes_can_be_exported():
+    names = {"__name__": "template"}
+    source = (Path(thruster_cli.__file__).parent / "templates" / "problem.py").read_text()
+    exec(compile(source, "problem.py", "exec"), names)
+    model = names["model"](4.0)
+    text = matlab_function(Choice("ekf", {}, {}), model, "mine", 0.1)
+    assert "m.f = @transition;" in text and "cannot be written out" not in text
 
 
 def test_the_function_holds_the_model_and_the_step_of_a_kalman_filter():
@@ -76,6 +142,7 @@ def test_a_model_that_cannot_be_written_out_says_so():
         prior_cov=[1.0],
     )
     text = matlab_function(Choice("ekf", {}, {}), model, "mine", None)
+    assert "%   Why: a function to be written out must" in text and "test_matlab.py, line" in text
     assert "m.f and m.h are yours to add" in text and "@transition" not in text and "m.dt" not in text
 
 

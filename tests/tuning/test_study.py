@@ -118,6 +118,20 @@ def test_a_torn_last_line_is_cut_off_and_the_study_goes_on(tmp_path):
     assert len(run_study(study_in(storage), PLAN, 5).trials) == 5
 
 
+@pytest.mark.parametrize("bytes_left", [1, 5, 28])
+def test_a_torn_first_line_is_cut_off_and_another_file_is_left_alone(tmp_path, bytes_left):
+    path = tmp_path / "j"
+    study_in(open_storage(str(path)))
+    path.write_bytes(path.read_bytes()[:bytes_left])
+    with pytest.warns(UserWarning, match="cut off its last line"):
+        storage = open_storage(str(path))
+    assert len(run_study(study_in(storage), PLAN, 2).trials) == 2
+    path.write_text("hello")
+    with pytest.raises(ValueError, match="it is no journal"):
+        open_storage(str(path))
+    assert path.read_text() == "hello"
+
+
 def test_a_killed_process_loses_its_running_trial_only(tmp_path):
     path = tmp_path / "j"
     program = (

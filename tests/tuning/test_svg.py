@@ -83,3 +83,15 @@ def test_the_script_comes_with_what_needs_it():
     pictures = Picture('<svg viewBox="0 0 9 9"></svg>', "c", "a"), Code("t", "x = 1 < 2")
     alone, lines = (html_page("t", "a", [Section("s", [one])]) for one in pictures)
     assert "<script>" not in alone and "<script>" in lines and "x = 1 &lt; 2" in lines
+
+
+def test_what_is_folded_stands_on_paper_and_what_scrolls_has_a_cue():
+    page = html_page("t", "a", [Section("s", [Code("MATLAB", "function x", folded=True)])])
+    assert "<details>" in page
+    paper = page[page.index("@media print") : page.index("</style>")]
+    assert re.search(r"details > :not\(summary\) \{ display: block !important", paper)
+    assert re.search(r"details::details-content \{[^}]*content-visibility: visible !important", paper)
+    assert "beforeprint" in page[page.index("<script>") :]
+    screen = page[: page.index("@media print")]
+    assert re.search(r"\.scroll, \.picture, \.code pre \{ background: linear-gradient.*no-repeat local", screen)
+    assert 'content: "Scroll the picture sideways. "' in screen[screen.index("max-width: 40rem") :]

@@ -176,7 +176,7 @@ def test_a_scenario_file_that_has_changed_is_told_and_what_was_tuned_on_counts(t
         (3, "a scenario in a file must be a mapping of about, .* ekf.json has 3"),
         ({"content": {"module": "os"}}, "a scenario in a file must be a mapping of about, .*'os'"),
         ({"content": {"scale": [1.0, -1.0]}}, r"scale must be positive in every state, .* \(in ekf.json\)"),
-        ({"content": {}}, "values of a scenario must be such as `Scenario` takes"),
+        ({"content": {}}, "values of a scenario must be valid for `Scenario`"),
     ],
 )
 def test_a_scenario_in_a_tuned_file_is_checked_as_one_in_a_file(kept, rule, moved, tmp_path):

@@ -28,7 +28,7 @@ def test_lift_and_voltage_gain_as_states_buy_what_no_q_can():
     rows = [line.strip("| ").split(" | ") for line in lines]
     ratios = [float(row[1].split()[0]) for row in rows]
     assert [row[0] for row in rows] == ["`ekf`, scaled default", *names]
-    assert ratios[0] == 1.0 and 0.25 < ratios[3] < ratios[2] < 0.6 < 1.0 < ratios[1]  # whose first trial is all
+    assert ratios[0] == 1.0 and 0.25 < ratios[3] < ratios[2] < 0.6 < ratios[1] < 1.0  # by the baselines alone
     assert float(rows[2][4]) < 3.0 < 10.0 < float(rows[0][4])  # the NEES says that no covariance holds a bias
 
 

@@ -56,9 +56,10 @@ def test_two_hosts_work_on_one_study(hosts, server):
     processes = [trial.user_attrs[PROCESS].partition(":") for trial in done]
     assert {host for host, _, _ in processes} == {host.name for host in hosts}
     assert len({process for _, _, process in processes}) == 2 * WORKERS
-    # Each worker proposes what is its own. Each host may queue the first trial, which then has a twin for each.
+    # Each worker proposes what is its own; what is enqueued, as every second trial is, no worker proposes.
+    # Each host may queue the first trial, which then has a twin for each.
     proposed = [tuple(trial.params.values()) for trial in done if "fixed_params" not in trial.system_attrs]
-    assert len(proposed) > TRIALS / 2 and len(set(proposed)) == len(proposed)
+    assert len(proposed) > TRIALS / 4 and len(set(proposed)) == len(proposed)
     points = [tuple(trial.params.values()) for trial in done]
     assert len(points) - len(set(points)) <= 2
     assert all((host.home / "out" / "s.json").exists() for host in hosts)

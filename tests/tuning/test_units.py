@@ -4,7 +4,7 @@ from math import nan
 
 import pytest
 
-from filters.consistency.intervals import Interval
+from filters.consistency.intervals import Interval, span
 from tuning.reporting.error_tables import about, limit_cell
 from tuning.reporting.page import Table, Words
 from tuning.reporting.units import power_of_ten, scaled_unit, typeset
@@ -34,3 +34,18 @@ def test_small_errors_on_a_terminal_have_powers_of_ten():
     assert about(value, 8) == "8.59e-06 ±2e-07" and limit_cell(7.5e-6, 8) == "7.50e-06"
     assert about(value._replace(value=0.1, low=0.09, high=0.11), 4) == "0.1000 ±0.0100"
     assert about(value._replace(value=float("nan")), 8) == limit_cell(float("nan"), 8) == ""
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        ((26.0, 25.0, 27.0), "26 % [25, 27]"),
+        ((26.0, 25.86, 26.14), "26.0 % [25.9, 26.1]"),
+        ((26.0, 25.99, 26.01), "26.00 % [25.99, 26.01]"),
+        ((26.0, 26.0, 26.0), "26 %"),
+        ((26.0, 26.0 - 1e-6, 26.0 + 1e-6), "26 %"),
+        ((0.0, -0.2, 0.6), "0 % [0, 1]"),
+    ],
+)
+def test_the_ends_of_an_interval_differ_or_are_left_out(value, said):
+    assert span(Interval(*value), 0, " %") == said

@@ -71,6 +71,7 @@ def assert_nothing_is_lost(study, lost, trials):
     assert len(set(points)) == len(points)  # each worker proposes what is its own
 
 
+@pytest.mark.slow
 def test_a_study_survives_the_death_of_one_of_three_workers(tmp_path):
     study, lost = run_with_a_kill(str(tmp_path / "j"), 80)
     assert_nothing_is_lost(study, lost, 80)
@@ -183,7 +184,6 @@ def test_the_page_has_the_picture_and_the_lines_that_its_script_makes():
         assert [int(n) for n, cell in zip(head[2:], row[2:], strict=True) if cell] == list(work.workers)
 
 
-@pytest.mark.slow
 def test_a_worker_gets_through_trials_while_it_is_watched(tmp_path):
     from pages.workers_rates import NOTHING, rate
 

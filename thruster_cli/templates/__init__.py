@@ -1,1 +1,1 @@
-"""What `thruster new` writes: files that work as they stand, to be changed into one's own."""
+"""Templates of `thruster new`: working files to adapt."""

@@ -1,6 +1,6 @@
-"""A Gymnasium env of your own, with a filter around it and a problem to tune that on. Here: a mass on a spring.
+"""A Gymnasium env of your own, with a filter and a problem to tune it. Here: a mass on a spring.
 
-Change what is below into what is yours. To try it as it stands:
+Replace the code below by your own. To try it as it is:
 
 python template.py                                              # an episode, estimated
 thruster tune --problem template:problem --filter ekf --trials 50
@@ -18,7 +18,7 @@ MEASUREMENT_STD = 0.01  # [m], of the sensor's data sheet
 
 
 class Constants(NamedTuple):
-    """Numbers of the plant."""
+    """Constants of the plant."""
 
     dt: float = 0.02  # sample time [s]
     mass: float = 1.0  # [kg]
@@ -38,12 +38,12 @@ def move(x, u, c):
 
 
 def look(x, c):
-    """What the sensor shows of a state, without noise: the position."""
+    """The measurement of a state, without noise: the position."""
     return (x[0],)
 
 
 def model():
-    """What a filter assumes of the env: the same equations, and variances of what they leave out."""
+    """What a filter assumes of the env: the same equations, and variances of the model error."""
     return StateSpaceModel(
         transition=move,
         observe=look,
@@ -71,7 +71,7 @@ class SpringEnv(gym.Env):
         self.dt, self._state = Constants().dt, np.zeros(2)
 
     def state_space_model(self, **changes):
-        """What filter wrappers ask an env for."""
+        """The model for filter wrappers."""
         return model().replace(**changes)
 
     def reset(self, *, seed=None, options=None):
@@ -93,7 +93,7 @@ class SpringEnv(gym.Env):
         return z, {"state": self._state.copy(), "measurement": z}
 
 
-# Each run is an episode under random levels of the force; a policy (a function of the observation) does as well.
+# Each run is an episode under random levels of the force; a policy (a function of the observation) works as well.
 problem = EnvProblem(
     SpringEnv,
     {"name": "steps", "amplitude": 4.0, "hold": 25},

@@ -1,6 +1,6 @@
-"""A model of your own: what moves, what is measured, and how uncertain both are. Here: a mass on a spring.
+"""A model of your own: motion, measurements, and their uncertainty. Here: a mass on a spring.
 
-Change what is below into what is yours. To try it as it stands:
+Replace the code below by your own. To try it as it is:
 
 python template.py                                        # writes template.csv, a log to try these with
 thruster estimate template.csv --model template:model --filter ekf --plot estimate.png
@@ -14,7 +14,7 @@ from filters import StateSpaceModel
 
 
 class Constants(NamedTuple):
-    """Numbers that the functions below use; `thruster identify --free NAME` finds them."""
+    """Constants of the functions below; `thruster identify --free NAME` finds them."""
 
     dt: float  # sample time [s]
     mass: float  # [kg]
@@ -34,7 +34,7 @@ def move(x, u, c):
 
 
 def look(x, c):
-    """What the sensors show of a state, without noise: here the position alone."""
+    """The measurements of a state, without noise: here only the position."""
     return (x[0],)
 
 
@@ -44,17 +44,17 @@ def model(dt=0.02, mass=1.0, stiffness=40.0, damping=1.5):
         transition=move,
         observe=look,
         constants=Constants(dt, mass, stiffness, damping),
-        # Variances of what the equations leave out, of each state. They are PER STEP and do not scale with dt.
+        # Variances of the model error of each state. They are PER STEP and do not scale with dt.
         process_noise_cov=[1e-7, 4e-4],
         # Variance of each measurement: the square of the data sheet's standard deviation.
         measurement_noise_cov=[1e-4],
-        # What is known before the first measurement: a mean, and the variance of each state about it.
+        # Knowledge before the first measurement: a mean, and the variance of each state.
         prior_mean=[0.0, 0.0],
         prior_cov=[0.01, 0.1],
-        # Range of each state in normal operation. The rule of thumb, where tuning starts, takes 1 % of it for Q.
+        # Range of each state in normal operation. The rule of thumb, the start of tuning, uses 1 % of it for Q.
         state_low=[-0.2, -1.0],
         state_high=[0.2, 1.0],
-        # Name, symbol and unit: what tables, pictures and the columns of logs are called.
+        # Name, symbol and unit, for tables, pictures and the columns of logs.
         states=[("position", "x", "m"), ("speed", "v", "m/s")],
         input_quantities=[("force", "F", "N")],
         measurements=[("measured position", "z", "m")],

@@ -1,6 +1,6 @@
-"""A problem of your own: a plant that makes data, and what filters assume of it. Here: a mass on a spring.
+"""A problem of your own: a plant that generates data, and what filters assume of it. Here: a mass on a spring.
 
-Change what is below into what is yours. To try it as it stands:
+Replace the code below by your own. To try it as it is:
 
 thruster tune --problem template:problem --filter ekf --trials 50
 thruster compare --problem template:problem --filter ekf --filter ukf --filter enkf
@@ -14,7 +14,7 @@ from tuning.problems.model_problem import ModelProblem
 
 
 class Constants(NamedTuple):
-    """Numbers that the functions below use."""
+    """Constants of the functions below."""
 
     dt: float  # sample time [s]
     mass: float  # [kg]
@@ -34,7 +34,7 @@ def move(x, u, c):
 
 
 def look(x, c):
-    """What the sensors show of a state, without noise: here the position alone."""
+    """The measurements of a state, without noise: here only the position."""
     return (x[0],)
 
 
@@ -44,26 +44,26 @@ def model(stiffness):
         transition=move,
         observe=look,
         constants=Constants(dt=0.02, mass=1.0, stiffness=stiffness, damping=1.5),
-        # Variances of what the equations leave out, of each state. They are PER STEP and do not scale with dt.
+        # Variances of the model error of each state. They are PER STEP and do not scale with dt.
         process_noise_cov=[1e-7, 4e-4],
         # Variance of each measurement: the square of the data sheet's standard deviation.
         measurement_noise_cov=[1e-4],
-        # What is known before the first measurement: a mean, and the variance of each state about it.
+        # Knowledge before the first measurement: a mean, and the variance of each state.
         prior_mean=[0.0, 0.0],
         prior_cov=[0.01, 0.1],
-        # Range of each state in normal operation. The rule of thumb, where tuning starts, takes 1 % of it for Q.
+        # Range of each state in normal operation. The rule of thumb, the start of tuning, uses 1 % of it for Q.
         state_low=[-0.2, -1.0],
         state_high=[0.2, 1.0],
-        # Name, symbol and unit: what tables and pictures are called by.
+        # Name, symbol and unit, for tables and pictures.
         states=[("position", "x", "m"), ("speed", "v", "m/s")],
         input_quantities=[("force", "F", "N")],
         measurements=[("measured position", "z", "m")],
     )
 
 
-# The truth draws states and measurements; filters believe in the second model, here in a spring that is too soft.
-# With one model instead of two the filter knows the plant. "steps" are random levels of the input, each held for
-# 25 steps; prbs, multi-sine and dwells are others, and an array of shape (steps, inputs) does as well.
+# States and measurements are drawn from the first model; filters assume the second, here with a spring that is too
+# soft. With one model instead of two the filter knows the plant. "steps" are random levels of the input, each held
+# for 25 steps; there are also prbs, multi-sine and dwells, or use an array of shape (steps, inputs).
 problem = ModelProblem(
     model(stiffness=40.0),
     model(stiffness=36.0),
@@ -71,5 +71,5 @@ problem = ModelProblem(
     steps=300,
     dt=0.02,
     name="template",
-    about="a mass on a spring that the filter takes for 10 % softer",
+    about="a mass on a spring that the filter assumes to be 10 % softer",
 )

@@ -2,7 +2,7 @@
 
 Both know the plant's nominal parameters. Both have Stable-Baselines3's `predict(observation, state, episode_start,
 deterministic) -> (action, state)`, for one observation (d,) or one of each env (n, d). Actions are voltages [V],
-(1,) or (n, 1). What a controller remembers is in `state`, (k,) or (n, k): give None at first, then what the last
+(1,) or (n, 1). A controller's memory is `state`, (k,) or (n, k): pass None at first, then the state that the last
 call returned. Rows where `episode_start` is true forget. (Where a vector env resets on the next step, an episode
 starts one step after the last one was done.)
 """
@@ -28,8 +28,9 @@ class PIController:
         e_k = r_k - z_k,                      I_{k+1} = I_k + K_i dt e_k
 
     V*(r) is the voltage whose steady thrust is r, or the last one within the range: feed-forward. The measurement
-    z_k is compared with the reference of its own time (with r_1 at the start), for a step of the reference that
-    the thrust cannot have answered yet is no error. With both gains zero the controller is feed-forward alone.
+    z_k is compared with the reference of its own time (with r_1 at the start), because a step of the reference to
+    which the thrust cannot have responded yet is not an error. With both gains zero the controller is feed-forward
+    alone.
 
     Against windup the integral is clamped: it stands still while the voltage is cut off and the error drives it
     further out. Source: K. J. Astrom, L. Rundqwist (1989), "Integrator windup and how to avoid it", American
@@ -109,7 +110,7 @@ class LQRController:
     The deviation of the motor speed is written as one of the thrust. With dT = C_omega domega_m + C_U dU_a the
     feedback K_1 domega_m + K_2 dU_a is K_T dT + K_U dU_a, where K_T = K_1/C_omega and K_U = K_2 - K_T C_U, to
     first order. But thrust is quadratic in the state: far from the operating point C dx is wrong, and T(x) - r is
-    not. (On `tunnel`, whose flow lags far behind, the three tasks cost 0.4 to 0.6 of what they do with domega_m.)
+    not. (On `tunnel`, whose flow lags far behind, the three tasks cost 0.4 to 0.6 of their cost with domega_m.)
 
     There is no integral: where the thruster is not the nominal one, an error stays. Observations begin with
     omega_m and U_a, true (see `plants.observe.ObserveState`) or estimated.

@@ -65,7 +65,7 @@ def quadratic_problem(plant: Plant, task: Task, voltage: float) -> tuple[np.ndar
         Q = diag(tracking C'C/T_max^2, voltage_rate/V_max^2)
         S = (0, 0, -voltage_rate/V_max^2)',    R = (energy + voltage_rate)/V_max^2
 
-    but for the cost of dT_0, which no voltage changes. Of the energy only the deviation counts; the energy that
+    except for the cost of dT_0, which no voltage changes. Of the energy only the deviation counts; the energy that
     holds the thrust itself would move the operating point.
     """
     a_d, b_d, c = sampled_plant(plant, voltage)

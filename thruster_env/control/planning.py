@@ -22,7 +22,7 @@ REGULARISATION = 1e-9  # where thrust has no slope, at rest
 
 
 class Problem(NamedTuple):
-    """What a plan needs to know of plant and task, as plain numbers."""
+    """The parameters of plant and task that a plan uses, as plain numbers."""
 
     constants: Constants
     substeps: int  # of a sample time
@@ -183,7 +183,7 @@ def improve_plans(states, last, references, plans: np.ndarray, problem: Problem)
         min over V_0 .. V_{H-1} within the range of  sum_k step_cost(T_{k+1} - r, V_k, V_k - V_{k-1})
 
     by Gauss-Newton's method with derivatives of the equations of motion, projected onto the range; a step that
-    costs more is halved. The reference r is held: nobody knows the next one.
+    costs more is halved. The reference r is held, because the next one is unknown.
 
     Source: D. P. Bertsekas (1982), "Projected Newton methods for optimization problems with simple constraints",
     SIAM J. Control and Optimization 20(2), 221-246.

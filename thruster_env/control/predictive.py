@@ -1,8 +1,8 @@
 """Nonlinear controllers: the voltage that costs least by the equations of motion, over one step or a few.
 
-They have the `predict` of `control.controllers`, and see what the LQR there sees: state, true or estimated, and
-the reference of the next step. What they plan with is a thruster's nominal equations; noise, dead bands, a
-changing flow and a changing reference are not in them.
+They have the `predict` of `control.controllers` and the inputs of the LQR there: state, true or estimated, and the
+reference of the next step. They plan with a thruster's nominal equations, without noise, dead bands, a changing
+flow or a changing reference.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class PredictiveController:
         V_k, .. = argmin sum_{i=0}^{H-1} c(T(x_{k+i+1}) - r, V_{k+i}, V_{k+i} - V_{k+i-1}),   |V| <= V_max
         x_{k+i+1} = F(x_{k+i}, V_{k+i}),     c = `task.step_cost`
 
-    of which the first is applied: model-predictive control. The reference r_{k+1} is held, because the next one is
+    the first of which is applied: model-predictive control. The reference r_{k+1} is held, because the next one is
     unknown. With H = 1, the one-step controller, V_k is the best voltage of a grid, refined once, which no local
     minimum can trap. Beyond, Gauss-Newton's method starts from it and the last plan (`planning.improve_plans`).
 

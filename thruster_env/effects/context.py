@@ -1,4 +1,4 @@
-"""What the effects on a thruster need to know of it."""
+"""The context of effects on a thruster."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from plants.disturbances.effects import Context
 
 @dataclass(frozen=True)
 class ThrusterContext(Context):
-    """What an effect on a thruster may need to turn its arguments into numbers."""
+    """The data with which an effect on a thruster computes its parameters."""
 
     thrust_scale: float  # steady thrust at max_voltage [N]
     back_emf: float  # motor speed to back-EMF, K1/K2 [V s/rad]

@@ -1,7 +1,7 @@
 """Reference thrust: signals that the thruster has to follow; those of a list are added.
 
-Levels are fractions of T_max, the steady thrust at max_voltage, so that one reference fits every preset. What is
-random is drawn anew each episode. Observation k holds r_{k+1}, so each signal works one step ahead.
+Levels are fractions of T_max, the steady thrust at max_voltage, so that one reference fits every preset. Random
+values are drawn for each episode. Observation k holds r_{k+1}, so each signal works one step ahead.
 """
 
 from __future__ import annotations

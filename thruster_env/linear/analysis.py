@@ -25,7 +25,7 @@ class LinearModel(NamedTuple):
     """The matrices of a linear thruster, float64."""
 
     a: np.ndarray  # A (2, 2)
-    b: np.ndarray  # B (2, 2), one column an input
+    b: np.ndarray  # B (2, 2), one column per input
     c: np.ndarray  # C (1, 2)
 
 

@@ -15,7 +15,7 @@ PUBLISHED_NOISE = 0.5  # variance of each state a step, and of the measurement, 
 
 @takes_arguments_of(make_plant, leaving_out=["preset", "uncertainty", "substeps"])
 def make_linear_plant(system: str = "tunnel", **plant_arguments) -> Plant:
-    """Make a plant that moves by a published linear system, in place of the equations of motion.
+    """Make a plant that follows a published linear system instead of the equations of motion.
 
     Args:
         system: "tunnel" or "open_bladed"; see `published`.

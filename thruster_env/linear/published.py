@@ -8,9 +8,9 @@ an operating point the equations give
     A_21 = C_1/K3                    A_22 = C_2/K3 - B_22   B_22 = 2 (K4/K3) |U_a - U_0|
 
 with C = (dT/d omega_m, dT/dU_a). So A_11, A_12 and C fix the four slopes of thrust and torque. In every state
-(omega_m, U_a), whatever the area and the pair of angles, at least one slope of the model has the other sign.
+(omega_m, U_a), for any area and pair of angles, at least one slope of the model has the opposite sign.
 
-What else the print leaves open:
+Other open questions of the print:
 
 - Open-bladed: A_22 = -0.13 contradicts C_2/K3 - B_22 = -10.4/4 - 2.73 = -5.33, with which the system would be
   stable. That it is unstable is therefore a slip of the print. (The tunnel's own numbers agree:
@@ -78,13 +78,13 @@ PUBLISHED: dict[str, PublishedLinearModel] = {
 }
 
 NO_LINEARISATION = (
-    "The published matrices are kept as data. They are no linearisation of the equations printed beside them, "
-    "which in every state give at least one slope of thrust or torque the other sign."
+    "The published matrices are kept as data. They are not a linearisation of the equations printed beside "
+    "them, in which at least one slope of thrust or torque has the opposite sign in every state."
 )
 
 
 def published_for(preset: str) -> tuple[str, PublishedLinearModel] | None:
-    """Name and model of the published linear thruster of a preset, or None if nobody printed one."""
+    """Name and model of the published linear thruster of a preset, or None if there is none."""
     for name, model in PUBLISHED.items():
         if preset in model.presets:
             return name, model

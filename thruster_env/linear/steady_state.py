@@ -26,9 +26,9 @@ def steady_state(p: ThrusterParameters, voltage: float, ambient_velocity: float 
     """Solve rates(x, (V_s, U_0)) = 0 for the state that a constant voltage [V] settles to.
 
     Thrust, torque and momentum drag are homogeneous of degree two, so at U_0 = 0 the ratio r = U_a/omega_m
-    solves T(1, r) = K4 r |r| whatever the voltage (in reverse T(-1, -r) = -K4 r |r|), and omega_m is the root
-    of a quadratic. That point is the start of a simulation where U_0 is not zero; a Newton-type solution then
-    polishes where that settles. (Against the flow there are saddles too, on which Newton's method may end.)
+    solves T(1, r) = K4 r |r| at any voltage (in reverse T(-1, -r) = -K4 r |r|), and omega_m is the root of a
+    quadratic. That point is the start of a simulation where U_0 is not zero; a Newton-type solution then polishes
+    where that settles. (Against the flow there are saddles too, on which Newton's method may end.)
 
     Raises ValueError if no steady state is found.
     """

@@ -1,8 +1,8 @@
 """The propeller seen from the side and end on, blurred by the angle that it turned while the frame was exposed.
 
 At full voltage a blade moves on to the place of the next in less than a step. Sharp pictures of every step would
-then seem to stand still or to turn backwards. So a frame is the mean of all pictures between two angles: what a
-camera sees whose shutter stays open from one frame to the next.
+then seem to stand still or to turn backwards. A frame is the mean of all pictures between two angles, as from a
+camera whose shutter stays open from one frame to the next.
 """
 
 from __future__ import annotations

@@ -70,7 +70,8 @@ def _learnt(groups: Groups) -> Iterator[str]:
             figure = figure_of(groups, VARIANT_NOISE, kind, observed)
             if best is not None and figure is not None:
                 value = as_interval(figure / best)
-                yield f"{name_of(kind, observed)} costs {shown(value, '.3f')} times what MPC does: {_near(value)}."
+                cost = shown(value, ".3f")
+                yield f"{name_of(kind, observed)} costs {cost} times as much as MPC: {_near(value)}."
 
 
 def _wrong(groups: Groups) -> Iterator[str]:
@@ -119,4 +120,4 @@ def _near(value: Interval) -> str:
 def _verdict(value: Interval) -> str:
     if value.low > 0:
         return "better"
-    return "worse" if value.high < 0 else "no difference that this shows"
+    return "worse" if value.high < 0 else "no significant difference"

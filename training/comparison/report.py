@@ -31,13 +31,16 @@ def check_page(page: Path) -> None:
         raise ValueError(f"{rule}, but {page} has none")
 
 
-def write_report(results: Sequence[Result], comparison: Comparison, page: Path) -> list[Path]:
+ROUGH = "**Rough**, by `--quick`: it shows that all runs, not which policy is better."
+
+
+def write_report(results: Sequence[Result], comparison: Comparison, page: Path, rough: bool = False) -> list[Path]:
     """Write the tables of a page again, and the pictures beside it; return the files.
 
-    A missing page is created. Tables stand between `<!-- table NAME -->` and `<!-- end -->`.
+    A missing page is created. Tables stand between `<!-- table NAME -->` and `<!-- end -->`; rough ones say so.
     """
     tables: dict[str, Callable[[], str]] = {
-        f"policies_{noise}": partial(_noise_table, results, noise) for noise in comparison.noises
+        f"policies_{noise}": partial(_noise_table, results, noise, rough) for noise in comparison.noises
     }
     tables["summary"] = lambda: table(["", *comparison.noises], summary_rows(results))
     tables["answers"] = lambda: "\n".join(f"- {sentence}" for sentence in answers(results))
@@ -48,8 +51,8 @@ def write_report(results: Sequence[Result], comparison: Comparison, page: Path) 
     return [page, curves, errors]
 
 
-def _noise_table(results: Sequence[Result], noise: str) -> str:
-    return table(HEADER, rows_of(results, noise))
+def _noise_table(results: Sequence[Result], noise: str, rough: bool) -> str:
+    return table(HEADER, rows_of(results, noise)) + (f"\n\n{ROUGH}" if rough else "")
 
 
 def _new_page(comparison: Comparison, names: Sequence[str]) -> str:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from numerics.files import write_whole
+from numerics.modules import safe_paths
 from numerics.threads import cores
 from training.classical import classical_policy
 from training.comparison.plan import CLASSICAL, Comparison, Run, runs_of
@@ -68,9 +69,10 @@ def run_comparison(
     done = len(runs) - len(missing)
     context = multiprocessing.get_context("spawn")
     workers = min(jobs or cores(), max(1, len(missing)))
-    pool = ProcessPoolExecutor(workers, context, _prepare, (context.Value("i", 0),))
+    with safe_paths():  # a process that tracks the shared counter starts here
+        pool = ProcessPoolExecutor(workers, context, _prepare, (context.Value("i", 0),))
     try:
-        with without_interrupts():
+        with without_interrupts(), safe_paths():
             futures: dict[Future, Run] = {
                 pool.submit(_do, run, folder, comparison.episodes): run for run in missing
             }

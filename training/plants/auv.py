@@ -82,11 +82,9 @@ class Vehicle(TrainingPlant):
         if observed.pairs or observed.form != "estimate":
             raise ValueError(f"{name} must observe measurements or a state, but got observe={observe!r}")
 
-    def classical(self, name: str, setup):
+    def classical(self, name: str, env, training_returns):
         """PD control of depth and course, from measurements, from an estimate or from the true state."""
-        from training.environments import make_single
-
-        return self.corrected(name, make_single(setup).env)
+        return self.corrected(name, env.env)
 
     def corrected(self, name: str, env):
         """The same for an env with a filter, or `ObserveState`, as its outermost wrapper, if it has one."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
     from training.controllers import ClassicalPolicy
-    from training.setup import TrainingConfiguration
+
+
+# Returns (copies, episodes) of so many copies of a policy, stepped side by side, on the same training seeds.
+TrainingReturns = Callable[["ClassicalPolicy", int, int], np.ndarray]
 
 
 class Task(NamedTuple):
@@ -96,8 +99,8 @@ class TrainingPlant(ABC):
             raise ValueError(f"{name} must observe a state, but got observe={observe!r}")
 
     @abstractmethod
-    def classical(self, name: str, setup: TrainingConfiguration) -> ClassicalPolicy:
-        """A classical policy for the observation set of a training configuration."""
+    def classical(self, name: str, env: gym.Wrapper, training_returns: TrainingReturns) -> ClassicalPolicy:
+        """A classical policy for the observations of an env, from `make_single`; its gains may be tried out."""
 
     def corrected(self, name: str, env: gym.Env) -> ClassicalPolicy:
         """The controller that a policy corrects, by one of the names `correctable`."""

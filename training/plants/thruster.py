@@ -66,11 +66,11 @@ class Thruster(TrainingPlant):
         """What a filter assumes: `thruster_env.model.thruster_model`."""
         return thruster_model(**arguments)
 
-    def classical(self, name: str, setup):
+    def classical(self, name: str, env, training_returns):
         """PI, LQR, or a predictive controller."""
         from training.plants.thruster_controllers import controller_of
 
-        return controller_of(name, setup)
+        return controller_of(name, env, training_returns)
 
     def corrected(self, name: str, env):
         """A predictive controller."""

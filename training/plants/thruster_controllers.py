@@ -17,10 +17,7 @@ from thruster_env.control.controllers import LQRController, PIController
 from thruster_env.control.predictive import HORIZONS, PredictiveController
 from thruster_env.dynamics import Constants
 from training.controllers import ClassicalPolicy
-from training.environments import make_single
-from training.score import score
-from training.setup import TrainingConfiguration
-from tuning.problems.seeds import training_seeds
+from training.plants.plant import TrainingReturns
 
 GAINS = (
     0.5,
@@ -50,25 +47,22 @@ def predictive(name: str, env: gym.Env) -> ClassicalPolicy:
     return ClassicalPolicy(controller, 1, _max_voltage(env), keeps_input=True)
 
 
-def lqr(setup: TrainingConfiguration) -> ClassicalPolicy:
+def lqr(env: gym.Env) -> ClassicalPolicy:
     """LQR on the true state, or on an estimate: certainty equivalence, so LQG."""
-    env = make_single(setup)
     return ClassicalPolicy(LQRController.for_env(env), 1, _max_voltage(env))
 
 
-def pi(setup: TrainingConfiguration) -> ClassicalPolicy:
+def pi(env: gym.Env, training_returns: TrainingReturns) -> ClassicalPolicy:
     """PI with feed-forward on the thrust of an observation set, with the best gains for it.
 
     Factors `GAINS` on both gains of `lambda_gains` are tried on training seeds; the highest mean return wins.
     """
-    env = make_single(setup)
     usual, top = PIController.for_env(env), _max_voltage(env)
     tried = np.array(list(product(GAINS, GAINS))) * [usual.proportional_gain, usual.integral_gain]
     # All pairs of gains at once, each on its own copies: gains may be arrays.
     each = np.repeat(tried, GAIN_SEEDS, axis=0).T
-    seeds = list(training_seeds(setup.seed, GAIN_SEEDS)) * len(tried)
-    returns = score(ClassicalPolicy(_with_gains(usual, *each), 0, top), setup, seeds).returns
-    best = tried[returns.reshape(len(tried), GAIN_SEEDS).mean(axis=1).argmax()]
+    returns = training_returns(ClassicalPolicy(_with_gains(usual, *each), 0, top), len(tried), GAIN_SEEDS)
+    best = tried[returns.mean(axis=1).argmax()]
     return ClassicalPolicy(_with_gains(usual, *best.tolist()), 0, top)
 
 
@@ -81,8 +75,8 @@ def _with_gains(controller: PIController, proportional, integral) -> PIControlle
     return replace(controller, proportional_gain=proportional, integral_gain=integral)
 
 
-def controller_of(name: str, setup: TrainingConfiguration) -> ClassicalPolicy:
-    """A classical policy of the thruster by the name of its controller."""
+def controller_of(name: str, env: gym.Wrapper, training_returns: TrainingReturns) -> ClassicalPolicy:
+    """A classical policy of the thruster by name; arguments as of `TrainingPlant.classical`."""
     if name in HORIZONS:
-        return predictive(name, make_single(setup).env)
-    return {"pi": pi, "lqr": lqr}[name](setup)
+        return predictive(name, env.env)
+    return lqr(env) if name == "lqr" else pi(env, training_returns)

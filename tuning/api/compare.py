@@ -10,15 +10,18 @@ from typing import Any
 
 from filters.augmented import Unknown
 from filters.estimators.find import is_foreign, label_of
+from filters.filter import Filter
 from filters.registry import filter_class
 from filters.tuned_file import read_tuned_file
 from numerics.checks import at_least, shown
 from tuning.api.comparison import FilterComparison
 from tuning.api.evaluate import NOMINAL
+from tuning.api.own_numbers import DEFAULT_FILTER, is_own, own_choice
 from tuning.api.problems import given_for, is_filter, problems_of
 from tuning.api.progress import console_for, row_bar
 from tuning.api.study import Study
 from tuning.api.tune import tune
+from tuning.evaluation.baselines import OWN
 from tuning.evaluation.compare import Contender, contender, sized
 from tuning.evaluation.compare import compare as compare_all
 from tuning.evaluation.fitting import fitting
@@ -57,17 +60,19 @@ def compare(
         comparison.plot_scores()
 
     Args:
-        filters: names of filters, tuned files, `Study`s, or somebody's estimators, in a list; the first is what
-            the others are compared with.
+        filters: names of filters, tuned files, `Study`s, other packages' estimators, or your own: a filter such as
+            `make_filter("ekf", model)` or a model with its Q and R, in a list; the others are compared with the
+            first.
         problem: on what, as `tuning.tune` takes it; several in a list. By default that of the first tuned file or
             study, or "nominal".
         seeds: number of held-out seeds.
         seed: of the study to which they belong.
         trials: tune each filter that is named with so many trials first; all filters on the same training seeds.
-        knows: what a filter that is named, and not tuned, knows of the plant's noise: "true" (oracle), "scaled"
-            (scaled default) or "untuned" (rule of thumb); the first that there is on every problem if None.
+        knows: the Q and R of a filter given by name: "true" (oracle), "scaled" (scaled default), "untuned" (rule
+            of thumb) or "given" (those of the model that filters assume); by default the oracle's, or the scaled
+            default's where the plant's Q and R are unknown.
         augment: constants of the model, such as "ambient_velocity", that each filter also estimates in a further
-            row; by name with an `Unknown`, or (std, walk), for what is believed of it.
+            row; by name with an `Unknown`, or (std, walk).
         ensemble_size: of all filters, or by name.
         preset: the problems of another thruster, by name or file.
         progress: whether to show it; None in terminals and notebooks only.
@@ -148,6 +153,9 @@ def contenders_of(
             out.append(
                 Contender(_new(f"{label_of(choice.name)} tuned", out), partial(_same, choice), knows=OF_FILE)
             )
+        elif is_own(one):
+            label = f"{one.name if isinstance(one, Filter) else DEFAULT_FILTER} {OWN}"
+            out.append(Contender(_new(label, out), partial(own_choice, one)))
         elif not is_filter(one):
             size = size_of(read_tuned_file(one)["filter"]["name"])
             out.append(Contender(_new(Path(one).stem, out), partial(_from_file, Path(one), size), knows=OF_FILE))
@@ -160,7 +168,7 @@ def contenders_of(
 
 
 def beliefs_of(augment: Sequence[str] | Mapping[str, Any]) -> dict[str, Unknown | None]:
-    """What is believed of constants at first; None for what is usual."""
+    """The priors of the constants; None for the defaults."""
     if not isinstance(augment, Mapping):
         return dict.fromkeys([augment] if isinstance(augment, str) else augment)
     found: dict[str, Unknown | None] = {}
@@ -173,7 +181,7 @@ def beliefs_of(augment: Sequence[str] | Mapping[str, Any]) -> dict[str, Unknown 
 
 
 def _is_named(given: Any) -> bool:
-    return not isinstance(given, Study) and is_filter(given)
+    return not isinstance(given, Study) and not is_own(given) and is_filter(given)
 
 
 def _default(filters: Sequence[Any]) -> Any:
@@ -181,13 +189,13 @@ def _default(filters: Sequence[Any]) -> Any:
     for one in filters:
         if isinstance(one, Study):
             return list(one.problems)
-        if not is_filter(one):
+        if not is_own(one) and not is_filter(one):
             return read_tuned(one, given_for(one))[1]
     return NOMINAL
 
 
 def knowledge_on(problems: Sequence[Problem]) -> str:
-    """What filters know of the noise unless it is said: all of it, or the scaled default where nobody does."""
+    """What filters know of the noise by default: all of it, or the scaled default if it is unknown."""
     return "scaled" if any(one.true is None for one in problems) else "true"
 
 

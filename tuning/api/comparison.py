@@ -11,6 +11,7 @@ import numpy as np
 
 from filters.consistency.intervals import Interval, slightly
 from filters.looks import colour_of
+from numerics.characters import TITLE, verbatim
 from numerics.plots import panels
 from numerics.text_tables import plain_text
 from tuning.api.held_out import cells_of
@@ -50,15 +51,15 @@ class FilterComparison:
 
     @property
     def filters(self) -> tuple[str, ...]:
-        """Labels of the filters; the first is what the others are compared with."""
+        """Labels of the filters; the others are compared with the first."""
         return tuple(row.label for row in self.boards[0].rows)
 
     def ranked(self, problem: int = 0) -> list[str]:
-        """Labels of the filters on a problem, by its place, the best score first; the likeliest without truth."""
+        """Labels of the filters on a problem, by its index, the best one (without truth the likeliest) first."""
         return [row.label for row in sorted(self.boards[problem].rows, key=_rank)]
 
     def sentences(self) -> list[str]:
-        """On each problem, who is significantly better or worse than the first filter."""
+        """The filters that are significantly better or worse than the first one, on each problem."""
         return [winners(board) for board in self.boards]
 
     def to_frame(self) -> pandas.DataFrame:
@@ -85,7 +86,7 @@ class FilterComparison:
         return frame(columns)
 
     def plot_scores(self) -> Figure:
-        """Score of each filter with its 95 % interval, a panel a problem; without truth the log-likelihood gained.
+        """Score of each filter with 95 % interval, a panel per problem; without truth the log-likelihood gained.
 
         Hollow are filters that do not differ significantly from the first.
         """
@@ -160,9 +161,9 @@ def _draw(axis: Any, board: Leaderboard) -> None:
         face = "white" if row.verdict == "tie" and place else colour
         axis.plot([value.low, value.high], [-place, -place], "|-", color=colour, linewidth=1.4)
         axis.plot(value.value, -place, "o", color=colour, markerfacecolor=face, markersize=6)
-    axis.set_yticks([-place for place in range(len(board.rows))], [row.label for row in board.rows])
+    axis.set_yticks([-place for place in range(len(board.rows))], [verbatim(row.label) for row in board.rows])
     axis.set_ylim(0.6 - len(board.rows), 0.6)
     axis.grid(axis="y", visible=False)
-    gained = f"log L of a run less that of {board.rows[0].label}"
+    gained = f"log L of a run less that of {verbatim(board.rows[0].label)}"
     axis.set_xlabel("score: mean RMSE over scale [-]" if truth else gained)
-    axis.set_title(board.scenario.name, fontsize=11)
+    axis.set_title(verbatim(board.scenario.name, most=TITLE), fontsize=11)

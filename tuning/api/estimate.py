@@ -38,10 +38,10 @@ def estimate(
     seed: int = 0,
     **numbers: Any,
 ) -> LogEstimates:
-    """Estimate the state of a recorded run, and say what the innovations tell of filter and model.
+    """Estimate the state of a recorded run, and report what the innovations say about filter and model.
 
-    What the log has of the model's states and outputs beside inputs and measurements, such as the thrust of a load
-    cell where the filter sees the tachometer, is held against the estimate.
+    If the log also has states or outputs of the model, such as the thrust of a load cell where the filter sees the
+    tachometer, they are compared with the estimate.
 
         estimates = tuning.estimate("run.csv", tuned="tuned.json")
         estimates.to_frame()
@@ -51,7 +51,7 @@ def estimate(
         log: the path of a .csv, .parquet or .npz file; a table, as a pandas.DataFrame or a mapping from headers to
             arrays; or a `Log`; or a pair (model, log).
         tuned: a tuned file or a `Study`: filter, Q, R and the like.
-        filter: without these, the name of a filter, or somebody's estimator; "ekf" if None.
+        filter: without these, the name of a filter, or another package's estimator; "ekf" if None.
         model: whose log it is, in place of a thruster: a `StateSpaceModel`, what makes or offers one,
             "module:object", or a thruster's preset.
         preset: the thruster that it is of, by name or file.

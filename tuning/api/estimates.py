@@ -1,4 +1,4 @@
-"""`LogEstimates`: what a filter or a smoother makes of a recorded run, as a value."""
+"""`LogEstimates`: the estimates of a filter or a smoother on a recorded run, as a value."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from filters.filter import Filter
 from filters.logs.columns import columns_of
 from filters.logs.estimate import LogEstimate
 from filters.logs.findings import LogFindings
+from filters.logs.verdict import verdict
 from plants.logs.log import Log
 from plants.logs.write import write_columns
 from tuning.api.showing import drawn, frame, html, number
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LogEstimates:
-    """Estimates and innovations of every row of a log, and what they tell of filter and model.
+    """Estimates and innovations of every row of a log, and what they say about filter and model.
 
     Attributes:
         found: the estimate itself.
@@ -64,6 +65,10 @@ class LogEstimates:
         """Of the rows that count; NaN for a filter without a covariance."""
         return self.findings.log_likelihood
 
+    def sentences(self) -> list[str]:
+        """Findings in the log, and what the innovations say about filter and model."""
+        return verdict(self.found, self.findings)
+
     def output(self, symbol: str) -> tuple[np.ndarray, np.ndarray]:
         """An output of the model, such as "T", at the estimates, (K + 1,), and its standard deviation."""
         return self.found.output(symbol)
@@ -82,7 +87,7 @@ class LogEstimates:
         Raises:
             ValueError: for another ending, or if the file cannot be written.
         """
-        write_columns(path, columns_of(self.found))
+        write_columns(path, columns_of(self.found), again=True)
         return Path(path)
 
     def plot_states(self) -> Figure:
@@ -112,4 +117,4 @@ class LogEstimates:
         for what, some in (("prediction less measurement", told.predictions), ("less reference", told.references)):
             for one in some:
                 rows.append([what, one.quantity.short_label, f"{one.rmse:.4g}", f"{one.bias:+.4g}", one.rows])
-        return html(repr(self), ["", "quantity", "RMSE", "bias", "rows"], rows)
+        return html(repr(self), ["", "quantity", "RMSE", "bias", "rows"], rows, " ".join(self.sentences()))

@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tuning.api.held_out import HeldOut, on_held_out
+from tuning.api.own_numbers import is_own, own_choice
 from tuning.api.problems import given_for, is_filter, problem_of
 from tuning.api.progress import console_for
 from tuning.api.study import Study
-from tuning.evaluation.baselines import rule_of_thumb
+from tuning.evaluation.baselines import OWN, TUNED, rule_of_thumb
 from tuning.evaluation.tuned import read_choice, read_tuned
 from tuning.problems.problem import Problem
 from tuning.search.plan import HELD_OUT_SEEDS
@@ -31,7 +32,7 @@ def evaluate(
     model: str | StateSpaceModel | None = None,
     progress: bool | None = None,
 ) -> HeldOut:
-    """Run a filter on held-out seeds of a problem, beside its baselines: scaled default, rule of thumb, oracle.
+    """Run a filter on held-out seeds of a problem, beside its baselines, what was given first.
 
     The rule of thumb takes R from the sensor's data sheet and Q from 1 % of each state's range. The scaled default
     is the same with one factor on Q that brings the mean NIS to 1. The oracle has the plant's own Q and R.
@@ -40,7 +41,8 @@ def evaluate(
         evaluation.to_frame()
 
     Args:
-        tuned: a tuned file, a `Study`, or the name of a filter: then it is the rule of thumb of that filter.
+        tuned: a tuned file, a `Study`, or the name of a filter: then it is the rule of thumb of that filter. Or
+            own numbers: a filter, as `make_filter("ekf", model)`, or a `StateSpaceModel` with its own Q and R.
         problem: on what: a name, a `Problem`, "module:object" or a pair (model, data); by default that of the
             tuned file, or "nominal" for the name of a filter.
         seeds: number of held-out seeds, of problems that can make as many as are asked for.
@@ -56,7 +58,8 @@ def evaluate(
         ValueError: states the rule and the value.
     """
     choice, found, is_tuned = subject_of(tuned, problem, preset, model)
-    return on_held_out(choice, found, seed, seeds, is_tuned=is_tuned, console=console_for(progress))
+    name = OWN if is_own(tuned) else TUNED
+    return on_held_out(choice, found, seed, seeds, is_tuned=is_tuned, console=console_for(progress), name=name)
 
 
 def subject_of(
@@ -68,14 +71,19 @@ def subject_of(
     """The choice, the problem, and whether it was tuned; the arguments are those of `evaluate`."""
     if isinstance(tuned, Study):
         return tuned.choice, problem_of(tuned.problem if problem is None else problem, preset), True
+    if is_own(tuned):
+        if problem is None:
+            raise ValueError(f"a filter or model must come with a problem, but got {type(tuned).__name__} alone")
+        found = problem_of(problem, preset)
+        return own_choice(tuned, found), found, True
     if is_filter(tuned):
         found = problem_of(NOMINAL if problem is None else problem, preset)
         return rule_of_thumb(tuned, found), found, False
     if problem is None:
         if preset is not None:
             raise ValueError(
-                "preset (--preset) must come with a problem (--problem), for a tuned file names its "
-                "own, but got it alone"
+                "preset (--preset) must come with a problem (--problem), because a tuned file names its own, "
+                "but got it alone"
             )
         choice, found, _ = read_tuned(tuned, given_for(tuned, model=model))
         return choice, found, True

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
+from rich.console import Console, RenderableType
 
 from filters.consistency.intervals import Interval
 from filters.consistency.report import ConsistencyReport
@@ -16,7 +16,7 @@ from numerics.checks import at_least
 from numerics.text_tables import plain_text
 from tuning.api.progress import working
 from tuning.api.showing import about, drawn, frame, html, number
-from tuning.evaluation.baselines import RULE, SCALED, TUNED, baselines
+from tuning.evaluation.baselines import RULE, TUNED, baselines
 from tuning.evaluation.evaluate import Evaluation, check_consistency
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import metrics
@@ -42,6 +42,8 @@ class HeldOut:
         proof: evaluations, bound and seeds.
         is_tuned: whether the choice is that of a study; else it is the rule of thumb.
         seed: of the study to which the seeds belong.
+        name: what the filter is called, "tuned" or, of numbers that the user brought, "own numbers".
+        chosen: of a study what was chosen and what gave way, in sentences.
     """
 
     choice: Choice
@@ -49,6 +51,8 @@ class HeldOut:
     proof: Comparison
     is_tuned: bool = True
     seed: int = 0
+    name: str = TUNED
+    chosen: tuple[str, ...] = ()
 
     @property
     def filter(self) -> Filter:
@@ -59,7 +63,10 @@ class HeldOut:
     def evaluations(self) -> dict[str, Evaluation]:
         """What each filter achieved: "rule of thumb", "scaled default", "tuned", "oracle", where there is one."""
         found = self.proof.evaluations
-        return {name: one for name, one in found.items() if self.is_tuned or name != TUNED}
+        return {self._called(name): one for name, one in found.items() if self.is_tuned or name != TUNED}
+
+    def _called(self, name: str) -> str:
+        return self.name if name == TUNED else name
 
     @property
     def evaluation(self) -> Evaluation:
@@ -69,7 +76,10 @@ class HeldOut:
     @property
     def choices(self) -> dict[str, Choice]:
         """The numbers of each filter."""
-        found = {TUNED: self.choice, **baselines(self.choice.name, self.problem, self.seed, self.proof.default)}
+        found = {
+            self.name: self.choice,
+            **baselines(self.choice.name, self.problem, self.seed, self.proof.default),
+        }
         return {name: found[name] for name in self.evaluations}
 
     @property
@@ -122,8 +132,8 @@ class HeldOut:
         return frame(columns, "filter")
 
     def check_consistency(self) -> ConsistencyReport:
-        """Hold the filter's errors and innovations against its own covariances: NEES, NIS, whiteness, coverage."""
-        return check_consistency(self.filter, self.problem.data(self.seeds))
+        """Compare the filter's errors and innovations with its own covariances: NEES, NIS, whiteness, coverage."""
+        return check_consistency(self.filter, self.problem.data(self.seeds), self.problem.dt)
 
     def plot_errors(self) -> Figure:
         """RMSE of each state, of all filters, with 95 % intervals and the bound.
@@ -147,10 +157,10 @@ class HeldOut:
         place = at_least("place", place, 0, len(self.seeds) - 1)
         pair = {RULE: self.choice}
         if self.is_tuned:
-            others = {name: one for name, one in self.choices.items() if name != TUNED}
-            first = SCALED if SCALED in others else RULE
-            pair = {first: others[first], TUNED: self.choice}
-        filters = {self.proof.label(name): one.filter(self.problem) for name, one in pair.items()}
+            others = {name: one for name, one in self.choices.items() if name != self.name}
+            first = self.proof.baselines[0]
+            pair = {first: others[first], self.name: self.choice}
+        filters = {name: one.filter(self.problem) for name, one in pair.items()}
         data, scored = self.problem.data(self.seeds), self.evaluation.scored or None
         return drawn(draw_estimates(filters, data, place, self.problem.dt, scored))
 
@@ -172,21 +182,23 @@ class HeldOut:
         what = f"{label_of(self.choice.name)} on {self.problem.name}, {seeds}"
         if not self.evaluation.has_truth:
             return f"HeldOut({what}: log-likelihood of a run {number(self.evaluation.log_likelihood)})"
-        ratios = [f"{about(one)} x {self.proof.label(name)}" for name, one in self.ratios.items()][
-            : int(self.is_tuned)
-        ]
+        ratios = [f"{about(one)} x {name}" for name, one in self.ratios.items()][: int(self.is_tuned)]
         return f"HeldOut({', '.join([f'{what}: score {about(self.score)}', *ratios])})"
 
     def __str__(self) -> str:
-        """The table of errors and what tuning is worth, as `thruster evaluate` prints them."""
+        """The choice, then the table of errors and the gain of tuning, as the commands print them."""
+        return plain_text([*self.chosen, *self.tables()])
+
+    def tables(self) -> list[RenderableType]:
+        """The table of errors and the gain of tuning, for a terminal."""
         where = f"held-out {self.problem.seed_word} {self.seeds.start} to {self.seeds.stop - 1}"
-        shown = [comparison_table(self.evaluations, self.bound, f"{where}, scenario {self.problem.name}")]
-        return plain_text([*shown, *self.sentences()])
+        table = comparison_table(self.evaluations, self.bound, f"{where}, scenario {self.problem.name}")
+        return [table, *self.sentences()]
 
     def sentences(self) -> list[str]:
-        """What tuning is worth beside each baseline; of a filter that is not tuned what the scaled default is."""
+        """The gain of tuning over each baseline; for an untuned filter a description of the scaled default."""
         if self.is_tuned:
-            return gains(self.proof, self.problem.seed_word)
+            return gains(self.proof, self.problem.seed_word, self.name)
         truth = [] if self.evaluation.has_truth else [without_truth(self.problem.name)]
         return [*truth, scaling_sentence(self.proof)]
 
@@ -197,7 +209,7 @@ class HeldOut:
             found = [number(one.log_likelihood, ".2f")]
             if truth:
                 found = [*(about(rmse) for rmse in one.rmse), about(one.score), number(one.nees.value, ".3g")]
-            rows.append([self.proof.label(name), *found, number(one.nis.value, ".3g")])
+            rows.append([name, *found, number(one.nis.value, ".3g")])
         what = "RMSE" if truth else "Log-likelihood of the innovations of a run, and their mean NIS,"
         title = f"{what} on {len(self.seeds)} held-out {self.problem.seed_word} of {self.problem.name}"
         note = "In brackets 95 % intervals. Score: mean over states of RMSE over scale." if truth else ""
@@ -212,10 +224,11 @@ def on_held_out(
     *,
     is_tuned: bool,
     console: Console,
+    name: str = TUNED,
 ) -> HeldOut:
     """Run a choice and its baselines on held-out seeds; arguments as of `HeldOut` and `evaluate_held_out`."""
     with working(f"{label_of(choice.name)} on {seeds} seeds of {problem.name}", console):
-        return HeldOut(choice, problem, evaluate_held_out(choice, problem, seed, seeds), is_tuned, seed)
+        return HeldOut(choice, problem, evaluate_held_out(choice, problem, seed, seeds), is_tuned, seed, name)
 
 
 def cells_of(one: Evaluation) -> dict[str, float]:
@@ -225,6 +238,6 @@ def cells_of(one: Evaluation) -> dict[str, float]:
     errors += [(one.outputs[symbol].short_label, rmse) for symbol, rmse in one.output_rmse.items()]
     for label, rmse in errors:
         cells |= {f"RMSE {label}": rmse.value, f"RMSE {label} low": rmse.low, f"RMSE {label} high": rmse.high}
-    for name, value in (("score", one.score), ("NEES", one.nees), ("NIS", one.nis)):
+    for name, value in (("score", one.score), ("log score", one.log_score), ("NEES", one.nees), ("NIS", one.nis)):
         cells |= {name: value.value, f"{name} low": value.low, f"{name} high": value.high}
     return cells | {"log-likelihood": one.log_likelihood, "restarts": one.divergences}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from tuning.api.showing import drawn, frame, html
 from tuning.identification.profiles import profile_figure, profiles
 from tuning.identification.result import Identification
 from tuning.identification.validation import Validation
-from tuning.logs.identify import write_found
+from tuning.logs.identify import remarks, write_found
 
 if TYPE_CHECKING:
     import pandas
@@ -71,16 +72,19 @@ class Identified:
         return self.found.objective.model_at(self.found.at)
 
     def sentences(self) -> list[str]:
-        """What the data determine, and what they do not."""
-        return self.found.sentences()
+        """Which parameters the data determine, and the findings in the logs."""
+        return [*self.found.sentences(), *remarks(self.runs, self.held_out, self.found)]
 
     def to_frame(self) -> pandas.DataFrame:
-        """A row a parameter: unit, start, value, standard error, and whether the data determine it.
+        """A row a parameter: unit, start, value, standard error, whether the data determine it, and a test.
+
+        "p" is the probability of so large a fall of the likelihood where the parameter is held "left out at", if
+        that were the truth: zero where its range holds zero, else the start.
 
         Raises:
             ValueError: if pandas is not installed.
         """
-        names = self.found.names
+        names, tests = self.found.names, self.found.null_tests
         columns: dict[str, Sequence[Any]] = {
             "parameter": list(names),
             "unit": [one.unit for one in self.found.objective.coordinates.free],
@@ -88,11 +92,13 @@ class Identified:
             "value": [self.values[name] for name in names],
             "standard error": [self.standard_errors[name] for name in names],
             "determined": [self.determined[name] for name in names],
+            "left out at": [tests[name].at if name in tests else math.nan for name in names],
+            "p": [tests[name].p if name in tests else math.nan for name in names],
         }
         return frame(columns, "parameter")
 
     def save(self, path: str | Path) -> Path:
-        """Write the file of what was found, the `preset` of other calls and commands; return the path.
+        """Write the result to a file, a `preset` for other calls and commands; return the path.
 
         Of a thruster it is a preset file, which `gym.make(preset=...)` takes, too; of another model its numbers.
 
@@ -121,13 +127,15 @@ class Identified:
         return f"Identified({values}{more}; {said}, {len(self.runs)} runs)"
 
     def _repr_html_(self) -> str:
+        tests = self.found.null_tests
         units = {one.name: one.unit for one in self.found.objective.coordinates.free}
         rows = [
             [name, units[name], f"{self.found.start[name]:.5g}", f"{value:.5g}"]
             + [f"{self.standard_errors[name]:.2g}", "yes" if self.determined[name] else "no"]
+            + ([f"{tests[name].at:.4g}", tests[name].said] if name in tests else ["-", "-"])
             for name, value in self.values.items()
         ]
-        columns = ["", "unit", "start", "value", "standard error", "determined"]
+        columns = ["", "unit", "start", "value", "standard error", "determined", "if left out, at", "p"]
         steps = sum(log.steps for log in self.runs)
         title = f"Identified on {len(self.runs)} runs, {steps} steps"
         return html(title, columns, rows, " ".join(self.sentences()))

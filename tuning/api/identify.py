@@ -40,6 +40,7 @@ def identify(
     noise: bool = True,
     held_out: Any = None,
     use_all: bool = False,
+    hold_gaps: bool = False,
     filter: str = "ekf",
     predicted: Sequence[str] = (),
     degrees: float = math.inf,
@@ -61,9 +62,9 @@ def identify(
     Args:
         logs: one recorded run or several: paths of .csv, .parquet or .npz files, tables, or `Log`s; or a pair
             (model, logs).
-        free: names of what is to be found; of a thruster its damping, gain and lift by default.
-        model: in place of a thruster: a function that makes a `StateSpaceModel` (of dt, if it takes it), a model,
-            "module:object" for either, or a thruster's preset.
+        free: names of the free parameters; for a thruster its damping, gain and lift by default.
+        model: in place of a thruster: a function that returns a `StateSpaceModel` (called with dt, if it takes
+            it), a model, "module:object" for either, or a thruster's preset.
         preset: the thruster where the search starts, by name or file.
         sensors: what the filter sees of a thruster.
         columns: headers by quantity.
@@ -74,6 +75,7 @@ def identify(
         noise: whether the variances of Q and R are found, too.
         held_out: runs that only validate, themselves or by path; by default every third of three or more.
         use_all: hold no run out.
+        hold_gaps: hold the last input over gaps of a log; by default runs are cut there.
         filter: "ekf", or "kf" for affine models.
         predicted: channels that the filter predicts but never sees, such as a load cell's thrust.
         degrees: of freedom of Student-t errors, such as 20, of predicted channels, if there are any.
@@ -93,7 +95,7 @@ def identify(
     logs, model, preset = whose_logs(logs, model, preset)
     whose: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensors}
     read: dict[str, Any] = {**whose, "columns": columns, "clock_offset": clock_offset, "dt": dt}
-    runs, proving = split_runs(logs, held_out, use_all=use_all, **read)
+    runs, proving = split_runs(logs, held_out, use_all=use_all, hold_gaps=hold_gaps, **read)
     family = family_of(runs, names, **whose, noise=noise, filter=filter)
     search: dict[str, Any] = {"predicted": tuple(predicted), "degrees": degrees, "gate": gate, "starts": starts}
     return identified(
@@ -125,7 +127,7 @@ def identified(
     starts: int = STARTS,
     **search: Any,
 ) -> Identified:
-    """Check what is asked for, search with progress, and validate: what `thruster identify` does, too.
+    """Check the request, search with progress, and validate, as `thruster identify` does.
 
     Args:
         family: from `tuning.logs.identify.family_of`.

@@ -1,4 +1,4 @@
-"""A line of progress in a notebook without ipywidgets, by which rich draws there: one output, drawn anew."""
+"""A line of progress in a notebook without ipywidgets, which rich needs there: one output, redrawn."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ ERASED = "\x1b[2K"
 
 
 class NotebookLine(io.StringIO):
-    """A file for a console of rich: what would stand in the terminal's last line stands in a notebook's output."""
+    """A file for a console of rich: the terminal's last line becomes a notebook's output."""
 
     def __init__(self) -> None:
         """Begin without an output; the first text makes one."""
@@ -27,7 +27,7 @@ class NotebookLine(io.StringIO):
         return len(text)
 
     def isatty(self) -> bool:
-        """True: lines are drawn anew."""
+        """True: lines are redrawn."""
         return True
 
     def _show(self, line: str) -> None:

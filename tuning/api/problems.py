@@ -1,4 +1,4 @@
-"""What a user gives for a problem, as a `Problem`: a name, a problem itself, or a model and recorded runs."""
+"""A user's problem argument as a `Problem`: a name, a problem itself, or a model and recorded runs."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from filters.tuned_file import read_tuned_file
 from numerics.checks import shown
 from numerics.modules import is_code
 from tuning.logs.problem import log_problem, problems_in
+from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem, named
 from tuning.problems.problem import Problem
 from tuning.problems.rooms import built_in, room_of_logs
@@ -42,18 +43,23 @@ def problem_of(given: Any, preset: str | Path | None = None, **of_logs: Any) -> 
     if isinstance(given, str | Path):
         found = find_problem(str(given))
     elif isinstance(given, Problem):
-        found = _told_apart(given)
+        found = checked_problem(_told_apart(given))
     else:
         raise ValueError(f"{RULE}, but got {shown(given)}")
     return room_of_logs().of_preset(found, preset)
 
 
 def problems_of(given: Any, preset: str | Path | None = None, **of_logs: Any) -> tuple[Problem, ...]:
-    """One problem, or several of a list; the arguments are those of `problem_of`."""
+    """One problem, or several of a list; the arguments are those of `problem_of`. The second "a" is "a (2)"."""
     some = given if isinstance(given, list) else [given]
     if not some:
         raise ValueError(f"{RULE}, or a list of some, but got an empty list")
-    return tuple(problem_of(one, preset, **of_logs) for one in some)
+    found = [problem_of(one, preset, **of_logs) for one in some]
+    names = [one.name for one in found]
+    for place, name in enumerate(names):
+        if name in names[:place]:  # tables and files know problems by their names
+            found[place] = named(found[place], f"{name} ({names[: place + 1].count(name)})")
+    return tuple(found)
 
 
 def given_for(file: str | Path, problem: Any = None, model: str | None = None, **of_logs: Any) -> list[Problem]:
@@ -72,7 +78,7 @@ def is_filter(given: Any) -> bool:
     """Whether something is a filter or an estimator, and no tuned file: a `Path`, or what ends in .json.
 
     Raises:
-        ValueError: for an unknown name, or what is neither.
+        ValueError: for an unknown name, or any other object.
     """
     if isinstance(given, Path) or (isinstance(given, str) and given not in FILTERS and _is_tuned_file(given)):
         return False

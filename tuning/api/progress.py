@@ -16,6 +16,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
 from filters.estimators.find import label_of
 from numerics.checks import shown
@@ -38,7 +39,7 @@ def console_for(progress: bool | None) -> Console:
     """Where progress is shown.
 
     Args:
-        progress: False for nowhere, True for standard error whatever it is, None for terminals and notebooks.
+        progress: False for none, True for standard error in any case, None for terminals and notebooks.
 
     Raises:
         ValueError: for anything else.
@@ -56,16 +57,17 @@ def console_for(progress: bool | None) -> Console:
 
 @contextmanager
 def working(text: str, console: Console) -> Iterator[None]:
-    """Say what goes on, with how far it is where that is told."""
-    with console.status(f"{text} ...") as status, listening(lambda far: status.update(f"{text}: {far}")):
-        yield
+    """Say what is running, with its progress if known."""
+    with console.status(Text(f"{text} ...")) as status:  # names are a user's, and no markup
+        with listening(lambda far: status.update(Text(f"{text}: {far}"))):
+            yield
 
 
 @contextmanager
 def trial_bar(
     plan: Plan, names: str, total: int, before: Sequence[FrozenTrial], console: Console
 ) -> Iterator[tuple[OnTrial, ShowKinds]]:
-    """What is called after each trial of a study, and with the kinds of filters that are under trial.
+    """The callback after each trial of a study, and with the filter types being tried.
 
     Args:
         plan: of the study.
@@ -78,10 +80,10 @@ def trial_bar(
 
     title, named = f"tuning {{}} on {names}", label_of(plan.filter)
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("best {task.fields[best]}"),
+        TextColumn("best {task.fields[best]}", markup=False),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console) as progress:
@@ -114,13 +116,18 @@ def _best(trials: Sequence[FrozenTrial]) -> str:
     from tuning.search.outcome import best_trial
 
     best = best_trial(trials)
-    return "-" if best is None else f"{best.values[0]:.3f}"
+    return "-" if best is None else f"{best.values[0]:.4g}"
 
 
 @contextmanager
 def row_bar(total: int, console: Console) -> Iterator[Callable[[Problem, str], None]]:
-    """What is called before each filter of a comparison is run, with the problem and the filter's label."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    """The callback before each filter of a comparison runs, with the problem and the filter's label."""
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("comparing ...", total=total)
         begun: list[str] = []

@@ -21,8 +21,8 @@ from tuning.problems.problem import Problem
 from tuning.reporting.beside import Source, write_beside
 from tuning.reporting.report import write_report
 from tuning.reporting.subject import is_file
+from tuning.search.sizing import SIZES
 from tuning.search.storage import open_storage
-from tuning.search.study import SIZES
 
 STUDIES = "out/studies.journal"  # where studies are unless it is told
 
@@ -38,7 +38,7 @@ def report(
 ) -> Path:
     """Write a page on a tuned filter, its study and its evaluation on held-out seeds; return the page's path.
 
-    Beside the page its tables are written as Markdown. The page needs nothing else, no network either. Of a list
+    Beside the page its tables are written as Markdown. The page is self-contained and needs no network. Of a list
     of two it has both side by side and, where they are of the same problem, the paired ratio of their scores.
 
         tuning.report("tuned.json", out="report.html")
@@ -59,7 +59,7 @@ def report(
     console = console_for(progress)
     several: list[Any] = list(source) if isinstance(source, list | tuple) else [source]
     if isinstance(out, Study) or (out is not None and Path(out).suffix == ".json"):
-        rule = "a page must be a file that ends in .html, or a folder for it, and two studies go into one list"
+        rule = "a page must be a file that ends in .html, or a folder for it, and two studies must be in one list"
         raise ValueError(f"{rule}, but got out={shown(out if isinstance(out, Study) else str(out))}")
     page = None if out is None or Path(out).suffix != ".html" else Path(out)
     if page is not None:

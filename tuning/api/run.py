@@ -1,4 +1,4 @@
-"""A study from its plan to its proof: what `tuning.tune` and `thruster tune` both do."""
+"""A study from its plan to its held-out evaluation, for `tuning.tune` and `thruster tune`."""
 
 from __future__ import annotations
 
@@ -22,9 +22,11 @@ from tuning.likelihood.gradient import DIFFERENTIABLE, GradientResult, maximise_
 from tuning.likelihood.identifiability import Identifiability, identify
 from tuning.problems.assumed import AssumedProblem
 from tuning.problems.problem import Problem
+from tuning.reporting.choice_words import choice_sentences
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.storage import open_storage
 from tuning.search.study import FINISHED, StudyResult, checked, finished_trials, open_study, run_study, run_trials
+from tuning.search.validation import as_data
 from tuning.search.workers import run_in_workers
 
 MOST_TRIALS = 1_000_000
@@ -33,7 +35,7 @@ METHODS = ("optuna", "gradient")
 
 
 class Tuning(NamedTuple):
-    """All that a tuning made."""
+    """All results of a tuning."""
 
     study: str
     plan: Plan
@@ -51,8 +53,13 @@ class Tuning(NamedTuple):
 
     @property
     def proof(self) -> Comparison:
-        """The proof on the first scenario."""
+        """The held-out evaluation on the first scenario."""
         return self.proofs[0]
+
+    @property
+    def chosen(self) -> tuple[str, ...]:
+        """What was chosen and what gave way, in sentences."""
+        return tuple(choice_sentences(as_data(self.result.validation), self.plan))
 
     def write(self, file: str | Path) -> None:
         """Write the tuned file."""
@@ -71,10 +78,10 @@ def run_tuning(
     by_gradient: bool = False,
     workers: int = 1,
 ) -> Tuning:
-    """Run or resume a study with a progress bar, prove its choice and, where asked, write the tuned file.
+    """Run or resume a study with a progress bar, evaluate its choice and, if requested, write the tuned file.
 
     Args:
-        plan: what the study is for.
+        plan: of the study.
         trials: finished trials that it shall have in total.
         console: where progress is shown.
         storage: journal file or URL; None for a study that ends with the process.
@@ -85,7 +92,7 @@ def run_tuning(
 
     Raises:
         ValueError: states the rule and the value.
-        KeyboardInterrupt: after Ctrl-C before any trial is complete, or in the midst of the proof.
+        KeyboardInterrupt: after Ctrl-C before any trial is complete, or during the held-out evaluation.
     """
     trials, workers = at_least("trials", trials, 1, MOST_TRIALS), at_least("workers", workers, 1, MOST_WORKERS)
     _check_method(plan, by_gradient)
@@ -106,7 +113,7 @@ def run_tuning(
         already = finished_trials(study)
         before = [trial for trial in study.get_trials(deepcopy=False) if trial.state in FINISHED]
         if already:
-            console.print(f"study {name!r} goes on after {already} finished trials")
+            console.print(f"study {name!r} continues after {already} finished trials")
         with trial_bar(plan, names_of(plan), trials, before, console) as (advance, show_kinds):
             run = partial(run_trials, on_choice=lambda choice: show_kinds([choice.name]))
             if storage is not None and workers > 1:
@@ -123,7 +130,9 @@ def run_tuning(
             proofs = tuple(evaluate_held_out(result.choice, scenario, plan.seed) for scenario in plan.scenarios)
     except KeyboardInterrupt:
         if storage is not None:
-            console.print(f"study {name!r} keeps its trials: the same command goes on with the proof")
+            console.print(
+                f"study {name!r} keeps its trials: the same command continues with the held-out evaluation"
+            )
         raise
     tuning = Tuning(name, plan, result, proofs, out, gradient, rival)
     if out is not None:
@@ -146,6 +155,8 @@ def _check_method(plan: Plan, by_gradient: bool) -> None:
     if not by_gradient:
         return
     one_of("a filter whose likelihood has a gradient", plan.filter, DIFFERENTIABLE)
+    if len(plan.scenarios) > 1:
+        raise ValueError(f"method='gradient' (--method) must come with one problem, but got {names_of(plan)}")
     if plan.hold_r:
         raise ValueError("R must be free for method='gradient' (--method), but got hold_r (--hold-r)")
     if plan.full_q:
@@ -155,7 +166,7 @@ def _check_method(plan: Plan, by_gradient: bool) -> None:
 
 
 def name_of(plan: Plan, by_gradient: bool = False) -> str:
-    """A name for a study of a plan: what differs from the default is in it."""
+    """A name for a study of a plan, with everything that differs from the default."""
     parts = [
         re.sub(r"[^\w.+-]+", "-", label_of(plan.filter)),
         names_of(plan).replace(", ", "+"),
@@ -174,7 +185,7 @@ def names_of(plan: Plan) -> str:
 
 
 def short_name(problem: Problem) -> str:
-    """A problem's name as that of a study and of a file has it."""
+    """A problem's name as used in names of studies and files."""
     return file_name(problem.name)
 
 

@@ -9,7 +9,7 @@ from html import escape
 from math import isfinite
 from typing import TYPE_CHECKING, Any
 
-from filters.consistency.intervals import Interval
+from filters.consistency.intervals import Interval, span
 from numerics.extras import to_install
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def html(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], note
 
 
 def drawn(figure: Any) -> Figure:
-    """The same figure, which a notebook shows even where nobody imported matplotlib.pyplot."""
+    """The same figure, which a notebook shows even without an import of matplotlib.pyplot."""
     figure._repr_png_ = partial(_png, figure)
     return figure
 
@@ -58,9 +58,7 @@ def _png(figure: Figure) -> bytes:
 
 def about(value: Interval, digits: int = 3) -> str:
     """A value with its 95 % interval in brackets; a dash where there is none."""
-    if not isfinite(value.value):
-        return "-"
-    return f"{value.value:.{digits}f} [{value.low:.{digits}f}, {value.high:.{digits}f}]"
+    return span(value, digits) if isfinite(value.value) else "-"
 
 
 def number(value: float | None, form: str = ".4g") -> str:

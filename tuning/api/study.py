@@ -1,8 +1,9 @@
-"""`Study`: what a tuning found, as a value that can be shown, saved and put to use."""
+"""`Study`: the result of a tuning, as a value that can be shown, saved and used."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from filters.estimators.find import label_of
 from filters.filter import Filter
+from numerics.text_tables import plain_text
 from tuning.api.held_out import HeldOut
 from tuning.api.run import Tuning
 from tuning.api.showing import about, drawn, frame, html, number
@@ -26,17 +28,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Study:
-    """A tuned filter, the trials that led to it, and what it is worth on held-out seeds.
+    """A tuned filter, the trials that led to it, and its gain on held-out seeds.
 
     Attributes:
-        tuning: all that was made, as the command line has it: plan, result and proofs.
+        tuning: all results, as on the command line: plan, result and held-out evaluations.
     """
 
     tuning: Tuning
 
     @property
     def name(self) -> str:
-        """What the study is called in its storage."""
+        """The study's name in its storage."""
         return self.tuning.study
 
     @property
@@ -46,7 +48,7 @@ class Study:
 
     @property
     def problem(self) -> Problem:
-        """What it was tuned on; of several problems the first."""
+        """The problem it was tuned on; the first of several."""
         return self.tuning.scenario
 
     @property
@@ -68,7 +70,8 @@ class Study:
     def evaluations(self) -> tuple[HeldOut, ...]:
         """The same on each problem."""
         pairs = zip(self.problems, self.tuning.proofs, strict=True)
-        return tuple(HeldOut(self.choice, one, proof, True, self.tuning.plan.seed) for one, proof in pairs)
+        seed, chosen = self.tuning.plan.seed, self.tuning.chosen
+        return tuple(HeldOut(self.choice, one, proof, seed=seed, chosen=chosen) for one, proof in pairs)
 
     @property
     def trials(self) -> list[FrozenTrial]:
@@ -77,7 +80,7 @@ class Study:
 
     @property
     def interrupted(self) -> bool:
-        """Whether Ctrl-C ended it before it had all its trials."""
+        """Whether Ctrl-C ended it before all trials were finished."""
         return self.tuning.result.interrupted
 
     @property
@@ -137,7 +140,7 @@ class Study:
         return self.held_out.plot_run(place)
 
     def plot_consistency(self) -> Figure:
-        """Whether the tuned filter's covariance is consistent on the held-out seeds, a panel a check."""
+        """Whether the tuned filter's covariance is consistent on the held-out seeds, a panel per check."""
         return self.held_out.plot_consistency()
 
     def plot_sizes(self) -> Figure:
@@ -168,8 +171,9 @@ class Study:
         return f"{said}{ended}: score {about(self.held_out.score)}; tuning {worth(self.tuning.proof)})"
 
     def __str__(self) -> str:
-        """What it is in a line, and the tables of its held-out evaluations."""
-        return "\n\n".join([repr(self), *map(str, self.evaluations)])
+        """The choice and its reason, a summary line, and the tables of its held-out evaluations."""
+        first, tables = plain_text(self.tuning.chosen), [plain_text(one.tables()) for one in self.evaluations]
+        return "\n\n".join([*([first] if first else []), repr(self), *tables])
 
     def _repr_html_(self) -> str:
         from tuning.reporting.units import number_rows
@@ -177,7 +181,8 @@ class Study:
         found = self.held_out
         rows = number_rows(list(found.choices.values()), self.choice.name, self.problem, _text)
         numbers = html(f"Numbers of the {label_of(self.choice.name)} filter", ["", *found.choices], rows)
-        return numbers + found._repr_html_() + f"<p>Tuning {worth(self.tuning.proof)}.</p>"
+        said = " ".join([*self.tuning.chosen, f"Tuning {worth(self.tuning.proof)}."])
+        return numbers + found._repr_html_() + f"<p>{escape(said)}</p>"
 
 
 def _text(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""`tuning.tune`: find the Q, R and other numbers that make a filter good, and prove them on held-out seeds."""
+"""`tuning.tune`: find a filter's Q, R and other parameters, and evaluate them on held-out seeds."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ def tune(
     seed: int = 0,
     objective: str | Sequence[str] | None = None,
     consistent: bool = True,
+    worst: bool = False,
     hold_r: bool = False,
     full_q: bool = False,
     budget: float | None = None,
@@ -40,13 +41,16 @@ def tune(
     held_out: Any = None,
     blocks: int | None = None,
     lead: int | None = None,
+    hold_gaps: bool | None = None,
+    start: str | None = None,
 ) -> Study:
-    """Find the Q, R and ensemble size that make a filter's estimate best, and prove it on held-out seeds.
+    """Find the Q, R and ensemble size that give a filter's best estimate, and evaluate it on held-out seeds.
 
     The score is the mean over states of RMSE over its bound, on 32 training seeds that every trial shares; of
     recorded runs without true states it is the negative log-likelihood of the innovations. The first trial is the
-    rule of thumb. The mean NIS is held in a band, for RMSE alone hardly tells Q and R: only their ratio matters to
-    the estimate. Ctrl-C keeps all finished trials: the study is that of these, and says that it was `interrupted`.
+    rule of thumb. The mean NIS is kept in a band, because RMSE hardly determines Q and R: only their ratio matters
+    to the estimate. Ctrl-C keeps all finished trials: the study is that of these, and says that it was
+    `interrupted`.
 
         study = tuning.tune("mismatch", filter="enkf", trials=50)
         study.save("tuned.json")
@@ -57,23 +61,25 @@ def tune(
     Args:
         problem: a name, such as "mismatch" or "auv:motion", a file that ends in .toml, or "module:object"; a
             `Problem`; a pair (model, data) of a model, or a thruster's preset, and recorded runs; or a list of
-            several problems, whose objectives are averaged. Recorded runs are paths, tables of pandas, mappings
-            from headers to arrays, or `Log`s.
+            several problems, of whose objectives the mean is minimised, or the `worst`. Recorded runs are paths,
+            tables of pandas, mappings from headers to arrays, or `Log`s.
         filter: name of a filter; "auto" for the best of all within the budget; or "module:object" for an estimator
             of your own, which can be used and evaluated, but not saved.
         trials: finished trials that the study shall have in total.
         seed: of all randomness; the same seed repeats all.
-        objective: what is minimised, or two for a Pareto front, as `thruster tune --objective` lists them; the
-            score, or without truth the negative log-likelihood.
-        consistent: whether the mean NIS is held between 0.8 and 1.25 of what is right.
-        hold_r: leave R as the data sheet has it, tune Q alone.
+        objective: the quantity to minimise, or two for a Pareto front, as `thruster tune --objective` lists them;
+            by default the score, or without truth the negative log-likelihood.
+        consistent: whether the mean NIS is kept between 0.8 and 1.25 times its expected value; the objective
+            "log-score" needs no such band.
+        worst: of several problems, minimise the objective of the worst one.
+        hold_r: keep R at the data sheet's value, tune only Q.
         full_q: tune the correlations of Q, too.
-        budget: what a step of the filter may cost [microseconds of one core].
+        budget: time limit of a step of the filter [microseconds of one core].
         sampler: of Optuna: "tpe", "random", "cma-es", ...
         prune: end a trial that is significantly worse than the best on the same seeds.
         method: "optuna", or "gradient": maximum likelihood, for kf and ekf.
         workers: processes on this host that share the study; several need a storage.
-        storage: journal file or URL of a database that keeps the study, so that the same call goes on with it; by
+        storage: journal file or URL of a database that saves the study, so that the same call continues it; by
             default it ends with the process.
         name: of the study; by default from the above.
         progress: whether to show it; None in terminals and notebooks only.
@@ -82,24 +88,27 @@ def tune(
         columns: of recorded runs, headers by quantity.
         clock_offset: of recorded runs, seconds by quantity that a channel's clock is ahead.
         dt: of recorded runs, the sample time [s].
-        held_out: recorded runs that only prove the choice; by default every third.
+        held_out: recorded runs used only for the held-out evaluation; by default every third.
         blocks: how many blocks a recorded run is cut into.
         lead: rows at the beginning of a block that do not count.
+        hold_gaps: of logs, whether runs are not cut at gaps, and their inputs are held there.
+        start: of logs, where blocks begin: "prior", or "measurement", where their first measurement says.
 
     Returns:
         `Study`: `filter`, `choice`, `held_out`, `save(path)`, `to_frame()`, `plot_history()`, `plot_errors()`.
 
     Raises:
         ValueError: states the rule and the value.
-        KeyboardInterrupt: after Ctrl-C before any trial is complete, or in the midst of the proof.
+        KeyboardInterrupt: after Ctrl-C before any trial is complete, or during the held-out evaluation.
     """
     one_of("method", method, METHODS)
     if not isinstance(filter, str):
         raise ValueError(
             f"filter must be a name or 'module:object', by which trials keep it, but got {shown(filter)}"
         )
-    of_logs = {"sensors": sensors, "columns": columns, "clock_offset": clock_offset, "dt": dt}
-    problems = problems_of(problem, preset, **of_logs, held_out=held_out, blocks=blocks, lead=lead)
+    of_logs: dict[str, Any] = {"sensors": sensors, "columns": columns, "clock_offset": clock_offset, "dt": dt}
+    of_logs |= {"held_out": held_out, "blocks": blocks, "lead": lead, "hold_gaps": hold_gaps, "start": start}
+    problems = problems_of(problem, preset, **of_logs)
     if objective is None:
         objective = "score" if problems[0].scale is not None else "likelihood"
     plan = Plan(
@@ -113,6 +122,7 @@ def tune(
         prune=prune,
         budget=budget,
         full_q=full_q,
+        worst=worst,
     )
     where = None if storage is None else str(storage)
     by_gradient = method == "gradient"

@@ -16,6 +16,7 @@ from auv_env.plant_data import check_same_plant, plant_data
 from auv_env.quantities import STATES
 from auv_env.simulation import simulate
 from filters.bounds import path_bound
+from filters.wrapped import wrapped_variances
 from numerics.checks import one_of, positive, shown, vector
 from numerics.streams import episode_keys, filter_keys
 from plants.state_space import StateSpaceModel
@@ -146,7 +147,7 @@ class Scenario(BaseScenario):
 
     @property
     def scale_about(self) -> str:
-        """What the scale is, in words; that of a file may be any."""
+        """A description of the scale, which a file may set freely."""
         return GIVEN if self.name.endswith(".toml") else PATH_BOUND
 
     def bound(self, data: Data) -> np.ndarray:
@@ -156,13 +157,15 @@ class Scenario(BaseScenario):
         the data. `posterior_bound` would be useless here, because angles and positions have hardly any process
         noise.
         """
-        exact, missing = model_of_plant(self.plant, states=self.states), np.isnan(data.measurements)
-        total = np.zeros(exact.n)
+        exact, missing = model_of_plant(self.plant, states=self.states), np.isnan(data.seen.measurements)
+        total, scored, inputs = np.zeros(exact.n), data.scored, data.seen.inputs
         for first in range(0, len(data.seeds), RUNS_AT_ONCE):
             some = slice(first, first + RUNS_AT_ONCE)
-            covs = path_bound(exact, data.inputs[some], missing[some])
-            total = total + np.einsum("bkii->i", covs[:, data.scored])
-        return np.sqrt(total / (len(data.seeds) * (data.steps + 1 - data.first_scored)))
+            covs = path_bound(exact, inputs[some], missing[some])
+            covs = covs[:, data.late] if data.counted is None else covs[scored[some]][None]
+            variances = np.einsum("bkii->bki", covs)
+            total = total + wrapped_variances(variances, exact.shape.state_angles).sum(axis=(0, 1))
+        return np.sqrt(total / scored.sum())
 
     def make(self, seeds: tuple[int, ...]) -> Data:
         """Truth and measurements under the excitation's thrusts and planes."""

@@ -1,4 +1,4 @@
-"""The baselines of a tuned filter: scaled default, rule of thumb and oracle.
+"""The baselines of a tuned filter: given, scaled default, rule of thumb, noise estimation and oracle.
 
 NIS is the normalised innovation squared.
 """
@@ -6,22 +6,27 @@ NIS is the normalised innovation squared.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
+from filters.registry import filter_class
 from tuning.evaluation.evaluate import values_of
-from tuning.problems.assumed import rows_argument
+from tuning.evaluation.residuals import noise_estimation
+from tuning.problems.assumed import as_argument, rows_argument
+from tuning.problems.check import data_of
 from tuning.problems.problem import Problem
 from tuning.search.objectives import LARGEST, nis_ratio
 from tuning.search.plan import TRAINING_SEEDS
-from tuning.search.space import Choice, oracle_choice, untuned_choice
+from tuning.search.space import Choice, given_choice, oracle_choice, untuned_choice
 
 # Their names in tables, sentences and pictures.
-SCALED, RULE, ORACLE, TUNED = "scaled default", "rule of thumb", "oracle", "tuned"
-MODEL_Q = "model's Q"  # the rule of thumb's name in these where there is no range for it to take 1 % of
-NO_RANGES = f"No ranges: the {MODEL_Q} is taken in place of a {RULE}; give the model state_low and state_high."
+GIVEN, SCALED, RULE, NOISE, ORACLE = "given", "scaled default", "rule of thumb", "noise estimation", "oracle"
+TUNED, OWN = "tuned", "own numbers"  # OWN: those that a user brings to an evaluation
+BY_IMPORTANCE = (GIVEN, SCALED, RULE, NOISE, ORACLE)  # the first that there is is the one that a headline names
+NO_RANGES = f"No ranges: the model's Q is taken in place of a {RULE}; give the model state_low and state_high."
 DECADES = 8  # powers of ten, up and down, within which the factor on Q is searched
 DIGITS = 4  # to which the factor is rounded, so that the printed factor is the one in use
 CLOSE = 0.02  # tolerance of the mean NIS about 1: that of an ensemble need not be continuous in Q
@@ -36,14 +41,40 @@ class Scaled(NamedTuple):
     reason: str = ""  # why there is none; empty where there is one
 
 
+def called(name: str) -> str:
+    """A baseline in a sentence, after "the"."""
+    return "given numbers" if name == GIVEN else name
+
+
 def rule_of_thumb(name: str, scenario: Problem) -> Choice:
     """R from the sensor's data sheet, Q = diag((1 % of each state's range)^2), N = 30 (particles: 1000)."""
     return untuned_choice(name, scenario)
 
 
+def given(name: str, scenario: Problem) -> Choice | None:
+    """The filter with the given Q and R of the problem's model; None if there are none.
+
+    Those of a model that has the plant's own Q and R are the oracle's, and not given.
+    """
+    return given_choice(name, scenario) if filter_class(name).has_covariance else None
+
+
 def rule_label(scenario: Problem) -> str:
-    """What the rule of thumb is called in tables and sentences on a problem."""
-    return MODEL_Q if scenario.lacks_ranges else RULE
+    """The name of the rule of thumb on a problem: "given" if it equals the model's given values."""
+    return GIVEN if scenario.given is not None and _same_values(scenario.given, scenario.untuned) else RULE
+
+
+def noise_estimated(name: str, scenario: Problem, seed: int = 0) -> Choice | None:
+    """The filter with the sample covariances of what its model leaves of the truth; None where there are none."""
+    if not filter_class(name).has_covariance:
+        return None
+    found = noise_estimation(scenario, seed)
+    if found.process_cov is None or found.measurement_cov is None:
+        return None
+    q, r = rows_argument(found.process_cov), as_argument(found.measurement_cov)
+    noise = {"process_noise_cov": q, "measurement_noise_cov": r}
+    rule = rule_of_thumb(name, scenario)
+    return rule._replace(model={**rule.model, **noise})
 
 
 def oracle(name: str, scenario: Problem) -> Choice | None:
@@ -57,7 +88,7 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
 
         mean of nu' S(c Q, R)^-1 nu over runs and scored steps = m,  solved for log c
 
-    An engineer who looks at the innovations once would do the same. R stays. The runs are the training runs of a
+    An engineer would do the same after one look at the innovations. R stays. The runs are the training runs of a
     study with this seed, and the random numbers are the same for each c, so the same arguments give the same
     factor.
 
@@ -72,8 +103,8 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
     """
     if not rule_of_thumb(name, scenario).filter(scenario).has_covariance:
         return Scaled(None, None, None, f"{name} has no NIS by which its Q could be scaled")
-    data = scenario.data(scenario.training_seeds(seed, TRAINING_SEEDS))
-    start = _with_q(rule_of_thumb(name, scenario), scenario)
+    data = data_of(scenario, scenario.training_seeds(seed, TRAINING_SEEDS))
+    start = _with_noise(rule_of_thumb(name, scenario), scenario)
 
     def nis_at(factor: float) -> float:
         ratio = nis_ratio(values_of(scaled(start, factor).filter(scenario), data, scenario.scale))
@@ -107,7 +138,7 @@ def scaled_default(name: str, scenario: Problem, seed: int = 0) -> Scaled:
 
 def scaled_rule(rule: Choice, scenario: Problem, factor: float) -> Choice:
     """A rule of thumb with a factor on its Q, even where Q follows from other parameters."""
-    return scaled(_with_q(rule, scenario), factor)
+    return scaled(_with_noise(rule, scenario), factor)
 
 
 def scaled(choice: Choice, factor: float) -> Choice:
@@ -120,20 +151,33 @@ def scaled(choice: Choice, factor: float) -> Choice:
     return choice._replace(model={**choice.model, "process_noise_cov": larger})
 
 
-def _with_q(choice: Choice, scenario: Problem) -> Choice:
-    """The same choice with Q among its arguments, even where Q follows from other parameters."""
+def _with_noise(choice: Choice, scenario: Problem) -> Choice:
+    """The same choice with Q and R among its arguments, even where they follow from other parameters."""
     if "process_noise_cov" in choice.model:
         return choice
-    q = rows_argument(scenario.model(**choice.model).process_noise_cov)
-    return choice._replace(model={**choice.model, "process_noise_cov": q})
+    model = scenario.model(**choice.model)
+    q, r = rows_argument(model.process_noise_cov), as_argument(model.measurement_noise_cov)
+    return choice._replace(model={**choice.model, "process_noise_cov": q, "measurement_noise_cov": r})
 
 
 def baselines(name: str, scenario: Problem, seed: int = 0, default: Scaled | None = None) -> dict[str, Choice]:
     """All baselines of a filter that exist, by name, the most important one first.
 
-    The scaled default is found for the study's seed, unless it is given.
+    The scaled default is computed for the study's seed, unless it is given. If the model's given values are the
+    rule of thumb, there is one baseline for both, called "given".
     """
     scaled = (scaled_default(name, scenario, seed) if default is None else default).choice
-    found = {SCALED: scaled} if scaled is not None else {}
-    known = oracle(name, scenario)
-    return found | {RULE: rule_of_thumb(name, scenario)} | ({} if known is None else {ORACLE: known})
+    found = {GIVEN: given(name, scenario), SCALED: scaled, RULE: rule_of_thumb(name, scenario)}
+    if found[GIVEN] is not None and rule_label(scenario) == GIVEN:
+        del found[RULE]
+    found |= {NOISE: noise_estimated(name, scenario, seed), ORACLE: oracle(name, scenario)}
+    return {key: choice for key, choice in found.items() if choice is not None}
+
+
+def same_filter(a: Choice, b: Choice) -> bool:
+    """Whether two choices are the same filter."""
+    return a.name == b.name and _same_values(a.model, b.model) and _same_values(a.numbers, b.numbers)
+
+
+def _same_values(a: Mapping, b: Mapping) -> bool:
+    return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)

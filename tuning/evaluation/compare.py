@@ -19,7 +19,7 @@ from filters.filter import Filter
 from filters.particles.weighted import WeightedFilter
 from filters.registry import filter_class, make_filter
 from numerics.checks import one_of
-from tuning.evaluation.baselines import oracle, rule_of_thumb, scaled_default
+from tuning.evaluation.baselines import given, oracle, rule_of_thumb, scaled_default
 from tuning.evaluation.evaluate import (
     Evaluation,
     compute_metrics,
@@ -29,6 +29,7 @@ from tuning.evaluation.evaluate import (
 )
 from tuning.evaluation.knowledge import KNOWLEDGE, beliefs_of
 from tuning.evaluation.runs import RunMetrics, joined, metrics_by_run
+from tuning.problems.check import data_of
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.problem import Problem
@@ -58,7 +59,7 @@ class Contender(NamedTuple):
         return make_filter(choice.name, augmented_model(filter_.model, beliefs), **choice.numbers)
 
     def beliefs(self, scenario: Problem) -> dict[str | int, Unknown]:
-        """What is believed at first of the constants that it estimates, too."""
+        """The prior of the constants that it also estimates."""
         return (
             beliefs_of(self.choose(scenario).filter(scenario).model.constants, self.unknown)
             if self.unknown
@@ -106,10 +107,10 @@ class Leaderboard(NamedTuple):
 
 
 def winners(board: Leaderboard) -> str:
-    """Who is significantly better or worse than the first filter."""
+    """The filters that are significantly better or worse than the first one."""
     first, *others = board.rows
     if not others:
-        return f"On {board.scenario.name} there is nothing to compare {first.label} with."
+        return f"On {board.scenario.name} no other filter can be compared with {first.label}."
     said = []
     for verdict, words in VERDICTS.items():
         names = [f"{row.label}{_doubt(row, first)}" for row in others if row.verdict == verdict]
@@ -137,7 +138,8 @@ def contender(
     Args:
         name: name of a filter; or an estimator, a function that makes one from a model, or "module:object".
         knows: "true" for the plant's own Q and R (the oracle), "scaled" for the scaled default, whose Q follows
-            from the mean NIS on the training runs, "untuned" for the rule of thumb.
+            from the mean NIS on the training runs, "untuned" for the rule of thumb, "given" for what the model
+            that filters assume came with.
         unknown: constants of the model to estimate with the states; a belief of None stands for `default_belief`.
         seed: seed of the study whose training runs scale the scaled default.
         **numbers: parameters of the filter, such as `ensemble_size`; by default those of the rule of thumb.
@@ -164,9 +166,14 @@ def contender(
 
 
 def _known(knows: str, name: str, scenario: Problem, seed: int) -> Choice:
-    """The choice of a filter with this knowledge; ValueError where there is no scaled default, or no oracle."""
+    """The choice of a filter with this knowledge; ValueError where there is none."""
     if knows == "untuned":
         return rule_of_thumb(name, scenario)
+    if knows == "given":
+        own = given(name, scenario)
+        if own is None:
+            raise ValueError(f"the model must come with a Q and R of its own, but {scenario.name}'s has none")
+        return own
     if knows == "true":
         known = oracle(name, scenario)
         if known is None:
@@ -191,7 +198,7 @@ def compare(
 ) -> tuple[list[Leaderboard], bool]:
     """Run filters over scenarios, all on the same seeds.
 
-    Ctrl-C ends it after the running filter and keeps what is done; a second one ends it at once.
+    Ctrl-C ends it after the running filter and keeps finished results; a second one ends it at once.
 
     Args:
         contenders: the filters; the others are compared with the first one.
@@ -218,7 +225,7 @@ def compare(
         with stop_on_interrupt() as stopped:
             for scenario, filters in teams:
                 chosen = seeds(scenario) if callable(seeds) else seeds
-                data = scenario.data(chosen)
+                data = data_of(scenario, chosen)
                 board = Leaderboard(scenario, chosen, scenario.bound(data), [])
                 boards.append(board)
                 for one, filter_ in zip(contenders, filters, strict=True):
@@ -236,7 +243,7 @@ def compare(
 
 
 def _row(label: str, filter_: Filter, data: Data, board: Leaderboard) -> Row:
-    runs, seconds = timed_runs(filter_, data)
+    runs, seconds = timed_runs(filter_, data, board.scenario.scale)
     evaluation = compute_metrics(filter_, runs, data, board.scenario.scale)
     first = board.rows[0].evaluation if board.rows else evaluation
     particles = isinstance(filter_, WeightedFilter)
@@ -248,15 +255,19 @@ def _row(label: str, filter_: Filter, data: Data, board: Leaderboard) -> Row:
         nees=evaluation.median_nees if particles else evaluation.nees.value,
         nees_is_median=particles,
         microseconds=1e6 * seconds / data.measurements[..., 0].size,
-        ratios=rmse_ratios(evaluation.mean_squares, first.mean_squares),
+        ratios=rmse_ratios(evaluation.mean_squares, first.mean_squares, evaluation.weights),
         score_ratio=score_ratio(evaluation, first),
         likelihood_gain=likelihood_gain(evaluation, first),
     )
 
 
-def timed_runs(filter_: Filter, data: Data) -> tuple[RunMetrics, float]:
-    """Metrics of a filter on some data, by run, and the seconds that its runs took without compilation."""
-    few = data.filter_keys[:2], data.inputs[:2, :2], data.measurements[:2, :3]
+def timed_runs(filter_: Filter, data: Data, scale) -> tuple[RunMetrics, float]:
+    """Metrics of a filter on some data, by run, and the seconds that its runs took without compilation.
+
+    The scale says of which states log scores are; None for none.
+    """
+    seen = data.seen
+    few = seen.filter_keys[:2], seen.inputs[:2, :2], seen.measurements[:2, :3]
     first = [np.ascontiguousarray(part) for part in few]
     for part in first:
         part.setflags(write=False)  # as the data's arrays: numba compiles again for writable ones
@@ -264,6 +275,6 @@ def timed_runs(filter_: Filter, data: Data) -> tuple[RunMetrics, float]:
     found, seconds, started = [], 0.0, time.perf_counter()
     for some, estimates in estimates_in_parts(filter_, data):
         seconds += time.perf_counter() - started
-        found.append(metrics_by_run(filter_, estimates, some))
+        found.append(metrics_by_run(filter_, estimates, some, scale=scale))
         started = time.perf_counter()
     return joined(found), seconds

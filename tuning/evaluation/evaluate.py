@@ -15,6 +15,7 @@ from filters.consistency.intervals import (
     Interval,
     interval,
     mean_interval,
+    pooled_mean,
     resampled_means,
     rmse_intervals,
     without_interval,
@@ -23,7 +24,8 @@ from filters.consistency.report import ConsistencyReport, findings, joined, repo
 from filters.ensembles.recording import record_members
 from filters.filter import Filter
 from plants.quantities import Quantity
-from tuning.evaluation.runs import RunMetrics, metrics_of_all
+from tuning.evaluation.blow_up import blow_up
+from tuning.evaluation.runs import RunMetrics, metrics_of_all, variance_ratios
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts
 
@@ -34,7 +36,7 @@ NOTHING = Interval(np.nan, np.nan, np.nan)
 class Evaluation(NamedTuple):
     """Metrics of a filter on B seeds; errors are pooled over seeds and scored steps.
 
-    Without truth errors, score and NEES are NaN; what follows from the innovations is there.
+    Without truth, errors, score and NEES are NaN; metrics of the innovations remain.
     """
 
     states: tuple[Quantity, ...]  # of the plant
@@ -53,6 +55,10 @@ class Evaluation(NamedTuple):
     divergences: int  # filter resets (restarts from the prior), over all seeds
     mean_squares: np.ndarray  # (B, n), mean square error of each run, for paired comparisons
     scale: np.ndarray  # (n,), by which the score divides errors
+    weights: np.ndarray | None = None  # (B,), number of scored steps of each run; None where they are all the same
+    log_score: Interval = NOTHING  # mean of log N(x; x^, P) a scored step, of the states that count
+    nees_variance: float = np.nan  # variance over a run's steps, mean over runs, over its expected value, 2 n
+    nis_variance: float = np.nan  # the same of the NIS; its expected value is 2 m where nothing is missing
 
     @property
     def has_truth(self) -> bool:
@@ -77,20 +83,25 @@ def evaluate(filter_: Filter, data: Data, scale) -> Evaluation:
     Raises:
         ValueError: if the scale is not positive, or not one number for each state.
     """
-    return compute_metrics(filter_, metrics_of_all(filter_, data), data, scale)
+    counted = None if data.states is None else _checked(scale, data.states.shape[-1])
+    return compute_metrics(filter_, metrics_of_all(filter_, data, scale=counted), data, scale)
 
 
 def values_of(filter_: Filter, data: Data, scale) -> Evaluation:
     """What `evaluate` gives, faster: values without intervals, without NEES and derived outputs."""
-    return compute_metrics(filter_, metrics_of_all(filter_, data, False, False), data, scale, False)
+    return compute_metrics(filter_, metrics_of_all(filter_, data, False, False), data, scale, False, False)
 
 
-def compute_metrics(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: bool = True) -> Evaluation:
+def compute_metrics(
+    filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: bool = True, variances: bool = True
+) -> Evaluation:
     """Metrics of a filter from those of its runs; other arguments and errors are those of `evaluate`.
 
-    Without intervals their ends are NaN: a trial of a study needs none, and they take longer than the values.
+    Without intervals their ends are NaN: a trial of a study needs none, and they take longer than the values;
+    so do variances of NEES and NIS.
     """
     some = runs.present[runs.present > 0]
+    nees_variance, nis_variance = variance_ratios(runs) if variances else (np.nan, np.nan)
     return Evaluation(
         **_errors(filter_, runs, data, scale, intervals),
         nis=mean_interval(runs.nis, intervals),
@@ -98,7 +109,11 @@ def compute_metrics(filter_: Filter, runs: RunMetrics, data: Data, scale, interv
         channels=data.measurements.shape[-1],
         log_likelihood=float(runs.log_likelihoods.mean()),
         log_likelihoods=runs.log_likelihoods,
+        weights=runs.weights,
         divergences=int(runs.divergences.sum()),
+        log_score=NOTHING if runs.log_scores is None else mean_interval(runs.log_scores, intervals),
+        nees_variance=nees_variance,
+        nis_variance=nis_variance,
     )
 
 
@@ -119,17 +134,17 @@ def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: boo
             "mean_squares": np.full((len(data.measurements), n), np.nan),
             "scale": np.full(n, np.nan),
         }
-    n, scale = data.states.shape[-1], _checked(scale, data.states.shape[-1])
-    found = without_interval(score(mean_squares, scale))
+    n, scale, weights = data.states.shape[-1], _checked(scale, data.states.shape[-1]), runs.weights
+    found = without_interval(score(mean_squares, scale, weights))
     if intervals:
-        found = interval(found.value, _scores(np.sqrt(resampled_means(mean_squares)), scale))
+        found = interval(found.value, _scores(np.sqrt(resampled_means(mean_squares, weights)), scale))
     squares_of = runs.output_mean_squares.items()
-    outputs = {symbol: rmse_intervals(squares, intervals)[0] for symbol, squares in squares_of}
+    outputs = {symbol: rmse_intervals(squares, intervals, weights)[0] for symbol, squares in squares_of}
     return {
         "states": filter_.model.states[:n],
         "outputs": {symbol: filter_.model.outputs[symbol].quantity for symbol in outputs},
-        "rmse": rmse_intervals(mean_squares, intervals),
-        "start_up_rmse": np.sqrt(start_up.mean(axis=(0, 1))),
+        "rmse": rmse_intervals(mean_squares, intervals, weights),
+        "start_up_rmse": np.sqrt(start_up.mean(axis=(0, 1)) if data.counted is None else _mean_there(start_up)),
         "score": found,
         "output_rmse": outputs,
         "nees": mean_interval(nees, intervals),
@@ -139,10 +154,17 @@ def _errors(filter_: Filter, runs: RunMetrics, data: Data, scale, intervals: boo
     }
 
 
+def _mean_there(values: np.ndarray) -> np.ndarray:
+    """Mean (n,) of values (B, T, n) without those that are NaN; NaN where there are no others."""
+    there = ~np.isnan(values)
+    counts = there.sum(axis=(0, 1))
+    return np.where(counts > 0, np.where(there, values, 0.0).sum(axis=(0, 1)) / np.maximum(counts, 1), np.nan)
+
+
 def _checked(scale, n: int) -> np.ndarray:
     scale = np.asarray(scale, dtype=np.float64)
     if scale.shape != (n,):
-        raise ValueError(f"scale must be one number a state, {n}, but got {scale.tolist()}")
+        raise ValueError(f"scale must be one number per state, {n}, but got {scale.tolist()}")
     if not (scale > 0).all():
         raise ValueError(f"scale must be positive in every state, but got {scale.tolist()}")
     if not np.isfinite(scale).any():
@@ -150,33 +172,47 @@ def _checked(scale, n: int) -> np.ndarray:
     return scale
 
 
-def check_consistency(filter_: Filter, data: Data) -> ConsistencyReport:
-    """Consistency of a filter's covariance on some data, and of an ensemble's members."""
-    model, members, first = filter_.model, None, data.scored.start
+def check_consistency(filter_: Filter, data: Data, dt: float | None = None) -> ConsistencyReport:
+    """Consistency of a filter's covariance on some data, and of an ensemble's members.
+
+    Args:
+        filter_: the filter.
+        data: of at least two runs.
+        dt: sample time [s], which is named where the model blows up between samples.
+    """
+    model, members, first = filter_.model, None, data.first_scored
+    seen, states = data.seen, None if data.states is None else data.known_states
     n = model.n if data.states is None else data.states.shape[-1]
     if filter_.size and data.states is not None:
-        some = (part[:MEMBER_RUNS] for part in (data.filter_keys, data.inputs, data.measurements))
+        some = (part[:MEMBER_RUNS] for part in (seen.filter_keys, seen.inputs, seen.measurements))
         members = record_members(filter_, *some, first=first, every=MEMBER_STEPS)
     angles = model.shape.state_angles[:n]
-    parts = []
+    parts, blown = [], ""
     for one, estimates in estimates_in_parts(filter_, data):
+        blown = blown or blow_up(filter_, estimates, one, dt)
         own = estimates._replace(means=estimates.means[..., :n], covs=estimates.covs[..., :n, :n])
-        parts.append(findings(own, one.states, one.measurements, first, angles))
+        parts.append(findings(own, one.states, one.measurements, first, angles, one.counted))
     found = report_of(
         joined(parts),
-        data.states,
+        states,
         members=members,
         first_step=first,
         names=[state.short_label for state in model.states[:n]],
         angles=angles,
         channels=[channel.label for channel in model.measurements],
     )
-    return found._replace(constants=tuple(getattr(model.constants, "_fields", ())))
+    return found._replace(constants=tuple(getattr(model.constants, "_fields", ())), blown=blown)
 
 
-def score(mean_squares: np.ndarray, scale: np.ndarray) -> float:
-    """Mean over states of RMSE over scale, from mean square errors of runs (B, n)."""
-    return float(_scores(np.sqrt(mean_squares.mean(axis=0)), scale))
+def score(mean_squares: np.ndarray, scale: np.ndarray, weights: np.ndarray | None = None) -> float:
+    """Mean over states of RMSE over scale, from mean square errors of runs (B, n), with weights if they differ."""
+    return float(_scores(np.sqrt(pooled_mean(mean_squares, weights)), scale))
+
+
+def mse(mean_squares: np.ndarray, scale: np.ndarray, weights: np.ndarray | None = None) -> float:
+    """Sum over the states that count of mean square error over scale^2; arguments as of `score`."""
+    counted = np.isfinite(scale)
+    return float((pooled_mean(mean_squares, weights)[counted] / scale[counted] ** 2).sum())
 
 
 def _scores(rmse: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -201,7 +237,7 @@ def score_ratio(a: Evaluation, b: Evaluation) -> Interval:
     _check_paired(a, b)
     if not (a.has_truth and b.has_truth):
         return NOTHING
-    value = score(a.mean_squares, a.scale) / score(b.mean_squares, b.scale)
+    value = score(a.mean_squares, a.scale, a.weights) / score(b.mean_squares, b.scale, b.weights)
     return interval(value, resampled_ratios(a, b))
 
 
@@ -214,7 +250,7 @@ def median_score_ratio(a: Evaluation, b: Evaluation) -> float:
 
 def resampled_ratios(a: Evaluation, b: Evaluation) -> np.ndarray:
     """Score of a over that of b for every bootstrap resample of the runs, which are the same for both."""
-    scores = [_scores(np.sqrt(resampled_means(e.mean_squares)), e.scale) for e in (a, b)]
+    scores = [_scores(np.sqrt(resampled_means(e.mean_squares, e.weights)), e.scale) for e in (a, b)]
     return scores[0] / scores[1]
 
 

@@ -10,17 +10,24 @@ import numpy as np
 from filters.consistency.intervals import Interval
 from numerics.progress import told
 from tuning.evaluation.baselines import (
+    BY_IMPORTANCE,
+    GIVEN,
+    NOISE,
     ORACLE,
     RULE,
     SCALED,
     TUNED,
     Scaled,
+    given,
+    noise_estimated,
     oracle,
     rule_label,
     rule_of_thumb,
+    same_filter,
     scaled_default,
 )
 from tuning.evaluation.evaluate import Evaluation, evaluate, likelihood_gain, score_ratio
+from tuning.problems.check import data_of
 from tuning.problems.problem import Problem
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
@@ -38,22 +45,24 @@ class Comparison(NamedTuple):
     default: Scaled | None = None  # its factor, or the reason why there is none; None where it was not requested
     kept_ratios: Mapping[str, Interval] | None = None  # given where evaluations are summaries without single runs
     kept_gains: Mapping[str, Interval] | None = None
-    rule: str = RULE  # what the rule of thumb is called where people read it: `rule_label`
+    rule: str = RULE  # GIVEN where the rule of thumb is what was given, and so no row of its own: `rule_label`
+    given: Evaluation | None = None  # what the model came with; None where nobody gave anything
+    noise: Evaluation | None = None  # noise estimation; None where there is none
+    lacks_ranges: bool = False  # whether the rule of thumb has the model's own Q: `Problem.lacks_ranges`
 
     @property
     def evaluations(self) -> dict[str, Evaluation]:
         """All evaluations by the names in tables, in the order of the rows."""
-        found = {RULE: self.untuned, SCALED: self.scaled, TUNED: self.tuned, ORACLE: self.true}
+        found = {GIVEN: self.given, RULE: self.untuned, SCALED: self.scaled, NOISE: self.noise}
+        found |= {TUNED: self.tuned, ORACLE: self.true}
+        if self.rule == GIVEN:
+            del found[RULE]
         return {name: evaluation for name, evaluation in found.items() if evaluation is not None}
 
-    def label(self, name: str) -> str:
-        """What a filter of `evaluations` is called where people read it."""
-        return self.rule if name == RULE else name
-
     @property
-    def labelled(self) -> dict[str, Evaluation]:
-        """`evaluations` by what people read."""
-        return {self.label(name): evaluation for name, evaluation in self.evaluations.items()}
+    def baselines(self) -> tuple[str, ...]:
+        """Names of the baselines that there are, the most important one first."""
+        return tuple(name for name in BY_IMPORTANCE if name in self.evaluations)
 
     @property
     def ratios(self) -> dict[str, Interval]:
@@ -61,8 +70,7 @@ class Comparison(NamedTuple):
         if self.kept_ratios is not None:
             return dict(self.kept_ratios)
         found = self.evaluations
-        names = [name for name in (SCALED, RULE, ORACLE) if name in found]
-        return {name: score_ratio(self.tuned, found[name]) for name in names}
+        return {name: score_ratio(self.tuned, found[name]) for name in self.baselines}
 
     @property
     def likelihood_gains(self) -> dict[str, Interval]:
@@ -70,8 +78,7 @@ class Comparison(NamedTuple):
         if self.kept_gains is not None:
             return dict(self.kept_gains)
         found = self.evaluations
-        names = [name for name in (SCALED, RULE, ORACLE) if name in found]
-        return {name: likelihood_gain(self.tuned, found[name]) for name in names}
+        return {name: likelihood_gain(self.tuned, found[name]) for name in self.baselines}
 
 
 def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int = HELD_OUT_SEEDS) -> Comparison:
@@ -84,30 +91,40 @@ def evaluate_held_out(choice: Choice, scenario: Problem, seed: int, count: int =
         count: number of held-out seeds; a problem of logs has a fixed number, and ignores it.
     """
     seeds = scenario.held_out_seeds(seed, count)
-    data = scenario.data(seeds)
+    data = data_of(scenario, seeds)
     default = scaled_default(choice.name, scenario, seed)
-    choices = (rule_of_thumb(choice.name, scenario), choice, oracle(choice.name, scenario), default.choice)
+    kind = choice.name
+    choices = {
+        "untuned": rule_of_thumb(kind, scenario),
+        "tuned": choice,
+        "true": oracle(kind, scenario),
+        "scaled": default.choice,
+        "given": given(kind, scenario),
+        "noise": noise_estimated(kind, scenario, seed),
+    }
     done: list[tuple[Choice, Evaluation]] = []
-    for one in told("filters on held-out seeds", choices):
+    for one in told("filters on held-out seeds", list(choices.values())):
         if one is not None and _found(one, done) is None:  # baselines may be the same filter
             done.append((one, evaluate(one.filter(scenario), data, scenario.scale)))
-    untuned, tuned, true, scaled = (None if one is None else _found(one, done) for one in choices)
+    found = {role: None if one is None else _found(one, done) for role, one in choices.items()}
+    untuned, tuned = found.pop("untuned"), found.pop("tuned")
     assert untuned is not None and tuned is not None  # these two choices are never None
-    bound, rule = scenario.bound(data), rule_label(scenario)
-    return Comparison(untuned, tuned, true, bound, seeds, scaled, default, rule=rule)
+    bound, rule, lacks = scenario.bound(data), rule_label(scenario), scenario.lacks_ranges
+    return Comparison(
+        untuned,
+        tuned,
+        found["true"],
+        bound,
+        seeds,
+        found["scaled"],
+        default,
+        rule=rule,
+        given=found["given"],
+        noise=found["noise"],
+        lacks_ranges=lacks,
+    )
 
 
 def _found(choice: Choice, done: Sequence[tuple[Choice, Evaluation]]) -> Evaluation | None:
     """The evaluation of the same filter, if there is one."""
-    return next((evaluation for before, evaluation in done if _same(choice, before)), None)
-
-
-def _same(a: Choice, b: Choice) -> bool:
-    """Whether two choices are the same filter."""
-    if a.name != b.name:
-        return False
-    pairs = (a.model, b.model), (a.numbers, b.numbers)
-    return all(
-        one.keys() == other.keys() and all(np.array_equal(one[key], other[key]) for key in one)
-        for one, other in pairs
-    )
+    return next((evaluation for before, evaluation in done if same_filter(choice, before)), None)

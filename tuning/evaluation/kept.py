@@ -24,7 +24,7 @@ from tuning.problems.problem import Problem
 from tuning.search.plan import SIZE_SEEDS, TRAINING_SEEDS, Plan
 from tuning.search.space import Choice, size_ladder
 
-ROLES = ("untuned", "tuned", "true", "scaled")  # evaluations of a `Comparison`
+ROLES = ("untuned", "tuned", "true", "scaled", "given", "noise")  # evaluations of a `Comparison`
 
 
 def sizes_as_data(rows: Sequence[SizeRow], choice: Choice, plan: Plan) -> dict:
@@ -126,13 +126,16 @@ def kept_comparison(content: Mapping, choice: Choice, problem: Problem) -> Compa
             kept_ratios={str(name): as_interval(ratio) for name, ratio in more["score_ratios"].items()},
             kept_gains={str(name): as_interval(gain) for name, gain in more["likelihood_gains"].items()},
             rule=rule_label(problem),
+            given=found["given"],
+            noise=found["noise"],
+            lacks_ranges=problem.lacks_ranges,
         )
     except (AttributeError, KeyError, TypeError, ValueError):
         return None
 
 
 def _summarised(role: str, held_out: Mapping, more: Mapping, problem: Problem) -> Evaluation | None:
-    if held_out[role] is None:
+    if held_out.get(role) is None:  # also of a file that is older than the role
         return None
     return summarised(held_out[role], problem, more["expected_nis"], more["median_nees"][role])
 

@@ -1,4 +1,4 @@
-"""What filters of a comparison know of the plant's noise, and believe of its constants: values and sentences."""
+"""What filters of a comparison know about the plant's noise and assume about its constants."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ SAID = {
     "true": "the plant's own (oracle; {option} true)",
     "scaled": "the scaled default ({option} scaled)",
     "untuned": "the rule of thumb ({option} untuned)",
+    "given": "those that the model came with ({option} given)",
     OF_FILE: "the tuned ones",
 }
-KNOWLEDGE = ("true", "scaled", "untuned")  # of the plant's Q and R: oracle, scaled default, rule of thumb
+KNOWLEDGE = ("true", "scaled", "untuned", "given")  # of Q and R; see `SAID`
 # Default belief of a constant: standard deviation of a flow [m/s], of others as a fraction of their value ...
 FLOW_STD, RELATIVE_STD, WALK_PART = 0.5, 0.2, 0.02  # ... and of a step's change, as a fraction of the prior's
 
 
 def noise_sentence(rows: Sequence[Any], option: str = "knows") -> str:
-    """Whose Q and R the filters of a comparison have; empty where nobody says.
+    """The source of the Q and R of the filters in a comparison; empty if not stated.
 
     Args:
         rows: with a label, and what the filter knows.
@@ -40,20 +41,20 @@ def noise_sentence(rows: Sequence[Any], option: str = "knows") -> str:
 
 
 def belief_sentences(rows: Sequence[Any]) -> list[str]:
-    """What is believed of each constant that filters estimate, the same of all filters, a sentence a constant."""
+    """The prior of each constant that filters estimate, the same for all filters, a sentence per constant."""
     beliefs = {name: belief for row in rows for name, belief in row.beliefs.items()}
     return [
-        f"{name} is believed to be {belief.mean:.4g} at first, with a standard deviation of {belief.std:.3g}, and "
-        f"to change by {belief.walk_std:.3g} a step (standard deviation; all in its own unit)."
+        f"{name} has a prior mean of {belief.mean:.4g}, a standard deviation of {belief.std:.3g} and a random "
+        f"walk of {belief.walk_std:.3g} per step (standard deviation; all in its own unit)."
         for name, belief in beliefs.items()
     ]
 
 
 def beliefs_of(constants: Any, unknown: Mapping[str, Unknown | None]) -> dict[str | int, Unknown]:
-    """What is believed of a model's constants, the defaults and the means filled in.
+    """The priors of a model's constants, with defaults and means filled in.
 
     Raises:
-        ValueError: for what is not one of the constants, or has no default.
+        ValueError: for a name that is not a constant, or a constant without a default.
     """
     beliefs: dict[str | int, Unknown] = {}
     for name, belief in unknown.items():

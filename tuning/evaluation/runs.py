@@ -14,51 +14,76 @@ from filters.consistency.nees import normalized_squares
 from filters.engine.batch import Estimates
 from filters.filter import Filter
 from numerics.angles import difference
-from tuning.problems.data import FIRST_SCORED_STEP, Data
+from tuning.evaluation.log_scores import log_scores_of
+from tuning.problems.data import FIRST_SCORED_STEP, Data, where_true
 from tuning.problems.in_parts import estimates_in_parts
 
 FARTHEST = 1e100  # outputs are clipped to this, so that their squares are finite
 
 
 class RunMetrics(NamedTuple):
-    """Metrics of a filter in each of B runs, over T scored steps; those that need the truth may be None."""
+    """Metrics of a filter in each of B runs, over T late steps; those that need the truth may be None.
 
-    nis: np.ndarray  # (B, T), NaN where nothing was measured or S is singular
-    present: np.ndarray  # (B, T), number of channels that were measured
+    Of the late steps those count that are scored (`Data.scored`).
+    """
+
+    nis: np.ndarray  # (B, T), NaN where nothing was measured or S is singular, or the step is not scored
+    present: np.ndarray  # (B, T), number of channels that were measured; 0 where the step is not scored
     log_likelihoods: np.ndarray  # (B,), of the scored steps; NaN for filters without a covariance
     divergences: np.ndarray  # (B,), filter resets: restarts from the prior
     mean_squares: np.ndarray | None  # (B, n), mean square errors of the states
     start_up_squares: np.ndarray | None  # (B, steps before 50, n), square errors
     nees: np.ndarray | None  # (B, T)
     output_mean_squares: Mapping[str, np.ndarray]  # (B, 1) each, by symbol
+    counts: np.ndarray  # (B,), number of scored steps
+    log_scores: np.ndarray | None = None  # (B, T), log N(x; x^, P); None if not wanted, NaN where there is none
+
+    @property
+    def weights(self) -> np.ndarray | None:
+        """By which runs are pooled, (B,): their numbers of scored steps; None where these are all the same."""
+        return None if (self.counts == self.counts[0]).all() else self.counts.astype(np.float64)
 
 
 def metrics_by_run(
-    filter_: Filter, estimates: Estimates, data: Data, nees: bool = True, outputs: bool = True
+    filter_: Filter,
+    estimates: Estimates,
+    data: Data,
+    nees: bool = True,
+    outputs: bool = True,
+    scale: np.ndarray | Sequence[float] | None = None,
 ) -> RunMetrics:
     """Metrics of a filter's estimates on some data, run by run, for the states that the plant has.
 
     The NEES is NaN unless it is wanted: for forty states it takes a tenth of the filter's own time. Errors of
-    derived outputs are left out unless they are wanted.
+    derived outputs are left out unless they are wanted; log scores are those of the states with a finite scale,
+    and left out where no scale is given.
     """
-    late, measurements = data.scored, data.measurements
-    present = (~np.isnan(measurements[:, late])).sum(axis=-1)
+    late, measurements = data.late, data.measurements
+    present = (~np.isnan(data.late_scored(measurements))).sum(axis=-1)
     squares = normalized_squares(estimates.innovations[:, late], estimates.innovation_covs[:, late])
     likelihoods = np.full(len(measurements), np.nan)
     if filter_.has_covariance:
-        likelihoods = estimates.log_likelihoods[:, late].sum(axis=1)
+        likelihoods = _sums(data, estimates.log_likelihoods)
     nis = np.where(present > 0, squares, np.nan)
-    found = RunMetrics(nis, present, likelihoods, estimates.divergences, None, None, None, {})
+    found = RunMetrics(nis, present, likelihoods, estimates.divergences, None, None, None, {}, data.scored_counts)
+    if scale is not None:
+        found = found._replace(log_scores=log_scores_of(filter_, estimates, data, scale))
     if data.states is None:
         return found
-    found = found._replace(**_against_truth(filter_, estimates, data, data.states, nees))
+    found = found._replace(**_against_truth(filter_, estimates, data, nees))
     return found._replace(output_mean_squares=_output_mean_squares(filter_, estimates, data)) if outputs else found
 
 
-def metrics_of_all(filter_: Filter, data: Data, nees: bool = True, outputs: bool = True) -> RunMetrics:
+def metrics_of_all(
+    filter_: Filter,
+    data: Data,
+    nees: bool = True,
+    outputs: bool = True,
+    scale: np.ndarray | Sequence[float] | None = None,
+) -> RunMetrics:
     """`metrics_by_run` of a filter on all runs of some data, in parts: the same as for all at once."""
     parts = estimates_in_parts(filter_, data)
-    return joined([metrics_by_run(filter_, found, some, nees, outputs) for some, found in parts])
+    return joined([metrics_by_run(filter_, found, some, nees, outputs, scale) for some, found in parts])
 
 
 def joined(parts: Sequence[RunMetrics]) -> RunMetrics:
@@ -75,7 +100,34 @@ def joined(parts: Sequence[RunMetrics]) -> RunMetrics:
         start_up_squares=_concatenated([one.start_up_squares for one in parts]),
         nees=_concatenated([one.nees for one in parts]),
         output_mean_squares={symbol: np.concatenate([one[symbol] for one in outputs]) for symbol in outputs[0]},
+        counts=np.concatenate([one.counts for one in parts]),
+        log_scores=_concatenated([one.log_scores for one in parts]),
     )
+
+
+def variance_ratios(runs: RunMetrics) -> tuple[float, float]:
+    """Variances of NEES and NIS over a run's steps over those of chi-squares, means over runs; NaN for none.
+
+    A chi-square of m degrees of freedom has the variance 2 m; where the number of measured channels changes, the
+    variance of that number adds to it.
+    """
+    degrees = runs.present[runs.present > 0]
+    nis = _variance_over_steps(runs.nis) / (2.0 * degrees.mean() + degrees.var()) if degrees.size else np.nan
+    if runs.nees is None or runs.mean_squares is None:
+        return np.nan, nis
+    return _variance_over_steps(runs.nees) / (2.0 * runs.mean_squares.shape[1]), nis
+
+
+def _variance_over_steps(values: np.ndarray) -> float:
+    """Variance of values (B, T) over each run's steps that are not NaN, mean over runs that have two of them."""
+    there = ~np.isnan(values)
+    several = there.sum(axis=1) > 1
+    there, counts = there[several], there[several].sum(axis=1)
+    if not counts.size:
+        return np.nan
+    means = np.where(there, values[several], 0.0).sum(axis=1) / counts
+    squares = np.where(there, values[several] - means[:, None], 0.0) ** 2
+    return float((squares.sum(axis=1) / (counts - 1)).mean())
 
 
 def _concatenated(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
@@ -85,29 +137,43 @@ def _concatenated(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
 
 
 def state_errors(filter_: Filter, estimates: Estimates, data: Data) -> np.ndarray:
-    """Errors (B, K + 1, n) of the plant's n states, those of angles the short way round; needs data with truth."""
-    return _errors(filter_, estimates, data.known_states)
+    """Errors (B, K + 1, n) of the plant's n states, those of angles the short way round; needs data with truth.
 
-
-def _errors(filter_: Filter, estimates: Estimates, states: np.ndarray) -> np.ndarray:
+    They are NaN where a step does not count.
+    """
+    states = data.known_states
     n = states.shape[-1]
     return difference(estimates.means[..., :n], states, filter_.model.shape.state_angles[:n])
 
 
-def _against_truth(filter_: Filter, estimates: Estimates, data: Data, states: np.ndarray, wanted: bool) -> dict:
+def _against_truth(filter_: Filter, estimates: Estimates, data: Data, wanted: bool) -> dict:
     """The fields of `RunMetrics` that need the true states."""
-    n, late = states.shape[-1], data.scored
-    errors = _errors(filter_, estimates, states)
+    errors = state_errors(filter_, estimates, data)  # NaN where a step does not count
+    n, late = errors.shape[-1], data.late
     late_errors = errors[:, late]
     nees = np.full(late_errors.shape[:2], np.nan)
     if wanted:
         nees = normalized_squares(late_errors, estimates.covs[:, late, :n, :n])
-    mean_squares, start_up = _means_over_steps(late_errors**2), errors[:, :FIRST_SCORED_STEP] ** 2
+    mean_squares, start_up = _means(data, late_errors**2), errors[:, :FIRST_SCORED_STEP] ** 2
     return {
         "mean_squares": mean_squares,
         "start_up_squares": start_up,
         "nees": nees,
     }
+
+
+def _sums(data: Data, values: np.ndarray) -> np.ndarray:
+    """Sums (B,) of values (B, K + 1) over each run's scored steps."""
+    found = data.late_scored(values)
+    return found.sum(axis=1) if data.counted is None else np.where(np.isnan(found), 0.0, found).sum(axis=1)
+
+
+def _means(data: Data, values: np.ndarray) -> np.ndarray:
+    """Means (B, n) of late values (B, T, n) over each run's scored steps."""
+    if data.counted is None:
+        return _means_over_steps(values)
+    kept = where_true(data.counted[:, data.late], values, 0.0)
+    return kept.sum(axis=1) / np.maximum(data.scored_counts, 1)[:, None]
 
 
 def _means_over_steps(values: np.ndarray) -> np.ndarray:
@@ -119,7 +185,7 @@ def _means_over_steps(values: np.ndarray) -> np.ndarray:
 
 def _output_mean_squares(filter_: Filter, estimates: Estimates, data: Data) -> dict[str, np.ndarray]:
     """Mean square errors of each derived output that both the truth and the filter's model have."""
-    late, found = data.scored, {}
+    late, found = data.late, {}
     for symbol, truth in (data.outputs or {}).items():
         if symbol not in filter_.model.outputs:
             continue
@@ -127,5 +193,8 @@ def _output_mean_squares(filter_: Filter, estimates: Estimates, data: Data) -> d
             values = filter_.model.output(symbol, estimates.means[:, late])
         values, angle = np.clip(values, -FARTHEST, FARTHEST), filter_.model.outputs[symbol].quantity.angle
         errors = difference(values[..., None], truth[:, late, None], (angle,))[..., 0]
-        found[symbol] = (errors**2).mean(axis=1, keepdims=True)
+        squares = errors**2
+        found[symbol] = (
+            squares.mean(axis=1, keepdims=True) if data.counted is None else _means(data, squares[..., None])
+        )
     return found

@@ -17,7 +17,7 @@ from tuning.evaluation.evaluate import Evaluation, evaluate, resampled_ratios, s
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.problem import Problem
-from tuning.search.objectives import nis_violation
+from tuning.search.objectives import MOST_PRICE, nis_violation
 from tuning.search.plan import SIZE_SEEDS, Plan
 from tuning.search.space import Choice, size_ladder
 
@@ -59,7 +59,8 @@ def ensemble_sizes(
         return few_seeds_first(choice, plan, training, sizes, consistent)
     outside = [_outside(choice.with_size(n), plan, training) if plan.is_constrained else 0.0 for n in sizes]
     tables = [_on(one, fresh, choice, sizes) for one, fresh in zip(plan.scenarios, plan.size_data(), strict=True)]
-    among = _counting(outside, consistent)
+    scores = np.mean([[one.score.value for one in found] for found in tables], axis=0).tolist()
+    among = _counting(outside, consistent, scores)
     columns = [_over_the_best(found, among) for found in tables]
     count = len(plan.size_data()[0].seeds)
     return [
@@ -93,13 +94,13 @@ def few_seeds_first(
     early = [on(few, n) for n in told("N", sizes)]
 
     def on_all(i: int) -> list[Evaluation]:
-        return early[i] if len(fresh[0].seeds) <= FEW else on(fresh, sizes[i])
+        return early[i] if all(len(one.seeds) <= FEW for one in fresh) else on(fresh, sizes[i])
 
     outside = [max(map(nis_violation, found)) if plan.is_constrained else 0.0 for found in early]
     trained: set[int] = set()
 
     def best_ones() -> list[int]:
-        among = _counting(outside, consistent)
+        among = _counting(outside, consistent, [_score(found) for found in early])
         return [min(among, key=lambda i: early[i][k].score.value) for k in range(len(fresh))]
 
     def train(i: int) -> None:
@@ -117,10 +118,10 @@ def few_seeds_first(
         if i not in whole:
             train(i)
             whole[i] = on_all(i)
-        ends = [ratio[i].high for ratio in _ratios_of(whole, _counting_of(whole, outside, consistent))]
-        if i in _counting_of(whole, outside, consistent) and max(ends) < 1.0 + SIZE_TOLERANCE:
+        ends = [ratio[i].high for ratio in _ratios_of(whole, _eligible(whole, outside, consistent))]
+        if i in _eligible(whole, outside, consistent) and max(ends) < 1.0 + SIZE_TOLERANCE:
             break
-    over = _ratios_of(whole, _counting_of(whole, outside, consistent))
+    over = _ratios_of(whole, _eligible(whole, outside, consistent))
     rows = []
     for i, n in enumerate(sizes):
         if i in whole:
@@ -140,10 +141,15 @@ def _ratios_of(whole: Mapping[int, Sequence[Evaluation]], among: Sequence[int]) 
     return [dict(zip(places, ratios, strict=True)) for ratios in found]
 
 
-def _counting_of(whole: Mapping[int, object], outside: Sequence[float], consistent: bool) -> list[int]:
+def _eligible(whole: Mapping[int, Sequence[Evaluation]], outside: Sequence[float], consistent: bool) -> list[int]:
     """The eligible sizes of `whole`."""
-    places = list(whole)
-    return [places[i] for i in _counting([outside[i] for i in places], consistent)]
+    places, scores = list(whole), [_score(found) for found in whole.values()]
+    return [places[i] for i in _counting([outside[i] for i in places], consistent, scores)]
+
+
+def _score(found: Sequence[Evaluation]) -> float:
+    """The mean score over some problems."""
+    return float(np.mean([one.score.value for one in found]))
 
 
 def _surely_worse(found: Sequence[Evaluation], best: Sequence[Sequence[Evaluation]]) -> bool:
@@ -164,7 +170,8 @@ def sufficient_size(sizes: Sequence[SizeRow], consistent: bool = False) -> int:
     ends within 1 % of where that of the best compromise ends. Where it has to be consistent, sizes whose mean NIS
     is outside its band are not eligible.
     """
-    rows = [sizes[i] for i in _counting([row.outside for row in sizes], consistent)]
+    scores = [row.ratio.value for row in sizes]
+    rows = [sizes[i] for i in _counting([row.outside for row in sizes], consistent, scores)]
     least, limit = min(row.ratio.high for row in rows), 1.0 + SIZE_TOLERANCE
     limit = limit if least < limit else limit * least
     return next(row.size for row in rows if row.ratio.high < limit)
@@ -196,18 +203,30 @@ def close_size(choice: Choice, plan: Plan, training: Sequence[Data]) -> int:
 
 
 def _scored(choice: Choice, scenario: Problem, data: Data) -> tuple[np.ndarray, np.ndarray]:
-    """Means and variances of the scored steps, (B, T, n) each."""
-    parts = [found for _, found in estimates_in_parts(choice.filter(scenario), data)]
+    """Means and variances of all scored steps, (steps, n) each."""
+    parts = list(estimates_in_parts(choice.filter(scenario), data))
     means, covs = (
-        np.concatenate([getattr(one, name)[:, data.scored] for one in parts]) for name in ("means", "covs")
+        np.concatenate([some.scored_rows(getattr(one, name)) for some, one in parts]) for name in ("means", "covs")
     )
-    return means, np.einsum("bkii->bki", covs)
+    return means, np.einsum("kii->ki", covs)
 
 
-def _counting(outside: Sequence[float], consistent: bool) -> list[int]:
-    """Indices of the eligible sizes: those with a mean NIS within its band, if required and if any has it."""
+def _counting(outside: Sequence[float], consistent: bool, scores: Sequence[float]) -> list[int]:
+    """Indices of the eligible sizes: those with a mean NIS within its band, if required and if any has it.
+
+    All of them, where the best score of these is more than 5 % above the best of all: that is too much to pay.
+    """
     everywhere = list(range(len(outside)))
-    return [i for i in everywhere if outside[i] <= 0 or not consistent] or everywhere
+    inside = [i for i in everywhere if outside[i] <= 0]
+    if not consistent or not inside or min(scores[i] for i in inside) > (1.0 + MOST_PRICE) * min(scores):
+        return everywhere
+    return inside
+
+
+def left_out(rows: Sequence[SizeRow], kept: int) -> list[int]:
+    """Sizes that were not eligible for their mean NIS, where the kept one is in its band."""
+    outside = {row.size: row.outside for row in rows}
+    return [] if outside.get(kept, 1.0) > 0 else [size for size, found in outside.items() if found > 0]
 
 
 def _on(scenario: Problem, data: Data, choice: Choice, sizes: Sequence[int]) -> list[Evaluation]:

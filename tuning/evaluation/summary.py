@@ -22,6 +22,7 @@ def summary(evaluation: Evaluation) -> dict:
         "score": numbers(evaluation.score),
         "nees": numbers(evaluation.nees),
         "nis": numbers(evaluation.nis),
+        "log_score": numbers(evaluation.log_score),
         "log_likelihood": None if math.isnan(evaluation.log_likelihood) else evaluation.log_likelihood,
         "divergences": evaluation.divergences,
     }
@@ -59,6 +60,7 @@ def summarised(
         log_likelihoods=np.array([likelihood]),
         divergences=int(data["divergences"]),
         mean_squares=np.array([[value.value**2 for value in rmse]]),
+        log_score=as_interval(data.get("log_score")),
         scale=np.array([math.nan] * len(rmse) if problem.scale is None else problem.scale, dtype=np.float64),
     )
 

@@ -21,7 +21,7 @@ from numerics.files import write_whole
 from plants.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
-from tuning.evaluation.kept import comparison_as_data, sizes_as_data
+from tuning.evaluation.kept import ROLES, comparison_as_data, sizes_as_data
 from tuning.evaluation.summary import summary
 from tuning.evaluation.versions import versions
 from tuning.problems.files import scenario_of
@@ -32,6 +32,9 @@ from tuning.search.objectives import NIS_BAND
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 from tuning.search.study import StudyResult
+from tuning.search.validation import as_data
+
+SAME_NOISE = 1e-6  # relative difference of two covariances, above which they are not the same
 
 
 def write_tuned(
@@ -84,6 +87,7 @@ def write_tuned(
         },
         "held_out": {problem.name: metrics(one) for problem, one in pairs},
         "comparisons": {problem.name: comparison_as_data(one) for problem, one in pairs},
+        "choice": as_data(result.validation),
         "ensemble_sizes": sizes_as_data(result.sizes, choice, plan) if result.sizes else None,
     }
     write_whole(Path(path), json.dumps(sealed(content), indent=2) + "\n")
@@ -131,8 +135,8 @@ def problem_in(content: Mapping, name, path: str | Path, given: Sequence[Problem
             return one
         if one.name == name:
             raise ValueError(
-                f"the problem of a tuned file must be what it was tuned on, {name} of digest {digest}, "
-                f"but here it has the digest {one.digest} ({path})"
+                f"the problem of a tuned file must be the one it was tuned on, {name} of digest {digest}, but "
+                f"here it has the digest {one.digest} ({path})"
             )
     mapping = kept.get("content") if isinstance(kept, Mapping) else kept
     if isinstance(mapping, Mapping) and "logs" in mapping:
@@ -211,12 +215,16 @@ def read_choice(path: str | Path, problem: Problem) -> Choice:
 
 
 def _choice(content: Mapping, problem: Problem) -> Choice:
-    """The choice of a tuned file's content: the problem's parameters if it has any, else Q and R."""
+    """The choice of a tuned file's content: the problem's parameters if it has any, else Q and R.
+
+    Both, where the file has a Q and R that the parameters do not give, as baselines have.
+    """
     entry, model = content["filter"], problem.model()
     own = [one.name for one in problem.parameters or ()]
     chosen = {name: entry["model"][name] for name in own if name in entry["model"]}
-    if not own or len(chosen) < len(own):
-        chosen = {
+    if not own or len(chosen) < len(own) or not _gives_noise(problem.model(**chosen), entry["model"]):
+        chosen = chosen if len(chosen) == len(own) else {}
+        chosen |= {
             name: _noise(name, entry["model"][name], size, positive_definite=name == "measurement_noise_cov")
             for name, size in zip(NOISE, (model.n, model.m), strict=True)
         }
@@ -225,6 +233,17 @@ def _choice(content: Mapping, problem: Problem) -> Choice:
     choice = Choice(entry["name"], chosen, dict(entry["numbers"]))
     choice.filter(problem)  # a clear error for parameters that the filter does not have
     return choice
+
+
+def _gives_noise(model: StateSpaceModel, entry: Mapping) -> bool:
+    """Whether a model has the Q and R of a file, as far as that tells them."""
+    for name in NOISE:
+        if name in entry:
+            own, kept = getattr(model, name), np.asarray(entry[name], dtype=np.float64)
+            kept = kept if kept.ndim == 2 else np.diag(np.atleast_1d(kept))
+            if kept.shape != own.shape or not np.allclose(own, kept, rtol=SAME_NOISE, atol=0.0):
+                return False
+    return True
 
 
 def _noise(name: str, given, size: int, *, positive_definite: bool):
@@ -240,7 +259,7 @@ def metrics(comparison: Comparison) -> dict:
     return {
         "seeds": [comparison.seeds.start, comparison.seeds.stop],
         "bound": [None if math.isnan(part) else part for part in comparison.bound.tolist()],
-        **{name: _summary_of(getattr(comparison, name)) for name in ("untuned", "tuned", "true", "scaled")},
+        **{name: _summary_of(getattr(comparison, name)) for name in ROLES},
         "scaled_default": scaling(comparison),
     }
 

@@ -14,7 +14,7 @@ from tuning.evaluation.versions import versions
 from tuning.problems.problem import Problem
 
 TOLERANCE = 1e-9  # relative: the effect of the order of a sum
-LATER = ("scaled", "scaled_default")  # keys that older files lack
+LATER = ("scaled", "scaled_default", "given", "noise", "log_score")  # keys that older files lack
 
 
 class Difference(NamedTuple):
@@ -64,8 +64,7 @@ def verify(path: str | Path, problems: Sequence[Problem] = ()) -> Verification:
         comparison = evaluate_held_out(
             choice, problem_in(content, name, path, problems), seed, _count(stored, path)
         )
-        found = {key: value for key, value in metrics(comparison).items() if key in stored or key not in LATER}
-        pairs = _numbers(stored), _numbers(found)
+        pairs = _numbers(stored), _numbers(_as_old_as(stored, metrics(comparison)))
         names = list(dict.fromkeys([*pairs[0], *pairs[1]]))
         differing = [Difference(f"{name}: {place}", *(part.get(place) for part in pairs)) for place in names]
         places += len(names)
@@ -80,6 +79,14 @@ def verify(path: str | Path, problems: Sequence[Problem] = ()) -> Verification:
     return Verification(places, differences, packages)
 
 
+def _as_old_as(stored: Any, found: Any) -> Any:
+    """What was found, without keys that came later than the file."""
+    if not (isinstance(stored, dict) and isinstance(found, dict)):
+        return found
+    known = {key: value for key, value in found.items() if key in stored or key not in LATER}
+    return {key: _as_old_as(stored.get(key), value) for key, value in known.items()}
+
+
 def _count(stored, path: str | Path) -> int:
     """Number of held-out seeds of a scenario's entry."""
     try:
@@ -87,8 +94,8 @@ def _count(stored, path: str | Path) -> int:
         return beyond - first
     except (KeyError, TypeError, ValueError):
         raise ValueError(
-            f"held-out metrics of a tuned file must tell their first seed and that after the last, but {path} has "
-            f"{shown(stored)}"
+            "held-out metrics of a tuned file must give their first seed and the one after the last, but "
+            f"{path} has {shown(stored)}"
         ) from None
 
 

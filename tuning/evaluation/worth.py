@@ -1,19 +1,22 @@
-"""Held-out results in words: the gain over each baseline, and what the scaled default is.
+"""Held-out results in words: the gain over each baseline, and a description of the scaled default.
 
 NIS is the normalised innovation squared.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import isnan
 
-from filters.consistency.intervals import Interval, slightly
-from tuning.evaluation.baselines import NO_RANGES, ORACLE, RULE, SCALED
+from filters.consistency.intervals import Interval, slightly, span
+from tuning.evaluation.baselines import GIVEN, NO_RANGES, ORACLE, RULE, SCALED, called
 from tuning.evaluation.held_out import Comparison
+
+HEADLINE = (GIVEN, SCALED, RULE)  # baselines that a headline names, in this order: what anybody has
 
 
 def without_truth(name: str) -> str:
-    """A sentence on what is compared where a problem, called `name`, has no truth."""
+    """A sentence on the comparison if a problem, called `name`, has no truth."""
     return (
         f"{name} has no truth: filters are compared by how well they predict the measurements, the log-likelihood "
         "and the NIS of their innovations."
@@ -28,21 +31,34 @@ def worth(comparison: Comparison, what: str = "the score") -> str:
     if not comparison.tuned.has_truth:
         return _likelihood_worth(comparison)
     ratios, seeds = comparison.ratios, len(comparison.seeds)
-    names = [name for name in (SCALED, RULE) if name in ratios]
-    first, *others = (f"{gain(ratios[name], seeds, what)} against the {comparison.label(name)}" for name in names)
-    shared = first.partition(" against " if "no difference" in first else " by ")[0]
-    return " and ".join([first, *(other.removeprefix(f"{shared} ") for other in others)])
+    names = [name for name in HEADLINE if name in ratios]
+    parts = []
+    for name in names:
+        verb, by, much = gain(ratios[name], seeds, what).partition(" by ")
+        parts.append((verb, f"{by}{much} against the {called(name)}".strip()))
+    return _listed(parts)
 
 
 def _likelihood_worth(comparison: Comparison) -> str:
-    gains = {name: gained for name, gained in comparison.likelihood_gains.items() if name in (SCALED, RULE)}
-    parts: list[str] = []
-    for name, gained in gains.items():
-        verb, (value, low, high) = ("raises" if gained.value >= 0 else "lowers"), sized(gained)
-        if not isnan(value):
-            what = "" if parts and parts[0].startswith(verb) else f"{verb} the log-likelihood of a run "
-            parts.append(f"{what}by {value:.2f} [{low:.2f}, {high:.2f}] against the {comparison.label(name)}")
-    return " and ".join(parts) if parts else "makes no difference that can be told without truth"
+    gains = {name: gained for name, gained in comparison.likelihood_gains.items() if name in HEADLINE}
+    parts = [
+        (
+            f"{'raises' if gained.value >= 0 else 'lowers'} the log-likelihood of a run",
+            f"by {span(sized(gained), 2)} against the {called(name)}",
+        )
+        for name, gained in gains.items()
+        if not isnan(gained.value)
+    ]
+    return _listed(parts) if parts else "has no effect that is measurable without truth"
+
+
+def _listed(parts: Sequence[tuple[str, str]]) -> str:
+    """Verbs and what follows them, with commas and an "and": a verb is not said again after the same."""
+    said = [
+        rest if place and parts[place - 1][0] == verb else f"{verb} {rest}"
+        for place, (verb, rest) in enumerate(parts)
+    ]
+    return " and ".join([*([", ".join(said[:-1])] if said[:-1] else []), said[-1]])
 
 
 def sized(gained: Interval) -> Interval:
@@ -53,27 +69,28 @@ def sized(gained: Interval) -> Interval:
 def gain(ratio: Interval, seeds: int, what: str = "the score") -> str:
     """A ratio of scores over those of a baseline in words, with its interval."""
     if ratio.low <= 1 <= ratio.high:
-        return f"makes no difference that {seeds} seeds can show"
+        return f"makes no significant difference on {seeds} seeds"
     ends = sorted(100 * abs(1 - part) for part in (ratio.low, ratio.high))
     verb = "lowers" if ratio.high < 1 else "raises"
     if slight := slightly(ratio):
         return f"{verb} {what} by {slight} (practically nothing)"
-    return f"{verb} {what} by {100 * abs(1 - ratio.value):.0f} % [{ends[0]:.0f}, {ends[1]:.0f}]"
+    return f"{verb} {what} by {span(Interval(100 * abs(1 - ratio.value), *ends), 0, ' %')}"
 
 
 def scaling_sentence(comparison: Comparison) -> str:
-    """What the scaled default is, or why there is none; empty where the comparison has no record of it."""
+    """A description of the scaled default, or why there is none; empty if the comparison has no record of it."""
     found = comparison.default
     if found is None:
         return ""
-    rule, known = comparison.rule, comparison.rule == RULE
-    its, remark = (" with its Q", "") if known else ("", f" {NO_RANGES}")
+    remark, first = f" {NO_RANGES}" if comparison.lacks_ranges else "", comparison.baselines[0]
+    rule = f"{RULE} with its" if comparison.rule == RULE else "given Q and R with this"
     if found.choice is None:
-        return f"There is no {SCALED}, so the {rule} comes first: {found.reason}.{remark}"
+        so = f", so the {RULE} comes first" if first == RULE else ""
+        return f"There is no {SCALED}{so}: {found.reason}.{remark}"
     if found.factor is None or found.nis is None:
         raise ValueError(f"a scaled default must have its factor and mean NIS, but got {found}")
     oracle = f"; the {ORACLE} has the plant's own Q and R" if comparison.true is not None else ""
     return (
-        f"The {SCALED} is the {rule}{its} times {found.factor:.4g}, which brings the mean NIS on the "
+        f"The {SCALED} is the {rule} Q times {found.factor:.4g}, which brings the mean NIS on the "
         f"training runs to {found.nis * comparison.tuned.expected_nis:.2f}{oracle}.{remark}"
     )

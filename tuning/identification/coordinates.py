@@ -19,7 +19,7 @@ class Coordinates:
     """
 
     def __init__(self, free: Sequence[Parameter]):
-        """Raise ValueError unless there are parameters, each with a name of its own."""
+        """Raise ValueError unless there are parameters with distinct names."""
         self.free = tuple(free)
         self.names = tuple(one.name for one in self.free)
         if not self.free or len(set(self.names)) < len(self.names):

@@ -31,6 +31,6 @@ def check_excitation(objective: Objective, logs: Sequence[Log], start: np.ndarra
     loose = [name for name, known in zip(coordinates.names, narrow, strict=True) if not known]
     if loose:
         raise ValueError(
-            f"logs must excite what is free, but constant inputs do not determine {', '.join(loose)}: "
+            f"logs must excite the free parameters, but constant inputs do not determine {', '.join(loose)}: "
             "hold these, or record steps"
         )

@@ -70,6 +70,11 @@ class ModelFamily:
             found.setdefault(name, Parameter(name, *ends, unit, default=variance))
         return found
 
+    @property
+    def variances_of_q(self) -> tuple[str, ...]:
+        """Names of the parameters that are variances in Q."""
+        return tuple(name for name, (kind, *_) in self._noise.items() if kind == "process_noise_cov")
+
     def model(self, **values: float) -> StateSpaceModel:
         """The model for values of some parameters; the others stay."""
         given = {name: value for name, value in values.items() if name in self._arguments}

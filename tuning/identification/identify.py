@@ -5,23 +5,30 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
+from filters.starts import Starts
 from numerics.checks import at_least, shown
+from numerics.streams import START_POINTS, derived_generator
 from plants.logs.log import Log
 from plants.state_space import StateSpaceModel
 from tuning.identification.ascent import Ascent, climb
 from tuning.identification.coordinates import Coordinates
+from tuning.identification.null_tests import NullTest, from_nothing, null_tests
 from tuning.identification.objective import Objective
 from tuning.identification.outliers import ROUNDS, outliers_of, without_outliers
-from tuning.identification.result import Identification, Optimum, identification_of
+from tuning.identification.result import Identification, Optimum, covariances_of, identification_of
+from tuning.identification.starts import starts_of
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.search.interruption import stop_on_interrupt
 
 STARTS = 4  # the given one, and others drawn about it
 MOST_STARTS = 1000
+START_ROUNDS = 3  # of finding further runs that begin elsewhere, at most
+LEAST_GATE = 2.0  # one sample of 22 is beyond it without any outlier; the filter then misses too many
 NEARER = 5  # largest number of times that a start without a likelihood is moved halfway to the first
 REACH = 0.25  # fraction of a range, to either side of the start, within which other starts are drawn
 
@@ -41,6 +48,7 @@ def identify(
     predicted: Sequence[str] = (),
     gate: float = math.inf,
     simulation_first: bool = True,
+    against: bool = True,
     progress: Progress | None = None,
 ) -> Identification:
     """Find the values of free parameters under which a filter's innovations are most likely.
@@ -54,6 +62,9 @@ def identify(
     `simulation_first` each start is first moved to where the model, simulated without process noise, is closest to
     the measurements, if that is more likely: innovations are small even for a model that is far off, as long as
     its filter follows the measurements.
+
+    Runs that begin elsewhere than the model's prior says begin where their first rows say, and these do not count
+    (`starts.starts_of`); unless a free parameter moves the prior.
 
     Args:
         data: `Data`, a `Log`, a sequence of these, or a function of some of the parameters (its arguments) that
@@ -70,9 +81,13 @@ def identify(
             be there later. Without them the model is identified for the best one-step prediction of the
             measurements; with them, for the best prediction of these channels.
         gate: leave out samples whose innovations exceed so many standard deviations of a robust filter, and
-            identify again, until the samples stay the same; infinite to keep all. (With Student-t innovations
-            alone the scale is robust, but the filter still follows outliers, and constants get a bias.)
+            identify again, until the samples stay the same; infinite to keep all. Squares of what is left are
+            divided by their share of the variance (`gates.kept_variance`), so that Q and R do not shrink. (With
+            Student-t innovations alone the scale is robust, but the filter still follows outliers, and constants
+            get a bias.)
         simulation_first: see above.
+        against: whether each parameter is tested against leaving it out (`null_tests.null_tests`), and the search
+            begins once more without effects that may be zero.
         progress: called with the number of the start, the log-likelihood and the values, after every rise.
 
     Returns:
@@ -86,25 +101,29 @@ def identify(
     begin = time.perf_counter()
     if not gate > 0:
         raise ValueError(f"gate must be positive, but got {gate}")
+    if gate < LEAST_GATE:
+        raise ValueError(f"gate must be at least {LEAST_GATE:g} standard deviations, but got {gate}")
     coordinates = Coordinates(free)
     objective = Objective(data, model, coordinates, filter=filter, degrees=degrees, predicted=predicted)
     first = coordinates.start(dict(start or {}))
     points = [first, *_others(coordinates, first, starts, seed)]
     with stop_on_interrupt() as asked:
+
+        def tell(at, found, number=0):
+            if progress is not None:
+                progress(number, found.value, coordinates.named(at))
+
+        objective = _with_starts(objective, first, simulation_first, asked, tell)
         ascents = []
         for number, point in enumerate(points):
             points[number] = point = _finite_start(objective, point, first)
-
-            def tell(at, found, number=number):
-                if progress is not None:
-                    progress(number, found.value, coordinates.named(at))
-
-            ascents.append(_climb_from(objective, point, simulation_first, asked, tell))
+            tell_of = partial(tell, number=number)
+            ascents.append(_climb_from(objective, point, simulation_first, asked, tell_of))
             if asked():
                 break
         if not any(math.isfinite(one.found.value) for one in ascents):
             raise ValueError(
-                "a start must be one at which the filter stays finite on all runs, but it does so at none of "
+                "the filter must stay finite on all runs from at least one start, but it does from none of "
                 f"{shown([coordinates.named(point) for point in points[: len(ascents)]])}"
             )
         optima = tuple(
@@ -113,23 +132,80 @@ def identify(
             )
             for point, one in zip(points, ascents, strict=False)
         )
-        best = max(ascents, key=lambda one: one.found.value)
+        plain = from_nothing(objective, first, asked, tell) if against and not asked() else None
+        best = max([*ascents, *([] if plain is None else [plain])], key=lambda one: one.found.value)
+        objective, best = _checked_starts(objective, best, asked, tell)
         if gate < math.inf:
             objective, best = _gated(objective, best, gate, asked, tell)
+        tests: Mapping[str, NullTest] = {}
+        if against and not asked():
+            best, tests = null_tests(objective, best, first, partial(covariances_of, objective), asked)
         return identification_of(
-            objective, first, best, optima, interrupted=asked(), seconds=time.perf_counter() - begin
+            objective, first, best, optima, tests, interrupted=asked(), seconds=time.perf_counter() - begin
         )
+
+
+def _with_starts(objective: Objective, first: np.ndarray, simulation_first: bool, stop, tell) -> Objective:
+    """The objective in which runs that do not begin as the model's prior says begin where their first rows say.
+
+    At the start of the search a run may seem not to: the model may be far off there. So the model is identified
+    with free starts of these runs, and whether they are needed is asked again.
+    """
+    if not math.isfinite(objective.value(first)) or objective.moves_prior(first):
+        return objective
+    if not _starts_at(objective, first).free.any():
+        return objective
+    free = objective.with_changes(starts=_starts_at(objective, first))
+    found = _climb_from(free, first, simulation_first, stop, tell)
+    at = found.at if math.isfinite(found.found.value) else first
+    return _spent(objective, free, objective.with_changes(starts=_starts_at(objective, at)))
+
+
+def _checked_starts(objective: Objective, best: Ascent, stop, tell) -> tuple[Objective, Ascent]:
+    """The objective and its maximum, with free starts of runs that need them by the model that was found, too."""
+    if objective.moves_prior(best.at):
+        return objective, best
+    for _ in range(START_ROUNDS):
+        found, before = _starts_at(objective, best.at), objective.starts
+        known = np.zeros_like(found.free) if before is None else before.free
+        if stop() or not (found.free & ~known).any():
+            break
+        if before is not None:
+            found = Starts(
+                found.free | before.free,
+                np.where(before.free[:, None], before.means, found.means),
+                np.where(before.free[:, None, None], before.covs, found.covs),
+                np.where(before.free, before.leads, found.leads),
+            )
+        further = objective.with_changes(starts=found)
+        best = climb(further, best.at, *_bounds(objective), stop=stop, progress=tell)
+        objective = _spent(objective, further)
+    return objective, best
+
+
+def _starts_at(objective: Objective, at: np.ndarray) -> Starts:
+    return starts_of(objective.model_at(at), objective.data_at(at), objective.unseen)
+
+
+def _spent(*objectives: Objective) -> Objective:
+    """The last objective, with the evaluations of all."""
+    objectives[-1].evaluations = sum(one.evaluations for one in objectives)
+    return objectives[-1]
+
+
+def _bounds(objective: Objective) -> tuple[np.ndarray, np.ndarray]:
+    return objective.coordinates.low, objective.coordinates.high
 
 
 def _gated(objective: Objective, best: Ascent, gate: float, stop, tell) -> tuple[Objective, Ascent]:
     """The objective without outliers, and its maximum: repeated until the outliers stay the same."""
-    coordinates, whole, left_out, spent = objective.coordinates, objective, None, objective.evaluations
+    whole, left_out, spent = objective, None, objective.evaluations
     for _ in range(ROUNDS):
-        found = outliers_of(whole.model_at(best.at), whole.data_at(best.at), gate)
+        found = outliers_of(whole.model_at(best.at), whole.data_at(best.at), gate, whole.starts)
         if stop() or (left_out is not None and np.array_equal(found, left_out)):
             break
-        left_out, objective = found, without_outliers(whole, found)
-        best = climb(objective, best.at, coordinates.low, coordinates.high, stop=stop, progress=tell)
+        left_out, objective = found, without_outliers(whole, found, gate)
+        best = climb(objective, best.at, *_bounds(whole), stop=stop, progress=tell)
         spent += objective.evaluations
     objective.evaluations = spent
     return objective, best
@@ -159,7 +235,7 @@ def _others(coordinates: Coordinates, first: np.ndarray, starts, seed: int) -> l
     """The starts after the first: given, or drawn."""
     if not isinstance(starts, (int, np.integer)):
         return [coordinates.start(dict(one)) for one in starts]
-    rng, width = np.random.default_rng(seed), REACH * (coordinates.high - coordinates.low)
+    rng, width = derived_generator(seed, START_POINTS), REACH * (coordinates.high - coordinates.low)
     drawn = [
         first + width * rng.uniform(-1, 1, len(first))
         for _ in range(at_least("starts", starts, 1, MOST_STARTS) - 1)

@@ -12,16 +12,19 @@ import numpy as np
 
 from filters.registry import make_filter
 from filters.sensitivity import ModelSlopes, sensitivity
+from filters.starts import Starts
 from numerics.checks import one_of, shown
 from plants.logs.log import Log
 from plants.state_space import StateSpaceModel
 from tuning.identification.coordinates import Coordinates
+from tuning.identification.gates import kept_variance
 from tuning.identification.runs import runs_of
 from tuning.likelihood.gradient import DIFFERENTIABLE
 from tuning.problems.data import Data
 
 STEP = 1e-4  # of differences of the model, in coordinates
 LARGE_STEP = 1e-2  # of differences of the likelihood itself
+COVARIANCES = "process_noise_cov", "measurement_noise_cov", "prior_cov"
 BLOCKS = 20  # least number of blocks of all runs, whose scores give the scatter
 
 
@@ -48,6 +51,9 @@ class Objective:
         degrees: of freedom of Student-t innovations; infinite for normal ones.
         predicted: symbols of channels that the filter predicts, but does not use.
         simulation: whether Q is set to zero: the filter then simulates, and -log L is a sum of squares.
+        starts: of runs that do not begin as the model's prior says; None if all do.
+        gate: number of standard deviations beyond which samples were left out; infinite if none were. The squares
+            of what is left are then smaller than S by `gates.kept_variance`, and are divided by that.
 
     Raises:
         ValueError: where models or data do not fit.
@@ -63,12 +69,14 @@ class Objective:
         degrees: float = math.inf,
         predicted: Sequence[str] = (),
         simulation: bool = False,
+        starts: Starts | None = None,
+        gate: float = math.inf,
     ):
         """Find the parameters that have sensitivities; see the class for the arguments."""
         self.filter = one_of("filter", filter, DIFFERENTIABLE)
         self.coordinates, self._model, self.degrees, self.simulation = coordinates, model, degrees, simulation
         self.data: Data | Callable[..., Any] = data if callable(data) else runs_of(data)
-        self.evaluations = 0
+        self.evaluations, self.starts, self.gate = 0, starts, gate
         self.predicted = tuple(predicted)
         self._of_data = _arguments_among(data, coordinates.names) if callable(data) else ()
         self.rough: tuple[int, ...] = ()  # indices of parameters without sensitivities
@@ -84,8 +92,8 @@ class Objective:
         self.blocks = 1 if count >= BLOCKS else -(-BLOCKS // count)
 
     def with_changes(self, **changes) -> Objective:
-        """The same with other data, filter, degrees or simulation."""
-        names = "filter", "degrees", "predicted", "simulation"
+        """The same with other data, filter, degrees, simulation, starts or gate."""
+        names = "filter", "degrees", "predicted", "simulation", "starts", "gate"
         kept = {name: getattr(self, name) for name in names}
         data = changes.pop("data", self.data)
         return Objective(data, self._model, self.coordinates, **{**kept, **changes})
@@ -148,7 +156,11 @@ class Objective:
     def _smooth_part(self, at: np.ndarray, places: Sequence[int]) -> Evaluation:
         self.evaluations += 1
         model, slopes = self.model_at(at), self._slopes(at, places)
-        runs = self.data_at(at)
+        runs, starts, kept = self.data_at(at), self.starts, kept_variance(self.gate)
+        if kept < 1.0:  # a common factor on Q, R and P moves no estimate
+            model = model.replace(**{name: kept * getattr(model, name) for name in COVARIANCES})
+            slopes = slopes._replace(**{name: kept * getattr(slopes, name) for name in COVARIANCES})
+            starts = None if starts is None else starts._replace(covs=kept * starts.covs)
         found = sensitivity(
             model,
             runs.inputs,
@@ -157,16 +169,28 @@ class Objective:
             degrees=self.degrees,
             blocks=self.blocks,
             predicted=self.unseen,
+            starts=starts,
         )
         scores = np.concatenate(found.block_gradients)
         information = found.information.sum(axis=0)
         values = found.values
+        if kept < 1.0:
+            values = values + 0.5 * math.log(kept) * _counted(runs, starts).sum(axis=1)
         if self._noise_factors_of is not None:  # densities of the samples, not of their averages
-            counts = (~np.isnan(runs.measurements)).sum(axis=1)
+            counts = _counted(runs, starts)
             values = values + 0.5 * counts @ np.log(self._noise_factors(at, model))
         value = float(values.sum())
         value = value if math.isfinite(value) else -math.inf
         return Evaluation(value, scores.sum(axis=0), information, scores, values)
+
+    def moves_prior(self, at: np.ndarray) -> bool:
+        """Whether some free parameter moves the prior of the first state, which is then what it says."""
+        found = self._slopes(at, self._smooth)
+        rough = [self._pair(at, j) for j in self.rough]
+        apart = [
+            np.abs(a.prior_mean - b.prior_mean).sum() + np.abs(a.prior_cov - b.prior_cov).sum() for a, b in rough
+        ]
+        return bool(found.prior_mean.any() or found.prior_cov.any() or np.any(apart))
 
     def _slopes(self, at: np.ndarray, places: Sequence[int]) -> ModelSlopes:
         pairs = [self._pair(at, j) for j in places]
@@ -186,6 +210,14 @@ class Objective:
         low, high = self.coordinates.low[place] + STEP, self.coordinates.high[place] - STEP
         middle[place] = np.clip(middle[place], low, high)
         return [self.model_at(middle + step), self.model_at(middle - step)]
+
+
+def _counted(runs: Data, starts: Starts | None) -> np.ndarray:
+    """Number of samples of each run and channel that count, (B, m)."""
+    there = ~np.isnan(runs.measurements)
+    if starts is not None:
+        there &= (np.arange(there.shape[1]) >= starts.counted_from[:, None])[..., None]
+    return there.sum(axis=1)
 
 
 def _arguments_among(function: Callable, names: Sequence[str]) -> tuple[str, ...]:

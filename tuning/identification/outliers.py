@@ -7,16 +7,17 @@ from collections.abc import Callable
 import numpy as np
 
 from filters.adaptive.robust import RobustExtendedKalmanFilter
-from filters.engine.batch import run
+from filters.starts import Starts
 from plants.state_space import StateSpaceModel
 from tuning.identification.objective import Objective
 from tuning.identification.runs import runs_of
+from tuning.identification.starts import estimates_of
 from tuning.problems.data import Data
 
-ROUNDS = 6  # of leaving out and identifying again, at most
+ROUNDS = 30  # of leaving out and identifying again, at most; a narrow gate takes many
 
 
-def outliers_of(model: StateSpaceModel, runs: Data, gate: float) -> np.ndarray:
+def outliers_of(model: StateSpaceModel, runs: Data, gate: float, starts: Starts | None = None) -> np.ndarray:
     """Which samples are outliers, (B, K + 1, m): innovations of more than `gate` standard deviations.
 
     The filter is an extended Kalman filter with Student-t noise (`filters.adaptive.robust`): the normal one
@@ -26,8 +27,9 @@ def outliers_of(model: StateSpaceModel, runs: Data, gate: float) -> np.ndarray:
         model: the model of the filter.
         runs: inputs and measurements.
         gate: number of standard deviations.
+        starts: of the runs, if some do not begin as the prior says.
     """
-    found = run(RobustExtendedKalmanFilter(model=model), runs.filter_keys, runs.inputs, runs.measurements)
+    found = estimates_of(model, runs, starts, RobustExtendedKalmanFilter)
     spread = np.sqrt(np.einsum("bkii->bki", found.innovation_covs))
     return np.abs(found.innovations) > gate * spread
 
@@ -49,6 +51,6 @@ class WithoutOutliers:
         return runs._replace(measurements=np.where(self.outliers, np.nan, runs.measurements))
 
 
-def without_outliers(objective: Objective, outliers: np.ndarray) -> Objective:
-    """The same objective without the outliers."""
-    return objective.with_changes(data=WithoutOutliers(objective.data, outliers))
+def without_outliers(objective: Objective, outliers: np.ndarray, gate: float) -> Objective:
+    """The same objective without the outliers, which are those beyond a gate."""
+    return objective.with_changes(data=WithoutOutliers(objective.data, outliers), gate=gate)

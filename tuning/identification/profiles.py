@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from numerics.characters import verbatim
 from numerics.checks import one_of
 from numerics.plots import BLUE, DARK, RUST, panels
 from tuning.identification.ascent import climb
@@ -15,6 +16,7 @@ from tuning.likelihood.identifiability import SIGNIFICANT
 from tuning.search.interruption import stop_on_interrupt
 
 REACH = (0.75, 1.5, 2.5)  # standard errors at which a parameter is held
+WIDE = 10.0  # ends of a range whose ratio is beyond this are told apart on a logarithmic axis alone
 LEGS = 6  # iterations of the other parameters at each
 
 
@@ -109,8 +111,10 @@ def profile_figure(found: Identification, made: Sequence[Profile]):
         axis.plot(grid, -0.5 * ((grid - best) / error) ** 2, color=RUST, linewidth=1, label="standard error")
         axis.plot(one.values, falls, "o-", color=BLUE, linewidth=1.2, markersize=3, label="profile")
         axis.axhline(-SIGNIFICANT, color=DARK, linewidth=0.8, linestyle=":")
+        if parameter.log and one.values[-1] > WIDE * one.values[0]:
+            axis.set_xscale("log")
         axis.set_ylim(min(-4.0, falls.min() * 1.05), 0.3)
-        axis.set_xlabel(one.name + (f" [{parameter.unit}]" if parameter.unit else ""))
+        axis.set_xlabel(verbatim(one.name + (f" [{parameter.unit}]" if parameter.unit else "")))
         axis.set_ylabel("fall in log L")
     axes[0].legend(fontsize=7, frameon=False)
     return figure

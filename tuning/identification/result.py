@@ -1,13 +1,16 @@
-"""The result of identification: values, standard errors, and what the data do not determine."""
+"""The result of identification: values, standard errors, and which parameters the data determine."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from tuning.identification.ascent import Ascent
 from tuning.identification.coordinates import Coordinates
+from tuning.identification.gates import lost_information
+from tuning.identification.null_tests import NullTest
 from tuning.identification.objective import Objective
 from tuning.likelihood.identifiability import COMPANION, KNOWN_WITHIN, TWO_SIDED
 
@@ -15,7 +18,8 @@ WIDEST = 0.5  # largest part of its range that the 95 % interval of a determined
 TRADED = 0.95  # correlation from which two parameters are reported to trade off
 EQUAL = 0.25  # standard errors within which the determined parameters of two equal optima lie ...
 EQUAL_VALUES = 0.01  # ... or difference of their log-likelihoods
-FLAT = 1e-10  # in range^-2: curvature below which a direction counts as flat
+LEVEL = 0.05  # of a test above which the data are as likely without a parameter
+MOST_RUNS = 8  # whose numbers a sentence has
 
 
 class Optimum(NamedTuple):
@@ -38,13 +42,17 @@ class Identification(NamedTuple):
     cov: np.ndarray  # (p, p)
     at: np.ndarray  # (p,), coordinates
     at_end: dict[str, bool]  # whether a value is at an end of its range
-    determined: dict[str, bool]  # by `is_narrow`, and not at an end of the range
+    determined: dict[
+        str, bool
+    ]  # by `is_narrow`, not at an end of the range, and zero is outside the 95 % interval
     log_likelihood: float
     start_log_likelihood: float
     optima: tuple[Optimum, ...]  # one for each start
     objective: Objective
     interrupted: bool
     seconds: float
+    narrow: Mapping[str, bool] = {}  # `is_narrow`
+    null_tests: Mapping[str, NullTest] = {}  # of each parameter against leaving it out; empty without
 
     @property
     def correlations(self) -> np.ndarray:
@@ -64,6 +72,12 @@ class Identification(NamedTuple):
             close = best.log_likelihood - one.log_likelihood < EQUAL_VALUES
             near += bool(close or (known.any() and (apart < EQUAL * scale)[known].all()))
         return near
+
+    @property
+    def begun_elsewhere(self) -> tuple[int, ...]:
+        """Places of the runs that do not begin as the model's prior says."""
+        starts = self.objective.starts
+        return () if starts is None else tuple(np.flatnonzero(starts.free).tolist())
 
     @property
     def left_out(self) -> int:
@@ -95,7 +109,7 @@ class Identification(NamedTuple):
         return {self.names[i]: float(axis[i]) for i in order}
 
     def _end_sentences(self) -> list[str]:
-        """Which values are at an end of their range; beyond zero, as of a dead band's width, there is nothing."""
+        """Which values are at an end of their range; an end at zero, as of a dead band's width, is separate."""
         said, free = [], [one for one in self.objective.coordinates.free if self.at_end[one.name]]
         gone = [
             one.name
@@ -104,22 +118,49 @@ class Identification(NamedTuple):
         ]
         others = [one.name for one in free if one.name not in gone]
         if gone:
-            said.append(f"At zero, where the range ends: {', '.join(gone)}. The data ask for none of it.")
+            said.append(f"At zero, where the range ends: {', '.join(gone)}. The data require none of them.")
         if others:
             said.append(f"At an end of the range: {', '.join(others)}. A wider one may fit better.")
         return said
 
+    def _needless(self) -> list[str]:
+        """The effects that the data do not require, by the tests."""
+        tests = self.null_tests.items()
+        some = [f"{name} (p = {one.p:.2g})" for name, one in tests if one.is_zero and one.p > LEVEL]
+        if not some:
+            return []
+        return [
+            f"The data are as likely without {', '.join(some)}: leave them out unless you know that they are "
+            "present."
+        ]
+
+    def _starts_sentence(self) -> str:
+        """Which runs do not begin as the prior says."""
+        places, starts = self.begun_elsewhere, self.objective.starts
+        leads = () if starts is None else starts.leads
+        some = ", ".join(str(place + 1) for place in places[:MOST_RUNS])
+        some += ", ..." if len(places) > MOST_RUNS else ""
+        rows = sorted({int(leads[place]) for place in places})
+        count = f"{rows[0]}" if len(rows) == 1 else f"{rows[0]} to {rows[-1]}"
+        which = f"Run {some} does" if len(places) == 1 else f"{len(places)} of {len(leads)} runs ({some}) do"
+        said = f"the first {count} rows only determine the initial state and are not scored"
+        return f"{which} not begin as the model's prior says: {said}."
+
     def sentences(self) -> list[str]:
-        """Sentences on what the data determine, and what they do not."""
+        """Sentences on which parameters the data determine."""
         said = []
         ends = [name for name in self.names if self.at_end[name]]
-        wide = [name for name in self.names if not self.determined[name] and not self.at_end[name]]
-        if not ends and not wide:
+        loose = [name for name in self.names if not self.determined[name] and not self.at_end[name]]
+        wide = [name for name in loose if not self.narrow[name]]
+        zero = [name for name in loose if self.narrow[name]]
+        if not ends and not loose:
             said.append("The data determine every free parameter.")
         if wide:
             rule = "a 95 % interval takes half the range, or a factor of ten"
             said.append(f"The data do not determine {', '.join(wide)}: {rule}.")
-        said += self._end_sentences()
+        if zero:
+            said.append(f"The data do not distinguish {', '.join(zero)} from zero: it lies in a 95 % interval.")
+        said += self._end_sentences() + self._needless()
         for one, other, correlation in self.traded:
             said.append(f"{one} and {other} trade off (correlation {correlation:.3f}).")
         if len(self.least_determined) > 1 and wide:
@@ -127,6 +168,8 @@ class Identification(NamedTuple):
             said.append(f"Least determined is a change of several together (as fractions of the ranges): {parts}.")
         if len(self.optima) > 1:
             said.append(f"{self.agreement} of {len(self.optima)} starts led to this maximum.")
+        if self.begun_elsewhere:
+            said.append(self._starts_sentence())
         if self.left_out:
             said.append(f"{self.left_out} samples beyond the gate were left out.")
         if self.interrupted:
@@ -139,17 +182,19 @@ def identification_of(
     first: np.ndarray,
     best: Ascent,
     optima: tuple[Optimum, ...],
+    tests: Mapping[str, NullTest] | None = None,
     *,
     interrupted: bool,
     seconds: float,
 ) -> Identification:
-    """The result at the best maximum, with standard errors and what is determined."""
+    """The result at the best maximum, with standard errors and which parameters are determined."""
     coordinates, at = objective.coordinates, best.at
     width = coordinates.high - coordinates.low
-    cov = covariance(best.found.information, best.found.scores, width)
+    cov, _ = covariances_of(objective, best)
     errors = np.sqrt(np.diag(cov))
     ends = (at <= coordinates.low + 1e-6 * width) | (at >= coordinates.high - 1e-6 * width)
-    narrow = is_narrow(cov, coordinates)
+    natural, values = errors * np.abs(coordinates.slopes(at)), coordinates.values(at)
+    narrow, not_zero = is_narrow(cov, coordinates), np.abs(values) > TWO_SIDED * natural
     names = coordinates.names
 
     def by_name(values) -> dict:
@@ -159,18 +204,30 @@ def identification_of(
         names=names,
         values=coordinates.named(at),
         start=coordinates.named(first),
-        standard_errors=by_name(errors * np.abs(coordinates.slopes(at))),
+        standard_errors=by_name(natural),
         cov=cov,
         at=at,
         at_end=by_name(ends),
-        determined=by_name(narrow & ~ends),
+        determined=by_name(narrow & ~ends & not_zero),
+        narrow=by_name(narrow),
         log_likelihood=best.found.value,
         start_log_likelihood=objective.value(first),
         optima=optima,
         objective=objective,
         interrupted=interrupted,
         seconds=seconds,
+        null_tests=tests or {},
     )
+
+
+def covariances_of(objective: Objective, best: Ascent) -> tuple[np.ndarray, np.ndarray]:
+    """Covariances (p, p) of the estimates at a maximum: as stated, and by Fisher's information alone.
+
+    Both include the information lost with the samples beyond a gate (`gates.lost_information`).
+    """
+    width, lost = objective.coordinates.high - objective.coordinates.low, lost_information(objective.gate)
+    information, scores = best.found.information, best.found.scores
+    return lost * covariance(information, scores, width), lost * covariance(information, scores[:0], width)
 
 
 def is_narrow(cov: np.ndarray, coordinates: Coordinates) -> np.ndarray:

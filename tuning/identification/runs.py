@@ -9,8 +9,9 @@ import numpy as np
 
 from numerics.checks import shown
 from numerics.streams import filter_keys
+from plants.diffusion import same_dt
 from plants.logs.log import Log
-from tuning.problems.data import Data
+from tuning.problems.data import Data, mask_of, padded
 
 
 def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
@@ -23,25 +24,23 @@ def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
     if not given or not all(isinstance(one, Data | Log) for one in given):
         raise ValueError(f"data must be some of Log or Data, but got {shown(data)}")
     if len(given) == 1 and isinstance(given[0], Data):
-        return given[0]
+        return given[0].seen
     times = sorted({one.dt for one in given if isinstance(one, Log)})
-    if times and times[-1] > times[0] * (1 + 1e-6):
+    if times and not same_dt(times[0], times[-1]):
         raise ValueError(f"logs must have one sample time, but got {', '.join(f'{dt:g} s' for dt in times)}")
     inputs: list[np.ndarray] = []
     measurements: list[np.ndarray] = []
     for one in given:
-        inputs += [one.inputs] if isinstance(one, Log) else list(one.inputs)
-        measurements += [one.measurements] if isinstance(one, Log) else list(one.measurements)
+        for part in [one] if isinstance(one, Log) else map(one.one, range(len(one.seeds))):
+            inputs += [part.inputs] if isinstance(part, Log) else list(part.inputs)
+            measurements += [part.measurements] if isinstance(part, Log) else list(part.measurements)
+    lengths = list(map(len, measurements))
     widths = {(u.shape[1], z.shape[1]) for u, z in zip(inputs, measurements, strict=True)}
     if len(widths) > 1:
         raise ValueError(f"runs must have the same inputs and measurements, but got {sorted(widths)} of each")
-    ((p, m),) = widths
-    steps, seeds = max(map(len, inputs)), tuple(range(len(inputs)))
-    all_inputs, all_measurements = np.zeros((len(seeds), steps, p)), np.full((len(seeds), steps + 1, m), np.nan)
-    for place, (u, z) in enumerate(zip(inputs, measurements, strict=True)):
-        all_inputs[place, : len(u)], all_inputs[place, len(u) :] = u, u[-1:]
-        all_measurements[place, : len(z)] = z
-    return Data(seeds, all_inputs, all_measurements, filter_keys(seeds), 0)
+    rows, seeds = max(map(len, measurements)), tuple(range(len(inputs)))
+    all_inputs, all_measurements = padded(inputs, rows - 1, None), padded(measurements, rows)
+    return Data(seeds, all_inputs, all_measurements, filter_keys(seeds), 0, counted=mask_of(lengths, rows))
 
 
 def _listed(data: Any) -> list[Data | Log]:

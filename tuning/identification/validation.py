@@ -10,12 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.engine.batch import Estimates, run
-from filters.gaussian.extended import ExtendedKalmanFilter
-from numerics.angles import difference
+from filters.engine.batch import Estimates
+from filters.starts import Starts, as_the_prior_says
+from numerics.angles import difference, on_one_branch
 from plants.logs.log import Log
 from plants.state_space import StateSpaceModel
 from tuning.identification.result import Identification
+from tuning.identification.starts import estimates_of, starts_of
 from tuning.problems.data import Data
 
 
@@ -29,37 +30,46 @@ class Validation(NamedTuple):
     nis: float  # mean NIS over the number of channels; 1 for a consistent filter
 
 
-def validation_of(model: StateSpaceModel, runs: Data, unseen: Sequence[bool] | None = None) -> Validation:
+def validation_of(
+    model: StateSpaceModel, runs: Data, unseen: Sequence[bool] | None = None, starts: Starts | None = None
+) -> Validation:
     """Metrics of a model on runs.
 
-    The simulation is a filter without process noise and prior covariance, whose gain is zero.
+    The simulation is a filter without process noise and prior covariance, whose gain is zero. Of runs that do not
+    begin as the prior says it begins where their first rows say, and these do not count.
 
     Args:
         model: the model of the filter.
         runs: inputs and measurements.
         unseen: (m,) which channels the filter only predicts: their errors are those of the estimate.
+        starts: of the runs; None if all begin as the model's prior says.
     """
     symbols = [one.symbol for one in model.measurements]
     hidden = np.zeros(model.m, dtype=bool) if unseen is None else np.asarray(unseen)
-    there = ~np.isnan(runs.measurements)
+    starts = as_the_prior_says(model, len(runs.measurements)) if starts is None else starts
+    counted = np.arange(runs.measurements.shape[1]) >= starts.counted_from[:, None]
+    there = ~np.isnan(runs.measurements) & counted[..., None]
     shown = runs._replace(measurements=np.where(hidden, np.nan, runs.measurements))
-    estimates, nothing = _estimates(model, shown), np.zeros((model.n, model.n))
-    simulated = _estimates(model.replace(process_noise_cov=nothing, prior_cov=nothing), shown)
+    estimates, nothing = estimates_of(model, shown, starts), np.zeros((model.n, model.n))
+    known = starts._replace(covs=np.zeros_like(starts.covs))
+    simulated = estimates_of(model.replace(process_noise_cov=nothing, prior_cov=nothing), shown, known)
 
     def rmse(found: Estimates) -> np.ndarray:
         errors = np.where(hidden, _less_predicted(model, runs, found, hidden), found.innovations)
         return np.sqrt((np.where(there, errors, 0.0) ** 2).sum(axis=(0, 1)) / there.sum(axis=(0, 1)))
 
     one_step, simulation = rmse(estimates), rmse(simulated)
-    spread = np.array([runs.measurements[..., i][there[..., i]].std() for i in range(model.m)])
+    rows = np.where(there, runs.measurements, np.nan).reshape(-1, model.m)
+    rows = on_one_branch(rows, model.shape.measurement_angles)
+    spread = np.array([rows[~np.isnan(rows[:, i]), i].std() for i in range(model.m)])
     fit = 100 * (1 - simulation / np.where(spread > 0, spread, np.nan))
     weighted = np.linalg.solve(estimates.innovation_covs, estimates.innovations[..., None])[..., 0]
-    nis = (weighted * estimates.innovations).sum() / there[..., ~hidden].sum()
+    nis = (weighted * estimates.innovations)[counted].sum() / there[..., ~hidden].sum()
 
     def by_symbol(values: np.ndarray) -> dict[str, float]:
         return dict(zip(symbols, map(float, values), strict=True))
 
-    likelihood = float(estimates.log_likelihoods.sum())
+    likelihood = float(estimates.log_likelihoods[counted].sum())
     return Validation(likelihood, by_symbol(one_step), by_symbol(simulation), by_symbol(fit), float(nis))
 
 
@@ -75,19 +85,19 @@ def validate(
     """
     objective = found.objective
     if data is not None:
-        objective = objective.with_changes(data=data)
+        objective = objective.with_changes(data=data, starts=None)
     points = {
         "start": objective.coordinates.of([found.start[name] for name in found.names]),
         "identified": found.at,
     }
-    unseen = objective.unseen
+    unseen, starts = objective.unseen, objective.starts
+    if data is not None:
+        kept = objective.moves_prior(found.at)
+        starts = None if kept else starts_of(objective.model_at(found.at), objective.data_at(found.at), unseen)
     return {
-        name: validation_of(objective.model_at(at), objective.data_at(at), unseen) for name, at in points.items()
+        name: validation_of(objective.model_at(at), objective.data_at(at), unseen, starts)
+        for name, at in points.items()
     }
-
-
-def _estimates(model: StateSpaceModel, runs: Data):
-    return run(ExtendedKalmanFilter(model=model), runs.filter_keys, runs.inputs, runs.measurements)
 
 
 def _less_predicted(model: StateSpaceModel, runs: Data, estimates: Estimates, hidden: np.ndarray) -> np.ndarray:

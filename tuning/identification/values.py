@@ -6,13 +6,16 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from numerics.checks import finite, shown
+from numerics.checks import finite, positive, shown
 from numerics.files import write_whole
 from numerics.toml import as_toml, read_toml
+from plants.diffusion import noise_for_dt, same_dt
+from plants.logs.write import check_not_beside
 from plants.state_space import StateSpaceModel
 from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification
@@ -20,15 +23,21 @@ from tuning.identification.result import Identification
 TABLES = ("values", "identified")
 
 
-def write_values(path: str | Path, found: Identification, logs: Sequence[str]) -> None:
-    """Write the identified values of a model; ValueError unless the path ends in .toml and can be written."""
+def write_values(path: str | Path, found: Identification, logs: Sequence[str], dt: float | None = None) -> None:
+    """Write the identified values of a model, and the sample time of its logs [s], if that is known.
+
+    Raises:
+        ValueError: unless the path ends in .toml, lies beside no log of its name and can be written.
+    """
     if not str(path).endswith(".toml"):
         raise ValueError(f"a file of values must end in .toml, but got {str(path)!r}")
+    check_not_beside(path)
     identified = {
         "logs": [Path(log).name for log in logs],
         "log_likelihood": found.log_likelihood,
         "standard_errors": found.standard_errors,
         "determined": found.determined,
+        **({} if dt is None else {"dt": float(dt)}),
     }
     tables: dict[str, Mapping] = {"values": found.values, "identified": identified}
     write_whole(path, as_toml(tables, "Numbers of a model as `thruster identify` found them."))
@@ -50,20 +59,46 @@ def read_values(path: str | Path) -> dict[str, float]:
 def with_values(make: Callable | StateSpaceModel, path: str | Path) -> Callable[[float], StateSpaceModel]:
     """A function of the sample time that makes a model with the values in a file.
 
+    Values belong to the sample time that the file says they were found at. At another one a function of `dt` makes
+    the model, with variances in Q as `noise_for_dt` has them; any other model is refused.
+
     Args:
         make: the model, or a function that makes it, as for `ModelFamily`.
         path: path of the file.
 
     Raises:
-        ValueError: if the file is damaged, or names a parameter that the model does not have.
+        ValueError: if the file is damaged, or names a parameter that the model does not have; the function raises
+            it for another sample time of a model that does not take one.
     """
-    values = read_values(path)
-    made = partial(valued, make, values)
+    values, of = read_values(path), _dt_of(path)
+    made = partial(_at_dt, make, values, of, str(path))
     try:
-        made(1.0)
+        made(1.0 if of is None else of)
     except ValueError as error:
         raise ValueError(f"{error} (in {path})") from None
     return made
+
+
+def _dt_of(path: str | Path) -> float | None:
+    """The sample time of the logs that values were found on [s]; None in a file that does not say."""
+    found = read_toml(path, "a file of values").get("identified")
+    dt = found.get("dt") if isinstance(found, dict) else None
+    return None if dt is None else positive(f"dt in {path}", dt)
+
+
+def _at_dt(
+    make: Callable | StateSpaceModel, values: Mapping[str, float], of: float | None, path: str, dt: float
+) -> StateSpaceModel:
+    """The model with values of one sample time at another."""
+    if of is not None and not same_dt(of, dt):
+        takes = not isinstance(make, StateSpaceModel) and "dt" in inspect.signature(make).parameters
+        if not takes:
+            raise ValueError(
+                f"the dt of a log must be that of {path}, {of:g} s, for a model that takes no dt, but is {dt:g} s"
+            )
+        own = ModelFamily(make, (), noise=False, dt=dt).variances_of_q
+        values = {n: float(noise_for_dt(v, of, dt)) if n in own else v for n, v in values.items()}
+    return valued(make, values, dt)
 
 
 def valued(

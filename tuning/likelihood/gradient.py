@@ -61,7 +61,7 @@ def maximise_likelihood(
     The search is L-BFGS-B in the logarithms of the variances with the gradient of `filters.likelihood`, within the
     same ranges as an Optuna study. With the Hessian H of -log L and the gradients g_b of B independent runs, the
     standard errors are the roots of the diagonal of H^-1 (sum_b g_b g_b') H^-1, which holds for a wrong model,
-    too. Where the problem has parameters of its own, from which Q and R follow, these are estimated.
+    too. If the problem has its own parameters, which determine Q and R, these are estimated.
 
     Args:
         filter_name: "kf" or "ekf".

@@ -9,8 +9,9 @@ import numpy as np
 from optuna.distributions import BaseDistribution
 
 from filters.registry import filter_class
+from filters.tuned_file import NOISE
 from tuning.likelihood.noise import known_information
-from tuning.problems.data import Data
+from tuning.problems.data import Data, where_true
 from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.problem import Problem
 from tuning.search.parameters import places_in
@@ -84,7 +85,7 @@ def identify(
             filter_ = choice_of(choice.name, moved, scenario).filter(scenario)
             some = estimates_in_parts(filter_, one)
             first = one.first_scored if scenario.leads_in else 0
-            parts += [estimates.log_likelihoods[:, first:].sum(axis=1) for _, estimates in some]
+            parts += [_in_run(part, estimates.log_likelihoods)[:, first:].sum(axis=1) for part, estimates in some]
         found = np.concatenate(parts)
         return np.where(np.isfinite(found), found, LEAST)
 
@@ -99,19 +100,33 @@ def identify(
     return Identifiability(names, tuned, np.exp(best), cov, identified)
 
 
+def _in_run(data: Data, log_likelihoods: np.ndarray) -> np.ndarray:
+    """Log-likelihoods of steps, (B, K + 1), with zeros in the padding of runs."""
+    if data.counted is None:
+        return log_likelihoods
+    return where_true(np.arange(data.steps + 1) < data.rows[:, None], log_likelihoods, 0.0)
+
+
 def too_many(choice: Choice, space: Mapping[str, BaseDistribution]) -> list[str]:
     """A sentence if identifiability is not computed because of too many parameters; else nothing."""
     count = len(_names(choice, space))
     if count <= MOST_NUMBERS:
         return []
     rule = f"Identifiability is computed for at most {MOST_NUMBERS} parameters"
-    return [f"{rule}; here are {count}. A problem may define fewer parameters of its own."]
+    return [f"{rule}; here are {count}. A problem may define its own, fewer parameters."]
 
 
 def _names(choice: Choice, space: Mapping[str, BaseDistribution]) -> tuple[str, ...]:
-    """The tuned parameters of the model; none without a covariance. Correlations have no logarithm."""
-    places = places_in(choice) if filter_class(choice.name).has_covariance else ()
-    return tuple(name for name, range_ in space.items() if name in places and getattr(range_, "log", False))
+    """The tuned parameters of the model; none without a covariance. Correlations and zeros have no logarithm.
+
+    Parameters of a problem's own are none where the choice has a Q and R that they do not give.
+    """
+    if not filter_class(choice.name).has_covariance:
+        return ()
+    places, own = places_in(choice), parameters_of(choice)
+    without = [name for name in choice.model if set(NOISE) & set(choice.model)]
+    logarithmic = [name for name, range_ in space.items() if name in places and getattr(range_, "log", False)]
+    return tuple(name for name in logarithmic if name not in without and own[name] > 0)
 
 
 def maximum(
@@ -190,7 +205,7 @@ def is_identified(
 
     They do if its 95 % interval is within that, if ten times more and ten times less are significantly less likely
     (log L falls by 1.92) when the other parameters move with it as in `cov`, and if the maximum is not at an end
-    of the range. The second rule detects what a curvature does not: that there may be no limit on one side.
+    of the range. The second rule detects a missing limit on one side, which a curvature does not show.
 
     Args:
         log_likelihoods: the function that returns those of all runs, (B,), at logarithms (p,).
@@ -216,7 +231,7 @@ def is_identified(
 
 
 def sentences(found: Identifiability) -> list[str]:
-    """Sentences on what the innovations determine, and what they do not."""
+    """Sentences on which parameters the innovations determine."""
     rows = list(zip(found.names, found.identified, found.factors, strict=True))
     known = [f"{name} within a factor of {factor:.3g}" for name, known, factor in rows if known]
     loose = [name for name, known, _ in rows if not known]

@@ -61,7 +61,7 @@ def noise_family(choice: Choice, problem: Problem, parameters: Sequence[Paramete
             np.array([(getattr(above, name) - getattr(below, name)) / (2 * STEP) for above, below in pairs])
             for name in ("process_noise_cov", "measurement_noise_cov")
         )
-        return model_at(values), data.inputs, data.measurements, q, r
+        return model_at(values), *_given(data), q, r
 
     return noise_at
 
@@ -111,9 +111,15 @@ def _variances(model: StateSpaceModel, parameters: Sequence[Parameter]) -> Calla
         slopes[range(count), places, places] = values
         q, r = np.diag(variances[:n]), np.diag(variances[n:])
         changed = model.replace(process_noise_cov=q, measurement_noise_cov=r)
-        return changed, data.inputs, data.measurements, slopes[:, :n, :n], slopes[:, n:, n:]
+        return changed, *_given(data), slopes[:, :n, :n], slopes[:, n:, n:]
 
     return noise_at
+
+
+def _given(data: Data) -> tuple[np.ndarray, np.ndarray]:
+    """Inputs and measurements of a likelihood, to which a run's padding adds nothing."""
+    seen = data.seen
+    return seen.inputs, seen.measurements
 
 
 def _index(place: Place, n: int) -> int:

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from numerics.checks import shown
 from numerics.modules import object_named
-from plants.logs.log import Log
+from plants.logs.findings import has_outliers, remarks_on
+from plants.logs.log import Log, cut_at_gaps
 from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification
 from tuning.identification.values import write_values
-from tuning.logs.problem import runs_by_name
+from tuning.logs.problem import runs_by_name, without_twins
 from tuning.logs.read import read_named
+from tuning.problems.log_checks import check_apart, check_times
 from tuning.problems.parameter import Parameter
 from tuning.problems.rooms import room_of_logs
 
 EVERY_THIRD = 3
+SHORTEST_PIECE = 10  # rows of a run between gaps: fewer tell little beside how they begin
 OFFSET_SHARE = 4  # a clock offset may be at most the length of a log divided by this
 
 
 def split_runs(
-    logs: Any, held_out: Any = None, *, use_all: bool = False, **options: Any
+    logs: Any, held_out: Any = None, *, use_all: bool = False, hold_gaps: bool = False, **options: Any
 ) -> tuple[list[Log], list[Log]]:
     """The training logs, and the held-out ones for validation: by default every third of three or more.
 
@@ -30,6 +34,7 @@ def split_runs(
         logs: recorded runs, as `tuning.logs.read.read_named` takes them.
         held_out: the held-out runs, or their paths or names.
         use_all: whether no run is held out.
+        hold_gaps: whether runs are not cut at gaps, and their inputs are held there.
         **options: options of `read_named`.
 
     Raises:
@@ -46,9 +51,20 @@ def split_runs(
     learning = [name for name in names if name not in validating]
     if not learning:
         raise ValueError("at least one log must be left to learn from, but all are held out")
-    read = {name: read_named(runs[name], **options, name=name)[0] for name in (*learning, *validating)}
-    _check_times(list(read.values()))
-    return [read[name] for name in learning], [read[name] for name in validating]
+    read = [read_named(runs[name], **options, name=name)[0] for name in (*learning, *validating)]
+    check_times(read)
+    read = without_twins(read, validating)
+    parts = [log for log in read if log.name not in validating], [log for log in read if log.name in validating]
+    check_apart(*parts)
+    if hold_gaps:
+        return parts
+    found = [[piece for log in some for piece in cut_at_gaps(log, SHORTEST_PIECE)] for some in parts]
+    if not found[0]:
+        raise ValueError(
+            f"logs must have {SHORTEST_PIECE} rows without a gap (or give hold_gaps, --hold-gaps), but "
+            f"{', '.join(log.name for log in parts[0])} have not"
+        )
+    return found[0], found[1]
 
 
 def family_of(
@@ -81,7 +97,7 @@ def family_of(
         whose = None if preset is None else str(preset)
         return room_of_logs().family_of_preset(logs, whose, sensors, list(free), noise=noise)
     if not free:
-        raise ValueError("free (--free) must name what of the model is to be found, but got none")
+        raise ValueError("free (--free) must name at least one parameter of the model, but got none")
     found = object_named(model, "model") if isinstance(model, str) else model
     return LoggedFamily(logs, found, list(free), noise=noise, dt=logs[0].dt)
 
@@ -92,11 +108,41 @@ class LoggedFamily(ModelFamily):
     def __init__(self, logs: Sequence[Log], make: Any, free: Sequence[str], **options: Any):
         """Keep the logs."""
         super().__init__(make, free, **options)
-        self.data = tuple(logs)
+        self.data, self.dt = tuple(logs), logs[0].dt
 
     def shifted(self, logs: Sequence[Log]) -> tuple[Log, ...]:
         """Other logs for this family, unchanged."""
         return tuple(logs)
+
+
+def remarks(runs: Sequence[Log], proving: Sequence[Log], found: Identification) -> list[str]:
+    """Findings in the logs, remedies, and the meaning of a gate for a filter with these parameters.
+
+    Args:
+        runs: training runs, or their pieces between gaps.
+        proving: held-out ones.
+        found: what was identified.
+    """
+    logs = (*runs, *proving)
+    said = remarks_on(logs)
+    if any(log.whole is not None for log in logs):
+        said.append(
+            "Runs are cut at gaps: each piece is a separate run with its own initial state (--hold-gaps, "
+            "hold_gaps=True, does not cut)."
+        )
+    if has_outliers(runs) and not found.left_out:
+        said.append(
+            "Outliers bias the result: --gate 5 (gate=5) leaves out samples beyond five standard deviations."
+        )
+    gate = found.objective.gate
+    if gate < math.inf:
+        held_out, seen = "held-out runs count all samples", "the runs it has seen are of the same samples"
+        said.append(
+            "R and Q are those of the samples within the gate: a filter that also meets the outliers needs a "
+            f"gate (session(gate={gate:g})), or to be robust (ekf-robust). Figures of "
+            f"{(held_out if proving else seen)}."
+        )
+    return said
 
 
 def check_offsets(parameters: Sequence[Parameter], logs: Sequence[Log]) -> None:
@@ -123,17 +169,8 @@ def write_found(path: str | Path, found: Identification, family: Any, logs: Sequ
         ValueError: if the path has another ending or cannot be written.
     """
     if not str(path).endswith(".toml"):
-        raise ValueError(f"a file of what was identified must end in .toml, but got {shown(str(path))}")
+        raise ValueError(f"a file of identified parameters must end in .toml, but got {shown(str(path))}")
     if isinstance(family, ModelFamily):
-        write_values(path, found, logs)
+        write_values(path, found, logs, getattr(family, "dt", None))  # of a family of logs
     else:
         room_of_logs().write_identified(path, found, family, logs)
-
-
-def _check_times(logs: Sequence[Log]) -> None:
-    """Raise ValueError unless all logs have the same sample time."""
-    for log in logs[1:]:
-        if abs(log.dt - logs[0].dt) > 1e-6 * logs[0].dt:
-            raise ValueError(
-                f"logs must have one sample time, but {logs[0].name} has {logs[0].dt:g} s, {log.name} {log.dt:g} s"
-            )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Problem
 
 OPTIONS = ("preset", "model", "sensors", "columns", "clock_offset", "dt")  # of `read_named`
-CUTS = ("held_out", "blocks", "lead")
+CUTS = ("held_out", "blocks", "lead", "hold_gaps", "start")
 
 
 def log_problem(
@@ -26,6 +26,10 @@ def log_problem(
     held_out: Any = None,
     blocks: int | None = None,
     lead: int | None = None,
+    hold_gaps: bool = False,
+    start: str | None = None,
+    *,
+    apart: bool = True,
     **options: Any,
 ) -> LogProblem:
     """The problem of some logs.
@@ -33,9 +37,14 @@ def log_problem(
     Args:
         logs: a recorded run or several: paths, tables or `Log`s, as `read_named` takes them. Names of
             tables are run1, run2, ...
-        held_out: held-out runs, or their paths or names; those that are not among the logs are added to them.
+        held_out: held-out runs, or their paths or names; those that are not among the logs are added to them. A
+            run among the logs with the same content is the held-out one, whatever its path or name.
         blocks: number of blocks of each run.
         lead: rows of a block's lead-in.
+        hold_gaps: whether runs are not cut at gaps, and their inputs are held there.
+        start: where blocks begin, "prior" or "measurement", as `LogProblem` takes it.
+        apart: whether to check that held-out runs are not among the others; a tuned file's digests have settled
+            it.
         **options: options of `read_named`.
 
     Raises:
@@ -48,10 +57,13 @@ def log_problem(
         )
     pairs = [read_named(log, **options, name=name) for name, log in runs.items()]
     recorded = [log for log, _ in pairs]
+    recorded = without_twins(recorded, held) if apart else recorded
+    runs = {log.name: runs[log.name] for log in recorded}
     model = read_for(recorded[0], pairs[0][1])[1]()
-    cuts: dict[str, Any] = {"held_out": held, "blocks": blocks, "lead": lead}
+    cuts: dict[str, Any] = {"held_out": held, "blocks": blocks, "lead": lead, "hold_gaps": hold_gaps or None}
+    cuts["start"] = start
     cuts = {key: value for key, value in cuts.items() if value is not None and value != []}
-    return LogProblem(recorded, model, **cuts, content=_content(runs, options, cuts))
+    return LogProblem(recorded, model, **cuts, apart=apart, content=_content(runs, options, cuts))
 
 
 def runs_by_name(logs: Any, held_out: Any = None) -> tuple[dict[str, Any], list[str]]:
@@ -61,11 +73,35 @@ def runs_by_name(logs: Any, held_out: Any = None) -> tuple[dict[str, Any], list[
         _add(runs, name_of(log, len(runs)), log)
     held = []
     for log in listed(held_out):
-        name = name_of(log, len(runs))
+        name = next((known for known, one in runs.items() if _is_same(one, log)), name_of(log, len(runs)))
         if not (isinstance(log, str) and name in runs):
             _add(runs, name, log)
         held.append(name)
     return runs, list(dict.fromkeys(held))
+
+
+def without_twins(logs: Sequence[Log], held: Sequence[str]) -> list[Log]:
+    """The logs without those that are the content of a held-out one under another name.
+
+    Args:
+        logs: recorded runs.
+        held: names of the held-out ones.
+
+    Raises:
+        ValueError: if nothing is left to learn from.
+    """
+    proving = {log.digest for log in logs if log.name in held}
+    left = [log for log in logs if log.name in held or log.digest not in proving]
+    if held and all(log.name in held for log in left):
+        raise ValueError("at least one log must be left to learn from, but all are held out")
+    return left
+
+
+def _is_same(one: Any, other: Any) -> bool:
+    """Whether two runs are one object, or paths of one file."""
+    if isinstance(one, str | PathLike) and isinstance(other, str | PathLike):
+        return Path(one).resolve() == Path(other).resolve()
+    return one is other
 
 
 def listed(logs: Any) -> list:
@@ -127,12 +163,20 @@ def problems_in(file: Path, model: str | None = None) -> list[Problem]:
                 f"logs in a tuned file must have paths and options, but {file} has {shown(content)}"
             ) from None
         _check_model(options.get("model"), model, file)
-        problem = log_problem(paths, **options)
+        problem = log_problem(paths, **options, apart=False)
         if name not in (problem.name, re.sub(r" and (\d+) more$", r"+\1", problem.name)):  # as it was until 0.1
             said = f"logs in a tuned file must be those of {shown(name)}"
             raise ValueError(f"{said}, but {file} has {problem.name}")
         found.append(named(problem, name))
     return found
+
+
+def model_named_in(problem: Problem) -> str | None:
+    """The model that must be given again (--model) with a tuned file of a problem; None where none must."""
+    content = problem.as_mapping()
+    if content is None or "logs" not in content:
+        return None
+    return content["options"].get("model")
 
 
 def _check_model(named, given: str | None, file: Path) -> None:
@@ -143,6 +187,6 @@ def _check_model(named, given: str | None, file: Path) -> None:
         )
     if named != given:
         raise ValueError(
-            f"the model of logs must be given where it is code, but {file} only names {shown(named)}: say --model "
+            f"the model of logs must be given if it is code, but {file} only names {shown(named)}: use --model "
             f"{named}, if you trust it"
         )

@@ -62,7 +62,10 @@ def read_named(
         if preset is not None:
             from tuning.identification.values import with_values  # which imports Optuna
 
+            log = read_for(path, offer, **options)[0]
             offer = with_values(offer, preset)
+            offer(log.dt)  # or the values are of another sample time
+            return log, offer
         return read_for(path, offer, **options)[0], offer
     room = room_of_logs()
     whose = room.DEFAULT_PRESET if preset is None else str(preset)

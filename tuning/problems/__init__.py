@@ -1,1 +1,1 @@
-"""What a study needs to know of a plant: problems by name, their data and scale."""
+"""Problems of studies: found by name, with their data and scale."""

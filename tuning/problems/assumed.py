@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property, lru_cache
+from inspect import signature
+from math import isfinite
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from filters.tuned_file import NOISE, PRIOR
-from numerics.angles import wrapped_where
+from numerics.angles import on_one_branch
 from numerics.checks import at_least, positive, shown
 from numerics.modules import said
 from plants.state_space import StateSpaceModel
@@ -67,8 +71,8 @@ class AssumedProblem(Problem):
                 f"first_scored_step must be below the number of steps, {self.steps}, but got {first_scored_step}"
             )
         self._assumed, self._scale = assumed, None if scale is None else tuple(map(float, scale))
-        self._parameters = _checked_parameters(parameters)
         self._untuned, self._true = _mapping("untuned", untuned), _mapping("true", true)
+        self._parameters = with_defaults(_checked_parameters(parameters), assumed, self._untuned or {})
         self._dt = None if dt is None else positive("dt", dt)
         if self._parameters is not None and isinstance(assumed, StateSpaceModel):
             raise ValueError(f"a model with parameters must be a function of them, but got {shown(assumed)}")
@@ -84,12 +88,12 @@ class AssumedProblem(Problem):
 
     @property
     def found_scale_about(self) -> str:
-        """What that scale is, in words."""
+        """A description of that scale."""
         return SPREAD
 
     @property
     def scale_about(self) -> str:
-        """What the scale is, in words."""
+        """A description of the scale."""
         return GIVEN if self._scale is not None else self.found_scale_about
 
     def model(self, **changes) -> StateSpaceModel:
@@ -133,9 +137,26 @@ class AssumedProblem(Problem):
             return {one.name: one.start for one in self._parameters} | (self._untuned or {})
         return self._thumb | (self._untuned or {})
 
+    @cached_property
+    def given(self) -> dict | None:
+        """The given values of the model: its own Q and R, or the defaults of its parameters, and `untuned`.
+
+        None for parameters without a default, and if they equal the oracle's.
+        """
+        if self._parameters is not None:
+            own = {one.name: one.default for one in self._parameters if one.default is not None}
+            found = own | (self._untuned or {})
+            return found if len(own) == len(self._parameters) else None
+        model = self.model()
+        q, r = rows_argument(model.process_noise_cov), as_argument(model.measurement_noise_cov)
+        found = {"process_noise_cov": q, "measurement_noise_cov": r} | (self._untuned or {})
+        known = self.true
+        same = known is not None and found.keys() == known.keys()
+        return None if same and known and all(np.array_equal(found[key], known[key]) for key in found) else found
+
     @property
     def lacks_ranges(self) -> bool:
-        """Whether the Q of `untuned` is the model's own: neither the model nor true states tell a range."""
+        """Whether the Q of `untuned` is the model's own, because nothing gives a range of states."""
         if self._parameters is not None or "process_noise_cov" in (self._untuned or {}):
             return False
         model = self.model()
@@ -175,7 +196,8 @@ class AssumedProblem(Problem):
         deviations = np.sqrt(np.diag(model.process_noise_cov))
         if model.state_low is not None and model.state_high is not None:
             deviations = RANGE_FRACTION * (model.state_high - model.state_low)
-        elif (states := self.data(self.range_seeds).states) is not None:
+        elif (data := self.data(self.range_seeds)).states is not None:
+            states = data.counted_rows(data.states)
             deviations[: states.shape[-1]] = RANGE_FRACTION * np.ptp(rows_of(states, model), axis=0)
         variances = tuple(float(v) for v in deviations**2)
         return {"process_noise_cov": variances, "measurement_noise_cov": as_argument(model.measurement_noise_cov)}
@@ -203,9 +225,9 @@ def _data(problem: AssumedProblem, seeds: tuple[int, ...]) -> Data:
 
 
 def rows_of(states: np.ndarray, model: StateSpaceModel) -> np.ndarray:
-    """True states of all runs and steps, one a row, angles in (-pi, pi]."""
+    """True states of all runs and steps, one a row, angles on the branch of their circular mean."""
     rows = states.reshape(-1, states.shape[-1])
-    return wrapped_where(rows, model.shape.state_angles[: rows.shape[1]])
+    return on_one_branch(rows, model.shape.state_angles[: rows.shape[1]])
 
 
 def as_argument(cov: np.ndarray):
@@ -232,6 +254,33 @@ def _checked_parameters(given) -> tuple[Parameter, ...] | None:
     if len(set(names)) < len(names):
         raise ValueError(f"names of parameters must differ from one another, but got {', '.join(names)}")
     return found
+
+
+def with_defaults(
+    parameters: tuple[Parameter, ...] | None, make: Any, untuned: Mapping
+) -> tuple[Parameter, ...] | None:
+    """Parameters with the given values as defaults: those in `untuned`, else those of the user's function.
+
+    A parameter's own default is kept. A range is widened to hold the default.
+    """
+    if parameters is None:
+        return None
+    try:
+        known = signature(make).parameters
+    except (TypeError, ValueError):  # of a callable without one
+        known = MappingProxyType({})
+    found = []
+    for one in parameters:
+        own = getattr(known.get(one.name), "default", None)
+        value = untuned.get(one.name, one.default if one.default is not None else own)
+        is_number = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
+        if not is_number or (one.log and value <= 0):
+            found.append(one)
+            continue
+        value = round(value) if one.integer else value
+        ends = {"low": min(one.low, value), "high": max(one.high, value)}
+        found.append(replace(one, default=value, **ends))
+    return tuple(found)
 
 
 def _mapping(name: str, given) -> dict | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -14,10 +15,11 @@ from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 
 SEEDS = (0, 1)  # with which a problem is checked
+_CHECKED: WeakValueDictionary[int, Problem] = WeakValueDictionary()  # problems that were checked, by their ids
 
 
 def checked_problem(problem, name: str | None = None) -> Problem:
-    """The same problem, checked with the data of two seeds.
+    """The same problem, checked with the data of two seeds; once for each object.
 
     Args:
         problem: the object to check.
@@ -32,6 +34,8 @@ def checked_problem(problem, name: str | None = None) -> Problem:
             f"a problem must be a tuning.problems.problem.Problem, but {shown(name)} is {shown(problem)}"
         )
     name = problem.name if name is None else name
+    if _CHECKED.get(id(problem)) is problem:
+        return problem
     model = problem.model(**problem.untuned)
     if not isinstance(model, StateSpaceModel):
         raise ValueError(f"the model of problem {name} must be a StateSpaceModel, but it is {shown(model)}")
@@ -41,7 +45,15 @@ def checked_problem(problem, name: str | None = None) -> Problem:
     check_data(data, model, name)
     check_model(model, data, name)
     _check_scale(problem, data, name)
+    _CHECKED[id(problem)] = problem
     return problem
+
+
+def data_of(problem: Problem, seeds: Sequence[int]) -> Data:
+    """A problem's data of some seeds, checked, for they may be off where those of the first seeds are not."""
+    data = problem.data(seeds)
+    check_data(data, problem.model(), problem.name)
+    return data
 
 
 def check_data(data: Data, model: StateSpaceModel, name: str) -> None:
@@ -53,18 +65,27 @@ def check_data(data: Data, model: StateSpaceModel, name: str) -> None:
         "filter_keys": (count, 2),
     }
     parts = {entry: getattr(data, entry) for entry in wanted}
+    if data.counted is not None:
+        _check_counted(data, (count, steps + 1), name)
     if data.states is not None:
         known = np.shape(data.states)[-1] if np.ndim(data.states) == 3 else 0
         parts["states"], wanted["states"] = data.states, (count, steps + 1, min(max(known, 1), model.n))
     for entry, one in (data.outputs or {}).items():
         parts[f"output {entry}"], wanted[f"output {entry}"] = one, (count, steps + 1)
     for entry, one in parts.items():
+        if isinstance(one, np.ma.MaskedArray):
+            raise ValueError(
+                f"{entry} of problem {name} must be a plain array, NaN where something is missing, "
+                "but got a masked one"
+            )
         if np.shape(one) != wanted[entry]:
             raise ValueError(
                 f"{entry} of problem {name} must have the shape {wanted[entry]} of its model, "
                 f"but got {np.shape(one)}"
             )
         finite = np.isfinite(one) if entry != "measurements" else ~np.isinf(one)
+        if entry != "filter_keys" and data.counted is not None:
+            finite |= _not_there(data, entry, finite)
         if not finite.all():
             rule = "finite or NaN" if entry == "measurements" else "finite"
             run, step, *place = np.argwhere(~finite)[0]
@@ -77,6 +98,31 @@ def check_data(data: Data, model: StateSpaceModel, name: str) -> None:
             f"first_scored of problem {name} must be from 0 to the number of steps, {steps}, "
             f"but got {data.first_scored}"
         )
+    for seed, scored in zip(data.seeds, data.scored_counts, strict=True):
+        if not scored:
+            raise ValueError(
+                f"each run of problem {name} must have a step that is scored, from {data.first_scored} on, "
+                f"with a truth if the problem has one, but that of seed {seed} has none"
+            )
+
+
+def _check_counted(data: Data, shape: tuple[int, int], name: str) -> None:
+    counted = np.asarray(data.counted)
+    if counted.shape != shape or counted.dtype != bool:
+        raise ValueError(
+            f"counted of problem {name} must be bool and of shape {shape}, one a measurement, but got "
+            f"{counted.dtype} of shape {counted.shape}"
+        )
+
+
+def _not_there(data: Data, entry: str, values: np.ndarray) -> np.ndarray:
+    """Where values of an entry may be anything: truth where a step does not count, all in padding."""
+    times = np.arange(values.shape[1])
+    if entry in ("inputs", "measurements"):
+        unseen = times + (entry == "inputs") >= data.rows[:, None]
+    else:
+        unseen = ~np.asarray(data.counted)
+    return unseen.reshape(unseen.shape + (1,) * (values.ndim - 2))
 
 
 def _before(states: np.ndarray, step: int, place: Sequence, model: StateSpaceModel) -> str:
@@ -91,7 +137,7 @@ def check_model(model: StateSpaceModel, data: Data, name: str) -> None:
     """Raise ValueError unless f and h of a model are finite at the first states of the data."""
     points = {"its prior mean": model.prior_mean}
     if data.states is not None and data.states.shape[-1] == model.n:
-        points["the first true state"] = data.states[0, 0]
+        points["the first true state"] = data.counted_rows(data.states)[0]
     control = as_value(data.inputs[0, 0].tolist() if data.steps else [0.0] * model.inputs)
     for where, point in points.items():
         x, c = as_value(point.tolist()), model.given_constants
@@ -122,8 +168,8 @@ def _check_scale(problem: Problem, data: Data, name: str) -> None:
     scale = np.asarray(problem.scale, dtype=np.float64)
     if scale.shape != data.states.shape[-1:] or not (scale > 0).all() or not np.isfinite(scale).any():
         raise ValueError(
-            f"scale of problem {name} must be {data.states.shape[-1]} positive numbers, infinite for states that "
-            f"do not count, but got {shown(problem.scale)}"
+            f"scale of problem {name} must be {data.states.shape[-1]} positive numbers, infinite for states "
+            f"that are not scored, but got {shown(problem.scale)}"
         )
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,12 @@ FIRST_SCORED_STEP = 50  # RMSE is of steps 50 to 500; the start-up is reported s
 
 
 class Data(NamedTuple):
-    """What a problem makes for B seeds and K steps; filters update with measurement k + 1 after input k."""
+    """The data of a problem for B seeds and K steps; filters update with measurement k + 1 after input k.
+
+    A step is scored from `first_scored` on, where it counts (`scored` is the one definition, for every metric). It
+    does not count where a run is over, or its truth is not known. Everything after a run's last scored step is
+    padding: nothing there, not even NaN, changes any result.
+    """
 
     seeds: tuple[int, ...]
     inputs: np.ndarray  # (B, K, p)
@@ -20,18 +25,39 @@ class Data(NamedTuple):
     first_scored: int = FIRST_SCORED_STEP  # the first step that is scored
     states: np.ndarray | None = None  # (B, K + 1, n), the first states of the model; None where there is no truth
     outputs: Mapping[str, np.ndarray] | None = None  # (B, K + 1) each, by symbol; None where there is no truth
+    counted: np.ndarray | None = None  # (B, K + 1) bool, which steps count; None where all do
 
     @property
-    def scored(self) -> slice:
-        """The scored steps."""
+    def late(self) -> slice:
+        """The steps from the first scored one on, whether they count or not."""
         return slice(self.first_scored, None)
 
     @property
+    def scored(self) -> np.ndarray:
+        """Which steps are scored, (B, K + 1) bool."""
+        found = np.ones(self.measurements.shape[:2], dtype=bool) if self.counted is None else self.counted.copy()
+        found[:, : self.first_scored] = False
+        return found
+
+    @property
+    def scored_counts(self) -> np.ndarray:
+        """Number of scored steps of each run, (B,)."""
+        return self.scored.sum(axis=1)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Number of rows of each run, (B,): up to its last step that counts."""
+        count, times = self.measurements.shape[:2]
+        if self.counted is None:
+            return np.full(count, times)
+        return np.where(self.counted.any(axis=1), times - self.counted[:, ::-1].argmax(axis=1), 0)
+
+    @property
     def known_states(self) -> np.ndarray:
-        """The true states, (B, K + 1, n); ValueError where they are unknown."""
+        """The true states, (B, K + 1, n), NaN where a step does not count; ValueError where they are unknown."""
         if self.states is None:
             raise ValueError("data must have true states, but got data without truth")
-        return self.states
+        return self.states if self.counted is None else where_true(self.counted, self.states, np.nan)
 
     @property
     def steps(self) -> int:
@@ -41,9 +67,39 @@ class Data(NamedTuple):
     @property
     def beginning(self) -> Data:
         """The steps before the first scored one, without truth."""
-        first = self.first_scored
-        inputs, measurements = self.inputs[:, : max(first - 1, 0)], self.measurements[:, :first]
-        return self._replace(inputs=inputs, measurements=measurements, states=None, outputs=None)
+        first, seen = self.first_scored, self.seen
+        inputs, measurements = seen.inputs[:, : max(first - 1, 0)], seen.measurements[:, :first]
+        return self._replace(inputs=inputs, measurements=measurements, states=None, outputs=None, counted=None)
+
+    @property
+    def seen(self) -> Data:
+        """The data as filters see them: in a run's padding nothing is measured, and the last input is held."""
+        if self.counted is None:
+            return self
+        times, last = np.arange(self.steps + 1), self.rows[:, None] - 1
+        held = np.minimum(times[:-1], np.maximum(last - 1, 0))[..., None]
+        measurements = where_true(times <= last, self.measurements, np.nan)
+        return self._replace(inputs=np.take_along_axis(self.inputs, held, axis=1), measurements=measurements)
+
+    def late_scored(self, values: np.ndarray) -> np.ndarray:
+        """The late ones of values (B, K + 1, ...) of every step, NaN where a step is not scored."""
+        if self.counted is None:
+            return values[:, self.late]
+        return where_true(self.counted[:, self.late], values[:, self.late], np.nan)
+
+    def scored_rows(self, values: np.ndarray) -> np.ndarray:
+        """Values (B, K + 1, ...) of all scored steps of all runs, one after the other."""
+        return values[self.scored]
+
+    def counted_rows(self, values: np.ndarray) -> np.ndarray:
+        """Values (B, K + 1, ...) of all steps that count, scored or not, one after the other."""
+        return values.reshape(-1, *values.shape[2:]) if self.counted is None else values[self.counted]
+
+    def pooled(self, values: np.ndarray) -> np.ndarray:
+        """Mean of values (B, K + 1, ...) over all scored steps of all runs."""
+        if self.counted is None:
+            return values[:, self.late].mean(axis=(0, 1))
+        return self.scored_rows(values).mean(axis=0)
 
     def slice(self, first: int, last: int) -> Data:
         """The runs from `first` up to, but without, `last`."""
@@ -55,12 +111,59 @@ class Data(NamedTuple):
             filter_keys=self.filter_keys[part],
             states=None if self.states is None else self.states[part],
             outputs=None if self.outputs is None else {name: one[part] for name, one in self.outputs.items()},
+            counted=None if self.counted is None else self.counted[part],
+        )
+
+    def one(self, index: int) -> Data:
+        """A single run, without padding."""
+        run, rows = self.slice(index, index + 1), int(self.rows[index])
+        return run._replace(
+            inputs=run.inputs[:, : max(rows - 1, 0)],
+            measurements=run.measurements[:, :rows],
+            states=None if run.states is None else run.states[:, :rows],
+            outputs=None if run.outputs is None else {name: one[:, :rows] for name, one in run.outputs.items()},
+            counted=None if run.counted is None else run.counted[:, :rows],
         )
 
     def read_only(self) -> Data:
         """The same data with arrays that cannot be written to, so that they can be shared."""
-        arrays = [self.inputs, self.measurements, self.filter_keys, self.states, *(self.outputs or {}).values()]
-        for array in arrays:
+        arrays = [self.inputs, self.measurements, self.filter_keys, self.states, self.counted]
+        for array in (*arrays, *(self.outputs or {}).values()):
             if array is not None:
                 array.setflags(write=False)
         return self
+
+
+def where_true(mask: np.ndarray, values: np.ndarray, other: float) -> np.ndarray:
+    """Values (B, T, ...) where a mask (B, T) is true, elsewhere a number."""
+    return np.where(mask.reshape(mask.shape + (1,) * (values.ndim - mask.ndim)), values, other)
+
+
+def padded(arrays: Sequence[np.ndarray], rows: int, fill: float | None = np.nan) -> np.ndarray:
+    """Arrays (rows or fewer, ...) of single runs as one, (B, rows, ...).
+
+    Args:
+        arrays: of the runs.
+        rows: of the result; longer ones are cut.
+        fill: what stands after a run's end; its last row if None.
+    """
+    first = np.asarray(arrays[0])
+    out = np.full((len(arrays), rows, *first.shape[1:]), 0.0 if fill is None else fill)
+    for place, array in enumerate(arrays):
+        count = min(len(array), rows)
+        out[place, :count] = array[:count]
+        if fill is None and count:
+            out[place, count:] = array[count - 1]
+    return out
+
+
+def mask_of(lengths: Sequence[int], rows: int) -> np.ndarray | None:
+    """Which of `rows` rows exist of runs of these lengths, (B, rows) bool; None where all do."""
+    found = np.arange(rows) < np.asarray(lengths)[:, None]
+    return None if found.all() else found
+
+
+def only(counted: np.ndarray | None, known: Any) -> np.ndarray | None:
+    """Which steps count, where only those of a mask (B, K + 1) may; None where all do."""
+    both = np.asarray(known) if counted is None else counted & known
+    return None if both.all() else both

@@ -9,19 +9,30 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from numerics.checks import covariance, shown
+from numerics.checks import as_floats, covariance, shown
+from numerics.global_generators import GlobalGenerators
 from numerics.modules import said
-from numerics.streams import episode_keys, filter_keys
+from numerics.streams import (
+    ACTION_SPACE,
+    ADDED_NOISE,
+    GLOBAL_GENERATORS,
+    RANDOM_ACTIONS,
+    derived_seed,
+    episode_keys,
+    filter_keys,
+)
 from plants.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_of
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.digest import digest_of
+from tuning.problems.env_digest import env_identity
 from tuning.problems.episodes import Episodes, measurement_noise
-from tuning.problems.excitation import Excitation, excitation_of
+from tuning.problems.excitation import Excitation
 from tuning.problems.parameter import Parameter
+from tuning.problems.policies import RANDOM, Policy, checked_policy, chooser
 
 SCALE_SEEDS = range(16)  # seeds whose true states' standard deviation is the scale, where none is given
-Policy = str | Mapping | Excitation | Callable
+DIFFERENCE = 1e-6  # of two runs of a seed, as part of the largest number: threads leave less
 
 
 class EnvProblem(AssumedProblem):
@@ -30,11 +41,16 @@ class EnvProblem(AssumedProblem):
     The inputs are the policy's actions, clipped to the action space as `EstimateState` clips them. The policy gets
     the env's observations, not a filter's estimates: all filters get the same runs.
 
+    A run is a function of its seed: each source of random numbers has its own stream, and the env's action space
+    and the global generators of Python, NumPy and torch are seeded as an episode begins. If an env or a policy
+    remembers anything beyond an episode, or draws from its own generator, that is an error: the first run is
+    repeated to find it.
+
     Args:
-        env: an env; its id; or a function that makes it.
+        env: an env, whose attributes are those of its digest as it is now; its id; or a function that makes it.
         policy: "random" for actions that are uniform over the action space; a function of the observation, or an
-            object with `predict(observation)` as Stable-Baselines3 has it; or an excitation, or a mapping with its
-            name.
+            object with `predict(observation)` as Stable-Baselines3 has it, which is asked to be deterministic
+            (both are reset if they have `reset`, or `reset(seed)`); or an excitation, or a mapping with its name.
         model: the `StateSpaceModel` that filters assume, or a function of `parameters` that makes it.
         steps: length K of a run; that of the env's spec if None. No episode may terminate earlier.
         state_of: a function of the unwrapped env that returns its state (n,); `info["state"]` if None.
@@ -48,7 +64,8 @@ class EnvProblem(AssumedProblem):
         first_scored_step, parameters, untuned, true, dt, name, about: those of `AssumedProblem`.
 
     Raises:
-        ValueError: if env, policy and model do not fit each other, or an argument is invalid.
+        ValueError: if env, policy and model do not fit each other, an argument is invalid, or two runs of one seed
+            differ.
     """
 
     def __init__(
@@ -75,7 +92,7 @@ class EnvProblem(AssumedProblem):
         """Make the env once, to check that all parts fit; see the class for the arguments."""
         self.env, self.env_arguments = env, dict(env_arguments or {})
         self.state_of, self.measure, self.has_truth = state_of, measure, bool(has_truth)
-        self.policy = _checked_policy(policy)
+        self.policy, self._repeats = checked_policy(policy), False
         made = self._make_env(name)
         try:
             space = _box(made, name)
@@ -84,6 +101,7 @@ class EnvProblem(AssumedProblem):
             own_dt = getattr(made.unwrapped, "dt", None)
             if dt is None and isinstance(own_dt, float):
                 dt = own_dt
+            identity = env_identity(self.env, made)
         finally:
             self._close(made)
         super().__init__(
@@ -107,18 +125,16 @@ class EnvProblem(AssumedProblem):
         self.noise_cov = None
         if measurement_noise_cov is not None:
             self.noise_cov = covariance("measurement_noise_cov", measurement_noise_cov, assumed.m)
+        drawn = (RANDOM, RANDOM_ACTIONS) if isinstance(self.policy, str) else self.policy
+        shown_by = self.state_of, self.measure, self.has_truth
+        noise = None if self.noise_cov is None else (self.noise_cov, ADDED_NOISE)
+        # Now, for policies and envs that are objects change while they run.
+        self._digest = digest_of(identity, self.env_arguments, drawn, (*shown_by, noise), self.assumptions)
 
     @property
     def digest(self) -> str:
-        """A hash of the env's id or function, the policy, the model and all else that determines the data."""
-        env: str | Callable
-        if isinstance(self.env, gym.Env):
-            spec = self.env.spec
-            env = spec.to_json() if spec is not None else type(self.env.unwrapped).__qualname__
-        else:
-            env = self.env
-        shown_by = self.state_of, self.measure, self.has_truth, self.noise_cov
-        return digest_of(env, self.env_arguments, self.policy, shown_by, self.assumptions)
+        """A hash of the env and its class, the policy, the model and all else that determines the data."""
+        return self._digest
 
     @property
     def untuned(self) -> dict:
@@ -135,7 +151,10 @@ class EnvProblem(AssumedProblem):
             size = int(np.prod(_box(env, self.name).shape))
             given = self.policy.inputs(keys, self.steps, self._dt or 1.0, size)
         try:
-            runs = [self._run(env, seed, None if given is None else given[i]) for i, seed in enumerate(seeds)]
+            levels = [None] * len(seeds) if given is None else given
+            runs = [self._run(env, seed, one) for seed, one in zip(seeds, levels, strict=True)]
+            if runs and not self._repeats:
+                self._check_repeated(seeds[0], runs[0], self._run(env, seeds[0], levels[0]))
         finally:
             self._close(env)
         inputs, measurements, found = (np.array(part, dtype=np.float64) for part in zip(*runs, strict=True))
@@ -164,7 +183,7 @@ class EnvProblem(AssumedProblem):
     def found_scale(self) -> np.ndarray:
         """The standard deviation of each true state over the scored steps of 16 seeds."""
         data = self.data(SCALE_SEEDS)
-        scale = rows_of(data.known_states[:, data.scored], self.model()).std(axis=0)
+        scale = rows_of(data.scored_rows(data.known_states), self.model()).std(axis=0)
         if not (scale > 0).all():
             raise ValueError(
                 f"the scale of problem {self.name} must be given where a state does not move, "
@@ -177,8 +196,29 @@ class EnvProblem(AssumedProblem):
         whole = states.shape[-1] == model.n
         return {symbol: model.output(symbol, states) for symbol in model.outputs} if whole else {}
 
+    def _check_repeated(self, seed: int, first: tuple, again: tuple) -> None:
+        """Raise ValueError unless two runs of a seed, with others in between, are the same."""
+        for what, one, other in zip(("inputs", "measurements", "states"), first, again, strict=True):
+            pair = np.array(one, dtype=np.float64), np.array(other, dtype=np.float64)
+            room = DIFFERENCE * np.nanmax(np.abs(pair), initial=0.0)
+            same = np.isclose(*pair, rtol=0.0, atol=room, equal_nan=True).all(axis=-1)
+            if not same.all():
+                raise ValueError(
+                    f"runs of problem {self.name} must be a function of the seed, but in two of seed {seed} "
+                    f"the {what} differ from step {int(np.argmin(same))} on: env and policy must use only "
+                    "generators seeded by reset(seed), and keep no memory of earlier episodes"
+                )
+        self._repeats = True
+
     def _run(self, env: gym.Env, seed: int, given: np.ndarray | None) -> tuple[list, list, list]:
-        """Inputs (K, p), measurements (K + 1, m) and states (K + 1, n) of one episode."""
+        """Inputs (K, p), measurements (K + 1, m) and states (K + 1, n) of one episode, on seeded generators."""
+        generators = GlobalGenerators()
+        generators.seed(derived_seed(seed, GLOBAL_GENERATORS))
+        env.action_space.seed(derived_seed(seed, ACTION_SPACE))  # a policy may sample it
+        with generators.used():
+            return self._episode(env, seed, given)
+
+    def _episode(self, env: gym.Env, seed: int, given: np.ndarray | None) -> tuple[list, list, list]:
         space, inputs = _box(env, self.name), []
         begun = env.reset(seed=seed)
         if not isinstance(begun, tuple) or len(begun) != 2:
@@ -186,10 +226,10 @@ class EnvProblem(AssumedProblem):
             raise ValueError(f"{rule}, but returned {shown(begun)}")
         observation, info = begun
         measurements, states = [self.measured(observation, info)], [self.state(env, info)]
-        choose = _chooser(self.policy, space, seed)
+        choose = chooser(self.policy if given is None else given, space, seed)
         for k in range(self.steps):
-            action = choose(observation) if given is None else given[k]
-            action = np.asarray(action, dtype=space.dtype).reshape(space.shape)
+            action = choose(observation)
+            action = np.array(action, dtype=space.dtype).reshape(space.shape)  # an env may write into it
             inputs.append(np.clip(np.ravel(action).astype(np.float64), np.ravel(space.low), np.ravel(space.high)))
             observation, _, terminated, _, info = env.step(action)
             measurements.append(self.measured(observation, info))
@@ -202,25 +242,25 @@ class EnvProblem(AssumedProblem):
         return inputs, measurements, states
 
     def measured(self, observation, info: Mapping) -> np.ndarray:
-        """The measurement (m,) of an observation and its info, without the noise that is added."""
+        """The measurement (m,) of an observation and its info, without the noise that is added, as a copy."""
         if self.measure is not None:
-            return np.ravel(np.asarray(self.measure(observation, info), dtype=np.float64))
+            return as_floats(self.measure(observation, info)).ravel().copy()
         if "measurement" not in info:
-            return np.ravel(np.asarray(observation, dtype=np.float64))
-        z = np.ravel(np.asarray(info["measurement"], dtype=np.float64))
+            return as_floats(observation).ravel().copy()
+        z = as_floats(info["measurement"]).ravel().copy()
         return np.where(np.ravel(info.get("measurement_valid", True)), z, np.nan)
 
     def state(self, env: gym.Env, info: Mapping) -> np.ndarray:
-        """The true state (n,), empty without truth; ValueError where nothing tells it."""
+        """The true state (n,), empty without truth; ValueError if it is not available."""
         if not self.has_truth:
             return np.zeros(0)
         if self.state_of is None and "state" not in info:
             raise ValueError(
-                f'the env of problem {self.name} must show its state in info["state"], or state_of must tell it, '
-                f"but info has {', '.join(info) or 'nothing'}"
+                f'the env of problem {self.name} must show its state in info["state"], or state_of must '
+                f"return it, but info has {', '.join(info) or 'nothing'}"
             )
         state = info["state"] if self.state_of is None else self.state_of(env.unwrapped)
-        return np.ravel(np.asarray(state, dtype=np.float64)).copy()
+        return as_floats(state).ravel().copy()
 
     def _make_env(self, name: str, arguments: Mapping | None = None) -> gym.Env:
         if isinstance(self.env, gym.Env):
@@ -230,7 +270,7 @@ class EnvProblem(AssumedProblem):
             made = make(**{**self.env_arguments, **(arguments or {})})
         except (gym.error.Error, TypeError, ImportError) as error:
             raise ValueError(
-                f"the env of problem {name} must be one that can be made, but {said(error)}"
+                f"it must be possible to make the env of problem {name}, but {said(error)}"
             ) from error
         if not isinstance(made, gym.Env):
             raise ValueError(f"the env of problem {name} must be a gymnasium.Env, but it is {shown(made)}")
@@ -247,23 +287,3 @@ def _box(env: gym.Env, name: str) -> gym.spaces.Box:
     if not isinstance(space, gym.spaces.Box):
         raise ValueError(f"the action space of problem {name} must be a Box, but got {space}")
     return space
-
-
-def _checked_policy(given: Policy) -> str | Excitation | Callable:
-    if isinstance(given, Excitation | Mapping):
-        return excitation_of(given)
-    if given != "random" and not callable(given) and not hasattr(given, "predict"):
-        rule = "policy must be 'random', a function of the observation, what has predict, or an excitation"
-        raise ValueError(f"{rule}, but got {shown(given)}")
-    return given
-
-
-def _chooser(policy, space: gym.spaces.Box, seed: int) -> Callable:
-    """The policy as a function of the observation, for one episode."""
-    if isinstance(policy, str):
-        generator = np.random.default_rng([seed, 0])
-        low, high = (np.clip(end, -1e3, 1e3) for end in (space.low, space.high))
-        return lambda observation: generator.uniform(low, high)
-    if hasattr(policy, "predict"):
-        return lambda observation: policy.predict(observation)[0]
-    return policy

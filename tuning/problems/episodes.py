@@ -9,7 +9,8 @@ import numpy as np
 from gymnasium.utils.seeding import np_random
 
 from numerics.checks import covariance_root
-from numerics.streams import MEASUREMENT, draw_key, normal_block
+from numerics.global_generators import GlobalGenerators
+from numerics.streams import ADDED_NOISE, GLOBAL_GENERATORS, derived_seed, draw_key, normal_block
 from tuning.problems.model_problem import NamedArguments
 
 if TYPE_CHECKING:
@@ -20,7 +21,8 @@ class Episodes(gym.Wrapper):
     """An env that offers filters a problem's model; the first episode of a seed has the measurements of its data.
 
     `info` holds "measurement" (m,), with the noise that the problem adds, and where the problem knows it "state"
-    (n,). Observation, reward and all else are the env's.
+    (n,). Observation, reward and all else are the env's. After a seeded reset the env has its own global
+    generators.
 
     Args:
         env: of the problem.
@@ -32,20 +34,24 @@ class Episodes(gym.Wrapper):
         super().__init__(env)
         self.state_space_model = NamedArguments(problem)
         self._problem, self._generator, self._key, self._step = problem, np_random()[0], np.zeros(2), 0
+        self._generators = GlobalGenerators()
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """Reset the env, and draw the key of the episode's measurement noise."""
-        observation, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
+            self._generators.seed(derived_seed(seed, GLOBAL_GENERATORS))
             self._generator = np_random(seed)[0]
-        self._key, self._step = draw_key(self._generator), 0
-        return observation, self._told(observation, info)
+        with self._generators.used():
+            observation, info = self.env.reset(seed=seed, options=options)
+            self._key, self._step = draw_key(self._generator), 0
+            return observation, self._told(observation, info)
 
     def step(self, action):
         """Step the env."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self._step += 1
-        return observation, reward, terminated, truncated, self._told(observation, info)
+        with self._generators.used():
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            self._step += 1
+            return observation, reward, terminated, truncated, self._told(observation, info)
 
     def _told(self, observation, info: dict) -> dict:
         problem, info = self._problem, dict(info)
@@ -55,7 +61,7 @@ class Episodes(gym.Wrapper):
         if problem.measure is not None:  # whose entries are no longer those that the env's flags are of
             info.pop("measurement_valid", None)
         info["measurement"] = z
-        if problem.has_truth and problem.state_of is not None:
+        if problem.has_truth and (problem.state_of is not None or "state" in info):
             info["state"] = problem.state(self.env, info)
         return info
 
@@ -69,6 +75,6 @@ def measurement_noise(keys: np.ndarray, steps: np.ndarray, cov: np.ndarray) -> n
         cov: covariance (m, m).
     """
     size = len(cov)
-    blocks = [normal_block(b, steps[None], MEASUREMENT, keys[:, :1], keys[:, 1:]) for b in range(-(-size // 4))]
+    blocks = [normal_block(b, steps[None], ADDED_NOISE, keys[:, :1], keys[:, 1:]) for b in range(-(-size // 4))]
     draws = np.stack([one for block in blocks for one in block][:size], axis=-1)
     return draws @ covariance_root(cov).T

@@ -41,7 +41,7 @@ class Excitation(Effect):
         raise TypeError(f"{type(self).__name__} has no inputs: use one of its subclasses")
 
     def limits(self, count: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """Smallest and largest input, each (count,), in the inputs' units; None where nothing tells them."""
+        """Smallest and largest input, each (count,), in the inputs' units; None if unknown."""
         return None
 
 

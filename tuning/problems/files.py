@@ -125,5 +125,5 @@ def _made(make: Callable[[], BaseScenario], content: Mapping, path: str | Path) 
         raise ValueError(f"{error} (in {path})") from None
     except (TypeError, AttributeError) as error:  # a value of another type than the plant takes
         raise ValueError(
-            f"values of a scenario must be such as `Scenario` takes, but got {shown(content)} in {path}: {error}"
+            f"values of a scenario must be valid for `Scenario`, but got {shown(content)} in {path}: {error}"
         ) from None

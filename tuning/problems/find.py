@@ -78,7 +78,7 @@ def find_given(name, given: Sequence[Problem], where: str | Path) -> Problem:
         )
     raise ValueError(
         f"a problem that is code must be given, but {where} only names {shown(name)}: "
-        f"say --problem {name}, if you trust it"
+        f"use --problem {name}, if you trust it"
     )
 
 

@@ -13,8 +13,16 @@ from plants.logs.log import Log
 LEAD = 50  # steps at the start of a block that are filtered and not scored
 WANTED = 24  # approximate number of blocks that logs are cut into: standard errors need several
 SHORTEST = 25  # scored rows of a block
+SIZES = (
+    (LEAD, SHORTEST),
+    (25, 12),
+    (12, 6),
+    (6, 4),
+    (2, 3),
+)  # lead-ins and scored rows: short logs have later ones
 EVERY_THIRD, EVERY_FOURTH = 3, 4
 FEWEST = 2  # training blocks, and as many held-out blocks
+SHARE = 4  # a block has at least the usual share of rows with a measurement divided by this
 
 
 class Block(NamedTuple):
@@ -25,41 +33,122 @@ class Block(NamedTuple):
     rows: int  # lead-in and scored ones
 
 
+class Piece(NamedTuple):
+    """Rows of one run between gaps."""
+
+    run: int
+    first: int
+    rows: int
+
+
 class Parts(NamedTuple):
-    """All blocks, in the order of their seeds 0, 1, ...: training, ensemble size, held out."""
+    """All blocks, in the order of their seeds 0, 1, ...: training, ensemble size, held out; unused rows."""
 
     blocks: tuple[Block, ...]
     training: range
     sizes: range
     held_out: range
+    lead: int = LEAD
+    shortest: int = SHORTEST
+    is_short: bool = False  # lead-in and blocks are shorter than usual, for the logs are short
+    empty: int = 0  # blocks that were left out, with too few measurements
+    short_pieces: int = 0  # pieces between gaps that are too short for a block
+
+    def sentences(self) -> list[str]:
+        """The lost rows, in words; empty if there are none."""
+        said = []
+        if self.empty:
+            are, have = ("is", "has") if self.empty == 1 else ("are", "have")
+            said.append(
+                f"{self.empty} of {self.empty + len(self.blocks)} blocks {are} left out and in no score: "
+                f"{'it' if self.empty == 1 else 'they'} {have} no measurements, or too few."
+            )
+        if self.short_pieces:
+            one = self.short_pieces == 1
+            said.append(
+                f"{self.short_pieces} piece{'' if one else 's'} of a run between gaps {'is' if one else 'are'} "
+                f"shorter than a lead-in and a block, {self.lead + self.shortest} rows, and left out."
+            )
+        if self.is_short:
+            said.append(
+                f"The logs are short: a lead-in has {self.lead} rows, a block {self.shortest} scored ones or more "
+                f"({LEAD} and {SHORTEST} are usual), so the model's prior counts in the score and intervals are "
+                f"wide."
+            )
+        return said
 
 
 def parts_of(
     logs: Sequence[Log],
-    lead: int = LEAD,
+    lead: int | None = None,
     blocks: int | None = None,
     held_out: Collection[str] | None = None,
     *,
+    hold_gaps: bool = False,
     sizes: bool = False,
+    known: Sequence[np.ndarray] | None = None,
+    shortest: int | None = None,
 ) -> Parts:
     """Cut logs into blocks for training, for the choice of the ensemble size, and for held-out evaluation.
 
-    Each run is cut into consecutive blocks of nearly equal length; a block's lead-in are the rows before it. Held
-    out are the named runs, else every third run of three or more, else every third block.
+    Each run is cut at its gaps (`plants.logs.log.Log.pieces`), and each piece into consecutive blocks of nearly
+    equal length; a block's lead-in are the rows before it. A block that is measured in less than a quarter of the
+    usual share of its rows is left out. Held out are the named runs, else every third run of three or
+    more, else every third block.
 
     Args:
         logs: of at least one run.
-        lead: rows of a lead-in.
-        blocks: number of blocks of each run; if None there are about 24 in all, each of 25 rows or more.
+        lead: rows of a lead-in; if None 50, of short logs fewer, as many as let them have blocks.
+        blocks: number of blocks of each run; if None there are about 24 in all, each of 25 rows or more, of short
+            logs 3 or more.
         held_out: names of the held-out runs.
-        sizes: whether every fourth of the other blocks is for the choice of an ensemble size.
+        hold_gaps: whether runs are not cut at gaps, and their inputs are held there.
+        sizes: whether every fourth of the other blocks is set aside for the choice at the end.
+        known: which rows of each log have a truth, (rows,) bool; a block without any that is scored is left out.
+        shortest: scored rows of a block; if None 25, of short logs fewer.
 
     Raises:
         ValueError: if a log is too short, or there are too few training or held-out blocks.
     """
-    lead = at_least("lead", lead, 0)
-    counts = _counts(logs, lead, blocks)
-    all_blocks = [block for run, log in enumerate(logs) for block in _cut(run, log, lead, counts[run])]
+    _check_names(logs, held_out)
+    if lead is not None:
+        lead = at_least("lead", lead, 0)
+    if blocks is not None:
+        blocks = at_least("blocks", blocks, 1)
+    pieces = [
+        Piece(run, first, rows)
+        for run, log in enumerate(logs)
+        for first, rows in ([(0, log.steps + 1)] if hold_gaps else log.pieces)
+    ]
+    for rows, least in SIZES if shortest is None else ((LEAD, at_least("shortest", shortest, 1)),):
+        try:
+            found = _parts(logs, pieces, rows if lead is None else lead, least, blocks, held_out, sizes, known)
+            return found._replace(is_short=shortest is None and least < SHORTEST)
+        except ValueError as error:
+            refused = error
+    raise refused
+
+
+def _parts(
+    logs: Sequence[Log],
+    pieces: Sequence[Piece],
+    lead: int,
+    shortest: int,
+    blocks: int | None,
+    held_out: Collection[str] | None,
+    sizes: bool,
+    known: Sequence[np.ndarray] | None,
+) -> Parts:
+    """The blocks with a lead-in and a least number of scored rows; ValueError where there are too few."""
+    long = [piece for piece in pieces if piece.rows >= lead + shortest]
+    counts = _counts(logs, long, lead, shortest, blocks)
+    cut = [block for piece, count in zip(long, counts, strict=True) for block in _cut(piece, lead, count)]
+    if known is not None:
+        rows = [known[one.run][one.first + lead : one.first + one.rows] for one in cut]
+        cut = [block for block, there in zip(cut, rows, strict=True) if there.any()]
+    measured = np.array([_measured(logs, block, lead) for block in cut])
+    usual = np.median(measured[measured > 0]) if measured.any() else 0.0
+    all_blocks = [block for block, share in zip(cut, measured, strict=True) if share and share * SHARE >= usual]
     held = _held(logs, all_blocks, held_out)
     held_blocks = [block for block, out in zip(all_blocks, held, strict=True) if out]
     left = [block for block, out in zip(all_blocks, held, strict=True) if not out]
@@ -70,45 +159,61 @@ def parts_of(
     for some, what in ((training, "to learn from"), (held_blocks, "held out")):
         if len(some) < FEWEST:
             raise ValueError(
-                f"there must be at least {FEWEST} blocks {what}, but {', '.join(log.name for log in logs)} give "
-                f"{len(some)}: give more logs, longer ones or more blocks"
+                f"there must be at least {FEWEST} blocks with measurements {what}, but "
+                f"{', '.join(log.name for log in logs)} give {len(some)}: give more "
+                f"logs, longer ones or more blocks"
             )
     ends = np.cumsum([len(training), len(choosing), len(held_blocks)]).tolist()
     ranges = range(0, ends[0]), range(ends[0], ends[1]), range(ends[1], ends[2])
-    return Parts((*training, *choosing, *held_blocks), *ranges)
+    whole = (*training, *choosing, *held_blocks)
+    empty, short = len(cut) - len(all_blocks), len(pieces) - len(long)
+    return Parts(whole, *ranges, lead, shortest, empty=empty, short_pieces=short)
 
 
-def _counts(logs: Sequence[Log], lead: int, blocks: int | None) -> list[int]:
-    """The number of blocks of each run."""
-    scored = [log.steps + 1 - lead for log in logs]
-    count = 1 if blocks is None else at_least("blocks", blocks, 1)
-    for log, rows in zip(logs, scored, strict=True):
-        if rows < SHORTEST * count:
+def _counts(
+    logs: Sequence[Log], pieces: Sequence[Piece], lead: int, shortest: int, blocks: int | None
+) -> list[int]:
+    """The number of blocks of each piece; ValueError where a run is too short for any."""
+    scored = np.array([piece.rows - lead for piece in pieces])
+    count = 1 if blocks is None else blocks
+    for run, log in enumerate(logs):
+        most = sum(rows // shortest for piece, rows in zip(pieces, scored, strict=True) if piece.run == run)
+        if most < count:
             raise ValueError(
-                f"a log must have at least {lead + SHORTEST * count} rows, {lead} of a lead-in and {SHORTEST} of "
+                f"a log must have at least {lead + shortest * count} rows, {lead} of a lead-in and {shortest} of "
                 f"each block, but {log.name} has {log.steps + 1}"
+                + (f" in {len(log.pieces)} pieces between gaps" if len(log.pieces) > 1 else "")
             )
-    if blocks is not None:
-        return [count] * len(logs)
-    length = max(SHORTEST, sum(scored) / WANTED)
-    return [max(1, min(round(rows / length), rows // SHORTEST)) for rows in scored]
+    if blocks is None:
+        length = max(shortest, scored.sum() / WANTED)
+        return [max(1, min(round(rows / length), rows // shortest)) for rows in scored.tolist()]
+    of_runs = [sum(r for piece, r in zip(pieces, scored, strict=True) if piece.run == one.run) for one in pieces]
+    return [max(1, round(blocks * rows / all_rows)) for rows, all_rows in zip(scored, of_runs, strict=True)]
 
 
-def _cut(run: int, log: Log, lead: int, count: int) -> list[Block]:
-    ends = np.linspace(lead, log.steps + 1, count + 1).round().astype(int).tolist()
-    return [Block(run, start - lead, end - start + lead) for start, end in zip(ends, ends[1:], strict=False)]
+def _cut(piece: Piece, lead: int, count: int) -> list[Block]:
+    last = piece.first + piece.rows
+    ends = np.linspace(piece.first + lead, last, count + 1).round().astype(int).tolist()
+    return [Block(piece.run, start - lead, end - start + lead) for start, end in zip(ends, ends[1:], strict=False)]
+
+
+def _measured(logs: Sequence[Log], block: Block, lead: int) -> float:
+    """The share of a block's scored rows in which something is measured."""
+    scored = logs[block.run].measurements[block.first + lead : block.first + block.rows]
+    return float((~np.isnan(scored)).any(axis=1).mean())
+
+
+def _check_names(logs: Sequence[Log], held_out: Collection[str] | None) -> None:
+    names = [log.name for log in logs]
+    unknown = [name for name in held_out or () if name not in names]
+    if unknown:
+        raise ValueError(f"runs that are held out must be among {', '.join(names)}, but got {shown(unknown[0])}")
 
 
 def _held(logs: Sequence[Log], blocks: Sequence[Block], held_out: Collection[str] | None) -> list[bool]:
     """Whether each block is held out."""
-    names = [log.name for log in logs]
     if held_out is not None:
-        unknown = [name for name in held_out if name not in names]
-        if unknown:
-            raise ValueError(
-                f"runs that are held out must be among {', '.join(names)}, but got {shown(unknown[0])}"
-            )
-        return [names[block.run] in held_out for block in blocks]
+        return [logs[block.run].name in held_out for block in blocks]
     if len(logs) >= EVERY_THIRD:
         return [block.run % EVERY_THIRD == EVERY_THIRD - 1 for block in blocks]
     return [place % EVERY_THIRD == EVERY_THIRD - 1 for place in range(len(blocks))]

@@ -3,32 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from numerics.checks import at_least, shown
+from filters.starts import MEASUREMENT, PRIOR, STARTS, cov_of_measured_starts
+from numerics.checks import at_least, one_of
 from numerics.streams import filter_keys
+from plants.logs.findings import remarks_on
 from plants.logs.log import Log
 from plants.replay import ReplayEnv
 from plants.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, rows_of
 from tuning.problems.check import check_quantities
-from tuning.problems.data import Data
+from tuning.problems.data import Data, mask_of, only, padded
 from tuning.problems.digest import digest_of
-from tuning.problems.log_parts import LEAD, Parts, parts_of
+from tuning.problems.log_checks import check_apart, checked_logs
+from tuning.problems.log_parts import Parts, parts_of
 from tuning.problems.parameter import Parameter
 
-SAME_DT = 1e-6  # relative: sample times of logs that are read off stamps
+AT_GAPS = (
+    "Runs are cut at gaps: no block has rows from both sides (--hold-gaps, hold_gaps=True, does not cut)",
+    "At gaps the last input is held (--hold-gaps, in Python hold_gaps=True)",
+)
+
+MEASURED = (
+    "Each block begins where its first measurement says: the prior covariance is wide where a measurement sees "
+    "the state."
+)
 
 
 class LogProblem(AssumedProblem):
     """Blocks of recorded runs as the data of a study; the seed of a block is its number.
 
     The problem decides which blocks are for training and which are held out, whatever the seed of the study: see
-    `tuning.problems.log_parts`. A block has a lead-in that filters run through and that is not scored. Blocks of
-    other lengths are padded with steps in which nothing is measured; where true states are known all blocks are
-    cut to the length of the shortest.
+    `tuning.problems.log_parts`. A block has a lead-in that filters run through and that is not scored, and no gap:
+    runs are cut there, and blocks with too few measurements are left out; `remarks` says so. Blocks may differ in
+    length, and each counts in full; where true states are known at some steps only, these are scored.
 
     Without true states there is no scale, and the negative log-likelihood of the innovations is minimised. The
     rule of thumb has the R of the model.
@@ -36,11 +48,16 @@ class LogProblem(AssumedProblem):
     Args:
         logs: recorded runs with the same sample time, with the model's inputs and measurements.
         assumed: the model that filters assume, or a function of `parameters` that makes it.
-        lead: steps of a lead-in.
+        lead: steps of a lead-in; 50 if None, of short logs fewer.
         blocks: number of blocks of each run; if None there are about 24 in all.
+        hold_gaps: whether runs are not cut at gaps, and their inputs are held there.
+        start: where blocks begin: "prior", as the model's prior says, or "measurement", where their first
+            measurement does (`filters.starts.cov_of_measured_starts`), the prior elsewhere.
         held_out: names of the held-out runs; if None every third run, or every third block of fewer than three
             runs.
-        truth: whether the logs' true states are used, if they have all of them.
+        truth: whether the logs' true states are used, if each log has all of them, at some steps at least.
+        shortest: scored rows that a block must have; 25 if None, of short logs fewer.
+        apart: whether it is an error that a held-out run has rows in common with another one.
         content: the options that make the problem, as data for JSON; commands store theirs there.
         scale, parameters, untuned, name, about: those of `AssumedProblem`; the scale is by default the standard
             deviation of each true state.
@@ -56,10 +73,14 @@ class LogProblem(AssumedProblem):
         logs: Log | Sequence[Log],
         assumed: StateSpaceModel | Callable[..., StateSpaceModel],
         *,
-        lead: int = LEAD,
+        lead: int | None = None,
         blocks: int | None = None,
+        hold_gaps: bool = False,
+        start: str = PRIOR,
         held_out: Collection[str] | None = None,
         truth: bool = True,
+        apart: bool = True,
+        shortest: int | None = None,
         content: Mapping | None = None,
         scale: Sequence[float] | None = None,
         parameters: Sequence[Parameter] | None = None,
@@ -68,13 +89,22 @@ class LogProblem(AssumedProblem):
         about: str = "",
     ):
         """Cut the logs into blocks; see the class for the arguments."""
-        self.logs = _checked_logs(logs)
-        self.parts: Parts = parts_of(self.logs, lead, blocks, held_out)
+        self.logs = checked_logs(logs)
+        self._start, self._first = one_of("start", start, STARTS), None
+        cut = partial(
+            parts_of, self.logs, lead, blocks, held_out, hold_gaps=hold_gaps, sizes=True, shortest=shortest
+        )
+        self.parts: Parts = cut()
+        self._holds = hold_gaps
+        proving = {self.parts.blocks[place].run for place in self.parts.held_out}
+        learning = {self.parts.blocks[place].run for place in (*self.parts.training, *self.parts.sizes)} - proving
+        if apart:
+            check_apart([self.logs[run] for run in sorted(learning)], [self.logs[run] for run in sorted(proving)])
         self._content = content
         super().__init__(
             assumed,
             steps=max(block.rows for block in self.parts.blocks) - 1,
-            first_scored_step=lead,
+            first_scored_step=self.parts.lead,
             scale=scale,
             parameters=parameters,
             untuned=untuned,
@@ -93,25 +123,55 @@ class LogProblem(AssumedProblem):
         if self._states is None and self._scale is not None:
             raise ValueError(f"a scale must come with logs of all true states, but {self.name} has not got them")
         if self._states is not None:
-            self.parts = parts_of(self.logs, lead, blocks, held_out, sizes=True)
-            self.steps = min(block.rows for block in self.parts.blocks) - 1
+            rows = [~np.isnan(states).any(axis=1) for states in self._states]
+            self.parts = cut(known=rows)
+            self.first_scored_step, self.steps = (
+                self.parts.lead,
+                max(block.rows for block in self.parts.blocks) - 1,
+            )
+        if start == MEASUREMENT:
+            self._first = _first_measured(self.data(self.parts.training).seen.measurements)
+            self.model()  # an error on a start that nothing sees
+        digests, parts = tuple(log.digest for log in self.logs), self.parts
+        of_blocks = parts.blocks, len(parts.training), self._states is None, *([] if start == PRIOR else [start])
+        self._digest = digest_of(digests, *of_blocks, self.assumptions)  # before anything remembers a run
 
     @property
     def digest(self) -> str:
         """A hash of the logs' samples, their blocks and everything else that determines the data and the score."""
-        logs = tuple(log.digest for log in self.logs)
-        return digest_of(logs, self.parts.blocks, len(self.parts.training), self._states is None, self.assumptions)
+        return self._digest
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Findings in the logs, and their rows that are in no block."""
+        found = remarks_on(self.logs)
+        if any(len(log.pieces) > 1 for log in self.logs):
+            found.append(f"{AT_GAPS[self._holds]}.")
+        if self._start == MEASUREMENT:
+            found.append(MEASURED)
+        return (*found, *self.parts.sentences())
+
+    def model(self, **changes) -> StateSpaceModel:
+        """The assumed model with some changes, and with the prior covariance of the start."""
+        found = super().model(**changes)
+        if self._first is None:
+            return found
+        return found.replace(prior_cov=cov_of_measured_starts(found, self._first))
 
     def training_seeds(self, seed: int, count: int) -> range:
-        """Numbers of all training blocks, whatever the count."""
+        """Numbers of all training blocks, for any count."""
         return self.parts.training
 
     def size_seeds(self, seed: int, count: int) -> range:
-        """Numbers of the blocks on which the ensemble size is chosen; the training blocks where there are none."""
+        """Numbers of the blocks set aside for the choice at the end; the training blocks where there are none."""
         return self.parts.sizes or self.parts.training
 
+    def validation_seeds(self, seed: int, count: int) -> range:
+        """Numbers of the blocks on which the best trials meet the baselines: those of `size_seeds`."""
+        return self.size_seeds(seed, count)
+
     def held_out_seeds(self, seed: int, count: int) -> range:
-        """Numbers of all held-out blocks, whatever the count."""
+        """Numbers of all held-out blocks, for any count."""
         return self.parts.held_out
 
     @property
@@ -137,31 +197,21 @@ class LogProblem(AssumedProblem):
             raise ValueError(
                 f"blocks of problem {self.name} must be numbered 0 to {known - 1}, but got {wrong[0]}"
             )
-        model, count, rows = self.model(), len(seeds), self.steps + 1
-        data = Data(
-            seeds,
-            np.zeros((count, rows - 1, model.inputs)),
-            np.full((count, rows, model.m), np.nan),
-            filter_keys(seeds),
-            self.first_scored_step,
-        )
-        states = None if self._states is None else np.empty((count, rows, model.n))
-        for place, seed in enumerate(seeds):
-            block = self.parts.blocks[seed]
-            log, some = self.logs[block.run], slice(block.first, block.first + min(block.rows, rows))
-            inputs, measured = log.inputs[some][: rows - 1], log.measurements[some]
-            data.inputs[place, : len(inputs)] = inputs
-            data.inputs[place, len(inputs) :] = inputs[-1:]
-            data.measurements[place, : len(measured)] = measured
-            if states is not None and self._states is not None:
-                states[place] = self._states[block.run][some]
-        if states is None:
+        model, rows, blocks = self.model(), self.steps + 1, [self.parts.blocks[seed] for seed in seeds]
+        places = [(block.run, slice(block.first, block.first + block.rows)) for block in blocks]
+        inputs = padded([self.logs[run].inputs[some][: rows - 1] for run, some in places], rows - 1, None)
+        measurements = padded([self.logs[run].measurements[some] for run, some in places], rows)
+        counted = mask_of([block.rows for block in blocks], rows)
+        data = Data(seeds, inputs, measurements, filter_keys(seeds), self.first_scored_step, counted=counted)
+        if self._states is None:
             return data
+        states = padded([self._states[run][some] for run, some in places], rows)
         outputs = {symbol: model.output(symbol, states) for symbol in model.outputs}
-        return data._replace(states=states, outputs=outputs)
+        counted = only(counted, ~np.isnan(states).any(axis=-1))
+        return data._replace(states=states, outputs=outputs, counted=counted)
 
     def make_env(self, *, run: int = 0, **arguments: Any) -> ReplayEnv:
-        """A recorded run as an env that replays it, whatever the action, and offers filters the assumed model.
+        """A recorded run as an env that replays it, ignoring the action, and offers filters the assumed model.
 
         Args:
             run: place of the run among the logs.
@@ -174,7 +224,7 @@ class LogProblem(AssumedProblem):
     def found_scale(self) -> np.ndarray:
         """The standard deviation of each true state over the scored steps of the training blocks."""
         data = self.data(self.parts.training)
-        scale = rows_of(data.known_states[:, data.scored], self.model()).std(axis=0)
+        scale = rows_of(data.scored_rows(data.known_states), self.model()).std(axis=0)
         if not (scale > 0).all():
             raise ValueError(
                 f"the scale of problem {self.name} must be given where a state does not move, "
@@ -189,23 +239,13 @@ class LogProblem(AssumedProblem):
         return {"logs": [{"file": log.name, "digest": log.digest} for log in self.logs], **self._content}
 
 
-def _checked_logs(given) -> tuple[Log, ...]:
-    logs = (given,) if isinstance(given, Log) else tuple(given) if isinstance(given, Sequence) else ()
-    if not logs or not all(isinstance(log, Log) for log in logs):
-        raise ValueError(f"logs must be some plants.logs.log.Log, but got {shown(given)}")
-    for log in logs:
-        if abs(log.dt - logs[0].dt) > SAME_DT * logs[0].dt:
-            raise ValueError(
-                f"logs of one problem must have the same sample time, but {logs[0].name} has {logs[0].dt:g} s and "
-                f"{log.name} {log.dt:g} s: put them on one grid with dt"
-            )
-    names = [log.name for log in logs]
-    if len(set(names)) < len(names):
-        raise ValueError(f"logs of one problem must have different names, but got {', '.join(names)}")
-    return logs
-
-
 def _name(logs: Sequence[Log]) -> str:
     """What logs are called together: the first one's name, and how many there are more."""
     more = f" and {len(logs) - 1} more" if len(logs) > 1 else ""
     return f"{logs[0].name}{more}"
+
+
+def _first_measured(measurements: np.ndarray) -> np.ndarray:
+    """The first value (B, m) of each channel of measurements (B, K + 1, m); NaN where there is none."""
+    places = (~np.isnan(measurements)).argmax(axis=1)
+    return np.take_along_axis(measurements, places[:, None], axis=1)[:, 0]

@@ -10,14 +10,16 @@ from typing import Any
 import numpy as np
 
 from filters.baselines.baselines import OpenLoop
-from filters.posterior import has_bound, posterior_variances
+from filters.posterior import has_bound
 from filters.tuned_file import NOISE, PRIOR
-from numerics.checks import shown
+from numerics.angles import difference
+from numerics.checks import as_floats, shown
 from numerics.streams import episode_keys, filter_keys
 from plants.model_env import ModelEnv
 from plants.simulate import simulate
 from plants.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, as_argument, rows_argument
+from tuning.problems.bound import average_bound
 from tuning.problems.check import check_quantities
 from tuning.problems.data import FIRST_SCORED_STEP, Data
 from tuning.problems.digest import digest_of
@@ -95,6 +97,7 @@ class ModelProblem(AssumedProblem):
         if self._true is None and self._shared == list(range(model.n)) and model.n == truth.n:
             r = as_argument(truth.measurement_noise_cov)
             self._true = {"process_noise_cov": rows_argument(truth.process_noise_cov), "measurement_noise_cov": r}
+        self._digest = digest_of(self.truth, self.inputs, self.assumptions)  # before anything remembers a run
 
     def _shared_states(self, model: StateSpaceModel) -> list[int]:
         """Indices in the truth of the assumed model's first states."""
@@ -114,7 +117,7 @@ class ModelProblem(AssumedProblem):
     @property
     def digest(self) -> str:
         """A hash of both models, the inputs and everything else that determines the data and the score."""
-        return digest_of(self.truth, self.inputs, self.assumptions)
+        return self._digest
 
     def make(self, seeds: tuple[int, ...]) -> Data:
         """Truth and measurements under the inputs of each seed."""
@@ -132,17 +135,20 @@ class ModelProblem(AssumedProblem):
         """The posterior Cramér-Rao bound of the truth on these inputs, (n,); NaN where its Q is singular.
 
         It is averaged over all inputs; for more than twelve states over as many as `posterior_variances` takes.
+        Of an angle it is that of wrapped errors (`filters.wrapped.wrapped_variances`).
         """
-        return self._bound(data, 100)
+        return self._bound(data)
 
     def found_scale(self) -> np.ndarray:
         """The bound over 200 seeds or, where there is none, the RMSE of the open loop of the truth."""
         data = self.data(SCALE_SEEDS)
-        scale = self._bound(data, 100)
+        scale = self._bound(data)
         if np.isnan(scale).any():
             with np.errstate(all="ignore"):
                 parts = estimates_in_parts(OpenLoop(model=self.truth), data)
-                errors = [(found.means[..., self._shared] - one.states)[:, one.scored] for one, found in parts]
+                angles = [self.truth.shape.state_angles[place] for place in self._shared]
+                pairs = [(found.means[..., self._shared], one) for one, found in parts]
+                errors = [difference(means, one.known_states, angles)[:, one.late] for means, one in pairs]
                 scale = np.sqrt((np.concatenate(errors) ** 2).mean(axis=(0, 1)))
         if not (np.isfinite(scale).all() and (scale > 0).all()):
             raise ValueError(
@@ -153,14 +159,13 @@ class ModelProblem(AssumedProblem):
 
     @property
     def found_scale_about(self) -> str:
-        """What the scale is where none is given: one zero on the diagonal of the true Q is enough for no bound."""
+        """The default scale: one zero on the diagonal of the true Q rules out the bound."""
         return BOUND if has_bound(self.truth.process_noise_cov) else f"{OPEN_LOOP}, for the true Q is singular"
 
-    def _bound(self, data: Data, truths: int) -> np.ndarray:
+    def _bound(self, data: Data) -> np.ndarray:
         if not has_bound(self.truth.process_noise_cov):
             return np.full(len(self._shared), np.nan)
-        variances = posterior_variances(self.truth, data.inputs, truths=truths)
-        return np.sqrt(variances[:, data.scored, self._shared].mean(axis=(0, 1)))
+        return average_bound(self.truth, data)[self._shared]
 
     def make_env(self, **arguments: Any) -> ModelEnv:
         """The truth as a Gymnasium env, which offers filters the assumed model; the data of a seed is its episode.
@@ -193,7 +198,7 @@ class ModelProblem(AssumedProblem):
             return self.inputs.inputs(episode_keys(seeds), self.steps, self._dt or 1.0, self.truth.inputs)
         if isinstance(self.inputs, np.ndarray):
             return np.ascontiguousarray(np.broadcast_to(self.inputs, shape))
-        found = np.array(self.inputs(seeds, self.steps), dtype=np.float64)
+        found = as_floats(self.inputs(seeds, self.steps)).copy()
         if found.shape != shape:
             raise ValueError(f"inputs of problem {self.name} must have the shape {shape}, but got {found.shape}")
         return found
@@ -228,7 +233,7 @@ def _checked_inputs(given: Inputs, count: int) -> np.ndarray | Excitation | Call
     if callable(given):
         return given
     try:
-        array = np.array(given, dtype=np.float64)
+        array = as_floats(given).copy()
         array = array[:, None] if array.ndim == 1 and count == 1 else array
         if array.ndim != 2 or array.shape[1] != count or not len(array) or not np.isfinite(array).all():
             raise ValueError

@@ -69,7 +69,7 @@ class Parameter:
     place: Place = None  # type: ignore[assignment]  # None is replaced as soon as the parameter is made
 
     def __post_init__(self):
-        """Check the range and fill in what is left out."""
+        """Check the range and fill in defaults."""
         if not isinstance(self.name, str) or not self.name or " " in self.name:
             raise ValueError(f"a parameter must have a name without spaces, but got {shown(self.name)}")
         check = at_least if self.integer else finite

@@ -67,6 +67,10 @@ class Problem(ABC):
         """Seeds on which a study with a given seed chooses the ensemble size, and nothing else."""
         return seeds.size_seeds(seed, count)
 
+    def validation_seeds(self, seed: int, count: int) -> range:
+        """Seeds on which the best trials of a study with a given seed meet the baselines, and nothing else."""
+        return seeds.validation_seeds(seed, count)
+
     def held_out_seeds(self, seed: int, count: int) -> range:
         """Seeds that a study with a given seed never sees."""
         return seeds.held_out_seeds(seed, count)
@@ -75,6 +79,19 @@ class Problem(ABC):
     @abstractmethod
     def untuned(self) -> Mapping:
         """Arguments of the model by rule of thumb: R from the data sheet, Q from 1 % of each state's range."""
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Remarks on the data, shown before any result: sentences of commands and reports."""
+        return ()
+
+    @property
+    def given(self) -> Mapping | None:
+        """Model arguments given by the user's model, preset or file, before any tuning.
+
+        None if there are none, or if they are `true`: those of a plant are not a guess.
+        """
+        return None
 
     @property
     def lacks_ranges(self) -> bool:
@@ -92,13 +109,13 @@ class Problem(ABC):
 
     @property
     def scale_about(self) -> str:
-        """What `scale` is, in words, for captions: a bound, a spread, or what the problem gives."""
+        """A description of `scale` for captions: a bound, a spread, or what the problem gives."""
         return GIVEN
 
     def make_env(self, **arguments: Any) -> gym.Env:
         """A Gymnasium env of the plant, for wrappers and policies; an episode of a seed is the data of that seed.
 
-        Filters around it that are told nothing assume what the env offers: `EstimateState(problem.make_env(),
+        By default filters with this env assume the model that it offers: `EstimateState(problem.make_env(),
         tuned=...)`, or "ekf".
 
         Args:

@@ -144,7 +144,7 @@ class BaseScenario(Problem):
     def make_env(self, **arguments: Any) -> gym.Env:
         """An env of the scenario's plant, as `gym.make` makes it, with the scenario's length.
 
-        Filters around it assume the plant itself: what the scenario lets them assume is in a tuned file, or
+        Filters with this env assume the plant itself; the scenario's assumptions are in a tuned file, or
 
             EstimateState(scenario.make_env(), "ekf", model_arguments=dict(scenario.held))
 

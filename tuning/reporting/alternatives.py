@@ -1,4 +1,4 @@
-"""What pictures show, in words and numbers, for whoever cannot see them."""
+"""Text alternatives of pictures, for readers who cannot see them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def of_comparison(proof: Comparison) -> str:
     """RMSE of every filter, state by state, and the bound."""
     told = []
     for i, state in enumerate(proof.tuned.states):
-        values = [f"{name} {found.rmse[i].value:.3g}" for name, found in proof.labelled.items()]
+        values = [f"{name} {found.rmse[i].value:.3g}" for name, found in proof.evaluations.items()]
         values += [f"bound {proof.bound[i]:.3g}"] if isfinite(proof.bound[i]) else []
         told.append(f"RMSE of {state.name}{f' in {state.unit}' if state.unit else ''}: {', '.join(values)}")
     return f"Bars with whiskers. {'; '.join(told)}."
@@ -50,7 +50,7 @@ def of_importances(found: Mapping[str, float]) -> str:
 
 
 def of_slices(trials: Sequence[FrozenTrial]) -> str:
-    """Parameters of the best trial, and the range that was searched."""
+    """Parameters of the best trial, and the range of the trials."""
     done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     best = best_trial(done) if done else None
     if best is None:
@@ -83,7 +83,7 @@ def of_sizes(sizes: Sequence[SizeRow], kept: int) -> str:
 
 
 def of_estimates(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None) -> str:
-    """RMSE of each filter in one run and how much of the truth, or of the innovations, is in its band."""
+    """RMSE of each filter in one run and the share of the truth, or of the innovations, in its band."""
     told = []
     for name, filter_ in filters.items():
         found, parts = one_run(filter_, data, index, dt), []
@@ -114,7 +114,7 @@ def of_series(names: Sequence[str], values: np.ndarray, units: Sequence[str]) ->
 
 
 def _against(errors, innovations: np.ndarray, estimates: Estimates):
-    """What is held against a band: values, covariances and their name."""
+    """What is compared with a band: values, covariances and their name."""
     if errors is not None:
         return errors, estimates.covs[0], "RMSE of"
     return innovations, estimates.innovation_covs[0], "RMS innovation of"

@@ -1,4 +1,4 @@
-"""The report of two studies: what each found, section by section and side by side."""
+"""The report of two studies: their results, section by section and side by side."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tuning.reporting.subject import find_subject, is_file
 
 
 class Source(NamedTuple):
-    """One side of a page: a tuned file or a study, and where it is found."""
+    """One side of a page: a tuned file or a study, and its location."""
 
     name: str | Path  # a tuned file, or the name of a study
     storage: str  # where the study is
@@ -30,7 +30,7 @@ class Source(NamedTuple):
 def write_beside(sources: Sequence[Source], out: str | Path | None = None) -> Report:
     """Write a page, A-beside-B.html, and its tables, A-beside-B.md, on two tuned files or studies.
 
-    Where both are of the same problem a table has the ratio of their scores, paired on the same held-out seeds.
+    If both are of the same problem, a table has the ratio of their scores, paired on the same held-out seeds.
 
     Args:
         sources: two tuned files or studies.
@@ -40,7 +40,7 @@ def write_beside(sources: Sequence[Source], out: str | Path | None = None) -> Re
         ValueError: as `write_report`, or if these are not two.
     """
     if len(sources) != 2:
-        raise ValueError(f"a report side by side must be of two studies, but got {len(sources)}")
+        raise ValueError(f"a side-by-side report must be of two studies, but got {len(sources)}")
     subjects = [find_subject(one.name, one.storage, one.problems) for one in sources]
     names = [
         Path(one.name).stem if is_file(one.name) else subject.name
@@ -75,7 +75,7 @@ def _paired(names: Sequence[str], found: Sequence[Pages]) -> list[Section]:
 
 
 def _summary(names: Sequence[str], found: Sequence[Pages]) -> tuple[Table, str]:
-    """What both tuned filters achieve on held-out data, and the paired ratio where the problem is the same."""
+    """Held-out metrics of both tuned filters, and the paired ratio if the problem is the same."""
     choices = [one.subject.choice for one in found]
     tuned = [one.proofs[0].tuned for one in found]
     rows = [
@@ -100,7 +100,7 @@ def _ratio(names: Sequence[str], found: Sequence[Pages]) -> str:
     problems = [one.subject.plan.scenarios[0] for one in found]
     seeds = [one.proofs[0].seeds for one in found]
     if problems[0].digest != problems[1].digest or seeds[0] != seeds[1]:
-        return "The two are of different problems or held-out data, so their scores are not paired."
+        return "The two have different problems or held-out data, so their scores are not paired."
     data = problems[0].data(seeds[0])
     a, b = (evaluate(one.subject.choice.filter(problems[0]), data, problems[0].scale) for one in found)
     if a.has_truth:

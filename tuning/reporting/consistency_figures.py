@@ -1,4 +1,4 @@
-"""One picture of whether a filter's covariance is consistent: a panel for each check of `filters.consistency`."""
+"""One picture of a filter's consistency: a panel for each check of `filters.consistency`."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from filters.consistency.report import ConsistencyReport
 from filters.consistency.scores import LEVELS
 from filters.consistency.verdicts import probability_text, rounded
 from filters.looks import colour_of
+from numerics.characters import TITLE, verbatim
 from numerics.plots import BLUE, DARK, RUST, panels, save_figure
 from tuning.reporting.panels import COLUMNS, shown_states
 
@@ -41,7 +42,7 @@ def draw_consistency(
     scored: Collection[int] | None = None,
     filter_name: str = "ekf",
 ) -> Figure:
-    """Draw a consistency report; dashed lines show the expected value, grey bands what chance allows.
+    """Draw a consistency report; dashed lines show the expected value, grey bands its 95 % range by chance.
 
     Of many states some are drawn; without truth the checks are those of the innovations.
 
@@ -65,14 +66,14 @@ def draw_consistency(
         draw(axis)
         axis.title.set_fontsize(10)
     _legend(figure, report, places, left_out, colour)
-    figure.suptitle(title, fontsize=11)
+    figure.suptitle(verbatim(title, most=TITLE), fontsize=11)
     return figure
 
 
 def _panels(
     report: ConsistencyReport, comparison: Mapping | None, places: Sequence[int], colour: str
 ) -> list[Callable]:
-    """A function on axes for each check of which there are numbers."""
+    """A function on axes for each check that has results."""
     squares = [check for check in (report.nees, report.nis) if not np.isnan(check.mean.value)]
     found: list[Callable] = [partial(_squares, check=check, report=report, colour=colour) for check in squares]
     if report.whiteness.statistic > 0:
@@ -115,7 +116,7 @@ def _legend(figure, report: ConsistencyReport, places: Sequence[int], left_out: 
     named = {report.states[i]: colour for i, colour in _of_states(places).items()} if report.has_truth else {}
     if len(report.channels) > 1:
         named |= {report.channels[j]: one for j, one in _of_channels(report, colour).items()}
-    handles += [Line2D([], [], color=colour, marker="o", label=name) for name, colour in named.items()]
+    handles += [Line2D([], [], color=colour, marker="o", label=verbatim(name)) for name, colour in named.items()]
     title = left_out if report.has_truth and left_out else None
     options = {"ncols": min(len(handles), MOST_HANDLES), "frameon": False, "title": title}
     figure.legend(handles=handles, loc="outside lower center", **options)
@@ -138,7 +139,7 @@ def _squares(axis, check: SquaresCheck, report: ConsistencyReport, colour: str) 
         axis.set_yscale("log", subs=(2, 5))
         axis.yaxis.set_major_formatter("{x:g}")
         axis.yaxis.set_minor_formatter("{x:g}")
-    axis.set_title(f"{check.name}: mean {rounded(check.mean.value)} where {check.dimension:.3g} is right")
+    axis.set_title(f"{check.name}: mean {rounded(check.mean.value)}, expected {check.dimension:.3g}")
     axis.set_xlabel("step [-]")
     axis.set_ylabel(f"mean {check.name} over runs [-]")
     axis.margins(x=0.01)
@@ -179,7 +180,7 @@ def _coverage(
     axis.plot([0, 100], [0, 100], color=DARK, linestyle="--", linewidth=1)
     for i, colour in colours.items():
         axis.plot(100 * LEVELS, 100 * by_level[:, i], ".-", linewidth=1, color=colour)
-    axis.set_title(f"95 % intervals hold {_told([100 * part.value for part in found], '{:.1f} %'.format)}")
+    axis.set_title(f"95 % intervals contain {_told([100 * part.value for part in found], '{:.1f} %'.format)}")
     axis.set_xlabel("level of the interval [%]")
     axis.set_ylabel(f"{what} found in it [%]")
 

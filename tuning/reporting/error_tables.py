@@ -1,4 +1,4 @@
-"""Tables of what filters achieve: any number of states, derived outputs and channels, with or without truth."""
+"""Tables of metrics of filters: any number of states, derived outputs and channels, with or without truth."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def comparison_table(
     Args:
         evaluations: by what the filters are called.
         bound: (n,), NaN where there is none.
-        where: on what seeds of what, for the title.
-        scale_about: what the score divides errors by, in words, for the caption where there is no bound.
+        where: seeds and scenario, for the title.
+        scale_about: the scale of the score, in words, for the caption if there is no bound.
     """
     first = next(iter(evaluations.values()))
     if not first.has_truth:
@@ -52,7 +52,7 @@ def comparison_table(
 
 
 def lowest(values: Sequence[float]) -> int | None:
-    """Place of the lowest of several values, NaN left out; None if there are none to compare."""
+    """Index of the lowest of several values, ignoring NaN; None if there are none to compare."""
     known = [value for value in values if not isnan(value)]
     return list(values).index(min(known)) if len(known) > 1 else None
 
@@ -99,18 +99,18 @@ def _below(evaluations: Mapping[str, Evaluation], bound: np.ndarray, outputs: Ma
 
 
 def _innovations_table(evaluations: Mapping[str, Evaluation], where: str) -> Table:
-    """What the innovations alone say of filters, a row each."""
+    """Metrics of the innovations, a row per filter."""
     first = next(iter(evaluations.values()))
     rows = [
         [name, unless_blank(found.log_likelihood, ".2f"), consistency_cells(found)[1], str(found.divergences)]
         for name, found in evaluations.items()
     ]
-    caption = f"log L: of a run, the more the better. Ideal: NIS {right_nis(first)}. div.: restarts."
+    caption = f"log L: of a run, higher is better. Ideal: NIS {right_nis(first)}. div.: restarts."
     return table(f"Innovations on {where}", ["filter", "log L", "NIS", "div."], rows, caption=caption)
 
 
 def above_bound(found: Evaluation, bound: np.ndarray) -> list[float]:
-    """By how many percent each state's RMSE is above the bound; NaN where there is none."""
+    """The excess of each state's RMSE over the bound in percent; NaN where there is none."""
     return [100.0 * (rmse.value / limit - 1.0) for rmse, limit in zip(found.rmse, bound, strict=True)]
 
 
@@ -126,7 +126,7 @@ def consistency_cells(found: Evaluation) -> list[str]:
 
 
 def right_nis(found: Evaluation) -> str:
-    """What the mean NIS should be: the mean number of channels that were there."""
+    """The expected mean NIS: the mean number of channels present."""
     return unless_blank(found.expected_nis, ".3g")
 
 
@@ -136,7 +136,7 @@ def two_lines(quantity: Quantity) -> str:
 
 
 def expected_word(bound: np.ndarray) -> str:
-    """What the row below the filters is called: without a bound it holds what NEES and NIS should be."""
+    """The label of the row below the filters: without a bound it has the expected NEES and NIS."""
     return "expected" if np.isnan(bound).all() else "bound"
 
 
@@ -157,11 +157,6 @@ def about(value: Interval, digits: int) -> str:
     if digits > MOST_DECIMALS and not isnan(value.value):
         return f"{value.value:.2e} ±{half_width:.0e}"
     return "" if isnan(value.value) else f"{value.value:.{digits}f} ±{half_width:.{digits}f}"
-
-
-def span(value: Interval, digits: int) -> str:
-    """A value with its 95 % interval in brackets."""
-    return f"{value.value:.{digits}f} [{value.low:.{digits}f}, {value.high:.{digits}f}]"
 
 
 def unless_blank(value: float, form: str) -> str:

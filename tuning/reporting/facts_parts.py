@@ -1,4 +1,4 @@
-"""What stands in a report on what was done: the score, the model, assumed Q and R, and the facts of the study."""
+"""Sections of a report on the setup: the score, the model, assumed Q and R, and the facts of the study."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ from tuning.problems.problem import BOUND, OPEN_LOOP, Problem
 from tuning.reporting.page import Section, Table, Words
 from tuning.reporting.subject import Subject
 from tuning.search.objectives import NIS_BAND, find_objective
-from tuning.search.plan import TRAINING_SEEDS
+from tuning.search.plan import TRAINING_SEEDS, Plan
+from tuning.search.ranges import range_words
 from tuning.search.space import Choice
 
 MOST_ROWS = 40  # of a table of variances
 
 
 def score_section(subject: Subject) -> Section:
-    """What the score is, in words and with its scales."""
+    """The definition of the score, in words and with its scales."""
     said = []
     for scenario in subject.plan.scenarios:
         if scenario.scale is None:
             said.append(
-                f"{scenario.name} has no truth, so there is no score: what counts is the log-likelihood of the "
-                "innovations, that is how probable the filter finds what was measured; more is better."
+                f"{scenario.name} has no truth, so there is no score. The criterion is the log-likelihood of "
+                "the innovations, the probability that the filter assigns to the measurements; higher is "
+                "better."
             )
             continue
         states = scenario.quantities.states
@@ -38,25 +40,25 @@ def score_section(subject: Subject) -> Section:
         ]
         said.append(
             f"The score of a filter on {scenario.name} is the mean over {', '.join(_scored(scenario))} of its "
-            f"RMSE over a fixed scale: {', '.join(scales)}. It has no unit, less is better, and 1 means errors as "
-            f"large as the scale, which is {scenario.scale_about}.{_no_bound(scenario)}"
+            f"RMSE over a fixed scale: {', '.join(scales)}. It has no unit, lower is better, and 1 means "
+            f"errors as large as the scale, which is {scenario.scale_about}.{_no_bound(scenario)}"
         )
     said.append(
-        f"What was learnt on training {_word(subject)} is evaluated on held-out {_word(subject)}, which no "
-        "trial saw. Intervals hold 95 % of resampled sets of runs; ratios are paired, run by run."
+        f"The filter tuned on training {_word(subject)} is evaluated on held-out {_word(subject)}, which no "
+        "trial saw. Intervals contain 95 % of resampled sets of runs; ratios are paired, run by run."
     )
     return Section("What the score is", [Words(said)])
 
 
 def _no_bound(scenario: Problem) -> str:
-    """Why a score counts something else than the bound, where it does; empty where it does not."""
+    """Why a score uses another scale than the bound; empty if it uses the bound."""
     if scenario.scale_about == BOUND:
         return " It is the least error that any filter can have."
     if not scenario.scale_about.startswith(OPEN_LOOP):
         return ""
     return (
-        " A posterior Cramér-Rao bound needs the inverse of Q: one state without noise of its own is enough for "
-        "none, so scores here cannot be compared with those of a problem whose scale is the bound."
+        " A posterior Cramér-Rao bound needs the inverse of Q: one state without process noise rules it out, "
+        "so scores here cannot be compared with those of a problem whose scale is the bound."
     )
 
 
@@ -82,8 +84,8 @@ def model_section(choice: Choice, scenario: Problem) -> Section:
         said.append(f"The filter {choice.name} has neither Q nor R.")
         return Section("Model, Q and R", [Words(said)])
     said.append(
-        "The filter takes w and v for white Gaussian noise of covariance Q and R. Covariances are per step and do "
-        "not scale with dt: another sample time needs another Q."
+        "The filter assumes that w and v are white Gaussian noise of covariance Q and R. Covariances are per "
+        "step and do not scale with dt: another sample time needs another Q."
     )
     said += [
         f"In each step {one.text_symbol} moves by {_amount(variance, one)} (standard deviation) beyond the model."
@@ -126,18 +128,22 @@ def _listed(quantities: Sequence[Quantity]) -> str:
 
 
 def facts_section(subject: Subject, nis: Sequence[float]) -> Section:
-    """What was tuned, on what and with what; `nis` is the choice's on training seeds, over the channels."""
+    """What was tuned, on which data and how; `nis` is the choice's on training seeds, over the channels."""
     plan, word = subject.plan, _word(subject)
-    training = plan.scenarios[0].training_seeds(plan.seed, TRAINING_SEEDS)
+    trained = dict.fromkeys(one.training_seeds(plan.seed, TRAINING_SEEDS) for one in plan.scenarios)
     about = [f"{one.name}: {one.about}" if one.about else one.name for one in plan.scenarios]
     rows = [
         ["filter", plan.filter if plan.filter == subject.choice.name else f"{plan.filter}: {subject.choice.name}"],
         *([["budget", f"{plan.budget:g} µs a step of one core"]] if plan.budget is not None else []),
         ["scenarios" if len(about) > 1 else "scenario", "; ".join(about)],
         ["minimised", "; ".join(f"{name}: {find_objective(name).about}" for name in plan.objectives)],
-        ["mean NIS", _nis_words(nis, word) if plan.is_constrained else "free"],
+        [
+            "mean NIS",
+            _nis_words(nis, plan) if plan.is_constrained else "free",
+        ],
         ["sampler", plan.sampler],
-        [f"training {word}", f"{training.start} to {training.stop - 1}"],
+        *([["ranges", range_words(plan)]] if range_words(plan) else []),
+        [f"training {word}", "; ".join(f"{some[0]} to {some[-1]}" for some in trained)],
         ["study", subject.name],
     ]
     if subject.study is not None:
@@ -148,10 +154,12 @@ def facts_section(subject: Subject, nis: Sequence[float]) -> Section:
     return Section("What was done", [Table("", [], rows)])
 
 
-def _nis_words(nis: Sequence[float], word: str) -> str:
+def _nis_words(nis: Sequence[float], plan: Plan) -> str:
+    word, channels = plan.scenarios[0].seed_word, len(plan.scenarios[0].quantities.measurements)
     low, high = NIS_BAND
     place = "inside" if all(low <= ratio <= high for ratio in nis) else "outside"
-    found = " and ".join(f"{ratio:.3g}" for ratio in nis)
+    found, low, high = " and ".join(f"{channels * ratio:.3g}" for ratio in nis), channels * low, channels * high
     return (
-        f"to lie between {low:g} and {high:g} of what is expected; it is {found}, {place}, on the training {word}"
+        f"to lie between {low:g} and {high:g}, where {channels} is right; it is {found}, {place}, on the "
+        f"training {word}"
     )

@@ -1,4 +1,4 @@
-"""Pictures of studies and of what they are worth: `draw_...` gives a figure, `..._figure` saves it as a file."""
+"""Figures of studies and their results: `draw_...` returns a figure, `..._figure` saves it as a file."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 from optuna.trial import FrozenTrial, TrialState
 
 from filters.looks import colour_of
-from numerics.plots import BLUE, DARK, GREEN, GREY, PALE, RUST, panels, save_figure
-from tuning.evaluation.baselines import ORACLE, RULE, SCALED, TUNED
+from numerics.characters import TITLE, verbatim
+from numerics.plots import BLUE, DARK, GREEN, GREY, MUSTARD, PALE, RUST, panels, save_figure
+from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED
 from tuning.evaluation.held_out import Comparison
 from tuning.reporting.panels import COLUMNS, shown_states
 from tuning.search.outcome import is_consistent
@@ -19,7 +20,8 @@ from tuning.search.outcome import is_consistent
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLOURS = {RULE: PALE, SCALED: GREY, ORACLE: GREEN}  # of baselines; the tuned filter has its own
+# Of baselines; the tuned filter has its own.
+COLOURS = {GIVEN: RUST, RULE: PALE, SCALED: GREY, NOISE: MUSTARD, ORACLE: GREEN}
 
 
 def history_figure(path: str | Path, trials: Sequence[FrozenTrial], title: str, label: str) -> Path:
@@ -31,7 +33,7 @@ def draw_history(trials: Sequence[FrozenTrial], title: str, label: str) -> Figur
     """First objective of every trial of a study and the best so far; the first trial is the untuned filter.
 
     Hollow circles are trials whose mean NIS is outside its band: they are not among the best, unless all are.
-    Crosses are pruned trials: the mean of the seeds that they came to.
+    Crosses are pruned trials: the mean of the seeds that they reached.
     """
     figure, (axis,) = panels(1, 1, (6.4, 4.4))
     done = [trial for trial in trials if trial.state == TrialState.COMPLETE]
@@ -57,19 +59,19 @@ def draw_history(trials: Sequence[FrozenTrial], title: str, label: str) -> Figur
     above = f" ({beyond} of {len(done) + len(early)} lie above the axis)" if done and beyond else ""
     axis.set_xlabel(f"trial{above}")
     axis.xaxis.get_major_locator().set_params(integer=True, min_n_ticks=1)
-    axis.set_ylabel(label)
-    axis.set_title(title, fontsize=11)
+    axis.set_ylabel(verbatim(label))
+    axis.set_title(verbatim(title, most=TITLE), fontsize=11)
     return figure
 
 
 def early_trials(trials: Sequence[FrozenTrial]) -> list[tuple[FrozenTrial, float]]:
-    """Pruned trials, each with the mean of what it reported: scores of single seeds."""
+    """Pruned trials, each with the mean of its reported scores of single seeds."""
     early = [trial for trial in trials if trial.state == TrialState.PRUNED and trial.intermediate_values]
     return [(trial, float(np.mean(list(trial.intermediate_values.values())))) for trial in early]
 
 
 def limit_values(axis, values: list[float]) -> int:
-    """Let an axis of objective values show the good ones and the first; return how many lie above it."""
+    """Limit an axis of objective values to the good ones and the first; return how many lie above it."""
     low, spread = min(values), max(values) - min(values)
     room = 0.1 * abs(low) or 0.1 * spread or 1.0
     top = max(low + 3 * room, values[0] + 1.5 * room)
@@ -105,11 +107,11 @@ def draw_comparison(proof: Comparison, title: str, filter_name: str = "ekf") -> 
             axis.annotate(f"{rmse.value:.3g}", (place, rmse.high), (0, 4), textcoords="offset points", ha="center")
         if np.isfinite(proof.bound[i]):
             axis.axhline(proof.bound[i], color=DARK, linestyle="--", label="posterior Cramér-Rao bound")
-        axis.set_xticks(range(len(names)), [proof.label(name).replace(" ", "\n", 1) for name in names])
+        axis.set_xticks(range(len(names)), [name.replace(" ", "\n", 1) for name in names], fontsize=8)
         axis.set_ylabel(f"RMSE of {states[i].plot_label}")
         axis.margins(y=0.15)
         axis.grid(axis="x", visible=False)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", frameon=False, title=left_out or None)
-    figure.suptitle(title, fontsize=11)
+    figure.suptitle(verbatim(title, most=TITLE), fontsize=11)
     return figure

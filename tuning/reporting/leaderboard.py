@@ -1,4 +1,4 @@
-"""What `thruster compare` says of filters on one scenario: tables, a sentence on who wins, or plain data."""
+"""The output of `thruster compare` for one scenario: tables, a sentence on the winner, or plain data."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tuning.reporting.error_tables import (
 
 
 def report(board: Leaderboard) -> list[RenderableType]:
-    """Two tables of a scenario, one without truth, and a sentence on who wins."""
+    """Two tables of a scenario, one without truth, and a sentence on the winner."""
     scenario, evaluation = board.scenario, board.rows[0].evaluation
     title = f"{scenario.name}: {scenario.about}" if scenario.about else scenario.name
     seeds = f"held-out {scenario.seed_word} {board.seeds[0]} to {board.seeds[-1]}"
@@ -42,18 +42,18 @@ def report(board: Leaderboard) -> list[RenderableType]:
         shown, said = [errors(board, f"{title}\nRMSE on {seeds}"), _against(board)], []
     noise = noise_sentence(board.rows, "--knows")
     beliefs = belief_sentences(board.rows)
-    hint = ["--augment NAME:STD:WALK changes what is believed."] if beliefs else []
+    hint = ["--augment NAME:STD:WALK changes these assumptions."] if beliefs else []
     return [*shown, *([noise] if noise else []), *beliefs, *hint, *said, f"{winners(board)}\n"]
 
 
 def winner(board: Leaderboard) -> int | None:
-    """Place of the row with the lowest score, without truth the highest log-likelihood; None if none has it."""
+    """Index of the row with the lowest score, without truth the highest log-likelihood; None if there is none."""
     found = [row.evaluation for row in board.rows]
     return lowest([one.score.value if one.has_truth else -one.log_likelihood for one in found])
 
 
 def _errors_across(board: Leaderboard, title: str) -> Table:
-    """RMSE of all states side by side, a row a filter."""
+    """RMSE of all states side by side, a row per filter."""
     states, digits = board.rows[0].evaluation.states, decimals(board.rows[0].evaluation)
     rows = []
     for row in board.rows:
@@ -73,7 +73,7 @@ def _errors_across(board: Leaderboard, title: str) -> Table:
 
 
 def _errors_below(board: Leaderboard, title: str) -> Table:
-    """RMSE of many states, a row a state of a filter."""
+    """RMSE of many states, a row per state of a filter."""
     states, digits, rows = board.rows[0].evaluation.states, decimals(board.rows[0].evaluation), []
     for row in board.rows:
         first = row.label == board.rows[0].label
@@ -97,7 +97,7 @@ def _errors_below(board: Leaderboard, title: str) -> Table:
 
 
 def _with_bound_or_not(board: Leaderboard, heads: list[str], rows: list[list[str]]) -> tuple:
-    """Columns, rows and caption; where there is no bound the caption says what the scale is."""
+    """Columns, rows and caption; without a bound the caption describes the scale."""
     rest = "±: half of the 95 % interval. start-up: the first 50 steps."
     if not np.isnan(board.bound).all():
         return heads, rows, f"above: the bound. {rest}"
@@ -130,7 +130,7 @@ def _against(board: Leaderboard) -> Table:
 
 
 def _median(n: int) -> str:
-    """What the median of the NEES of n states should be, of chi-square's distribution."""
+    """The expected median of the NEES of n states, from the chi-square distribution."""
     from scipy.special import chdtri
 
     return f" (~ median NEES, {chdtri(n, 0.5):.2f})"

@@ -1,4 +1,4 @@
-"""Axes of panels over time: limits from the steps that are scored, so that a start-up flattens nothing."""
+"""Axes of panels over time: limits from the scored steps, so that a start-up does not flatten the rest."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def limit_errors(
         axes: of the row, a filter each.
         values: of each filter (K + 1,), NaN where there is none.
         bands: half widths beside them.
-        start: the first step that is scored; what is before may leave the panel.
+        start: the first scored step; earlier ones may leave the panel.
         word: for the root of the mean square.
     """
     reaches = [_reach(*pair, start) for pair in zip(values, bands, strict=True)]
@@ -44,7 +44,7 @@ def limit_errors(
 
 
 def limit_values(axes: Sequence, shown: Sequence[np.ndarray], bands: Sequence[np.ndarray]) -> None:
-    """One pair of limits for a row of estimates: all that is shown, and of the bands as much again at most.
+    """One pair of limits for a row of estimates: everything shown, and at most as much again of the bands.
 
     Args:
         axes: of the row, a filter each.
@@ -71,6 +71,6 @@ def _ends(series: Sequence[np.ndarray]) -> tuple[float, float] | None:
 
 
 def _reach(values: np.ndarray, band: np.ndarray, start: int) -> float:
-    """How far a panel has to reach: to the largest error, and to the end of a band that is not far beyond."""
+    """The range of a panel: to the largest error, and to the end of a band not far beyond."""
     (_, error), (_, width) = (_ends([np.abs(one[start:])]) or (0.0, 0.0) for one in (values, band))
     return max(error, min(width, WIDEST * error) if error > 0 else width)

@@ -1,4 +1,4 @@
-"""What stands in a report to be copied: lines of Python, JSON and MATLAB that use the tuned filter."""
+"""Lines of a report to copy: Python, JSON and MATLAB that use the tuned filter."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ tuned = found.filter  # with its model, Q and R
 """
 BY_HAND = """
 belief = tuned.init()
-for measurement, command in zip(measurements, inputs):  # arrays of your own, a row a step
+for measurement, command in zip(measurements, inputs):  # arrays of your own, a row per step
     belief, innovation = tuned.update(belief, measurement)
     print(belief.mean, belief.cov)
     belief = tuned.predict(belief, command)
@@ -55,14 +55,14 @@ def lines_section(choice: Choice, problem: Problem, file: str | None) -> Section
         [
             *said,
             Code("Python", python),
-            Code("JSON: the filter, as the tuned file has it", json.dumps(entry, indent=2, default=str)),
+            Code("JSON: the filter, as in the tuned file", json.dumps(entry, indent=2, default=str)),
             Code("MATLAB or GNU Octave: a function that needs no toolbox", matlab, folded=True),
         ],
     )
 
 
 def _found_by(problem: Problem) -> str:
-    """Lines that give a problem: by its name or, where it is code of the user's, from where they have it."""
+    """Lines that load a problem: by its name or, if it is the user's code, from its module."""
     if problem.name in built_in() or problem.name.endswith(".toml"):
         return f"from tuning.problems.find import find_problem\n\nproblem = find_problem({problem.name!r})"
     module, colon, name = problem.name.partition(":")

@@ -1,6 +1,6 @@
 """A tuned filter as a MATLAB function: its model, Q, R and, where it is an extended Kalman filter, its step.
 
-What is written runs in MATLAB and in GNU Octave without a toolbox. The functions f and h take columns, as
+The code runs in MATLAB and in GNU Octave without a toolbox. The functions f and h take columns, as
 `extendedKalmanFilter` and `unscentedKalmanFilter` of MATLAB's toolboxes want them.
 """
 
@@ -85,7 +85,10 @@ def matlab_function(choice: Choice, model: StateSpaceModel, problem: str, dt: fl
         dt: sample time [s], if it has one.
     """
     name = function_name(choice.name, problem)
-    pieces, fields = _functions(model)
+    try:
+        (pieces, fields), why = _functions(model), ""
+    except ValueError as error:
+        pieces, fields, why = "", [], str(error)
     steps = choice.name in STEPPED and pieces and (choice.name == "ekf" or isinstance(model, AffineModel))
     head = HEAD + (STEP if steps else TOOLBOX if pieces else "")
     text = head.format(
@@ -100,7 +103,9 @@ def matlab_function(choice: Choice, model: StateSpaceModel, problem: str, dt: fl
     )
     if not pieces:
         text = text.replace(": m.f(x, u), m.h(x), ", ": ")
-        text += "%   f and h are code that cannot be written out: m.f and m.h are yours to add.\n"
+        text += (
+            f"%   f and h are code that cannot be written out: m.f and m.h are yours to add.\n%   Why: {why}.\n"
+        )
     lines = [f"m.dt = {dt:.17g};"] if dt else []
     lines += [f"m.Q = {_matrix(model.process_noise_cov)};", f"m.R = {_matrix(model.measurement_noise_cov)};"]
     lines += [f"m.x0 = {_matrix(model.prior_mean[:, None])};", f"m.P0 = {_matrix(model.prior_cov)};", *fields]
@@ -127,7 +132,7 @@ def function_name(*parts: str) -> str:
 
 
 def _functions(model: StateSpaceModel) -> tuple[str, list[str]]:
-    """Functions f and h, empty if they cannot be written out, and more fields of the struct."""
+    """Functions f and h, and more fields of the struct; ValueError if they cannot be written out."""
     if isinstance(model, AffineModel):
         a, b, offset, c, shift = model.matrices()
         moved = f"y = {_matrix(a)} * x + {_matrix(offset[:, None])}"
@@ -141,8 +146,8 @@ def _functions(model: StateSpaceModel) -> tuple[str, list[str]]:
     x, u = [f"x({i + 1})" for i in range(model.n)], [f"u({i + 1})" for i in range(model.inputs)]
     f = traced(model.transition, (x, u), model.given_constants)
     h = traced(model.observe, (x,), model.given_constants)
-    if f is None or h is None or max(len(f), len(h)) > LONGEST:
-        return "", []
+    if max(len(f), len(h)) > LONGEST:
+        raise ValueError(f"f and h must have at most {LONGEST} lines, but they have {len(f)} and {len(h)}")
     whole = "\n".join(f"    {line}" for line in (*f[:-1], f"x = {f[-1]};"))
     loop = f"for part = 1:{model.substeps}\n{whole}\nend\ny = x;"
     seen = "\n".join((*h[:-1], f"z = {h[-1]};"))

@@ -1,4 +1,4 @@
-"""A page of its own: tables and pictures in one HTML file that needs no network, and tables as Markdown."""
+"""A self-contained page: tables and pictures in one HTML file that needs no network, and tables as Markdown."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Table(NamedTuple):
     rows: Sequence[Sequence[str]]
 
     def html(self) -> str:
-        """The table for a page: on a phone a row of many columns is folded, what is still too wide is scrolled."""
+        """The table for a page: on a phone a row of many columns is folded; if still too wide, it scrolls."""
         head = "".join(f'<th scope="col">{_text(column)}</th>' for column in self.columns)
         rows = "\n".join(
             f'<tr><th scope="row">{_text(row[0])}</th>{self._cells(row[1:])}</tr>' for row in self.rows
@@ -55,7 +55,7 @@ class Table(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A picture with a sentence below, and in words what it shows, for whoever cannot see it."""
+    """A picture with a caption and a text alternative."""
 
     svg: str  # an element without a size
     caption: str
@@ -136,16 +136,16 @@ class Section(NamedTuple):
 
     @property
     def anchor(self) -> str:
-        """Where a list of contents leads."""
+        """The targets of a table of contents."""
         return re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-") or "section"
 
 
 def html_page(title: str, advice: str | Sequence[str], sections: Sequence[Section], beside: bool = False) -> str:
-    """The whole page; all that is said is escaped.
+    """The whole page; all text is escaped.
 
     Args:
         title: of the page.
-        advice: what it comes to, a sentence or several.
+        advice: the summary, a sentence or several.
         sections: what follows.
         beside: whether it is wide, for two studies.
     """
@@ -194,6 +194,6 @@ def _line(cells: Sequence[str]) -> str:
 
 def _plain(text: str) -> str:
     """Text that Markdown takes as it is."""
-    for mark in "\\|*_`<":
-        text = text.replace(mark, f"\\{mark}")
-    return " ".join(text.split())
+    text = re.sub(r"([\\|*_`<$~])", r"\\\1", " ".join(text.split()))
+    text = text.replace("](", "\\](").replace("![", "!\\[").replace("&", "&amp;")
+    return f"\\{text}" if text[:1] in ("#", ">") else text

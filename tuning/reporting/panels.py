@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from textwrap import wrap
 
+from numerics.characters import verbatim
 from plants.quantities import Quantity
 
 MOST_PANELS = 6  # of states in one figure
 COLUMNS = 3  # of panels side by side
+LABEL_WIDTH = 18  # characters of a line beside a panel
 
 
 def shown_states(
     states: Sequence[Quantity] | Sequence[str], scored: Collection[int] | None = None
 ) -> tuple[list[int], str]:
-    """Places of the states that a figure shows, in their order, and a line that says how many it leaves out.
+    """Indices of the states that a figure shows, in their order, and a line with the number of those left out.
 
     Args:
         states: all of them.
@@ -27,7 +30,8 @@ def shown_states(
 
 
 def axis_label(quantity: Quantity) -> str:
-    """Name and symbol above the unit, as axes of narrow panels have it."""
+    """Name and symbol above the unit, in lines as short as the axes of low panels have room for."""
     named = quantity.symbol in quantity.name.split()  # as "measured thrust" is
-    label = quantity.name if named else quantity._replace(unit="").plot_label
-    return f"{label}\n[{quantity.unit}]" if quantity.unit else label
+    label = verbatim(quantity.name) if named else quantity._replace(unit="").plot_label
+    label = "\n".join(wrap(label, LABEL_WIDTH, break_long_words=False, break_on_hyphens=False))
+    return f"{label}\n[{verbatim(quantity.unit)}]" if quantity.unit else label

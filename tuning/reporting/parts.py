@@ -1,8 +1,8 @@
-"""What stands in a report: the advice, what was achieved, how the search went, and ensemble sizes."""
+"""Sections of a report: the advice, the results, the course of the search, and ensemble sizes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import isnan
 from textwrap import fill
 
@@ -18,6 +18,7 @@ from tuning.evaluation.sizes import SizeRow
 from tuning.evaluation.worth import scaling_sentence, without_truth, worth
 from tuning.problems.problem import score_label
 from tuning.reporting.alternatives import of_comparison, of_front, of_history, of_importances, of_sizes, of_slices
+from tuning.reporting.choice_words import choice_sentences
 from tuning.reporting.figures import draw_comparison, draw_history
 from tuning.reporting.page import Part, Picture, Section, Table, Words
 from tuning.reporting.search_figures import (
@@ -40,35 +41,36 @@ from tuning.search.space import AUTO, Choice
 MANY_TRIALS = 50
 
 
-def advice(choice: Choice, plan: Plan, proofs: Sequence[Comparison]) -> str:
-    """One sentence: what tuning is worth, the ensemble size to take, and whether the covariance is consistent.
+def advice(choice: Choice, plan: Plan, proofs: Sequence[Comparison], chosen: Mapping | None = None) -> str:
+    """The choice and its reason, if `chosen` has them; the gain of tuning, N, and whether the covariance is right.
 
-    Of the covariance the mean NEES tells; without truth the mean NIS does.
+    The covariance is checked by the mean NEES; without truth by the mean NIS.
     """
     places = [f" on {scenario.name}" if len(proofs) > 1 else "" for scenario in plan.scenarios]
     gains = [f"{worth(proof)}{place}" for proof, place in zip(proofs, places, strict=True)]
-    parts = [f"Tuning {' and '.join(gains)}"]
+    subject = "This" if chosen else "Tuning"
+    parts = [f"{subject} {' and '.join(gains)}"]
     if "ensemble_size" in choice.numbers:
         parts.append(f"take N = {choice.numbers['ensemble_size']}")
     squares = [_squares(proof.tuned) for proof in proofs]
     if not any(isnan(mean.value) for _, mean, _ in squares):
         found = [
-            f"{confidence(mean, right)}{place} (mean {name} {rounded(mean.value)} where {right:.3g} is right)"
+            f"{confidence(mean, right)}{place} (mean {name} {rounded(mean.value)}, expected {right:.3g})"
             for (name, mean, right), place in zip(squares, places, strict=True)
         ]
         parts.append(f"the covariance is {' and '.join(found)}")
-    return "; ".join(parts) + "."
+    return " ".join([*choice_sentences(chosen, plan), "; ".join(parts) + "."])
 
 
 def _squares(evaluation: Evaluation) -> tuple[str, Interval, float]:
-    """What tells whether a covariance is consistent: its name, mean and expected value."""
+    """The metric of a covariance's consistency: its name, mean and expected value."""
     if evaluation.has_truth:
         return "NEES", evaluation.nees, len(evaluation.rmse)
     return "NIS", evaluation.nis, evaluation.expected_nis
 
 
 def held_out_section(book: Sketchbook, subject: Subject, proofs: Sequence[Comparison]) -> Section:
-    """Errors before and after, scenario by scenario; without truth what the innovations tell."""
+    """Errors before and after, scenario by scenario; without truth metrics of the innovations."""
     parts: list[Part] = []
     for scenario, proof in zip(subject.plan.scenarios, proofs, strict=True):
         if not proof.tuned.has_truth:
@@ -79,16 +81,16 @@ def held_out_section(book: Sketchbook, subject: Subject, proofs: Sequence[Compar
         name, place = subject.choice.name, f"{subject.choice.name} on {scenario.name}"
         said = scaling_sentence(proof)
         parts += [errors_table(scenario, proof), *([Words([said])] if said else [])]
-        caption = f"RMSE on {where} with 95 % intervals{bound}. Each panel has an axis of its own."
+        caption = f"RMSE on {where} with 95 % intervals{bound}. Each panel has its own axis."
         parts.append(book.picture(draw_comparison(proof, place, name), caption, of_comparison(proof)))
     return Section(f"Before and after, on held-out {subject.plan.scenarios[0].seed_word}", parts)
 
 
 def search_section(book: Sketchbook, subject: Subject) -> Section:
-    """How the study went: convergence, importances, slices, and the front of two objectives."""
+    """The course of the study: convergence, importances, slices, and the front of two objectives."""
     study, title = subject.study, "The study"
     if study is None:
-        said = f"Study {subject.name!r} is not in the storage, so how it went is not told here."
+        said = f"Study {subject.name!r} is not in the storage, so its course is not shown here."
         return Section(title, [Words([said])])
     trials = study.get_trials(deepcopy=False)
     objectives = subject.plan.objectives
@@ -111,7 +113,7 @@ def search_section(book: Sketchbook, subject: Subject) -> Section:
     if subject.plan.filter == AUTO:
         parts.append(_kinds_table(trials, objectives[0]))
     if len(objectives) > 1:
-        caption = "Trials by both objectives; no trial beats those of the Pareto front in both."
+        caption = "Trials by both objectives; no trial is better than those of the Pareto front in both."
         picture = draw_front(trials, study.best_trials, labels)
         parts.append(book.picture(picture, caption, of_front(study.best_trials, objectives)))
     return Section(title, parts)
@@ -124,16 +126,16 @@ def _importance_part(book: Sketchbook, study: Study, word: str) -> Picture | Wor
         return Words([f"Importances need {FEWEST_TRIALS} finished trials or more."])
     complete, early = counted_trials(study)
     rough = ", rough on so few" if complete + early < MANY_TRIALS else ""
-    pruned = f" and {early} pruned ones, each at the mean of the {word} that it came to" if early else ""
+    pruned = f" and {early} pruned ones, each at the mean of the {word} that it reached" if early else ""
     caption = (
-        "How much each parameter matters for a trial to be among the best tenth, by how its values there differ "
-        f"from those of all trials (PED-ANOVA): {complete} complete trials{pruned}{rough}."
+        "Importance of each parameter for a trial to be among the best tenth, from the difference between "
+        f"its values there and those of all trials (PED-ANOVA): {complete} complete trials{pruned}{rough}."
     )
     return book.picture(draw_importance(found), caption, of_importances(found))
 
 
 def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
-    """Kinds of filters that the trials chose, the best first."""
+    """Filter types that the trials chose, the best first."""
     columns = ["filter", "trials", "pruned", "over budget", f"best {objective}", "µs/step"]
     rows = [
         [kind.name, f"{kind.trials}", f"{kind.pruned}", f"{kind.over_budget}"]
@@ -142,11 +144,11 @@ def _kinds_table(trials: Sequence[FrozenTrial], objective: str) -> Table:
         for kind in filter_types_tried(trials)
     ]
     caption = "Filters that were tried; the slices are those of the best"
-    return Table(f"{caption}. *: mean NIS outside its band, to be chosen only where all are", columns, rows)
+    return Table(f"{caption}. *: mean NIS outside its band, chosen only if all are", columns, rows)
 
 
 def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) -> Section:
-    """Errors against ensemble size; how many seeds tell it of each is said where that differs."""
+    """Errors against ensemble size, with the number of seeds of each if they differ."""
     first = subject.plan.scenarios[0]
     fresh = first.size_seeds(subject.plan.seed, SIZE_SEEDS)
     where = f"{first.seed_word} {fresh.start} to {fresh.stop - 1} of {first.name}"
@@ -154,8 +156,8 @@ def sizes_section(book: Sketchbook, subject: Subject, sizes: Sequence[SizeRow]) 
     kept = subject.choice.numbers["ensemble_size"]
     ratios = [[f"{row.size}", f"{row.ratio.value:.4f}", f"{row.ratio.high:.4f}", f"{row.seeds}"] for row in sizes]
     said = (
-        f"Score over the best, paired on the same {first.seed_word}; of several scenarios the largest. The "
-        "smallest N whose upper end is below 1.01 is sufficient"
+        f"Score relative to the best, paired on the same {first.seed_word}; the largest of several scenarios. "
+        "The smallest N whose upper end is below 1.01 is sufficient"
     )
     columns = ["N", "score over the best", "upper end of its 95 % interval", first.seed_word]
     if len({row.seeds for row in sizes}) == 1:

@@ -1,4 +1,4 @@
-"""The report of a tuning: one page with all that is known of it, and its tables as Markdown."""
+"""The report of a tuning: one page with all results, and its tables as Markdown."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ from tuning.reporting.sketchbook import Sketchbook
 from tuning.reporting.subject import Subject, find_subject, is_file
 from tuning.reporting.tables import errors_table, known_table, numbers_table
 from tuning.search.objectives import nis_ratio
+from tuning.search.ranges import at_ends
 from tuning.search.space import has_ensemble
 from tuning.search.trials import measure
 
 
 class Report(NamedTuple):
-    """What was written, and the sentences that sum it up, one a study."""
+    """The files written, and a summary sentence per study."""
 
     page: Path
     tables: Path
@@ -34,7 +35,7 @@ class Report(NamedTuple):
 
 
 class Pages(NamedTuple):
-    """All that is known of one study, ready for a page."""
+    """All results of one study, ready for a page."""
 
     subject: Subject
     title: str
@@ -53,8 +54,8 @@ def write_report(
 ) -> Report:
     """Write a page, NAME.html, and its tables, NAME.md, on a tuned file or a study.
 
-    Held-out metrics and the table of ensemble sizes are those that the file or the study keeps, where they were
-    made of the same problems by the same versions of packages; else they are computed anew. `verify` always does.
+    Held-out metrics and the table of ensemble sizes come from the file or the study if they were made from the
+    same problems by the same versions of packages; otherwise they are recomputed. `verify` always recomputes.
 
     Args:
         source: a tuned file, or the name of a study.
@@ -85,7 +86,7 @@ def report_files(source: str | Path, name: str, out: str | Path | None) -> tuple
 
 
 def pages_of(source: str | Path, subject: Subject, prefix: str = "p", file: str | None = None) -> Pages:
-    """Everything that a page holds of a study, whose pictures' names begin with a prefix."""
+    """The contents of a page on a study, whose pictures' names begin with a prefix."""
     plan, choice = subject.plan, subject.choice
     file = str(source) if file is None and is_file(source) else file or None
     data = plan.training_data()
@@ -103,7 +104,8 @@ def pages_of(source: str | Path, subject: Subject, prefix: str = "p", file: str 
     ]
     title = f"{choice.name} tuned on {', '.join(_short(scenario.name) for scenario in plan.scenarios)}"
     known = identify(choice, plan.scenarios, data, plan.space())
-    identified = sentences(known) if known else too_many(choice, plan.space())
+    identified = at_ends(choice, plan)
+    identified += sentences(known) if known else too_many(choice, plan.space())
     nis = subject.nis or [nis_ratio(found) for found in measure(choice, plan, data)]
     numbers = [
         numbers_table(choice, plan.scenarios[0], plan.seed, proofs[0].default),
@@ -112,6 +114,7 @@ def pages_of(source: str | Path, subject: Subject, prefix: str = "p", file: str 
     book = Sketchbook(prefix)
     sections = [
         held_out_section(book, subject, proofs),
+        *data_sections(plan.scenarios),
         score_section(subject),
         Section("The parameters", [*numbers, *([Words(identified)] if identified else [])]),
         model_section(choice, plan.scenarios[0]),
@@ -122,9 +125,17 @@ def pages_of(source: str | Path, subject: Subject, prefix: str = "p", file: str 
         facts_section(subject, nis),
     ]
     errors = [errors_table(scenario, proof) for scenario, proof in zip(plan.scenarios, proofs, strict=True)]
-    return Pages(subject, title, advice(choice, plan, proofs), sections, [*errors, *numbers], proofs)
+    return Pages(
+        subject, title, advice(choice, plan, proofs, subject.validation), sections, [*errors, *numbers], proofs
+    )
+
+
+def data_sections(problems: Sequence[Problem]) -> list[Section]:
+    """A section with remarks on the data, if there are any."""
+    said = [one for problem in problems for one in problem.remarks]
+    return [Section("The data", [Words(said)])] if said else []
 
 
 def _short(name: str) -> str:
-    """A problem's name in a title: of a file its own name alone."""
+    """A problem's name in a title: for a file only its name."""
     return Path(name).stem if name.endswith(".toml") else name

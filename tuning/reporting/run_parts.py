@@ -1,4 +1,4 @@
-"""What stands in a report on one run over time: estimates, what was measured, innovations, gain, consistency."""
+"""Sections of a report on one run over time: estimates, measurements, innovations, gain, consistency."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from tuning.reporting.subject import Subject
 from tuning.reporting.time_figures import draw_estimates
 
 AXES = (
-    "Limits are those of the scored steps, the same in a row unless its panels say that their axes differ; RMSE "
-    "and RMS are over these steps."
+    "Limits are those of the scored steps, the same in a row unless its panels say otherwise; RMSE and RMS "
+    "are over these steps."
 )
-READ = "Values are read off under the pointer; drag sideways to enlarge a stretch, double-click for all of it."
+READ = "Point at a figure to read values; drag sideways to zoom in, double-click to zoom out."
 
 
 def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[Section]:
@@ -30,7 +30,7 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
     choice, scenario = subject.choice, subject.plan.scenarios[0]
     data, tuned = scenario.data(proof.seeds), choice.filter(scenario)
     name, before = next(iter(baselines(choice.name, scenario, subject.plan.seed, proof.default).items()))
-    pair, dt = {proof.label(name): before.filter(scenario), TUNED: tuned}, scenario.dt
+    pair, dt = {name: before.filter(scenario), TUNED: tuned}, scenario.dt
     word = scenario.seed_word.removesuffix("s")
     where = f"{scenario.name}, held-out {word} {proof.seeds.start}"
     has_covariance, scored = filter_class(choice.name).has_covariance, proof.tuned.scored or None
@@ -42,10 +42,8 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
     sections = [Section("One run over time", [picture, *remark])]
     model = tuned.model
     named = [one.name for one in model.measurements], [one.unit for one in model.measurements]
-    alt = f"Measured: {of_series(named[0], data.measurements[0], named[1])}"
-    caption = (
-        f"What was measured on {where}, what the tuned filter expected of it before each update, and the inputs."
-    )
+    alt = f"Measured: {of_series(named[0], data.one(0).measurements[0], named[1])}"
+    caption = f"Measurements on {where}, their prediction by the tuned filter before each update, and the inputs."
     sections.append(Section("Measured signal", [book.picture(draw_signal(tuned, data, 0, dt), caption, alt)]))
     if not has_covariance:
         return sections
@@ -58,7 +56,7 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
         sections.append(Section("Innovations", [picture]))
     if not is_array(model.n, model.m):
         sections.append(_gain_section(book, pair, data, dt, scored, where))
-    report = check_consistency(tuned, data)
+    report = check_consistency(tuned, data, dt)
     said = sentences(report)
     runs = f"{report.runs} held-out {scenario.seed_word} of {scenario.name}"
     drawn = draw_consistency(report, f"{choice.name}, tuned, on {runs}", scored=scored, filter_name=choice.name)
@@ -71,10 +69,10 @@ def run_sections(book: Sketchbook, subject: Subject, proof: Comparison) -> list[
 
 
 NEES_NIS = (
-    "NEES, the normalised estimation error squared, holds the error against the filter's covariance: on average "
-    "it is the number of states where the covariance is right. NIS, the normalised innovation squared, does so "
-    "with the innovation: it is the number of channels. CRPS, the continuous ranked probability score, is the "
-    "error of a whole distribution, in the unit of the state."
+    "NEES, the normalised estimation error squared, relates the error to the filter's covariance: if the "
+    "covariance is right, its mean is the number of states. NIS, the normalised innovation squared, does the "
+    "same with the innovation: its mean is the number of channels. CRPS, the continuous ranked probability "
+    "score, is the error of a whole distribution, in the unit of the state."
 )
 
 
@@ -92,9 +90,9 @@ def _gain_section(book: Sketchbook, pair, data, dt, scored, where: str) -> Secti
             )
             told.append(f"{title}: {values} at the end")
     caption = (
-        f"Gain K on {where}: by how much an innovation of one unit moves each state, before and after tuning. It "
-        "is that of the covariance after the update, K = P H' inv(R), with H at the estimate. Each panel has an "
-        "axis of its own."
+        f"Gain K on {where}: the change of each state per unit of innovation, before and after tuning. It "
+        "is computed from the covariance after the update, K = P H' inv(R), with H at the estimate. Each "
+        "panel has its own axis."
     )
     picture = book.picture(draw_gains(pair, data, 0, dt, scored), caption, f"Gain over time. {'. '.join(told)}.")
     return Section("Gain over time", [picture])

@@ -1,4 +1,4 @@
-"""What a page does by itself: values read off its pictures, a part of the time drawn large, lines copied."""
+"""The script of a page: reading values from pictures, zooming in time, copying lines."""
 
 from __future__ import annotations
 
@@ -136,5 +136,6 @@ document.querySelectorAll('.code').forEach(block => {
     .then(() => { button.textContent = 'copied'; }));
   block.append(button);
 });
+addEventListener('beforeprint', () => document.querySelectorAll('details').forEach(one => one.open = true));
 })();
 """

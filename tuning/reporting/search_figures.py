@@ -1,4 +1,4 @@
-"""Pictures of what a study searched and found: importance, slices, Pareto front, ensemble sizes."""
+"""Pictures of a study's search: importance, slices, Pareto front, ensemble sizes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import optuna
 from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
 from optuna.trial import FrozenTrial, TrialState
 
+from numerics.characters import verbatim
 from numerics.plots import BLUE, GREY, RUST, grid_of, new_figure, panels, tidy
 from tuning.evaluation.sizes import SizeRow
 from tuning.reporting.figures import early_trials, limit_values
@@ -25,11 +26,11 @@ CROSS = {"color": GREY, "markersize": 4, "markeredgewidth": 0.8}
 
 
 def importances(study: optuna.Study) -> dict[str, float]:
-    """How much each parameter matters for a trial to be among the best tenth; empty where trials are too few.
+    """Importance of each parameter for a trial to be among the best tenth; empty if there are too few trials.
 
-    Where fewer than ten trials are complete, pruned ones count, too, at the mean of the seeds that they came to:
-    they are among the worse ones, whatever seeds were left. With two objectives the best are those nearest to the
-    Pareto front. In a study over several kinds of filters only parameters that all kinds have are told.
+    If fewer than ten trials are complete, pruned ones are included at the mean of the seeds that they reached:
+    they are among the worse ones on any other seeds, too. With two objectives the best are those nearest to the
+    Pareto front. A study over several filter types shows only parameters that all types have.
 
     Source: Watanabe et al. (2023), "PED-ANOVA: efficiently quantifying hyperparameter importance in arbitrary
     subspaces".
@@ -44,7 +45,7 @@ def importances(study: optuna.Study) -> dict[str, float]:
 
 
 def counted_trials(study: optuna.Study) -> tuple[int, int]:
-    """How many complete trials, and how many pruned ones, importances are made of."""
+    """The numbers of complete and of pruned trials behind importances."""
     trials = study.get_trials(deepcopy=False)
     complete = sum(trial.state == TrialState.COMPLETE for trial in trials)
     alone = complete >= FEWEST_TRIALS or len(study.directions) > 1
@@ -52,9 +53,12 @@ def counted_trials(study: optuna.Study) -> tuple[int, int]:
 
 
 def _with_pruned(study: optuna.Study) -> optuna.Study:
-    """A copy of a study in memory, whose pruned trials are complete at the mean of what they reported."""
+    """A copy of a study in memory, with pruned trials completed at the mean of their reports."""
     trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+    before = optuna.logging.get_verbosity()
+    optuna.logging.set_verbosity(optuna.logging.ERROR)  # it would tell of the copy
     copied = optuna.create_study(direction=study.direction)
+    optuna.logging.set_verbosity(before)
     copied.add_trials(trials)
     for trial, value in early_trials(study.get_trials(deepcopy=False)):
         made = optuna.trial.create_trial(params=trial.params, distributions=trial.distributions, value=value)
@@ -78,7 +82,7 @@ def draw_importance(found: Mapping[str, float]) -> Figure:
 
 
 def draw_slices(trials: Sequence[FrozenTrial], label: str) -> Figure:
-    """First objective against each number, a panel a number; dashed is the best trial.
+    """First objective against each parameter, a panel per parameter; dashed is the best trial.
 
     Hollow circles have a mean NIS outside its band; crosses were pruned and stand at the mean of their seeds.
     """
@@ -94,18 +98,20 @@ def draw_slices(trials: Sequence[FrozenTrial], label: str) -> Figure:
         axis.plot([trial.params[name] for trial, _ in early], [value for _, value in early], "x", **CROSS)
         axis.axvline(best.params[name], color=RUST, linestyle="--", linewidth=1)
         if getattr(best.distributions[name], "log", False):
+            if len({*places, *(trial.params[name] for trial, _ in early)}) == 1:
+                axis.set_xlim(places[0] / 2.0, places[0] * 2.0)  # the few trials of a short study may be alike
             axis.set_xscale("log")
         if name == "N" or name.endswith(" N"):
             _size_axis(axis, sorted(trial.params[name] for trial in trials if name in trial.params))
-        axis.set_xlabel(words(name))
+        axis.set_xlabel(verbatim(words(name)))
     limit_values(axes[0], values)
     for axis in axes[:: grid_of(len(names), COLUMNS)[1]]:
-        axis.set_ylabel(label, fontsize=9)
+        axis.set_ylabel(verbatim(label), fontsize=9)
     return figure
 
 
 def draw_front(trials: Sequence[FrozenTrial], front: Sequence[FrozenTrial], labels: Sequence[str]) -> Figure:
-    """Trials by their two objectives, and those that no other beats in both."""
+    """Trials by their two objectives, and the Pareto front."""
     figure = new_figure((6.4, 4.4))
     axis = figure.subplots()
     tidy([axis])
@@ -120,8 +126,8 @@ def draw_front(trials: Sequence[FrozenTrial], front: Sequence[FrozenTrial], labe
         shown = done[done[:, column] <= high + room, column]
         pad = 0.08 * (shown.max() - low) or room
         getattr(axis, f"set_{axis_name}lim")(low - pad, shown.max() + pad)
-    axis.set_xlabel(labels[0])
-    axis.set_ylabel(labels[1])
+    axis.set_xlabel(verbatim(labels[0]))
+    axis.set_ylabel(verbatim(labels[1]))
     axis.legend(frameon=False)
     return figure
 
@@ -148,7 +154,7 @@ def draw_sizes(sizes: Sequence[SizeRow], kept: int) -> Figure:
 
 
 def words(name: str) -> str:
-    """A trial parameter as it is said in a picture."""
+    """The label of a trial parameter in a picture."""
     return name.replace("_", " ")
 
 

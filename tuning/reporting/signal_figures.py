@@ -1,4 +1,4 @@
-"""What a filter was given in one run, its innovations, and its gain, over time."""
+"""The inputs and measurements of one run, innovations, and gain, over time."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ import numpy as np
 
 from filters.filter import Filter
 from filters.looks import MEASURED, colour_of
+from numerics.angles import wrapped, wrapped_where
+from numerics.characters import TITLE, verbatim
 from numerics.plots import GREY, new_figure, thinned, tidy
 from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.reporting.panels import axis_label, shown_states
-from tuning.reporting.time_figures import TWO_SIDED, WIDTH, draw_in_band, limit_innovations, one_run
+from tuning.reporting.time_figures import TWO_SIDED, WIDTH, draw_in_band, limit_innovations, line_of, one_run
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,7 +27,7 @@ STEP = 1e-6  # of a central difference, in standard deviations
 
 
 def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Figure:
-    """Every measured channel of a run with what the filter expected of it, and the inputs below.
+    """Every measured channel of a run with the filter's prediction, and the inputs below.
 
     Args:
         filter_: what predicts.
@@ -33,18 +35,23 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
         index: which of its runs.
         dt: sample time [s]; None for an axis of steps.
     """
-    found, model = one_run(filter_, data, index, dt), filter_.model
+    found, model, one = one_run(filter_, data, index, dt), filter_.model, data.one(index)
     seen, left_out = shown_states(model.measurements)
     given, _ = shown_states(model.input_quantities)
     figure, axes = _rows(len(seen) + len(given), 2 * WIDTH, dt)
-    measured, colour = data.measurements[index], colour_of(filter_.name)
+    measured = wrapped_where(one.measurements[0], model.shape.measurement_angles)
+    colour = colour_of(filter_.name)
     for axis, j in zip(axes, seen, strict=False):
-        axis.plot(*thinned(found.time, measured[:, j]), label="measured", **(MEASURED | {"linewidth": 2.0}))
+        angle = model.measurements[j].angle
+        line = line_of(angle, found.time, measured[:, j])
+        axis.plot(*line, label="measured", **(MEASURED | {"linewidth": 2.0}))
         expected = measured[:, j] - found.innovations[:, j]
-        axis.plot(*thinned(found.time, expected), color=colour, linewidth=0.8, label="expected before the update")
+        expected = wrapped(expected) if angle else expected
+        line = line_of(angle, found.time, expected)
+        axis.plot(*line, color=colour, linewidth=0.8, label="predicted before the update")
         axis.set_ylabel(axis_label(model.measurements[j]))
     for axis, i in zip(axes[len(seen) :], given, strict=True):
-        time, values = thinned(found.time[:-1], data.inputs[index][:, i])
+        time, values = thinned(found.time[:-1], one.inputs[0][:, i])
         axis.plot(time, values, color=GREY, drawstyle="steps-post", linewidth=1.2, label="input")
         axis.set_ylabel(axis_label(model.input_quantities[i]))
     _legend(figure, axes, left_out.replace("states", "channels"))
@@ -52,7 +59,7 @@ def draw_signal(filter_: Filter, data: Data, index: int, dt: float | None) -> Fi
 
 
 def draw_innovations(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None) -> Figure:
-    """Innovations of every channel in the band that each filter expects; one column a filter."""
+    """Innovations of every channel in the band that each filter expects; one column per filter."""
     channels = next(iter(filters.values())).model.measurements
     seen, left_out = shown_states(channels)
     figure = new_figure((WIDTH * len(filters), HEIGHT * 1.2 * len(seen) + 0.8))
@@ -63,11 +70,11 @@ def draw_innovations(filters: Mapping[str, Filter], data: Data, index: int, dt: 
         for axis, j in zip(column, seen, strict=True):
             band = TWO_SIDED * np.sqrt(found.estimates.innovation_covs[0, :, j, j])
             draw_in_band(axis, found.time, found.innovations[:, j], band, "innovation", colour_of(filter_.name))
-        column[0].set_title(title, fontsize=11)
+        column[0].set_title(verbatim(title, most=TITLE), fontsize=11)
         column[-1].set_xlabel(_time(dt))
     for line, j in zip(axes, seen, strict=True):
         line[0].set_ylabel(axis_label(channels[j]))
-        limit_innovations(line, runs, data.scored.start, j)
+        limit_innovations(line, runs, data.first_scored, j)
     _legend(figure, axes[:, 0], left_out.replace("states", "channels"))
     return figure
 
@@ -85,12 +92,12 @@ def gains(filter_: Filter, data: Data, index: int) -> np.ndarray:
     slopes = np.stack([_slopes(model, mean) for mean in means])  # (K + 1, m, n)
     products = slopes @ covs.transpose(0, 2, 1)  # H P', (K + 1, m, n)
     found_gains = np.linalg.solve(model.measurement_noise_cov, products).transpose(0, 2, 1)
-    found_gains[np.isnan(data.measurements[index]).all(axis=1)] = np.nan
+    found_gains[np.isnan(data.one(index).measurements[0]).all(axis=1)] = np.nan
     return found_gains
 
 
 def draw_gains(filters: Mapping[str, Filter], data: Data, index: int, dt: float | None, scored=None) -> Figure:
-    """The gain on every state, a line a channel and a column a filter, each panel with an axis of its own."""
+    """The gain on every state, a line per channel and a column per filter, each panel with its own axis."""
     model = next(iter(filters.values())).model
     places, left_out = shown_states(model.states, scored)
     channels, _ = shown_states(model.measurements)
@@ -104,7 +111,7 @@ def draw_gains(filters: Mapping[str, Filter], data: Data, index: int, dt: float 
             for row, j in enumerate(channels):
                 look = {"color": colour_of(filter_.name), "linestyle": DASHES[row % len(DASHES)], "linewidth": 1.0}
                 axis.plot(*thinned(time, found[:, i, j]), label=f"by {model.measurements[j].text_symbol}", **look)
-        column[0].set_title(title, fontsize=11)
+        column[0].set_title(verbatim(title, most=TITLE), fontsize=11)
         column[-1].set_xlabel(_time(dt))
     for axis, i in zip(axes[:, 0], places, strict=True):
         units = {_over(model.states[i], model.measurements[j]) for j in channels}

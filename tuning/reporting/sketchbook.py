@@ -1,4 +1,4 @@
-"""Pictures of a page, each with ids of its own."""
+"""Pictures of a page, each with its own ids."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Sketchbook:
-    """Numbers pictures: what is said of each is its caption, and for whoever cannot see it what it shows."""
+    """Numbers pictures, each with a caption and a text alternative."""
 
     def __init__(self, prefix: str = "p"):
         """Pictures are called by a prefix and a number."""

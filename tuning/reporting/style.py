@@ -1,9 +1,15 @@
-"""How a page looks: on white and on dark screens, on narrow ones, and on paper."""
+"""The style of a page: on white and on dark screens, on narrow ones, and on paper."""
 
 from __future__ import annotations
 
 DARK = """color-scheme: dark; --paper: #15191d; --ink: #e4e7ea; --soft: #aab3ba; --line: #3a424a; 
   --strong: #5a646e; --card: #1e2930; --mark: #5fb3dc; --link: #7cc4ea;"""
+# A shadow at each edge behind which there is more: two covers scroll with what they cover, the shadows stay.
+UNDER = "var(--under, var(--paper))"
+SHADOWS = f"""linear-gradient(to right, {UNDER} 40%, transparent) left / 3rem 100% no-repeat local,
+  linear-gradient(to left, {UNDER} 40%, transparent) right / 3rem 100% no-repeat local,
+  linear-gradient(to right, var(--strong), transparent) left / .8rem 100% no-repeat scroll,
+  linear-gradient(to left, var(--strong), transparent) right / .8rem 100% no-repeat scroll, {UNDER}"""
 STYLE = f"""
 :root {{ color-scheme: light; --paper: #fff; --ink: #222; --soft: #444; --line: #e0e0e0; --strong: #bbb;
   --card: #f1f6f9; --mark: #0b6fa4; --link: #0b5c88; }}
@@ -11,7 +17,7 @@ STYLE = f"""
 @media screen {{ :root.dark {{ {DARK} }} }}
 * {{ box-sizing: border-box; }}
 html {{ scroll-behavior: smooth; }}
-body {{ margin: 0 auto; max-width: 62rem; padding: 1.5rem 1rem 4rem; background: var(--paper); color: var(--ink);
+body {{ margin: 0 auto; max-width: 68rem; padding: 1.5rem 1rem 4rem; background: var(--paper); color: var(--ink);
   font: 1rem/1.55 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; overflow-wrap: break-word; }}
 a {{ color: var(--link); }}
 h1 {{ font-size: 1.6rem; line-height: 1.25; margin: 0 0 1rem; }}
@@ -26,9 +32,10 @@ nav a {{ text-decoration: none; }}
 nav a:hover {{ text-decoration: underline; }}
 .scroll {{ overflow-x: auto; margin: 1rem 0; }}
 table {{ border-collapse: collapse; font-variant-numeric: tabular-nums; }}
+.scroll, .picture, .code pre {{ background: {SHADOWS}; }}
 .caption {{ font-weight: 600; margin: 1.25rem 0 0; }}
 .caption + .scroll {{ margin-top: .35rem; }}
-th, td {{ padding: .3rem 0 .3rem 1.1rem; text-align: right; vertical-align: top;
+th, td {{ padding: .3rem 0 .3rem .9rem; text-align: right; vertical-align: top;
   border-bottom: 1px solid var(--line); }}
 th:first-child {{ text-align: left; padding-left: 0; position: sticky; left: 0; background: var(--paper); }}
 td {{ white-space: nowrap; }}
@@ -44,7 +51,7 @@ figcaption {{ color: var(--soft); font-size: .92rem; max-width: 46rem; }}
   background: var(--paper); border: 1px solid var(--strong); border-radius: .25rem; font-size: .8rem;
   font-variant-numeric: tabular-nums; white-space: pre; line-height: 1.35; }}
 pre {{ background: var(--card); padding: .75rem 1rem; overflow-x: auto; font-size: .85rem; line-height: 1.45; }}
-.code {{ position: relative; }}
+.code {{ position: relative; --under: var(--card); }}
 .code button {{ position: absolute; top: .4rem; right: .4rem; font: inherit; font-size: .8rem; cursor: pointer;
   color: var(--ink); background: var(--paper); border: 1px solid var(--strong); border-radius: .25rem; }}
 details {{ margin: .5rem 0; }}
@@ -69,6 +76,7 @@ body.beside {{ max-width: 84rem; }}
   table.fold td small {{ flex-basis: 100%; }}
   table.fold td:empty {{ display: none; }}
   .wide svg {{ max-width: none; width: 38rem; }}
+  .wide figcaption::before {{ content: "Scroll the picture sideways. "; font-weight: 600; }}
 }}
 @media print {{
   @page {{ size: A4; margin: 14mm 12mm; }}
@@ -77,6 +85,10 @@ body.beside {{ max-width: 84rem; }}
   h2 {{ margin-top: 1.2rem; break-after: avoid; }}
   h3, .caption {{ break-after: avoid; }}
   .scroll, .picture, pre {{ overflow: visible; }}
+  .scroll, .picture {{ background: none; }}
+  .code pre {{ background: var(--card); }}
+  details > :not(summary) {{ display: block !important; }}
+  details::details-content {{ display: block !important; content-visibility: visible !important; }}
   table {{ font-size: 8pt; width: 100%; }}
   table.words {{ width: auto; }}
   table.many {{ font-size: 6.5pt; }}

@@ -1,4 +1,4 @@
-"""What a report is of: a tuned file with its study, or a study alone."""
+"""The subject of a report: a tuned file with its study, or a study alone."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ from tuning.problems.find import find_given
 from tuning.problems.problem import Problem
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
+from tuning.search.sizing import SIZES
 from tuning.search.space import Choice, choice_of
 from tuning.search.storage import open_storage
 from tuning.search.storage_url import shown_storage
-from tuning.search.study import SIZES
+from tuning.search.study import chosen_of
+from tuning.search.validation import choice_from
 
 
 class Subject(NamedTuple):
-    """A choice, and where it comes from."""
+    """A choice and its source."""
 
     name: str  # of the study
     plan: Plan
@@ -35,6 +37,7 @@ class Subject(NamedTuple):
     consistent: bool = False  # whether its mean NIS is in its band, where it has to be
     content: Mapping = {}  # of the tuned file
     sizes: object = None  # the table of ensemble sizes as it is kept
+    validation: Mapping | None = None  # how the best trials met the baselines: `validation.as_data`
     nis: tuple[float, ...] = ()  # mean NIS over the channels on each scenario's training seeds, where it is kept
 
 
@@ -70,15 +73,16 @@ def _of_file(path: str, storage: str, problems: Sequence[Problem]) -> Subject:
         first, beyond = content["held_out"][scenario.name]["seeds"]
         count = at_least("the number of held-out seeds", beyond - first, 2)
     except (KeyError, TypeError):
-        raise ValueError(f"a tuned file must tell its held-out seeds, but {path} does not") from None
+        raise ValueError(f"a tuned file must contain its held-out seeds, but {path} does not") from None
     consistent = plan.is_constrained and bool(content["study"].get("any_trial_consistent"))
     kept = content if content.get("digest") == plan.scenarios[0].digest else {}
     sizes, nis = content.get("ensemble_sizes"), _kept_nis(kept, plan)
-    return Subject(name, plan, choice, study, count, True, consistent, kept, sizes, nis)
+    met = content.get("choice")
+    return Subject(name, plan, choice, study, count, True, consistent, kept, sizes, met, nis)
 
 
 def _kept_nis(content: Mapping, plan: Plan) -> tuple[float, ...]:
-    """The mean NIS on the training seeds that a tuned file tells; nothing if other packages made it."""
+    """The mean NIS on the training seeds in a tuned file; nothing if it was made with other packages."""
     found = content.get("study", {}).get("mean_nis") if content.get("made_with") == versions() else None
     if not isinstance(found, list) or len(found) != len(plan.scenarios):
         return ()
@@ -95,14 +99,17 @@ def _of_study(name: str, storage: str, problems: Sequence[Problem]) -> Subject:
     best = best_trial(study.get_trials(deepcopy=False))
     if best is None:
         raise ValueError(f"a study must have a complete trial for a report, but {name!r} has none")
-    choice = choice_of(plan.filter, best.params, plan.scenarios[0])
+    choice, met = choice_of(plan.filter, best.params, plan.scenarios[0]), chosen_of(study)
+    if met is not None:
+        one = next(one for one in met["met"] if one["name"] == met["chosen"])
+        choice = choice_from(one["choice"])
     consistent = plan.is_constrained and is_consistent(best)
-    chosen, sizes = len(plan.objectives) > 1, study.user_attrs.get(SIZES)
-    return Subject(name, plan, choice, study, HELD_OUT_SEEDS, chosen, consistent, sizes=sizes)
+    chosen, sizes = len(plan.objectives) > 1 or met is not None, study.user_attrs.get(SIZES)
+    return Subject(name, plan, choice, study, HELD_OUT_SEEDS, chosen, consistent, sizes=sizes, validation=met)
 
 
 def _load(name: str, storage: str) -> optuna.Study | None:
-    """A study by name, None if it is not there; no storage is made."""
+    """A study by name, None if it does not exist; no storage is created."""
     if "://" not in storage and not Path(storage).is_file():
         return None
     try:
@@ -112,7 +119,7 @@ def _load(name: str, storage: str) -> optuna.Study | None:
 
 
 def _plan(identity, where: str | Path, find: Callable[[str], Problem]) -> Plan:
-    """The plan of which an identity tells, its scenarios found by name."""
+    """The plan of an identity, its scenarios found by name."""
     try:
         scenarios = tuple(find(name) for name in identity["scenarios"])
         objectives, seed = tuple(identity["objectives"]), at_least("seed", identity["seed"], 0)

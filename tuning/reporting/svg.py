@@ -1,4 +1,4 @@
-"""Figures as SVG within a page: text stays text, colours follow the page's, and a script can read off values."""
+"""Figures as SVG within a page: text stays text, colours follow the page's, and a script can read values."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ COLOUR = re.compile(r"#([0-9a-fA-F]{6})\b")
 
 
 def figure_svg(figure: Figure, name: str) -> tuple[str, str]:
-    """A figure as an SVG element without its size and its alternative text, and what may be read off it as JSON.
+    """A figure as an SVG element without its size and its alternative text, and its readable values as JSON.
 
     Args:
         figure: of matplotlib.
@@ -102,7 +102,7 @@ def plain(label: str) -> str:
 
 
 def _readings(figure: Figure, name: str) -> str:
-    """Where axes are, what they show, and which of their lines can be read off; empty if there is none."""
+    """Positions and contents of axes, and their readable lines; empty if there is none."""
     width, height = figure.get_size_inches() * 72.0
     found = [_axes(axis, place, name, width, height) for place, axis in enumerate(figure.axes)]
     found = [one for one in found if one["lines"]]

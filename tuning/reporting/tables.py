@@ -1,4 +1,4 @@
-"""Tables of a report: what filters achieve on held-out seeds, and their numbers."""
+"""Tables of a report: metrics of filters on held-out seeds, and their parameters."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from filters.consistency.intervals import Interval
 from filters.consistency.verdicts import rounded
-from tuning.evaluation.baselines import RULE, TUNED, Scaled, baselines, rule_label
+from tuning.evaluation.baselines import TUNED, Scaled, baselines
 from tuning.evaluation.evaluate import NOTHING
 from tuning.evaluation.held_out import Comparison
 from tuning.likelihood.identifiability import Identifiability
@@ -38,7 +38,7 @@ def errors_table(scenario: Problem, proof: Comparison) -> Table:
 def _errors_across(proof: Comparison, where: str) -> Table:
     ratios, tuned, errors = proof.ratios, proof.tuned, _errors(proof)
     rows = [
-        [proof.label(name), _span(ratios.get(name, NOTHING)), _span(found.score)]
+        [name, _span(ratios.get(name, NOTHING)), _span(found.score)]
         + [*(cells[place] for _, cells, _ in errors), *map(_span, (found.nees, found.nis))]
         for place, (name, found) in enumerate(proof.evaluations.items())
     ]
@@ -58,11 +58,11 @@ def _errors_below(proof: Comparison, where: str) -> Table:
         ["mean NEES", *(_span(e.nees) for e in found.values()), right[0]],
         ["mean NIS", *(_span(e.nis) for e in found.values()), right[1]],
     ]
-    return Table(where, ["", *map(proof.label, found), _expected(proof)], rows)
+    return Table(where, ["", *found, _expected(proof)], rows)
 
 
 def _errors(proof: Comparison) -> list[tuple[str, list[str], str]]:
-    """RMSE of each state and output: label, a cell a filter, and the bound, all with one power of ten."""
+    """RMSE of each state and output: label, a cell per filter, and the bound, all with one power of ten."""
     found, told = proof.evaluations.values(), []
     parts = [
         (state.text_symbol, state.unit, [e.rmse[i] for e in found], float(proof.bound[i]))
@@ -82,50 +82,52 @@ def _errors(proof: Comparison) -> list[tuple[str, list[str], str]]:
 
 
 def _expected(proof: Comparison) -> str:
-    """What the row is called that stands beside the metrics."""
+    """The label of the row beside the metrics."""
     return "expected" if np.isnan(proof.bound).all() else "bound; expected"
 
 
 def _innovations_table(proof: Comparison, where: str) -> Table:
     gains = proof.likelihood_gains
     rows = [
-        [proof.label(name), "" if isnan(e.log_likelihood) else f"{e.log_likelihood:.2f}", _span(e.nis)]
+        [name, "" if isnan(e.log_likelihood) else f"{e.log_likelihood:.2f}", _span(e.nis)]
         + [_span(gains.get(name, NOTHING)), str(e.divergences)]
         for name, e in proof.evaluations.items()
     ]
     right = "" if isnan(proof.tuned.nis.value) else f"{proof.tuned.expected_nis:.3g}"
     rows.append(["expected", "", right, "", ""])
-    columns = ["filter", "log-likelihood of a run", "mean NIS", "that of tuned less this", "restarts"]
+    columns = ["filter", "log-likelihood of a run", "mean NIS", "tuned less this", "restarts"]
     return Table(where, columns, rows)
 
 
 def numbers_table(choice: Choice, scenario: Problem, seed: int, default: Scaled | None = None) -> Table:
-    """The numbers of a tuned filter and of its baselines; the scaled default is found unless it is given."""
+    """The parameters of a tuned filter and of its baselines; the scaled default is computed unless given."""
     found = baselines(choice.name, scenario, seed, default)
-    choices, usual = {TUNED: choice, **found}, found[RULE].numbers
+    choices, usual = {TUNED: choice, **found}, next(iter(found.values())).numbers
     whole = [one._replace(numbers={**usual, **one.numbers}) for one in choices.values()]
     rows = number_rows(whole, choice.name, scenario, _number, "²")
     return Table(
         f"Parameters of the {choice.name} filter",
-        ["", *(rule_label(scenario) if name == RULE else name for name in choices)],
+        ["", *choices],
         rows,
     )
 
 
 def _number(value: float | None) -> str:
-    """A number of a filter; empty where a choice lacks it."""
+    """A parameter of a filter; empty if a choice lacks it."""
     return "" if value is None else f"{value:.4g}"
 
 
 def known_table(found: Identifiability) -> Table:
-    """What the innovations alone say of the numbers, and whether they determine them."""
+    """The parameters as the innovations determine them."""
     columns = found.names, found.tuned, found.most_likely, found.factors, found.identified
     rows = [
         [name, f"{tuned:.4g}", f"{best:.4g}", f"{factor:.3g}" if known else "", "yes" if known else "no"]
         for name, tuned, best, factor, known in zip(*columns, strict=True)
     ]
     header = ["", "tuned", "most likely", "known within a factor of", "determined"]
-    return Table("What the innovations of the training runs say, with 95 % probability", header, rows)
+    return Table(
+        "Parameters determined by the innovations of the training runs, with 95 % probability", header, rows
+    )
 
 
 def _span(value: Interval) -> str:

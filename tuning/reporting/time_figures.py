@@ -12,6 +12,8 @@ import numpy as np
 from filters.engine.batch import Estimates, run
 from filters.filter import Filter
 from filters.looks import TRUTH, colour_of
+from numerics.angles import with_breaks, wrapped_where
+from numerics.characters import TITLE, verbatim
 from numerics.plots import BLUE, RUST, new_figure, save_figure, thinned, tidy
 from plants.quantities import Quantity
 from tuning.evaluation.runs import state_errors
@@ -60,7 +62,7 @@ def draw_estimates(
     scored: Collection[int] | None = None,
     **options,
 ) -> Figure:
-    """Truth and estimate of every state over time, and the error in its 95 % band; one column a filter.
+    """Truth and estimate of every state over time, and the error in its 95 % band; one column per filter.
 
     The panels of a row have the same limits, those of the scored steps, unless one error is far larger.
 
@@ -89,11 +91,11 @@ def draw_estimates(
     for column, found, (title, filter_) in zip(axes.T, runs, filters.items(), strict=True):
         for axis, row in zip(column, rows, strict=True):
             row.draw(axis, found, colour=colour_of(filter_.name))
-        column[0].set_title(title, fontsize=11)
+        column[0].set_title(verbatim(title, most=TITLE), fontsize=11)
         column[-1].set_xlabel("step" if dt is None else "time [s]")
     for line, row in zip(axes, rows, strict=True):
         line[0].set_ylabel(row.label)
-        row.limit(line, runs, data.scored.start)
+        row.limit(line, runs, data.first_scored)
     figure.align_ylabels(axes[:, 0])
     named: dict[str, Any] = {}
     for axis in axes[:, 0]:
@@ -110,7 +112,14 @@ def _rows(
     """Each state above its error; without truth all states, then the innovations of the channels."""
     rows = []
     for i in places:
-        rows.append(Row(TALL, axis_label(states[i]), partial(_values, i=i), partial(_limit_values, i=i)))
+        rows.append(
+            Row(
+                TALL,
+                axis_label(states[i]),
+                partial(_values, i=i, angle=states[i].angle),
+                partial(_limit_values, i=i),
+            )
+        )
         if has_truth:
             label = axis_label(Quantity("error", "error", states[i].unit))
             rows.append(Row(LOW, label, partial(_error, i=i), partial(_limit_errors, i=i)))
@@ -125,22 +134,32 @@ def _rows(
 
 def one_run(filter_: Filter, data: Data, index: int, dt: float | None) -> Run:
     """One run of a filter on some data, with errors where there is a truth; `dt` as in `draw_estimates`."""
-    one = slice(index, index + 1)
-    estimates = run(filter_, data.filter_keys[one], data.inputs[one], data.measurements[one])
-    time = (1.0 if dt is None else dt) * np.arange(data.measurements.shape[1])
-    innovations = np.where(np.isnan(data.measurements[index]), np.nan, estimates.innovations[0])
-    if data.states is None:
+    one = data.one(index)
+    estimates = run(filter_, one.filter_keys, one.inputs, one.measurements)
+    time = (1.0 if dt is None else dt) * np.arange(one.steps + 1)
+    innovations = np.where(np.isnan(one.measurements[0]), np.nan, estimates.innovations[0])
+    if one.states is None:
         return Run(time, None, None, estimates, innovations)
-    errors = state_errors(filter_, estimates, data._replace(states=data.states[one]))[0]
-    return Run(time, data.states[index], errors, estimates, innovations)
+    errors = state_errors(filter_, estimates, one)[0]
+    truth = wrapped_where(one.known_states[0], filter_.model.shape.state_angles[: one.known_states.shape[-1]])
+    return Run(time, truth, errors, estimates, innovations)
 
 
-def _values(axis, found: Run, i: int, colour: str) -> None:
+def _values(axis, found: Run, i: int, angle: bool, colour: str) -> None:
     mean, band = found.estimates.means[0, :, i], TWO_SIDED * np.sqrt(found.estimates.covs[0, :, i, i])
-    draw_band(axis, found.time, mean - band, mean + band, colour)
+    lines = found.time, mean, mean - band, mean + band
+    time, _, low, high = with_breaks(*lines) if angle else lines
+    draw_band(axis, time, low, high, colour)
     if found.truth is not None:
-        axis.plot(*thinned(found.time, found.truth[:, i]), label="truth", **TRUTH)
-    axis.plot(*thinned(found.time, mean), color=colour, linewidth=1.0, label="estimate")
+        axis.plot(*line_of(angle, found.time, found.truth[:, i]), label="truth", **TRUTH)
+    axis.plot(*line_of(angle, found.time, mean), color=colour, linewidth=1.0, label="estimate")
+
+
+def line_of(angle: bool, time: np.ndarray, line: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A line over time for a figure: that of an angle breaks where it jumps from one end to the other."""
+    if angle:
+        time, line = with_breaks(time, line)
+    return thinned(time, line)
 
 
 def _error(axis, found: Run, i: int, colour: str) -> None:
@@ -174,7 +193,7 @@ def limit_innovations(axes, runs: Sequence[Run], start: int, j: int) -> None:
 
 
 def draw_in_band(axis, time: np.ndarray, values: np.ndarray, band: np.ndarray, label: str, colour: str) -> None:
-    """An error over time in the band that a filter believes in."""
+    """An error over time in the filter's band."""
     draw_band(axis, time, -band, band, colour)
     own = BLUE if colour == RUST else RUST  # an error never looks like the estimate
     axis.plot(*thinned(time, values), color=own, linewidth=0.9, label=label)

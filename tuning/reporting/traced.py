@@ -1,119 +1,91 @@
-"""A function of a model as lines of another language, found by running it on symbols instead of numbers.
+"""A function of a model as lines of another language, obtained by running it on symbols.
 
-It takes functions made of + - * / % abs ** and numpy's elementary functions, as those of the thruster and of the
-vehicle are; one that branches, or calls `math`, cannot be traced.
+It accepts functions made of + - * / // % abs ** min max and the elementary functions of `math` and numpy, and
+their callees. A function that branches on a value cannot be traced.
 """
 
 from __future__ import annotations
 
+import builtins
+import linecache
+import types
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
-FUNCTIONS = {  # numpy's names: those of MATLAB and of Python's math
-    "sin": "sin",
-    "cos": "cos",
-    "tan": "tan",
-    "arctan": "atan",
-    "sinh": "sinh",
-    "cosh": "cosh",
-    "tanh": "tanh",
-    "exp": "exp",
-    "log": "log",
-    "sqrt": "sqrt",
-}
+from tuning.reporting import symbols
+from tuning.reporting.symbols import Branch, Symbol, Tape, on_symbols, text
+
+OWN = (__file__, symbols.__file__)
 
 
-class Tape:
-    """Operations in their order, none of them twice."""
-
-    def __init__(self):
-        """Nothing is on it yet."""
-        self._places: dict[str, str] = {}
-        self._used: dict[str, tuple[str, ...]] = {}
-
-    def note(self, expression: str, *parts: str) -> Symbol:
-        """The symbol of an operation on some parts."""
-        name = self._places.setdefault(expression, f"t{len(self._places) + 1}")
-        self._used[name] = parts
-        return Symbol(self, name)
-
-    def lines(self, results: Sequence[str]) -> list[tuple[str, str]]:
-        """Names and expressions of what some results need, in the order of computing."""
-        needed, rest = set(), list(results)
-        while rest:
-            name = rest.pop()
-            if name in self._used and name not in needed:
-                needed.add(name)
-                rest += self._used[name]
-        return [(name, expression) for expression, name in self._places.items() if name in needed]
-
-
-def _both(sign: str) -> tuple[Callable, Callable]:
-    """An operator with a symbol on its left, and with one on its right."""
-
-    def note(tape: Tape, first: Any, second: Any) -> Symbol:
-        a, b = _text(first), _text(second)
-        return tape.note(f"{a} {sign} {b}", a, b)
-
-    return lambda self, other: note(self.tape, self, other), lambda self, other: note(self.tape, other, self)
-
-
-class Symbol:
-    """What stands for a number."""
-
-    def __init__(self, tape: Tape, name: str):
-        """A symbol of a name on a tape."""
-        self.tape, self.name = tape, name
-
-    __add__, __radd__ = _both("+")
-    __sub__, __rsub__ = _both("-")
-    __mul__, __rmul__ = _both("*")
-    __truediv__, __rtruediv__ = _both("/")
-    __pow__, __rpow__ = _both("^")
-
-    def __mod__(self, other: Any) -> Symbol:
-        """Remainder, of the sign of the divisor."""
-        return self.tape.note(f"mod({self.name}, {_text(other)})", self.name, _text(other))
-
-    def __neg__(self) -> Symbol:
-        """Minus a symbol."""
-        return self.tape.note(f"-{self.name}", self.name)
-
-    def __abs__(self) -> Symbol:
-        """Absolute value of a symbol."""
-        return self.tape.note(f"abs({self.name})", self.name)
-
-    def __bool__(self) -> bool:
-        """Nobody knows."""
-        raise TypeError("a symbol is neither true nor false")
-
-    def __getattr__(self, name: str) -> Callable[[], Symbol]:
-        """What numpy's functions call on objects."""
-        if name not in FUNCTIONS:
-            raise AttributeError(name)
-        return lambda: self.tape.note(f"{FUNCTIONS[name]}({self.name})", self.name)
-
-
-def traced(function: Callable, arguments: Sequence[Sequence[str]], constants: Any) -> list[str] | None:
-    """Lines "t1 = a + b;" of a function and, last, "[t7; t9]", its results; None if it cannot be traced.
+def traced(function: Callable, arguments: Sequence[Sequence[str]], constants: Any) -> list[str]:
+    """Lines "t1 = a + b;" of a function and, last, "[t7; t9]", its results.
 
     Args:
         function: of a model, which takes tuples of components and the constants last.
         arguments: names of the components of each tuple.
         constants: of the model.
+
+    Raises:
+        ValueError: in one line, with that of the function, where it cannot be traced.
     """
     tape = Tape()
     try:
-        found = function(*(tuple(Symbol(tape, name) for name in names) for names in arguments), constants)
-        results = [_text(one) for one in found]
-    except (TypeError, AttributeError, ValueError):
-        return None
+        run = _rebound(function, {})
+        found = run(*(tuple(Symbol(tape, name) for name in names) for names in arguments), constants)
+        results = [text(one) for one in found]
+    except (TypeError, AttributeError, ValueError, ArithmeticError, LookupError) as error:
+        what = str(error) if isinstance(error, Branch) else f"cannot be run on symbols ({_first_line(error)})"
+        raise ValueError(
+            "a function to be written out must be made of operators and elementary functions, but "
+            f"{_place(error, function)} {what}"
+        ) from None
     return [*(f"{name} = {told};" for name, told in tape.lines(results)), f"[{'; '.join(results)}]"]
 
 
-def _text(value: Any) -> str:
-    """A symbol's name, or a number as it is written in a product."""
-    if isinstance(value, Symbol):
-        return value.name
-    number = float(value)
-    return f"{number:.17g}" if number >= 0 else f"({number:.17g})"
+def _rebound(value: Any, seen: dict[int, Any]) -> Any:
+    """A function with what it calls by name, and the functions in its closure, put on symbols; else the value."""
+    if not isinstance(value, types.FunctionType):
+        return on_symbols(value)
+    if id(value) in seen:
+        return seen[id(value)]
+    code, names = value.__code__, dict(value.__globals__)
+    cells = None if value.__closure__ is None else tuple(types.CellType() for _ in value.__closure__)
+    other = types.FunctionType(code, names, value.__name__, value.__defaults__, cells)
+    other.__kwdefaults__ = value.__kwdefaults__
+    seen[id(value)] = other
+    for name in _names(code):
+        if name in names:
+            names[name] = _rebound(names[name], seen)
+        elif hasattr(builtins, name):
+            names[name] = on_symbols(getattr(builtins, name))
+    for cell, before in zip(cells or (), value.__closure__ or (), strict=True):
+        try:
+            cell.cell_contents = _rebound(before.cell_contents, seen)
+        except ValueError:  # an empty one
+            continue
+    return other
+
+
+def _names(code: types.CodeType) -> set[str]:
+    inner = [_names(one) for one in code.co_consts if isinstance(one, types.CodeType)]
+    return set(code.co_names).union(*inner)
+
+
+def _place(error: BaseException, function: Callable) -> str:
+    """The last line of the user's that an error came through."""
+    found, at = None, error.__traceback__
+    while at is not None:
+        if at.tb_frame.f_code.co_filename not in OWN:
+            found = at
+        at = at.tb_next
+    if found is None:
+        return getattr(function, "__name__", "a function")
+    file = found.tb_frame.f_code.co_filename
+    line = linecache.getline(file, found.tb_lineno).strip()
+    return f"{Path(file).name}, line {found.tb_lineno},{f' {line!r},' if line else ''}"
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -1,4 +1,4 @@
-"""Numbers of a filter in words, each with its unit."""
+"""Parameters of a filter in words, each with its unit."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def scaled_unit(unit: str, power: int) -> str:
 
 
 def labels(names: Iterable[str], kind: str, problem: Problem, square: str = "^2") -> dict[str, str]:
-    """What tables call the numbers of a filter: Q11 of the thruster is "Q11 [(rad/s)^2]".
+    """The labels of a filter's parameters in tables: Q11 of the thruster is "Q11 [(rad/s)^2]".
 
     Args:
         names: of trial parameters.
@@ -87,3 +87,12 @@ def _shared(group: Sequence[Sequence[str]]) -> list[str]:
     """One row for several: "Q11 to Q44 [m^2]"."""
     (first, *cells), last = group[0], group[-1][0]
     return [f"{first.partition(' [')[0]} to {last}", *cells]
+
+
+def apart(*values: float) -> list[str]:
+    """Numbers with four significant digits, or enough to distinguish those that differ by more than rounding."""
+    for digits in range(4, 9):
+        texts = [f"{value:.{digits}g}" for value in values]
+        if len(set(texts)) == len({float(f"{value:.8g}") for value in values}):
+            break
+    return texts

@@ -1,1 +1,1 @@
-"""Optuna studies: what is searched, how trials are scored, and where a study is kept."""
+"""Optuna studies: the search space, the scores of trials, and the storage."""

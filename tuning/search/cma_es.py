@@ -18,9 +18,9 @@ _ARRAYS = {("numpy", "ndarray"), ("numpy", "dtype")} | {
 
 
 class CmaEsSampler(optuna.samplers.CmaEsSampler):
-    """`optuna.samplers.CmaEsSampler` that reads from a journal or database its own state and nothing else.
+    """`optuna.samplers.CmaEsSampler` that reads only its own state from a journal or database.
 
-    Optuna unpickles the state that it finds in a study's trials, so a study by somebody else could run code.
+    Optuna unpickles the state that it finds in a study's trials, so a study from another person could run code.
     """
 
     def _restore_optimizer(self, completed_trials: list[FrozenTrial]):

@@ -35,6 +35,7 @@ def microseconds_a_step(filter_: Filter, data: Data) -> float:
 
 
 def _part(data: Data, runs: int, steps: int) -> tuple[np.ndarray, ...]:
+    data = data.slice(0, runs).seen
     return data.filter_keys[:runs], data.inputs[:runs, :steps], data.measurements[:runs, : steps + 1]
 
 

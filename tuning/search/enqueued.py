@@ -6,14 +6,20 @@ NIS is the normalised innovation squared.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from numbers import Real
 
 import numpy as np
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from tuning.likelihood.gradient import is_large, optimum
+from filters.registry import filter_class
+from tuning.evaluation.baselines import GIVEN, ORACLE, RULE, baselines
+from tuning.likelihood.gradient import is_large, optimum, starts_of
+from tuning.problems.data import Data
+from tuning.problems.problem import Problem
 from tuning.search.cost import COST
+from tuning.search.local import is_local, near
 from tuning.search.outcome import best_trial, is_consistent, is_over_budget
 from tuning.search.parameters import model_parameters
 from tuning.search.plan import Plan
@@ -25,13 +31,16 @@ UNTUNED = "untuned"  # the filter whose parameters before any tuning these are
 RESCALED = "consistent twin"  # how often the trial's Q and R have been rescaled
 SMALLER = "smaller ensemble of"  # number of the trial that was over the budget
 TRANSFERRED = "noise of"  # number of the trial of another filter type that Q and R are from
-MAXIMUM_LIKELIHOOD = "likeliest noise"  # Q and R have maximum likelihood
+MAXIMUM_LIKELIHOOD = "likeliest noise"  # Q and R have maximum likelihood; of a study what they are
+NEAR_BEST = "near"  # number of the best trial, of which this one is a variation
+BASELINE = "baseline"  # the name of the baseline that the trial is
 NEAR = 2e-5  # relative difference of parameters, above which trials are certainly not equal
 MOST_RESCALINGS = 2  # nonlinear filters may need a second one
 FIRST_ROUND = 3  # trials for each filter type, after which the noise of the best trial is tried with all types
 ROOM = 0.9  # part of the budget that a smaller ensemble shall take
-MAXIMUM_LIKELIHOOD_AFTER = 20  # trials
-MAXIMUM_LIKELIHOOD_RUNS = 8  # of a model with many states: they determine Q and R well enough for a trial
+MAXIMUM_LIKELIHOOD_AFTER = 20  # trials, after which the likeliest noise is tried with all else of the best one
+MOST_FOR_STARTS = 8  # parameters, of which an ascent has more than one start
+MAXIMUM_LIKELIHOOD_RUNS = 8  # of a model with many states, and to compare starts: they tell Q and R well enough
 
 
 def enqueue_what_is_left(study: optuna.Study, plan: Plan) -> None:
@@ -45,19 +54,34 @@ def enqueue_what_is_left(study: optuna.Study, plan: Plan) -> None:
 def enqueue_after(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:
     """Enqueue the trials that the last one calls for.
 
-    These are the same trial with rescaled Q and R, a smaller ensemble, the Q and R of maximum likelihood, and its
-    Q and R for other filter types; and the next filter type when these are done.
+    After the first one these are the baselines and the maximum-likelihood trial, which is repeated later with the
+    other parameters of the best trial. Further the same trial with rescaled Q and R, a smaller ensemble, and its Q
+    and R for other filter types; and the next filter type when these are done.
     """
     if _rescales(plan):
         _enqueue_rescaled(study, plan, last)
     if plan.budget is not None and (last.number == 0 or UNTUNED in last.user_attrs):
         _enqueue_smaller_ensemble(study, plan, last, plan.budget)
-    if last.number == MAXIMUM_LIKELIHOOD_AFTER - 1 and not plan.hold_r and plan.tunes_noise:
-        _enqueue_maximum_likelihood(study, plan)
+    if last.number == 0 and UNTUNED in last.user_attrs and len(plan.filter_types) == 1:
+        _enqueue_baselines(study, plan)
+        _enqueue_maximum_likelihood(study, plan, last.params)
+    if last.number == MAXIMUM_LIKELIHOOD_AFTER - 1:
+        best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
+        if best is not None:
+            _enqueue_maximum_likelihood(study, plan, best.params)
     count = len(plan.filter_types)
     if count > 1 and _ends_a_round(last.number + 1, count):
         _enqueue_transferred_noise(study)
     _enqueue_untuned(study, plan)
+    if is_local(plan, last.number):
+        _enqueue_near(study, plan, last.number)
+
+
+def _enqueue_near(study: optuna.Study, plan: Plan, number: int) -> None:
+    """Enqueue a trial near the best one, once all other enqueued trials have been run."""
+    best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
+    if best is not None and not study.get_trials(deepcopy=False, states=(TrialState.WAITING,)):
+        enqueue_new(study, near(best.params, plan.space(), plan, number), {NEAR_BEST: best.number})
 
 
 def _rescales(plan: Plan) -> bool:
@@ -77,7 +101,8 @@ def _enqueue_untuned(study: optuna.Study, plan: Plan) -> None:
     name = next((name for name in plan.filter_types if name not in begun), None)
     if name is not None and not any(trial.state == TrialState.WAITING for trial in trials):
         choice = untuned_choice(name, plan.scenarios[0])
-        study.enqueue_trial(trial_parameters(choice, plan.space()), user_attrs={UNTUNED: name})
+        space = plan.space()
+        study.enqueue_trial(_within(trial_parameters(choice, space), space), user_attrs={UNTUNED: name})
 
 
 def _enqueue_rescaled(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:
@@ -142,31 +167,82 @@ def _enqueue_smaller_ensemble(study: optuna.Study, plan: Plan, last: FrozenTrial
         study.enqueue_trial({**last.params, names[0]: size}, user_attrs={SMALLER: last.number})
 
 
-def _enqueue_maximum_likelihood(study: optuna.Study, plan: Plan) -> None:
-    """Enqueue the best trial with the Q and R under which the innovations are most likely.
+def _enqueue_baselines(study: optuna.Study, plan: Plan) -> None:
+    """Enqueue the baselines of the first filter type as far as the space has them, without the oracle.
+
+    The scaled default and noise estimation of a problem with parameters of its own have a Q that no parameters
+    give: they meet the best trials at the end (`tuning.search.validation`), and are no trials.
+    """
+    problem, space = plan.scenarios[0], plan.space()
+    for name, choice in baselines(plan.filter_types[0], problem, plan.seed).items():
+        if name != ORACLE and (problem.parameters is None or name in (GIVEN, RULE)):
+            enqueue_new(study, _within(trial_parameters(choice, space), space), {BASELINE: name})
+
+
+def _enqueue_maximum_likelihood(study: optuna.Study, plan: Plan, start: dict) -> None:
+    """Enqueue a trial's parameters with the numbers of the model under which the innovations are most likely.
+
+    On recorded runs, whose likelihood is all there is, they are also tried with all else untuned.
+    """
+    noise = likeliest(study, plan)
+    if noise is None:
+        return
+    enqueue_new(study, {**start, **noise}, {MAXIMUM_LIKELIHOOD: True})
+    if any(problem.leads_in for problem in plan.scenarios):
+        space = plan.space()
+        filter_type = start.get(FILTER_TYPE, plan.filter)
+        plain = _within(trial_parameters(untuned_choice(filter_type, plan.scenarios[0]), space), space)
+        enqueue_new(study, {**plain, **noise}, {MAXIMUM_LIKELIHOOD: True})
+
+
+def likeliest(study: optuna.Study, plan: Plan) -> dict[str, float] | None:
+    """The Q and R, or own parameters, under which the innovations are most likely, kept with the study.
 
     They are those of the first scenario's model in an extended Kalman filter, or in the Kalman filter where that
-    is tuned. Near the best Q and R the score is so flat that a sampler finds the place late; where the model is
-    wrong the trial is one among many. On recorded runs they are also tried with all else untuned.
+    is tuned, by an ascent with gradients: of models of few states from three starts. Near the best Q and R the
+    score is so flat that a sampler finds the place late; where the model is wrong the trial is one among many.
+    None for parameters that change more of the model than Q and R, which have no such gradient.
     """
-    best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
-    if best is None:
-        return
+    if plan.hold_r or not all(filter_class(name).has_covariance for name in plan.filter_types):
+        return None
+    known = study.user_attrs.get(MAXIMUM_LIKELIHOOD)
+    if known is not None:
+        return known or None
+    problem, space = plan.scenarios[0], plan.space()
     name = "kf" if plan.filter_types == ("kf",) else "ekf"
-    data = plan.training_data()[0]
-    data = data.slice(0, MAXIMUM_LIKELIHOOD_RUNS) if is_large(plan.scenarios[0]) else data
-    found = optimum(name, plan.scenarios[0], data)
-    names = [one.name for one in model_parameters(plan.scenarios[0])]
-    space = plan.space()
-    noise = {
-        name: float(np.clip(value, *ends_of(space[name])))
-        for name, value in zip(names, found.variances, strict=True)
-    }
-    study.enqueue_trial({**best.params, **noise}, user_attrs={MAXIMUM_LIKELIHOOD: True})
-    if any(problem.leads_in for problem in plan.scenarios):  # recorded runs, whose likelihood is all there is
-        filter_type = best.params.get(FILTER_TYPE, plan.filter)
-        plain = trial_parameters(untuned_choice(filter_type, plan.scenarios[0]), space)
-        enqueue_new(study, {**plain, **noise}, {MAXIMUM_LIKELIHOOD: True})
+    data, own = plan.training_data()[0], model_parameters(problem)
+    large = is_large(problem)
+    data = data.slice(0, MAXIMUM_LIKELIHOOD_RUNS) if large else data
+    try:
+        start = 1.0 if large or len(own) > MOST_FOR_STARTS else _best_start(name, problem, data)
+        found = optimum(name, problem, data, start)
+    except ValueError:  # more than Q and R changes, or on another scale
+        study.set_user_attr(MAXIMUM_LIKELIHOOD, {})
+        return None
+    names = [one.name for one in own]
+    noise = _within(dict(zip(names, found.variances.tolist(), strict=True)), space)
+    study.set_user_attr(MAXIMUM_LIKELIHOOD, noise)
+    return noise
+
+
+def _best_start(name: str, problem: Problem, data: Data) -> list[float]:
+    """The start of an ascent, as factors: on a few runs three starts are tried, and this is the highest end."""
+    own, few = model_parameters(problem), data.slice(0, MAXIMUM_LIKELIHOOD_RUNS)
+    ends = [optimum(name, problem, few, start) for start in starts_of(own)]
+    best = max(ends, key=lambda one: one.log_likelihood)
+    before = untuned_choice(name, problem)
+    return [value / one.get(before) for value, one in zip(best.variances.tolist(), own, strict=True)]
+
+
+def _within(parameters: Mapping, space: Mapping) -> dict:
+    """The parameters, each moved into its range."""
+    found = {}
+    for name, value in parameters.items():
+        if isinstance(value, Real):
+            low, high = ends_of(space[name])
+            value = min(max(value, low), high)
+        found[name] = value
+    return found
 
 
 def _ends_a_round(trials: int, filter_types: int) -> bool:

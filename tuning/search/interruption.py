@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 from numerics.progress import tell
 
-STOPPING = "stopping after what runs now; Ctrl-C again stops at once"
+STOPPING = "stopping after the running task; Ctrl-C again stops at once"
 
 
 @contextmanager

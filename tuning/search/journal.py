@@ -15,6 +15,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
 
 INTERMEDIATE = "intermediate_value"  # key of an entry of Optuna's with the value of a seed
+BEGINNING = b'{"op_code":'  # of each entry of a journal
 
 
 class Journal(JournalStorage):
@@ -33,10 +34,10 @@ class Journal(JournalStorage):
 class JournalFile(JournalFileBackend):
     """Optuna's journal file, to which entries are added as a whole or not at all.
 
-    A disk takes a millisecond to keep what it was given for good, more than a trial of a cheap filter. So the file
-    is synchronised at what has to outlive the machine: a finished trial, with all before it, and what a study
-    knows. Of a running trial, which would be repeated anyway, nobody else needs the value of each seed at once:
-    these wait for the next entry of another kind, or the next reader in this process.
+    A disk takes a millisecond to store data permanently, more than a trial of a cheap filter. The file is
+    therefore synchronised only for what must survive a power cut: a finished trial, with everything before it, and
+    the attributes of a study. The values of single seeds of a running trial, which would be repeated anyway, are
+    not needed elsewhere at once: they wait for the next entry of another kind, or the next reader in this process.
     """
 
     def __init__(self, path: Path, lock: JournalFileOpenLock):
@@ -54,7 +55,7 @@ class JournalFile(JournalFileBackend):
         """Add a line for each entry.
 
         Raises:
-            OSError: if there is no room; the file is then as it was, and others can go on with it.
+            OSError: if the disk is full; the file is then unchanged, and others can still use it.
         """
         self._was_put_off = all(INTERMEDIATE in log for log in logs)
         if self._was_put_off:
@@ -115,7 +116,7 @@ def cut_unfinished_line(path: Path) -> None:
             continue
         if number < len(lines):
             raise ValueError(f"line {number} is no journal entry")
-        if number == 1:
+        if number == 1 and (line.endswith(b"\n") or line[: len(BEGINNING)] != BEGINNING[: len(line)]):
             raise ValueError("it is no journal")
         warnings.warn(f"{path}: cut off its last line, which a process left unfinished", stacklevel=4)
         with path.open("r+b") as stream:

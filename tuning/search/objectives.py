@@ -1,6 +1,9 @@
 """Objectives that a study minimises, and the constraint on the mean NIS.
 
-NEES is the normalised estimation error squared, NIS the normalised innovation squared.
+NEES is the normalised estimation error squared, NIS the normalised innovation squared. Sources: Chen, Heckman,
+Julier, Ahmed (2018), arXiv 1807.08855 (`nees`, `nis`); Chen, Biggie, Ahmed, Julier, Heckman, arXiv 2306.07225
+(`c-nees`, `c-nis`); Abbeel, Coates, Montemerlo, Ng, Thrun (2005), "Discriminative training of Kalman filters",
+Robotics: Science and Systems (`mse`, `log-score`).
 """
 
 from __future__ import annotations
@@ -10,13 +13,20 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from numerics.checks import one_of, shown
-from tuning.evaluation.evaluate import Evaluation
+from tuning.evaluation.evaluate import Evaluation, mse
 from tuning.problems.problem import Problem
 
 NIS_BAND = (0.8, 1.25)  # of the mean NIS over its expected value: a constrained study calls this consistent
+MOST_PRICE = 0.05  # of the score, that a mean NIS within its band may cost
 DIVERGENCE_PENALTY = 10.0  # added for each filter reset
 LARGEST = 1e6  # larger errors are clipped to this: studies need finite numbers
 OUTPUT = "output:"  # prefix of objectives on derived outputs
+MSE, LOG_SCORE, LIKELIHOOD = "mse", "log-score", "likelihood"
+PROPER = (
+    LOG_SCORE,
+    LIKELIHOOD,
+)  # sums of logarithms, of which differences count: proper scores of mean and covariance
+TRUTH, COVARIANCE, NEES, LOG_SCORES, VARIANCES = "truth", "covariance", "nees", "log scores", "variances"
 
 
 class Objective(NamedTuple):
@@ -24,10 +34,8 @@ class Objective(NamedTuple):
 
     about: str
     value: Callable[[Evaluation, float], float]  # of an evaluation and its us/step
-    needs_covariance: bool = False
-    needs_truth: bool = False
+    needs: tuple[str, ...] = ()  # of TRUTH, COVARIANCE, NEES, LOG_SCORES, VARIANCES
     output: str = ""  # symbol of the derived output that it needs
-    needs_nees: bool = False
 
 
 def nis_ratio(evaluation: Evaluation) -> float:
@@ -35,15 +43,19 @@ def nis_ratio(evaluation: Evaluation) -> float:
     return evaluation.nis.value / evaluation.expected_nis
 
 
-def _nis_inconsistency(evaluation: Evaluation, _: float) -> float:
-    """|log(NIS / m)| of the mean."""
-    return abs(math.log(nis_ratio(evaluation)))
+def nees_ratio(evaluation: Evaluation) -> float:
+    """The mean NEES over the number of states: expected value 1; NaN without truth or without a covariance."""
+    return evaluation.nees.value / len(evaluation.rmse)
 
 
-def _inconsistency(evaluation: Evaluation, _: float) -> float:
-    """|log(NEES / n)| + |log(NIS / m)| of the means: zero for a consistent filter."""
-    of_errors = abs(math.log(evaluation.nees.value / len(evaluation.rmse)))
-    return of_errors + _nis_inconsistency(evaluation, _)
+def _from_one(*ratios: Callable[[Evaluation], float]) -> Callable[[Evaluation, float], float]:
+    """The sum of |log| of ratios whose expected value is 1, as a function of an evaluation; infinite for none."""
+
+    def value(evaluation: Evaluation, _: float) -> float:
+        found = [ratio(evaluation) for ratio in ratios]
+        return sum(abs(math.log(one)) for one in found) if all(one > 0.0 for one in found) else math.inf
+
+    return value
 
 
 def output_objective(symbol: str, about: str = "") -> Objective:
@@ -51,28 +63,45 @@ def output_objective(symbol: str, about: str = "") -> Objective:
     return Objective(
         about or f"RMSE of the output {symbol}",
         lambda evaluation, _: evaluation.output_rmse[symbol].value,
-        needs_truth=True,
-        output=symbol,
+        (TRUTH,),
+        symbol,
     )
 
 
 OBJECTIVES = {
     "score": Objective(
-        "mean over states of RMSE over the scenario's scale [-]",
-        lambda evaluation, _: evaluation.score.value,
-        needs_truth=True,
+        "mean over states of RMSE over the scenario's scale [-]", lambda e, _: e.score.value, (TRUTH,)
+    ),
+    MSE: Objective(
+        "sum over states of mean square error over the scenario's scale squared [-]",
+        lambda e, _: mse(e.mean_squares, e.scale, e.weights),
+        (TRUTH,),
+    ),
+    LOG_SCORE: Objective(
+        "negative log score of the true state, -log N(x; x^, P), mean a step [nat]",
+        lambda e, _: -e.log_score.value,
+        (TRUTH, COVARIANCE, LOG_SCORES),
     ),
     "thrust": output_objective("T", "RMSE of thrust [N]"),
-    "likelihood": Objective(
-        "negative log-likelihood of the innovations, a run", lambda e, _: -e.log_likelihood, needs_covariance=True
+    LIKELIHOOD: Objective(
+        "negative log-likelihood of the innovations, a run", lambda e, _: -e.log_likelihood, (COVARIANCE,)
     ),
-    "nis": Objective("|log(mean NIS / m)|", _nis_inconsistency, needs_covariance=True),
+    "nis": Objective("|log(mean NIS / m)|", _from_one(nis_ratio), (COVARIANCE,)),
+    "c-nis": Objective(
+        "|log(mean NIS / m)| + |log(variance of the NIS / 2 m)|",
+        _from_one(nis_ratio, lambda e: e.nis_variance),
+        (COVARIANCE, VARIANCES),
+    ),
+    "nees": Objective("|log(mean NEES / n)|", _from_one(nees_ratio), (TRUTH, COVARIANCE, NEES)),
+    "c-nees": Objective(
+        "|log(mean NEES / n)| + |log(variance of the NEES / 2 n)|",
+        _from_one(nees_ratio, lambda e: e.nees_variance),
+        (TRUTH, COVARIANCE, NEES, VARIANCES),
+    ),
     "consistency": Objective(
         "|log(mean NEES / n)| + |log(mean NIS / m)|",
-        _inconsistency,
-        needs_covariance=True,
-        needs_truth=True,
-        needs_nees=True,
+        _from_one(nees_ratio, nis_ratio),
+        (TRUTH, COVARIANCE, NEES),
     ),
     "cost": Objective("microseconds a step of one run, of one core", lambda _, microseconds: microseconds),
 }
@@ -89,8 +118,8 @@ def check_objectives(names: Iterable[str], problem: Problem) -> None:
     """Raise ValueError if an objective needs the truth, or a derived output, that a problem does not have."""
     for name in names:
         objective = find_objective(name)
-        if objective.needs_truth and problem.scale is None:
-            free = ", ".join(known for known, one in OBJECTIVES.items() if not one.needs_truth)
+        if TRUTH in objective.needs and problem.scale is None:
+            free = ", ".join(known for known, one in OBJECTIVES.items() if TRUTH not in one.needs)
             raise ValueError(
                 f"an objective on {problem.name}, which has no truth, must be one of {free}, but got {shown(name)}"
             )

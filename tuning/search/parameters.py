@@ -18,8 +18,8 @@ from tuning.problems.problem import Problem
 from tuning.search.correlations import correlations_of, full_covariance
 
 Q, R = NOISE  # arguments of the model
-Q_FACTORS = (1e-5, 1e2)  # range of each process noise variance, as factors on the untuned one
-R_FACTORS = (1e-2, 1e3)  # range of each measurement noise variance, as factors on that of the data sheet
+FACTORS = (1e-10, 1e4)  # range of each variance of Q and R, as factors on that of the rule of thumb
+Q_FIRST, R_FIRST = (1e-5, 1e2), (1e-2, 1e3)  # the part of it in which a search begins
 CORRELATIONS = (-0.99, 0.99)  # range of each correlation in a full Q
 PRIOR_FACTORS = (1e-4, 1e2)  # range of P_0, as a factor on the covariance of the plant's initial state
 
@@ -57,7 +57,9 @@ class ProcessCorrelation:
         """The choice with another correlation, and so with a full Q."""
         variances = _diagonal(choice.model[Q])
         count = len(variances) * (len(variances) - 1) // 2
-        given = correlations_of(np.asarray(choice.model[Q])) if np.ndim(choice.model[Q]) == 2 else [0.0] * count
+        full = np.ndim(choice.model[Q]) == 2
+        found = correlations_of(np.asarray(choice.model[Q])) if full else [0.0] * count
+        given = np.clip(found, *CORRELATIONS).tolist()  # those of a singular Q may be 1
         q = full_covariance(variances, _replaced(given, self.index, value))
         return choice._replace(model={**choice.model, Q: tuple(map(tuple, q.tolist()))})
 
@@ -156,12 +158,14 @@ def model_parameters(
         return list(problem.parameters)
     untuned, quantities, found = problem.untuned, problem.quantities, []
     variances, count = _diagonal(untuned[Q]), len(quantities.states)
+    given = untuned if problem.given is None else problem.given
+    given_q, given_r = _diagonal(given[Q]), _diagonal(given[R])
     scales = [*(() if problem.scale is None else problem.scale), *[0.0] * count]
     for i, (variance, state) in enumerate(zip(variances, quantities.states, strict=True)):
         if variance > 0:  # otherwise the state has no noise, and no range
             # Where the input hardly moves a state, noise may move it more.
             scale = scales[i] if np.isfinite(scales[i]) else 0.0
-            low, high = Q_FACTORS[0] * variance, Q_FACTORS[1] * max(variance, scale**2)
+            low, high = _range(variance, given_q[i], max(variance, scale**2))
             found.append(Parameter(f"Q{i + 1}{i + 1}", low, high, squared(state.unit), place=ProcessVariance(i)))
     if full_q:
         names = correlation_names(count)
@@ -171,12 +175,24 @@ def model_parameters(
     if not hold_r:
         channels = quantities.measurements
         for i, (variance, channel) in enumerate(zip(_diagonal(untuned[R]), channels, strict=True)):
-            low, high = (variance * factor for factor in R_FACTORS)
+            low, high = _range(variance, given_r[i], variance)
             place = MeasurementVariance(i)
             found.append(Parameter(r_name(i, len(channels)), low, high, squared(channel.unit), place=place))
     if prior:
         found.append(Parameter("P0", *PRIOR_FACTORS, place=PRIOR))
     return found
+
+
+def _range(variance: float, given: float, largest: float) -> tuple[float, float]:
+    """The range of a variance, by the rule of thumb; what was given lies inside."""
+    low, high = FACTORS[0] * variance, FACTORS[1] * largest
+    return (min(low, given) if given > 0 else low), max(high, given)
+
+
+def first_range(one: Parameter) -> tuple[float, float] | None:
+    """The part of a number's range in which a search begins; None of a number that is no variance of Q or R."""
+    factors = {ProcessVariance: Q_FIRST, MeasurementVariance: R_FIRST}.get(type(one.place))
+    return factors and (one.low * factors[0] / FACTORS[0], one.high * factors[1] / FACTORS[1])
 
 
 def places_in(choice) -> dict[str, Place]:

@@ -1,4 +1,4 @@
-"""`Plan`: what a study is for. Two studies with the same plan are the same study.
+"""`Plan`: the definition of a study. Two studies with the same plan are the same study.
 
 NIS is the normalised innovation squared.
 """
@@ -10,16 +10,22 @@ from typing import NamedTuple
 import optuna
 from optuna.distributions import BaseDistribution
 
+from filters.estimators.find import estimator_named
 from filters.registry import filter_class
 from numerics.checks import positive, shown
+from numerics.modules import is_code
+from tuning.problems.check import checked_problem, data_of
 from tuning.problems.data import Data
+from tuning.problems.digest import digest_of
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
-from tuning.search.objectives import Objective, check_objectives, find_objective
+from tuning.search.objectives import COVARIANCE, LOG_SCORE, Objective, check_objectives, find_objective
+from tuning.search.parameters import first_range
 from tuning.search.space import AUTO, AUTO_FILTER_TYPES, has_search_space, joint_distributions, joint_parameters
 
 TRAINING_SEEDS = 32
 HELD_OUT_SEEDS = 200
+VALIDATION_SEEDS = 100  # on which the best trials meet the baselines
 SIZE_SEEDS = 100  # enough to distinguish an ensemble that is 1 % worse than the best, as N = 30 from N = 50
 
 
@@ -36,11 +42,15 @@ class Plan(NamedTuple):
     prune: bool = True  # whether a trial is pruned that is worse than the best one on the same seeds
     budget: float | None = None  # us/step that the filter may take, as `cost.microseconds_a_step` measures them
     full_q: bool = False  # whether Q has correlations
+    worst: bool = False  # of several problems the worst one counts, and not their mean
 
     @property
     def identity(self) -> dict:
-        """What has to be the same for a study to be continued."""
+        """What has to be the same for a study to be continued: of a user's own estimator, its code, too."""
+        own = {name: digest_of(estimator_named(name)) for name in self.filter_types if is_code(name)}
         return {
+            **({"estimators": own} if own else {}),
+            **({"worst": True} if self.worst else {}),
             "filter": self.filter,
             "kinds": list(self.filter_types),
             "budget": self.budget,
@@ -62,8 +72,11 @@ class Plan(NamedTuple):
 
     @property
     def is_constrained(self) -> bool:
-        """Whether the mean NIS has to be within its band: a filter without a covariance has no NIS."""
-        return self.consistent and self._has_covariance
+        """Whether the mean NIS has to be within its band.
+
+        A filter without a covariance has no NIS, and the log score needs no band: P counts in it.
+        """
+        return self.consistent and self._has_covariance and self.objectives[0] != LOG_SCORE
 
     @property
     def _has_covariance(self) -> bool:
@@ -84,7 +97,7 @@ class Plan(NamedTuple):
         if not 1 <= len(self.objectives) <= 2 or len(set(self.objectives)) < len(self.objectives):
             raise ValueError(f"objectives must be one, or two different ones, but got {list(self.objectives)}")
         for name, objective in zip(self.objectives, self.found_objectives(), strict=True):
-            if objective.needs_covariance and not self._has_covariance:
+            if COVARIANCE in objective.needs and not self._has_covariance:
                 raise ValueError(
                     f"the objective {name!r} needs a filter with a covariance, but got {self.filter!r}"
                 )
@@ -114,13 +127,18 @@ class Plan(NamedTuple):
         for one in self.scenarios:
             if not isinstance(one, Problem):
                 raise ValueError(f"a study must be of tuning.problems.problem.Problem, but got {shown(one)}")
-            sizes = len(one.quantities.states), len(one.quantities.measurements)
-            shapes.append((sizes, [parameter.name for parameter in one.parameters or ()]))
+            checked_problem(one)
+            own = [parameter.name for parameter in one.parameters or ()]
+            sizes = () if own else (len(one.quantities.states), len(one.quantities.measurements))
+            shapes.append((sizes, own))
             if shapes[-1] != shapes[0]:
                 raise ValueError(
-                    "problems of one study must have as many states and measurements, and the same parameters, "
-                    f"but {self.scenarios[0].name} and {one.name} have not"
+                    "problems of one study must have the same numbers of states and measurements, or the "
+                    f"same parameters of their own, but {self.scenarios[0].name} and {one.name} do not"
                 )
+        names = [one.name for one in self.scenarios]
+        if len(set(names)) < len(names):
+            raise ValueError(f"problems of one study must have different names, but got {', '.join(names)}")
 
     def found_objectives(self) -> list[Objective]:
         """The objectives themselves."""
@@ -137,6 +155,11 @@ class Plan(NamedTuple):
         """A trial's parameters by name, without the filter type."""
         return joint_parameters(self.filter_types, self.scenarios[0], **self._options)
 
+    def first_ranges(self) -> dict[str, tuple[float, float]]:
+        """The parts of the ranges of Q and R in which a search begins, by name."""
+        found = {name: first_range(one) for name, one in self.parameters().items()}
+        return {name: part for name, part in found.items() if part is not None}
+
     @property
     def tunes_noise(self) -> bool:
         """Whether Q and R are tuned: the problem has no parameters of its own, the filters a covariance."""
@@ -149,8 +172,12 @@ class Plan(NamedTuple):
 
     def training_data(self) -> list[Data]:
         """Data that all trials share, one for each scenario."""
-        return [scenario.data(scenario.training_seeds(self.seed, TRAINING_SEEDS)) for scenario in self.scenarios]
+        return [data_of(one, one.training_seeds(self.seed, TRAINING_SEEDS)) for one in self.scenarios]
+
+    def validation_data(self) -> list[Data]:
+        """Data on which the best trials meet the baselines, one for each scenario."""
+        return [one.data(one.validation_seeds(self.seed, VALIDATION_SEEDS)) for one in self.scenarios]
 
     def size_data(self) -> list[Data]:
         """Data that choose the ensemble size once Q and R are chosen, one for each scenario."""
-        return [scenario.data(scenario.size_seeds(self.seed, SIZE_SEEDS)) for scenario in self.scenarios]
+        return [data_of(one, one.size_seeds(self.seed, SIZE_SEEDS)) for one in self.scenarios]

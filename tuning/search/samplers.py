@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
+from types import MappingProxyType
 
 import numpy as np
 import optuna
@@ -13,6 +15,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from numerics.checks import one_of
 from numerics.extras import to_install
+from tuning.search.box import GpInBox, RandomInBox, TpeInBox
 from tuning.search.cma_es import CmaEsSampler
 from tuning.search.space import FILTER_TYPE
 
@@ -21,16 +24,17 @@ SAMPLERS = {
     "gp": "Gaussian process; the fewest trials, but 0.1 to 0.4 s for each proposal (needs torch)",
     "cma-es": "covariance matrix adaptation; good for many trials of a smooth error (needs cmaes)",
     "nsga-ii": "genetic, made for two objectives",
-    "random": "independent draws, what every other sampler should beat",
+    "random": "independent draws, which every other sampler should beat",
     "grid": "every combination of some values of each parameter, in random order",
 }
 WITHOUT_FILTER_TYPES = ("cma-es", "grid")  # cannot choose among filter types with parameters of their own
 GRID_VALUES = 5  # of each parameter
+NOTHING: Mapping = MappingProxyType({})
 NEEDS = {"gp": ("torch", "rl"), "cma-es": ("cmaes", "samplers")}
 
 
 def make_sampler(
-    name: str, seed: int, present: int, distributions: Mapping, worker: int = 0
+    name: str, seed: int, present: int, distributions: Mapping, worker: int = 0, first: Mapping = NOTHING
 ) -> optuna.samplers.BaseSampler:
     """A sampler.
 
@@ -40,6 +44,7 @@ def make_sampler(
         present: number of trials in the study, so that a resumed study does not propose its first trials again.
         distributions: of all parameters by name, from which a grid is made.
         worker: index of this process among those that share the study; each has its own random numbers.
+        first: the parts of ranges in which a search begins, by name, for samplers that draw within a box.
 
     Raises:
         ValueError: for an unknown name, a missing package, or one that cannot choose among filter types.
@@ -56,18 +61,18 @@ def make_sampler(
         return optuna.samplers.GridSampler(values, seed=seed)
     seed = int(np.random.SeedSequence([seed, present, worker]).generate_state(1)[0])
     makers: dict[str, Callable[..., optuna.samplers.BaseSampler]] = {
-        "tpe": _tpe,
-        "gp": optuna.samplers.GPSampler,
+        "tpe": partial(_tpe, first),
+        "gp": partial(GpInBox, first),
         "cma-es": CmaEsSampler,
         "nsga-ii": optuna.samplers.NSGAIISampler,
-        "random": optuna.samplers.RandomSampler,
+        "random": partial(RandomInBox, first),
     }
     return makers[name](seed=seed)
 
 
-def _tpe(seed: int) -> optuna.samplers.TPESampler:
+def _tpe(first: Mapping, seed: int) -> optuna.samplers.TPESampler:
     """Optuna's sampler, which evaluates its densities as arrays where its version is known."""
-    sampler = optuna.samplers.TPESampler(seed=seed)
+    sampler = TpeInBox(first, seed=seed)
     with suppress(ImportError):  # of another version
         from tuning.search.parzen import ParzenEstimator, is_optunas
 
@@ -77,7 +82,7 @@ def _tpe(seed: int) -> optuna.samplers.TPESampler:
 
 
 def give_sampler(study: optuna.Study, make: Callable[[int], optuna.samplers.BaseSampler], present: int) -> None:
-    """Give a study the sampler of index 0 or, if another process runs trials of it too, one of its own index.
+    """Give a study the sampler of index 0 or, if another process also runs trials of it, one with its own index.
 
     Processes that open a study at the same number of trials would propose the same trials. But trials have
     different

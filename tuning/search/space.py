@@ -62,6 +62,11 @@ def untuned_choice(name: str, problem: Problem) -> Choice:
     return Choice(name, dict(problem.untuned), _default_numbers(name, problem))
 
 
+def given_choice(name: str, problem: Problem) -> Choice | None:
+    """The filter with the model's given values and the untuned ensemble size; None if there are none."""
+    return None if problem.given is None else Choice(name, dict(problem.given), _default_numbers(name, problem))
+
+
 def oracle_choice(name: str, problem: Problem) -> Choice | None:
     """The filter that knows the plant's own Q and R, with the untuned ensemble size; None if they are unknown."""
     return None if problem.true is None else Choice(name, dict(problem.true), _default_numbers(name, problem))
@@ -125,7 +130,7 @@ def distributions(name: str, problem: Problem, **options) -> dict[str, BaseDistr
 
 
 def joint_parameters(filter_types: Sequence[str], problem: Problem, **options) -> dict[str, Parameter]:
-    """What a study may choose among several filter types, by the names of the trials' parameters.
+    """The choices of a study among several filter types, by the names of the trials' parameters.
 
     Parameters of the model (Q, R, P_0) are shared by all filter types. The parameters of one type, such as
     "enkf N", are chosen only in trials of that type. Of a single type these are its `parameters`.

@@ -48,7 +48,7 @@ def open_storage(storage: str) -> BaseStorage:
         if is_misspelt(storage):  # which would become folders, its password their name
             raise ValueError("a URL has :// after its first word")
         if path.exists() and not path.is_file():
-            raise ValueError("it is no regular file")
+            raise ValueError("it is not a regular file")
         path.parent.mkdir(parents=True, exist_ok=True)
         # A killed process may leave its lock behind; locks are held for milliseconds.
         lock = JournalFileOpenLock(str(path), grace_period=LOCK_SECONDS)
@@ -59,7 +59,7 @@ def open_storage(storage: str) -> BaseStorage:
         finally:
             lock.release()
         return Journal(JournalFile(path, lock))
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(
             f"storage must be a journal file that can be written, but got {shown_storage(storage)}: {error}"
         ) from None

@@ -29,7 +29,7 @@ def shown_storage(storage: str) -> str:
 
 
 def is_misspelt(storage: str) -> bool:
-    """Whether this is a database's URL but for its slashes, and no path."""
+    """Whether this is a database's URL except for its slashes, and not a path."""
     return bool(_MISSPELT.match(storage))
 
 

@@ -13,23 +13,25 @@ from typing import NamedTuple
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from tuning.evaluation.kept import kept_sizes, sizes_as_data
-from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
+from tuning.evaluation.sizes import SizeRow
 from tuning.problems.data import Data
 from tuning.search.cost import COST
 from tuning.search.enqueued import enqueue_after, enqueue_what_is_left
 from tuning.search.interruption import stop_on_interrupt
+from tuning.search.measures import measured
 from tuning.search.objectives import nis_ratio
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.plan import Plan
 from tuning.search.samplers import give_sampler, make_sampler
-from tuning.search.space import Choice, choice_of, has_ensemble, trial_parameters
+from tuning.search.sizing import sized, sizes_of
+from tuning.search.space import Choice, choice_of, trial_parameters
 from tuning.search.storage import PROCESS, retry_orphans, this_process
 from tuning.search.trials import cost_of, make_pruner, measure, run_trial
+from tuning.search.validation import Validation, as_data, validate
 
 FINISHED = (TrialState.COMPLETE, TrialState.PRUNED)
 BEST = "best trial under the constraints"  # attribute of a study, for programs that ignore constraints
-SIZES = "ensemble sizes"  # attribute of a study: their table, with its digest
+CHOSEN = "choice at the end"  # attribute of a study: how the best trials met the baselines, and its trials then
 OnTrial = Callable[[optuna.Study, int], None]
 
 
@@ -42,7 +44,7 @@ class StudyResult(NamedTuple):
     """The result of a study, before held-out evaluation."""
 
     choice: Choice  # with the smallest sufficient ensemble
-    best_value: float  # first objective of the best trial, on the training seeds
+    best_value: float  # first objective of the choice, on the training seeds
     trials: list[FrozenTrial]
     sizes: list[SizeRow]  # score against ensemble size, empty without an ensemble
     seconds: float
@@ -54,6 +56,7 @@ class StudyResult(NamedTuple):
     microseconds: float | None = None  # us/step of the choice, where the plan asks for it
     consistent: bool | None = None  # whether any trial's mean NIS is within its band; None without a constraint
     nis: tuple[float, ...] = ()  # NIS of the choice over the number of channels, on each scenario's training seeds
+    validation: Validation | None = None  # how the best trials met the baselines; None where they did not
 
     @property
     def finished(self) -> int:
@@ -73,7 +76,7 @@ class StudyResult(NamedTuple):
 
 
 def checked(plan: Plan) -> Plan:
-    """A plan that can work, whose sampler is there; ValueError otherwise, before anything is stored."""
+    """A feasible plan whose sampler is installed; ValueError otherwise, before anything is stored."""
     plan = plan.checked()
     make_sampler(plan.sampler, plan.seed, 0, plan.space())
     return plan
@@ -98,7 +101,7 @@ def open_study(
         worker: index of this process among those that share the study; 0 if it may be the only one.
 
     Raises:
-        ValueError: if the plan cannot work, or a study of this name was made for something else or by another
+        ValueError: if the plan is not feasible, or a study of this name was made for another plan or by another
             version of Optuna.
     """
     plan, space = checked(plan), plan.space()
@@ -113,9 +116,10 @@ def open_study(
     retry_orphans(study)
     present = len(study.get_trials(deepcopy=False))
     if worker:
-        study.sampler = make_sampler(plan.sampler, plan.seed, present, space, worker)
+        study.sampler = make_sampler(plan.sampler, plan.seed, present, space, worker, plan.first_ranges())
     else:
-        give_sampler(study, partial(make_sampler, plan.sampler, plan.seed, present, space), present)
+        make = partial(make_sampler, plan.sampler, plan.seed, present, space, first=plan.first_ranges())
+        give_sampler(study, lambda worker: make(worker=worker), present)
     if not present:
         study.set_user_attr("identity", plan.identity)
         if start is not None:
@@ -133,6 +137,11 @@ def _check_identity(name: str, wanted: dict, found: dict) -> None:
             raise ValueError(
                 f"a study must be for one model and its data, but {name!r} exists here for another model or other "
                 "logs: give it another name (--study NAME), or move the file that keeps it (out/studies.journal)"
+            )
+        if differing == ["estimators"]:
+            raise ValueError(
+                f"a study must be of one estimator, but the code of {', '.join(wanted['estimators'])} is not what "
+                f"{name!r} was made with: give it another name (--study NAME)"
             )
         raise ValueError(f"study {name!r} must be for {wanted}, but it was made for {found}: give it another name")
 
@@ -167,36 +176,42 @@ def run_study(
     data = plan.training_data()
     started = time.perf_counter()
     interrupted = (run or run_trials)(study, plan, data, trials, on_trial)
-    present = study.get_trials(deepcopy=False)
+    present = _begun(study)
     best = best_trial(present)
     if best is None:
         costs = [trial.user_attrs[COST] for trial in present if COST in trial.user_attrs]
         if plan.budget is None or interrupted or not costs:
             raise KeyboardInterrupt
         raise ValueError(
-            f"budget must be at least what the cheapest trial takes, {min(costs):.3g} microseconds a step, "
+            f"budget must be at least the time of the cheapest trial, {min(costs):.3g} microseconds a step, "
             f"but got {plan.budget:g}"
         )
     if study.user_attrs.get(BEST) != best.number:  # another worker may have written an older one last
         study.set_user_attr(BEST, best.number)
-    choice = choice_of(plan.filter, best.params, plan.scenarios[0])
     sizes: list[SizeRow] = []
+
+    def resize(choice: Choice, consistent: bool) -> Choice:
+        sizes[:] = sizes_of(study, choice, plan, data, consistent)
+        return sized(choice, plan, data, sizes, consistent)
+
     consistent = plan.is_constrained and is_consistent(best)
-    if has_ensemble(choice.name) and len(plan.objectives) == 1:
-        kept = kept_sizes(study.user_attrs.get(SIZES), choice, plan)
-        if kept is None:
-            sizes = ensemble_sizes(choice, plan, data, consistent)
-            study.set_user_attr(SIZES, sizes_as_data(sizes, choice, plan))
-        else:
-            sizes = kept
-        if sizes:
-            choice = choice.with_size(sufficient_size(sizes, consistent))
-        elif all(scenario.leads_in for scenario in plan.scenarios):
-            choice = choice.with_size(close_size(choice, plan, data))
+    validation, value = validate(plan, present, data, resize), best.values[0]
+    if validation is None:
+        choice = resize(choice_of(plan.filter, best.params, plan.scenarios[0]), consistent)
+    else:
+        chosen = validation.named(validation.chosen)
+        choice = chosen.choice
+        if validation.gave_way:  # a larger ensemble is no worse, a smaller one may be
+            larger = resize(choice, plan.is_constrained and chosen.consistent)
+            choice = max(choice, larger, key=lambda one: one.numbers.get("ensemble_size", 0))
+        value = measured(choice, plan, data).value
+        met = [one._replace(choice=choice) if one is chosen else one for one in validation.met]
+        written = as_data(validation._replace(met=tuple(met)))
+        study.set_user_attr(CHOSEN, {"trials": len(present), **(written or {})})
     complete = [trial.values[0] for trial in present if trial.state == TrialState.COMPLETE]
     return StudyResult(
         choice,
-        best.values[0],
+        value,
         present,
         sizes,
         time.perf_counter() - started,
@@ -207,7 +222,19 @@ def run_study(
         min(cost_of(choice, plan, data), best.user_attrs[COST]) if plan.asks_for_cost else None,
         is_consistent(best) if plan.is_constrained else None,
         tuple(map(nis_ratio, measure(choice, plan, data))) if plan.is_constrained else (),
+        validation,
     )
+
+
+def _begun(study: optuna.Study) -> list[FrozenTrial]:
+    return [one for one in study.get_trials(deepcopy=False) if one.state != TrialState.WAITING]
+
+
+def chosen_of(study: optuna.Study) -> dict | None:
+    """The validation of a study's best trials, if there have been no trials since; else None."""
+    found = study.user_attrs.get(CHOSEN)
+    same = isinstance(found, dict) and found.get("trials") == len(_begun(study))
+    return found if same else None
 
 
 def _note_best(study: optuna.Study, last: FrozenTrial) -> None:

@@ -17,7 +17,7 @@ from tuning.evaluation.evaluate import Evaluation, compute_metrics, run_scores
 from tuning.evaluation.runs import RunMetrics, joined, metrics_of_all
 from tuning.problems.data import Data
 from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
-from tuning.search.objectives import LARGEST, nis_ratio, nis_violation, penalised
+from tuning.search.objectives import LARGEST, LOG_SCORES, NEES, VARIANCES, nis_ratio, nis_violation, penalised
 from tuning.search.plan import Plan
 from tuning.search.pruning import BLOCK, PairedPruner
 from tuning.search.space import Choice, suggest
@@ -61,15 +61,16 @@ def run_trial(
         trial.set_constraint(BUDGET, over_budget(microseconds, plan.budget))
         if microseconds > plan.budget:
             raise optuna.TrialPruned
-    prunes = plan.prune and plan.objectives == ("score",)
+    prunes = plan.prune and plan.objectives == ("score",) and not plan.worst
     evaluations = measure(choice, plan, data, trial if prunes else None)
     if plan.is_constrained:
         outside = max(map(nis_violation, evaluations))
         trial.set_constraint(CONSISTENCY, outside)
         if outside < LARGEST:  # otherwise there is no finite NIS
             trial.set_user_attr(NIS, geometric_mean(map(nis_ratio, evaluations)))
+    of_all = max if plan.worst else np.mean
     return [
-        float(np.mean([penalised(objective.value(e, microseconds), e) for e in evaluations]))
+        float(of_all([penalised(objective.value(e, microseconds), e) for e in evaluations]))
         for objective in plan.found_objectives()
     ]
 
@@ -85,28 +86,48 @@ def measure(
 ) -> list[Evaluation]:
     """Run a choice on all data; with a trial, report each seed's score to it and stop if it should be pruned.
 
+    All runs of all problems count. Where problems have different numbers of runs, a score that is reported is of
+    an equal share of each problem's: a run of the one with the fewest, and the mean of some of each other's.
+
     The NEES and errors of outputs are computed where an objective needs them, and no interval.
     """
     objectives = plan.found_objectives()
-    nees, outputs = any(one.needs_nees for one in objectives), any(one.output for one in objectives)
+    needs = {need for one in objectives for need in one.needs}
+    nees, outputs = NEES in needs, any(one.output for one in objectives)
+    scales = [scenario.scale if LOG_SCORES in needs else None for scenario in plan.scenarios]
     filters = [choice.filter(scenario) for scenario in plan.scenarios]
-    count = len(data[0].seeds)
+    count = min(len(one.seeds) for one in data)
     size = count if trial is None else BLOCK
+    ends = [shares(len(one.seeds), count) for one in data]
     parts: list[list[RunMetrics]] = [[] for _ in filters]
     for first in range(0, count, size):
-        block = [one.slice(first, first + size) for one in data]
-        for runs, filter_, one in zip(parts, filters, block, strict=True):
-            runs.append(metrics_of_all(filter_, one, nees, outputs))
+        last = min(first + size, count)
+        for runs, filter_, one, places, scale in zip(parts, filters, data, ends, scales, strict=True):
+            runs.append(metrics_of_all(filter_, one.slice(places[first], places[last]), nees, outputs, scale))
         if trial is not None:
-            _report(trial, first, [runs[-1] for runs in parts], plan)
-            if first + size < count and trial.should_prune():
+            _report(trial, first, last, [runs[-1] for runs in parts], ends, plan)
+            if last < count and trial.should_prune():
                 raise optuna.TrialPruned
     rows = zip(filters, map(joined, parts), data, plan.scenarios, strict=True)
-    return [compute_metrics(filter_, runs, one, scenario.scale, False) for filter_, runs, one, scenario in rows]
+    return [
+        compute_metrics(filter_, runs, one, scenario.scale, False, VARIANCES in needs)
+        for filter_, runs, one, scenario in rows
+    ]
 
 
-def _report(trial: optuna.Trial, first: int, parts: list[RunMetrics], plan: Plan) -> None:
-    pairs = zip(parts, plan.scenarios, strict=True)
-    scores = np.mean([run_scores(runs, scenario.scale) for runs, scenario in pairs], axis=0)
-    for place, score in enumerate(scores):
+def shares(runs: int, count: int) -> list[int]:
+    """Ends of `count` nearly equal shares of some runs: share i is ends[i] up to, but without, ends[i + 1]."""
+    return [i * runs // count for i in range(count + 1)]
+
+
+def _report(
+    trial: optuna.Trial, first: int, last: int, parts: list[RunMetrics], ends: list[list[int]], plan: Plan
+) -> None:
+    """Report the mean over problems of the scores of their shares `first` up to, without, `last`."""
+    scores = []
+    for runs, scenario, places in zip(parts, plan.scenarios, ends, strict=True):
+        begin = np.subtract(places[first:last], places[first])
+        sizes = np.diff(places[first : last + 1])
+        scores.append(np.add.reduceat(run_scores(runs, scenario.scale), begin) / sizes)
+    for place, score in enumerate(np.mean(scores, axis=0)):
         trial.report(float(score), first + place)

@@ -1,8 +1,8 @@
 """Several processes on one host that run trials of one study.
 
-Each is `python -m tuning.search.workers`, in a session of its own, so that Ctrl-C reaches the parent alone. It
-reads its task as a line of JSON from its standard input, and ends after its running trial when that is closed: by
-its parent, or because its parent has ended.
+Each runs `tuning.search.workers` in its own session, so that Ctrl-C reaches only the parent. It reads its task as
+a line of JSON from its standard input, and ends after its running trial when that is closed: by its parent, or
+because its parent has ended.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from typing import Any
 
 import optuna
 
+from numerics.modules import as_module, working_folder_last
 from numerics.threads import cores
 from tuning.problems.data import Data
 from tuning.problems.find import find_same
@@ -99,12 +100,13 @@ def _packed(problem: LogProblem) -> str:
 
 
 def _unpacked(text: str) -> LogProblem:
-    return pickle.loads(base64.b64decode(text))
+    with working_folder_last():  # where the model's module may lie
+        return pickle.loads(base64.b64decode(text))
 
 
 def _start(orders: dict) -> subprocess.Popen:
-    command = [sys.executable, "-m", "tuning.search.workers"]
     with without_interrupts():
+        command = as_module("tuning.search.workers")
         process = subprocess.Popen(command, stdin=subprocess.PIPE, text=True, start_new_session=True)
     assert process.stdin is not None  # a pipe
     with suppress(BrokenPipeError):  # it has died already, which its exit code shows

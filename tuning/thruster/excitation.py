@@ -57,7 +57,9 @@ class ClosedLoop(Excitation):
 
     def inputs(self, keys: np.ndarray, steps: int, dt: float, count: int) -> np.ndarray:
         """Raise ValueError: the voltages depend on the thruster, see `voltages`."""
-        raise ValueError("the excitation 'pi' must be a thruster's, for it is a loop closed through its sensor")
+        raise ValueError(
+            "the excitation 'pi' must be a thruster's, because it is a loop closed through its sensor"
+        )
 
     def voltages(self, plant: Plant, keys: np.ndarray, steps: int) -> np.ndarray:
         """Voltages (B, steps) [V]; ValueError if the plant does not measure its thrust."""

@@ -42,7 +42,7 @@ FASTEST_FLOW = 2.0  # [m/s], ambient
 DEAD_PART = 0.25  # largest dead band, as a fraction of the largest voltage
 DEAD_START = 0.02
 BIAS_PART = 0.25  # largest bias, as a fraction of the channel's largest magnitude
-LAGS = 0.1, 100.0  # time constants in sample times
+LONGEST_LAG = 100.0  # in sample times
 LAG_START = 3.0
 OFFSETS = 10.0  # largest clock offset, in sample times, but at least
 LEAST_OFFSET = 0.1  # [s]
@@ -70,7 +70,7 @@ class ThrusterFamily:
         """Find the parameters by name."""
         self.logs, self.plant, self.seen = tuple(logs), plant, seen
         if plant.linear is not None:
-            raise ValueError("a thruster must move by its equations to be identified, but this one is linear")
+            raise ValueError("an identified thruster must follow the equations of motion, but this one is linear")
         known = self.known
         names = list(free) + [name for name in self.noise_names if noise and name not in free]
         wrong = [name for name in names if name not in known]
@@ -114,7 +114,7 @@ class ThrusterFamily:
                 name, min(-bias, 2 * at), max(bias, 2 * at), quantity.unit, log=False, default=at
             )
             name, lag = f"lag_{channel}", dict(seen.lag).get(channel, LAG_START * dt)
-            found[name] = Parameter(name, min(LAGS[0] * dt, lag), max(LAGS[1] * dt, lag), "s", default=lag)
+            found[name] = Parameter(name, 0.0, max(LONGEST_LAG * dt, lag), "s", log=False, default=lag)
             name = f"clock_offset_{channel}"
             found[name] = Parameter(name, -offset, offset, "s", log=False, default=0.0)
         q, r = np.diag(plant.process_noise_cov), np.diag(plant.measurement_noise_cov)

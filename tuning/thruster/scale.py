@@ -37,7 +37,7 @@ def computed_scale(scenario: Scenario, sequences: int = SEQUENCES, truths: int =
     elif is_stable(scenario.plant):
         open_loop = OpenLoop(model=model_of_plant(scenario.plant))
         estimates = run(open_loop, data.filter_keys, data.inputs, data.measurements)
-        errors = (estimates.means - data.states)[:, data.scored]
+        errors = (estimates.means - data.states)[:, data.late]
         what, scale = "the RMSE of the open loop", np.sqrt((errors**2).mean(axis=(0, 1)))
     else:
         raise ValueError(

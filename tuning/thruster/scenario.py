@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from filters.posterior import has_bound, posterior_variances
+from filters.posterior import has_bound
 from filters.tuned_file import NOISE
 from numerics.checks import positive, shown, vector
 from numerics.streams import episode_keys, filter_keys
@@ -23,6 +23,7 @@ from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_PROCESS_
 from thruster_env.plant_data import check_same_plant, plant_data
 from thruster_env.preset_file import is_file, preset_mapping
 from thruster_env.simulation import simulate
+from tuning.problems.bound import average_bound
 from tuning.problems.data import Data
 from tuning.problems.plain import plain
 from tuning.problems.problem import BOUND, GIVEN, OPEN_LOOP
@@ -152,7 +153,7 @@ class Scenario(BaseScenario):
 
     @property
     def scale_about(self) -> str:
-        """What the scale is, in words; that of a file may be any."""
+        """A description of the scale, which a file may set freely."""
         if self.name.endswith(".toml"):
             return GIVEN
         return BOUND if self.has_bound else f"{OPEN_LOOP}, for the true Q is singular"
@@ -165,8 +166,7 @@ class Scenario(BaseScenario):
         """
         if not self.has_bound:
             return np.full(2, np.nan)
-        inputs = np.asarray(data.inputs, dtype=np.float64)
-        return _bound(self, truths, inputs.shape, inputs.tobytes()).copy()
+        return average_bound(model_of_plant(self.plant), data, truths)
 
     def make(self, seeds: tuple[int, ...]) -> Data:
         """Truth and measurements under the excitation's voltages."""
@@ -184,14 +184,6 @@ class Scenario(BaseScenario):
             simulation.states,
             {"T": simulation.thrusts},
         )
-
-
-@lru_cache(maxsize=8)  # the held-out seeds are the same for all filters, and 200 of them take two seconds
-def _bound(scenario: Scenario, truths: int, shape: tuple[int, ...], inputs: bytes) -> np.ndarray:
-    """`Scenario.bound` for inputs of a shape."""
-    given = np.frombuffer(inputs).reshape(shape)
-    variances = posterior_variances(model_of_plant(scenario.plant), given, truths=truths)
-    return np.sqrt(variances[:, scenario.first_scored_step :].mean(axis=(0, 1)))
 
 
 def _variances(given, channels: int) -> float | tuple[float, ...]:

@@ -1,0 +1,52 @@
+"""Where numbers lie in the memory of a filter and its derivatives, and the matrices that stand for them."""
+
+from __future__ import annotations
+
+from numerics.algebra.matrices import Matrix, given
+from numerics.algebra.programs import Place
+from plants.layout import number_places, starts_of
+from plants.shape import Shape
+
+
+class Memory:
+    """The arrays of `numerics.algebra.programs`, for a model's sizes.
+
+        rows      x, P; x and P as a stage leaves them; u, z; log-likelihood; what derivatives need of the values
+        change    of a parameter: dx, dP; d log-likelihood; of the information what `notes` says, twice
+        numbers   the model's, then the tails of two densities (`operations.tail_of`)
+        move      of a parameter: dQ, dR, dc, the relative size of dc; dx and dP at the start
+
+    Matrices lie by rows. Of what lies in `rows` and `change` there is one number for each run.
+    """
+
+    def __init__(self, shape: Shape):
+        """Take the sizes."""
+        n, m, places = shape.n, shape.m, number_places(shape.n, shape.m)
+        self.shape, self.state, self.notes = shape, n + n * n, m + m * m
+        self.left, self.input, self.measured, self.level, self.length = starts_of(
+            self.state, self.state, shape.inputs, m, 1
+        )[1:]
+        self.slope = self.state  # of the log-likelihood
+        self.noted, self.weighed, self.depth = starts_of(self.state + 1, self.notes, self.notes)[1:]
+        r, c, size, self.prior, self.width = starts_of(n * n, m * m, shape.constants, 1, self.state)[1:]
+        tail = places.constants + shape.constants
+        self.tail, self.predicted_tail = tail, tail + m + 2
+        self.x = given(Place("rows", 0), (n,))
+        self.P = self._beside("rows", n, n, n, symmetric=True)
+        self.u, self.z = self._beside("rows", self.input, shape.inputs), self._beside("rows", self.measured, m)
+        self.Q = self._beside("numbers", places.q, n, n, symmetric=True)
+        self.R = self._beside("numbers", places.r, m, m, symmetric=True)
+        self.scales = self._beside("numbers", places.scales, n)
+        self.constants = self._beside("numbers", places.constants, shape.constants)
+        self.tails = [self._beside("numbers", first, m + 2) for first in (tail, self.predicted_tail)]
+        self.constants_slope = self._beside("move", c, shape.constants)
+        self.size = self._beside("move", size)
+        self.moves = {
+            self.x: self._beside("change", 0, n),
+            self.P: self._beside("change", n, n, n, symmetric=True),
+            self.Q: self._beside("move", 0, n, n, symmetric=True),
+            self.R: self._beside("move", r, m, m, symmetric=True),
+        }
+
+    def _beside(self, array: str, first: int, *shape: int, symmetric: bool = False) -> Matrix:
+        return given(Place(array, first), shape, symmetric=symmetric, beside=self.x)

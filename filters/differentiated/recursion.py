@@ -1,0 +1,226 @@
+"""The recursion of a filter over some runs, with derivatives along parameters: what calls its stages.
+
+Runs lie side by side in memory, as many as a stage works on at once. What is accumulated is each run's own, so
+that it does not matter which of them lie together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.differentiated.equations import Equations
+from filters.differentiated.memory import Memory
+from filters.differentiated.stages import Stage, as_calls, as_programs, stage_of
+from filters.differentiated.traced import MOST
+from filters.pages import extended
+from numerics.algebra.densities import density, density_slope, dot, heavier, outlier_weight
+from numerics.algebra.derivatives import slopes_of
+from numerics.algebra.matrices import Matrix
+from numerics.algebra.operations import factor, inverse, only, present, quotient, uncorrelated, wrap
+from numerics.algebra.programs import callable_of
+from numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from plants.layout import constants_reader, number_places
+from plants.shape import Functions, Shape, observation_slopes, transition_slopes
+
+AT_ONCE = 4  # runs of a program: of eight each would take a fifth less, but a run alone twice as long
+
+
+class Wanted(NamedTuple):
+    """What is worked out beside the log-likelihood and its gradient."""
+
+    information: bool  # Fisher's
+    constants: bool  # slopes along the model's constants
+    tails: bool  # densities with more outliers than the normal one, and channels that are predicted only
+
+
+class Recursion(NamedTuple):
+    """A compiled recursion; see `runs` for its arguments."""
+
+    run: CompiledOrPython
+    at_once: int  # runs
+    length: int  # of the memory `rows`
+    depth: int  # of `change`
+
+    def sizes(self, parameters: int) -> tuple[tuple[int, ...], ...]:
+        """Shapes of the arrays that the recursion works in, its last arguments but the first and last run."""
+        changes = max(parameters, 1), self.depth * self.at_once
+        return (self.length * self.at_once,), changes, (parameters, parameters, self.at_once), (self.at_once,)
+
+
+def recursion_of(functions: Functions, shape: Shape, wanted: Wanted) -> Recursion:
+    """The recursion of the extended Kalman filter for a model's functions and sizes."""
+    return _recursion_of(functions, shape, wanted, is_interpreting())
+
+
+@cache
+def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, interpreting: bool) -> Recursion:
+    memory = Memory(shape)
+    try:
+        stages = stages_of(
+            memory, Equations(functions, memory, constants_move=wanted.constants, trace=True), wanted
+        )
+        made = [as_programs(stage, memory.length, MOST) for stage in stages]
+        works = [callable_of(program, AT_ONCE) for one in made for program in one[:2]]
+        fingerprint, at_once = function_fingerprint(within=__name__), AT_ONCE
+    except Exception:  # whatever a user's function raises of numbers that it does not know: it is called, then
+        model = Equations(functions, memory, constants_move=wanted.constants, trace=False)
+        readers = {memory.constants: constants_reader(shape)}
+        made = [
+            as_calls(stage, memory.length, model.called, readers) for stage in stages_of(memory, model, wanted)
+        ]
+        works = [work for one in made for work in one[:2]]
+        slopes = transition_slopes(functions, shape), observation_slopes(functions, shape)
+        fingerprint = function_fingerprint(functions.transition, functions.observe, *slopes, within=__name__)
+        at_once = 1
+    length = max(one.length for one in made)
+    run = CompiledOrPython(_accumulator(memory, works, wanted, at_once, fingerprint))
+    return Recursion(run, at_once, length, memory.depth)
+
+
+def stages_of(memory: Memory, model: Equations, wanted: Wanted) -> list[Stage]:
+    """The stages of a step, and what is done with channels that are predicted only."""
+    n, (x, p) = memory.shape.n, (memory.x, memory.P)
+    moves = dict(memory.moves)
+    if wanted.constants:
+        moves[memory.constants] = memory.constants_slope
+
+    def moved(mean: Matrix, cov: Matrix, more: dict | None = None, slopes: dict | None = None) -> Stage:
+        left = {memory.left: mean, memory.left + n: cov}
+        found = stage_of(left | (more or {}), {0: mean, n: cov}, moves)
+        return found._replace(slopes=found.slopes | (slopes or {}))
+
+    stages = [moved(*extended.advance(model, x, p, memory.u)), moved(*extended.settle(model, x, p))]
+    mean, cov, v, s, _ = extended.update(model, x, p, memory.z)
+    stages.append(moved(mean, cov, *_density(memory, v, s, moves, memory.tails[0], wanted)))
+    if wanted.tails:
+        seen = present(memory.z)
+        v = only(seen, wrap(memory.z - model.h(x), model.measurement_angles))
+        stages.append(Stage(*_density(memory, v, uncorrelated(seen, model.R), moves, memory.tails[1], wanted)))
+    return stages
+
+
+def _density(memory: Memory, v: Matrix, s: Matrix, moves: dict, tail: Matrix, wanted: Wanted) -> tuple[dict, dict]:
+    """The log density of an innovation, and of a parameter its slope, and what the information takes of both."""
+    seen, of = present(memory.z), factor(s)
+    w, e = quotient(v, of), inverse(of, seen)
+    level, weighted = density(v, of, seen), w
+    if wanted.tails:
+        q = dot(v, w)
+        level, weighted = level + heavier(q, seen, tail), w * outlier_weight(q, seen, tail)
+    dv, ds = slopes_of([v, s], moves)
+    slopes = {memory.slope: density_slope(w, weighted, e, dv, ds)}
+    if wanted.information:
+        m = memory.shape.m
+        slopes |= {memory.noted: dv, memory.noted + m: ds}
+        slopes |= {memory.weighed: e @ dv, memory.weighed + m: (e @ ds @ e) * 0.5}
+    return {memory.level: level}, slopes
+
+
+def _accumulator(
+    memory: Memory, works: list[Callable], wanted: Wanted, at_once: int, fingerprint: str
+) -> Callable:
+    """The recursion over steps of some runs."""
+    advance, advance_slopes, settle, settle_slopes, update, update_slopes = works[:6]
+    predicted, predicted_slopes = works[6:] or works[4:6]  # not called, if there are none
+    state, left = memory.state, memory.left
+    first_input, first_measured, level, slope = memory.input, memory.measured, memory.level, memory.slope
+    prior, noted, weighed, notes = memory.prior, memory.noted, memory.weighed, memory.notes
+    inputs_count, channels, informative = memory.shape.inputs, memory.shape.m, wanted.information
+    nan = np.nan
+    substeps = number_places(memory.shape.n, memory.shape.m).substeps
+
+    def accumulate(
+        inputs,
+        measurements,
+        begins,
+        numbers,
+        moves,
+        own,
+        counted_from,
+        fed,
+        turns,
+        out,
+        information,
+        rows,
+        changes,
+        told,
+        counted,
+        first,
+        last,
+    ):
+        fingerprint  # noqa: B018 - part of the cache's key
+        count = out.shape[2] - 1
+        for b in range(first, last, at_once):
+            there = min(at_once, last - b)  # beyond, the last run again
+            for j in range(at_once):
+                run = b + min(j, there - 1)
+                for i in range(state):
+                    rows[i * at_once + j] = begins[run, i]
+                    for q in range(count):
+                        changes[q, i * at_once + j] = moves[q, prior + i] * own[run]
+            for q in range(count):
+                for r in range(count):
+                    for j in range(at_once):
+                        told[q, r, j] = 0.0
+            for k in range(measurements.shape[1]):
+                if k > 0:
+                    for j in range(at_once):
+                        for i in range(inputs_count):
+                            rows[(first_input + i) * at_once + j] = inputs[b + min(j, there - 1), k - 1, i]
+                    for part in range(int(numbers[substeps]) + 1):
+                        if part < int(numbers[substeps]):
+                            advance(rows, changes[0], numbers, moves[0])
+                            for q in range(count):
+                                advance_slopes(rows, changes[q], numbers, moves[q])
+                        else:
+                            settle(rows, changes[0], numbers, moves[0])
+                            for q in range(count):
+                                settle_slopes(rows, changes[q], numbers, moves[q])
+                        for i in range(state):
+                            for j in range(at_once):
+                                rows[i * at_once + j] = rows[(left + i) * at_once + j]
+                block = k * out.shape[1] // measurements.shape[1]
+                for turn in range(turns):
+                    for j in range(at_once):
+                        run = b + min(j, there - 1)
+                        counted[j] = 1.0 if k >= counted_from[run] else 0.0
+                        for i in range(channels):
+                            z = measurements[run, k, i]
+                            rows[(first_measured + i) * at_once + j] = z if fed[i] == 1.0 - turn else nan
+                    if turn == 0:
+                        update(rows, changes[0], numbers, moves[0])
+                        for q in range(count):
+                            update_slopes(rows, changes[q], numbers, moves[q])
+                        for i in range(state):
+                            for j in range(at_once):
+                                rows[i * at_once + j] = rows[(left + i) * at_once + j]
+                    else:
+                        predicted(rows, changes[0], numbers, moves[0])
+                        for q in range(count):
+                            predicted_slopes(rows, changes[q], numbers, moves[q])
+                    for j in range(there):
+                        if counted[j] > 0.0:
+                            out[b + j, block, 0] += rows[level * at_once + j]
+                            for q in range(count):
+                                out[b + j, block, 1 + q] += changes[q, slope * at_once + j]
+                    if informative:
+                        for q in range(count):
+                            for r in range(q + 1):
+                                for i in range(notes):
+                                    for j in range(at_once):
+                                        product = (
+                                            changes[q, (noted + i) * at_once + j]
+                                            * changes[r, (weighed + i) * at_once + j]
+                                        )
+                                        told[q, r, j] += product if counted[j] > 0.0 else 0.0
+            if informative:
+                for j in range(there):
+                    for q in range(count):
+                        for r in range(q + 1):
+                            information[b + j, q, r] = information[b + j, r, q] = told[q, r, j]
+
+    return accumulate

@@ -1,0 +1,101 @@
+"""The log-likelihood of some runs and its derivatives along parameters of a whole model."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.differentiated.recursion import Wanted, recursion_of
+from filters.starts import Starts, as_the_prior_says
+from numerics.algebra.densities import tail_of
+from numerics.angles import wrapped_where
+from numerics.threads import spread
+from plants.state_space import StateSpaceModel
+
+
+class ModelSlopes(NamedTuple):
+    """Derivatives of a model with respect to p parameters, each scaled so that 1 is a sensible change of it."""
+
+    constants: np.ndarray  # (p, c)
+    process_noise_cov: np.ndarray  # (p, n, n), symmetric
+    measurement_noise_cov: np.ndarray  # (p, m, m), symmetric
+    prior_mean: np.ndarray  # (p, n)
+    prior_cov: np.ndarray  # (p, n, n), symmetric
+
+
+class Density(NamedTuple):
+    """Of innovations: degrees of freedom of Student's t, and which channels (m,) the filter sees."""
+
+    degrees: float
+    seen: np.ndarray
+
+
+def derivatives(
+    model: StateSpaceModel,
+    inputs: np.ndarray,
+    measurements: np.ndarray,
+    slopes: ModelSlopes,
+    wanted: Wanted,
+    *,
+    density: Density | None = None,
+    blocks: int = 1,
+    starts: Starts | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log-likelihoods and gradients of parts of B runs, (B, blocks, 1 + p), and their information, (B, p, p).
+
+    Arguments are those of `filters.sensitivity.sensitivity`, of which shapes have been checked. Of what is not
+    wanted there is nothing: (B, 0, 0).
+    """
+    count, parameters, m = len(measurements), len(slopes.constants), model.m
+    recursion = recursion_of(model.functions, model.shape, wanted)
+    begun = as_the_prior_says(model, count) if starts is None else starts
+    own = 1.0 - (begun.free & begun.held).astype(np.float64)  # of runs whose priors parameters move
+    given = density or Density(np.inf, np.ones(m))
+    turns = 1 if (given.seen > 0).all() else 2  # channels that are predicted only come behind the others
+    tails = [tail_of(np.inf, m), tail_of(given.degrees, m)]
+    numbers = np.concatenate([model.numbers, *(tails if turns == 2 else tails[::-1])])
+    out = np.zeros((count, blocks, 1 + parameters))
+    information = np.zeros((count, parameters, parameters) if wanted.information else (count, 0, 0))
+    arguments = (
+        *(np.ascontiguousarray(one) for one in (inputs, measurements, _begins(model, begun))),
+        numbers,
+        _moves(slopes, model),
+        own,
+        begun.counted_from.astype(np.int64),
+        given.seen,
+        turns,
+        out,
+        information,
+    )
+    at_once, sizes = recursion.at_once, recursion.sizes(parameters)
+
+    def some(first: int, last: int) -> None:
+        memory = (np.zeros(size) for size in sizes)
+        recursion.run(*arguments, *memory, first * at_once, min(last * at_once, count))
+
+    spread(some, -(-count // at_once))
+    return out, information
+
+
+def _begins(model: StateSpaceModel, starts: Starts) -> np.ndarray:
+    """Mean and covariance of each run at its beginning, (B, n + n^2)."""
+    free, count = starts.free[:, None], len(starts.free)
+    means = wrapped_where(np.where(free, starts.means, model.prior_mean), model.shape.state_angles)
+    covs = np.where(free[..., None], starts.covs, model.prior_cov)
+    return np.concatenate([means, covs.reshape(count, model.n**2)], axis=1)
+
+
+def _moves(slopes: ModelSlopes, model: StateSpaceModel) -> np.ndarray:
+    """Rows of parameters, as `Memory` has them; at least one, for compiled code reads it."""
+    p, nn, mm = len(slopes.constants), model.n**2, model.m**2
+    noise = slopes.process_noise_cov.reshape(p, nn), slopes.measurement_noise_cov.reshape(p, mm)
+    prior = slopes.prior_mean, slopes.prior_cov.reshape(p, nn)
+    rows = np.concatenate([*noise, slopes.constants, _relative(slopes.constants, model)[:, None], *prior], axis=1)
+    return rows if p else np.zeros((1, rows.shape[1]))
+
+
+def _relative(slopes: np.ndarray, model: StateSpaceModel) -> np.ndarray:
+    """The largest of |dc|/(|c| + |dc|) for each parameter, (p,), in which steps along it are measured."""
+    base = np.abs(np.array(model.constants, dtype=np.float64)) + np.abs(slopes)
+    return (np.abs(slopes) / np.where(base > 0, base, 1.0)).max(axis=1, initial=0.0)

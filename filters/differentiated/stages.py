@@ -1,0 +1,130 @@
+"""A stage of a filter with derivatives: two functions, of which one works out values, the other slopes of these.
+
+The first is called once, the second for each parameter. What slopes need of the values is worked out with them
+and kept in memory: in the graph of the slopes it is what does not depend on a parameter, and is an argument of
+what does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from math import prod
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from numerics.algebra.calls import arguments_of, calls_of
+from numerics.algebra.derivatives import slopes_of
+from numerics.algebra.graphs import Graph, Number, needed_by
+from numerics.algebra.matrices import Matrix, Operation, evaluate, in_order
+from numerics.algebra.operations import present
+from numerics.algebra.programs import DECISIONS, Place, program_of
+
+OF_PARAMETER = ("change", "move")  # arrays whose numbers are those of a parameter
+FREE = ("given", "constant", *DECISIONS)  # operations whose results are at hand, or cannot be kept as floats
+
+
+class Stage(NamedTuple):
+    """What a stage leaves in memory: values in `rows`, and in `change` what is a parameter's."""
+
+    values: dict[int, Matrix]
+    slopes: dict[int, Matrix]
+
+    @property
+    def stores(self) -> tuple[list[tuple[Place, Matrix]], list[tuple[Place, Matrix]]]:
+        """Places of all values, then of all slopes."""
+        values = [(Place("rows", at), one) for at, one in self.values.items()]
+        return values, [(Place("change", at), one) for at, one in self.slopes.items()]
+
+
+def stage_of(values: Mapping[int, Matrix], slopes: Mapping[int, Matrix], moves: Mapping[Matrix, Matrix]) -> Stage:
+    """A stage that stores matrices at some places, and slopes of matrices at others."""
+    found = slopes_of(list(slopes.values()), moves)
+    return Stage(dict(values), {at: one for at, one in zip(slopes, found, strict=True) if one is not None})
+
+
+class Made(NamedTuple):
+    """A stage as two functions or programs, and how much of memory they use."""
+
+    values: Any
+    slopes: Any
+    length: int
+
+
+def as_programs(stage: Stage, first: int, most: int) -> Made:
+    """A stage as programs, whose kept numbers lie in rows from `first` on.
+
+    Raises:
+        TypeError: if a function cannot be traced, or there are more than `most` operations.
+    """
+    graph, wanted = Graph(most), [one for stores in stage.stores for _, one in stores]
+    known = {one: _numbers(graph, one) for one in in_order(wanted) if isinstance(one.operation, Place)}
+    entries = iter(evaluate(wanted, known))
+    values, slopes = (
+        [
+            (Place(array, start + k), graph.number(number))
+            for (array, start), _ in stores
+            for k, number in enumerate(np.ravel(np.array(next(entries), dtype=object)))
+        ]
+        for stores in stage.stores
+    )
+    slopes = [(place, number) for place, number in slopes if number.arguments != (place,)]
+    order = needed_by([number for _, number in slopes])
+    kept = _kept(order, lambda one: one.of, _of_parameter, lambda one: one.operation in FREE)
+    rows = {number.place: Place("rows", first + k) for k, number in enumerate(kept)}
+    values += [(rows[number.place], number) for number in kept]
+    return Made(program_of(values, {}), program_of(slopes, rows), first + len(kept))
+
+
+def _numbers(graph: Graph, one: Matrix) -> Any:
+    """The entries of a matrix that is given; of a symmetric one those on and below the diagonal are read."""
+    array, start = one.operation
+    found = np.empty(one.shape, dtype=object)
+    for at in np.ndindex(*one.shape):
+        there = tuple(sorted(at, reverse=True)) if one.symmetric else at
+        found[at] = graph.given(Place(array, start + int(np.ravel_multi_index(there, one.shape)) if at else start))
+    return found if one.shape else found[()]
+
+
+def _of_parameter(one: Number | Matrix) -> bool:
+    """Whether a number or matrix is given, for each parameter another one."""
+    place = one.operation if isinstance(one, Matrix) else one.arguments[0] if one.operation == "given" else None
+    return isinstance(place, Place) and place.array in OF_PARAMETER
+
+
+def _kept(order: Sequence, of: Callable, of_parameter: Callable, free: Callable) -> list:
+    """What is no parameter's among the arguments of what is; what is free is worked out anew, of what is kept."""
+    moving: set[int] = set()
+    found: dict[int, Any] = {}
+
+    def keep(one) -> None:
+        if free(one):
+            for argument in of(one):
+                keep(argument)
+        else:
+            found[id(one)] = one
+
+    for one in order:
+        if of_parameter(one) or any(id(a) in moving for a in of(one)):
+            moving.add(id(one))
+            for argument in of(one):
+                if id(argument) not in moving:
+                    keep(argument)
+    return list(found.values())
+
+
+def as_calls(stage: Stage, first: int, functions: Mapping[Operation, Callable], readers: Mapping) -> Made:
+    """A stage as functions that call others, whose kept matrices lie in rows from `first` on."""
+    values, slopes = stage.stores
+    slopes = [(place, one) for place, one in slopes if one.operation != place]
+    order = in_order([one for _, one in slopes], (), arguments_of)
+    kept = _kept(order, arguments_of, _of_parameter, lambda one: one.operation is present or not one.of)
+    rows = {}
+    for one in kept:
+        rows[one] = Place("rows", first)
+        first += prod(one.shape)
+    known = {one: one.operation for one in in_order([one for _, one in values + slopes]) if not one.of} | dict(
+        readers
+    )
+    values = values + [(place, one) for one, place in rows.items()]
+    return Made(calls_of(values, known, functions), calls_of(slopes, known | rows, functions), first)

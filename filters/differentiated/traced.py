@@ -1,0 +1,104 @@
+"""A model's functions, traced: graphs of numbers, and derivatives of these."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from numerics.algebra.graphs import Graph
+from numerics.algebra.programs import Place, values_of
+from numerics.algebra.slopes import along
+from numerics.algebra.tracing import traced
+from numerics.derivatives import by_complex_step
+from numerics.sources import is_array
+from plants.shape import Shape, constants_are_array
+
+MOST = 30_000  # operations of a stage: beyond, instructions take longer to compile than calls
+POINTS = ((0.1, 0.5), (1.0, 1.0), (1.0, 2.5), (10.0, 4.0))  # magnitudes and phases, where graphs are compared
+
+
+class Traced:
+    """A function of a model, traced: of arrays of Numbers it is what it does, and so are its derivatives.
+
+    Attributes:
+        parts: it, its Jacobian, and the slopes of both, as operations of `Equations` take them.
+    """
+
+    def __init__(self, function: Callable, jacobian: Callable | None, others: int, shape: Shape):
+        """Take the function of x and others, and its Jacobian as the model gives it, or None."""
+        self._function, self._others, self._shape = traced(function), others, shape
+        self._jacobian = None if jacobian is None or by_complex_step(jacobian) else traced(jacobian)
+        self.parts = self._value, self._matrix, self._by_constants, self._slope
+        self._check(function, jacobian)
+
+    def _check(self, *functions: Callable | None) -> None:
+        """Raise TypeError unless the graph has the functions' values, wherever these are finite.
+
+        A function that asks what kind of a number it got may have done something else with ours.
+        """
+        graph, shape = Graph(MOST), self._shape
+        sizes = (shape.n, shape.inputs, shape.constants) if self._others == 2 else (shape.n, shape.constants)
+        ends, agreed = np.cumsum(sizes), False
+        x, *others = np.split(np.array([graph.given(Place("numbers", k)) for k in range(ends[-1])]), ends[:-1])
+        graphs = [self._value(x, *others)]
+        if self._jacobian is not None:
+            graphs.append(self._matrix(x, None, *others))
+        numbers = [graph.number(one) for part in graphs for one in part.ravel()]
+        for magnitude, phase in POINTS:
+            point = magnitude * np.sin(phase + np.arange(ends[-1]))
+            point[ends[-2] :] = 0.1 + abs(point[ends[-2] :])  # constants
+            expected = _values_at(self._given(*np.split(point, ends[:-1])), functions[: len(graphs)])
+            if np.isfinite(expected).all():
+                with np.errstate(all="ignore"):
+                    found = values_of(numbers, point)
+                agreed = np.allclose(found, expected, rtol=1e-9, atol=1e-9 * abs(expected).max(initial=0.0))
+                if not agreed:
+                    raise TypeError("a function does something else with numbers that are not known yet")
+        if not agreed:
+            raise TypeError("a function has no value at any point where its graph could be compared with it")
+
+    def _given(self, x, *others) -> list:
+        """Arguments in the form in which the model takes them."""
+        *u, c = others
+        plain = [one if is_array(len(one)) else tuple(one) for one in (x, *u)]
+        form = self._shape.form
+        return [*plain, c if constants_are_array(form) else tuple(c) if isinstance(form, int) else form(*c)]
+
+    def _value(self, x, *others):
+        return np.array([*self._function(*self._given(x, *others))], dtype=object)
+
+    def _matrix(self, x, scales, *others):
+        if self._jacobian is not None:
+            return np.array([[*row] for row in self._jacobian(*self._given(x, *others))], dtype=object)
+        value = self._value(x, *others)
+        return np.array([_along(value, (x, unit)) for unit in np.eye(len(x))], dtype=object).T
+
+    def _by_constants(self, x, *others):
+        given, (dc, _) = others[: self._others], others[self._others :]
+        return _along(self._value(x, *given), (given[-1], dc))
+
+    def _slope(self, x, scales, *others):
+        given, (dx, *moves) = others[: self._others], others[self._others :]
+        return _along(self._matrix(x, scales, *given), (x, dx), *((given[-1], dc) for dc in moves[:1]))
+
+
+def _values_at(arguments: list, functions: Sequence[Callable | None]) -> np.ndarray:
+    """What functions return, one behind the other; NaN where they have no value."""
+    with np.errstate(all="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            values = [np.array(one(*arguments), dtype=np.float64).ravel() for one in functions if one]
+        except (ArithmeticError, ValueError, TypeError):  # also of complex numbers
+            return np.array([np.nan])
+    return np.concatenate(values)
+
+
+def _along(y: np.ndarray, *moves: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """The slope of y where Numbers that are given move."""
+    pairs = [(one, change) for given, changes in moves for one, change in zip(given, changes, strict=True)]
+    graph = pairs[0][0].graph
+    directions = {one.place: graph.number(change) for one, change in pairs if graph.number(change).value != 0.0}
+    found = along([graph.number(one) for one in y.ravel()], directions)
+    return np.array([0.0 if one is None else one for one in found], dtype=object).reshape(y.shape)

@@ -1,0 +1,1 @@
+"""Filters as in a textbook: pure functions of small matrices, for programs to differentiate and compile."""

@@ -1,0 +1,9 @@
+"""Algebra that is written once, as in a textbook, and worked out, differentiated and compiled by programs.
+
+graphs, folding, tracing          what a plain function of floats computes, as a graph of numbers
+slopes                            derivatives of such a graph
+matrices, operations, densities   what is computed of matrices: A @ B.T, divide(C, S), log_density(v, S, seen)
+derivatives                       of matrices, by the rules of matrix calculus
+programs, instructions            a graph of numbers as machine code, for some runs side by side
+calls                             a graph of matrices as calls of functions for its sizes, for any model
+"""

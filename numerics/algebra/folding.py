@@ -1,0 +1,87 @@
+"""Operations on Numbers that make others than themselves: of constants, with zeros and ones, with signs.
+
+A matrix of a model has zeros and ones in places that are known when it is traced. Products with them vanish
+here, so that no program multiplies by zero: of an A P A' with a sparse A little is left.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from numerics.algebra.graphs import Number
+
+
+def _values(*numbers: Number) -> list[float] | None:
+    """Values of constants, if all are."""
+    values = [number.value for number in numbers]
+    return None if None in values else values  # type: ignore[return-value]
+
+
+def worked_out(operation: str, *numbers: Number) -> Number:
+    """An operation of one or two numbers; that of constants is done."""
+    values, graph = _values(*numbers), numbers[0].graph
+    if values is None:
+        return graph.make(operation, *numbers)
+    try:
+        return graph.constant((_OF_CONSTANTS.get(operation) or getattr(math, operation))(*values))
+    except (ValueError, ArithmeticError):  # where machine code has NaN or infinity
+        return graph.make(operation, *numbers)
+
+
+_OF_CONSTANTS: dict[str, Callable] = {"negative": operator.neg, "abs": abs, "arctan": math.atan, "pow": math.pow}
+
+
+def negative(a: Number) -> Number:
+    """-a."""
+    if a.operation == "-":
+        return difference(a.arguments[1], a.arguments[0])
+    return a.arguments[0] if a.operation == "negative" else worked_out("negative", a)
+
+
+def total(a: Number, b: Number) -> Number:
+    """A sum: nothing is added to zero, and of a negative number the difference is taken."""
+    if (values := _values(a, b)) is not None:
+        return a.graph.constant(sum(values))
+    if 0.0 in (a.value, b.value):
+        return b if a.value == 0.0 else a
+    if b.operation == "negative":
+        return difference(a, b.arguments[0])
+    return difference(b, a.arguments[0]) if a.operation == "negative" else a.graph.make("+", a, b)
+
+
+def difference(a: Number, b: Number) -> Number:
+    """A difference, as a sum has it."""
+    if (values := _values(a, b)) is not None:
+        return a.graph.constant(values[0] - values[1])
+    if b.value == 0.0:
+        return a
+    if b.operation == "negative":
+        return total(a, b.arguments[0])
+    return negative(b) if a.value == 0.0 else a.graph.make("-", a, b)
+
+
+def product(a: Number, b: Number) -> Number:
+    """A product: zero with zero, the other one with one; signs stand before it."""
+    if (values := _values(a, b)) is not None:
+        return a.graph.constant(values[0] * values[1])
+    for one, other in ((a, b), (b, a)):
+        if one.value == 0.0:
+            return one
+        if one.value in (1.0, -1.0):
+            return other if one.value > 0 else negative(other)
+        if one.operation == "negative":
+            return negative(product(one.arguments[0], other))
+    return a.graph.make("*", a, b)
+
+
+def quotient(a: Number, b: Number) -> Number:
+    """A quotient, as the product with the reciprocal: of each divisor there is one."""
+    if a.value == 0.0 or b.value == 1.0:
+        return a
+    if b.value is not None:
+        return a.graph.make("/", a, b) if b.value == 0.0 else product(a, a.graph.constant(1.0 / b.value))
+    return b.graph.make("/", a, b) if a.value == 1.0 else product(a, quotient(b.graph.constant(1.0), b))

@@ -1,0 +1,228 @@
+"""Matrices and vectors that are not known yet: an algorithm written with them is a graph of operations.
+
+A page of a textbook, `sym(F @ P @ F.T) + Q`, is a function of matrices. Called with NumPy's arrays it computes;
+called with objects of this class it says what it would compute. What is said so can be differentiated
+(`derivatives`), worked out with Numbers in the places of floats (`evaluate`), or written out as calls of
+functions made for its sizes (`calls`).
+
+An `Operation` knows what it computes of arrays, whose entries may be floats or Numbers; the shape of that; and its
+derivative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+
+class Matrix:
+    """A matrix (rows, columns), vector (rows,) or number () that an operation makes of others.
+
+    Attributes:
+        operation: an `Operation`, or a name for one that is given.
+        arguments: what it is made of, Matrices and other values that can be hashed.
+        shape: of it.
+        symmetric: whether it is its own transpose.
+    """
+
+    __array_ufunc__ = None  # an array's operator leaves it to ours
+    __slots__ = ("operation", "arguments", "shape", "symmetric", "_made")
+
+    def __init__(
+        self, operation: Any, arguments: tuple = (), shape: tuple = (), symmetric: bool = False, made=None
+    ):
+        """For operations, and for `given`."""
+        self.operation, self.arguments, self.shape, self.symmetric = operation, arguments, shape, symmetric
+        self._made: dict = {} if made is None else made
+
+    @property
+    def of(self) -> tuple[Matrix, ...]:
+        """The matrices that it is made of."""
+        return tuple(a for a in self.arguments if isinstance(a, Matrix))
+
+    @property
+    def T(self) -> Matrix:
+        """The transpose."""
+        return self if self.symmetric else self.arguments[0] if self.operation is transposed else transposed(self)
+
+    def __repr__(self) -> str:
+        name = getattr(self.operation, "name", self.operation)
+        return f"<{name} {'x'.join(map(str, self.shape))}>"
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __add__(self, other):
+        return add(self, other)
+
+    def __sub__(self, other):
+        return subtract(self, other)
+
+    def __matmul__(self, other):
+        return multiply(self, other)
+
+    def __mul__(self, factor):
+        return scale(self, factor if isinstance(factor, Matrix) else float(factor))
+
+    __rmul__ = __mul__
+
+    def __neg__(self):
+        return scale(self, -1.0)
+
+
+class Operation:
+    """Something that is done with matrices; called with arrays it is done at once."""
+
+    def __init__(self, compute: Callable, shape: Callable, symmetric: Callable):
+        """For `operation`, and for the functions of a model."""
+        self.compute, self.shape, self.symmetric = compute, shape, symmetric
+        self.name, self.__doc__ = compute.__name__, compute.__doc__
+        self.slope: Callable = _no_rule
+
+    def __call__(self, *arguments):
+        """The result, or a Matrix that stands for it."""
+        known = next((a for a in arguments if isinstance(a, Matrix)), None)
+        if known is None:
+            return self.compute(*arguments)
+        made, key = known._made, (self, *arguments)
+        if key not in made:
+            shapes = [a.shape if isinstance(a, Matrix) else a for a in arguments]
+            made[key] = Matrix(self, arguments, self.shape(*shapes), self.symmetric(*arguments), made)
+        return made[key]
+
+    def derivative(self, rule: Callable) -> Callable:
+        """Decorate rule(result, arguments, slopes): the slope of the result, of slopes of which None are zero."""
+        self.slope = rule
+        return rule
+
+
+def _no_rule(result: Matrix, arguments: Sequence, slopes: Sequence) -> Matrix:
+    raise TypeError(f"there is no derivative of {result}")
+
+
+def never(*arguments) -> bool:
+    """Of results that are not symmetric, whatever they are made of."""
+    return False
+
+
+def operation(shape: Callable, symmetric: Callable = never) -> Callable:
+    """Decorate a function of arrays.
+
+    Args:
+        shape: of the result, a function of the arguments' shapes; an argument that is no matrix stands for itself.
+        symmetric: whether the result is, a function of the arguments.
+    """
+    return lambda compute: Operation(compute, shape, symmetric)
+
+
+def given(name: Any, shape: tuple[int, ...], *, symmetric: bool = False, beside: Matrix | None = None) -> Matrix:
+    """A matrix that is known when the others are worked out; `beside` one that it occurs together with."""
+    return Matrix(name, (), shape, symmetric, None if beside is None else beside._made)
+
+
+def same(shape, *others):
+    """The shape of the first argument."""
+    return shape
+
+
+def _product_shape(a: tuple, b: tuple) -> tuple:
+    return (*a[:-1], *b[1:])
+
+
+@operation(same, symmetric=lambda a, b: a.symmetric and b.symmetric)
+def add(a, b):
+    """The sum a + b."""
+    return a + b
+
+
+@operation(same, symmetric=lambda a, b: a.symmetric and b.symmetric)
+def subtract(a, b):
+    """The difference a - b."""
+    return a - b
+
+
+@operation(same, symmetric=lambda a, factor: a.symmetric)
+def scale(a, factor):
+    """A matrix times a number."""
+    return a * factor
+
+
+@operation(lambda shape: shape[::-1])
+def transposed(a):
+    """The transpose a'."""
+    return a.T
+
+
+@operation(_product_shape)
+def multiply(a, b):
+    """The product a b; its derivative stands in `operations`, with that of quotients."""
+    return a @ b
+
+
+def plus(*slopes: Matrix | None) -> Matrix | None:
+    """The sum of slopes, of which None are zero."""
+    moving = [slope for slope in slopes if slope is not None]
+    return sum(moving[1:], moving[0]) if moving else None
+
+
+def minus(first: Matrix | None, second: Matrix | None) -> Matrix | None:
+    """The difference of two slopes, of which None are zero."""
+    return (
+        first - second if first is not None and second is not None else plus(first, through(lambda a: -a, second))
+    )
+
+
+def through(operate: Callable, *arguments) -> Matrix | None:
+    """What an operation that is linear in all of these makes of them; zero where one is."""
+    return None if any(a is None for a in arguments) else operate(*arguments)
+
+
+@add.derivative
+def _of_sum(result, arguments, slopes):
+    return plus(*slopes)
+
+
+@subtract.derivative
+def _of_difference(result, arguments, slopes):
+    return minus(*slopes)
+
+
+@scale.derivative
+def _of_multiple(result, arguments, slopes):
+    return through(lambda slope: slope * arguments[1], slopes[0])
+
+
+@transposed.derivative
+def _of_transpose(result, arguments, slopes):
+    return through(lambda slope: slope.T, slopes[0])
+
+
+def evaluate(wanted: Sequence[Matrix], known: dict[Matrix, Any]) -> list:
+    """Values of matrices, of those of the matrices that are given: arrays, of floats or of Numbers."""
+    values = dict(known)
+    for one in in_order(wanted, known):
+        if one not in values:
+            arguments = (values[a] if isinstance(a, Matrix) else a for a in one.arguments)
+            values[one] = one.operation.compute(*arguments)
+    return [values[one] for one in wanted]
+
+
+def in_order(wanted: Sequence[Matrix], known=(), of: Callable = lambda one: one.of) -> list[Matrix]:
+    """Matrices and all that they are made of, in an order in which to work them out.
+
+    Args:
+        wanted: the last ones.
+        known: of which it does not matter what they are made of.
+        of: what a matrix is made of.
+    """
+    found: dict[Matrix, None] = {}
+
+    def visit(one: Matrix) -> None:
+        if one not in found:
+            for argument in () if one in known else of(one):
+                visit(argument)
+            found[one] = None
+
+    for one in wanted:
+        visit(one)
+    return list(found)

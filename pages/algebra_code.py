@@ -1,0 +1,134 @@
+"""Take the pieces of code of docs/algebra.md from the program.
+
+    python -m pages.algebra_code [FOLDER]
+
+What the page shows is made of the extended Kalman filter of a body that its drag slows down.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Sequence
+
+from filters import StateSpaceModel
+from filters.differentiated.equations import Equations
+from filters.differentiated.memory import Memory
+from filters.differentiated.recursion import MOST, Wanted, stages_of
+from filters.differentiated.stages import Stage, as_programs
+from filters.pages import extended
+from numerics.algebra.matrices import Matrix, in_order
+from numerics.algebra.programs import Place, Program
+from pages.page import make_page
+
+WANTED = Wanted(information=False, constants=True, tails=False)
+
+
+def slowed(x, u, c):
+    """The speed of a body a tenth of a second later: drag c[0] x |x|, and a force."""
+    return (x[0] - 0.1 * (c[0] * x[0] * abs(x[0]) - u[0]),)
+
+
+def seen(x, c):
+    """Its speed."""
+    return (x[0],)
+
+
+def body() -> StateSpaceModel:
+    """The body."""
+    return StateSpaceModel(
+        transition=slowed,
+        observe=seen,
+        constants=(0.5,),
+        process_noise_cov=[0.01],
+        measurement_noise_cov=[0.1],
+        prior_mean=[1.0],
+        prior_cov=[1.0],
+        inputs=1,
+    )
+
+
+def stages() -> tuple[list[Stage], Memory]:
+    """Of a step of its filter: advance, settle, update; and where numbers lie."""
+    model = body()
+    memory = Memory(model.shape)
+    equations = Equations(model.functions, memory, constants_move=True, trace=True)
+    return stages_of(memory, equations, WANTED), memory
+
+
+def block(text: str, language: str = "python") -> str:
+    """A block of code in Markdown."""
+    return f"```{language}\n{text}\n```"
+
+
+def page() -> str:
+    """The filter as it stands in a textbook."""
+    functions = extended.advance, extended.settle, extended.update
+    return block("\n\n\n".join(inspect.getsource(one).rstrip() for one in functions))
+
+
+def said(wanted: Sequence[Matrix], names: dict[Matrix, str]) -> list[str]:
+    """What operations some matrices are made of, a line each."""
+    lines = []
+    for one in in_order(wanted):
+        if one in names:
+            continue
+        if isinstance(one.operation, Place):
+            names[one] = str(one.operation)
+            continue
+        names[one] = f"m{sum(name.startswith('m') for name in names.values())}"
+        arguments = ", ".join(names[a] if isinstance(a, Matrix) else repr(a) for a in one.arguments)
+        lines.append(f"{names[one]} = {one.operation.name.strip('_')}({arguments})")
+    return lines
+
+
+def names_of(memory: Memory) -> dict[Matrix, str]:
+    """The matrices that are given, by the page's names."""
+    given = {memory.x: "x", memory.P: "P", memory.u: "u", memory.z: "z", memory.Q: "Q", memory.R: "R"}
+    given |= {memory.scales: "s", memory.constants: "c", memory.constants_slope: "dc", memory.size: "size"}
+    return given | {slope: f"d{given[one]}" for one, slope in memory.moves.items()}
+
+
+def graph() -> str:
+    """The update as a graph of matrices."""
+    made, memory = stages()
+    return block("\n".join(said(list(made[2].values.values()), names_of(memory))), "text")
+
+
+def slopes() -> str:
+    """The prediction's derivatives, beside what they share with its values."""
+    made, memory = stages()
+    names = names_of(memory)
+    values = said(list(made[0].values.values()), names)
+    derived = said(list(made[0].slopes.values()), names)
+    return block("\n".join([*values, "", *derived]), "text")
+
+
+def numbers() -> str:
+    """The prediction as programs: its values, and their derivatives."""
+    made, memory = stages()
+    both = as_programs(made[0], memory.length, MOST)
+    texts = ("\n".join(_shown(one)) for one in (both.values, both.slopes))
+    return block(
+        "\n\n".join(f"# {title}\n{text}" for title, text in zip(("values", "slopes"), texts, strict=True))
+    )
+
+
+def _shown(program: Program) -> list[str]:
+    """A program's lines, with constants in decimal digits."""
+    lines = []
+    for line in program.text:
+        name, _, value = line.partition(" = float.fromhex(")
+        lines.append(f"{name} = {float.fromhex(value[1:-2])!r}" if value else line)
+    return lines
+
+
+TABLES = {"page": page, "graph": graph, "slopes": slopes, "numbers": numbers}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line."""
+    make_page("algebra", "pages.algebra_code", {}, TABLES, "The code of docs/algebra.md.", arguments)
+
+
+if __name__ == "__main__":
+    main()

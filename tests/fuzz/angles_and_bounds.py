@@ -1,0 +1,134 @@
+"""Attacks on angles, on noise whose variances lie far apart, and on samples that are masked or NaN.
+
+Each takes a generator and how long it may take [s], and returns a line with what it counted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+
+import numpy as np
+
+from filters import FILTERS, affine_model, make_filter, run
+from filters.bounds import path_bound
+from filters.posterior import posterior_bound
+from filters.wrapped import wrapped_variances
+from numerics.angles import difference, on_one_branch, wrapped
+from numerics.compiled import interpreted
+from numerics.streams import filter_keys
+from plants.logs.log import Log, at_offset
+from tests.filters.test_bounds_at_any_scale import VELOCITY, apart, exact_covariances
+from tests.fuzz.python_interface import _line, _until
+from tests.models import line_model, simulated, small
+from tests.numerics.test_angles import data_of, makers, plain_run, rotated
+from tests.plants.test_logs_of_angles import model, recorded
+
+WITHIN = 2e-8  # of angle filters about another heading
+STEPS = 20
+
+
+def headings(rng: np.random.Generator, seconds: float) -> str:
+    """Every filter about any heading, with any whole turns in its compass: it errs as about 0."""
+    counts, names = Counter(), list(FILTERS)
+    with interpreted():
+        for k in _until(seconds):
+            name, heading = names[k % len(names)], rng.uniform(-20.0, 20.0)
+            _, plain, make = makers(name)
+            keys, inputs, measurements = data_of(plain)
+            seen = rotated(measurements, heading, rng.integers(-5, 6, size=measurements.shape[:2]))
+            found = run(small(name, make(heading)), keys, inputs, seen)
+            off = difference(found.means, plain_run(name).means + [0.0, heading], (False, True))
+            assert np.abs(off).max() < WITHIN, (name, heading)
+            assert (np.abs(found.means[..., 1]) <= math.pi).all(), (name, heading)
+            np.testing.assert_allclose(found.covs, plain_run(name).covs, rtol=WITHIN, atol=WITHIN)
+            counts["runs"] += 1
+    return _line("headings", counts)
+
+
+def angles_of_logs(rng: np.random.Generator, seconds: float) -> str:
+    """Clock offsets, spreads and bounds of an angle: those of the same motion about another heading."""
+    counts, far = Counter(), recorded(0.0)
+    for _ in _until(seconds):
+        heading, offset = rng.uniform(-math.pi, math.pi), rng.uniform(-0.3, 0.3)
+        near = recorded(heading)
+        for channel in ("measurement:z", "state:psi"):
+            pair = [at_offset(log, channel, offset) for log in (far, near)]
+            values = [
+                one.references[channel] if channel in one.references else one.measurements[:, 0] for one in pair
+            ]
+            off = wrapped(values[1] - values[0] - heading)
+            assert np.nanmax(np.abs(off)) < 1e-9 and (np.isnan(off) == np.isnan(values[0])).all(), (
+                heading,
+                offset,
+            )
+        spreads = [on_one_branch(log.measurements, (True,)).std() for log in (far, near)]
+        assert math.isclose(*spreads, rel_tol=1e-6), (heading, spreads)
+        variance = np.array([10.0 ** rng.uniform(-20, 20)])
+        bound = wrapped_variances(variance, model().shape.state_angles[:1])
+        assert 0.0 < bound[0] <= min(variance[0], math.pi**2 / 3), variance
+        counts["logs"] += 1
+    return _line("angles of logs", counts)
+
+
+def stiff_noise(rng: np.random.Generator, seconds: float) -> str:
+    """Bounds and the Kalman filter where Q, R and P lie up to 24 powers of ten apart, against 80 digits."""
+    counts = Counter()
+    with interpreted():
+        for _ in _until(seconds):
+            q = _covariance(rng, 10.0 ** rng.uniform(-20.0, 4.0, size=2))
+            prior, r = 10.0 ** rng.uniform(-4.0, 2.0, size=2), 10.0 ** rng.uniform(-4.0, 4.0)
+            f = np.array(VELOCITY) if rng.random() < 0.5 else np.diag(10.0 ** rng.uniform(-9.0, 0.0, size=2))
+            h = [1.0, 0.0] if rng.random() < 0.7 else [0.0, 1.0]
+            given = {"f": f.tolist(), "h": h, "r": r, "prior": prior.tolist(), "q": q.tolist()}
+            one = affine_model(
+                a=f,
+                b=np.zeros((2, 0)),
+                c=[h],
+                process_noise_cov=q,
+                measurement_noise_cov=[r],
+                prior_mean=[0.0, 0.0],
+                prior_cov=prior,
+            )
+            inputs, exact = np.zeros((1, STEPS, 0)), exact_covariances(f, h, r, prior, q, STEPS)
+            assert apart(posterior_bound(one, inputs, truths=2)[0], exact) < 1e-8, given
+            assert apart(path_bound(one, inputs)[0], exact) < 1e-5, given
+            kf = run(
+                make_filter("kf", one, form="square-root"), np.zeros((1, 2)), inputs, np.zeros((1, STEPS + 1, 1))
+            )
+            assert apart(kf.covs[0], exact) < 1e-8 and not kf.divergences.any(), given
+            counts["models"] += 1
+    return _line("stiff noise", counts)
+
+
+def masked_samples(rng: np.random.Generator, seconds: float) -> str:
+    """Samples behind a mask, of any share and with any fill value: the same as NaN on all paths."""
+    counts, names, one = Counter(), list(FILTERS), line_model()
+    with interpreted():
+        for k in _until(seconds):
+            name = names[k % len(names)]
+            inputs, measurements = simulated(one, 10, seed=int(rng.integers(1000)))
+            where = rng.random(measurements.shape) < rng.random()
+            plain = np.where(where, np.nan, measurements)
+            behind = float(rng.choice([1e300, -1.0, math.inf, math.nan, 0.0]))
+            hidden = np.ma.masked_array(np.where(where, behind, measurements), where, fill_value=3.0)
+            filter_ = small(name, one)
+            expected = run(filter_, filter_keys([k]), inputs, plain)
+            for part, other in zip(run(filter_, filter_keys([k]), inputs, hidden), expected, strict=True):
+                np.testing.assert_array_equal(part, other, err_msg=name)
+            session, other = filter_.session(), filter_.session()
+            session.start((k, 1), hidden[0, 0]), other.start((k, 1), plain[0, 0])
+            for step in range(10):
+                session.step(inputs[0, step], hidden[0, step + 1])
+                other.step(inputs[0, step], plain[0, step + 1])
+            np.testing.assert_array_equal(session.mean, other.mean, err_msg=name)
+            log = Log("run", 0.1, inputs[0], hidden[0], one.input_quantities, one.measurements)
+            np.testing.assert_array_equal(log.measurements, plain[0])
+            counts["runs"] += 1
+    return _line("masked samples", counts)
+
+
+def _covariance(rng: np.random.Generator, variances: np.ndarray) -> np.ndarray:
+    """A covariance of given variances, diagonal or correlated."""
+    correlation = rng.choice([0.0, rng.uniform(-0.999, 0.999)])
+    return np.sqrt(np.outer(variances, variances)) * np.array([[1.0, correlation], [correlation, 1.0]])

@@ -1,0 +1,241 @@
+"""Attacks on what a run follows from: streams of one seed, digests of changed code, arrays that others write into.
+
+Each takes a generator and how long it may take [s], and returns a line with what it counted.
+"""
+
+from __future__ import annotations
+
+import itertools
+import random
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+
+from filters import StateSpaceModel
+from filters.engine.batch import run
+from filters.estimators.estimator import Estimator
+from filters.estimators.find import foreign_filter
+from numerics.streams import SPAWN_KEYS, derived_generator, derived_seed
+from tests.fuzz.python_interface import _until
+from tuning.problems.digest import digest_of
+from tuning.problems.env_problem import EnvProblem
+
+STEPS, RUNS = 50, 20
+SURE = 6.0  # standard deviations of a correlation: one of some 1e8 pairs is beyond
+DRAWS: dict[str, Callable] = {
+    "env": lambda env: env.np_random.uniform(-1.0, 1.0),
+    "NumPy": lambda env: np.random.uniform(-1.0, 1.0),
+    "Python": lambda env: random.uniform(-1.0, 1.0),
+}
+
+
+class Plant(gym.Env):
+    """x' = a x + b u + w, w from one of several generators; arrays are new ones or the env's own buffers."""
+
+    def __init__(self, a: float, b: float, source: str, buffered: bool):
+        """Take the numbers."""
+        self.a, self.b, self.source, self.buffered = a, b, source, buffered
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+        self.buffers = {"observation": np.zeros(1), "state": np.zeros(1), "measurement": np.zeros(1)}
+        self.info = {"state": self.buffers["state"], "measurement": self.buffers["measurement"]}
+
+    def reset(self, *, seed=None, options=None):
+        """Begin at a random state."""
+        super().reset(seed=seed)
+        self.x = DRAWS[self.source](self)
+        return self.shown()
+
+    def step(self, action):
+        """One step; the action is spoilt."""
+        self.x = self.a * self.x + self.b * float(action[0]) + DRAWS[self.source](self)
+        if self.buffered:
+            action[:] = np.nan
+        observation, info = self.shown()
+        return observation, 0.0, False, False, info
+
+    def shown(self):
+        """What it shows, copies or buffers."""
+        for buffer in self.buffers.values():
+            buffer[:] = self.x
+        if self.buffered:
+            return self.buffers["observation"], self.info
+        copies = {name: buffer.copy() for name, buffer in self.buffers.items()}
+        return copies.pop("observation"), copies
+
+
+class Held:
+    """A policy that returns its own array, draws from any generator, and remembers until it is reset."""
+
+    def __init__(self, source: str):
+        """Take where it draws from."""
+        self.source, self.action, self.count = source, np.zeros(1), 0
+
+    def reset(self, seed=None):
+        """Forget."""
+        self.count, self.generator = 0, np.random.default_rng(seed)
+
+    def __call__(self, observation):
+        """An action; the observation is spoilt."""
+        self.count += 1
+        own = {"NumPy": np.random.uniform, "Python": random.uniform, "env": self.generator.uniform}[self.source]
+        self.action[:] = 0.9 * own(-1.0, 1.0) + 0.1 * np.sin(self.count)
+        return self.action
+
+
+def _model() -> StateSpaceModel:
+    return StateSpaceModel(
+        transition=lambda x, u, c: (0.5 * x[0] + u[0],),
+        observe=lambda x, c: (x[0],),
+        process_noise_cov=[0.3],
+        measurement_noise_cov=[0.1],
+        prior_mean=[0.0],
+        prior_cov=[1.0],
+        inputs=1,
+    )
+
+
+def runs_of_envs(rng: np.random.Generator, seconds: float) -> str:
+    """Envs and policies that draw anywhere, return buffers, write into arguments: the seed says all of a run."""
+    tried = 0
+    for _ in _until(seconds):
+        sources, seed = [str(rng.choice(list(DRAWS))) for _ in range(2)], int(rng.integers(2**40))
+        numbers = float(rng.uniform(-0.9, 0.9)), float(rng.uniform(0.1, 2.0)), sources[0]
+        policies = {
+            "random": lambda: "random",
+            "held": lambda: Held(sources[1]),  # noqa: B023
+            "steps": lambda: {"name": "steps", "amplitude": 1.0, "hold": 3},
+        }
+        name = str(rng.choice(list(policies)))
+        what = f"{numbers}, {name} from {sources[1]}, seed {seed}"
+        found = []
+        for buffered, seeds in ((False, range(seed, seed + RUNS)), (True, range(seed + RUNS - 1, seed - 1, -1))):
+            env = lambda buffered=buffered: Plant(*numbers, buffered)  # noqa: B023, E731
+            problem = EnvProblem(env, policies[name](), _model(), steps=STEPS, first_scored_step=0, scale=(1.0,))
+            np.random.seed(int(rng.integers(2**32)))
+            found.append(problem.data(list(seeds)))
+        plain, other = found
+        for part in ("inputs", "measurements", "states"):
+            assert np.array_equal(getattr(plain, part), getattr(other, part)[::-1]), f"{part} of {what}"
+        x, u = plain.states[..., 0], plain.inputs[..., 0]
+        w = x[:, 1:] - numbers[0] * x[:, :-1] - numbers[1] * u
+        _uncorrelated({"noise": w.ravel(), "inputs": u.ravel()}, what)
+        tried += 1
+    return f"runs of envs: {tried}, each the same in another order, with buffers and other global generators"
+
+
+def pairs_of_streams(rng: np.random.Generator, seconds: float) -> str:
+    """All generators of a random seed and of its neighbour."""
+    tried = 0
+    for _ in _until(seconds):
+        seed, number, rows = int(rng.integers(2 ** int(rng.integers(1, 62)))), int(rng.integers(100)), {}
+        for one in (seed, seed + 1):
+            rows[f"env {one}"] = np.random.default_rng(one).uniform(size=4000)
+            for purpose, key in SPAWN_KEYS.items():
+                rows[f"{purpose} {one}"] = derived_generator(one, key).uniform(size=4000)
+                rows[f"{purpose} {one} {number}"] = derived_generator(one, key, number).uniform(size=4000)
+                space = gym.spaces.Box(0.0, 1.0, (4000,), np.float64)
+                space.seed(derived_seed(one, key))
+                rows[f"space of {purpose} {one}"] = space.sample()
+        _uncorrelated(rows, f"seed {seed}")
+        tried += 1
+    return f"streams: {tried} seeds, {len(rows)} of each, no pair correlated"
+
+
+def _uncorrelated(rows: dict[str, np.ndarray], what: str) -> None:
+    parts = np.array(list(rows.values()))
+    found = np.abs(np.corrcoef(parts))
+    for i, j in itertools.combinations(range(len(rows)), 2):
+        names = list(rows)
+        assert found[i, j] < SURE / np.sqrt(parts.shape[1]), f"{names[i]} and {names[j]} of {what}: {found[i, j]}"
+
+
+def estimators(rng: np.random.Generator, seconds: float) -> str:
+    """Estimators that draw anywhere, remember and spoil their arguments: the key and the data say all of a run."""
+    tried, model = 0, _model()
+    for _ in _until(seconds):
+        source, steps = str(rng.choice(["NumPy", "Python"])), int(rng.integers(1, 20))
+        keys = rng.integers(0, 2**32, size=(3, 2)).astype(np.float64)
+        u, z = rng.normal(size=(3, steps, 1)), rng.normal(size=(3, steps + 1, 1))
+        z[rng.random(z.shape) < 0.2] = np.nan
+        filter_ = foreign_filter(_Spoiling(source), model)
+        whole = run(filter_, keys, u, z).means
+        order = rng.permutation(3)
+        np.random.seed(int(rng.integers(2**32)))
+        again = run(filter_, keys[order], u[order], z[order]).means
+        assert np.array_equal(again, whole[order]), f"an estimator that draws from {source}, keys {keys.tolist()}"
+        tried += 1
+    return f"estimators: {tried} batches, each run the same in another order"
+
+
+class _Spoiling(Estimator):
+    has_covariance = False
+
+    def __init__(self, source: str):
+        self.draw, self.mean, self.count = DRAWS[source], np.zeros(1), 0
+
+    def reset(self, key, z):
+        return self.step(np.zeros(1), z)
+
+    def step(self, u, z):
+        self.count += 1
+        self.mean[:] = self.draw(None) + self.count + u[0] + np.nan_to_num(z[0])
+        u[:], z[:] = np.nan, np.nan
+        return self.mean
+
+
+LINES = {
+    "A = {0}": "a module's constant",
+    "def helped(x): return x + {0} * A": "a helper",
+    "class Base:\n    def base(self, x): return helped(x) * {0}": "a base",
+    "class Kind(Base):\n    limit = {0}\n    def __init__(self, g={0}): self.g = g\n"
+    "    @property\n    def own(self): return self.g * {0}\n"
+    "    @staticmethod\n    def still(x): return x * {0}\n"
+    "    @classmethod\n    def made(cls): return cls({0})\n"
+    "    def __call__(self, x): return self.base(x) + self.own + self.still(x) + self.limit": "a class",
+    "def around(k):\n    def inner(x): return x + k * {0}\n    return inner": "a closure",
+    "VALUE = Kind({0}), Kind.made, functools.partial(Kind(), {0}), around({0}), lambda x: x * {0}": "values",
+}
+
+
+def digests(rng: np.random.Generator, seconds: float) -> str:
+    """Code of random numbers: one number changed is another digest; other orders, processes and names are none."""
+    tried, count = 0, sum(line.count("{0}") for line in LINES)
+    for k in _until(seconds):
+        numbers = rng.integers(1, 1000, count).tolist()
+        changed = [*numbers]
+        changed[int(rng.integers(count))] += 1000
+        with tempfile.TemporaryDirectory() as folder:
+            texts = [_text(numbers), "# a comment\n\n" + _text(numbers), _text(changed)]
+            found = [_digest(folder, f"m{k}_{i}_{rng.integers(2**30)}", text) for i, text in enumerate(texts)]
+            assert found[0] == found[1] != found[2], f"{numbers} and {changed}: {found}"
+            if k % 8 == 0:  # a process of its own takes a second
+                path = Path(folder) / "run_as_a_script.py"
+                path.write_text(
+                    texts[0] + "\nfrom tuning.problems.digest import digest_of\nprint(digest_of(VALUE))\n"
+                )
+                done = subprocess.run([sys.executable, str(path)], capture_output=True, text=True, check=True)
+                assert done.stdout.strip() == found[0], f"{numbers}: run {done.stdout}, imported {found[0]}"
+        tried += 1
+    return f"digests: {tried} files, each change seen, and nothing else"
+
+
+def _text(numbers: list[int]) -> str:
+    left = iter(numbers)
+    lines = "\n".join(LINES).split("{0}")
+    return "import functools\n" + lines[0] + "".join(f"{next(left)}.0{rest}" for rest in lines[1:])
+
+
+def _digest(folder: str, name: str, text: str) -> str:
+    (Path(folder) / f"{name}.py").write_text(text)
+    sys.path.insert(0, folder)
+    try:
+        return digest_of(__import__(name).VALUE)
+    finally:
+        sys.path.remove(folder)
+        sys.modules.pop(name, None)

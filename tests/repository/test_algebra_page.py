@@ -1,0 +1,37 @@
+"""docs/algebra.md shows the code that the program makes, and says of the example what is so."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from filters.likelihood import likelihood
+from numerics.compiled import interpreted
+from pages.algebra_code import TABLES, body
+
+PAGE = (Path(__file__).parents[2] / "docs" / "algebra.md").read_text()
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_piece_of_code_is_that_of_the_program(name):
+    assert f"<!-- table {name} -->\n{TABLES[name]()}\n<!-- end -->" in PAGE
+
+
+def test_the_programs_on_the_page_are_the_prediction():
+    values, _, slopes = TABLES["numbers"]().strip("`\n").removeprefix("python").partition("# slopes")
+    rows, change = np.zeros((60, 1)), np.zeros((4, 1))
+    numbers, move = np.zeros(40), np.zeros(10)
+    names = {"rows": rows, "change": change, "numbers": numbers, "move": move, "abs": abs, "where": np.where}
+    rows[:2, 0], rows[4, 0], change[:2, 0], move[2] = (2.0, 0.5), 1.0, (0.1, 0.2), 0.3
+    numbers[9] = 0.5  # the drag
+    exec(values + slopes, names)
+    f, df = 1 - 0.1 * 2 * 0.5 * 2.0, -0.1 * 2 * (0.3 * 2.0 + 0.5 * 0.1)  # by hand, for x > 0
+    np.testing.assert_allclose(rows[2:4, 0], (2.0 - 0.1 * (0.5 * 4.0 - 1.0), f * f * 0.5), rtol=1e-14)
+    expected = f * 0.1 - 0.1 * 0.3 * 4.0, f * f * 0.2 + 2 * f * df * 0.5
+    np.testing.assert_allclose(change[:2, 0], expected, rtol=1e-14)
+
+
+def test_the_body_has_a_likelihood():
+    with interpreted():
+        found = likelihood(body(), np.ones((1, 3, 1)), np.ones((1, 4, 1)), np.eye(1)[None], np.eye(1)[None])
+    assert np.isfinite(found.values).all() and np.isfinite(found.gradients).all()

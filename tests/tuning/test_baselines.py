@@ -1,0 +1,115 @@
+"""Baselines: what was given, the rule of thumb, the scaled default, noise estimation and the oracle."""
+
+import numpy as np
+import pytest
+
+from studies import lorenz63
+from studies.benchmark import noise_free_problem
+from tests import altitude_problem
+from tests.linear_problem import LinearProblem
+from tests.models import wide_model
+from tests.small_problems import UNITS, pair, thruster
+from tuning.evaluation.baselines import (
+    GIVEN,
+    NOISE,
+    ORACLE,
+    RULE,
+    SCALED,
+    TUNED,
+    baselines,
+    given,
+    noise_estimated,
+    rule_label,
+    rule_of_thumb,
+    same_filter,
+)
+from tuning.evaluation.held_out import evaluate_held_out
+from tuning.evaluation.residuals import noise_estimation, residuals
+from tuning.evaluation.worth import worth
+from tuning.problems.parameter import Parameter
+from tuning.reporting.gains import gains
+from tuning.search.correlations import correlations_of, full_covariance
+
+
+def test_what_the_model_of_a_user_came_with_is_a_baseline_and_comes_first():
+    own = wide_model(**UNITS).replace(process_noise_cov=[0.5, 0.5, 0.5])
+    problem = pair(assumed=own)
+    assert problem.given["process_noise_cov"] == (0.5, 0.5, 0.5)
+    found = baselines("kf", problem)
+    assert list(found) == [GIVEN, SCALED, RULE, NOISE, ORACLE]
+    np.testing.assert_array_equal(found[GIVEN].filter(problem).model.process_noise_cov, np.diag([0.5] * 3))
+    proof = evaluate_held_out(rule_of_thumb("kf", problem), problem, 0, 20)
+    assert list(proof.evaluations) == [GIVEN, RULE, SCALED, NOISE, TUNED, ORACLE]
+    assert list(proof.ratios)[0] == GIVEN and proof.ratios[RULE] == (1.0, 1.0, 1.0)
+    assert " against the given numbers" in worth(proof).partition(" and ")[0]
+    assert "that of the given numbers, x " in gains(proof, "seeds")[0]
+
+
+def test_a_model_with_the_noise_of_its_plant_gives_nothing_for_that_is_the_oracle():
+    assert pair().given is None and given("kf", pair()) is None and GIVEN not in baselines("kf", pair())
+    assert thruster().given is None
+
+
+def test_the_default_of_the_user_s_function_is_the_rule_of_thumb_and_given():
+    problem = altitude_problem.problem()
+    assert problem.untuned == problem.given == altitude_problem.GIVEN
+    assert list(baselines("ekf", problem)) == [GIVEN, SCALED, NOISE, ORACLE]
+    proof = evaluate_held_out(given("ekf", problem), problem, 0, 4)
+    assert list(proof.evaluations) == [GIVEN, SCALED, NOISE, TUNED, ORACLE]
+
+
+def test_own_numbers_are_within_their_ranges_always():
+    names = "sigma_a", "sigma_b", "r_baro", "r_range"
+    far = altitude_problem.problem(parameters=[Parameter(name, 10.0, 20.0) for name in names])
+    assert far.untuned == altitude_problem.GIVEN and [one.low for one in far.parameters] == [1.0, 0.01, 0.2, 3e-4]
+    told = altitude_problem.problem(untuned={"sigma_a": 500.0})
+    assert told.given["sigma_a"] == 500.0 == told.parameters[0].high
+    none = altitude_problem.problem(
+        parameters=[Parameter("x", 0.1, 10.0)], assumed=lambda x: altitude_problem.model(sigma_a=x)
+    )
+    assert none.given is None and none.untuned == {"x": pytest.approx(1.0)} and rule_label(none) == RULE
+
+
+def test_noise_estimation_finds_the_noise_of_a_simulation_and_what_a_model_lacks_in_the_mean():
+    problem = LinearProblem()
+    q, r = (noise_estimated("kf", problem).model[f"{name}_noise_cov"] for name in ("process", "measurement"))
+    np.testing.assert_allclose(q, 0.02 * np.eye(3), atol=0.003)
+    np.testing.assert_allclose(r, 0.1 * np.eye(2), atol=0.015)
+    biased = thruster(parameter_factors={"voltage_gain": 0.5})
+    assert abs(noise_estimation(biased).measurement_mean[0]) < 0.1
+    assert noise_estimated("open-loop", problem) is None
+    assert noise_estimation(LinearProblem(truth=False)).reason == "there is no truth"
+
+
+def test_noise_estimation_gives_no_noise_to_a_model_whose_residuals_are_rounding():
+    quiet = noise_free_problem(lorenz63.model(), steps=40, first_scored_step=10, scale=[1.0] * 3)
+    assert noise_estimated("ekf", quiet).model["process_noise_cov"] == (0.0, 0.0, 0.0)
+
+
+def test_residuals_are_those_of_the_model_step_by_step():
+    problem = thruster()
+    model, data = problem.model(), problem.data([1, 2])
+    found = residuals(model, data)
+    k, late = 3, data.late.start
+    x, u = tuple(data.states[0, late + k]), tuple(data.inputs[0, late + k])
+    for _ in range(model.substeps):
+        x = model.transition(x, u, model.constants)
+    np.testing.assert_allclose(found.process[k], data.states[0, late + k + 1] - x, rtol=1e-9, atol=1e-12)
+    seen = model.observe(tuple(data.states[0, late + k]), model.constants)
+    np.testing.assert_allclose(found.measurement[k], data.measurements[0, late + k] - seen, rtol=1e-9)
+
+
+def test_correlations_of_a_singular_covariance_are_none():
+    g = np.array([1.0, 2.0, 0.0])
+    singular = np.outer(g, g) + np.diag([0.0, 0.0, 3.0])
+    assert np.isfinite(correlations_of(singular)).all() and np.isfinite(correlations_of(np.zeros((2, 2)))).all()
+    np.testing.assert_allclose(full_covariance(np.diag(singular), correlations_of(singular)), singular, rtol=1e-2)
+    regular = np.array([[2.0, 0.3, -0.1], [0.3, 1.0, 0.4], [-0.1, 0.4, 0.5]])
+    np.testing.assert_allclose(full_covariance(np.diag(regular), correlations_of(regular)), regular, rtol=1e-12)
+
+
+def test_equal_filters_are_known_as_equal():
+    one = rule_of_thumb("kf", LinearProblem())
+    assert same_filter(one, rule_of_thumb("kf", LinearProblem())) and not same_filter(
+        one, one._replace(name="ekf")
+    )

@@ -1,0 +1,88 @@
+"""What a gap and outliers did to identified constants, and what cutting there and a gate make of it."""
+
+from functools import cache
+
+import numpy as np
+
+import tuning
+from numerics.streams import episode_keys
+from plants.affine import affine_model
+from plants.simulate import simulate
+from tuning.identification.validation import validate
+from tuning.logs.identify import remarks
+
+DT, COOLING, SPEED = 0.1, 52_000.0, 55.0  # [s], [J/(min K)], [rad/s/V]
+HEAT, PERIOD = 6e5, 25  # heat capacity [J/K]; rows for which the coolant keeps its temperature
+
+
+def kettle(cooling=48_000.0, process_noise_cov=1e-4, measurement_noise_cov=0.01):
+    """A cooled kettle: T' = cooling (T_c - T)/heat, in minutes of sixty rows."""
+    kept = 1.0 - cooling * DT / HEAT
+    return affine_model(
+        a=[[kept]], b=[[1.0 - kept]], c=[[1.0]], process_noise_cov=[process_noise_cov],
+        measurement_noise_cov=[measurement_noise_cov], prior_mean=[0.0], prior_cov=[0.01],
+        states=[("temperature", "T", "K")], input_quantities=[("coolant", "u", "K")],
+        measurements=[("thermometer", "z", "K")],
+    )  # fmt: skip
+
+
+def motor(gain=50.0, process_noise_cov=1.0, measurement_noise_cov=25.0):
+    """A motor whose speed follows its voltage: w' = (gain u - w)/(0.5 s)."""
+    return affine_model(
+        a=[[0.8]], b=[[0.2 * gain]], c=[[1.0]], process_noise_cov=[process_noise_cov],
+        measurement_noise_cov=[measurement_noise_cov], prior_mean=[0.0], prior_cov=[1.0],
+        states=[("speed", "w", "rad/s")], input_quantities=[("voltage", "u", "V")],
+        measurements=[("tachometer", "z", "rad/s")],
+    )  # fmt: skip
+
+
+def table(model, size, rows, seed):
+    """A run of a model under levels of its input."""
+    u = np.random.default_rng(seed).uniform(-size, size, rows // PERIOD).repeat(PERIOD)
+    drawn = simulate(model, episode_keys([seed]), u[None, :-1, None])
+    return {"time_s": DT * np.arange(rows), "u": u, "z": drawn.measurements[0, :, 0].copy()}
+
+
+def found_in(run, make, free, **options):
+    return tuning.identify(run, free, model=make, starts=1, use_all=True, **options)
+
+
+@cache
+def gap(hold):
+    run = table(kettle(COOLING), 30.0, 600, seed=2)
+    kept = np.r_[0:280, 320:600]
+    return found_in({name: one[kept] for name, one in run.items()}, kettle, "cooling", hold_gaps=hold)
+
+
+def test_a_constant_beside_a_gap_is_within_its_standard_error_where_the_run_is_cut_there():
+    cut = gap(False)
+    assert abs(cut.values["cooling"] - COOLING) < 3.9 * cut.standard_errors["cooling"]
+    assert abs(cut.values["Q11"] - 1e-4) < 3.9 * cut.standard_errors["Q11"]
+
+
+def test_held_over_the_gap_it_is_off_by_several_and_q_much_too_large():
+    cut, held = gap(False), gap(True)
+    assert abs(held.values["cooling"] - COOLING) > 3.9 * cut.standard_errors["cooling"]
+    assert held.values["Q11"] > 10 * cut.values["Q11"]
+    assert held.standard_errors["cooling"] > 3 * cut.standard_errors["cooling"]
+
+
+def test_outliers_name_the_gate_and_with_it_the_constant_is_nearer():
+    run = table(motor(SPEED), 2.0, 500, seed=3)
+    loaded = np.flatnonzero(run["u"] > 0.8)  # where the tachometer's brushes spark
+    run["z"][np.random.default_rng(4).choice(loaded, 12, replace=False)] += 150.0
+    plain, gated = (found_in(run, motor, "gain", **options) for options in ({}, {"gate": 5.0}))
+    unaware, said = (" ".join(one.sentences()) for one in (plain, gated))
+    assert "--gate 5" in unaware and "--gate 5" not in said
+    assert "within the gate: a filter" not in unaware
+    assert (
+        "needs a gate (session(gate=5)), or to be robust (ekf-robust). Figures of the runs it has seen are "
+        in said
+    )
+    whole = validate(gated.found, gated.runs)
+    assert gated.validation["identified"].log_likelihood > whole["identified"].log_likelihood + 100.0
+    proven = remarks(gated.runs, gated.runs, gated.found)
+    assert proven[-1].endswith("(ekf-robust). Figures of held-out runs count all samples.")
+    assert abs(gated.values["gain"] - SPEED) < 3.9 * gated.standard_errors["gain"]
+    assert abs(gated.values["gain"] - SPEED) < abs(plain.values["gain"] - SPEED) / 2
+    assert gated.standard_errors["gain"] < plain.standard_errors["gain"] / 2

@@ -1,0 +1,239 @@
+"""Runs of different lengths, and a truth here and there: every metric is that of each run by hand, pooled."""
+
+import numpy as np
+import pytest
+
+from filters import make_filter, run
+from filters.consistency.intervals import RESAMPLES
+from filters.consistency.nees import normalized_squares, whitened
+from filters.consistency.report import consistency_report
+from plants.affine import affine_model
+from tests.linear_problem import LinearProblem
+from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain, score_ratio
+from tuning.evaluation.sizes import close_size
+from tuning.likelihood.gradient import slopes_of
+from tuning.likelihood.identifiability import identify
+from tuning.likelihood.noise import noise_family
+from tuning.problems.check import check_data, checked_problem
+from tuning.problems.data import Data, mask_of, only, padded
+from tuning.problems.log_problem import LogProblem
+from tuning.problems.runs_problem import RunsProblem, log_of
+from tuning.reporting.time_figures import one_run
+from tuning.search.parameters import model_parameters
+from tuning.search.plan import Plan
+from tuning.search.space import untuned_choice
+
+LENGTHS, FIRST, SCALE = (75, 40, 61, 40, 28), 10, np.array([0.3, np.inf, 0.5])
+MODEL = LinearProblem().model()
+KF, WORSE = (make_filter("kf", MODEL.replace(process_noise_cov=[q, 0.02, 0.02])) for q in (0.02, 0.3))
+GAPS = np.arange(75) % 7 != 3  # where the truth is known, in the second test
+
+
+def runs_of(lengths=LENGTHS):
+    """Each run alone: inputs, measurements, states."""
+    found = [LinearProblem(steps=count - 1).data([7 + place]) for place, count in enumerate(lengths)]
+    return [(one.inputs[0], one.measurements[0], one.states[0]) for one in found]
+
+
+def data_of(runs, truth=None, junk=None):
+    """The runs as one; `junk` stands in the padding, and where the truth is unknown."""
+    inputs, measurements, states = zip(*runs, strict=True)
+    rows = max(map(len, measurements))
+    exists = mask_of([len(one) for one in measurements], rows)
+    counted = exists if truth is None else only(exists, np.broadcast_to(truth[:rows], (len(runs), rows)))
+    given = padded(inputs, rows - 1, None), padded(measurements, rows), padded(states, rows)
+    if junk is not None:
+        given[0][~exists[:, 1:]], given[1][~exists], given[2][~counted] = junk, junk, junk
+    keys = np.zeros((len(runs), 2))
+    with np.errstate(over="ignore"):
+        energy = {"E": 0.5 * given[2][..., 1] ** 2}
+    return Data(tuple(range(len(runs))), given[0], given[1], keys, FIRST, given[2], energy, counted)
+
+
+def by_hand(filter_, runs, truth=None):
+    """Squares, NEES, NIS, log-likelihoods and channels of the scored steps of each run, run alone."""
+    found = []
+    for inputs, measurements, states in runs:
+        one = run(filter_, np.zeros((1, 2)), inputs[None], measurements[None])
+        there = np.arange(len(measurements)) >= FIRST
+        there &= True if truth is None else truth[: len(measurements)]
+        errors, nu = one.means[0] - states, one.innovations[0]
+        nis = np.where(np.isnan(measurements).all(axis=1), np.nan, normalized_squares(nu, one.innovation_covs[0]))
+        energy = 0.5 * (one.means[0, :, 1] ** 2 - states[:, 1] ** 2)
+        parts = errors**2, normalized_squares(errors, one.covs[0]), nis, one.log_likelihoods[0], energy**2
+        found.append([part[there] for part in parts])
+    return found
+
+
+@pytest.mark.parametrize("truth", [None, GAPS], ids=["lengths", "gaps in the truth"])
+def test_metrics_are_those_of_each_run_pooled_over_all_scored_steps(truth):
+    runs = runs_of()
+    found = evaluate(KF, data_of(runs, truth), SCALE)
+    squares, nees, nis, likelihoods, energy = zip(*by_hand(KF, runs, truth), strict=True)
+    rmse = np.sqrt(np.concatenate(squares).mean(axis=0))
+    np.testing.assert_allclose([one.value for one in found.rmse], rmse, rtol=1e-12)
+    assert found.score.value == pytest.approx((rmse[0] / 0.3 + rmse[2] / 0.5) / 2, rel=1e-12)
+    assert found.nees.value == pytest.approx(np.concatenate(nees).mean(), rel=1e-10)
+    assert found.median_nees == pytest.approx(np.median(np.concatenate(nees)), rel=1e-10)
+    assert found.nis.value == pytest.approx(np.nanmean(np.concatenate(nis)), rel=1e-10)
+    np.testing.assert_allclose(found.log_likelihoods, [one.sum() for one in likelihoods], rtol=1e-12)
+    assert found.output_rmse["E"].value == pytest.approx(np.sqrt(np.concatenate(energy).mean()), rel=1e-12)
+    assert len(np.concatenate(squares)) < 5 * max(LENGTHS)
+
+
+def test_intervals_resample_whole_runs_with_their_lengths():
+    runs = runs_of()
+    found = evaluate(KF, data_of(runs), SCALE)
+    squares = [one[0] for one in by_hand(KF, runs)]
+    picks = np.random.default_rng(0).multinomial(5, [0.2] * 5, size=RESAMPLES)
+    sums, counts = np.array([one.sum(axis=0) for one in squares]), np.array([len(one) for one in squares])
+    ends = np.quantile(np.sqrt(picks @ sums / (picks @ counts)[:, None]), [0.025, 0.975], axis=0)
+    np.testing.assert_allclose([(one.low, one.high) for one in found.rmse], ends.T, rtol=1e-12)
+    worse = evaluate(WORSE, data_of(runs), SCALE)
+    np.testing.assert_allclose(score_ratio(worse, found).value, worse.score.value / found.score.value, rtol=1e-12)
+    assert likelihood_gain(found, worse).value == pytest.approx(found.log_likelihood - worse.log_likelihood)
+
+
+@pytest.mark.parametrize("junk", [np.nan, np.inf, 1e300, -3.0])
+def test_nothing_in_the_padding_changes_any_number(junk):
+    clean, dirty = (data_of(runs_of(), GAPS, given) for given in (None, junk))
+    for filter_ in (KF, make_filter("enkf", MODEL, ensemble_size=6)):
+        for one, other in zip(evaluate(filter_, clean, SCALE), evaluate(filter_, dirty, SCALE), strict=True):
+            np.testing.assert_array_equal(np.array(one, dtype=object), np.array(other, dtype=object))
+        reports = [repr(check_consistency(filter_, data)) for data in (clean, dirty)]
+        assert reports[0] == reports[1]
+    problem = LinearProblem()
+    choice = untuned_choice("kf", problem)
+    noise_at = noise_family(choice, problem, model_parameters(problem))
+    found = [slopes_of(problem, noise_at, data)(np.log(np.full(5, 0.1))) for data in (clean, dirty)]
+    np.testing.assert_array_equal(found[0].gradients, found[1].gradients)
+    assert np.isfinite(found[0].values).all()
+    np.testing.assert_array_equal(clean.beginning.measurements, dirty.beginning.measurements)
+    check_data(dirty, MODEL, "dirty")
+    shown = [one_run(KF, data, 1, None) for data in (clean, dirty)]
+    assert len(shown[0].time) == LENGTHS[1] and np.nanmax(np.abs(shown[0].errors - shown[1].errors)) == 0
+
+
+def test_consistency_is_looked_at_where_steps_are_scored():
+    data, runs = data_of(runs_of(), GAPS), runs_of()
+    found = check_consistency(KF, data)
+    squares, nees, nis, *_ = zip(*by_hand(KF, runs, GAPS), strict=True)
+    assert found.nees.mean.value == pytest.approx(np.concatenate(nees).mean(), rel=1e-10)
+    assert found.nis.mean.value == pytest.approx(np.nanmean(np.concatenate(nis)), rel=1e-10)
+    estimates = run(KF, data.filter_keys, data.seen.inputs, data.seen.measurements)
+    deviations = np.sqrt(estimates.covs[..., 0, 0])[data.scored]
+    inside = np.sqrt(np.concatenate(squares)[:, 0]) <= 1.959964 * deviations
+    assert found.coverage[0].value == pytest.approx(inside.mean(), rel=1e-12)
+    e = whitened(estimates.innovations, estimates.innovation_covs)
+    there = data.scored[..., None] & ~np.isnan(data.measurements)
+    pairs, e = there[:, :-1, 0] & there[:, 1:, 0], np.where(there, e, 0.0)
+    size = (e[..., 0] ** 2).sum() / there[..., 0].sum()
+    expected = (e[:, :-1, 0] * e[:, 1:, 0]).sum() / pairs.sum() / size
+    assert found.whiteness.correlations[0, 0, 0] == pytest.approx(expected, rel=1e-10)
+    alone = consistency_report(estimates, data.states, data.measurements, first_step=FIRST, counted=data.counted)
+    assert alone.nees.mean == found.nees.mean
+
+
+def test_what_all_runs_have_is_scored_as_before_to_the_last_bit():
+    data = LinearProblem().data(range(4))
+    everything = data._replace(counted=np.ones(data.measurements.shape[:2], dtype=bool))
+    before, masked = evaluate(KF, data, SCALE), evaluate(KF, everything, SCALE)
+    assert before.weights is None and masked.weights is None
+    errors = run(KF, data.filter_keys, data.inputs, data.measurements).means - data.states
+    late = np.ascontiguousarray(np.swapaxes(errors[:, FIRST:] ** 2, 0, 1))
+    np.testing.assert_array_equal(before.mean_squares, late.mean(axis=0))
+    np.testing.assert_allclose([one.value for one in before.rmse], [one.value for one in masked.rmse], rtol=1e-13)
+
+
+def test_a_restart_in_the_padding_is_none():
+    unstable = affine_model(
+        a=[[30.0]], b=[[1.0]], c=[[1.0]], process_noise_cov=[1.0], measurement_noise_cov=[1.0],
+        prior_mean=[0.0], prior_cov=[1.0],
+    )  # fmt: skip
+    filter_ = make_filter("kf", unstable)
+    z = [np.zeros((rows, 1)) for rows in (400, 5)]
+    data = Data((0, 1), np.zeros((2, 399, 1)), padded(z, 400), np.zeros((2, 2)), 0, counted=mask_of((400, 5), 400))
+    assert run(filter_, data.filter_keys, data.inputs, data.measurements).divergences[1] > 0
+    assert evaluate(filter_, data, None).divergences == 0
+
+
+def test_a_list_of_runs_is_a_problem_in_which_each_run_counts_in_full():
+    runs = runs_of((30, 47, 33, 52, 26, 61, 38, 44, 59))
+    runs[1][2][5:9] = np.nan  # truth unknown
+    problem = checked_problem(RunsProblem(runs, MODEL, first_scored_step=3, held_out=[2, 5], name="mine"))
+    assert (problem.training_seeds(0, 32), problem.held_out_seeds(0, 0)) == (range(7), range(7, 9))
+    lengths = [problem.data([seed]).scored_counts[0] for seed in range(9)]
+    assert sorted(lengths) == sorted([27, 40, 30, 49, 23, 58, 35, 41, 56])
+    held = problem.data(problem.held_out_seeds(0, 0))
+    np.testing.assert_array_equal(held.one(0).inputs[0], runs[2][0])
+    np.testing.assert_array_equal(held.one(1).states[0], runs[5][2])
+    named = [dict(zip(("inputs", "measurements", "states"), one, strict=True)) for one in runs]
+    same = RunsProblem(named, MODEL, first_scored_step=3, held_out=[2, 5])
+    assert same.digest == problem.digest and problem.counts_start_up
+    scored = np.concatenate(
+        [problem.data([seed]).states[0][problem.data([seed]).scored[0]] for seed in problem.parts.training]
+    )
+    np.testing.assert_allclose(problem.scale, scored.std(axis=0), rtol=1e-12)
+    assert RunsProblem([one[:2] for one in runs], MODEL).scale is None
+
+
+def test_logs_with_a_truth_are_not_cut_to_the_shortest():
+    logs = [log_of(one, MODEL, 0.1, f"log {place}") for place, one in enumerate(runs_of((90, 140, 75, 101)))]
+    problem = LogProblem(logs, MODEL, lead=10, blocks=1, held_out=["log 0", "log 1"])
+    assert sorted(problem.data(range(4)).scored_counts) == [65, 80, 91, 130]
+    gap = runs_of((90, 140, 75, 101, 300))
+    gap[4][2][:280] = np.nan
+    logs = [log_of(one, MODEL, 0.1, f"log {place}") for place, one in enumerate(gap)]
+    problem = checked_problem(LogProblem(logs, MODEL, lead=10))
+    assert all(problem.data([seed]).scored_counts[0] > 0 for seed in range(len(problem.parts.blocks)))
+
+
+def test_other_results_know_of_the_mask():
+    problem = RunsProblem(runs_of((30, 47, 33, 52, 26, 61)), MODEL, first_scored_step=3)
+    plan = Plan("enkf", (problem,), objectives=("likelihood",))
+    choice, data = untuned_choice("enkf", problem), plan.training_data()
+    assert close_size(choice, plan, data) in (5, 8, 10, 12, 15, 20, 30, 50, 75, 100, 150, 200)
+    kf = untuned_choice("kf", problem)
+    ends = problem.data(problem.parts.training)
+    space = Plan("kf", (problem,)).space()
+    tidy, junk = (identify(kf, (problem,), [one], space) for one in (ends, ends._replace(inputs=_late_junk(ends))))
+    np.testing.assert_array_equal(tidy.cov, junk.cov)
+
+
+def _late_junk(data):
+    past = np.arange(data.steps) + 1 >= data.rows[:, None]
+    return np.where(past[..., None], 1e9, data.inputs)
+
+
+BAD = {
+    "a list": (lambda: RunsProblem("runs.csv", MODEL), "runs must be a list of runs, .* but got 'runs.csv'"),
+    "parts": (lambda: RunsProblem([(1, 2, 3, 4)], MODEL), r"run 0 must be \(inputs, measurements\) or"),
+    "keys": (lambda: RunsProblem([{"z": [1.0]}], MODEL), "run 0 must have measurements, .* but got 'z'"),
+    "columns": (
+        lambda: RunsProblem([(np.ones((4, 1)), np.ones((5, 3)))], MODEL),
+        "measurements of run 0 must have 2",
+    ),
+    "rows": (
+        lambda: RunsProblem([(np.ones((5, 1)), np.ones((5, 2)))], MODEL),
+        r"inputs of run 0 .* \(4, 1\), but got",
+    ),
+    "model": (
+        lambda: RunsProblem([(np.ones((4, 1)), np.ones((5, 2)))], 3),
+        "model must be a StateSpaceModel, .* got 3",
+    ),
+}
+
+
+@pytest.mark.parametrize(("make", "line"), BAD.values(), ids=list(BAD))
+def test_what_is_no_run_is_one_clear_line(make, line):
+    with pytest.raises(ValueError, match=line) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_a_mask_of_another_shape_and_a_run_without_a_scored_step_are_refused():
+    data = data_of(runs_of())
+    with pytest.raises(ValueError, match=r"counted of problem x must be bool and of shape \(5, 75\)"):
+        check_data(data._replace(counted=np.ones((5, 3), dtype=bool)), MODEL, "x")
+    with pytest.raises(ValueError, match="each run of problem x must have a step that is scored, from 30 on"):
+        check_data(data._replace(first_scored=30), MODEL, "x")

@@ -1,0 +1,93 @@
+"""`thruster log`: the contents and the problems of a recorded log."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import RenderableType
+
+from plants.logs.findings import sentences
+from plants.logs.log import Log
+from thruster_cli.options import (
+    OUTPUT,
+    ClockOption,
+    ColumnOption,
+    DtOption,
+    JsonOption,
+    LogPresetOption,
+    ModelOption,
+    SensorOption,
+)
+from thruster_cli.output import check_picture, check_targets, emit, table
+from tuning.logs.read import read_named
+
+
+def command(
+    log: Annotated[Path, typer.Argument(metavar="LOG", help="A .csv, .parquet or .npz file with a header.")],
+    preset: LogPresetOption = None,
+    model: ModelOption = None,
+    sensor: SensorOption = None,
+    column: ColumnOption = None,
+    clock_offset: ClockOption = None,
+    dt: DtOption = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Picture of all channels, findings marked: .png, .svg or .pdf.",
+            rich_help_panel=OUTPUT,
+        ),
+    ] = None,
+    json: JsonOption = None,
+) -> None:
+    """Show how a recorded log is read: its channels, and the gaps, stuck sensors, outliers and the like in it.
+
+    Other commands that read logs print the same before their results. docs/logs.md has the rules.
+
+    Example: thruster log run.csv --plot run.png
+
+    Example: thruster log run.csv --sensor speed --column speed=motor_rpm --column voltage=u_cmd_V
+    """
+    if plot is not None:
+        check_picture(plot, "--plot")
+    recorded, _ = read_named(log, preset, model, sensor, column, clock_offset, dt)
+    check_targets((plot,), json, read=(log, preset))
+    if plot is not None:
+        from plants.logs.figure import findings_figure
+
+        findings_figure(plot, recorded)
+    emit(_shown(recorded, plot), _as_json(recorded, plot), json)
+
+
+def _shown(log: Log, plot: Path | None) -> list[RenderableType]:
+    rows = []
+    for channel in log.channels:
+        values = log.series(channel).values
+        kind, _, symbol = channel.partition(":")
+        some = {"input": log.input_quantities, "measurement": log.measured}.get(kind, [*log.referred.values()])
+        unit = next((one.unit for one in some if one.symbol == symbol), "")
+        name = f"{kind} {symbol} [{unit}]" if unit else f"{kind} {symbol}"
+        ends = [f"{values.min():.5g}", f"{values.max():.5g}", f"{values.std():.5g}"] if len(values) else [""] * 3
+        rows.append([name, str(len(values)), *ends])
+    on_grid = ", put on a grid" if log.irregular else ""
+    title = f"{log.name}: {log.steps + 1} rows, dt {log.dt:g} s{on_grid}"
+    columns = ["channel", "samples", "smallest", "largest", "standard\ndeviation"]
+    said = sentences(log.findings) or ["Nothing stands out: no gaps, no stuck sensors, no outliers."]
+    return [table(title, columns, rows), *said, *([f"wrote {plot}"] if plot is not None else [])]
+
+
+def _as_json(log: Log, plot: Path | None) -> dict:
+    return {
+        "log": log.name,
+        "digest": log.digest,
+        "dt": log.dt,
+        "rows": log.steps + 1,
+        "irregular": log.irregular,
+        "samples": {channel: len(log.series(channel).values) for channel in log.channels},
+        "pieces": [list(piece) for piece in log.pieces],
+        "findings": [asdict(one) for one in log.findings],
+        "files": [] if plot is None else [str(plot)],
+    }

@@ -1,0 +1,32 @@
+"""Does the model of a filter blow up between samples? Asked of its innovations on a problem's data."""
+
+from __future__ import annotations
+
+from filters.consistency.blow_up import blow_up_sentence
+from filters.engine.batch import Estimates
+from filters.filter import Filter
+from tuning.problems.data import Data
+from tuning.problems.in_parts import estimates_in_parts
+
+RUNS = 20  # that tell
+
+
+def blow_up(filter_: Filter, estimates: Estimates, data: Data, dt: float | None) -> str:
+    """A sentence on a filter whose model blows up between samples, from its scored innovations; empty otherwise.
+
+    Args:
+        filter_: that made the estimates.
+        estimates: on the same data.
+        data: inputs and measurements.
+        dt: sample time [s], if there is one.
+    """
+    names = [channel.name for channel in filter_.model.measurements]
+    innovations, measurements = (data.late_scored(one) for one in (estimates.innovations, data.measurements))
+    return blow_up_sentence(innovations, measurements, names, dt)
+
+
+def blow_up_on(filter_: Filter, data: Data, dt: float | None) -> str:
+    """`blow_up` of a filter on the first runs of some data."""
+    some = data.slice(0, RUNS)
+    said = [blow_up(filter_, estimates, one, dt) for one, estimates in estimates_in_parts(filter_, some)]
+    return next((one for one in said if one), "")

@@ -1,0 +1,168 @@
+"""Initial states of recorded runs: the model's prior, or a state determined by the first rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import chi2
+
+from filters.engine.batch import Estimates, run
+from filters.gaussian.extended import ExtendedKalmanFilter
+from filters.sensitivity import ModelSlopes, sensitivity
+from filters.starts import Starts, as_the_prior_says, wide_cov
+from numerics.angles import difference
+from plants.state_space import StateSpaceModel
+from tuning.problems.data import Data
+from tuning.problems.log_parts import LEAD
+
+PART = 4  # a lead-in is LEAD measured rows, at most the run's measured rows divided by this
+LEVEL = 1e-3  # of the test by which a run does not begin as the prior says
+STEPS = 20  # of Gauss and Newton, at most
+ROUNDING = 1e-6  # of a variance
+SETTLED = 0.1  # standard deviations by which a first state may still move
+
+
+def starts_of(model: StateSpaceModel, runs: Data, unseen: Sequence[bool] | None = None) -> Starts:
+    """The first state of each run, from its first rows alone, and which runs do not begin as the prior says.
+
+    The first state m maximises the likelihood of the first rows for a filter that begins there without a variance,
+    by Gauss-Newton steps (J + W^-1)^-1 g, with gradient g, Fisher information J and a wide covariance W. With the
+    model's prior N(m_0, P_0) of n states,
+
+        d = (m - m_0)' (P + P_0)^-1 (m - m_0),  P = (J + W^-1)^-1,
+
+    is chi-squared with n degrees of freedom for a run that begins as the prior says. Where it is beyond the
+    quantile of 1 - LEVEL the run begins elsewhere: its filter begins with N(m, W), and its lead-in does not count.
+    What does is the likelihood of the later rows, given the first ones. A state that the first rows do not
+    determine begins at the prior mean.
+
+    Args:
+        model: of the filter.
+        runs: inputs and measurements.
+        unseen: (m,) which channels the filter only predicts.
+
+    Source: Durbin, Koopman (2012), Time Series Analysis by State Space Methods, sections 5.2 and 5.7, on starts
+    that are diffuse or unknown constants.
+    """
+    count = len(runs.measurements)
+    found = as_the_prior_says(model, count)
+    seen = np.where(np.zeros(model.m, dtype=bool) if unseen is None else unseen, np.nan, runs.measurements)
+    found.leads[:] = [_lead(one) for one in seen]
+    rows = max(int(found.leads.max()), 1)
+    seen, inputs = seen[:, :rows], runs.inputs[:, : rows - 1]
+    seen = np.where((np.arange(rows) < found.leads[:, None])[..., None], seen, np.nan)
+    wide, guesses = _wide_and_guess(model, runs)
+    best = [_first_states(model, wide, inputs, seen, guess) for guess in guesses]
+    likeliest = np.argmax([one[2] for one in best], axis=0)
+    for place, (choice, lead) in enumerate(zip(likeliest, found.leads, strict=True)):
+        mean, cov, value = (part[place] for part in best[choice])
+        if lead > 0 and np.isfinite(value) and _is_elsewhere(model, mean, cov):
+            found.free[place], found.means[place], found.covs[place] = True, mean, wide
+    return found
+
+
+def estimates_of(
+    model: StateSpaceModel, runs: Data, starts: Starts | None, kind=ExtendedKalmanFilter
+) -> Estimates:
+    """What a filter makes of runs that begin where they do; innovations before the first row that counts are NaN.
+
+    Args:
+        model: of the filter.
+        runs: inputs and measurements.
+        starts: of the runs; None if all begin with the model's prior.
+        kind: the filter, with no other argument than the model.
+    """
+    if starts is None or not starts.free.any():
+        return run(kind(model=model), runs.filter_keys, runs.inputs, runs.measurements)
+    some = [runs.slice(place, place + 1) for place in range(len(runs.measurements))]
+    parts = [
+        run(kind(model=starts.model(model, place)), one.filter_keys, one.inputs, one.measurements)
+        for place, one in enumerate(some)
+    ]
+    return Estimates(*(np.concatenate([getattr(one, name) for one in parts]) for name in Estimates._fields))
+
+
+def _wide_and_guess(model: StateSpaceModel, runs: Data) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The wide covariance (n, n) of `filters.starts.wide_cov`, and guesses (B, n).
+
+    How far runs reach is what a simulation from the prior's mean says. Guesses are the prior's mean, and what the
+    inputs lead to where the first one has acted for long.
+    """
+    nothing = np.zeros((model.n, model.n))
+    simulated = ExtendedKalmanFilter(model=model.replace(process_noise_cov=nothing, prior_cov=nothing))
+    first = np.repeat(runs.inputs[:, :1], LEAD, axis=1)
+    blind = np.full((len(first), LEAD + 1, model.m), np.nan)
+    guesses = run(simulated, runs.filter_keys, first, blind).means[:, -1]
+    silent = np.full_like(runs.measurements, np.nan)
+    means = run(simulated, runs.filter_keys, runs.inputs, silent).means
+    reach = np.abs(difference(means, model.prior_mean, model.shape.state_angles))
+    reach = np.where(np.isfinite(reach), reach, 0.0).max(axis=(0, 1))
+    at_prior = np.tile(model.prior_mean, (len(first), 1))
+    settled = np.where(np.isfinite(guesses).all(axis=1, keepdims=True), guesses, at_prior)
+    return wide_cov(model, reach), [at_prior, settled]
+
+
+def _lead(measured: np.ndarray) -> int:
+    """Rows of the lead-in of a run with measurements (K + 1, m); 0 for a run with too few."""
+    there = np.flatnonzero(~np.isnan(measured).all(axis=1))
+    wanted = min(LEAD, len(there) // PART)
+    return int(there[wanted - 1]) + 1 if wanted > 0 else 0
+
+
+def _first_states(
+    model: StateSpaceModel, wide: np.ndarray, inputs: np.ndarray, measured: np.ndarray, guess: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Likeliest first states (B, n), their covariances (B, n, n), and log-likelihoods (B,), from a guess."""
+    n, count = model.n, len(measured)
+    scale = np.sqrt(np.diag(wide))
+    still = {name: np.zeros((n, *np.shape(getattr(model, name)))) for name in ModelSlopes._fields}
+    slopes = ModelSlopes(**{**still, "prior_mean": np.diag(scale)})  # a unit is a wide standard deviation
+    known = (scale > 0).astype(np.float64)
+
+    def at(means: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        begun = Starts(np.ones(count, dtype=bool), means, np.zeros((count, n, n)), np.zeros(count, dtype=np.int64))
+        found = sensitivity(model, inputs, measured, slopes, starts=begun._replace(held=False))
+        parts = found.gradients, found.information
+        fine = np.isfinite(found.values) & np.all(
+            [np.isfinite(one).reshape(count, -1).all(axis=1) for one in parts], 0
+        )
+        return np.where(fine, found.values, -np.inf), *(
+            np.nan_to_num(one, posinf=0.0, neginf=0.0) for one in parts
+        )
+
+    means, damping = np.array(guess), np.ones(count)
+    values, gradients, information = at(means)
+    for _ in range(STEPS):
+        matrix = information + damping[:, None, None] * np.eye(n)
+        step = known * np.linalg.solve(matrix, gradients[..., None])[..., 0]
+        if (np.abs(step) <= SETTLED * np.sqrt(1.0 / np.einsum("bii->bi", matrix))).all():
+            break
+        further = means + scale * step
+        after = at(further)
+        better = after[0] > values
+        damping = np.where(better, damping / 10.0, damping * 10.0)
+        means = np.where(better[:, None], further, means)
+        values, gradients, information = (
+            np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+            for new, old in zip(after, (values, gradients, information), strict=True)
+        )
+    covs = np.linalg.inv(information + np.eye(n))
+    variances = np.einsum("bii->bi", covs)
+    # Of a model that blows up along the first rows J is a number, and none of a Fisher information: then P > W.
+    sound = np.isfinite(covs).all(axis=(1, 2)) & ((variances > 0.0) & (variances < 1.0 + ROUNDING)).all(axis=1)
+    return means, covs * np.outer(scale, scale), np.where(sound, values, -np.inf)
+
+
+def _is_elsewhere(model: StateSpaceModel, mean: np.ndarray, cov: np.ndarray) -> bool:
+    """Whether a first state, known with a covariance, does not belong to the model's prior."""
+    apart, whole = difference(mean, model.prior_mean, model.shape.state_angles), cov + model.prior_cov
+    scale = np.sqrt(np.diag(whole))
+    some = scale > 0  # a state that is known exactly stays where it is
+    if not some.any():
+        return False
+    scaled = apart[some] / scale[some]
+    values, axes = np.linalg.eigh(whole[np.ix_(some, some)] / np.outer(scale[some], scale[some]))
+    along = scaled @ axes
+    distance = (along**2 / np.maximum(values, 1e-10)).sum()
+    return bool(distance > chi2.isf(LEVEL, int(some.sum())))

@@ -1,0 +1,113 @@
+"""The comparison of the best trials with the baselines, and its result, in sentences.
+
+NIS is the normalised innovation squared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import isfinite
+from typing import Any
+
+from filters.consistency.intervals import Interval, span
+from filters.consistency.verdicts import rounded
+from filters.tuned_file import NOISE
+from tuning.evaluation.baselines import BY_IMPORTANCE, called
+from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MOST_PRICE, MSE, PROPER
+from tuning.search.validation import choice_from
+
+
+def choice_sentences(found: Mapping[str, Any] | None, plan: Any) -> list[str]:
+    """The choice and its reason, then the price of a mean NIS within its band where it was too high.
+
+    Args:
+        found: from `tuning.search.validation.as_data`, or of a tuned file; nothing is said of None.
+        plan: of the study.
+    """
+    if not found:
+        return []
+    met = {one["name"]: one for one in found["met"]}
+    candidate, baseline = found["candidate"], found["baseline"]
+    likely = plan.objectives[0] in PROPER
+    over, what = _over(met[candidate]["over"], likely), _what(plan)
+    where = f"{len(_range(found['seeds']))} validation {plan.scenarios[0].seed_word}"
+    if not found["own_seeds"]:
+        where = f"the training {plan.scenarios[0].seed_word}, because there are too few to set some aside"
+    best = f"the best baseline, the {called(baseline)}"
+    if candidate == baseline:
+        said = [f"The {called(baseline)} {_verb(baseline)} taken: every trial is the same filter as a baseline."]
+    elif found["gave_way"]:
+        said = [
+            f"Tuning gave way to the {called(baseline)}: on {where} no trial is significantly better ({candidate} "
+            f"has {over} its {what})."
+        ]
+        if NOISE[0] in met[baseline]["choice"]["model"] and plan.scenarios[0].parameters is not None:
+            said.append(
+                f"Your own parameters cannot express its Q and R; in {candidate} they are "
+                f"{_own(met[candidate], plan)}."
+            )
+    elif _is_even(met[candidate]["over"], likely):
+        said = [
+            f"{_capital(candidate)} is taken: it has the same {what} as {best}, on {where}, and is consistent."
+        ]
+    else:
+        said = [f"{_capital(candidate)} is taken: on {where} it has {over} the {what} of {best}."]
+    if found["price"] is not None and found["price"] > MOST_PRICE:
+        channels = len(plan.scenarios[0].quantities.measurements)
+        said.append(_price_sentence(found, met[candidate], what, channels))
+    return said
+
+
+def _price_sentence(found: Mapping, taken: Mapping, what: str, channels: int) -> str:
+    """The price of the band, with both sides of the choice."""
+    inside = [one for one in found["met"] if one["consistent"] and one["name"] not in BY_IMPORTANCE]
+    best = min(inside, key=lambda one: one["value"])
+    nis = rounded(channels * best["nis"]), rounded(channels * taken["nis"])
+    return (
+        f"A mean NIS within its band would cost {100 * found['price']:.3g} % of the {what}, which is too much: "
+        f"{best['name']} has {rounded(best['value'])} with a mean NIS of {nis[0]}. Of the trials within "
+        f"{100 * MOST_PRICE:g} % of the best, {taken['name']} has the best log score: {rounded(taken['value'])} "
+        f"with a mean NIS of {nis[1]}, where {channels} is right."
+    )
+
+
+def _over(given: Sequence[float], likely: bool) -> str:
+    value, low, high = given
+    if not likely:
+        return f"{span(Interval(value, low, high), 3) if isfinite(low + high) else format(value, '.3f')} times"
+    gained = [f"{-part:+.3g}" for part in (value, high, low)]
+    known = isfinite(low + high) and gained[1] != gained[2]
+    return f"{gained[0]} [{gained[1]}, {gained[2]}] beside" if known else f"{gained[0]} beside"
+
+
+def _own(found: Mapping[str, Any], plan: Any) -> str:
+    """The user's own parameters of a validated choice, in words."""
+    choice = choice_from(found["choice"])
+    values = [(one, one.get(choice)) for one in plan.scenarios[0].parameters]
+    return ", ".join(f"{one.name} = {value:.3g} {one.unit}".rstrip() for one, value in values if value is not None)
+
+
+def _is_even(given: Sequence[float], likely: bool) -> bool:
+    return not given[2] < (0.0 if likely else 1.0)
+
+
+def _what(plan: Any) -> str:
+    named = {
+        "score": "score",
+        MSE: "mean square error",
+        LOG_SCORE: "log score",
+        LIKELIHOOD: "log-likelihood of a run",
+    }
+    return named.get(plan.objectives[0], "error")
+
+
+def _range(ends: Sequence[int]) -> range:
+    return range(*ends)
+
+
+def _verb(name: str) -> str:
+    return "are" if called(name).endswith("s") else "is"
+
+
+def _capital(words: str) -> str:
+    return words[:1].upper() + words[1:]

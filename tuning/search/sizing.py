@@ -1,0 +1,38 @@
+"""The ensemble size of a study's choice, from a table that the study keeps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import optuna
+
+from tuning.evaluation.kept import kept_sizes, sizes_as_data
+from tuning.evaluation.sizes import SizeRow, close_size, ensemble_sizes, sufficient_size
+from tuning.problems.data import Data
+from tuning.search.plan import Plan
+from tuning.search.space import Choice, has_ensemble
+
+SIZES = "ensemble sizes"  # attribute of a study: their table, with its digest
+
+
+def sizes_of(
+    study: optuna.Study, choice: Choice, plan: Plan, data: Sequence[Data], consistent: bool
+) -> list[SizeRow]:
+    """The table of ensemble sizes of a choice, kept with the study; empty where there is none."""
+    if not has_ensemble(choice.name) or len(plan.objectives) > 1:
+        return []
+    kept = kept_sizes(study.user_attrs.get(SIZES), choice, plan)
+    if kept is None:
+        kept = ensemble_sizes(choice, plan, data, consistent)
+        study.set_user_attr(SIZES, sizes_as_data(kept, choice, plan))
+    return kept
+
+
+def sized(choice: Choice, plan: Plan, data: Sequence[Data], sizes: Sequence[SizeRow], consistent: bool) -> Choice:
+    """A choice with the smallest sufficient ensemble; unchanged where it has none."""
+    if sizes:
+        return choice.with_size(sufficient_size(sizes, consistent))
+    recorded = all(scenario.leads_in for scenario in plan.scenarios)
+    if has_ensemble(choice.name) and len(plan.objectives) == 1 and recorded:
+        return choice.with_size(close_size(choice, plan, data))
+    return choice

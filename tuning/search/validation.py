@@ -1,0 +1,226 @@
+"""The choice at the end of a study: the best trials and the baselines meet on validation seeds.
+
+NIS is the normalised innovation squared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+from optuna.trial import FrozenTrial, TrialState
+
+from filters.consistency.intervals import Interval
+from filters.registry import filter_class
+from filters.tuned_file import NOISE as NOISE_ARGUMENTS
+from tuning.evaluation.baselines import ORACLE, baselines, same_filter
+from tuning.problems.data import Data
+from tuning.search.measures import Measured, measured, over
+from tuning.search.objectives import MOST_PRICE, MSE, NIS_BAND, OUTPUT, PROPER
+from tuning.search.outcome import best_trial, is_consistent
+from tuning.search.plan import Plan
+from tuning.search.space import Choice, choice_of
+from tuning.search.trials import cost_of
+
+VALIDATED = ("score", "thrust", MSE, *PROPER)  # objectives, beside those of outputs, that each run has
+BY_SCORE, BY_CONSISTENCY = 4, 2  # trials that meet the baselines: the best ones, and the best consistent ones
+EQUAL = 1e-4  # of the score, within which two filters are surely one in error, and consistency decides
+
+
+class Met(NamedTuple):
+    """One filter on the validation seeds."""
+
+    name: str  # of a baseline, or "trial 18" with trials numbered from 1
+    choice: Choice
+    value: float  # the study's objective: the score, or the negative log-likelihood of a run
+    over: Interval  # over the best baseline, paired: ratio of errors, or difference of log-likelihoods
+    proper: float  # log score of the state a step; without truth log-likelihood of a run; more is better
+    nis: float  # the mean NIS over the number of channels; of several problems the one farthest from 1
+    consistent: bool  # whether it is in its band on all problems
+
+
+class Validation(NamedTuple):
+    """The meeting of the best trials and the baselines, and what came of it."""
+
+    seeds: tuple[int, ...]  # of the first problem; of logs numbers of blocks
+    own: bool  # whether no trial saw them: a short log has no blocks to set aside
+    met: tuple[Met, ...]  # the baselines first
+    baseline: str  # name of the best baseline
+    candidate: str  # name of the best trial; that of the baseline where no trial is another filter
+    chosen: str  # which of the two the filter is that a study gives
+    price: float | None  # error of the best consistent trial over that of the best one, less 1
+
+    @property
+    def gave_way(self) -> bool:
+        """Whether the trials gave way to a baseline."""
+        return self.chosen == self.baseline
+
+    def named(self, name: str) -> Met:
+        """One of those that met."""
+        return next(one for one in self.met if one.name == name)
+
+    @property
+    def ratio(self) -> Interval:
+        """The best trial over the best baseline: ratio of errors, or difference of negative log-likelihoods."""
+        return self.named(self.candidate).over
+
+    @property
+    def paid(self) -> bool:
+        """Whether a mean NIS within its band cost so much that the best proper score was taken instead."""
+        return self.price is not None and self.price > MOST_PRICE
+
+
+def is_validated(plan: Plan) -> bool:
+    """Whether the runs of a plan's objective can be compared with those of baselines, filter by filter."""
+    first = plan.objectives[0]
+    return len(plan.objectives) == 1 and (first in VALIDATED or first.startswith(OUTPUT))
+
+
+def validate(
+    plan: Plan, trials: Sequence[FrozenTrial], training: Sequence[Data], resize: Callable[[Choice, bool], Choice]
+) -> Validation | None:
+    """Let the best trials and the baselines meet, and choose.
+
+    The best baseline is the one with the least objective. The best trial is the one with the least objective among
+    the consistent ones, if these cost at most 5 % more than the best of all; else the one with the best proper
+    score of those within 5 % of the best. The best trial is taken if it is significantly better than the best
+    baseline (Student's 95 % interval of the jackknife), or if it alone is consistent and surely loses less than
+    1e-4 of the error. Otherwise it gives way, also where parameters of the user's own cannot give the baseline.
+    The interval is not widened for the number of trials: a trial that is taken by chance is one that hardly
+    differs, and held out it is significantly worse in less than 1 % of studies.
+
+    Args:
+        plan: of the study.
+        trials: its trials.
+        training: its training data, by which the cost of a baseline is measured.
+        resize: gives the best trial its ensemble size before it is compared; called with whether it is consistent.
+
+    Returns:
+        What came of it; None for a plan whose objective cannot be compared, and where no trial is complete.
+    """
+    finalists = finalists_of(plan, trials)
+    if not is_validated(plan) or not finalists:
+        return None
+    data = plan.validation_data()
+    of_kind = next(iter(finalists.values())).name
+    before = _baselines_of(plan, of_kind, training)
+    if not before:  # all are over the budget
+        return None
+    finalists = {
+        name: choice
+        for name, choice in finalists.items()
+        if not any(same_filter(choice, one) for one in before.values())
+    }
+    everyone = {**before, **finalists}
+    found = {name: measured(one, plan, data) for name, one in everyone.items()}
+    baseline = min(before, key=lambda name: found[name].value)
+    ratio = plan.objectives[0] not in PROPER
+    candidate, price = _best_of(plan, {name: found[name] for name in finalists}, ratio)
+    if candidate is not None:
+        sized = resize(finalists[candidate], _is_consistent(found[candidate], plan))
+        if not same_filter(sized, finalists[candidate]):
+            everyone[candidate], found[candidate] = sized, measured(sized, plan, data)
+    met = tuple(
+        Met(
+            name,
+            everyone[name],
+            one.value,
+            over(one, found[baseline], ratio=ratio),
+            one.proper,
+            max(one.nis, key=lambda part: abs(part - 1.0)),
+            _is_consistent(one, plan),
+        )
+        for name, one in found.items()
+    )
+    seeds = data[0].seeds
+    own = not set(seeds) & set(training[0].seeds)
+    validation = Validation(seeds, own, met, baseline, candidate or baseline, baseline, price)
+    wins = candidate is not None and _wins(validation.named(candidate), validation.named(baseline), plan, ratio)
+    return validation._replace(chosen=candidate or baseline) if wins else validation
+
+
+def finalists_of(plan: Plan, trials: Sequence[FrozenTrial]) -> dict[str, Choice]:
+    """The trials that meet the baselines, by name: the best ones, and the best consistent ones."""
+    complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
+    complete.sort(key=lambda trial: trial.values[0])
+    best = best_trial(complete)
+    first = [] if best is None else [best]
+    chosen = [*first, *complete[:BY_SCORE], *[one for one in complete if is_consistent(one)][:BY_CONSISTENCY]]
+    return {f"trial {one.number + 1}": choice_of(plan.filter, one.params, plan.scenarios[0]) for one in chosen}
+
+
+def _baselines_of(plan: Plan, kind: str, training: Sequence[Data]) -> dict[str, Choice]:
+    """The baselines of a kind of filter but the oracle, within the budget; of several problems those of the first.
+
+    Where R is held none of them changes it.
+    """
+    problem = plan.scenarios[0]
+    found = {name: one for name, one in baselines(kind, problem, plan.seed).items() if name != ORACLE}
+    if plan.hold_r and filter_class(kind).has_covariance:
+        held = {"measurement_noise_cov": problem.untuned["measurement_noise_cov"]}
+        found = {name: one._replace(model={**one.model, **held}) for name, one in found.items()}
+    sizes = {(one.model().n, one.model().m) for one in plan.scenarios}
+    if len(sizes) > 1:  # a Q or R fits problems of one size alone
+        found = {name: one for name, one in found.items() if not set(NOISE_ARGUMENTS) & set(one.model)}
+    budget = plan.budget
+    if budget is not None:
+        found = {name: one for name, one in found.items() if cost_of(one, plan, training) <= budget}
+    return found
+
+
+def _best_of(plan: Plan, found: dict[str, Measured], ratio: bool) -> tuple[str | None, float | None]:
+    """The name of the best trial, and what a mean NIS within its band costs; None where there is none."""
+    if not found:
+        return None, None
+    free = min(found, key=lambda name: found[name].value)
+    inside = [name for name, one in found.items() if _is_consistent(one, plan)]
+    if not plan.is_constrained or not inside:
+        return free, None
+    best = min(inside, key=lambda name: found[name].value)
+    if not ratio:  # the objective is a proper score itself
+        return (best if over(found[best], found[free], ratio=False).low <= 0 else free), None
+    price = found[best].value / found[free].value - 1.0
+    if price <= MOST_PRICE:
+        return best, price
+    near = [name for name, one in found.items() if one.value <= (1.0 + MOST_PRICE) * found[free].value]
+    return max(near, key=lambda name: found[name].proper), price
+
+
+def _wins(candidate: Met, baseline: Met, plan: Plan, ratio: bool) -> bool:
+    """Whether the best trial is taken and not the best baseline."""
+    if not ratio:
+        return candidate.over.high < 0.0
+    alone = plan.is_constrained and candidate.consistent and not baseline.consistent
+    return candidate.over.high < (1.0 + EQUAL if alone else 1.0)
+
+
+def _is_consistent(found: Measured, plan: Plan) -> bool:
+    """Whether the mean NIS is in its band on all problems; true without a band."""
+    return not plan.is_constrained or all(NIS_BAND[0] <= one <= NIS_BAND[1] for one in found.nis)
+
+
+def as_data(found: Validation | None) -> dict | None:
+    """The meeting as plain data, for a tuned file and JSON."""
+    if found is None:
+        return None
+    return {
+        "chosen": found.chosen,
+        "candidate": found.candidate,
+        "baseline": found.baseline,
+        "gave_way": found.gave_way,
+        "seeds": [found.seeds[0], found.seeds[-1] + 1],
+        "own_seeds": found.own,
+        "price": found.price,
+        "met": [{**one._asdict(), "over": list(one.over), "choice": one.choice._asdict()} for one in found.met],
+    }
+
+
+def choice_from(data: Mapping) -> Choice:
+    """A choice from its plain data."""
+    return Choice(
+        data["name"], {key: _tuples(value) for key, value in data["model"].items()}, dict(data["numbers"])
+    )
+
+
+def _tuples(value):
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
