@@ -13,7 +13,7 @@ from optuna.trial import TrialState
 from tuning.search import database
 from tuning.search.plan import Plan
 from tuning.search.space import distributions
-from tuning.search.storage import PROCESS, RETRY_OF, open_storage
+from tuning.search.storage import PROCESS, RETRY_OF, open_storage, retry_once
 from tuning.search.study import open_study, run_study
 from tuning.thruster.find import find_scenario
 
@@ -83,6 +83,33 @@ def test_an_answer_that_gets_lost_is_asked_for_again(flaky):
     assert [trial.values for trial in study.trials] == [[1.0]]
     with pytest.raises(ValueError):  # what is finished cannot be told twice
         study.tell(trial.number, 1.0)
+
+
+@pytest.mark.filterwarnings("ignore:Heartbeat of storage is supposed to be used with Study.optimize")
+def test_a_trial_whose_making_was_not_answered_is_made_once(flaky):
+    storage, fail = flaky
+    study = optuna.create_study(storage=storage)
+    fail("_create_new_trial", 1)
+    study.enqueue_trial({"a": 0.5}, user_attrs={"kind": "given"})
+    assert [(t.state.name, t.user_attrs) for t in study.trials] == [("WAITING", {"kind": "given"})]
+    study.enqueue_trial({"a": 0.5})  # what is asked for twice is made twice
+    assert len(study.trials) == 2
+    popped = study.ask()
+    assert popped.number == 0 and popped.suggest_float("a", 0.0, 1.0) == 0.5
+    study.ask()
+    fail("_create_new_trial", 1)
+    running = study.ask()
+    assert running.number == 2 and [t.state.name for t in study.trials] == ["RUNNING"] * 3
+    study.tell(running, 1.0)
+
+
+def test_an_enqueued_trial_that_was_lost_before_its_first_parameter_is_enqueued_again(tmp_path):
+    study = optuna.create_study(storage=open_storage(str(tmp_path / "j")))
+    study.enqueue_trial({"a": 0.5})
+    study.ask()  # by a process that ends now: it never signs
+    assert retry_once(study, study.trials[0])
+    again = study.ask()
+    assert again.user_attrs == {RETRY_OF: 0} and again.suggest_float("a", 0.0, 1.0) == 0.5
 
 
 def test_patience_has_an_end(flaky, monkeypatch):

@@ -6,8 +6,10 @@ Only a study in a database loads SQLAlchemy, which takes a tenth of a second.
 from __future__ import annotations
 
 import contextlib
+import copy
 import re
 import time
+import uuid
 import warnings
 from collections.abc import Callable
 from functools import wraps
@@ -20,7 +22,7 @@ from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
 from optuna.storages import BaseStorage, GrpcStorageProxy, RDBStorage
 from optuna.storages._cached_storage import _CachedStorage
 from optuna.storages._heartbeat import BaseHeartbeat
-from optuna.trial import FrozenTrial
+from optuna.trial import FrozenTrial, TrialState, create_trial
 from sqlalchemy.exc import DBAPIError, OperationalError
 
 from tuning.search.storage_url import first_line, without_secrets
@@ -32,6 +34,7 @@ WITH_TIMEOUT = re.compile(r"(postgresql(\+psycopg2?)?|(mysql|mariadb)(\+(pymysql
 HEARTBEAT_SECONDS = 10  # between two signs of life of a running trial in a database
 GRACE_SECONDS = 180  # without one, after which it counts as lost; an outage is shorter
 PROXY_PORT, PROXY_SECONDS = 13000, 10  # the default port of a proxy, and the time in which it has to answer
+MARK = "made by call"  # system attribute of a trial, by which a repeated call finds what the first one made
 OnLost = Callable[[optuna.Study, FrozenTrial], Any]  # of a module: storages are pickled
 
 
@@ -154,6 +157,18 @@ def _all_patient(storage: type) -> type:
     return storage
 
 
+@_patient
+def _make_once(self: _PatientStorage, study_id: int, template: FrozenTrial, tries: list[bool]) -> int:
+    """Make a marked trial, unless an earlier try, whose answer got lost, has made it."""
+    if tries:
+        mark = template.system_attrs[MARK]
+        for trial in self.get_all_trials(study_id, deepcopy=False):
+            if trial.system_attrs.get(MARK) == mark:
+                return trial._trial_id
+    tries.append(True)
+    return _CachedStorage.create_new_trial(self, study_id, template)
+
+
 @_all_patient
 class _PatientStorage(_CachedStorage):
     """Optuna's cached storage of a database, whose calls are repeated until the database answers."""
@@ -161,6 +176,12 @@ class _PatientStorage(_CachedStorage):
     def __init__(self, database: RDBStorage):
         super().__init__(database)
         self.outage = Outage()
+
+    def create_new_trial(self, study_id: int, template_trial: FrozenTrial | None = None) -> int:
+        """Make one trial: it bears a mark, lest a call that is repeated makes it twice, and it runs twice."""
+        template = copy.deepcopy(template_trial) or create_trial(state=TrialState.RUNNING)
+        template.system_attrs[MARK] = uuid.uuid4().hex
+        return _make_once(self, study_id, template, [])
 
     def record_heartbeat(self, trial_id: int) -> None:
         """Give one sign of life; where it gets lost the next one follows soon, and other calls find out why."""

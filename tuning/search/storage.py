@@ -87,9 +87,10 @@ def retry_orphans(study: optuna.Study) -> int:
 
 def retry_once(study: optuna.Study, trial: FrozenTrial) -> bool:
     """Enqueue a lost trial once more, unless it is a second try or has no parameters yet; return whether so."""
-    if RETRY_OF in trial.user_attrs or not trial.params:
+    parameters = {**trial.system_attrs.get("fixed_params", {}), **trial.params}  # first those it was enqueued with
+    if RETRY_OF in trial.user_attrs or not parameters:
         return False
-    study.enqueue_trial(trial.params, user_attrs={RETRY_OF: trial.number})
+    study.enqueue_trial(parameters, user_attrs={RETRY_OF: trial.number})
     return True
 
 
