@@ -12,6 +12,7 @@ from tuning.likelihood.gradient import GradientResult
 from tuning.problems.problem import Problem
 from tuning.reporting.units import number_rows
 from tuning.search.filter_types import FilterType
+from tuning.search.objectives import LIKELIHOOD
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 
@@ -68,16 +69,23 @@ def _best(kind: FilterType) -> str:
 
 
 def gradient_table(found: GradientResult, seed_word: str = "seeds") -> Table:
-    """The result of each start, and how well the data determine the maximum."""
+    """The result of each start, and how well the data determine the optimum."""
+    likeliest = found.objective == LIKELIHOOD
     rows = [
         ["x ".join(f"{factor:g}" for factor in optimum.start)]
         + [f"{variance:.4g}" for variance in optimum.variances]
-        + [f"{optimum.log_likelihood:.2f}", str(optimum.evaluations)]
+        + [f"{found.level(optimum):{'.2f' if likeliest else '.6g'}}", str(optimum.evaluations)]
         for optimum in found.optima
     ]
     errors = [
         f"± {100 * error:.0f} %" if error < 1 else f"x/: {np.exp(error):.2g}" for error in found.standard_errors
     ]
     rows.append(["standard error", *errors, "", ""])
-    columns = ["start, factors on the rule of thumb", *found.names, "log L", "evaluations"]
-    return table(f"Maximum of the innovations' likelihood on the training {seed_word}", columns, rows)
+    columns = [
+        "start, factors on the rule of thumb",
+        *found.names,
+        "log L" if likeliest else found.objective,
+        "evaluations",
+    ]
+    what = "Maximum of the innovations' likelihood" if likeliest else f"Minimum of {found.objective}"
+    return table(f"{what} on the training {seed_word}", columns, rows)

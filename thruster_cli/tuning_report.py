@@ -26,7 +26,7 @@ from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.gains import gains
 from tuning.reporting.units import apart
 from tuning.search.filter_types import filter_types_tried
-from tuning.search.objectives import NIS_BAND
+from tuning.search.objectives import LIKELIHOOD, NIS_BAND
 from tuning.search.outcome import is_over_budget
 from tuning.search.plan import Plan
 from tuning.search.ranges import at_ends, range_words
@@ -170,15 +170,16 @@ def _gradient_sentences(tuning: Tuning, gradient: GradientResult, rival: Compari
     ours, theirs = tuning.proof.tuned, rival.tuned
     loose = [name for name, known in zip(gradient.names, gradient.identified, strict=True) if not known]
     words = []
+    optimum, optima = ("maximum", "maxima") if gradient.objective == LIKELIHOOD else ("minimum", "minima")
     if loose:
         words.append(
             f"The data do not determine {', '.join(loose)}: the 95 % interval exceeds a factor of ten, or the "
-            "maximum lies at the end of the range."
+            f"{optimum} lies at the end of the range."
         )
     agree = (
-        "All starts lead to the same maximum."
+        f"All starts lead to the same {optimum}."
         if gradient.agree
-        else "Starts lead to different maxima: the best is kept."
+        else f"Starts lead to different {optima}: the best is kept."
     )
     over = (
         f"Score over Optuna's on the held-out {tuning.scenario.seed_word}: {span(score_ratio(ours, theirs), 3)}."
@@ -234,7 +235,7 @@ def as_json(tuning: Tuning) -> dict:
     if tuning.gradient is not None and tuning.rival is not None:
         found = tuning.gradient
         data["gradient"] = {
-            "log_likelihood": found.best.log_likelihood,
+            "log_likelihood" if found.objective == LIKELIHOOD else found.objective: found.level(found.best),
             "standard_errors_of_logarithms": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
             "identified": dict(zip(found.names, found.identified.tolist(), strict=True)),
             "agree": found.agree,

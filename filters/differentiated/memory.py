@@ -11,9 +11,9 @@ from plants.shape import Shape
 class Memory:
     """The arrays of `numerics.algebra.programs`, for a model's sizes.
 
-        rows      x, P; x and P as a stage leaves them; u, z; log-likelihood; what derivatives need of the values
-        change    of a parameter: dx, dP; d log-likelihood; of the information what `notes` says, twice
-        numbers   the model's, then the tails of two densities (`operations.tail_of`)
+        rows      x, P; x and P as a stage leaves them; u, z; the score; the true x; what derivatives need
+        change    of a parameter: dx, dP; d score; of the information what `notes` says, twice
+        numbers   the model's, then the tails of two densities (`densities.tail_of`), and weights of errors
         move      of a parameter: dQ, dR, dc, the relative size of dc; dx and dP at the start
 
     Matrices lie by rows. Of what lies in `rows` and `change` there is one number for each run.
@@ -23,10 +23,10 @@ class Memory:
         """Take the sizes."""
         n, m, places = shape.n, shape.m, number_places(shape.n, shape.m)
         self.shape, self.state, self.notes = shape, n + n * n, m + m * m
-        self.left, self.input, self.measured, self.level, self.length = starts_of(
-            self.state, self.state, shape.inputs, m, 1
+        self.left, self.input, self.measured, self.level, self.true, self.length = starts_of(
+            self.state, self.state, shape.inputs, m, 1, n
         )[1:]
-        self.slope = self.state  # of the log-likelihood
+        self.slope = self.state  # of the score
         self.noted, self.weighed, self.depth = starts_of(self.state + 1, self.notes, self.notes)[1:]
         r, c, size, self.prior, self.width = starts_of(n * n, m * m, shape.constants, 1, self.state)[1:]
         tail = places.constants + shape.constants
@@ -39,6 +39,8 @@ class Memory:
         self.scales = self._beside("numbers", places.scales, n)
         self.constants = self._beside("numbers", places.constants, shape.constants)
         self.tails = [self._beside("numbers", first, m + 2) for first in (tail, self.predicted_tail)]
+        self.truth = self._beside("rows", self.true, n)
+        self.weights = self._beside("numbers", self.predicted_tail + m + 2, n, n, symmetric=True)
         self.constants_slope = self._beside("move", c, shape.constants)
         self.size = self._beside("move", size)
         self.moves = {

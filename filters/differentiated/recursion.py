@@ -29,12 +29,21 @@ from plants.shape import Functions, Shape, observation_slopes, transition_slopes
 AT_ONCE = 4  # runs of a program: of eight each would take a fifth less, but a run alone twice as long
 
 
+LIKELIHOOD, LOG_SCORE, SQUARES = "likelihood", "log-score", "squares"  # what is summed over steps
+
+
 class Wanted(NamedTuple):
-    """What is worked out beside the log-likelihood and its gradient."""
+    """What is worked out: a score, with its gradient, and what stands beside it."""
 
     information: bool  # Fisher's
     constants: bool  # slopes along the model's constants
     tails: bool  # densities with more outliers than the normal one, and channels that are predicted only
+    score: str = LIKELIHOOD  # of the innovations; or of the true states, which are given then
+
+    @property
+    def of_truth(self) -> bool:
+        """Whether the score is one of the true states."""
+        return self.score != LIKELIHOOD
 
 
 class Recursion(NamedTuple):
@@ -95,6 +104,11 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted) -> list[Stage]:
 
     stages = [moved(*extended.advance(model, x, p, memory.u)), moved(*extended.settle(model, x, p))]
     mean, cov, v, s, _ = extended.update(model, x, p, memory.z)
+    if wanted.of_truth:
+        known = present(memory.truth)
+        off = only(known, wrap(memory.truth - mean, model.state_angles))
+        stages.append(moved(mean, cov, *_of_truth(memory, off, cov, moves, wanted.score)))
+        return stages
     stages.append(moved(mean, cov, *_density(memory, v, s, moves, memory.tails[0], wanted)))
     if wanted.tails:
         seen = present(memory.z)
@@ -120,6 +134,21 @@ def _density(memory: Memory, v: Matrix, s: Matrix, moves: dict, tail: Matrix, wa
     return {memory.level: level}, slopes
 
 
+def _of_truth(memory: Memory, off: Matrix, cov: Matrix, moves: dict, score: str) -> tuple[dict, dict]:
+    """A score of the estimate, given its error without the states that do not count, and its slope."""
+    if score == SQUARES:
+        weighted = memory.weights @ off
+        doff = slopes_of([off], moves)[0]
+        slope = None if doff is None else dot(weighted, doff) * -2.0
+        return {memory.level: dot(weighted, off) * -1.0}, {memory.slope: slope}
+    known = present(memory.truth)
+    s = uncorrelated(known, cov)
+    of = factor(s)
+    w = quotient(off, of)
+    slope = density_slope(w, w, inverse(of, known), *slopes_of([off, s], moves))
+    return {memory.level: density(off, of, known)}, {memory.slope: slope}
+
+
 def _accumulator(
     memory: Memory, works: list[Callable], wanted: Wanted, at_once: int, fingerprint: str
 ) -> Callable:
@@ -130,12 +159,14 @@ def _accumulator(
     first_input, first_measured, level, slope = memory.input, memory.measured, memory.level, memory.slope
     prior, noted, weighed, notes = memory.prior, memory.noted, memory.weighed, memory.notes
     inputs_count, channels, informative = memory.shape.inputs, memory.shape.m, wanted.information
+    first_true, true_states = memory.true, memory.shape.n if wanted.of_truth else 0
     nan = np.nan
     substeps = number_places(memory.shape.n, memory.shape.m).substeps
 
     def accumulate(
         inputs,
         measurements,
+        truth,
         begins,
         numbers,
         moves,
@@ -191,6 +222,8 @@ def _accumulator(
                         for i in range(channels):
                             z = measurements[run, k, i]
                             rows[(first_measured + i) * at_once + j] = z if fed[i] == 1.0 - turn else nan
+                        for i in range(true_states):
+                            rows[(first_true + i) * at_once + j] = truth[run, k, i]
                     if turn == 0:
                         update(rows, changes[0], numbers, moves[0])
                         for q in range(count):

@@ -31,6 +31,13 @@ class Density(NamedTuple):
     seen: np.ndarray
 
 
+class Truth(NamedTuple):
+    """True states of B runs, NaN where they do not count, and the weight (n,) of each state's squared error."""
+
+    states: np.ndarray  # (B, K + 1, n)
+    weights: np.ndarray
+
+
 def derivatives(
     model: StateSpaceModel,
     inputs: np.ndarray,
@@ -41,8 +48,9 @@ def derivatives(
     density: Density | None = None,
     blocks: int = 1,
     starts: Starts | None = None,
+    truth: Truth | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Log-likelihoods and gradients of parts of B runs, (B, blocks, 1 + p), and their information, (B, p, p).
+    """Scores and gradients of parts of B runs, (B, blocks, 1 + p), and their information, (B, p, p).
 
     Arguments are those of `filters.sensitivity.sensitivity`, of which shapes have been checked. Of what is not
     wanted there is nothing: (B, 0, 0).
@@ -54,11 +62,12 @@ def derivatives(
     given = density or Density(np.inf, np.ones(m))
     turns = 1 if (given.seen > 0).all() else 2  # channels that are predicted only come behind the others
     tails = [tail_of(np.inf, m), tail_of(given.degrees, m)]
-    numbers = np.concatenate([model.numbers, *(tails if turns == 2 else tails[::-1])])
+    states, weights = truth or Truth(np.zeros((count, 0, 0)), np.zeros(0))
+    numbers = np.concatenate([model.numbers, *(tails if turns == 2 else tails[::-1]), np.diag(weights).ravel()])
     out = np.zeros((count, blocks, 1 + parameters))
     information = np.zeros((count, parameters, parameters) if wanted.information else (count, 0, 0))
     arguments = (
-        *(np.ascontiguousarray(one) for one in (inputs, measurements, _begins(model, begun))),
+        *(np.ascontiguousarray(one) for one in (inputs, measurements, states, _begins(model, begun))),
         numbers,
         _moves(slopes, model),
         own,

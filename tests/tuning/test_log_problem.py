@@ -129,7 +129,7 @@ def test_the_lead_in_counts_in_no_likelihood():
     evaluation = evaluate(choice.filter(problem), data, None)
     found = maximise_likelihood("kf", problem, data, [1.0])
     best = evaluate(found.choice.filter(problem), data, None)
-    assert best.log_likelihoods.sum() == pytest.approx(found.best.log_likelihood, rel=1e-9)
+    assert best.log_likelihoods.sum() == pytest.approx(found.best.value, rel=1e-9)
     assert best.log_likelihood >= evaluation.log_likelihood
     whole = likelihood(MODEL, data.inputs, data.measurements, np.zeros((1, 1, 1)), np.zeros((1, 1, 1)))
     assert whole.values.sum() < evaluate(_with(problem, MODEL), data, None).log_likelihoods.sum() - 10

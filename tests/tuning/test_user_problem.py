@@ -102,7 +102,7 @@ def test_by_python_a_study_of_one_number_comes_near_its_most_likely_value(tuned)
         choice = choice_of("ekf", {"sigma": factor * found.choice.model["sigma"]}, problem)
         return run(choice.filter(problem), data.filter_keys, data.inputs, data.measurements).log_likelihoods.sum()
 
-    assert log_likelihood(1.0) == pytest.approx(found.best.log_likelihood, rel=1e-9)
+    assert log_likelihood(1.0) == pytest.approx(found.best.value, rel=1e-9)
     assert log_likelihood(1.0) > max(log_likelihood(0.95), log_likelihood(1.05))
 
 

@@ -18,11 +18,12 @@ from numerics.files import check_target
 from tuning.api.progress import trial_bar, working
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
-from tuning.likelihood.gradient import DIFFERENTIABLE, GradientResult, maximise_likelihood
+from tuning.likelihood.gradient import DIFFERENTIABLE, OF_STATES, GradientResult, maximise_likelihood
 from tuning.likelihood.identifiability import Identifiability, identify
 from tuning.problems.assumed import AssumedProblem
 from tuning.problems.problem import Problem
 from tuning.reporting.choice_words import choice_sentences
+from tuning.search.objectives import LIKELIHOOD
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.storage import open_storage
 from tuning.search.study import FINISHED, StudyResult, checked, finished_trials, open_study, run_study, run_trials
@@ -42,7 +43,7 @@ class Tuning(NamedTuple):
     result: StudyResult
     proofs: tuple[Comparison, ...]  # one for each scenario
     file: Path | None  # the tuned file, where one was written
-    gradient: GradientResult | None = None  # where the choice is the maximum of the likelihood ...
+    gradient: GradientResult | None = None  # where the choice is the optimum that gradients lead to ...
     rival: Comparison | None = None  # ... and what an Optuna study in its stead would have chosen
     known: Identifiability | None = None  # what the innovations determine; None without a covariance
 
@@ -58,7 +59,9 @@ class Tuning(NamedTuple):
 
     @property
     def chosen(self) -> tuple[str, ...]:
-        """What was chosen and what gave way, in sentences."""
+        """Which trial was chosen and what gave way, in sentences; none where gradients led to the choice."""
+        if self.gradient is not None:
+            return ()
         return tuple(choice_sentences(as_data(self.result.validation), self.plan))
 
     def write(self, file: str | Path) -> None:
@@ -87,7 +90,8 @@ def run_tuning(
         storage: journal file or URL; None for a study that ends with the process.
         name: of the study; from the plan if None.
         out: the tuned file; none is written if None.
-        by_gradient: whether the choice is the maximum of the likelihood, beside a study.
+        by_gradient: whether the choice is the maximum of the likelihood, beside a study; of a study of "mse" or
+            "log-score" it is the minimum of that.
         workers: processes that share the study.
 
     Raises:
@@ -121,8 +125,10 @@ def run_tuning(
             result = run_study(study, plan, trials, advance, run)
     gradient = rival = None
     if by_gradient:
-        with working("maximising the likelihood", console):
-            gradient = maximise_likelihood(plan.filter, plan.scenarios[0], plan.training_data()[0])
+        aim = plan.objectives[0] if plan.objectives[0] in OF_STATES else LIKELIHOOD
+        with working(f"following the gradient of the {aim}", console):
+            data = plan.training_data()[0]
+            gradient = maximise_likelihood(plan.filter, plan.scenarios[0], data, objective=aim)
         rival = evaluate_held_out(result.choice, plan.scenarios[0], plan.seed)
         result = result._replace(choice=gradient.choice, consistent=None, nis=())
     try:

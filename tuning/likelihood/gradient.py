@@ -1,4 +1,4 @@
-"""Q and R by maximum likelihood of the innovations, with gradients."""
+"""Q and R by gradients: of maximum likelihood of the innovations, or of the best score at the true states."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from filters.differentiated.recursion import LOG_SCORE as OF_BELIEF
+from filters.differentiated.recursion import SQUARES
 from filters.likelihood import Likelihood, likelihood
+from filters.state_scores import state_score
 from numerics.checks import one_of
 from numerics.sources import is_array
 from tuning.likelihood.identifiability import KNOWN_WITHIN, TWO_SIDED
@@ -16,10 +19,12 @@ from tuning.likelihood.noise import noise_family
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
+from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE
 from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters
 from tuning.search.space import Choice, untuned_choice
 
 DIFFERENTIABLE = ("kf", "ekf")
+OF_STATES = {MSE: SQUARES, LOG_SCORE: OF_BELIEF}  # objectives on the true states that have a gradient
 BAD_START = (1.0, 1e-2, 1e2)  # factors on Q11, Q22 and R, far from the optimum
 STEP = 1e-3  # in the logarithms, of the differences of gradients that give the Hessian
 FLAT = 1e-12  # curvature relative to the largest one, below which a direction counts as flat
@@ -35,13 +40,13 @@ class Optimum(NamedTuple):
 
     start: tuple[float, ...]  # factors on the untuned parameters
     variances: np.ndarray  # (p,), the diagonals of Q, then of R; or the problem's parameters
-    log_likelihood: float  # of all training runs
-    evaluations: int  # of log-likelihood and gradient
+    value: float  # what is maximised: log L of all training runs; or - objective x scored steps
+    evaluations: int  # of that and its gradient
     converged: bool
 
 
 class GradientResult(NamedTuple):
-    """A maximum of the likelihood, and how well the data determine it."""
+    """A maximum of the likelihood, or the minimum of another objective, and how well the data determine it."""
 
     choice: Choice
     names: tuple[str, ...]  # of the parameters
@@ -51,10 +56,20 @@ class GradientResult(NamedTuple):
     identified: np.ndarray  # (p,) whether a parameter's 95 % interval is within a factor of ten
     agree: bool  # whether all starts led to the same optimum, in the identified variances
     seconds: float
+    objective: str = LIKELIHOOD
+    steps: int = 1  # scored steps of all runs
+
+    def level(self, optimum: Optimum) -> float:
+        """Log L of all runs at an optimum; of other objectives their value there, as a study has it."""
+        return optimum.value if self.objective == LIKELIHOOD else -optimum.value / self.steps
 
 
 def maximise_likelihood(
-    filter_name: str, problem: Problem, data: Data, starts: Sequence[Sequence[float] | float] | None = None
+    filter_name: str,
+    problem: Problem,
+    data: Data,
+    starts: Sequence[Sequence[float] | float] | None = None,
+    objective: str = LIKELIHOOD,
 ) -> GradientResult:
     """Find the diagonal Q and R under which a Kalman filter's innovations are most likely.
 
@@ -63,28 +78,38 @@ def maximise_likelihood(
     standard errors are the roots of the diagonal of H^-1 (sum_b g_b g_b') H^-1, which holds for a wrong model,
     too. If the problem has its own parameters, which determine Q and R, these are estimated.
 
+    With true states the same search minimises the objectives "log-score" and "mse" of a study, by the gradients of
+    `filters.state_scores`. A common factor on Q and R changes the mse of a linear filter only through the prior,
+    so that the mse determines none, and its covariance is of no use.
+
     Args:
         filter_name: "kf" or "ekf".
         problem: makes the assumed model, and has the untuned variances.
         data: the training runs.
         starts: factors on the untuned parameters, one for all or one each, (Q11, Q22, ..., R); `starts_of` if
             None.
+        objective: "likelihood", "log-score" or "mse".
 
     Raises:
-        ValueError: for another filter, or a parameter of the problem that changes more than Q and R.
+        ValueError: for another filter or objective, for one on true states without these, or a parameter of the
+            problem that changes more than Q and R.
 
     Source: Huber (1967), "The behavior of maximum likelihood estimates under nonstandard conditions".
     """
     one_of("filter", filter_name, DIFFERENTIABLE)
+    one_of("objective", objective, (LIKELIHOOD, *OF_STATES))
     begin = time.perf_counter()
     parameters = model_parameters(problem)
     untuned = untuned_choice(filter_name, problem)
     noise_at = noise_family(untuned, problem, parameters)
     bounds = [tuple(np.log([one.low, one.high])) for one in parameters]
     given = starts_of(parameters) if starts is None else starts
-    optima = [optimum(filter_name, problem, data, start) for start in given]
-    best = max(optima, key=lambda optimum: optimum.log_likelihood)
-    errors = _standard_errors(slopes_of(problem, noise_at, data), np.log(best.variances))
+    optima = [optimum(filter_name, problem, data, start, objective) for start in given]
+    best = max(optima, key=lambda optimum: optimum.value)
+    steps, unit = int(data.scored_counts.sum()), 1.0
+    if objective == MSE:  # as in least squares, information is counted in the mean square that remains
+        unit = -2.0 * best.value / np.isfinite(_counted(problem, data, objective)).sum()
+    errors = _standard_errors(slopes_of(problem, noise_at, data, objective), np.log(best.variances), unit)
     inside = np.array(
         [low < value < high for value, (low, high) in zip(np.log(best.variances), bounds, strict=True)]
     )
@@ -102,10 +127,18 @@ def maximise_likelihood(
         identified=identified,
         agree=all((distances < EQUAL_LOGARITHMS).all() for distances in apart),
         seconds=time.perf_counter() - begin,
+        objective=objective,
+        steps=steps,
     )
 
 
-def optimum(filter_name: str, problem: Problem, data: Data, start: Sequence[float] | float = 1.0) -> Optimum:
+def optimum(
+    filter_name: str,
+    problem: Problem,
+    data: Data,
+    start: Sequence[float] | float = 1.0,
+    objective: str = LIKELIHOOD,
+) -> Optimum:
     """The maximum to which one start leads, without the standard errors of `maximise_likelihood`.
 
     For models with many states, whose likelihood takes long, the search is first on a few runs, and continues on
@@ -116,6 +149,7 @@ def optimum(filter_name: str, problem: Problem, data: Data, start: Sequence[floa
         problem: as for `maximise_likelihood`.
         data: the training runs.
         start: factors on the untuned parameters, one for all or one each, (Q11, Q22, ..., R).
+        objective: as for `maximise_likelihood`.
     """
     parameters = model_parameters(problem)
     untuned = untuned_choice(filter_name, problem)
@@ -126,16 +160,21 @@ def optimum(filter_name: str, problem: Problem, data: Data, start: Sequence[floa
     point, count = np.log(reference * factors), len(data.measurements)
     large = is_large(problem)
     for runs in (FEW_RUNS, count) if large and count > FEW_RUNS else (count,):
-        found = _minimum(slopes_of(problem, noise_at, data.slice(0, runs)), point, bounds, large)
+        found = _minimum(slopes_of(problem, noise_at, data.slice(0, runs), objective), point, bounds, large)
         point = found.x
     return Optimum(tuple(factors.tolist()), np.exp(point), -found.fun, found.nfev, bool(found.success))
 
 
-def slopes_of(problem: Problem, noise_at: Callable, data: Data) -> Callable[[np.ndarray], Likelihood]:
+def slopes_of(
+    problem: Problem, noise_at: Callable, data: Data, objective: str = LIKELIHOOD
+) -> Callable[[np.ndarray], Likelihood]:
     """Log-likelihood of each run (B,), and its gradients (B, p), as a function of the logarithms of parameters.
 
-    The lead-in of runs, in which the filter settles, is left out of both.
+    The lead-in of runs, in which the filter settles, is left out of both. Of another objective it is minus the sum
+    of its terms over the scored steps.
     """
+    if objective != LIKELIHOOD:
+        return _of_states(problem, noise_at, data, objective)
     beginning = data.beginning if problem.leads_in and data.first_scored else None
 
     def slopes(logarithms: np.ndarray) -> Likelihood:
@@ -147,6 +186,24 @@ def slopes_of(problem: Problem, noise_at: Callable, data: Data) -> Callable[[np.
         return Likelihood(found.values - before.values, found.gradients - before.gradients)
 
     return slopes
+
+
+def _of_states(problem: Problem, noise_at: Callable, data: Data, objective: str) -> Callable:
+    truth, score = _counted(problem, data, objective), OF_STATES[objective]
+    weights = 1.0 / np.square(np.asarray(problem.scale, dtype=np.float64))
+
+    def slopes(logarithms: np.ndarray) -> Likelihood:
+        model, inputs, measurements, q_slopes, r_slopes = noise_at(np.exp(logarithms), data)
+        return state_score(model, inputs, measurements, truth, q_slopes, r_slopes, score, weights)
+
+    return slopes
+
+
+def _counted(problem: Problem, data: Data, objective: str) -> np.ndarray:
+    """The true states, NaN where an objective does not count them."""
+    if data.states is None or problem.scale is None:
+        raise ValueError(f"objective must be {LIKELIHOOD!r} without true states, but got {objective!r}")
+    return np.where(data.scored[..., None] & np.isfinite(problem.scale), data.states, np.nan)
 
 
 def is_large(problem: Problem) -> bool:
@@ -183,10 +240,11 @@ def _bad(parameter: Parameter) -> float:
     return BAD_START[parameter.place.index % 2] if isinstance(parameter.place, ProcessVariance) else BAD_START[1]
 
 
-def _standard_errors(slopes: Callable, logarithms: np.ndarray) -> np.ndarray:
+def _standard_errors(slopes: Callable, logarithms: np.ndarray, unit: float = 1.0) -> np.ndarray:
     """Standard errors of the logarithms, (p,): from the scatter between runs, or from the Hessian if larger.
 
-    In a direction in which the likelihood is flat both scatter and Hessian vanish, and the Hessian decides.
+    The Hessian is counted in a unit of what is maximised, which is 1 where that is a log density. In a direction
+    in which the likelihood is flat both scatter and Hessian vanish, and the Hessian decides.
     """
     count = len(logarithms)
     hessian = np.empty((count, count))
@@ -198,4 +256,4 @@ def _standard_errors(slopes: Callable, logarithms: np.ndarray) -> np.ndarray:
     scores = slopes(logarithms).gradients @ axes / values
     scores -= scores.mean(axis=0)
     scatter = axes @ (scores.T @ scores) @ axes.T * len(scores) / (len(scores) - 1)
-    return np.sqrt(np.maximum(np.diag(scatter), np.diag(axes / values @ axes.T)))
+    return np.sqrt(np.maximum(np.diag(scatter), unit * np.diag(axes / values @ axes.T)))

@@ -15,11 +15,12 @@ from optuna.trial import FrozenTrial, TrialState
 
 from filters.registry import filter_class
 from tuning.evaluation.baselines import GIVEN, ORACLE, RULE, baselines
-from tuning.likelihood.gradient import is_large, optimum, starts_of
+from tuning.likelihood.gradient import OF_STATES, is_large, optimum, starts_of
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 from tuning.search.cost import COST
 from tuning.search.local import is_local, near
+from tuning.search.objectives import LIKELIHOOD
 from tuning.search.outcome import best_trial, is_consistent, is_over_budget
 from tuning.search.parameters import model_parameters
 from tuning.search.plan import Plan
@@ -32,6 +33,7 @@ RESCALED = "consistent twin"  # how often the trial's Q and R have been rescaled
 SMALLER = "smaller ensemble of"  # number of the trial that was over the budget
 TRANSFERRED = "noise of"  # number of the trial of another filter type that Q and R are from
 MAXIMUM_LIKELIHOOD = "likeliest noise"  # Q and R have maximum likelihood; of a study what they are
+BY_GRADIENT = "gradient of"  # the objective on the true states, of which Q and R are the minimum; of a study they
 NEAR_BEST = "near"  # number of the best trial, of which this one is a variation
 BASELINE = "baseline"  # the name of the baseline that the trial is
 NEAR = 2e-5  # relative difference of parameters, above which trials are certainly not equal
@@ -65,10 +67,12 @@ def enqueue_after(study: optuna.Study, plan: Plan, last: FrozenTrial) -> None:
     if last.number == 0 and UNTUNED in last.user_attrs and len(plan.filter_types) == 1:
         _enqueue_baselines(study, plan)
         _enqueue_maximum_likelihood(study, plan, last.params)
+        _enqueue_minimum(study, plan, last.params)
     if last.number == MAXIMUM_LIKELIHOOD_AFTER - 1:
         best = best_trial(study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)))
         if best is not None:
             _enqueue_maximum_likelihood(study, plan, best.params)
+            _enqueue_minimum(study, plan, best.params)
     count = len(plan.filter_types)
     if count > 1 and _ends_a_round(last.number + 1, count):
         _enqueue_transferred_noise(study)
@@ -195,8 +199,17 @@ def _enqueue_maximum_likelihood(study: optuna.Study, plan: Plan, start: dict) ->
         enqueue_new(study, {**plain, **noise}, {MAXIMUM_LIKELIHOOD: True})
 
 
-def likeliest(study: optuna.Study, plan: Plan) -> dict[str, float] | None:
+def _enqueue_minimum(study: optuna.Study, plan: Plan, start: dict) -> None:
+    """Enqueue a trial's parameters with the Q and R to which gradients of the objective lead, if it has them."""
+    noise = likeliest(study, plan, plan.objectives[0]) if plan.objectives[0] in OF_STATES else None
+    if noise is not None:
+        enqueue_new(study, {**start, **noise}, {BY_GRADIENT: plan.objectives[0]})
+
+
+def likeliest(study: optuna.Study, plan: Plan, objective: str = LIKELIHOOD) -> dict[str, float] | None:
     """The Q and R, or own parameters, under which the innovations are most likely, kept with the study.
+
+    Of another objective that has gradients, those with its least value.
 
     They are those of the first scenario's model in an extended Kalman filter, or in the Kalman filter where that
     is tuned, by an ascent with gradients: of models of few states from three starts. Near the best Q and R the
@@ -205,7 +218,8 @@ def likeliest(study: optuna.Study, plan: Plan) -> dict[str, float] | None:
     """
     if plan.hold_r or not all(filter_class(name).has_covariance for name in plan.filter_types):
         return None
-    known = study.user_attrs.get(MAXIMUM_LIKELIHOOD)
+    key = MAXIMUM_LIKELIHOOD if objective == LIKELIHOOD else f"{BY_GRADIENT} {objective}"
+    known = study.user_attrs.get(key)
     if known is not None:
         return known or None
     problem, space = plan.scenarios[0], plan.space()
@@ -214,22 +228,22 @@ def likeliest(study: optuna.Study, plan: Plan) -> dict[str, float] | None:
     large = is_large(problem)
     data = data.slice(0, MAXIMUM_LIKELIHOOD_RUNS) if large else data
     try:
-        start = 1.0 if large or len(own) > MOST_FOR_STARTS else _best_start(name, problem, data)
-        found = optimum(name, problem, data, start)
+        start = 1.0 if large or len(own) > MOST_FOR_STARTS else _best_start(name, problem, data, objective)
+        found = optimum(name, problem, data, start, objective)
     except ValueError:  # more than Q and R changes, or on another scale
-        study.set_user_attr(MAXIMUM_LIKELIHOOD, {})
+        study.set_user_attr(key, {})
         return None
     names = [one.name for one in own]
     noise = _within(dict(zip(names, found.variances.tolist(), strict=True)), space)
-    study.set_user_attr(MAXIMUM_LIKELIHOOD, noise)
+    study.set_user_attr(key, noise)
     return noise
 
 
-def _best_start(name: str, problem: Problem, data: Data) -> list[float]:
+def _best_start(name: str, problem: Problem, data: Data, objective: str) -> list[float]:
     """The start of an ascent, as factors: on a few runs three starts are tried, and this is the highest end."""
     own, few = model_parameters(problem), data.slice(0, MAXIMUM_LIKELIHOOD_RUNS)
-    ends = [optimum(name, problem, few, start) for start in starts_of(own)]
-    best = max(ends, key=lambda one: one.log_likelihood)
+    ends = [optimum(name, problem, few, start, objective) for start in starts_of(own)]
+    best = max(ends, key=lambda one: one.value)
     before = untuned_choice(name, problem)
     return [value / one.get(before) for value, one in zip(best.variances.tolist(), own, strict=True)]
 

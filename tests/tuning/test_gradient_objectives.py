@@ -1,0 +1,57 @@
+"""Gradients of objectives on the true states: their minimum is a study's objective, and lower than others."""
+
+import numpy as np
+import pytest
+
+from tuning.evaluation.evaluate import evaluate
+from tuning.likelihood.gradient import maximise_likelihood
+from tuning.search.enqueued import BY_GRADIENT, MAXIMUM_LIKELIHOOD_AFTER
+from tuning.search.objectives import OBJECTIVES
+from tuning.search.plan import Plan
+from tuning.search.study import open_study, run_study
+from tuning.thruster.find import find_scenario
+
+MISMATCH = find_scenario("mismatch")
+
+
+def value_of(objective, choice, problem, data):
+    found = evaluate(choice.filter(problem), data, problem.scale)
+    return OBJECTIVES[objective].value(found, np.nan)
+
+
+@pytest.mark.parametrize("objective", ["mse", "log-score"])
+def test_the_minimum_is_the_objectives_and_lower_than_other_ways_lead(objective):
+    data = MISMATCH.data(range(40))
+    found = maximise_likelihood("ekf", MISMATCH, data, objective=objective)
+    least = value_of(objective, found.choice, MISMATCH, data)
+    assert found.level(found.best) == pytest.approx(least, rel=1e-9)
+    others = maximise_likelihood("ekf", MISMATCH, data, [1.0]).choice
+    assert least < value_of(objective, others, MISMATCH, data)
+    for name in found.names:  # a step either way is worse, unless the data do not tell
+        at = found.names.index(name)
+        for factor in (0.7, 1.4):
+            moved = found.best.variances.copy()
+            moved[at] *= factor
+            model = dict(found.choice.model) | {
+                "process_noise_cov": tuple(moved[:2]),
+                "measurement_noise_cov": tuple(moved[2:]),
+            }
+            assert least <= value_of(objective, found.choice._replace(model=model), MISMATCH, data) * (1 + 1e-9)
+
+
+def test_a_study_of_an_objective_that_has_a_gradient_tries_where_it_leads_and_finds_nothing_much_better():
+    plan = Plan("ekf", (MISMATCH,), objectives=("log-score",), consistent=False)
+    result = run_study(open_study("gradient", plan), plan, MAXIMUM_LIKELIHOOD_AFTER + 2)
+    (tried,) = [trial for trial in result.trials if BY_GRADIENT in trial.user_attrs]
+    assert 0 < tried.number < 6 and tried.user_attrs[BY_GRADIENT] == "log-score"
+    found = maximise_likelihood("ekf", MISMATCH, plan.training_data()[0], [1.0], "log-score")
+    assert [tried.params[name] for name in found.names] == pytest.approx(found.best.variances)
+    assert result.best_value == pytest.approx(found.level(found.best), rel=1e-6)
+
+
+def test_objectives_on_true_states_need_them():
+    data = MISMATCH.data(range(2))
+    with pytest.raises(ValueError, match="must be 'likelihood' without true states, but got 'mse'"):
+        maximise_likelihood("ekf", MISMATCH, data._replace(states=None), objective="mse")
+    with pytest.raises(ValueError, match="objective must be one of likelihood, mse, log-score, but got 'score'"):
+        maximise_likelihood("ekf", MISMATCH, data, objective="score")
