@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import linecache
 import sys
+import zlib
 from collections.abc import Callable, Iterable
 
 from numerics.compiled import inlined
@@ -34,26 +35,21 @@ def written_out(name: str, arguments: str, *lines: str, _loops: bool = False, **
 
 
 def _shown_in_tracebacks(name: str, text: str) -> str:
-    """A file name for a text, under which `linecache` finds it."""
+    """A file name for a text, under which `linecache` finds it.
+
+    Numba finds machine code again by the function's code, of which the name is a part: so it holds a digest of the
+    text, and no number, which would depend on what the process has made before.
+    """
     frame = sys._getframe(2)
     while frame.f_globals.get("__name__") in _MAKERS and frame.f_back is not None:
         frame = frame.f_back
     code, values = frame.f_code, frame.f_locals
     sizes = (values.get(argument) for argument in code.co_varnames[: code.co_argcount])
     shown = ", ".join(str(size) for size in sizes if type(size) is int)
-    stem = f"{name}, written out by {frame.f_globals.get('__name__')}.{code.co_name}({shown})"
-    number, file = 1, f"<{stem}>"
-    while _holds_another(file, text):
-        number += 1
-        file = f"<{stem} {number}>"
+    maker, digest = f"{frame.f_globals.get('__name__')}.{code.co_name}({shown})", zlib.crc32(text.encode())
+    file = f"<{name}, written out by {maker}, {digest:08x}>"
     linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
     return file
-
-
-def _holds_another(file: str, text: str) -> bool:
-    """Whether `linecache` holds another text under a name."""
-    held = linecache.cache.get(file)
-    return held is not None and (len(held) == 1 or "".join(held[2]) != text)
 
 
 def made_here(function: Callable) -> bool:

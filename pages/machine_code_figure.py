@@ -37,7 +37,7 @@ def inside(function: Callable, *path: str) -> Callable:
 def written(function: Callable) -> str:
     """The text that a function was made of, laid out by rows, under who made it."""
     file = function.__code__.co_filename
-    maker = file.strip("<>").partition("written out by ")[2]
+    maker = file.strip("<>").partition("written out by ")[2].rpartition(", ")[0]  # without the digest of its text
     text = ast.unparse(ast.parse("".join(linecache.getlines(file))))
     body, _, result = text.rpartition("    return ")
     rows = [ast.unparse(row) for row in ast.parse(result).body[0].value.elts] if result.startswith("((") else []
