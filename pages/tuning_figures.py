@@ -21,7 +21,7 @@ from pages.tuning_recovery import bad_start
 from tuning.evaluation.baselines import ORACLE, RULE, SCALED
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
-from tuning.likelihood.gradient import maximise_likelihood
+from tuning.likelihood.gradient import tune_by_gradient
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, NIS_BAND
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
@@ -120,9 +120,9 @@ def recovered() -> str:
 def likeliest() -> str:
     """The maximum of the likelihood beside the true numbers."""
     scenario = find_scenario("nominal")
-    found = maximise_likelihood("ekf", scenario, Plan("ekf", (scenario,), SEED).training_data()[0])
+    found = tune_by_gradient("ekf", scenario, Plan("ekf", (scenario,), SEED).training_data()[0])
     true = (*scenario.process_noise_cov, scenario.measurement_noise_cov)
-    columns = zip(found.names, true, found.best.variances, found.standard_errors, strict=True)
+    columns = zip(found.names, true, found.best.parameters, found.standard_errors, strict=True)
     rows = [[name, f"{value:.4g}", f"{best:.4g}", f"{100 * error:.0f} %"] for name, value, best, error in columns]
     return table(["", "true", "most likely", "standard error"], rows)
 
@@ -133,7 +133,7 @@ def aims() -> str:
     data = Plan("ekf", (scenario,), SEED).training_data()[0]
     rows = []
     for aim in (LIKELIHOOD, MSE, LOG_SCORE):
-        found = maximise_likelihood("ekf", scenario, data, objective=aim)
+        found = tune_by_gradient("ekf", scenario, data, objective=aim)
         rows.append(_proved(f"gradient of `{aim}`", found.choice, scenario, found.names, found.identified))
     choice = studied("ekf", scenario).choice
     rows.append(_proved(f"study of `score`, {TRIALS} trials", choice, scenario))

@@ -68,24 +68,23 @@ def _best(kind: FilterType) -> str:
     return "" if kind.value is None else f"{kind.value:.4g}{'' if kind.consistent else '*'}"
 
 
+MOST_FACTORS = 4  # of a start, that fit into a caption
+
+
 def gradient_table(found: GradientResult, seed_word: str = "seeds") -> Table:
-    """The result of each start, and how well the data determine the optimum."""
+    """Where each start led, and how well the data determine the optimum."""
     likeliest = found.objective == LIKELIHOOD
-    rows = [
-        ["x ".join(f"{factor:g}" for factor in optimum.start)]
-        + [f"{variance:.4g}" for variance in optimum.variances]
-        + [f"{found.level(optimum):{'.2f' if likeliest else '.6g'}}", str(optimum.evaluations)]
-        for optimum in found.optima
-    ]
-    errors = [
-        f"± {100 * error:.0f} %" if error < 1 else f"x/: {np.exp(error):.2g}" for error in found.standard_errors
-    ]
-    rows.append(["standard error", *errors, "", ""])
-    columns = [
-        "start, factors on the rule of thumb",
-        *found.names,
-        "log L" if likeliest else found.objective,
-        "evaluations",
-    ]
+    starts = "; ".join(", ".join(f"{factor:g}" for factor in one) for one in found.starts)
+    caption = f"starts: factors {starts} on the untuned values" if len(found.free) <= MOST_FACTORS else None
+    rows = []
+    for i, (one, error) in enumerate(zip(found.free, found.standard_errors.tolist(), strict=True)):
+        of_factor = f"± {100 * error:.0f} %" if error < 1 else f"x/: {np.exp(error):.2g}"
+        values = [f"{optimum.parameters[i]:.4g}" for optimum in found.optima]
+        name = f"{one.name} [{one.unit}]" if one.unit else one.name
+        rows.append([name, *values, of_factor if one.log else f"± {error:.2g}"])
+    levels = [f"{level:{'.2f' if likeliest else '.6g'}}" for level in (one.level for one in found.optima)]
+    rows.append(["log L" if likeliest else found.objective, *levels, ""])
+    rows.append(["evaluations", *(str(one.evaluations) for one in found.optima), ""])
     what = "Maximum of the innovations' likelihood" if likeliest else f"Minimum of {found.objective}"
-    return table(f"{what} on the training {seed_word}", columns, rows)
+    titles = [f"start {i + 1}" for i in range(len(found.starts))]
+    return table(f"{what} on the training {seed_word}", ["", *titles, "standard error"], rows, caption=caption)

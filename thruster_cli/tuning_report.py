@@ -173,8 +173,8 @@ def _gradient_sentences(tuning: Tuning, gradient: GradientResult, rival: Compari
     optimum, optima = ("maximum", "maxima") if gradient.objective == LIKELIHOOD else ("minimum", "minima")
     if loose:
         words.append(
-            f"The data do not determine {', '.join(loose)}: the 95 % interval exceeds a factor of ten, or the "
-            f"{optimum} lies at the end of the range."
+            f"The data do not determine {', '.join(loose)}: the 95 % interval exceeds a factor of ten (or half of "
+            f"a range that is not logarithmic), or the {optimum} lies at the end of the range."
         )
     agree = (
         f"All starts lead to the same {optimum}."
@@ -235,14 +235,21 @@ def as_json(tuning: Tuning) -> dict:
     if tuning.gradient is not None and tuning.rival is not None:
         found = tuning.gradient
         data["gradient"] = {
-            "log_likelihood" if found.objective == LIKELIHOOD else found.objective: found.level(found.best),
-            "standard_errors_of_logarithms": dict(zip(found.names, found.standard_errors.tolist(), strict=True)),
+            "log_likelihood" if found.objective == LIKELIHOOD else found.objective: found.best.level,
+            "standard_errors_of_logarithms": _errors(found, log=True),
+            "standard_errors": _errors(found, log=False),
             "identified": dict(zip(found.names, found.identified.tolist(), strict=True)),
             "agree": found.agree,
             "seconds": found.seconds,
             "score_over_optuna": score_ratio(tuning.proof.tuned, tuning.rival.tuned),
         }
     return data
+
+
+def _errors(found: GradientResult, log: bool) -> dict[str, float]:
+    """Standard errors of the parameters on logarithmic scales, or of the others, by name."""
+    pairs = zip(found.free, found.standard_errors.tolist(), strict=True)
+    return {one.name: error for one, error in pairs if one.log == log}
 
 
 def ratios_as_json(proof: Comparison) -> dict:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,22 @@ class ModelSlopes(NamedTuple):
     measurement_noise_cov: np.ndarray  # (p, m, m), symmetric
     prior_mean: np.ndarray  # (p, n)
     prior_cov: np.ndarray  # (p, n, n), symmetric
+
+    @classmethod
+    def of(cls, model: StateSpaceModel, parameters: int, **moving: np.ndarray) -> ModelSlopes:
+        """Those of parameters that move what is named, and nothing else."""
+        still = (name for name in cls._fields if name not in moving)
+        return cls(**moving, **{name: np.zeros((parameters, *np.shape(getattr(model, name)))) for name in still})
+
+    @classmethod
+    def between(cls, pairs: Sequence[tuple[StateSpaceModel, StateSpaceModel]], step: float) -> ModelSlopes:
+        """Differences of pairs of models, one for each parameter, over the step between the models of a pair."""
+        return cls(
+            *(
+                np.array([np.subtract(getattr(a, name), getattr(b, name)) / step for a, b in pairs])
+                for name in cls._fields
+            )
+        )
 
 
 class Density(NamedTuple):
@@ -85,6 +102,11 @@ def derivatives(
 
     spread(some, -(-count // at_once))
     return out, information
+
+
+def same_functions(one: StateSpaceModel, other: StateSpaceModel) -> bool:
+    """Whether models differ in numbers alone, for which there are slopes."""
+    return (one.functions, one.shape, one.substeps) == (other.functions, other.shape, other.substeps)
 
 
 def _begins(model: StateSpaceModel, starts: Starts) -> np.ndarray:

@@ -8,7 +8,7 @@ from filters.likelihood import information, likelihood
 from numerics.compiled import interpreted
 from numerics.streams import episode_keys
 from plants import simulate
-from tuning.likelihood.gradient import BAD_START, maximise_likelihood
+from tuning.likelihood.gradient import BAD_START, tune_by_gradient
 from tuning.problems.seeds import training_seeds
 from tuning.thruster.find import find_scenario
 
@@ -122,25 +122,24 @@ def test_shapes_that_do_not_fit_are_refused():
 
 def test_three_starts_lead_to_the_true_q_and_r_within_their_standard_errors():
     scenario = find_scenario("nominal")
-    found = maximise_likelihood("ekf", scenario, scenario.data(training_seeds(3, 32)))
-    assert found.agree and len({optimum.start for optimum in found.optima}) == 3
-    assert BAD_START in {optimum.start for optimum in found.optima}
+    found = tune_by_gradient("ekf", scenario, scenario.data(training_seeds(3, 32)))
+    assert found.agree and len(set(found.starts)) == 3 and BAD_START in found.starts
     assert all(optimum.converged for optimum in found.optima)
     true = np.array([*scenario.process_noise_cov, scenario.measurement_noise_cov])
     assert found.identified.all() and (found.standard_errors < 0.2).all()
-    assert (abs(np.log(found.best.variances / true)) < 3 * found.standard_errors).all()
+    assert (abs(np.log(found.best.parameters / true)) < 3 * found.standard_errors).all()
     assert found.names == ("Q11", "Q22", "R")
-    assert found.choice.model["process_noise_cov"] == tuple(found.best.variances[:2])
+    assert found.choice.model["process_noise_cov"] == tuple(found.best.parameters[:2])
 
 
 def test_a_variance_that_the_data_do_not_determine_is_said_to_be_so():
     # One affine model for all voltages errs so much in the flow that Q22 has to cover what Q11 does as well.
     scenario = find_scenario("nominal")
-    found = maximise_likelihood("kf", scenario, scenario.data(training_seeds(0, 16)), starts=[(1.0, 1.0, 1.0)])
+    found = tune_by_gradient("kf", scenario, scenario.data(training_seeds(0, 16)), starts=[(1.0, 1.0, 1.0)])
     assert found.identified.tolist() == [False, True, True]
 
 
 def test_only_filters_with_sensitivities_have_a_gradient():
     scenario = find_scenario("nominal")
     with pytest.raises(ValueError, match="filter must be one of kf, ekf, but got 'enkf'"):
-        maximise_likelihood("enkf", scenario, scenario.data(training_seeds(0, 2)))
+        tune_by_gradient("enkf", scenario, scenario.data(training_seeds(0, 2)))

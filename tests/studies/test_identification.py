@@ -9,8 +9,8 @@ from studies import identification
 from studies.identification import AMPLITUDE, PRESET, SENSORS, TRUTH, coverage, record, report, study
 from thruster_env.logged import Shown
 from thruster_env.plant import make_plant
-from tuning.identification.coordinates import Coordinates
 from tuning.identification.objective import Objective
+from tuning.problems.coordinates import Coordinates
 from tuning.thruster.identification import ThrusterFamily
 
 

@@ -191,8 +191,8 @@ BAD = [
     (("tune", "--filter", "none"), "filter must be one of kf, kf-steady, ekf, "),
     (("tune", "--scenario", "none"), "problem must be one of"),
     (
-        ("tune", "--filter", "ekf", "--method", "gradient", "--hold-r"),
-        "R must be free for method='gradient' (--method), but got hold_r (--hold-r)",
+        ("tune", "--filter", "ekf", "--method", "gradient", "--worst"),
+        "method='gradient' (--method) must count the mean of problems, but got worst (--worst)",
     ),
     (
         ("tune", "--filter", "enkf", "--method", "gradient"),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tuning.evaluation.evaluate import evaluate
-from tuning.likelihood.gradient import maximise_likelihood
+from tuning.likelihood.gradient import tune_by_gradient
 from tuning.search.enqueued import BY_GRADIENT, MAXIMUM_LIKELIHOOD_AFTER
 from tuning.search.objectives import OBJECTIVES
 from tuning.search.plan import Plan
@@ -22,15 +22,15 @@ def value_of(objective, choice, problem, data):
 @pytest.mark.parametrize("objective", ["mse", "log-score"])
 def test_the_minimum_is_the_objectives_and_lower_than_other_ways_lead(objective):
     data = MISMATCH.data(range(40))
-    found = maximise_likelihood("ekf", MISMATCH, data, objective=objective)
+    found = tune_by_gradient("ekf", MISMATCH, data, objective=objective)
     least = value_of(objective, found.choice, MISMATCH, data)
-    assert found.level(found.best) == pytest.approx(least, rel=1e-9)
-    others = maximise_likelihood("ekf", MISMATCH, data, [1.0]).choice
+    assert found.best.level == pytest.approx(least, rel=1e-9)
+    others = tune_by_gradient("ekf", MISMATCH, data, [1.0]).choice
     assert least < value_of(objective, others, MISMATCH, data)
     for name in found.names:  # a step either way is worse, unless the data do not tell
         at = found.names.index(name)
         for factor in (0.7, 1.4):
-            moved = found.best.variances.copy()
+            moved = found.best.parameters.copy()
             moved[at] *= factor
             model = dict(found.choice.model) | {
                 "process_noise_cov": tuple(moved[:2]),
@@ -44,14 +44,14 @@ def test_a_study_of_an_objective_that_has_a_gradient_tries_where_it_leads_and_fi
     result = run_study(open_study("gradient", plan), plan, MAXIMUM_LIKELIHOOD_AFTER + 2)
     (tried,) = [trial for trial in result.trials if BY_GRADIENT in trial.user_attrs]
     assert 0 < tried.number < 6 and tried.user_attrs[BY_GRADIENT] == "log-score"
-    found = maximise_likelihood("ekf", MISMATCH, plan.training_data()[0], [1.0], "log-score")
-    assert [tried.params[name] for name in found.names] == pytest.approx(found.best.variances)
-    assert result.best_value == pytest.approx(found.level(found.best), rel=1e-6)
+    found = tune_by_gradient("ekf", MISMATCH, plan.training_data()[0], [1.0], "log-score")
+    assert [tried.params[name] for name in found.names] == pytest.approx(found.best.parameters)
+    assert result.best_value == pytest.approx(found.best.level, rel=1e-6)
 
 
 def test_objectives_on_true_states_need_them():
     data = MISMATCH.data(range(2))
     with pytest.raises(ValueError, match="must be 'likelihood' without true states, but got 'mse'"):
-        maximise_likelihood("ekf", MISMATCH, data._replace(states=None), objective="mse")
+        tune_by_gradient("ekf", MISMATCH, data._replace(states=None), objective="mse")
     with pytest.raises(ValueError, match="objective must be one of likelihood, mse, log-score, but got 'score'"):
-        maximise_likelihood("ekf", MISMATCH, data, objective="score")
+        tune_by_gradient("ekf", MISMATCH, data, objective="score")

@@ -8,8 +8,8 @@ from numerics.streams import episode_keys
 from plants import simulate
 from thruster_cli.tune import tune
 from thruster_cli.tuning_report import as_json, report
-from tuning.likelihood import identifiability, noise
-from tuning.likelihood.gradient import maximise_likelihood
+from tuning.likelihood import family, identifiability
+from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import (
     Identifiability,
     as_data,
@@ -115,10 +115,10 @@ def test_an_ekf_has_the_intervals_of_the_gradient_method_from_a_bad_choice():
     own = parameters_of(oracle_choice("ekf", scenario))
     bad = choice_of("ekf", {**own, "Q22": own["Q22"] / 100, "R": own["R"] * 100}, scenario)
     found = identify(bad, plan.scenarios, data, plan.space())
-    right = maximise_likelihood("ekf", scenario, data[0], starts=[(1.0, 1.0, 1.0)])
+    right = tune_by_gradient("ekf", scenario, data[0], starts=[(1.0, 1.0, 1.0)])
     assert found.names == right.names == ("Q11", "Q22", "R") and found.identified.all()
     errors = np.log(found.factors) / 1.96
-    assert (abs(np.log(found.most_likely / right.best.variances)) < 0.5 * errors).all()
+    assert (abs(np.log(found.most_likely / right.best.parameters)) < 0.5 * errors).all()
     np.testing.assert_allclose(errors, right.standard_errors, rtol=0.6)
     assert found.tuned.tolist() == [bad.model["process_noise_cov"][0], own["Q22"] / 100, own["R"] * 100]
     assert all(number["determined"] for number in as_data(found).values())
@@ -141,7 +141,7 @@ def test_fishers_information_gives_the_judgement_of_differences(name, kind, monk
     plan = Plan(kind, (scenario,))
     given = oracle_choice(kind, scenario), plan.scenarios, plan.training_data(), plan.space()
     differences = identify(*given)
-    monkeypatch.setattr(noise, "LEAST_NUMBERS", 0)
+    monkeypatch.setattr(family, "LEAST_NUMBERS", 0)
     information = identify(*given)
     assert information.identified.tolist() == differences.identified.tolist()
     widths = [np.log(found.factors) for found in (information, differences)]

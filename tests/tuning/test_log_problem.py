@@ -19,7 +19,7 @@ from tuning.evaluation.evaluate import evaluate
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.sizes import close_size
 from tuning.evaluation.worth import scaling_sentence, worth
-from tuning.likelihood.gradient import maximise_likelihood
+from tuning.likelihood.gradient import tune_by_gradient
 from tuning.likelihood.identifiability import identify
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem
@@ -127,7 +127,7 @@ def test_the_lead_in_counts_in_no_likelihood():
     data = problem.data(problem.parts.training)
     choice = untuned_choice("kf", problem)
     evaluation = evaluate(choice.filter(problem), data, None)
-    found = maximise_likelihood("kf", problem, data, [1.0])
+    found = tune_by_gradient("kf", problem, data, [1.0])
     best = evaluate(found.choice.filter(problem), data, None)
     assert best.log_likelihoods.sum() == pytest.approx(found.best.value, rel=1e-9)
     assert best.log_likelihood >= evaluation.log_likelihood

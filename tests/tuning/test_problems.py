@@ -6,7 +6,6 @@ import pickle
 import numpy as np
 import pytest
 
-from filters.likelihood import likelihood
 from filters.posterior import posterior_bound
 from filters.tuned_file import NOISE
 from tests import pendulum_problem
@@ -16,7 +15,7 @@ from tests.tuned_files import write_untuned
 from tuning.evaluation import held_out
 from tuning.evaluation.baselines import Scaled
 from tuning.evaluation.tuned import read_choice, read_tuned
-from tuning.likelihood.noise import noise_family
+from tuning.likelihood.family import Family
 from tuning.problems import model_problem
 from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem
@@ -177,15 +176,15 @@ def test_several_sensors_are_kept_by_a_tuned_file(make, tmp_path, monkeypatch):
 def test_the_gradient_of_correlated_sensors_is_that_of_their_likelihood():
     problem = pair(steps=20, first_scored_step=5)
     data, choice, numbers = problem.data([1]), untuned_choice("ekf", problem), parameters("ekf", problem)
-    noise_at = noise_family(choice, problem, numbers)
-    values = np.array([one.get(choice) for one in numbers])
+    family = Family(choice, problem, numbers)
+    point = family.coordinates.of([one.get(choice) for one in numbers])
 
-    def log_likelihood(logarithms):
-        return likelihood(*noise_at(values * np.exp(logarithms), data)).values[0]
+    def log_likelihood(step):
+        return family.derivatives(point + step, data)[0][0, 0]
 
-    steps = 1e-4 * np.eye(len(values))
+    steps = 1e-4 * np.eye(len(point))
     differences = [(log_likelihood(step) - log_likelihood(-step)) / 2e-4 for step in steps]
-    found = likelihood(*noise_at(values, data)).gradients[0]
+    found = family.derivatives(point, data)[0][0, 1:]
     np.testing.assert_allclose(found, differences, rtol=1e-4, atol=1e-5)
-    model = noise_at(values, data)[0]
+    model = family.at(point)[0]
     np.testing.assert_allclose(model.measurement_noise_cov, problem.truth.measurement_noise_cov)

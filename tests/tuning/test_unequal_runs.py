@@ -11,15 +11,13 @@ from plants.affine import affine_model
 from tests.linear_problem import LinearProblem
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain, score_ratio
 from tuning.evaluation.sizes import close_size
-from tuning.likelihood.gradient import slopes_of
+from tuning.likelihood.gradient import goal_of
 from tuning.likelihood.identifiability import identify
-from tuning.likelihood.noise import noise_family
 from tuning.problems.check import check_data, checked_problem
 from tuning.problems.data import Data, mask_of, only, padded
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.runs_problem import RunsProblem, log_of
 from tuning.reporting.time_figures import one_run
-from tuning.search.parameters import model_parameters
 from tuning.search.plan import Plan
 from tuning.search.space import untuned_choice
 
@@ -103,9 +101,7 @@ def test_nothing_in_the_padding_changes_any_number(junk):
         reports = [repr(check_consistency(filter_, data)) for data in (clean, dirty)]
         assert reports[0] == reports[1]
     problem = LinearProblem()
-    choice = untuned_choice("kf", problem)
-    noise_at = noise_family(choice, problem, model_parameters(problem))
-    found = [slopes_of(problem, noise_at, data)(np.log(np.full(5, 0.1))) for data in (clean, dirty)]
+    found = [goal_of("kf", problem, data)(np.log(np.full(5, 0.1))) for data in (clean, dirty)]
     np.testing.assert_array_equal(found[0].gradients, found[1].gradients)
     assert np.isfinite(found[0].values).all()
     np.testing.assert_array_equal(clean.beginning.measurements, dirty.beginning.measurements)

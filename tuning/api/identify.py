@@ -13,7 +13,6 @@ from numerics.checks import shown
 from plants.logs.log import Log
 from tuning.api.identified import Identified
 from tuning.api.progress import console_for
-from tuning.identification.coordinates import Coordinates
 from tuning.identification.excitation import check_excitation
 from tuning.identification.family import with_ranges
 from tuning.identification.identify import STARTS
@@ -22,6 +21,7 @@ from tuning.identification.objective import Objective
 from tuning.identification.validation import validate
 from tuning.logs.identify import check_offsets, family_of, split_runs
 from tuning.logs.whose import whose_logs
+from tuning.problems.coordinates import Coordinates
 from tuning.problems.parameter import Parameter
 
 

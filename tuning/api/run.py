@@ -18,7 +18,9 @@ from numerics.files import check_target
 from tuning.api.progress import trial_bar, working
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
-from tuning.likelihood.gradient import DIFFERENTIABLE, OF_STATES, GradientResult, maximise_likelihood
+from tuning.likelihood.family import DIFFERENTIABLE
+from tuning.likelihood.goal import OF_STATES
+from tuning.likelihood.gradient import GradientResult, tune_by_gradient
 from tuning.likelihood.identifiability import Identifiability, identify
 from tuning.problems.assumed import AssumedProblem
 from tuning.problems.problem import Problem
@@ -127,8 +129,8 @@ def run_tuning(
     if by_gradient:
         aim = plan.objectives[0] if plan.objectives[0] in OF_STATES else LIKELIHOOD
         with working(f"following the gradient of the {aim}", console):
-            data = plan.training_data()[0]
-            gradient = maximise_likelihood(plan.filter, plan.scenarios[0], data, objective=aim)
+            data, options = plan.training_data(), plan.options
+            gradient = tune_by_gradient(plan.filter, plan.scenarios, data, objective=aim, options=options)
         rival = evaluate_held_out(result.choice, plan.scenarios[0], plan.seed)
         result = result._replace(choice=gradient.choice, consistent=None, nis=())
     try:
@@ -161,12 +163,8 @@ def _check_method(plan: Plan, by_gradient: bool) -> None:
     if not by_gradient:
         return
     one_of("a filter whose likelihood has a gradient", plan.filter, DIFFERENTIABLE)
-    if len(plan.scenarios) > 1:
-        raise ValueError(f"method='gradient' (--method) must come with one problem, but got {names_of(plan)}")
-    if plan.hold_r:
-        raise ValueError("R must be free for method='gradient' (--method), but got hold_r (--hold-r)")
-    if plan.full_q:
-        raise ValueError("Q must be diagonal for method='gradient' (--method), but got full_q (--full-q)")
+    if plan.worst:
+        raise ValueError("method='gradient' (--method) must count the mean of problems, but got worst (--worst)")
     if plan.budget is not None:
         raise ValueError("method='gradient' (--method) must come without a budget, but got budget (--budget)")
 

@@ -15,12 +15,12 @@ from numerics.streams import START_POINTS, derived_generator
 from plants.logs.log import Log
 from plants.state_space import StateSpaceModel
 from tuning.identification.ascent import Ascent, climb
-from tuning.identification.coordinates import Coordinates
 from tuning.identification.null_tests import NullTest, from_nothing, null_tests
 from tuning.identification.objective import Objective
 from tuning.identification.outliers import ROUNDS, outliers_of, without_outliers
 from tuning.identification.result import Identification, Optimum, covariances_of, identification_of
 from tuning.identification.starts import starts_of
+from tuning.problems.coordinates import Coordinates
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.search.interruption import stop_on_interrupt

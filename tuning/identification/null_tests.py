@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from tuning.identification.ascent import Ascent, climb
-from tuning.identification.coordinates import Coordinates
 from tuning.identification.objective import Objective
+from tuning.problems.coordinates import Coordinates
 
 LEGS = 25  # iterations of the other parameters, at most
 ROUNDS = 4  # of going on from a better place that a test has found, at most

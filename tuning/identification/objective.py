@@ -10,16 +10,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from filters.differentiated.runs import same_functions
 from filters.registry import make_filter
 from filters.sensitivity import ModelSlopes, sensitivity
 from filters.starts import Starts
 from numerics.checks import one_of, shown
 from plants.logs.log import Log
 from plants.state_space import StateSpaceModel
-from tuning.identification.coordinates import Coordinates
 from tuning.identification.gates import kept_variance
 from tuning.identification.runs import runs_of
-from tuning.likelihood.gradient import DIFFERENTIABLE
+from tuning.likelihood.family import DIFFERENTIABLE
+from tuning.problems.coordinates import Coordinates
 from tuning.problems.data import Data
 
 STEP = 1e-4  # of differences of the model, in coordinates
@@ -82,7 +83,7 @@ class Objective:
         self.rough: tuple[int, ...] = ()  # indices of parameters without sensitivities
         at = coordinates.start()
         pairs = [self._pair(at, j) for j in range(len(at))]
-        same = [_same_functions(*pair) for pair in pairs]
+        same = [same_functions(*pair) for pair in pairs]
         self.rough = tuple(j for j, name in enumerate(coordinates.names) if name in self._of_data or not same[j])
         self._smooth = [j for j in range(len(at)) if j not in self.rough]
         runs = self.data_at(at)
@@ -195,21 +196,13 @@ class Objective:
     def _slopes(self, at: np.ndarray, places: Sequence[int]) -> ModelSlopes:
         pairs = [self._pair(at, j) for j in places]
         if not pairs:
-            model = self.model_at(at)
-            return ModelSlopes(*(np.zeros((0, *np.shape(getattr(model, name)))) for name in ModelSlopes._fields))
-        return ModelSlopes(
-            *(
-                np.array([np.subtract(getattr(a, name), getattr(b, name)) / (2 * STEP) for a, b in pairs])
-                for name in ModelSlopes._fields
-            )
-        )
+            return ModelSlopes.of(self.model_at(at), 0)
+        return ModelSlopes.between(pairs, 2 * STEP)
 
-    def _pair(self, at: np.ndarray, place: int) -> list[StateSpaceModel]:
-        """Models one step above and below; at an end of the range both are within it."""
-        middle, step = np.array(at, dtype=np.float64), STEP * np.eye(len(at))[place]
-        low, high = self.coordinates.low[place] + STEP, self.coordinates.high[place] - STEP
-        middle[place] = np.clip(middle[place], low, high)
-        return [self.model_at(middle + step), self.model_at(middle - step)]
+    def _pair(self, at: np.ndarray, place: int) -> tuple[StateSpaceModel, StateSpaceModel]:
+        """Models one step above and below."""
+        above, below = self.coordinates.beside(at, place, STEP)
+        return self.model_at(above), self.model_at(below)
 
 
 def _counted(runs: Data, starts: Starts | None) -> np.ndarray:
@@ -228,10 +221,6 @@ def _arguments_among(function: Callable, names: Sequence[str]) -> tuple[str, ...
     if isinstance(function, partial):
         arguments -= set(function.keywords)
     return tuple(name for name in names if name in arguments)
-
-
-def _same_functions(one: StateSpaceModel, other: StateSpaceModel) -> bool:
-    return (one.functions, one.shape, one.substeps) == (other.functions, other.shape, other.substeps)
 
 
 def _check_runs(run: Data, model: StateSpaceModel) -> None:

@@ -116,8 +116,7 @@ def _first_states(
     """Likeliest first states (B, n), their covariances (B, n, n), and log-likelihoods (B,), from a guess."""
     n, count = model.n, len(measured)
     scale = np.sqrt(np.diag(wide))
-    still = {name: np.zeros((n, *np.shape(getattr(model, name)))) for name in ModelSlopes._fields}
-    slopes = ModelSlopes(**{**still, "prior_mean": np.diag(scale)})  # a unit is a wide standard deviation
+    slopes = ModelSlopes.of(model, n, prior_mean=np.diag(scale))  # a unit is a wide standard deviation
     known = (scale > 0).astype(np.float64)
 
     def at(means: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

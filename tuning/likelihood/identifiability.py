@@ -10,7 +10,7 @@ from optuna.distributions import BaseDistribution
 
 from filters.registry import filter_class
 from filters.tuned_file import NOISE
-from tuning.likelihood.noise import known_information
+from tuning.likelihood.family import known_information
 from tuning.problems.data import Data, where_true
 from tuning.problems.in_parts import estimates_in_parts
 from tuning.problems.problem import Problem

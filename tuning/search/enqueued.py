@@ -15,14 +15,12 @@ from optuna.trial import FrozenTrial, TrialState
 
 from filters.registry import filter_class
 from tuning.evaluation.baselines import GIVEN, ORACLE, RULE, baselines
-from tuning.likelihood.gradient import OF_STATES, is_large, optimum, starts_of
-from tuning.problems.data import Data
-from tuning.problems.problem import Problem
+from tuning.likelihood.goal import OF_STATES, Goal
+from tuning.likelihood.gradient import goal_of, optimum, start_at, starts_of
 from tuning.search.cost import COST
 from tuning.search.local import is_local, near
 from tuning.search.objectives import LIKELIHOOD
 from tuning.search.outcome import best_trial, is_consistent, is_over_budget
-from tuning.search.parameters import model_parameters
 from tuning.search.plan import Plan
 from tuning.search.space import FILTER_TYPE, ends_of, trial_parameters, untuned_choice
 from tuning.search.trials import NIS
@@ -211,41 +209,37 @@ def likeliest(study: optuna.Study, plan: Plan, objective: str = LIKELIHOOD) -> d
 
     Of another objective that has gradients, those with its least value.
 
-    They are those of the first scenario's model in an extended Kalman filter, or in the Kalman filter where that
-    is tuned, by an ascent with gradients: of models of few states from three starts. Near the best Q and R the
-    score is so flat that a sampler finds the place late; where the model is wrong the trial is one among many.
-    None for parameters that change more of the model than Q and R, which have no such gradient.
+    They are those of the models in an extended Kalman filter, or in the Kalman filter where that is tuned, by an
+    ascent with gradients: of models of few states from three starts. Near the best Q and R the score is so flat
+    that a sampler finds the place late, and among many correlations never; where the model is wrong the trial is
+    one among many. None for parameters that change functions of the model, which have no such gradient.
     """
-    if plan.hold_r or not all(filter_class(name).has_covariance for name in plan.filter_types):
+    if not all(filter_class(name).has_covariance for name in plan.filter_types):
         return None
     key = MAXIMUM_LIKELIHOOD if objective == LIKELIHOOD else f"{BY_GRADIENT} {objective}"
     known = study.user_attrs.get(key)
     if known is not None:
         return known or None
-    problem, space = plan.scenarios[0], plan.space()
     name = "kf" if plan.filter_types == ("kf",) else "ekf"
-    data, own = plan.training_data()[0], model_parameters(problem)
-    large = is_large(problem)
-    data = data.slice(0, MAXIMUM_LIKELIHOOD_RUNS) if large else data
     try:
-        start = 1.0 if large or len(own) > MOST_FOR_STARTS else _best_start(name, problem, data, objective)
-        found = optimum(name, problem, data, start, objective)
-    except ValueError:  # more than Q and R changes, or on another scale
+        goal = goal_of(name, plan.scenarios, plan.training_data(), objective, plan.options)
+        goal = goal.of_few(MAXIMUM_LIKELIHOOD_RUNS) if goal.is_large else goal
+        found = optimum(goal, _best_start(goal))
+    except ValueError:  # more than numbers changes, or whole numbers
         study.set_user_attr(key, {})
         return None
-    names = [one.name for one in own]
-    noise = _within(dict(zip(names, found.variances.tolist(), strict=True)), space)
+    noise = _within(dict(zip(goal.coordinates.names, found.parameters.tolist(), strict=True)), plan.space())
     study.set_user_attr(key, noise)
     return noise
 
 
-def _best_start(name: str, problem: Problem, data: Data, objective: str) -> list[float]:
-    """The start of an ascent, as factors: on a few runs three starts are tried, and this is the highest end."""
-    own, few = model_parameters(problem), data.slice(0, MAXIMUM_LIKELIHOOD_RUNS)
-    ends = [optimum(name, problem, few, start, objective) for start in starts_of(own)]
-    best = max(ends, key=lambda one: one.value)
-    before = untuned_choice(name, problem)
-    return [value / one.get(before) for value, one in zip(best.variances.tolist(), own, strict=True)]
+def _best_start(goal: Goal) -> np.ndarray:
+    """The start of an ascent: of a model with few numbers where the best of three starts leads on a few runs."""
+    free, few = goal.coordinates.free, goal.of_few(MAXIMUM_LIKELIHOOD_RUNS)
+    if goal.is_large or len(free) > MOST_FOR_STARTS:
+        return start_at(goal, [1.0] * len(free))
+    best = max((optimum(few, start_at(goal, one)) for one in starts_of(free)), key=lambda one: one.value)
+    return goal.coordinates.of(best.parameters)
 
 
 def _within(parameters: Mapping, space: Mapping) -> dict:

@@ -149,11 +149,11 @@ class Plan(NamedTuple):
 
         The scale of P_0 is one of them where a scenario scores the start-up.
         """
-        return joint_distributions(self.filter_types, self.scenarios[0], **self._options)
+        return joint_distributions(self.filter_types, self.scenarios[0], **self.options)
 
     def parameters(self) -> dict[str, Parameter]:
         """A trial's parameters by name, without the filter type."""
-        return joint_parameters(self.filter_types, self.scenarios[0], **self._options)
+        return joint_parameters(self.filter_types, self.scenarios[0], **self.options)
 
     def first_ranges(self) -> dict[str, tuple[float, float]]:
         """The parts of the ranges of Q and R in which a search begins, by name."""
@@ -166,7 +166,8 @@ class Plan(NamedTuple):
         return self.scenarios[0].parameters is None and self._has_covariance
 
     @property
-    def _options(self) -> dict:
+    def options(self) -> dict[str, bool]:
+        """What of the model is tuned, as `model_parameters` has it."""
         prior = self.tunes_noise and any(scenario.counts_start_up for scenario in self.scenarios)
         return {"hold_r": self.hold_r, "full_q": self.full_q, "prior": prior}
 

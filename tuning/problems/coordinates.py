@@ -31,7 +31,7 @@ class Coordinates:
         self.units = np.array([1.0 if one.log else PART * (one.high - one.low) for one in self.free])
         self.low, self.high = self.of([one.low for one in self.free]), self.of([one.high for one in self.free])
 
-    def of(self, values: Sequence[float]) -> np.ndarray:
+    def of(self, values: Sequence[float] | np.ndarray) -> np.ndarray:
         """Coordinates of values (p,)."""
         given = np.asarray(values, dtype=np.float64)
         return np.where(self.log, np.log(np.where(self.log, given, 1.0)), given) / self.units
@@ -48,6 +48,12 @@ class Coordinates:
     def slopes(self, at: np.ndarray) -> np.ndarray:
         """Derivative of each value by its coordinate, (p,)."""
         return np.where(self.log, self.values(at), 1.0) * self.units
+
+    def beside(self, at: np.ndarray, place: int, step: float) -> tuple[np.ndarray, np.ndarray]:
+        """Coordinates a step above and below in one place; at an end of the range both are within it."""
+        middle, steps = np.array(at, dtype=np.float64), step * np.eye(len(at))[place]
+        middle[place] = np.clip(middle[place], self.low[place] + step, self.high[place] - step)
+        return middle + steps, middle - steps
 
     def start(self, given: dict[str, float] | None = None) -> np.ndarray:
         """Coordinates of given values, of the defaults of parameters without; ValueError outside the range."""

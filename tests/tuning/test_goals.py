@@ -1,0 +1,117 @@
+"""What gradients lead to: its values are those of evaluations, gradients those of differences, of all numbers."""
+
+import numpy as np
+import pytest
+
+from filters import StateSpaceModel, run
+from tuning.evaluation.evaluate import evaluate
+from tuning.likelihood.gradient import goal_of, tune_by_gradient
+from tuning.problems.model_problem import ModelProblem
+from tuning.problems.parameter import Parameter
+from tuning.search.objectives import LIKELIHOOD, OBJECTIVES
+from tuning.search.plan import Plan
+from tuning.search.study import open_study, run_study
+from tuning.thruster.find import find_scenario
+
+NAMES = "startup", "nominal", "published_noise", "mismatch"
+STARTUP, NOMINAL, NOISY, MISMATCH = map(find_scenario, NAMES)
+
+
+def decay(x, u, c):
+    return (x[0] + 0.1 * (u[0] - c[0] * x[0] - 0.1 * x[0] * x[0] * x[0]), x[1] + 0.05 * (x[0] - x[1]))
+
+
+def both(x, c):
+    return (x[0] + x[1] + c[1], x[1])
+
+
+def vessel(drag=0.5, noise=0.05, offset=0.2):
+    """A model whose constants, noise and prior have parameters, one of them on a linear scale."""
+    return StateSpaceModel(
+        transition=decay,
+        observe=both,
+        constants=(drag, offset),
+        process_noise_cov=[noise**2, 1e-3],
+        measurement_noise_cov=[[0.01, 0.002 * drag], [0.002 * drag, 0.02]],
+        prior_mean=[1.0 + offset, 0.0],
+        prior_cov=[drag, 1.0],
+    )
+
+
+def of_own_numbers(first_scored_step):
+    """A problem with parameters that move all numbers of a model."""
+    free = [Parameter("drag", 0.1, 2.0), Parameter("noise", 1e-3, 1.0), Parameter("offset", -1.0, 1.0, log=False)]
+    name = f"vessel from {first_scored_step}"
+    inputs = np.ones((40, 1))
+    return ModelProblem(vessel(), vessel, inputs, first_scored_step=first_scored_step, parameters=free, name=name)
+
+
+CASES = {
+    "correlation and prior": ([STARTUP], {"full_q": True, "prior": True}),
+    "R held": ([NOISY], {"hold_r": True}),
+    "own numbers": ([of_own_numbers(3)], {}),
+    "several problems": ([of_own_numbers(0), of_own_numbers(30)], {}),
+}
+
+
+def level(goal, choice, problems, data):
+    """The objective of a choice, as a study evaluates it with the filter that runs."""
+    pairs = [(choice.filter(one), runs, one.scale) for one, runs in zip(problems, data, strict=True)]
+    if goal.objective == LIKELIHOOD:  # of all steps, where no lead-in is left out
+        some = [run(one, runs.filter_keys, runs.inputs, runs.measurements) for one, runs, _ in pairs]
+        return sum(one.log_likelihoods.sum() for one in some)
+    found = [evaluate(*one) for one in pairs]
+    return np.mean([OBJECTIVES[goal.objective].value(one, np.nan) for one in found])
+
+
+@pytest.mark.parametrize("objective", ["likelihood", "mse", "log-score"])
+@pytest.mark.parametrize("case", CASES)
+def test_a_goal_is_the_objective_of_the_filter_that_runs_and_its_gradient_that_of_differences(case, objective):
+    problems, options = CASES[case]
+    data = [problem.data(range(3)) for problem in problems]
+    goal = goal_of("ekf", problems, data, objective, options)
+    point = goal.coordinates.of(goal.untuned) + np.linspace(0.1, 0.3, len(goal.untuned))
+    found = goal(point)
+    value = level(goal, goal.choice_at(point), problems, data)
+    assert goal.level(found.values.sum()) == pytest.approx(value, rel=1e-9)
+    unit = found.values.sum() / value
+    slopes = []
+    for step in 1e-4 * np.eye(len(point)):
+        above, below = (level(goal, goal.choice_at(point + sign * step), problems, data) for sign in (1, -1))
+        slopes.append(unit * (above - below) / 2e-4)
+    tolerance = 1e-6 * np.abs(slopes).max()
+    np.testing.assert_allclose(found.gradients.sum(axis=0), slopes, rtol=1e-5, atol=tolerance)
+
+
+def test_the_numbers_of_a_model_are_found_together_whatever_they_move():
+    problem = of_own_numbers(3)
+    data = problem.data(range(40))
+    found = tune_by_gradient("ekf", problem, data)
+    assert found.agree and found.identified.all() and found.names == ("drag", "noise", "offset")
+    distances = (found.best.parameters - [0.5, 0.05, 0.2]) / [0.5, 0.05, 1.0]  # errors are of two logarithms
+    assert (abs(distances) < 3.5 * found.standard_errors).all() and (found.standard_errors < 0.2).all()
+
+
+def test_a_full_q_is_at_least_as_likely_as_a_diagonal_one_and_a_study_tries_it():
+    plan = Plan("ekf", (MISMATCH,), objectives=("log-score",), full_q=True)
+    data = plan.training_data()
+    some = [one.slice(0, 8) for one in data]
+    diagonal = tune_by_gradient("ekf", plan.scenarios, some, [1.0], "log-score")
+    full = tune_by_gradient("ekf", plan.scenarios, some, [1.0], "log-score", plan.options)
+    assert full.names == ("Q11", "Q22", "correlation_12", "R") and full.best.level < diagonal.best.level
+    choice = full.choice.model["process_noise_cov"]
+    assert np.shape(choice) == (2, 2) and abs(full.best.parameters[2]) > 0.01
+    result = run_study(open_study("full", plan), plan, 8)
+    best = tune_by_gradient("ekf", plan.scenarios, data, [1.0], "log-score", plan.options).best
+    assert result.best_value == pytest.approx(best.level, rel=1e-4)
+
+
+def test_problems_of_a_list_have_one_optimum():
+    both = NOISY, NOMINAL
+    data = [one.data(range(8)) for one in both]
+    found = tune_by_gradient("ekf", both, data, [1.0])
+    alone = [tune_by_gradient("ekf", one, runs, [1.0]) for one, runs in zip(both, data, strict=True)]
+    assert found.best.value < sum(one.best.value for one in alone) - 1.0
+    goal = goal_of("ekf", both, data)
+    best = goal.coordinates.of(found.best.parameters)
+    assert abs(goal(best).gradients.sum(axis=0)).max() < 1e-3 * abs(goal(best + 0.1).gradients.sum(axis=0)).max()
