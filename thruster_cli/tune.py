@@ -87,6 +87,9 @@ def command(
     full_q: Annotated[
         bool, typer.Option("--full-q", help="Tune the correlations of Q, too.", rich_help_panel=SEARCH)
     ] = False,
+    full_r: Annotated[
+        bool, typer.Option("--full-r", help="Tune the correlations of R, too.", rich_help_panel=SEARCH)
+    ] = False,
     budget: Annotated[
         float | None,
         typer.Option(
@@ -193,6 +196,7 @@ def command(
         prune=not no_pruning,
         budget=budget,
         full_q=full_q,
+        full_r=full_r,
         worst=worst,
     )
     tuning = tune(plan, trials, storage, study, out, by_gradient=method == "gradient", workers=workers)

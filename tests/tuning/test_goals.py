@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 
 from filters import StateSpaceModel, run
+from thruster_cli.tune import tune
 from tuning.evaluation.evaluate import evaluate
+from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import goal_of, tune_by_gradient
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
 from tuning.search.objectives import LIKELIHOOD, OBJECTIVES
 from tuning.search.plan import Plan
+from tuning.search.space import choice_of, parameters_of
 from tuning.search.study import open_study, run_study
 from tuning.thruster.find import find_scenario
 
@@ -115,3 +118,52 @@ def test_problems_of_a_list_have_one_optimum():
     goal = goal_of("ekf", both, data)
     best = goal.coordinates.of(found.best.parameters)
     assert abs(goal(best).gradients.sum(axis=0)).max() < 1e-3 * abs(goal(best + 0.1).gradients.sum(axis=0)).max()
+
+
+def of_two_sensors(**assumed):
+    """A walk measured by two sensors, whose noise is correlated; filters assume that it is not."""
+    truth = StateSpaceModel(
+        transition=lambda x, u, c: (x[0], 0.9 * x[1]),
+        observe=lambda x, c: (x[0] + x[1], x[1]),
+        process_noise_cov=[0.01, 0.04],
+        measurement_noise_cov=[[1.0, 1.2], [1.2, 4.0]],
+        prior_mean=[0.0, 0.0],
+        prior_cov=[1.0, 1.0],
+        inputs=0,
+    )
+    return ModelProblem(truth, truth.replace(measurement_noise_cov=[1.0, 4.0]), steps=200, **assumed)
+
+
+def test_correlated_sensors_are_found_and_a_full_r_is_read_back_wherever_a_tuned_file_is(tmp_path):
+    plan = Plan("ekf", (of_two_sensors(),), full_q=True, full_r=True).checked()
+    found = tune_by_gradient("ekf", plan.scenarios, plan.training_data(), [1.0], options=plan.options)
+    assert found.names == ("Q11", "Q22", "correlation_12", "R11", "R22", "R_correlation_12")
+    at, error = found.best.parameters[-1], found.standard_errors[-1]
+    assert abs(at - 0.6) < 3.5 * error < 0.2 and found.identified[-1]
+    file = tmp_path / "full.json"
+    result = tune(plan, 8, out=file, by_gradient=True)
+    choice, *_ = read_tuned(file, plan.scenarios)
+    assert np.array(choice.model["measurement_noise_cov"])[0, 1] > 0.5 and choice == result.result.choice
+    assert choice_of("ekf", parameters_of(choice), plan.scenarios[0]).filter(plan.scenarios[0]).model.digest == (
+        choice.filter(plan.scenarios[0]).model.digest
+    )
+    ratios = result.proof.ratios
+    assert result.proof.true is not None and abs(ratios["oracle"].value - 1.0) < 0.01
+    assert plan.identity["full_r"] and "full_r" not in plan._replace(full_r=False).identity
+
+
+@pytest.mark.parametrize(
+    ("plan", "rule"),
+    [
+        (Plan("ekf", (of_two_sensors(),), full_r=True, hold_r=True), "R must be free to be full, but got hold_r"),
+        (Plan("ekf", (NOMINAL,), full_r=True), "a full R needs two measurements or more, but nominal has 1"),
+        (
+            Plan("low-pass", (NOMINAL,), full_r=True),
+            "a full R needs a filter with a cov.* 'low-pass'",
+        ),
+        (Plan("ekf", (of_own_numbers(0),), full_r=True), "a full R .* tunes drag, noise, offset"),
+    ],
+)
+def test_a_full_r_that_cannot_be_is_refused(plan, rule):
+    with pytest.raises(ValueError, match=rule):
+        plan.checked()

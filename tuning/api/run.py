@@ -178,6 +178,7 @@ def name_of(plan: Plan, by_gradient: bool = False) -> str:
     ]
     parts += ["+".join(plan.objectives)] * (plan.objectives != ("score",))
     parts += ["hold-r"] * plan.hold_r + ["full-q"] * plan.full_q
+    parts += ["full-r"] * plan.full_r
     parts += [] if plan.budget is None else [f"budget{plan.budget:g}"]
     parts += ["any-nis"] * (not plan.consistent) + [plan.sampler] * (plan.sampler != "tpe")
     return "-".join(parts + ["gradient"] * by_gradient)

@@ -25,6 +25,7 @@ def tune(
     worst: bool = False,
     hold_r: bool = False,
     full_q: bool = False,
+    full_r: bool = False,
     budget: float | None = None,
     sampler: str = "tpe",
     prune: bool = True,
@@ -74,6 +75,7 @@ def tune(
         worst: of several problems, minimise the objective of the worst one.
         hold_r: keep R at the data sheet's value, tune only Q.
         full_q: tune the correlations of Q, too.
+        full_r: tune the correlations of R, too.
         budget: time limit of a step of the filter [microseconds of one core].
         sampler: of Optuna: "tpe", "random", "cma-es", ...
         prune: end a trial that is significantly worse than the best on the same seeds.
@@ -123,6 +125,7 @@ def tune(
         prune=prune,
         budget=budget,
         full_q=full_q,
+        full_r=full_r,
         worst=worst,
     )
     where = None if storage is None else str(storage)

@@ -133,6 +133,8 @@ def _plan(identity, where: str | Path, find: Callable[[str], Problem]) -> Plan:
             identity["hold_r"],
             budget=identity["budget"],
             full_q=identity["full_q"],
+            full_r=identity.get("full_r", False),
+            worst=identity.get("worst", False),
         )
     except (KeyError, TypeError):
         raise ValueError(f"a report needs the plan of the study, but {where} has {shown(identity)}") from None

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import floor, isfinite, log10
 
 from tuning.problems.problem import Problem
-from tuning.search.space import Choice, neutral, parameters, parameters_of
+from tuning.search.space import Choice, everything_of, neutral, parameters, parameters_of
 
 SMALL, LARGE = 1e-3, 1e5  # what is smaller or larger is told in a unit with a power of ten
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -41,8 +41,8 @@ def labels(names: Iterable[str], kind: str, problem: Problem, square: str = "^2"
         problem: whose parameters have the units.
         square: what stands for "squared".
     """
-    everything = {} if problem.parameters is not None else {"full_q": True, "prior": True}
-    units = {one.name: one.unit.replace("^2", square) for one in parameters(kind, problem, **everything)}
+    known = parameters(kind, problem, **everything_of(problem))
+    units = {one.name: one.unit.replace("^2", square) for one in known}
     said = {name: name.replace("_", " ") for name in names}
     return {name: f"{words} [{units[name]}]" if units.get(name) else words for name, words in said.items()}
 
@@ -72,14 +72,15 @@ def number_rows(
 
 
 def _said(column: Mapping[str, float], name: str) -> float | None:
-    """A number of a choice; where it has none of Q, neither has it correlations."""
-    tells_q = any(re.fullmatch(r"Q\d+", known) for known in column)
-    return column.get(name, neutral(name) if tells_q or not name.startswith("correlation") else None)
+    """A number of a choice; where it has none of Q or R, neither has it correlations of these."""
+    letter = "R" if name.startswith("R") else "Q"
+    tells = "correlation_" not in name or any(re.fullmatch(rf"{letter}\d+", known) for known in column)
+    return column.get(name, neutral(name) if tells else None)
 
 
 def _letters(label: str) -> str | None:
     """What the label of a variance or a correlation begins with and ends with; the whole of all others."""
-    found = re.fullmatch(r"(Q|R|correlation )\d+(?: \d+)?( \[.*\])?", label)
+    found = re.fullmatch(r"(Q|R|correlation |R correlation )\d+(?: \d+)?( \[.*\])?", label)
     return f"{found[1]}{found[2]}" if found else label
 
 

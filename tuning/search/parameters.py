@@ -20,7 +20,7 @@ from tuning.search.correlations import correlations_of, full_covariance
 Q, R = NOISE  # arguments of the model
 FACTORS = (1e-10, 1e4)  # range of each variance of Q and R, as factors on that of the rule of thumb
 Q_FIRST, R_FIRST = (1e-5, 1e2), (1e-2, 1e3)  # the part of it in which a search begins
-CORRELATIONS = (-0.99, 0.99)  # range of each correlation in a full Q
+CORRELATIONS = (-0.99, 0.99)  # range of each correlation in a full Q or R
 PRIOR_FACTORS = (1e-4, 1e2)  # range of P_0, as a factor on the covariance of the plant's initial state
 
 
@@ -42,26 +42,29 @@ class ProcessVariance:
 
 
 @dataclass(frozen=True)
-class ProcessCorrelation:
-    """One of the correlations from which `correlations.full_covariance` makes a full Q."""
+class Correlation:
+    """One of the correlations from which `correlations.full_covariance` makes a full Q or R."""
 
+    covariance: str  # argument of the model
     index: int
     is_variance: ClassVar[bool] = False
 
     def get(self, choice) -> float:
-        """The correlation in a choice; zero where Q is diagonal."""
-        q = choice.model.get(Q)
-        return 0.0 if q is None or np.ndim(q) < 2 else correlations_of(np.asarray(q))[self.index]
+        """The correlation in a choice; zero where the covariance is diagonal."""
+        cov = choice.model.get(self.covariance)
+        return 0.0 if cov is None or np.ndim(cov) < 2 else correlations_of(np.asarray(cov))[self.index]
 
     def set(self, choice, value):
-        """The choice with another correlation, and so with a full Q."""
-        variances = _diagonal(choice.model[Q])
+        """The choice with another correlation, and so with a full covariance."""
+        before = choice.model[self.covariance]
+        if np.ndim(before) == 2 and value == self.get(choice):
+            return choice  # to the last digit
+        variances = _diagonal(before)
         count = len(variances) * (len(variances) - 1) // 2
-        full = np.ndim(choice.model[Q]) == 2
-        found = correlations_of(np.asarray(choice.model[Q])) if full else [0.0] * count
+        found = correlations_of(np.asarray(before)) if np.ndim(before) == 2 else [0.0] * count
         given = np.clip(found, *CORRELATIONS).tolist()  # those of a singular Q may be 1
-        q = full_covariance(variances, _replaced(given, self.index, value))
-        return choice._replace(model={**choice.model, Q: tuple(map(tuple, q.tolist()))})
+        cov = full_covariance(variances, _replaced(given, self.index, value))
+        return choice._replace(model={**choice.model, self.covariance: tuple(map(tuple, cov.tolist()))})
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,7 @@ def filter_parameters(name: str, sizes: tuple[int, int] | None, process_noise: b
 
 
 def model_parameters(
-    problem: Problem, *, hold_r: bool = False, full_q: bool = False, prior: bool = False
+    problem: Problem, *, hold_r: bool = False, full_q: bool = False, full_r: bool = False, prior: bool = False
 ) -> list[Parameter]:
     """Parameters of a problem's model that a study may choose: its `parameters`, or the variances of Q and R.
 
@@ -152,6 +155,7 @@ def model_parameters(
         problem: the ranges follow from its untuned values.
         hold_r: leave R as on the sensor's data sheet.
         full_q: choose the correlations of Q, too (`correlations.full_covariance`).
+        full_r: choose those of R, too.
         prior: choose the scale of P_0, too.
     """
     if problem.parameters is not None:
@@ -168,19 +172,26 @@ def model_parameters(
             low, high = _range(variance, given_q[i], max(variance, scale**2))
             found.append(Parameter(f"Q{i + 1}{i + 1}", low, high, squared(state.unit), place=ProcessVariance(i)))
     if full_q:
-        names = correlation_names(count)
-        found += [
-            Parameter(name, *CORRELATIONS, log=False, place=ProcessCorrelation(k)) for k, name in enumerate(names)
-        ]
+        found += _correlations(Q, count)
     if not hold_r:
         channels = quantities.measurements
         for i, (variance, channel) in enumerate(zip(_diagonal(untuned[R]), channels, strict=True)):
             low, high = _range(variance, given_r[i], variance)
             place = MeasurementVariance(i)
             found.append(Parameter(r_name(i, len(channels)), low, high, squared(channel.unit), place=place))
+        found += _correlations(R, len(channels)) if full_r else []
     if prior:
         found.append(Parameter("P0", *PRIOR_FACTORS, place=PRIOR))
     return found
+
+
+def _correlations(covariance: str, size: int) -> list[Parameter]:
+    """The correlations of Q or R."""
+    names = correlation_names(size, covariance)
+    places = [Correlation(covariance, k) for k in range(len(names))]
+    return [
+        Parameter(name, *CORRELATIONS, log=False, place=place) for name, place in zip(names, places, strict=True)
+    ]
 
 
 def _range(variance: float, given: float, largest: float) -> tuple[float, float]:
@@ -208,19 +219,21 @@ def places_in(choice) -> dict[str, Place]:
     if q is not None:
         found |= {f"Q{i + 1}{i + 1}": ProcessVariance(i) for i in range(len(q))}
         if np.ndim(q) == 2:
-            found |= {name: ProcessCorrelation(k) for k, name in enumerate(correlation_names(len(q)))}
+            found |= {name: Correlation(Q, k) for k, name in enumerate(correlation_names(len(q)))}
     if r is not None:
         count = np.size(_diagonal(r))
         found |= {r_name(i, count): MeasurementVariance(i) for i in range(count)}
+        if np.ndim(r) == 2:
+            found |= {name: Correlation(R, k) for k, name in enumerate(correlation_names(count, R))}
     if PRIOR.name in choice.model:
         found["P0"] = PRIOR
     return found
 
 
-def correlation_names(states: int) -> list[str]:
-    """Names of the correlations of Q as trial parameters, in the order of `correlations.full_covariance`."""
-    between = "" if states < 10 else "_"
-    return [f"correlation_{j}{between}{i}" for i in range(2, states + 1) for j in range(1, i)]
+def correlation_names(size: int, covariance: str = Q) -> list[str]:
+    """Names of the correlations of Q or R as trial parameters, in the order of `correlations.full_covariance`."""
+    stem, between = "correlation" if covariance == Q else "R_correlation", "" if size < 10 else "_"
+    return [f"{stem}_{j}{between}{i}" for i in range(2, size + 1) for j in range(1, i)]
 
 
 def r_name(index: int, channels: int) -> str:

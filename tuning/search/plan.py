@@ -42,6 +42,7 @@ class Plan(NamedTuple):
     prune: bool = True  # whether a trial is pruned that is worse than the best one on the same seeds
     budget: float | None = None  # us/step that the filter may take, as `cost.microseconds_a_step` measures them
     full_q: bool = False  # whether Q has correlations
+    full_r: bool = False  # whether R has correlations
     worst: bool = False  # of several problems the worst one counts, and not their mean
 
     @property
@@ -51,6 +52,7 @@ class Plan(NamedTuple):
         return {
             **({"estimators": own} if own else {}),
             **({"worst": True} if self.worst else {}),
+            **({"full_r": True} if self.full_r else {}),
             "filter": self.filter,
             "kinds": list(self.filter_types),
             "budget": self.budget,
@@ -104,14 +106,16 @@ class Plan(NamedTuple):
         for problem in self.scenarios:
             check_objectives(self.objectives, problem)
         parameters = self.scenarios[0].parameters
-        if parameters is not None and (self.full_q or self.hold_r):
+        if parameters is not None and (self.full_q or self.full_r or self.hold_r):
             names = ", ".join(one.name for one in parameters)
             raise ValueError(
-                f"a full Q or an R that is held must be asked of a problem that tunes Q and R, but "
+                f"a full Q, a full R or an R that is held must be asked of a problem that tunes Q and R, but "
                 f"{self.scenarios[0].name} tunes {names}"
             )
         if self.full_q and not self._has_covariance:
             raise ValueError(f"a full Q needs a filter with a covariance, but got {self.filter!r}")
+        if self.full_r:
+            self._check_full_r()
         if self.budget is not None:
             positive("budget", self.budget)
         elif self.filter == AUTO and "cost" not in self.objectives:
@@ -120,6 +124,16 @@ class Plan(NamedTuple):
                 "enkf of 30 members 0.7, a pf of 1000 particles 20) or the objective 'cost', but got neither"
             )
         return self
+
+    def _check_full_r(self) -> None:
+        """Raise ValueError unless R may have correlations."""
+        if self.hold_r:
+            raise ValueError("R must be free to be full, but got hold_r (--hold-r) with full_r (--full-r)")
+        if not self._has_covariance:
+            raise ValueError(f"a full R needs a filter with a covariance, but got {self.filter!r}")
+        count = len(self.scenarios[0].quantities.measurements)
+        if count < 2:
+            raise ValueError(f"a full R needs two measurements or more, but {self.scenarios[0].name} has {count}")
 
     def _check_problems(self) -> None:
         """Raise ValueError unless all scenarios are problems, and the same parameters have a meaning for each."""
@@ -169,7 +183,7 @@ class Plan(NamedTuple):
     def options(self) -> dict[str, bool]:
         """What of the model is tuned, as `model_parameters` has it."""
         prior = self.tunes_noise and any(scenario.counts_start_up for scenario in self.scenarios)
-        return {"hold_r": self.hold_r, "full_q": self.full_q, "prior": prior}
+        return {"hold_r": self.hold_r, "full_q": self.full_q, "full_r": self.full_r, "prior": prior}
 
     def training_data(self) -> list[Data]:
         """Data that all trials share, one for each scenario."""

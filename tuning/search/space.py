@@ -103,7 +103,13 @@ def _of_filter(name: str, process_noise: bool = False) -> list[Parameter]:
 
 
 def parameters(
-    name: str, problem: Problem, *, hold_r: bool = False, full_q: bool = False, prior: bool = False
+    name: str,
+    problem: Problem,
+    *,
+    hold_r: bool = False,
+    full_q: bool = False,
+    full_r: bool = False,
+    prior: bool = False,
 ) -> list[Parameter]:
     """The parameters that a study may choose for a filter.
 
@@ -116,11 +122,12 @@ def parameters(
         problem: the ranges follow from its untuned values.
         hold_r: leave R as on the sensor's data sheet.
         full_q: choose the correlations of Q, too.
+        full_r: choose those of R, too.
         prior: choose the scale of P_0, too.
     """
     found = []
     if filter_class(name).has_covariance:
-        found = model_parameters(problem, hold_r=hold_r, full_q=full_q, prior=prior)
+        found = model_parameters(problem, hold_r=hold_r, full_q=full_q, full_r=full_r, prior=prior)
     return found + _of_filter(name, has_process_noise(problem))
 
 
@@ -194,11 +201,15 @@ def choice_of(name: str, values: Mapping[str, float | int | str], problem: Probl
     choice = untuned_choice(name, problem)
     if "N" not in values:
         choice.numbers.pop("ensemble_size", None)
-    everything = {} if problem.parameters is not None else {"full_q": True, "prior": True}
-    for one in parameters(name, problem, **everything):
+    for one in parameters(name, problem, **everything_of(problem)):
         if one.name in values:
             choice = one.set(choice, values[one.name])
     return choice
+
+
+def everything_of(problem: Problem) -> dict[str, bool]:
+    """The options of `parameters` with which a problem has all that a study may choose."""
+    return {} if problem.parameters is not None else {"full_q": True, "full_r": True, "prior": True}
 
 
 def has_search_space(name: str) -> bool:
@@ -209,7 +220,7 @@ def has_search_space(name: str) -> bool:
 def parameters_of(choice: Choice) -> dict[str, float | int]:
     """The trial parameters of a choice of one filter type: the inverse of `choice_of`.
 
-    Correlations and P0 are among them where the choice has a full Q and a factor on P_0.
+    Correlations and P0 are among them where the choice has a full Q or R and a factor on P_0.
     """
     places = places_in(choice) | {one.name: one.place for one in _of_filter(choice.name)}
     found = {name: place.get(choice) for name, place in places.items()}
@@ -218,7 +229,7 @@ def parameters_of(choice: Choice) -> dict[str, float | int]:
 
 def neutral(parameter: str) -> float | None:
     """The value of a trial parameter that a choice lacks: no correlation, P_0 unchanged; None for all others."""
-    return 1.0 if parameter == "P0" else 0.0 if parameter.startswith("correlation") else None
+    return 1.0 if parameter == "P0" else 0.0 if "correlation_" in parameter else None
 
 
 def trial_parameters(choice: Choice, space: Mapping[str, BaseDistribution]) -> dict[str, float | int | str]:
