@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 import typer
 
-from numerics.checks import one_of
 from thruster_cli.log_problems import problems_of
 from thruster_cli.options import (
     FILTER,
@@ -37,7 +36,7 @@ from thruster_cli.options import (
 from thruster_cli.output import announce_compilation, check_targets, emit, progress_console
 from thruster_cli.problems import PROBLEMS
 from thruster_cli.tuning_report import Tuning, as_json, report
-from tuning.api.run import METHODS, name_of, run_tuning
+from tuning.api.run import aim_of, name_of, run_tuning
 from tuning.evaluation.tuned import check_keepable
 from tuning.search.objectives import OBJECTIVES
 from tuning.search.plan import Plan
@@ -112,8 +111,8 @@ def command(
     method: Annotated[
         str,
         typer.Option(
-            help="optuna; or gradient, for kf and ekf: maximum likelihood, or the best mse or log-score where "
-            "that is the --objective; optuna runs for comparison.",
+            help="optuna; or gradient, for kf and ekf: maximum likelihood, or the best score, mse or log-score "
+            "where that is the --objective; optuna runs for comparison.",
             rich_help_panel=SEARCH,
         ),
     ] = "optuna",
@@ -177,7 +176,7 @@ def command(
 
     Example: thruster tune --filter auto --budget 2 --scenario published_noise --trials 100
     """
-    one_of("method", method, METHODS)
+    aim = aim_of(method, objective)
     check_keepable(filter_name)
     of_logs: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensor, "columns": column}
     of_logs |= {"clock_offset": clock_offset, "dt": dt, "held_out": held_out, "blocks": blocks, "lead": lead}
@@ -199,7 +198,7 @@ def command(
         full_r=full_r,
         worst=worst,
     )
-    tuning = tune(plan, trials, storage, study, out, by_gradient=method == "gradient", workers=workers)
+    tuning = tune(plan, trials, storage, study, out, by_gradient=aim, workers=workers)
     emit(report(tuning), as_json(tuning), json)
     if tuning.result.interrupted:
         sys.exit(130)
@@ -214,7 +213,7 @@ def tune(
     study_name: str | None = None,
     out: Path | None = None,
     *,
-    by_gradient: bool = False,
+    by_gradient: str | None = None,
     workers: int = 1,
 ) -> Tuning:
     """Run or resume a study with a progress bar, evaluate its choice and write the tuned file."""

@@ -111,7 +111,7 @@ def test_a_consistent_twin_has_the_same_correlation():
 
 def test_the_gradient_refuses_a_budget_with_one_clear_line(tmp_path):
     with pytest.raises(ValueError, match="must come without a budget, but got budget"):
-        tune(PLAN._replace(budget=1.0), 1, out=tmp_path / "t.json", by_gradient=True)
+        tune(PLAN._replace(budget=1.0), 1, out=tmp_path / "t.json", by_gradient="likelihood")
 
 
 def test_correlations_of_a_singular_covariance_are_those_that_something_determines():

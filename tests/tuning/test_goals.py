@@ -49,10 +49,26 @@ def of_own_numbers(first_scored_step):
     return ModelProblem(vessel(), vessel, inputs, first_scored_step=first_scored_step, parameters=free, name=name)
 
 
+def drift(x, u, c):
+    return (*decay(x, u, c), x[2])
+
+
+def with_drift(x, c):
+    return (x[0] + x[1] + c[1] + x[2], x[1])
+
+
+def of_one_more_state():
+    """A problem whose filters assume one more state than the plant has."""
+    noise = {"process_noise_cov": [0.01, 1e-3, 1e-5], "prior_mean": [1.2, 0.0, 0.0], "prior_cov": [0.5, 1.0, 0.1]}
+    assumed = vessel().replace(transition=drift, observe=with_drift, states=None, **noise)
+    return ModelProblem(vessel(), assumed, np.ones((40, 1)), first_scored_step=3, name="vessel with a drift")
+
+
 CASES = {
     "correlation and prior": ([STARTUP], {"full_q": True, "prior": True}),
     "R held": ([NOISY], {"hold_r": True}),
     "own numbers": ([of_own_numbers(3)], {}),
+    "one more state": ([of_one_more_state()], {}),
     "several problems": ([of_own_numbers(0), of_own_numbers(30)], {}),
 }
 
@@ -67,7 +83,7 @@ def level(goal, choice, problems, data):
     return np.mean([OBJECTIVES[goal.objective].value(one, np.nan) for one in found])
 
 
-@pytest.mark.parametrize("objective", ["likelihood", "mse", "log-score"])
+@pytest.mark.parametrize("objective", ["likelihood", "score", "mse", "log-score"])
 @pytest.mark.parametrize("case", CASES)
 def test_a_goal_is_the_objective_of_the_filter_that_runs_and_its_gradient_that_of_differences(case, objective):
     problems, options = CASES[case]
@@ -141,7 +157,7 @@ def test_correlated_sensors_are_found_and_a_full_r_is_read_back_wherever_a_tuned
     at, error = found.best.parameters[-1], found.standard_errors[-1]
     assert abs(at - 0.6) < 3.5 * error < 0.2 and found.identified[-1]
     file = tmp_path / "full.json"
-    result = tune(plan, 8, out=file, by_gradient=True)
+    result = tune(plan, 8, out=file, by_gradient="likelihood")
     choice, *_ = read_tuned(file, plan.scenarios)
     assert np.array(choice.model["measurement_noise_cov"])[0, 1] > 0.5 and choice == result.result.choice
     assert choice_of("ekf", parameters_of(choice), plan.scenarios[0]).filter(plan.scenarios[0]).model.digest == (

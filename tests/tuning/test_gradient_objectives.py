@@ -19,7 +19,7 @@ def value_of(objective, choice, problem, data):
     return OBJECTIVES[objective].value(found, np.nan)
 
 
-@pytest.mark.parametrize("objective", ["mse", "log-score"])
+@pytest.mark.parametrize("objective", ["score", "mse", "log-score"])
 def test_the_minimum_is_the_objectives_and_lower_than_other_ways_lead(objective):
     data = MISMATCH.data(range(40))
     found = tune_by_gradient("ekf", MISMATCH, data, objective=objective)
@@ -53,5 +53,7 @@ def test_objectives_on_true_states_need_them():
     data = MISMATCH.data(range(2))
     with pytest.raises(ValueError, match="must be 'likelihood' without true states, but got 'mse'"):
         tune_by_gradient("ekf", MISMATCH, data._replace(states=None), objective="mse")
-    with pytest.raises(ValueError, match="objective must be one of likelihood, mse, log-score, but got 'score'"):
-        tune_by_gradient("ekf", MISMATCH, data, objective="score")
+    with pytest.raises(
+        ValueError, match="objective must be one of likelihood, score, mse, log-score, but got 'nees'"
+    ):
+        tune_by_gradient("ekf", MISMATCH, data, objective="nees")

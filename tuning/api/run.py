@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from tuning.likelihood.identifiability import Identifiability, identify
 from tuning.problems.assumed import AssumedProblem
 from tuning.problems.problem import Problem
 from tuning.reporting.choice_words import choice_sentences
-from tuning.search.objectives import LIKELIHOOD
+from tuning.search.objectives import LIKELIHOOD, SCORE
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.storage import open_storage
 from tuning.search.study import FINISHED, StudyResult, checked, finished_trials, open_study, run_study, run_trials
@@ -80,7 +80,7 @@ def run_tuning(
     name: str | None = None,
     out: Path | None = None,
     *,
-    by_gradient: bool = False,
+    by_gradient: str | None = None,
     workers: int = 1,
 ) -> Tuning:
     """Run or resume a study with a progress bar, evaluate its choice and, if requested, write the tuned file.
@@ -92,8 +92,7 @@ def run_tuning(
         storage: journal file or URL; None for a study that ends with the process.
         name: of the study; from the plan if None.
         out: the tuned file; none is written if None.
-        by_gradient: whether the choice is the maximum of the likelihood, beside a study; of a study of "mse" or
-            "log-score" it is the minimum of that.
+        by_gradient: the objective whose gradient leads to the choice, beside a study; None where the study does.
         workers: processes that share the study.
 
     Raises:
@@ -126,11 +125,10 @@ def run_tuning(
                 run = partial(run_in_workers, storage=storage, workers=workers)
             result = run_study(study, plan, trials, advance, run)
     gradient = rival = None
-    if by_gradient:
-        aim = plan.objectives[0] if plan.objectives[0] in OF_STATES else LIKELIHOOD
-        with working(f"following the gradient of the {aim}", console):
+    if by_gradient is not None:
+        with working(f"following the gradient of the {by_gradient}", console):
             data, options = plan.training_data(), plan.options
-            gradient = tune_by_gradient(plan.filter, plan.scenarios, data, objective=aim, options=options)
+            gradient = tune_by_gradient(plan.filter, plan.scenarios, data, objective=by_gradient, options=options)
         rival = evaluate_held_out(result.choice, plan.scenarios[0], plan.seed)
         result = result._replace(choice=gradient.choice, consistent=None, nis=())
     try:
@@ -145,7 +143,7 @@ def run_tuning(
     tuning = Tuning(name, plan, result, proofs, out, gradient, rival)
     if out is not None:
         tuning.write(out)
-    if by_gradient:
+    if gradient is not None:
         return tuning
     return tuning._replace(known=identify(result.choice, plan.scenarios, plan.training_data(), plan.space()))
 
@@ -158,9 +156,16 @@ def _draw_first(plan: Plan, console: Console) -> None:
                 problem.data(problem.held_out_seeds(plan.seed, HELD_OUT_SEEDS))
 
 
-def _check_method(plan: Plan, by_gradient: bool) -> None:
+def aim_of(method: str, asked: Sequence[str] | None) -> str | None:
+    """The objective whose gradient a method follows: what was asked for, if it has one, or the likelihood."""
+    if one_of("method", method, METHODS) == METHODS[0]:
+        return None
+    return asked[0] if asked and asked[0] in OF_STATES else LIKELIHOOD
+
+
+def _check_method(plan: Plan, by_gradient: str | None) -> None:
     """Raise ValueError for a plan that the gradient method cannot serve."""
-    if not by_gradient:
+    if by_gradient is None:
         return
     one_of("a filter whose likelihood has a gradient", plan.filter, DIFFERENTIABLE)
     if plan.worst:
@@ -169,7 +174,7 @@ def _check_method(plan: Plan, by_gradient: bool) -> None:
         raise ValueError("method='gradient' (--method) must come without a budget, but got budget (--budget)")
 
 
-def name_of(plan: Plan, by_gradient: bool = False) -> str:
+def name_of(plan: Plan, by_gradient: str | None = None) -> str:
     """A name for a study of a plan, with everything that differs from the default."""
     parts = [
         re.sub(r"[^\w.+-]+", "-", label_of(plan.filter)),
@@ -181,7 +186,8 @@ def name_of(plan: Plan, by_gradient: bool = False) -> str:
     parts += ["full-r"] * plan.full_r
     parts += [] if plan.budget is None else [f"budget{plan.budget:g}"]
     parts += ["any-nis"] * (not plan.consistent) + [plan.sampler] * (plan.sampler != "tpe")
-    return "-".join(parts + ["gradient"] * by_gradient)
+    parts += [] if by_gradient is None else ["gradient-score" if by_gradient == SCORE else "gradient"]
+    return "-".join(parts)
 
 
 def names_of(plan: Plan) -> str:

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from numerics.checks import one_of, shown
+from numerics.checks import shown
 from tuning.api.problems import problems_of
 from tuning.api.progress import console_for
-from tuning.api.run import METHODS, run_tuning
+from tuning.api.run import aim_of, run_tuning
 from tuning.api.study import Study
 from tuning.search.plan import Plan
 
@@ -79,8 +79,8 @@ def tune(
         budget: time limit of a step of the filter [microseconds of one core].
         sampler: of Optuna: "tpe", "random", "cma-es", ...
         prune: end a trial that is significantly worse than the best on the same seeds.
-        method: "optuna"; or "gradient", for kf and ekf: maximum likelihood, or the best "mse" or "log-score" where
-            that is the objective.
+        method: "optuna"; or "gradient", for kf and ekf: maximum likelihood, or the best "score", "mse" or
+            "log-score" where that is the objective.
         workers: processes on this host that share the study; several need a storage.
         storage: journal file or URL of a database that saves the study, so that the same call continues it; by
             default it ends with the process.
@@ -104,7 +104,8 @@ def tune(
         ValueError: states the rule and the value.
         KeyboardInterrupt: after Ctrl-C before any trial is complete, or during the held-out evaluation.
     """
-    one_of("method", method, METHODS)
+    asked = [objective] if isinstance(objective, str) else objective
+    aim = aim_of(method, None if asked is None else list(asked))
     if not isinstance(filter, str):
         raise ValueError(
             f"filter must be a name or 'module:object', by which trials keep it, but got {shown(filter)}"
@@ -129,6 +130,5 @@ def tune(
         worst=worst,
     )
     where = None if storage is None else str(storage)
-    by_gradient = method == "gradient"
     console = console_for(progress)
-    return Study(run_tuning(plan, trials, console, where, name, by_gradient=by_gradient, workers=workers))
+    return Study(run_tuning(plan, trials, console, where, name, by_gradient=aim, workers=workers))

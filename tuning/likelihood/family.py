@@ -44,6 +44,11 @@ class Family:
         exact = len(self._places) == len(places) and all(map(_is_diagonal, covs))
         self._diagonal = np.concatenate(list(map(np.diag, covs))) if exact else None
 
+    @property
+    def states(self) -> int:
+        """Number of states of the models."""
+        return self._base.n
+
     def at(self, point: np.ndarray) -> tuple[StateSpaceModel, ModelSlopes]:
         """The model at coordinates, and its derivatives by them: exact for variances, else central differences."""
         if self._diagonal is not None:

@@ -6,19 +6,25 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from filters.consistency.intervals import pooled_mean
 from filters.differentiated import recursion
 from filters.differentiated.runs import Truth
 from filters.likelihood import Likelihood
 from numerics.checks import one_of
 from numerics.sources import is_array
+from tuning.evaluation.runs import metrics_of_all
 from tuning.likelihood.family import Family
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
-from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE
+from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
 from tuning.search.space import Choice, neutral
 
-OF_STATES = {MSE: recursion.SQUARES, LOG_SCORE: recursion.LOG_SCORE}  # objectives on the true states
+OF_STATES = {  # objectives on the true states: what of them is summed over steps
+    SCORE: recursion.SQUARES,
+    MSE: recursion.SQUARES,
+    LOG_SCORE: recursion.LOG_SCORE,
+}
 
 
 class Goal:
@@ -27,12 +33,15 @@ class Goal:
     It is the log-likelihood of a run; or minus the sum of an objective's terms over the scored steps of a run. Of
     several problems the mean of their objectives counts, as in a study, and the likelihood of all their runs.
 
+    The score, sum_i sqrt(M_i) / (n s_i) with M_i the mean square error of state i over all runs and s_i its scale,
+    is that of squares with the weights w_i = 1 / (n s_i sqrt(M_i)), and its derivative half of theirs.
+
     Args:
         choice: of a Kalman filter.
         problems: make its models, which have the same parameters.
         data: of each problem.
         parameters: the p parameters.
-        objective: "likelihood", "mse" or "log-score".
+        objective: "likelihood", "score", "mse" or "log-score".
 
     Raises:
         ValueError: for another objective, one on true states without these, or a parameter that has no gradient.
@@ -51,17 +60,22 @@ class Goal:
         self._choice, self._problems, self._data = choice, tuple(problems), tuple(data)
         self._families = [Family(choice, problem, parameters) for problem in problems]
         self.coordinates = self._families[0].coordinates
-        self._truths = [self._truth(*pair) for pair in zip(problems, data, strict=True)]
+        self._truths = [self._truth(*those) for those in zip(problems, data, self._families, strict=True)]
+        self._parts = list(zip(problems, data, self._families, self._truths, strict=True))
         self.steps = sum(int(one.scored_counts.sum()) for one in data)
 
     def __call__(self, point: np.ndarray) -> Likelihood:
         """Values of all runs, (B,), and their gradients, (B, p), at coordinates."""
         found = []
-        for family, data, truth in zip(self._families, self._data, self._truths, strict=True):
+        for problem, data, family, truth in self._parts:
             score = OF_STATES.get(self.objective, recursion.LIKELIHOOD)
+            if truth is not None and self.objective == SCORE:
+                truth = truth._replace(weights=self._of_score(point, problem, data, family))
             out, _ = family.derivatives(point, data, score=score, truth=truth)
             found.append(out * self._weight(data))
         runs = np.concatenate(found)
+        if self.objective == SCORE:
+            runs[:, 1:] *= 0.5
         return Likelihood(runs[:, 0], runs[:, 1:])
 
     def of_few(self, runs: int) -> Goal:
@@ -95,25 +109,38 @@ class Goal:
 
     def unit(self, value: float) -> float:
         """In what information is counted at an optimum: in a log density, or in the mean square that remains."""
-        if self.objective != MSE:
+        if self.objective not in (SCORE, MSE):
             return 1.0
         counted = sum(int(np.isfinite(one.states).sum()) for one in self._truths if one is not None)
-        return -2.0 * value / counted
+        return (-2.0 if self.objective == MSE else -1.0) * value / counted
 
     def _weight(self, data: Data) -> float:
         if self.objective == LIKELIHOOD:
             return 1.0
         return self.steps / (len(self._data) * int(data.scored_counts.sum()))
 
-    def _truth(self, problem: Problem, data: Data) -> Truth | None:
-        """The true states, NaN where the objective does not count them."""
+    def _truth(self, problem: Problem, data: Data, family: Family) -> Truth | None:
+        """The true states, NaN where the objective does not count them: those that the plant lacks, too."""
         if self.objective == LIKELIHOOD:
             return None
         if data.states is None or problem.scale is None:
             raise ValueError(f"objective must be {LIKELIHOOD!r} without true states, but got {self.objective!r}")
         scale = np.asarray(problem.scale, dtype=np.float64)
-        states = np.where(data.scored[..., None] & np.isfinite(scale), data.states, np.nan)
-        return Truth(states, 1.0 / np.square(scale))
+        known = np.where(data.scored[..., None] & np.isfinite(scale), data.states, np.nan)
+        states = np.full((*known.shape[:2], family.states), np.nan)
+        states[..., : len(scale)] = known
+        weights = np.zeros(family.states)
+        weights[: len(scale)] = 1.0 / np.square(scale)
+        return Truth(states, weights)
+
+    def _of_score(self, point: np.ndarray, problem: Problem, data: Data, family: Family) -> np.ndarray:
+        """The weights of squares that give the score, (n,), from the filter's mean square errors."""
+        metrics = metrics_of_all(family.choice_at(point).filter(problem), data, nees=False, outputs=False)
+        scale, weights = np.asarray(problem.scale, dtype=np.float64), np.zeros(family.states)
+        deviations = np.sqrt(pooled_mean(np.asarray(metrics.mean_squares), metrics.weights))
+        with np.errstate(divide="ignore"):
+            weights[: len(scale)] = 1.0 / (np.isfinite(scale).sum() * scale * deviations)
+        return weights
 
 
 def is_large(problem: Problem) -> bool:

@@ -76,16 +76,16 @@ def tune_by_gradient(
     gradients g_b of B independent runs, the standard errors are the roots of the diagonal of
     H^-1 (sum_b g_b g_b') H^-1, which holds for a wrong model, too.
 
-    With true states the same search minimises the objectives "log-score" and "mse" of a study. A common factor on
-    Q and R changes the mse of a linear filter only through the prior, so that the mse determines none, and its
-    covariance is of no use.
+    With true states the same search minimises the objectives "score", "mse" and "log-score" of a study. A common
+    factor on Q and R changes a linear filter's errors only through the prior, so that the first two determine
+    none, and their covariance is of no use.
 
     Args:
         filter_name: "kf" or "ekf".
         problems: make the assumed models, and have the untuned parameters; ranges are those of the first.
         data: the training runs of each problem.
         starts: factors on the untuned parameters, one for all or one each; `starts_of` if None.
-        objective: "likelihood", "log-score" or "mse"; of several problems their mean.
+        objective: "likelihood", "score", "mse" or "log-score"; of several problems their mean.
         options: hold_r, full_q and prior of `model_parameters`.
 
     Raises:

@@ -21,7 +21,7 @@ MOST_PRICE = 0.05  # of the score, that a mean NIS within its band may cost
 DIVERGENCE_PENALTY = 10.0  # added for each filter reset
 LARGEST = 1e6  # larger errors are clipped to this: studies need finite numbers
 OUTPUT = "output:"  # prefix of objectives on derived outputs
-MSE, LOG_SCORE, LIKELIHOOD = "mse", "log-score", "likelihood"
+SCORE, MSE, LOG_SCORE, LIKELIHOOD = "score", "mse", "log-score", "likelihood"
 PROPER = (
     LOG_SCORE,
     LIKELIHOOD,
@@ -69,7 +69,7 @@ def output_objective(symbol: str, about: str = "") -> Objective:
 
 
 OBJECTIVES = {
-    "score": Objective(
+    SCORE: Objective(
         "mean over states of RMSE over the scenario's scale [-]", lambda e, _: e.score.value, (TRUTH,)
     ),
     MSE: Objective(

@@ -17,7 +17,16 @@ from tuning.evaluation.evaluate import Evaluation, compute_metrics, run_scores
 from tuning.evaluation.runs import RunMetrics, joined, metrics_of_all
 from tuning.problems.data import Data
 from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
-from tuning.search.objectives import LARGEST, LOG_SCORES, NEES, VARIANCES, nis_ratio, nis_violation, penalised
+from tuning.search.objectives import (
+    LARGEST,
+    LOG_SCORES,
+    NEES,
+    SCORE,
+    VARIANCES,
+    nis_ratio,
+    nis_violation,
+    penalised,
+)
 from tuning.search.plan import Plan
 from tuning.search.pruning import BLOCK, PairedPruner
 from tuning.search.space import Choice, suggest
@@ -61,7 +70,7 @@ def run_trial(
         trial.set_constraint(BUDGET, over_budget(microseconds, plan.budget))
         if microseconds > plan.budget:
             raise optuna.TrialPruned
-    prunes = plan.prune and plan.objectives == ("score",) and not plan.worst
+    prunes = plan.prune and plan.objectives == (SCORE,) and not plan.worst
     evaluations = measure(choice, plan, data, trial if prunes else None)
     if plan.is_constrained:
         outside = max(map(nis_violation, evaluations))

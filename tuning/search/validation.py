@@ -16,13 +16,13 @@ from filters.tuned_file import NOISE as NOISE_ARGUMENTS
 from tuning.evaluation.baselines import ORACLE, baselines, same_filter
 from tuning.problems.data import Data
 from tuning.search.measures import Measured, measured, over
-from tuning.search.objectives import MOST_PRICE, MSE, NIS_BAND, OUTPUT, PROPER
+from tuning.search.objectives import MOST_PRICE, MSE, NIS_BAND, OUTPUT, PROPER, SCORE
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.plan import Plan
 from tuning.search.space import Choice, choice_of
 from tuning.search.trials import cost_of
 
-VALIDATED = ("score", "thrust", MSE, *PROPER)  # objectives, beside those of outputs, that each run has
+VALIDATED = (SCORE, "thrust", MSE, *PROPER)  # objectives, beside those of outputs, that each run has
 BY_SCORE, BY_CONSISTENCY = 4, 2  # trials that meet the baselines: the best ones, and the best consistent ones
 EQUAL = 1e-4  # of the score, within which two filters are surely one in error, and consistency decides
 
