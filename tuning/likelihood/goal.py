@@ -83,6 +83,15 @@ class Goal:
         few = [one.slice(0, runs) for one in self._data]
         return Goal(self._choice, self._problems, few, self.coordinates.free, self.objective)
 
+    def of(self, objective: str) -> Goal:
+        """Another objective of the same runs."""
+        return Goal(self._choice, self._problems, self._data, self.coordinates.free, objective)
+
+    @property
+    def is_of_squares(self) -> bool:
+        """Whether squared errors are minimised, in which the covariance does not count."""
+        return self.objective in (SCORE, MSE)
+
     def choice_at(self, point: np.ndarray) -> Choice:
         """The choice at coordinates."""
         return self._families[0].choice_at(point)
@@ -109,7 +118,7 @@ class Goal:
 
     def unit(self, value: float) -> float:
         """In what information is counted at an optimum: in a log density, or in the mean square that remains."""
-        if self.objective not in (SCORE, MSE):
+        if not self.is_of_squares:
             return 1.0
         counted = sum(int(np.isfinite(one.states).sum()) for one in self._truths if one is not None)
         return (-2.0 if self.objective == MSE else -1.0) * value / counted

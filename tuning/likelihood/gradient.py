@@ -24,6 +24,7 @@ STEP = 1e-3  # in coordinates, of the differences of gradients that give the Hes
 FLAT = 1e-12  # curvature relative to the largest one, below which a direction counts as flat
 DIVERGED = 1e12  # in place of -log L where the filter diverges
 EQUAL = 0.02  # optima this close in every coordinate are the same
+SAME_LEVEL = 1e-4  # relative difference of their levels, up to which they may be
 PRECISE = 1e-13  # relative decrease of -log L below which the search ends
 FEW_RUNS = 4  # with which the search for a model of many states begins
 COARSE = 1e-9  # the same for models of many states, whose log L is of the order of a million
@@ -50,7 +51,7 @@ class GradientResult(NamedTuple):
     optima: tuple[Optimum, ...]  # one for each start
     standard_errors: np.ndarray  # (p,), of logarithms, or of parameters on linear scales; from the runs' scatter
     identified: np.ndarray  # (p,) whether a 95 % interval is within a factor of ten, or half of a linear range
-    agree: bool  # whether all starts led to the same optimum, in the identified parameters
+    agree: bool  # whether all starts led to the same optimum, in its level and the identified parameters
     seconds: float
     objective: str = LIKELIHOOD
 
@@ -77,8 +78,8 @@ def tune_by_gradient(
     H^-1 (sum_b g_b g_b') H^-1, which holds for a wrong model, too.
 
     With true states the same search minimises the objectives "score", "mse" and "log-score" of a study. A common
-    factor on Q and R changes a linear filter's errors only through the prior, so that the first two determine
-    none, and their covariance is of no use.
+    factor on Q and R changes a linear filter's errors only through the prior, so that the first two determine none
+    (`optimum` keeps it near the likeliest one).
 
     Args:
         filter_name: "kf" or "ekf".
@@ -106,6 +107,7 @@ def tune_by_gradient(
     inside = (coordinates.low < point) & (point < coordinates.high)
     identified = inside & (errors * TWO_SIDED < np.where(coordinates.log, KNOWN_WITHIN, LINEAR_WITHIN))
     apart = [abs(coordinates.of(one.parameters) - point)[identified] for one in optima]
+    levels = [abs(one.level - best.level) <= SAME_LEVEL * max(abs(best.level), 1.0) for one in optima]
     return GradientResult(
         choice=goal.choice_at(point),
         free=free,
@@ -114,7 +116,7 @@ def tune_by_gradient(
         optima=tuple(optima),
         standard_errors=errors * coordinates.units,
         identified=identified,
-        agree=all((distances < EQUAL).all() for distances in apart),
+        agree=all(levels) and all((distances < EQUAL).all() for distances in apart),
         seconds=time.perf_counter() - begin,
         objective=objective,
     )
@@ -143,6 +145,10 @@ def start_at(goal: Goal, factors: Sequence[float]) -> np.ndarray:
 def optimum(goal: Goal, start: np.ndarray) -> Optimum:
     """The maximum to which one start leads, without the standard errors of `tune_by_gradient`.
 
+    Squared errors hardly know the scale of Q and R, nor what of them no estimate depends on: where these are
+    minimised, the search begins at the likeliest parameters, and a weak prior about those counts, as one
+    observation each would that says "within a factor of ten".
+
     For models with many states, whose likelihood takes long, the search is first on a few runs, and continues on
     all runs from there; it ends where an iteration gains less than 1e-9 of log L.
 
@@ -150,12 +156,17 @@ def optimum(goal: Goal, start: np.ndarray) -> Optimum:
         goal: what is maximised.
         start: coordinates.
     """
-    point, large = start, goal.is_large
+    prior = 0.0
+    if goal.is_of_squares:
+        first = goal.of(LIKELIHOOD)
+        start = first.coordinates.of(optimum(first, start).parameters)
+        prior = goal.unit(goal(start).values.sum()) / KNOWN_WITHIN**2
+    point, large, evaluations = start, goal.is_large, 0
     for one in (goal.of_few(FEW_RUNS), goal) if large and goal.runs > FEW_RUNS else (goal,):
-        found = _minimum(one, point, large)
-        point = found.x
-    value = -float(found.fun)
-    return Optimum(goal.coordinates.values(point), value, goal.level(value), found.nfev, bool(found.success))
+        found = _minimum(one, point, large, prior * (one.steps / goal.steps), start)
+        point, evaluations = found.x, evaluations + found.nfev
+    value = float(goal(point).values.sum()) if prior else -float(found.fun)
+    return Optimum(goal.coordinates.values(point), value, goal.level(value), evaluations, bool(found.success))
 
 
 def _factors(start: Sequence[float] | float, count: int) -> tuple[float, ...]:
@@ -181,13 +192,18 @@ def _bad(parameter: Parameter) -> float:
     return BAD_START[parameter.place.index % 2] if isinstance(parameter.place, ProcessVariance) else BAD_START[1]
 
 
-def _minimum(goal: Goal, first: np.ndarray, large: bool):
-    """The minimum of minus the sum over all runs, from a start."""
+def _minimum(goal: Goal, first: np.ndarray, large: bool, prior: float, centre: np.ndarray):
+    """The minimum of minus the sum over all runs and of a prior about a centre, from a start."""
     from scipy.optimize import minimize
 
     def negative(point: np.ndarray) -> tuple[float, np.ndarray]:
-        found = goal(point)
-        value, gradient = -found.values.sum(), -found.gradients.sum(axis=0)
+        away = point - centre
+        try:
+            found = goal(point)
+        except ValueError:  # a covariance is singular by rounding
+            return DIVERGED, np.zeros_like(point)
+        value = 0.5 * prior * (away @ away) - found.values.sum()
+        gradient = prior * away - found.gradients.sum(axis=0)
         if np.isfinite(value) and np.isfinite(gradient).all():
             return value, gradient
         return DIVERGED, np.zeros_like(gradient)  # the line search takes a shorter step
