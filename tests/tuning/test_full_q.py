@@ -15,7 +15,7 @@ from thruster_cli.tune import tune
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import read_tuned, write_tuned
 from tuning.evaluation.verify import verify
-from tuning.search.correlations import correlations_of, full_covariance
+from tuning.search.correlations import correlation_slopes, correlations_of, full_covariance
 from tuning.search.enqueued import RESCALED
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters_of, trial_parameters, untuned_choice
@@ -112,6 +112,15 @@ def test_a_consistent_twin_has_the_same_correlation():
 def test_the_gradient_refuses_a_budget_with_one_clear_line(tmp_path):
     with pytest.raises(ValueError, match="must come without a budget, but got budget"):
         tune(PLAN._replace(budget=1.0), 1, out=tmp_path / "t.json", by_gradient="likelihood")
+
+
+@pytest.mark.parametrize("correlations", [[0.3, -0.6, 0.7, 0.0, 0.98, -0.2], [0.0] * 6])
+def test_derivatives_of_a_full_covariance_are_those_of_differences(correlations):
+    variances, steps = (1.0, 2.0, 3.0, 0.5), 1e-6 * np.eye(6)
+    found = correlation_slopes(variances, correlations)
+    for slope, step in zip(found, steps, strict=True):
+        above, below = (full_covariance(variances, np.add(correlations, sign * step)) for sign in (1, -1))
+        np.testing.assert_allclose(slope, (above - below) / 2e-6, rtol=1e-7, atol=1e-8)
 
 
 def test_correlations_of_a_singular_covariance_are_those_that_something_determines():

@@ -10,11 +10,12 @@ from filters.differentiated.recursion import LIKELIHOOD, Wanted
 from filters.differentiated.runs import ModelSlopes, Truth, derivatives, same_functions
 from filters.registry import make_filter
 from plants.state_space import StateSpaceModel
+from tuning.likelihood.noise import TunedCovariance
 from tuning.problems.coordinates import Coordinates
 from tuning.problems.data import Data
-from tuning.problems.parameter import Parameter, Place
+from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
-from tuning.search.parameters import MeasurementVariance, ProcessVariance, model_parameters
+from tuning.search.parameters import Correlation, MeasurementVariance, ProcessVariance, Q, R, model_parameters
 from tuning.search.space import Choice
 
 DIFFERENTIABLE = ("kf", "ekf")  # filters
@@ -35,14 +36,15 @@ class Family:
     """
 
     def __init__(self, choice: Choice, problem: Problem, parameters: Sequence[Parameter]):
-        """Find out whether all parameters are variances, of which derivatives are known."""
+        """Find out whether all parameters are of Q and R, of which derivatives are known."""
         self.coordinates, self._choice, self._problem = Coordinates(parameters), choice, problem
-        self._base = base = self._model(choice)
-        covs = base.process_noise_cov, base.measurement_noise_cov
-        places = [_place(one.place, base.n) for one in parameters]
-        self._places = [place for place in places if place is not None]
-        exact = len(self._places) == len(places) and all(map(_is_diagonal, covs))
-        self._diagonal = np.concatenate(list(map(np.diag, covs))) if exact else None
+        self._base, places = self._model(choice), [one.place for one in parameters]
+        kinds = ProcessVariance, MeasurementVariance
+        of_q, of_r = ([one.index if isinstance(one, kind) else None for one in places] for kind in kinds)
+        self._noise = None
+        if all(isinstance(one, (*kinds, Correlation)) for one in places):
+            q = TunedCovariance(self._base.process_noise_cov, Q, of_q, places)
+            self._noise = q, TunedCovariance(self._base.measurement_noise_cov, R, of_r, places)
 
     @property
     def states(self) -> int:
@@ -50,9 +52,12 @@ class Family:
         return self._base.n
 
     def at(self, point: np.ndarray) -> tuple[StateSpaceModel, ModelSlopes]:
-        """The model at coordinates, and its derivatives by them: exact for variances, else central differences."""
-        if self._diagonal is not None:
-            return self._with_variances(self._diagonal, self.coordinates.values(point))
+        """The model at coordinates, and its derivatives by them: exact of Q and R, else central differences."""
+        if self._noise is not None:
+            values, units = self.coordinates.values(point), self.coordinates.units
+            (q, by_q), (r, by_r) = (one.at(values, units) for one in self._noise)
+            model = self._base.replace(process_noise_cov=q, measurement_noise_cov=r)
+            return model, ModelSlopes.of(model, len(point), process_noise_cov=by_q, measurement_noise_cov=by_r)
         pairs = []
         for place, name in enumerate(self.coordinates.names):
             above, below = map(self._model_at, self.coordinates.beside(point, place, STEP))
@@ -103,17 +108,6 @@ class Family:
     def _model(self, choice: Choice) -> StateSpaceModel:
         return make_filter(choice.name, self._problem.model(**choice.model)).kernel_model
 
-    def _with_variances(self, diagonal: np.ndarray, values: np.ndarray) -> tuple[StateSpaceModel, ModelSlopes]:
-        """The model with variances, whose derivatives by their logarithms are the variances themselves."""
-        n, count, places, variances = self._base.n, len(values), self._places, diagonal.copy()
-        variances[places] = values
-        slopes = np.zeros((count, len(diagonal), len(diagonal)))
-        slopes[range(count), places, places] = values
-        q, r = np.diag(variances[:n]), np.diag(variances[n:])
-        model = self._base.replace(process_noise_cov=q, measurement_noise_cov=r)
-        noise = {"process_noise_cov": slopes[:, :n, :n], "measurement_noise_cov": slopes[:, n:, n:]}
-        return model, ModelSlopes.of(model, count, **noise)
-
 
 def known_information(
     choice: Choice, scenarios: Sequence[Problem], data: Sequence[Data], names: Sequence[str], values: np.ndarray
@@ -143,14 +137,3 @@ def known_information(
         except ValueError:  # more than numbers changes
             return None
     return np.concatenate(found)
-
-
-def _place(place: Place, n: int) -> int | None:
-    """The index of a variance in the diagonals of Q, (n,), then of R; None of another parameter."""
-    if isinstance(place, ProcessVariance):
-        return place.index
-    return n + place.index if isinstance(place, MeasurementVariance) else None
-
-
-def _is_diagonal(cov: np.ndarray) -> bool:
-    return np.array_equal(cov, np.diag(np.diag(cov)))

@@ -31,13 +31,39 @@ def full_covariance(variances: Sequence[float], correlations: Sequence[float]) -
         raise ValueError(f"variances must be positive, but got {diagonal.tolist()}")
     if len(correlations) != count or not all(abs(r) <= 1 for r in correlations):
         raise ValueError(f"correlations must be {count} numbers from -1 to 1, but got {list(correlations)}")
-    lower, given = np.zeros((len(diagonal),) * 2), iter(correlations)
+    factor = np.sqrt(diagonal)[:, None] * _lower(len(diagonal), correlations)
+    return factor @ factor.T
+
+
+def correlation_slopes(variances: Sequence[float], correlations: Sequence[float]) -> np.ndarray:
+    """Derivatives of `full_covariance` by its correlations, (n (n - 1) / 2, n, n).
+
+    Only row i of L depends on r_ij: by it L_ij grows with sqrt(1 - sum_{k<j} L_ik^2), and what stands behind shrinks
+    with r_ij / (1 - r_ij^2).
+    """
+    n = len(variances)
+    lower, deviations = _lower(n, correlations), np.sqrt(np.asarray(variances, dtype=np.float64))
+    slopes, given, k = np.zeros((len(correlations), n, n)), list(correlations), 0
+    for i in range(n):
+        for j in range(i):
+            by = np.zeros(n)
+            by[j] = np.sqrt(max(1.0 - float(lower[i, :j] @ lower[i, :j]), 0.0))
+            by[j + 1 :] = -given[k] / (1.0 - given[k] ** 2) * lower[i, j + 1 :]
+            row = deviations[i] * deviations * (lower @ by)
+            row[i] = 0.0  # the variance stays
+            slopes[k, i], slopes[k, :, i] = row, row
+            k += 1
+    return slopes
+
+
+def _lower(n: int, correlations: Sequence[float]) -> np.ndarray:
+    """The Cholesky factor L of the correlations."""
+    lower, given = np.zeros((n, n)), iter(correlations)
     for i, row in enumerate(lower):
         for j in range(i):
             row[j] = next(given) * np.sqrt(max(1.0 - float(row[:j] @ row[:j]), 0.0))
         row[i] = np.sqrt(max(1.0 - float(row[:i] @ row[:i]), 0.0))
-    factor = np.sqrt(diagonal)[:, None] * lower
-    return factor @ factor.T
+    return lower
 
 
 def correlations_of(cov: np.ndarray) -> list[float]:
