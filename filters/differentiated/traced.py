@@ -24,6 +24,7 @@ class Traced:
 
     Attributes:
         parts: it, its Jacobian, and the slopes of both, as operations of `Equations` take them.
+        of_points: it and its slope, of each column of a matrix.
     """
 
     def __init__(self, function: Callable, jacobian: Callable | None, others: int, shape: Shape):
@@ -31,6 +32,7 @@ class Traced:
         self._function, self._others, self._shape = traced(function), others, shape
         self._jacobian = None if jacobian is None or by_complex_step(jacobian) else traced(jacobian)
         self.parts = self._value, self._matrix, self._by_constants, self._slope
+        self.of_points = self._values_of_points, self._slopes_of_points
         self._check(function, jacobian)
 
     def _check(self, *functions: Callable | None) -> None:
@@ -83,6 +85,15 @@ class Traced:
         given, (dx, *moves) = others[: self._others], others[self._others :]
         return _along(self._matrix(x, scales, *given), (x, dx), *((given[-1], dc) for dc in moves[:1]))
 
+    def _values_of_points(self, points, *others):
+        return np.array([self._value(x, *others) for x in points.T]).T
+
+    def _slopes_of_points(self, points, scales, *others):
+        given, (changes, *moves) = others[: self._others], others[self._others :]
+        of_constants = [(given[-1], dc) for dc in moves[:1]]
+        pairs = zip(points.T, changes.T, strict=True)
+        return np.array([_along(self._value(x, *given), (x, dx), *of_constants) for x, dx in pairs]).T
+
 
 def _values_at(arguments: list, functions: Sequence[Callable | None]) -> np.ndarray:
     """What functions return, one behind the other; NaN where they have no value."""
@@ -99,6 +110,9 @@ def _along(y: np.ndarray, *moves: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """The slope of y where Numbers that are given move."""
     pairs = [(one, change) for given, changes in moves for one, change in zip(given, changes, strict=True)]
     graph = pairs[0][0].graph
-    directions = {one.place: graph.number(change) for one, change in pairs if graph.number(change).value != 0.0}
+    directions: dict = {one.place: graph.number(change) for one, change in pairs}
+    if len(directions) < len(pairs):
+        raise TypeError("numbers that move must differ from one another, but some are equal")
+    directions = {place: None if change.value == 0.0 else change for place, change in directions.items()}
     found = along([graph.number(one) for one in y.ravel()], directions)
     return np.array([0.0 if one is None else one for one in found], dtype=object).reshape(y.shape)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from numerics import matrices as made
-from numerics.algebra import densities, matrices, operations
+from numerics.algebra import densities, matrices, operations, points_called
 from numerics.algebra.matrices import Matrix, Operation, in_order
 from numerics.algebra.programs import ARRAYS, Place
 from numerics.angles import NAMES, short_way
@@ -176,7 +176,11 @@ def _identity(shape: tuple, *of: tuple) -> Callable:
 
 def _on_one_branch(shape: tuple, angles: tuple[bool, ...], *of: tuple) -> Callable:
     source = Source("wrapped_angles", "a", result=shape, a=shape)
-    return source.function(source.entries(shape, lambda i: short_way(f"a[{i}]", i, angles)), **NAMES)
+
+    def entry(i, *others) -> str:
+        return short_way(f"a[{i}]" + "".join(f"[{j}]" for j in others), i, angles)
+
+    return source.function(source.entries(shape, entry), **NAMES)
 
 
 def _only(result: tuple, z: tuple, shape: tuple) -> Callable:
@@ -247,4 +251,5 @@ _FUNCTIONS: dict[Operation, Callable] = {
     densities.stretch: _stretch,
     densities.heavier: _of_tail(f"({HEAVIER} if tail[0] > 0.0 else 0.0)"),
     densities.outlier_weight: _of_tail(WEIGHT),
+    **points_called.FUNCTIONS,
 }

@@ -32,7 +32,13 @@ def worked_out(operation: str, *numbers: Number) -> Number:
         return graph.make(operation, *numbers)
 
 
-_OF_CONSTANTS: dict[str, Callable] = {"negative": operator.neg, "abs": abs, "arctan": math.atan, "pow": math.pow}
+_OF_CONSTANTS: dict[str, Callable] = {
+    "negative": operator.neg,
+    "abs": abs,
+    "arctan": math.atan,
+    "arctan2": math.atan2,
+    "pow": math.pow,
+}
 
 
 def negative(a: Number) -> Number:

@@ -206,6 +206,14 @@ def where(condition, a, b):
     return a if a is b else condition.graph.make("where", condition, a, b)
 
 
+def arctan2(y, x):
+    """The angle of a point (x, y), of numbers known or not."""
+    known = next((one for one in (y, x) if isinstance(one, Number)), None)
+    if known is None:
+        return np.arctan2(y, x)
+    return worked_out("arctan2", known.graph.number(y), known.graph.number(x))
+
+
 def needed_by(numbers: Iterable[Number], known: Container[int] = ()) -> list[Number]:
     """Numbers and all that they are made of, in an order in which to work them out.
 

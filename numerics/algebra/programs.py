@@ -70,7 +70,7 @@ def _expression(operation: str, values: list[str]) -> str:
         return f"float.fromhex({values[0]!r})"
     if operation in SPECIAL:
         return SPECIAL[operation].format(*values)
-    known = len(values) == 2 and not operation.isalpha()
+    known = len(values) == 2 and not operation.isalnum()
     return f" {operation} ".join(values) if known else f"{operation}({', '.join(values)})"
 
 

@@ -25,15 +25,15 @@ def added(*slopes: Slope) -> Slope:
     return sum(moving[1:], moving[0]) if moving else None
 
 
-def along(numbers: Sequence[Number], moves: Mapping[int, Number]) -> list[Slope]:
+def along(numbers: Sequence[Number], moves: Mapping[int, Slope]) -> list[Slope]:
     """Derivatives of numbers in the direction in which the numbers at some places of their graph move.
 
     Args:
         numbers: to be differentiated.
-        moves: by the place of each number that moves, its change.
+        moves: by the place of each number that moves, its change, or None; what such are made of does not matter.
     """
     slopes: dict[int, Slope] = dict(moves)
-    for number in needed_by(numbers):
+    for number in needed_by(numbers, moves):
         if number.place not in slopes:
             of = [slopes[one.place] for one in number.of]
             slopes[number.place] = _RULES[number.operation](number, *number.of, *of) if any_of(of) else None
@@ -56,6 +56,11 @@ def _of_choice(y, condition, a, b, of_condition, da, db):
 
 def _of_power(y, x, e, dx, de):
     return added(times(dx, lambda: e * x ** (e - 1.0)), times(de, lambda: y * x.log()))
+
+
+def _of_angle(y, a, b, da, db):
+    square = a * a + b * b
+    return added(times(da, lambda: b / square), times(db, lambda: -a / square))
 
 
 def _none(y, *others):
@@ -81,6 +86,7 @@ _RULES: dict[str, Callable] = {
     "sinh": lambda y, x, dx: dx * x.cosh(),
     "cosh": lambda y, x, dx: dx * x.sinh(),
     "pow": _of_power,
+    "arctan2": _of_angle,
     "where": _of_choice,
     **dict.fromkeys(("floor", "ceil", "<", "<=", ">", ">=", "==", "!=", "and"), _none),
 }

@@ -21,9 +21,16 @@ from typing import Any
 
 import numpy as np
 
-from numerics.algebra.graphs import UNARY, Number, where
+from numerics.algebra.graphs import UNARY, Number, arctan2, where
 
-OTHER_NAMES = {"atan": "arctan", "fabs": "absolute", "abs": "absolute", "pow": "power"}  # of math's, NumPy's
+OTHER_NAMES = {
+    "atan": "arctan",
+    "atan2": "arctan2",
+    "fabs": "absolute",
+    "abs": "absolute",
+    "pow": "power",
+}
+"""NumPy's names of functions of `math`."""
 
 
 def _of_number(name: str) -> Callable:
@@ -62,6 +69,7 @@ FUNCTIONS: dict[str, Callable] = {
     "hypot": lambda x, y: (x * x + y * y) ** 0.5,
     "sign": lambda x: where(x > 0.0, 1.0, where(x < 0.0, -1.0, 0.0)),
     "where": where,
+    "arctan2": arctan2,
     "maximum": _largest,
     "minimum": _smallest,
     "zeros": _filled(0.0),

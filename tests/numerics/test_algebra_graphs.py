@@ -20,6 +20,7 @@ FUNCTIONS = {
     "math": lambda x, y: math.sin(x) * math.cos(y) + math.exp(-x) * math.log(y) + math.atan(x) + math.tanh(y),
     "numpy": lambda x, y: np.sin(x) + np.sqrt(y) * np.tan(x) + np.sinh(y) + np.cosh(x) + np.hypot(x, y),
     "decisions": lambda x, y: max(x, y, 1.0) + min([x, 0.7]) + abs(x - y) + np.where(x > y, x, y * y),
+    "angles": lambda x, y: math.atan2(x - 1.0, y - 2.0) + np.arctan2(0.3, y) * math.atan2(1.0, -2.0),
     "remainders": lambda x, y: x % 0.7 + (10.0 * y) % 1.0 + x // 0.3,
 }
 POINTS = [(0.35, 1.73), (1.13, 0.44), (2.63, 2.25)]
@@ -70,6 +71,13 @@ def test_what_is_equal_is_there_once_and_structure_vanishes():
     assert (x / y).operation == "*" and (x / y).arguments[1] is 1.0 / y
     assert (x * 2.0 * 0.0).value == 0.0 and (abs(x * 0.0 - 2.0) ** 0.5).value == 2.0**0.5
     assert where(x < y, x, x) is x and along([x * x], {y.place: x}) == [None]
+
+
+def test_what_moves_of_itself_moves_with_nothing_that_it_is_made_of():
+    x, y = pair()
+    z = x * y
+    assert along([z * x], {z.place: y, x.place: None}) == [y * x]
+    assert along([z], {x.place: y, z.place: None}) == [None]
 
 
 UNTRACEABLE = {

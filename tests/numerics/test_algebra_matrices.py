@@ -10,6 +10,7 @@ from numerics.algebra.densities import heavier, log_density, outlier_weight, tai
 from numerics.algebra.derivatives import slopes_of
 from numerics.algebra.matrices import Matrix, evaluate, given, in_order
 from numerics.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
+from numerics.algebra.points import first, on_circle, ones, others, outer, root, square, units
 from numerics.algebra.programs import Place
 
 RNG = np.random.default_rng(0)
@@ -55,6 +56,12 @@ FORMULAS = {
     "posterior": posterior,
     "any gain": lambda g: joseph(g["P"], g["H"].T, g["H"], g["R"]),
     "rest": lambda g: (eye(g["x"]) - g["F"]) @ wrap(g["x"] + g["x"], (True, False) + (False,) * (len(g["x"]) - 2)),
+    "root": lambda g: root(g["P"]),
+    "points": lambda g: g["H"] @ (outer(g["x"], ones(units(g["x"]))) + (root(g["P"]) * 0.7) @ units(g["x"])),
+    "scatter": lambda g: (
+        square(others(g["F"])) + outer(first(g["F"]), first(g["F"])) + outer(g["x"], g["F"] @ g["x"])
+    ),
+    "circle": lambda g: on_circle(g["F"], (True, False) + (True,) * (len(g["x"]) - 2)),
     "density": lambda g: log_density(only(present(g["z"]), g["v"]), innovation_covariance(g), present(g["z"])),
 }
 ENTRIES = ("P", "R", "H", "F", "x", "v", "z")
