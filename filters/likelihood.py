@@ -8,6 +8,7 @@ import numpy as np
 
 from filters.differentiated.recursion import Wanted
 from filters.differentiated.runs import ModelSlopes, derivatives
+from filters.filter import Filter
 from numerics.checks import as_floats
 from plants.state_space import StateSpaceModel
 
@@ -20,14 +21,21 @@ class Likelihood(NamedTuple):
 
 
 def likelihood(
-    model: StateSpaceModel, inputs: np.ndarray, measurements: np.ndarray, q_slopes, r_slopes
+    model: StateSpaceModel,
+    inputs: np.ndarray,
+    measurements: np.ndarray,
+    q_slopes,
+    r_slopes,
+    filter: Filter | None = None,
 ) -> Likelihood:
-    """Log-likelihood of the (extended) Kalman filter's innovations, with its gradient.
+    """Log-likelihood of a filter's innovations, by default the (extended) Kalman filter's, with its gradient.
 
         log L = -1/2 sum_k (v' S^-1 v + log det 2 pi S),  v = z - h(m),  S = H P H' + R
 
-    Beside mean m and covariance P the recursion carries dm and dP for each parameter: the derivative of every
-    equation of the filter (`filters.pages.extended`), in which what all parameters share is formed once a step.
+    or with the v and S of another filter. Beside mean m and covariance P the recursion carries dm and dP for each
+    parameter: the derivative of every equation of the filter (`filters.pages`), in which what all parameters share
+    is formed once a step. Sigma-point filters carry the slope of P's root, too; it is NaN where P is singular and
+    a parameter makes it regular.
     F = df/dx and H = dh/dx depend on the parameters through m. Of functions that can be traced, which is
     arithmetic without decisions, their derivatives along dm are exact; of others they are central differences
     of the model's Jacobians, of large models along each component of x.
@@ -38,19 +46,26 @@ def likelihood(
         measurements: (B, K + 1, m); NaN where missing.
         q_slopes: dQ/dparameter, (parameters, n, n), symmetric.
         r_slopes: dR/dparameter, (parameters, m, m), symmetric.
+        filter: a filter "kf", "ekf", "iekf", "ukf" or "ckf", of which the type and its own parameters count: it is
+            used with `model` in place of its own.
 
     Raises:
-        ValueError: if shapes do not fit.
+        ValueError: if shapes do not fit, or for another filter.
 
     Source: Gupta, Mehra (1974), "Computational aspects of maximum likelihood estimation and reduction in
     sensitivity function calculations", IEEE Trans. Automatic Control 19(6).
     """
-    out, _ = _derivatives(model, (inputs, measurements, q_slopes, r_slopes), False)
+    out, _ = _derivatives(model, (inputs, measurements, q_slopes, r_slopes), False, filter)
     return Likelihood(out[:, 0], out[:, 1:])
 
 
 def information(
-    model: StateSpaceModel, inputs: np.ndarray, measurements: np.ndarray, q_slopes, r_slopes
+    model: StateSpaceModel,
+    inputs: np.ndarray,
+    measurements: np.ndarray,
+    q_slopes,
+    r_slopes,
+    filter: Filter | None = None,
 ) -> np.ndarray:
     """Fisher's information on p parameters in the innovations of each of B trajectories, (B, p, p).
 
@@ -61,11 +76,13 @@ def information(
 
     Source: Gupta, Mehra (1974), as above.
     """
-    _, found = _derivatives(model, (inputs, measurements, q_slopes, r_slopes), True)
+    _, found = _derivatives(model, (inputs, measurements, q_slopes, r_slopes), True, filter)
     return found
 
 
-def _derivatives(model: StateSpaceModel, given: tuple, informative: bool) -> tuple[np.ndarray, np.ndarray]:
+def _derivatives(
+    model: StateSpaceModel, given: tuple, informative: bool, used: Filter | None
+) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihood with gradient, (B, 1 + p), and the information, (B, p, p), or nothing in its place."""
     inputs, measurements, q_slopes, r_slopes = (np.ascontiguousarray(as_floats(value)) for value in given)
     n, m, p = model.n, model.m, len(q_slopes)
@@ -74,7 +91,7 @@ def _derivatives(model: StateSpaceModel, given: tuple, informative: bool) -> tup
     prior = np.zeros((p, n)), np.zeros((p, n, n))
     slopes = ModelSlopes(np.zeros((p, len(model.constants))), q_slopes, r_slopes, *prior)
     wanted = Wanted(information=informative, constants=False, tails=False)
-    out, found = derivatives(model, inputs, measurements, slopes, wanted)
+    out, found = derivatives(model, inputs, measurements, slopes, wanted, used=used)
     return out[:, 0], found
 
 

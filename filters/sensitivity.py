@@ -10,6 +10,7 @@ import numpy as np
 
 from filters.differentiated.recursion import Wanted
 from filters.differentiated.runs import Density, ModelSlopes, derivatives
+from filters.filter import Filter
 from filters.likelihood import check_shapes
 from filters.starts import Starts
 from numerics.checks import as_floats
@@ -37,6 +38,7 @@ def sensitivity(
     blocks: int = 1,
     predicted: Sequence[bool] | None = None,
     starts: Starts | None = None,
+    filter: Filter | None = None,
 ) -> Sensitivity:
     """`likelihood`, and Fisher's information, for parameters that move all numbers of a model.
 
@@ -59,9 +61,10 @@ def sensitivity(
         starts: of trajectories that do not begin as the prior says: their priors do not move with parameters
             (unless they are not held), and the innovations of their lead-ins do not count. That is the likelihood
             of what follows, given them.
+        filter: as `likelihood` takes it; the (extended) Kalman filter by default.
 
     Raises:
-        ValueError: if shapes do not fit, or degrees are not above 2.
+        ValueError: if shapes do not fit, degrees are not above 2, or for another filter.
 
     Source: Gupta, Mehra (1974), as `likelihood`; Astrom (1980), "Maximum likelihood and prediction error methods",
     Automatica 16(5), for the information.
@@ -79,7 +82,7 @@ def sensitivity(
     wanted = Wanted(information=True, constants=True, tails=True)
     density = Density(float(degrees), seen)
     out, information = derivatives(
-        model, inputs, measurements, slopes, wanted, density=density, blocks=blocks, starts=starts
+        model, inputs, measurements, slopes, wanted, density=density, blocks=blocks, starts=starts, used=filter
     )
     total = out.sum(axis=1)
     return Sensitivity(total[:, 0], total[:, 1:], information, out[:, :, 1:])

@@ -1,4 +1,4 @@
-"""Scores of a Kalman filter's estimate where the true states are known, with gradients with respect to Q and R."""
+"""Scores of a filter's estimate where the true states are known, with gradients with respect to Q and R."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from filters.differentiated.recursion import LOG_SCORE, SQUARES, Wanted
 from filters.differentiated.runs import ModelSlopes, Truth, derivatives
+from filters.filter import Filter
 from filters.likelihood import Likelihood, check_shapes
 from numerics.checks import as_floats, one_of
 from plants.state_space import StateSpaceModel
@@ -22,8 +23,9 @@ def state_score(
     r_slopes,
     score: str = LOG_SCORE,
     weights: Sequence[float] | np.ndarray | None = None,
+    filter: Filter | None = None,
 ) -> Likelihood:
-    """A score of the (extended) Kalman filter's estimate at the true states, larger is better, and its gradient.
+    """A score of a filter's estimate at the true states, larger is better, and its gradient.
 
         log-score:  sum_k log N(x; m, P)
         squares:    -sum_k e' W e,  e = x - m,  W = diag(weights)
@@ -40,9 +42,10 @@ def state_score(
         r_slopes: dR/dparameter, (parameters, m, m), symmetric.
         score: "log-score" or "squares".
         weights: of the squares, (n,), one by default; those of a log score are one.
+        filter: as `filters.likelihood.likelihood` takes it; the (extended) Kalman filter by default.
 
     Raises:
-        ValueError: if shapes do not fit, or for another score.
+        ValueError: if shapes do not fit, or for another score or filter.
 
     Source: Abbeel, Coates, Montemerlo, Ng, Thrun (2005), "Discriminative training of Kalman filters", Robotics:
     Science and Systems, criteria (ii) and (iii); here with exact gradients.
@@ -61,5 +64,5 @@ def state_score(
         np.zeros((p, len(model.constants))), q_slopes, r_slopes, np.zeros((p, n)), np.zeros((p, n, n))
     )
     wanted = Wanted(information=False, constants=False, tails=False, score=score)
-    out, _ = derivatives(model, inputs, measurements, slopes, wanted, truth=Truth(states, of_squares))
+    out, _ = derivatives(model, inputs, measurements, slopes, wanted, truth=Truth(states, of_squares), used=filter)
     return Likelihood(out[:, 0, 0], out[:, 0, 1:])

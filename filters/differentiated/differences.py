@@ -43,14 +43,15 @@ def called_parts(functions: Functions, shape: Shape, which: str, constants_move:
         value, matrix = functions.observe, observation_slopes(functions, shape)
         rows, angles, others = shape.m, shape.measurement_angles, "c"
     by_constants = _by_constants(value, rows, shape, angles, others)
-    parts = value, matrix, by_constants, _slope(matrix, rows, shape, others, constants_move)
+    size = rows, shape.n
+    entry = "(a[{0}][{1}] - b[{0}][{1}]) / (2.0 * h)"
+    difference = entrywise("difference", "a, b, h", size, lambda i, j: entry.format(i, j), a=size, b=size)
+    parts = value, matrix, by_constants, slope_of(matrix, difference, shape, others, constants_move)
     large = is_array(rows, shape.n) and which == "motion" and not constants_move
     return (*parts, _curvature(matrix, rows, shape.n, others), _contraction(rows, shape.n)) if large else parts
 
 
 def _by_constants(value: Callable, rows: int, shape: Shape, angles: tuple[bool, ...], others: str) -> Callable:
-    source = Source("difference", "above, below, h", result=(rows,), above=(rows,), below=(rows,))
-    entries = source.vector(rows, lambda i: short_way(f"(above[{i}] - below[{i}])", i, angles) + " / (2.0 * h)")
     sides = [others.replace("c", f"shift(c, {sign}h, dc)") for sign in ("", "-")]
     lines = (
         f"h = {RELATIVE_STEP} / max(size, 1e-300)",
@@ -60,35 +61,37 @@ def _by_constants(value: Callable, rows: int, shape: Shape, angles: tuple[bool, 
     names: dict[str, Any] = {
         "value": value,
         "shift": _constants_shift(shape),
-        "difference": source.function(entries, **NAMES),
+        "difference": difference_of_values(rows, angles),
     }
     return written_out("by_constants", f"x, {others}, dc, size", *lines, **names)
 
 
-def _slope(matrix: Callable, rows: int, shape: Shape, others: str, constants_move: bool) -> Callable:
-    size = rows, shape.n
+def difference_of_values(rows: int, angles: tuple[bool, ...]) -> Callable:
+    """`difference(above, below, h)`: the slope between two vectors that lie 2 h apart, of angles the short way."""
+    source = Source("difference", "above, below, h", result=(rows,), above=(rows,), below=(rows,))
+    entries = source.vector(rows, lambda i: short_way(f"(above[{i}] - below[{i}])", i, angles) + " / (2.0 * h)")
+    return source.function(entries, **NAMES)
+
+
+def slope_of(
+    function: Callable, difference: Callable, shape: Shape, others: str, constants_move: bool
+) -> Callable:
+    """`slope(x, scales, ..., c, dx)` of a function (x, scales, ..., c); with dc and its size if constants move."""
     sides = [
         (sign, others.replace("c", f"shift(c, {sign}h, dc)") if constants_move else others) for sign in ("", "-")
     ]
-    calls = (f"matrix(move(x, {sign}h, dx), scales, {side})" for sign, side in sides)
+    calls = (f"function(move(x, {sign}h, dx), scales, {side})" for sign, side in sides)
     lines = (
         f"h = step(x, scales, dx, {'size' if constants_move else '0.0'})",
         f"above, below = {', '.join(calls)}",
         "difference(above, below, h)",
     )
     names: dict[str, Any] = {
-        "matrix": matrix,
+        "function": function,
         "step": _step(shape.n),
         "move": scaled_sum(shape.n),
         "shift": _constants_shift(shape),
-        "difference": entrywise(
-            "difference",
-            "a, b, h",
-            size,
-            lambda i, j: f"(a[{i}][{j}] - b[{i}][{j}]) / (2.0 * h)",
-            a=size,
-            b=size,
-        ),
+        "difference": difference,
     }
     return written_out("slope", f"x, scales, {others}, dx" + ", dc, size" * constants_move, *lines, **names)
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from filters.differentiated.at_points import called_at_points
 from filters.differentiated.differences import called_parts
 from filters.differentiated.memory import Memory
 from filters.differentiated.traced import Traced
@@ -24,6 +25,7 @@ class Equations:
 
     Attributes:
         Q, R: its covariances.
+        own: the filter's own numbers.
         state_angles, measurement_angles: flags of components that are angles.
         called: if functions are to be called, those that work out the model's operations.
     """
@@ -33,34 +35,38 @@ class Equations:
         shape, f, by_f, h, by_h = memory.shape, *functions
         self.state_angles, self.measurement_angles = shape.state_angles, shape.measurement_angles
         self.Q, self.R, self._scales, self._constants = memory.Q, memory.R, memory.scales, memory.constants
+        self.own = memory.own
         self._moves = (memory.constants_slope, memory.size) if constants_move and shape.constants else ()
         self.called: dict[Operation, Callable] = {}
-        motion: tuple[Callable, ...]
-        sight: tuple[Callable, ...]
+        motion: tuple[tuple[Callable, ...], ...]
+        sight: tuple[tuple[Callable, ...], ...]
         if trace:
-            motion, sight = Traced(f, by_f, 2, shape).parts, Traced(h, by_h, 1, shape).parts
+            traced = Traced(f, by_f, 2, shape), Traced(h, by_h, 1, shape)
+            motion, sight = ((one.parts, one.of_points) for one in traced)
         else:
-            motion, sight = (
-                called_parts(functions, shape, which, bool(self._moves)) for which in ("motion", "sight")
-            )
-        self._motion = self._operations("f", motion, shape.n, shape.n, trace)
-        self._sight = self._operations("h", sight, shape.m, shape.n, trace)
+            chosen = ((functions, shape, which, bool(self._moves)) for which in ("motion", "sight"))
+            points = memory.X.shape[1]
+            motion, sight = ((called_parts(*one), called_at_points(*one, points)) for one in chosen)
+        self._f, self._F = self._operations("f", motion[0], shape.n, shape.n, trace)
+        self._h, self._H = self._operations("h", sight[0], shape.m, shape.n, trace)
+        self._f_of_points = self._of_points("f", motion[1], shape.n, trace)
+        self._h_of_points = self._of_points("h", sight[1], shape.m, trace)
 
     def f(self, x: Matrix, u: Matrix) -> Matrix:
-        """The state, a substep after x."""
-        return self._motion[0](x, u, self._constants)
+        """The state, a substep after x; of points (n, points) that of each."""
+        return (self._f if len(x.shape) == 1 else self._f_of_points)(x, u, self._constants)
 
     def F(self, x: Matrix, u: Matrix) -> Matrix:  # noqa: N802
         """df/dx."""
-        return self._motion[1](x, self._scales, u, self._constants)
+        return self._F(x, self._scales, u, self._constants)
 
     def h(self, x: Matrix) -> Matrix:
-        """What is measured at x."""
-        return self._sight[0](x, self._constants)
+        """What is measured at x; of points (n, points) at each."""
+        return (self._h if len(x.shape) == 1 else self._h_of_points)(x, self._constants)
 
     def H(self, x: Matrix) -> Matrix:  # noqa: N802
         """dh/dx."""
-        return self._sight[1](x, self._scales, self._constants)
+        return self._H(x, self._scales, self._constants)
 
     def _operations(
         self, name: str, parts: tuple[Callable, ...], rows: int, n: int, trace: bool
@@ -95,6 +101,22 @@ class Equations:
             return slope(*arguments, slopes[0], *self._moves)
 
         return value, matrix
+
+    def _of_points(self, name: str, parts: tuple[Callable, ...], rows: int, trace: bool) -> Operation:
+        """An equation (X, ..., c) of each column of X; its slope (X, scales, ..., c, dX) is an operation, too."""
+        value, slope = (
+            Operation(part if trace else _not_known, lambda x, *_: (rows, x[1]), never) for part in parts
+        )
+        value.name, slope.name = f"{name}_of_points", f"d{name}_of_points"
+        if not trace:
+            self.called |= {value: parts[0], slope: parts[1]}
+
+        @value.derivative
+        def of_value(result, arguments, slopes):
+            x, *others = arguments
+            return slope(x, self._scales, *others, slopes[0], *self._moves)
+
+        return value
 
 
 def _not_known(*arguments):

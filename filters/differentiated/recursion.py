@@ -13,37 +13,21 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.differentiated.equations import Equations
+from filters.differentiated.kinds import EXTENDED, Kind
 from filters.differentiated.memory import Memory
+from filters.differentiated.scores import LIKELIHOOD, LOG_SCORE, SQUARES, Wanted, density_of, score_of_truth
 from filters.differentiated.stages import Stage, as_calls, as_programs, stage_of
 from filters.differentiated.traced import MOST
-from filters.pages import extended
-from numerics.algebra.densities import density, density_slope, dot, heavier, outlier_weight
-from numerics.algebra.derivatives import slopes_of
 from numerics.algebra.matrices import Matrix
-from numerics.algebra.operations import factor, inverse, only, present, quotient, uncorrelated, wrap
+from numerics.algebra.operations import only, present, uncorrelated, wrap
 from numerics.algebra.programs import callable_of
-from numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape, observation_slopes, transition_slopes
 
+__all__ = ["LIKELIHOOD", "LOG_SCORE", "SQUARES", "Recursion", "Wanted", "recursion_of", "stages_of"]
+
 AT_ONCE = 4  # runs of a program: of eight each would take a fifth less, but a run alone twice as long
-
-
-LIKELIHOOD, LOG_SCORE, SQUARES = "likelihood", "log-score", "squares"  # what is summed over steps
-
-
-class Wanted(NamedTuple):
-    """What is worked out: a score, with its gradient, and what stands beside it."""
-
-    information: bool  # Fisher's
-    constants: bool  # slopes along the model's constants
-    tails: bool  # densities with more outliers than the normal one, and channels that are predicted only
-    score: str = LIKELIHOOD  # of the innovations; or of the true states, which are given then
-
-    @property
-    def of_truth(self) -> bool:
-        """Whether the score is one of the true states."""
-        return self.score != LIKELIHOOD
 
 
 class Recursion(NamedTuple):
@@ -60,18 +44,17 @@ class Recursion(NamedTuple):
         return (self.length * self.at_once,), changes, (parameters, parameters, self.at_once), (self.at_once,)
 
 
-def recursion_of(functions: Functions, shape: Shape, wanted: Wanted) -> Recursion:
-    """The recursion of the extended Kalman filter for a model's functions and sizes."""
-    return _recursion_of(functions, shape, wanted, is_interpreting())
+def recursion_of(functions: Functions, shape: Shape, wanted: Wanted, kind: Kind = EXTENDED) -> Recursion:
+    """The recursion of a kind of filter for a model's functions and sizes."""
+    return _recursion_of(functions, shape, wanted, kind, is_interpreting())
 
 
 @cache
-def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, interpreting: bool) -> Recursion:
-    memory = Memory(shape)
+def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, kind: Kind, interpreting: bool) -> Recursion:
+    memory = Memory(shape, kind.points(shape.n), kind.own)
     try:
-        stages = stages_of(
-            memory, Equations(functions, memory, constants_move=wanted.constants, trace=True), wanted
-        )
+        model = Equations(functions, memory, constants_move=wanted.constants, trace=True)
+        stages = stages_of(memory, model, wanted, kind)
         made = [as_programs(stage, memory.length, MOST) for stage in stages]
         works = [callable_of(program, AT_ONCE) for one in made for program in one[:2]]
         fingerprint, at_once = function_fingerprint(within=__name__), AT_ONCE
@@ -79,18 +62,26 @@ def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, interpreti
         model = Equations(functions, memory, constants_move=wanted.constants, trace=False)
         readers = {memory.constants: constants_reader(shape)}
         made = [
-            as_calls(stage, memory.length, model.called, readers) for stage in stages_of(memory, model, wanted)
+            as_calls(stage, memory.length, model.called, readers)
+            for stage in stages_of(memory, model, wanted, kind)
         ]
         works = [work for one in made for work in one[:2]]
         slopes = transition_slopes(functions, shape), observation_slopes(functions, shape)
         fingerprint = function_fingerprint(functions.transition, functions.observe, *slopes, within=__name__)
         at_once = 1
     length = max(one.length for one in made)
-    run = CompiledOrPython(_accumulator(memory, works, wanted, at_once, fingerprint))
+    if kind.begin is None:
+        works[:0] = nothing, nothing
+    run = CompiledOrPython(_accumulator(memory, works, wanted, kind, at_once, fingerprint))
     return Recursion(run, at_once, length, memory.depth)
 
 
-def stages_of(memory: Memory, model: Equations, wanted: Wanted) -> list[Stage]:
+@inlined
+def nothing(rows, change, numbers, move):
+    """In place of the first stage of filters whose belief is the same during a step."""
+
+
+def stages_of(memory: Memory, model: Equations, wanted: Wanted, kind: Kind = EXTENDED) -> list[Stage]:
     """The stages of a step, and what is done with channels that are predicted only."""
     n, (x, p) = memory.shape.n, (memory.x, memory.P)
     moves = dict(memory.moves)
@@ -102,60 +93,33 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted) -> list[Stage]:
         found = stage_of(left | (more or {}), {0: mean, n: cov}, moves)
         return found._replace(slopes=found.slopes | (slopes or {}))
 
-    stages = [moved(*extended.advance(model, x, p, memory.u)), moved(*extended.settle(model, x, p))]
-    mean, cov, v, s, _ = extended.update(model, x, p, memory.z)
+    if kind.begin is None:
+        stages = [moved(*kind.advance(model, x, p, memory.u)), moved(*kind.settle(model, x, p))]
+    else:
+        points = kind.begin(model, x, p), kind.advance(model, memory.X, memory.u)
+        stages = [stage_of({memory.left: one}, {0: one}, moves) for one in points]
+        stages.append(moved(*kind.settle(model, memory.X)))
+    mean, cov, v, s, _ = kind.update(model, x, p, memory.z)
     if wanted.of_truth:
         known = present(memory.truth)
         off = only(known, wrap(memory.truth - mean, model.state_angles))
-        stages.append(moved(mean, cov, *_of_truth(memory, off, cov, moves, wanted.score)))
+        stages.append(moved(mean, cov, *score_of_truth(memory, off, cov, moves, wanted.score)))
         return stages
-    stages.append(moved(mean, cov, *_density(memory, v, s, moves, memory.tails[0], wanted)))
+    stages.append(moved(mean, cov, *density_of(memory, v, s, moves, memory.tails[0], wanted)))
     if wanted.tails:
         seen = present(memory.z)
         v = only(seen, wrap(memory.z - model.h(x), model.measurement_angles))
-        stages.append(Stage(*_density(memory, v, uncorrelated(seen, model.R), moves, memory.tails[1], wanted)))
+        stages.append(Stage(*density_of(memory, v, uncorrelated(seen, model.R), moves, memory.tails[1], wanted)))
     return stages
 
 
-def _density(memory: Memory, v: Matrix, s: Matrix, moves: dict, tail: Matrix, wanted: Wanted) -> tuple[dict, dict]:
-    """The log density of an innovation, and of a parameter its slope, and what the information takes of both."""
-    seen, of = present(memory.z), factor(s)
-    w, e = quotient(v, of), inverse(of, seen)
-    level, weighted = density(v, of, seen), w
-    if wanted.tails:
-        q = dot(v, w)
-        level, weighted = level + heavier(q, seen, tail), w * outlier_weight(q, seen, tail)
-    dv, ds = slopes_of([v, s], moves)
-    slopes = {memory.slope: density_slope(w, weighted, e, dv, ds)}
-    if wanted.information:
-        m = memory.shape.m
-        slopes |= {memory.noted: dv, memory.noted + m: ds}
-        slopes |= {memory.weighed: e @ dv, memory.weighed + m: (e @ ds @ e) * 0.5}
-    return {memory.level: level}, slopes
-
-
-def _of_truth(memory: Memory, off: Matrix, cov: Matrix, moves: dict, score: str) -> tuple[dict, dict]:
-    """A score of the estimate, given its error without the states that do not count, and its slope."""
-    if score == SQUARES:
-        weighted = memory.weights @ off
-        doff = slopes_of([off], moves)[0]
-        slope = None if doff is None else dot(weighted, doff) * -2.0
-        return {memory.level: dot(weighted, off) * -1.0}, {memory.slope: slope}
-    known = present(memory.truth)
-    s = uncorrelated(known, cov)
-    of = factor(s)
-    w = quotient(off, of)
-    slope = density_slope(w, w, inverse(of, known), *slopes_of([off, s], moves))
-    return {memory.level: density(off, of, known)}, {memory.slope: slope}
-
-
 def _accumulator(
-    memory: Memory, works: list[Callable], wanted: Wanted, at_once: int, fingerprint: str
+    memory: Memory, works: list[Callable], wanted: Wanted, kind: Kind, at_once: int, fingerprint: str
 ) -> Callable:
     """The recursion over steps of some runs."""
-    advance, advance_slopes, settle, settle_slopes, update, update_slopes = works[:6]
-    predicted, predicted_slopes = works[6:] or works[4:6]  # not called, if there are none
-    state, left = memory.state, memory.left
+    begin, begin_slopes, advance, advance_slopes, settle, settle_slopes, update, update_slopes = works[:8]
+    predicted, predicted_slopes = works[8:] or works[6:8]  # not called, if there are none
+    begun, state, left, first_part = memory.begun, memory.state, memory.left, 0 if kind.begin is None else -1
     first_input, first_measured, level, slope = memory.input, memory.measured, memory.level, memory.slope
     prior, noted, weighed, notes = memory.prior, memory.noted, memory.weighed, memory.notes
     inputs_count, channels, informative = memory.shape.inputs, memory.shape.m, wanted.information
@@ -189,7 +153,7 @@ def _accumulator(
             there = min(at_once, last - b)  # beyond, the last run again
             for j in range(at_once):
                 run = b + min(j, there - 1)
-                for i in range(state):
+                for i in range(begun):
                     rows[i * at_once + j] = begins[run, i]
                     for q in range(count):
                         changes[q, i * at_once + j] = moves[q, prior + i] * own[run]
@@ -202,8 +166,12 @@ def _accumulator(
                     for j in range(at_once):
                         for i in range(inputs_count):
                             rows[(first_input + i) * at_once + j] = inputs[b + min(j, there - 1), k - 1, i]
-                    for part in range(int(numbers[substeps]) + 1):
-                        if part < int(numbers[substeps]):
+                    for part in range(first_part, int(numbers[substeps]) + 1):
+                        if part < 0:
+                            begin(rows, changes[0], numbers, moves[0])
+                            for q in range(count):
+                                begin_slopes(rows, changes[q], numbers, moves[q])
+                        elif part < int(numbers[substeps]):
                             advance(rows, changes[0], numbers, moves[0])
                             for q in range(count):
                                 advance_slopes(rows, changes[q], numbers, moves[q])

@@ -7,7 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from filters.differentiated.kinds import differentiable
 from filters.differentiated.recursion import Wanted, recursion_of
+from filters.filter import Filter
 from filters.starts import Starts, as_the_prior_says
 from numerics.algebra.densities import tail_of
 from numerics.angles import wrapped_where
@@ -66,21 +68,30 @@ def derivatives(
     blocks: int = 1,
     starts: Starts | None = None,
     truth: Truth | None = None,
+    used: Filter | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Scores and gradients of parts of B runs, (B, blocks, 1 + p), and their information, (B, p, p).
 
-    Arguments are those of `filters.sensitivity.sensitivity`, of which shapes have been checked. Of what is not
-    wanted there is nothing: (B, 0, 0).
+    Arguments are those of `filters.sensitivity.sensitivity`, of which shapes have been checked; and the filter
+    is used with the model in place of its own. Of what is not wanted there is nothing: (B, 0, 0).
     """
-    count, parameters, m = len(measurements), len(slopes.constants), model.m
-    recursion = recursion_of(model.functions, model.shape, wanted)
+    count, parameters, m, functions = len(measurements), len(slopes.constants), model.m, model.functions
+    model, kind, own_numbers = differentiable(model, used)
+    if model.functions != functions:  # those of an affine approximation, with constants of its own
+        if wanted.constants:
+            raise ValueError(
+                "slopes along constants must be of a filter of the model itself, but got 'kf' of another"
+            )
+        slopes = slopes._replace(constants=np.zeros((parameters, len(model.constants))))
+    recursion = recursion_of(model.functions, model.shape, wanted, kind)
     begun = as_the_prior_says(model, count) if starts is None else starts
     own = 1.0 - (begun.free & begun.held).astype(np.float64)  # of runs whose priors parameters move
     given = density or Density(np.inf, np.ones(m))
     turns = 1 if (given.seen > 0).all() else 2  # channels that are predicted only come behind the others
     tails = [tail_of(np.inf, m), tail_of(given.degrees, m)]
     states, weights = truth or Truth(np.zeros((count, 0, 0)), np.zeros(0))
-    numbers = np.concatenate([model.numbers, *(tails if turns == 2 else tails[::-1]), np.diag(weights).ravel()])
+    of_density = tails if turns == 2 else tails[::-1]
+    numbers = np.concatenate([model.numbers, *of_density, own_numbers, np.diag(weights).ravel()])
     out = np.zeros((count, blocks, 1 + parameters))
     information = np.zeros((count, parameters, parameters) if wanted.information else (count, 0, 0))
     arguments = (

@@ -23,18 +23,22 @@ PLAIN = Wanted(information=False, constants=False, tails=False)
 class OfArrays:
     """A model as a page sees it, of NumPy's arrays."""
 
-    def __init__(self, model):
-        self._model, self._c = model, model.constants
+    def __init__(self, model, own=()):
+        self._model, self._c, self.own = model, model.constants, own
         self.Q, self.R = model.process_noise_cov, model.measurement_noise_cov
         self.state_angles, self.measurement_angles = model.shape.state_angles, model.shape.measurement_angles
 
     def f(self, x, u):
+        if x.ndim == 2:
+            return np.stack([self.f(point, u) for point in x.T], axis=1)
         return np.array(self._model.transition(tuple(x), tuple(u), self._c))
 
     def F(self, x, u):  # noqa: N802
         return np.array(self._model.transition_jacobian(tuple(x), tuple(u), self._c))
 
     def h(self, x):
+        if x.ndim == 2:
+            return np.stack([self.h(point) for point in x.T], axis=1)
         return np.array(self._model.observe(tuple(x), self._c))
 
     def H(self, x):  # noqa: N802

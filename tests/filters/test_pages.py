@@ -1,0 +1,286 @@
+"""The pages of filters beside the extended one: they are the filters, and their slopes those of differences."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from filters import KalmanFilter, make_filter, run, thruster_model
+from filters.differentiated import recursion
+from filters.differentiated.kinds import KINDS, differentiable
+from filters.differentiated.recursion import Wanted, recursion_of
+from filters.likelihood import information, likelihood
+from filters.sensitivity import ModelSlopes, sensitivity
+from filters.state_scores import state_score
+from numerics.compiled import interpreted
+from numerics.streams import episode_keys
+from tests.filters.test_differentiated import OfArrays, units
+from tests.filters.test_likelihood import directions, two_channels
+from tests.filters.test_sensitivity import pendulum as turning_pendulum
+from tests.filters.test_sensitivity import ring, slopes_of, turn
+from tests.filters.test_state_scores import WEIGHTS, data_of, textbook
+from tests.models import plane_model, random_affine, simulated, wide_model
+
+NAMES = ("iekf", "ukf", "ckf")
+CHANGED = {"iekf": {"iterations": 3}, "ukf": {"alpha": 0.8, "beta": 1.5, "kappa": 1.0}, "ckf": {}}
+PLAIN = Wanted(information=False, constants=False, tails=False)
+
+
+def gaze(x, c):
+    """A bent scale of the angle, and the rate with a bias and a part that depends on the angle."""
+    return x[0] + 0.4 * np.sin(x[0]), x[1] + c.offset + 0.3 * np.cos(x[0])
+
+
+def wide_pendulum(**changes):
+    """The pendulum on top, where its angle wraps; points of it are more than half a turn apart."""
+    model = turning_pendulum(**{"start": 3.0, "spread": 2.0, **changes})
+    return model.replace(observe=gaze, observe_jacobian=None)
+
+
+def made(name, model):
+    """A filter with parameters of its own."""
+    return make_filter(name, model, **CHANGED[name])
+
+
+def with_noise(model, q, r):
+    return model.replace(process_noise_cov=q, measurement_noise_cov=r)
+
+
+def central(model, value, q_slopes, r_slopes):
+    """Slopes (B, p) of the values of models by central differences."""
+    q, r = model.process_noise_cov, model.measurement_noise_cov
+    found = []
+    for dq, dr in zip(q_slopes, r_slopes, strict=True):
+        h = 1e-4 * (np.diag(q).min() if dq.any() else np.diag(r).min())
+        above, below = (value(with_noise(model, q + s * dq, r + s * dr)) for s in (h, -h))
+        found.append((above - below) / (2 * h))
+    return np.stack(found, axis=1)
+
+
+def assert_slopes(found, expected, accuracy=1e-6):
+    assert abs(expected).max(axis=0).all()
+    for one, other in zip(found.T, expected.T, strict=True):
+        np.testing.assert_allclose(one, other, rtol=accuracy, atol=accuracy * abs(other).max())
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("make", [wide_model, wide_pendulum])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_page_of_arrays_is_the_filter(name, make):
+    filter_ = made(name, make())
+    model, page, own = differentiable(make(), filter_)
+    inputs, z = simulated(model, 12, missing=0.3)
+    estimates = run(filter_, episode_keys([0]), inputs, z)
+    equations, x, p = OfArrays(model, own), model.prior_mean, model.prior_cov
+    for k in range(13):
+        if k:
+            belief = (x, p) if page.begin is None else (page.begin(equations, x, p),)
+            for _ in range(model.substeps):
+                belief = page.advance(equations, *belief, inputs[0, k - 1])
+                belief = belief if page.begin is None else (belief,)
+            x, p = page.settle(equations, *belief)
+        x, p, v, s, level = page.update(equations, x, p, z[0, k])
+        np.testing.assert_allclose(x, estimates.means[0, k], rtol=1e-10, atol=1e-11)
+        np.testing.assert_allclose(p, estimates.covs[0, k], rtol=1e-10, atol=1e-12)
+        assert level == pytest.approx(estimates.log_likelihoods[0, k], rel=1e-10, abs=1e-12)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("make", [two_channels, wide_pendulum])
+@pytest.mark.parametrize("name", NAMES)
+def test_the_likelihood_is_the_filters_and_its_gradient_that_of_central_differences(name, make):
+    model = make()
+    keys, inputs, z, _ = data_of(model, steps=12)
+    q_slopes, r_slopes = map(np.array, directions(model))
+
+    def value(changed):
+        return run(made(name, changed), keys, inputs, z).log_likelihoods.sum(axis=1)
+
+    found = likelihood(model, inputs, z, q_slopes, r_slopes, filter=made(name, make()))
+    np.testing.assert_allclose(found.values, value(model), rtol=1e-10)
+    assert_slopes(found.gradients, central(model, value, q_slopes, r_slopes))
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("score", ["log-score", "squares"])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_score_is_that_of_the_estimates_and_its_gradient_that_of_central_differences(name, score):
+    model = wide_pendulum()
+    data = data_of(model, steps=12)
+    q_slopes, r_slopes = (np.array(one)[[0, 2, 5]] for one in directions(model))
+
+    def value(changed):
+        return textbook(changed, lambda model: made(name, model), data, score)
+
+    found = state_score(model, *data[1:], q_slopes, r_slopes, score, WEIGHTS, filter=made(name, model))
+    np.testing.assert_allclose(found.values, value(model), rtol=1e-10)
+    assert_slopes(found.gradients, central(model, value, q_slopes, r_slopes))
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", NAMES)
+def test_of_an_affine_model_all_filters_have_the_derivatives_of_kalmans(name):
+    model = two_channels()
+    _, inputs, z, x = data_of(model, steps=12)
+    slopes = tuple(map(np.array, directions(model)))
+    filters = [KalmanFilter(model=model), made(name, model)]
+    for work in (likelihood, lambda *given, **used: [information(*given, **used)]):
+        kalman, other = (work(model, inputs, z, *slopes, filter=one) for one in filters)
+        for a, b in zip(kalman, other, strict=True):
+            np.testing.assert_allclose(b, a, rtol=1e-10, atol=1e-10 * abs(a).max())
+    kalman, other = (state_score(model, inputs, z, x, *slopes, filter=one) for one in filters)
+    np.testing.assert_allclose(other.gradients, kalman.gradients, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_interpreted_likelihood_is_the_compiled_one(name):
+    model = wide_pendulum()
+    _, inputs, z, _ = data_of(model, steps=12)
+    slopes = tuple(map(np.array, directions(model)))
+    compiled = likelihood(model, inputs, z, *slopes, filter=make_filter(name, model))
+    alone = likelihood(model, inputs[3:4], z[3:4], *slopes, filter=make_filter(name, model))
+    np.testing.assert_array_equal(compiled.gradients[3], alone.gradients[0])
+    with interpreted():
+        plain = likelihood(model, inputs, z, *slopes, filter=make_filter(name, model))
+    for a, b in zip(compiled, plain, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10 * abs(b).max())
+
+
+def turn_if(x, u, c):
+    """The pendulum, by a function that decides."""
+    return (0.0, 0.0) if abs(x[1]) > 1e6 else turn(x, u, c)
+
+
+def at_once(model, filter_):
+    used, kind, _ = differentiable(model, filter_)
+    return recursion_of(used.functions, used.shape, PLAIN, kind).at_once
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", NAMES)
+def test_functions_that_are_called_have_the_derivatives_of_those_that_are_traced(name):
+    model = wide_pendulum()
+    decides = model.replace(transition=turn_if)
+    _, inputs, z, x = data_of(model, steps=12)
+    slopes = tuple(map(np.array, directions(model)))
+    assert (at_once(model, made(name, model)), at_once(decides, made(name, decides))) == (recursion.AT_ONCE, 1)
+    for work in (likelihood, partial(state_score, states=x)):
+        given = {"inputs": inputs, "measurements": z, "q_slopes": slopes[0], "r_slopes": slopes[1]}
+        traced, called = (work(one, **given, filter=made(name, one)) for one in (model, decides))
+        np.testing.assert_allclose(called.values, traced.values, rtol=1e-11)
+        assert_slopes(called.gradients, traced.gradients, 1e-8)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("function", [turn, turn_if])
+@pytest.mark.parametrize("name", ["ukf", "ckf"])
+def test_slopes_along_constants_and_the_prior_are_those_of_central_differences(name, function):
+    values = {"stiffness": 9.0, "damping": 0.3, "drive": 2.0, "start": 3.0, "spread": 0.5}
+    sizes = {"stiffness": 1.0, "damping": 0.1, "drive": 0.5, "start": 0.3, "spread": 0.1}
+
+    def model_of(**changes):
+        return wide_pendulum(**changes).replace(transition=function)
+
+    _, inputs, z, _ = data_of(model_of(**values), steps=12)
+    slopes = slopes_of(model_of, values, sizes)
+    found = sensitivity(model_of(**values), inputs, z, slopes, filter=made(name, model_of(**values)))
+    expected = []
+    for key, size in sizes.items():
+        above, below = (
+            run(made(name, model_of(**values | {key: values[key] + h * size})), episode_keys(range(5)), inputs, z)
+            for h in (1e-4, -1e-4)
+        )
+        expected.append((above.log_likelihoods - below.log_likelihoods).sum(axis=1) / 2e-4)
+    assert_slopes(found.gradients, np.stack(expected, axis=1))
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", NAMES)
+def test_a_model_that_is_too_large_to_be_written_out_is_called(name, monkeypatch):
+    monkeypatch.setattr(recursion, "MOST", 50)
+    recursion._recursion_of.cache_clear()
+    model = random_affine(n=7, m=2, p=1)  # its matrices are arrays
+    inputs, z = simulated(model, 3, count=2, missing=0.2)
+    slopes = units(model)
+    slopes = slopes[0], np.array([np.zeros((2, 2))] * 7 + [np.eye(2)])
+    assert at_once(model, made(name, model)) == 1
+    kalman, other = (likelihood(model, inputs, z, *slopes, filter=one) for one in (None, made(name, model)))
+    recursion._recursion_of.cache_clear()
+    np.testing.assert_allclose(other.values, kalman.values, rtol=1e-11)
+    np.testing.assert_allclose(other.gradients, kalman.gradients, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_forty_states_have_the_derivatives_of_kalmans_filter(name):
+    model = ring(40)
+    inputs, z = simulated(model, 20, count=2, missing=0.2)
+    q, r = np.array([np.eye(40), np.zeros((40, 40))]), np.array([np.zeros((20, 20)), np.eye(20)])
+    kalman, other = (likelihood(model, inputs, z, q, r, filter=one) for one in (None, made(name, model)))
+    np.testing.assert_allclose(other.values, kalman.values, rtol=1e-11)
+    np.testing.assert_allclose(other.gradients, kalman.gradients, rtol=1e-7)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", NAMES)
+def test_a_state_that_is_known_does_not_matter_until_a_parameter_makes_it_unknown(name):
+    model = plane_model(a=[[0.9, 0.3], [0.0, 1.0]], process_noise_cov=[0.3, 0.0], prior_cov=[1.0, 0.0])
+    _, inputs, z, _ = data_of(model, steps=12)
+    q, r = np.array([np.diag([1.0, 0.0]), np.diag([0.0, 1.0]), np.zeros((2, 2))]), np.zeros((3, 2, 2))
+    r[2] = np.eye(2)
+    kalman, other = (likelihood(model, inputs, z, q, r, filter=one) for one in (None, made(name, model)))
+    there = [0, 2]
+    np.testing.assert_allclose(other.gradients[:, there], kalman.gradients[:, there], rtol=1e-9)
+    assert np.isfinite(kalman.gradients).all()
+    assert np.isnan(other.gradients[:, 1]).all() == (name != "iekf")  # roots have no slope there
+
+
+@pytest.mark.usefixtures("as_python")
+def test_parameters_of_a_filter_reach_its_page():
+    model = wide_pendulum()
+    _, inputs, z, _ = data_of(model, steps=12)
+    slopes = tuple(map(np.array, directions(model)))
+    of = {
+        (name, k): likelihood(model, inputs, z, *slopes, filter=make_filter(name, model, **own)).gradients
+        for name, k, own in [
+            ("ekf", 0, {}),
+            ("iekf", 1, {"iterations": 1}),
+            ("iekf", 2, {"iterations": 2}),
+            ("ukf", 1, {"alpha": 0.5}),
+            ("ukf", 2, {"alpha": 0.6}),
+        ]
+    }
+    np.testing.assert_allclose(of["iekf", 1], of["ekf", 0], rtol=1e-12, atol=1e-12)
+    assert abs(of["iekf", 2] - of["ekf", 0]).max() > 1e-3 < abs(of["ukf", 1] - of["ukf", 2]).max()
+    kinds = [differentiable(model, make_filter("ukf", model, alpha=alpha)).kind for alpha in (0.5, 0.6)]
+    assert kinds[0] is kinds[1]  # one program for both
+
+
+@pytest.mark.usefixtures("as_python")
+def test_kalmans_filter_of_a_nonlinear_model_is_that_of_its_affine_one():
+    model = thruster_model()
+    inputs, z = simulated(model, 8, count=2)
+    q, r = units(model)
+    found = likelihood(model, inputs, z, q, r, filter=KalmanFilter(model=model))
+    expected = run(KalmanFilter(model=model), episode_keys(range(2)), inputs, z).log_likelihoods.sum(axis=1)
+    np.testing.assert_allclose(found.values, expected, rtol=1e-10)
+    assert abs(likelihood(model, inputs, z, q, r).values / expected - 1).max() > 1e-6
+    unmoved = ModelSlopes(np.zeros((3, len(model.constants))), q, r, np.zeros((3, 2)), 0.0 * q)
+    with pytest.raises(ValueError, match="of a filter of the model itself"):
+        sensitivity(model, inputs, z, unmoved, filter=KalmanFilter(model=model))
+
+
+def test_filters_without_a_page_are_refused():
+    model = two_channels()
+    given = (model, np.zeros((1, 2, 1)), np.zeros((1, 3, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2, 2)))
+    rule = "a filter with derivatives must be one of kf, ekf, iekf, ukf, ckf, but got "
+    assert [kind.name for kind in KINDS] == ["kf", "ekf", "iekf", "ukf", "ckf"]
+    for other, name in ((make_filter("enkf", model), "enkf"), ("ukf", "str")):
+        with pytest.raises(ValueError, match=f"{rule}'{name}'"):
+            likelihood(*given, filter=other)
+    scheduled = KalmanFilter(model=thruster_model(), schedule=3)
+    with pytest.raises(ValueError, match="must have schedule=1, but got 3"):
+        likelihood(*given, filter=scheduled)
+    three = make_filter("ukf", wide_model(), kappa=-2.5)
+    with pytest.raises(ValueError, match="kappa must be above minus the number of states, -2, but got -2.5"):
+        likelihood(*given, filter=three)
