@@ -1,5 +1,6 @@
 """The pages of filters beside the extended one: they are the filters, and their slopes those of differences."""
 
+import math
 from functools import partial
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from filters import KalmanFilter, make_filter, run, thruster_model
 from filters.differentiated import recursion
+from filters.differentiated.at_points import called_at_points
 from filters.differentiated.kinds import KINDS, differentiable
 from filters.differentiated.recursion import Wanted, recursion_of
 from filters.likelihood import information, likelihood
@@ -26,15 +28,33 @@ CHANGED = {"iekf": {"iterations": 3}, "ukf": {"alpha": 0.8, "beta": 1.5, "kappa"
 PLAIN = Wanted(information=False, constants=False, tails=False)
 
 
+def whirl(x, u, c):
+    """The pendulum with its angle in (-pi, pi]."""
+    angle, rate = turn(x, u, c)
+    return math.atan2(math.sin(angle), math.cos(angle)), rate
+
+
+def whirl_slopes(x, u, c):
+    """The Jacobian of that."""
+    return (1.0, 0.1), (-0.1 * c.stiffness * math.cos(x[0]), 1.0 - 0.1 * c.damping)
+
+
 def gaze(x, c):
-    """A bent scale of the angle, and the rate with a bias and a part that depends on the angle."""
-    return x[0] + 0.4 * np.sin(x[0]), x[1] + c.offset + 0.3 * np.cos(x[0])
+    """The bearing of the pendulum's mass from below its pivot, and the rate with a bias."""
+    return math.atan2(math.sin(x[0]), math.cos(x[0]) + 0.4), x[1] + c.offset + 0.3 * math.cos(x[0])
+
+
+def gaze_slopes(x, c):
+    """The Jacobian of that."""
+    cosine = math.cos(x[0])
+    return ((1.0 + 0.4 * cosine) / (1.16 + 0.8 * cosine), 0.0), (-0.3 * math.sin(x[0]), 1.0)
 
 
 def wide_pendulum(**changes):
     """The pendulum on top, where its angle wraps; points of it are more than half a turn apart."""
     model = turning_pendulum(**{"start": 3.0, "spread": 2.0, **changes})
-    return model.replace(observe=gaze, observe_jacobian=None)
+    functions = {"transition": whirl, "transition_jacobian": whirl_slopes, "observe": gaze}
+    return model.replace(**functions, observe_jacobian=gaze_slopes, analytic=False)
 
 
 def made(name, model):
@@ -148,7 +168,7 @@ def test_the_interpreted_likelihood_is_the_compiled_one(name):
 
 def turn_if(x, u, c):
     """The pendulum, by a function that decides."""
-    return (0.0, 0.0) if abs(x[1]) > 1e6 else turn(x, u, c)
+    return (0.0, 0.0) if abs(x[1]) > 1e6 else whirl(x, u, c)
 
 
 def at_once(model, filter_):
@@ -172,7 +192,7 @@ def test_functions_that_are_called_have_the_derivatives_of_those_that_are_traced
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("function", [turn, turn_if])
+@pytest.mark.parametrize("function", [whirl, turn_if])
 @pytest.mark.parametrize("name", ["ukf", "ckf"])
 def test_slopes_along_constants_and_the_prior_are_those_of_central_differences(name, function):
     values = {"stiffness": 9.0, "damping": 0.3, "drive": 2.0, "start": 3.0, "spread": 0.5}
@@ -208,6 +228,18 @@ def test_a_model_that_is_too_large_to_be_written_out_is_called(name, monkeypatch
     recursion._recursion_of.cache_clear()
     np.testing.assert_allclose(other.values, kalman.values, rtol=1e-11)
     np.testing.assert_allclose(other.gradients, kalman.gradients, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("points", [3, 40])
+def test_the_slope_of_points_goes_the_short_way_over_the_cut(points):
+    model = wide_pendulum()
+    values, slopes = called_at_points(model.functions, model.shape, "sight", False, points)
+    x, dx = (np.tile([[a], [b]], points) for a, b in ((math.pi, 1.0), (1.0, 0.5)))
+    seen, expected = gaze(x[:, 0], model.constants), np.array(gaze_slopes(x[:, 0], model.constants)) @ dx[:, 0]
+    np.testing.assert_allclose(np.array(values(x, model.constants)).T, [seen] * points)
+    found = np.array(slopes(x, np.ones(2), model.constants, dx))
+    np.testing.assert_allclose(found.T, [expected] * points, rtol=1e-8)
 
 
 @pytest.mark.slow
@@ -252,6 +284,9 @@ def test_parameters_of_a_filter_reach_its_page():
     }
     np.testing.assert_allclose(of["iekf", 1], of["ekf", 0], rtol=1e-12, atol=1e-12)
     assert abs(of["iekf", 2] - of["ekf", 0]).max() > 1e-3 < abs(of["ukf", 1] - of["ukf", 2]).max()
+    of_another = make_filter("ukf", wide_model(), alpha=0.5)  # its spread depends on the number of states
+    found = likelihood(model, inputs, z, *slopes, filter=of_another).gradients
+    np.testing.assert_array_equal(found, of["ukf", 1])
     kinds = [differentiable(model, make_filter("ukf", model, alpha=alpha)).kind for alpha in (0.5, 0.6)]
     assert kinds[0] is kinds[1]  # one program for both
 
