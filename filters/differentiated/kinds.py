@@ -73,15 +73,13 @@ def differentiable(model: StateSpaceModel, filter_: Filter | None) -> Differenti
     """
     if filter_ is None:
         return Differentiable(model, EXTENDED, ())
+    if not isinstance(filter_, Filter):
+        raise ValueError(f"filter must be an object that make_filter returns, but got {filter_!r}")
     if type(filter_) not in KINDS:
         names = ", ".join(kind.name for kind in KINDS)
-        raise ValueError(f"a filter with derivatives must be one of {names}, but got {_name(filter_)!r}")
+        raise ValueError(f"a filter with derivatives must be one of {names}, but got {filter_.name!r}")
     if isinstance(filter_, KalmanFilter) and filter_.schedule != 1:
         raise ValueError(f"a filter with derivatives must have schedule=1, but got {filter_.schedule}")
     used = replace(filter_, model=model)
     kind = KINDS[type(filter_)](used)
     return Differentiable(used.kernel_model, kind, tuple(used.own_numbers)[: kind.own])
-
-
-def _name(filter_) -> str:
-    return getattr(filter_, "name", type(filter_).__name__)
