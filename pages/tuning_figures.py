@@ -16,13 +16,14 @@ import numpy as np
 from filters.consistency.intervals import Interval
 from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from pages.page import log_ticks, make_page, table
+from pages.tuning_masses import TABLES as MASSES_TABLES
 from pages.tuning_recovery import TABLES as RECOVERY_TABLES
 from pages.tuning_recovery import bad_start
 from tuning.evaluation.baselines import ORACLE, RULE, SCALED
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.likelihood.gradient import tune_by_gradient
-from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, NIS_BAND
+from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, NIS_BAND, SCORE
 from tuning.search.plan import Plan
 from tuning.search.space import Choice
 from tuning.search.study import StudyResult, open_study, quiet_optuna, run_study
@@ -132,7 +133,7 @@ def aims() -> str:
     scenario = find_scenario("mismatch")
     data = Plan("ekf", (scenario,), SEED).training_data()[0]
     rows = []
-    for aim in (LIKELIHOOD, MSE, LOG_SCORE):
+    for aim in (LIKELIHOOD, SCORE, MSE, LOG_SCORE):
         found = tune_by_gradient("ekf", scenario, data, objective=aim)
         rows.append(_proved(f"gradient of `{aim}`", found.choice, scenario, found.names, found.identified))
     choice = studied("ekf", scenario).choice
@@ -153,7 +154,7 @@ def _about(value: Interval, digits: int = 3) -> str:
 
 FIGURES: dict[str, Callable[[Path], Path]] = {"tuning_ridge.png": ridge}
 TABLES: dict[str, Callable[[], str]] = {made.__name__: made for made in (earned, recovered, likeliest, aims)}
-TABLES |= RECOVERY_TABLES
+TABLES |= RECOVERY_TABLES | MASSES_TABLES
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -65,11 +65,12 @@ def of_one_more_state():
 
 
 CASES = {
-    "correlation and prior": ([STARTUP], {"full_q": True, "prior": True}),
-    "R held": ([NOISY], {"hold_r": True}),
-    "own numbers": ([of_own_numbers(3)], {}),
-    "one more state": ([of_one_more_state()], {}),
-    "several problems": ([of_own_numbers(0), of_own_numbers(30)], {}),
+    "correlation and prior": ("ekf", [STARTUP], {"full_q": True, "prior": True}),
+    "R held": ("ukf", [NOISY], {"hold_r": True}),
+    "own numbers": ("ckf", [of_own_numbers(3)], {}),
+    "one more state": ("iekf", [of_one_more_state()], {}),
+    "several problems": ("ekf", [of_own_numbers(0), of_own_numbers(30)], {}),
+    "affine": ("kf", [NOISY], {}),
 }
 
 
@@ -86,9 +87,9 @@ def level(goal, choice, problems, data):
 @pytest.mark.parametrize("objective", ["likelihood", "score", "mse", "log-score"])
 @pytest.mark.parametrize("case", CASES)
 def test_a_goal_is_the_objective_of_the_filter_that_runs_and_its_gradient_that_of_differences(case, objective):
-    problems, options = CASES[case]
+    name, problems, options = CASES[case]
     data = [problem.data(range(3)) for problem in problems]
-    goal = goal_of("ekf", problems, data, objective, options)
+    goal = goal_of(name, problems, data, objective, options)
     point = goal.coordinates.of(goal.untuned) + np.linspace(0.1, 0.3, len(goal.untuned))
     found = goal(point)
     value = level(goal, goal.choice_at(point), problems, data)

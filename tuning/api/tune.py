@@ -79,8 +79,8 @@ def tune(
         budget: time limit of a step of the filter [microseconds of one core].
         sampler: of Optuna: "tpe", "random", "cma-es", ...
         prune: end a trial that is significantly worse than the best on the same seeds.
-        method: "optuna"; or "gradient", for kf and ekf: maximum likelihood, or the best "score", "mse" or
-            "log-score" where that is the objective.
+        method: "optuna"; or "gradient", for kf, ekf, iekf, ukf and ckf: maximum likelihood, or the best
+            "score", "mse" or "log-score" where that is the objective.
         workers: processes on this host that share the study; several need a storage.
         storage: journal file or URL of a database that saves the study, so that the same call continues it; by
             default it ends with the process.

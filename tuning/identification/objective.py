@@ -19,10 +19,10 @@ from plants.logs.log import Log
 from plants.state_space import StateSpaceModel
 from tuning.identification.gates import kept_variance
 from tuning.identification.runs import runs_of
-from tuning.likelihood.family import DIFFERENTIABLE
 from tuning.problems.coordinates import Coordinates
 from tuning.problems.data import Data
 
+FILTERS = "kf", "ekf"
 STEP = 1e-4  # of differences of the model, in coordinates
 LARGE_STEP = 1e-2  # of differences of the likelihood itself
 COVARIANCES = "process_noise_cov", "measurement_noise_cov", "prior_cov"
@@ -74,7 +74,7 @@ class Objective:
         gate: float = math.inf,
     ):
         """Find the parameters that have sensitivities; see the class for the arguments."""
-        self.filter = one_of("filter", filter, DIFFERENTIABLE)
+        self.filter = one_of("filter", filter, FILTERS)
         self.coordinates, self._model, self.degrees, self.simulation = coordinates, model, degrees, simulation
         self.data: Data | Callable[..., Any] = data if callable(data) else runs_of(data)
         self.evaluations, self.starts, self.gate = 0, starts, gate

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from filters.differentiated.kinds import KINDS
 from filters.differentiated.recursion import LIKELIHOOD, Wanted
 from filters.differentiated.runs import ModelSlopes, Truth, derivatives, same_functions
 from filters.registry import make_filter
@@ -18,7 +19,7 @@ from tuning.problems.problem import Problem
 from tuning.search.parameters import Correlation, MeasurementVariance, ProcessVariance, Q, R, model_parameters
 from tuning.search.space import Choice
 
-DIFFERENTIABLE = ("kf", "ekf")  # filters
+DIFFERENTIABLE = tuple(kind.name for kind in KINDS)  # filters
 LEAST_NUMBERS = 8  # number of parameters from which the information is faster than differences
 STEP = 1e-4  # in coordinates, of the differences of a model's numbers
 
@@ -27,7 +28,7 @@ class Family:
     """The models that a problem's filter assumes, by the coordinates (p,) of parameters.
 
     Args:
-        choice: of a Kalman filter; its other parameters are held.
+        choice: of one of the `DIFFERENTIABLE` filters; its other parameters are held.
         problem: makes the models.
         parameters: the p parameters.
 
@@ -38,7 +39,8 @@ class Family:
     def __init__(self, choice: Choice, problem: Problem, parameters: Sequence[Parameter]):
         """Find out whether all parameters are of Q and R, of which derivatives are known."""
         self.coordinates, self._choice, self._problem = Coordinates(parameters), choice, problem
-        self._base, places = self._model(choice), [one.place for one in parameters]
+        self._filter = make_filter(choice.name, self._model(choice), **choice.numbers)
+        self._base, places = self._filter.model, [one.place for one in parameters]
         kinds = ProcessVariance, MeasurementVariance
         of_q, of_r = ([one.index if isinstance(one, kind) else None for one in places] for kind in kinds)
         self._noise = None
@@ -86,7 +88,8 @@ class Family:
         wanted = Wanted(information, constants=bool(slopes.constants.any()), tails=False, score=score)
 
         def of(some: Data) -> tuple[np.ndarray, np.ndarray]:
-            out, told = derivatives(model, some.seen.inputs, some.seen.measurements, slopes, wanted, truth=truth)
+            arguments = model, some.seen.inputs, some.seen.measurements, slopes, wanted
+            out, told = derivatives(*arguments, truth=truth, used=self._filter)
             return out[:, 0], told
 
         found = of(data)

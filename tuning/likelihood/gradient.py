@@ -82,7 +82,7 @@ def tune_by_gradient(
     (`optimum` keeps it near the likeliest one).
 
     Args:
-        filter_name: "kf" or "ekf".
+        filter_name: "kf", "ekf", "iekf", "ukf" or "ckf".
         problems: make the assumed models, and have the untuned parameters; ranges are those of the first.
         data: the training runs of each problem.
         starts: factors on the untuned parameters, one for all or one each; `starts_of` if None.

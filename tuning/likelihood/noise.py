@@ -34,7 +34,7 @@ class TunedCovariance:
         self._count = len(places)
 
     def at(self, values: np.ndarray, units: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The covariance and its derivatives (p, n, n) by coordinates: logarithms of variances, r_ij over units."""
+        """The covariance and its derivatives (p, n, n) by coordinates, for values and units of all parameters."""
         n = len(self._base)
         variances = np.diag(self._base).copy()
         variances[list(self._variances.values())] = values[list(self._variances)]

@@ -38,7 +38,7 @@ def full_covariance(variances: Sequence[float], correlations: Sequence[float]) -
 def correlation_slopes(variances: Sequence[float], correlations: Sequence[float]) -> np.ndarray:
     """Derivatives of `full_covariance` by its correlations, (n (n - 1) / 2, n, n).
 
-    Only row i of L depends on r_ij: by it L_ij grows with sqrt(1 - sum_{k<j} L_ik^2), and what stands behind shrinks
+    Only row i of L depends on r_ij: L_ij grows with sqrt(1 - sum_{k<j} L_ik^2), and what stands behind it shrinks
     with r_ij / (1 - r_ij^2).
     """
     n = len(variances)
