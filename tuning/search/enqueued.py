@@ -42,6 +42,7 @@ FIRST_ROUND = 3  # trials for each filter type, after which the noise of the bes
 ROOM = 0.9  # part of the budget that a smaller ensemble shall take
 MAXIMUM_LIKELIHOOD_AFTER = 20  # trials, after which the likeliest noise is tried with all else of the best one
 MOST_FOR_STARTS = 8  # parameters, of which an ascent has more than one start
+MOST_STATES = 8  # of a model, in which filters but the linear and the extended one follow their own gradients
 MOST_FOR_ALL = 24  # parameters, of which an ascent has all runs
 MAXIMUM_LIKELIHOOD_RUNS = 8  # of a model with many states or parameters, and to compare starts: they tell enough
 
@@ -218,8 +219,8 @@ def likeliest(study: optuna.Study, plan: Plan, objective: str = LIKELIHOOD) -> d
 
     Of another objective that has gradients, those with its least value.
 
-    They are those of the tuned filter where it has gradients, else of an extended Kalman filter, by an ascent: of
-    models of few states from three starts. Near the best Q and R the score is so flat
+    They are those of the tuned filter where it has gradients and the model few states, else of an extended Kalman
+    filter, by an ascent: of models of few states from three starts. Near the best Q and R the score is so flat
     that a sampler finds the place late, and among many correlations never; where the model is wrong the trial is
     one among many. None for parameters that change functions of the model, which have no such gradient.
     """
@@ -229,7 +230,8 @@ def likeliest(study: optuna.Study, plan: Plan, objective: str = LIKELIHOOD) -> d
     known = study.user_attrs.get(key)
     if known is not None:
         return known or None
-    name = plan.filter if plan.filter in DIFFERENTIABLE else "ekf"
+    small = len(plan.scenarios[0].quantities.states) <= MOST_STATES
+    name = plan.filter if plan.filter == "kf" or (small and plan.filter in DIFFERENTIABLE) else "ekf"
     try:
         goal = goal_of(name, plan.scenarios, plan.training_data(), objective, plan.options)
         some = goal.is_large or len(goal.coordinates.free) > MOST_FOR_ALL
