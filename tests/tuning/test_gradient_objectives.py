@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
+from tests.linear_problem import LinearProblem
 from tuning.evaluation.evaluate import evaluate
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.search.enqueued import BY_GRADIENT, MAXIMUM_LIKELIHOOD_AFTER
 from tuning.search.objectives import OBJECTIVES
 from tuning.search.plan import Plan
+from tuning.search.space import choice_of
 from tuning.search.study import open_study, run_study
 from tuning.thruster.find import find_scenario
 
@@ -57,3 +59,19 @@ def test_objectives_on_true_states_need_them():
         ValueError, match="objective must be one of likelihood, score, mse, log-score, but got 'nees'"
     ):
         tune_by_gradient("ekf", MISMATCH, data, objective="nees")
+
+
+def test_a_study_of_the_score_follows_its_gradient_only_where_there_are_many_numbers():
+    plan = Plan("kf", (LinearProblem(n=3),), full_q=True, full_r=True)
+    result = run_study(open_study("many", plan), plan, 8)
+    (tried,) = [trial for trial in result.trials if BY_GRADIENT in trial.user_attrs]
+    best = tune_by_gradient("kf", plan.scenarios, plan.training_data(), [1.0], "score", plan.options).best
+    assert tried.user_attrs[BY_GRADIENT] == "score" and len(best.parameters) == 9
+    values = [trial.values[0] for trial in result.trials if trial.values]
+    assert best.level <= min(values) * (1 + 1e-4)
+    choice = choice_of("kf", tried.params, plan.scenarios[0])
+    (data,) = plan.training_data()
+    assert value_of("score", choice, plan.scenarios[0], data) == pytest.approx(best.level, rel=1e-4)
+    few = plan._replace(full_q=False, full_r=False)
+    result = run_study(open_study("few", few), few, 8)
+    assert not any(BY_GRADIENT in trial.user_attrs for trial in result.trials)
