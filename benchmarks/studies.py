@@ -19,7 +19,7 @@ from benchmarks.timing import Timing
 from benchmarks.workloads import step_by_size, times
 from numerics.threads import cores
 from tuning.evaluation import sizes
-from tuning.likelihood import gradient
+from tuning.likelihood import family
 from tuning.search import trials
 from tuning.search.plan import TRAINING_SEEDS, Plan
 from tuning.search.space import oracle_choice
@@ -34,7 +34,7 @@ MEMORY_GOAL = 500.0  # [MB]
 FILTERS_AND_SCORES = {  # what runs filters or rates their runs, where a study calls it; none calls another
     trials: ("metrics_of_all", "compute_metrics"),
     sizes: ("evaluate", "values_of"),
-    gradient: ("likelihood",),
+    family: ("derivatives",),
 }
 WARM_UP = 25  # trials, with the first search of the likeliest Q and R
 IN_A_PROCESS = """
