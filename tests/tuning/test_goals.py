@@ -126,6 +126,22 @@ def test_a_full_q_is_at_least_as_likely_as_a_diagonal_one_and_a_study_tries_it()
     assert result.best_value == pytest.approx(best.level, rel=1e-4)
 
 
+def blown(x, u, c):
+    return (x[0] * x[0] * x[0] + c[0], 0.5 * x[1])
+
+
+def unseen(x, c):
+    return (x[1], x[1] + x[0] * 1e-12)
+
+
+def test_where_the_filter_diverges_from_every_start_nothing_is_determined():
+    assumed = vessel().replace(transition=blown, observe=unseen, prior_mean=[9.0, 0.0])
+    problem = ModelProblem(vessel(), assumed, np.ones((40, 1)), first_scored_step=3, name="blown")
+    found = tune_by_gradient("ekf", problem, problem.data(range(3)), [1.0])
+    assert not found.identified.any() and np.isinf(found.standard_errors).all()
+    assert found.best.parameters == pytest.approx(goal_of("ekf", problem, problem.data([1])).untuned)
+
+
 def test_problems_of_a_list_have_one_optimum():
     both = NOISY, NOMINAL
     data = [one.data(range(8)) for one in both]

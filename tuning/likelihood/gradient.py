@@ -225,6 +225,8 @@ def _standard_errors(goal: Goal, point: np.ndarray, unit: float = 1.0) -> np.nda
     for i, step in enumerate(STEP * np.eye(count)):
         above, below = (goal(point + sign * step).gradients.sum(axis=0) for sign in (1, -1))
         hessian[i] = (below - above) / (2 * STEP)
+    if not np.isfinite(hessian).all():  # the filter diverges
+        return np.full(count, np.inf)
     values, axes = np.linalg.eigh((hessian + hessian.T) / 2)
     values = np.maximum(values, FLAT * abs(values).max())
     scores = goal(point).gradients @ axes / values
