@@ -88,8 +88,7 @@ def _derivatives(
     n, m, p = model.n, model.m, len(q_slopes)
     arrays = {"inputs": inputs, "measurements": measurements, "q_slopes": q_slopes, "r_slopes": r_slopes}
     check_shapes(arrays, model, (p, n, n), (p, m, m))
-    prior = np.zeros((p, n)), np.zeros((p, n, n))
-    slopes = ModelSlopes(np.zeros((p, len(model.constants))), q_slopes, r_slopes, *prior)
+    slopes = ModelSlopes.of(model, p, process_noise_cov=q_slopes, measurement_noise_cov=r_slopes)
     wanted = Wanted(information=informative, constants=False, tails=False)
     out, found = derivatives(model, inputs, measurements, slopes, wanted, used=used)
     return out[:, 0], found

@@ -60,9 +60,7 @@ def state_score(
     of_squares = np.ones(n) if weights is None else as_floats(weights)
     if of_squares.shape != (n,):
         raise ValueError(f"weights must have the shape ({n},), but got {of_squares.shape}")
-    slopes = ModelSlopes(
-        np.zeros((p, len(model.constants))), q_slopes, r_slopes, np.zeros((p, n)), np.zeros((p, n, n))
-    )
+    slopes = ModelSlopes.of(model, p, process_noise_cov=q_slopes, measurement_noise_cov=r_slopes)
     wanted = Wanted(information=False, constants=False, tails=False, score=score)
     out, _ = derivatives(model, inputs, measurements, slopes, wanted, truth=Truth(states, of_squares), used=filter)
     return Likelihood(out[:, 0, 0], out[:, 0, 1:])

@@ -184,7 +184,8 @@ def _of_congruence(result, arguments, slopes):
 
 @eye.derivative
 @present.derivative
-def _of_constant(result, arguments, slopes):
+def of_constant(result, arguments, slopes):
+    """Of what depends on nothing that moves."""
     return None
 
 

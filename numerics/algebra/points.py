@@ -14,7 +14,7 @@ import numpy as np
 
 from numerics.algebra.graphs import arctan2, where
 from numerics.algebra.matrices import operation, plus, same, through
-from numerics.algebra.operations import with_transposed
+from numerics.algebra.operations import of_constant, with_transposed
 from numerics.angles import wrapped
 from numerics.triangles import RESOLUTION
 
@@ -128,10 +128,8 @@ def _of_square(result, arguments, slopes):
     return through(lambda slope: with_transposed(slope @ arguments[0].T), slopes[0])
 
 
-@units.derivative
-@ones.derivative
-def _of_constant(result, arguments, slopes):
-    return None
+units.derivative(of_constant)
+ones.derivative(of_constant)
 
 
 @first.derivative

@@ -28,6 +28,7 @@ from tuning.evaluation.verify import verify
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem, find_same
+from tuning.search.enqueued import noise_by_gradient
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of, parameters
 from tuning.search.study import open_study, run_study
@@ -113,6 +114,8 @@ def test_a_number_that_changes_functions_has_no_gradient():
     problem = pendulum_problem.problem(of_step, parameters=[pendulum_problem.Parameter("dt", 0.1, 1.0)])
     with pytest.raises(ValueError, match="must change numbers of the model alone, but dt changes its functions"):
         tune_by_gradient("ekf", problem, problem.data([1, 2]))
+    plan = Plan("ekf", (problem,))
+    assert noise_by_gradient(open_study("functions", plan), plan) is None
 
 
 def pendulum(dt=0.05, model=None):

@@ -47,6 +47,8 @@ class Family:
         if all(isinstance(one, (*kinds, Correlation)) for one in places):
             q = TunedCovariance(self._base.process_noise_cov, Q, of_q, places)
             self._noise = q, TunedCovariance(self._base.measurement_noise_cov, R, of_r, places)
+        else:
+            self._check_functions()
 
     @property
     def states(self) -> int:
@@ -60,16 +62,7 @@ class Family:
             (q, by_q), (r, by_r) = (one.at(values, units) for one in self._noise)
             model = self._base.replace(process_noise_cov=q, measurement_noise_cov=r)
             return model, ModelSlopes.of(model, len(point), process_noise_cov=by_q, measurement_noise_cov=by_r)
-        pairs = []
-        for place, name in enumerate(self.coordinates.names):
-            above, below = map(self._model_at, self.coordinates.beside(point, place, STEP))
-            pairs.append((above, below))
-            if not same_functions(above, below):
-                raise ValueError(
-                    f"parameters of a gradient must change numbers of the model alone, but {name} changes its "
-                    "functions"
-                )
-        return self._model_at(point), ModelSlopes.between(pairs, 2 * STEP)
+        return self._model_at(point), ModelSlopes.between(self._pairs(point), 2 * STEP)
 
     def derivatives(
         self,
@@ -104,6 +97,21 @@ class Family:
         for one, value in zip(self.coordinates.free, self.coordinates.values(point).tolist(), strict=True):
             changed = one.set(changed, value)
         return changed
+
+    def _check_functions(self) -> None:
+        """Raise ValueError if a parameter changes functions of the model."""
+        pairs = self._pairs(self.coordinates.start())
+        for name, (above, below) in zip(self.coordinates.names, pairs, strict=True):
+            if not same_functions(above, below):
+                raise ValueError(
+                    f"parameters of a gradient must change numbers of the model alone, but {name} changes its "
+                    "functions"
+                )
+
+    def _pairs(self, point: np.ndarray) -> list[tuple[StateSpaceModel, StateSpaceModel]]:
+        """Models a step above and below along each parameter."""
+        sides = (self.coordinates.beside(point, place, STEP) for place in range(len(point)))
+        return [(self._model_at(above), self._model_at(below)) for above, below in sides]
 
     def _model_at(self, point: np.ndarray) -> StateSpaceModel:
         return self._model(self.choice_at(point))

@@ -59,15 +59,15 @@ class Goal:
         self.objective = one_of("objective", objective, (LIKELIHOOD, *OF_STATES))
         self._choice, self._problems, self._data = choice, tuple(problems), tuple(data)
         self._families = [Family(choice, problem, parameters) for problem in problems]
-        self.coordinates = self._families[0].coordinates
         self._truths = [self._truth(*those) for those in zip(problems, data, self._families, strict=True)]
-        self._parts = list(zip(problems, data, self._families, self._truths, strict=True))
+        self.coordinates = self._families[0].coordinates
         self.steps = sum(int(one.scored_counts.sum()) for one in data)
 
     def __call__(self, point: np.ndarray) -> Likelihood:
         """Values of all runs, (B,), and their gradients, (B, p), at coordinates."""
         found = []
-        for problem, data, family, truth in self._parts:
+        parts = zip(self._problems, self._data, self._families, self._truths, strict=True)
+        for problem, data, family, truth in parts:
             score = OF_STATES.get(self.objective, recursion.LIKELIHOOD)
             if truth is not None and self.objective == SCORE:
                 truth = truth._replace(weights=self._of_score(point, problem, data, family))
@@ -105,7 +105,7 @@ class Goal:
     @property
     def is_large(self) -> bool:
         """Whether a model has so many states that a run takes long."""
-        return any(is_large(problem) for problem in self._problems)
+        return any(is_array(family.states, family.states) for family in self._families)
 
     @property
     def runs(self) -> int:
@@ -150,9 +150,3 @@ class Goal:
         with np.errstate(divide="ignore"):
             weights[: len(scale)] = 1.0 / (np.isfinite(scale).sum() * scale * deviations)
         return weights
-
-
-def is_large(problem: Problem) -> bool:
-    """Whether a problem's model has so many states that its likelihood takes long."""
-    count = len(problem.quantities.states)
-    return is_array(count, count)

@@ -71,7 +71,8 @@ def tune_by_gradient(
 ) -> GradientResult:
     """Find the parameters of a model under which a Kalman filter's innovations are most likely.
 
-    They are those of a study: the variances of Q and R, with `full_q` Q's correlations, or a problem's own. The
+    They are those of a study: the variances of Q and R, with `full_q` and `full_r` their
+    correlations, or a problem's own. The
     search is L-BFGS-B in their coordinates, which are the logarithms of variances, with the gradient of
     `filters.differentiated` and within the ranges of an Optuna study. With the Hessian H of -log L and the
     gradients g_b of B independent runs, the standard errors are the roots of the diagonal of
@@ -87,7 +88,7 @@ def tune_by_gradient(
         data: the training runs of each problem.
         starts: factors on the untuned parameters, one for all or one each; `starts_of` if None.
         objective: "likelihood", "score", "mse" or "log-score"; of several problems their mean.
-        options: hold_r, full_q and prior of `model_parameters`.
+        options: hold_r, full_q, full_r and prior of `model_parameters`.
 
     Raises:
         ValueError: for another filter or objective, for one on true states without these, or a parameter that

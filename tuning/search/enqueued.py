@@ -190,7 +190,7 @@ def _enqueue_maximum_likelihood(study: optuna.Study, plan: Plan, start: dict) ->
 
     On recorded runs, whose likelihood is all there is, they are also tried with all else untuned.
     """
-    noise = likeliest(study, plan)
+    noise = noise_by_gradient(study, plan)
     if noise is None:
         return
     enqueue_new(study, {**start, **noise}, {MAXIMUM_LIKELIHOOD: True})
@@ -209,15 +209,13 @@ def _enqueue_minimum(study: optuna.Study, plan: Plan, start: dict) -> None:
     objective, parameters = plan.objectives[0], model_parameters(plan.scenarios[0], **plan.options)
     if objective not in OF_STATES or (objective == SCORE and len(parameters) <= MOST_FOR_STARTS):
         return
-    noise = likeliest(study, plan, objective)
+    noise = noise_by_gradient(study, plan, objective)
     if noise is not None:
         enqueue_new(study, {**start, **noise}, {BY_GRADIENT: objective})
 
 
-def likeliest(study: optuna.Study, plan: Plan, objective: str = LIKELIHOOD) -> dict[str, float] | None:
-    """The Q and R, or own parameters, under which the innovations are most likely, kept with the study.
-
-    Of another objective that has gradients, those with its least value.
+def noise_by_gradient(study: optuna.Study, plan: Plan, objective: str = LIKELIHOOD) -> dict[str, float] | None:
+    """The Q and R, or own parameters, to which gradients of an objective lead, kept with the study.
 
     They are those of the tuned filter where it has gradients and the model few states, else of an extended Kalman
     filter, by an ascent: of models of few states from three starts. Near the best Q and R the score is so flat
