@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from filters.engine.batch import run
-from filters.engine.belief import Kernels
-from filters.gaussian.extended import ExtendedKalmanFilter, kernels_of
-from filters.gaussian.square_root import square_root_kernels
+from filters.gaussian.extended import ExtendedKalmanFilter
+from filters.gaussian.square_root import SQUARE_ROOT
+from filters.pages.page import Page
 from numerics.checks import as_floats
 from plants.affine import AffineModel
 from plants.simulate import simulate
@@ -75,6 +76,4 @@ def path_bound(model: StateSpaceModel, inputs: np.ndarray, missing: np.ndarray |
 class _SquareRootFilter(ExtendedKalmanFilter):
     """The extended Kalman filter with roots of covariances."""
 
-    def kernels(self) -> Kernels:
-        """Those of the square-root form."""
-        return kernels_of(self.kernel_model, square_root_kernels)
+    page: ClassVar[Page] = SQUARE_ROOT

@@ -12,6 +12,7 @@ from functools import cache
 from numerics import arrays
 from numerics.sources import Source, entrywise, is_array
 from numerics.triangles import (
+    careful_factor,
     cholesky_factor,
     factored_inverse,
     forward_solver,
@@ -27,6 +28,7 @@ from numerics.triangles import (
 )
 
 __all__ = [
+    "careful_factor",
     "cholesky_factor",
     "factored_inverse",
     "forward_solver",

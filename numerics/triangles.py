@@ -9,6 +9,7 @@ from functools import cache
 from numerics import arrays
 from numerics.sources import Local, Source, is_array
 
+NEGLIGIBLE = 1e-13  # a pivot below this part of its variance counts as zero in `careful_factor`
 RESOLUTION = 1e-15  # of the difference of two float64, relative to them
 
 
@@ -40,6 +41,15 @@ def pivoted_factor(size: int, diagonal: str, **names: float) -> Callable:
 def cholesky_factor(size: int) -> Callable:
     """Return `factor(a)`: the lower triangular L with L L' = a; NaN where a is not positive definite."""
     return pivoted_factor(size, "({d} if {d} > 0.0 else nan) ** 0.5", nan=math.nan)
+
+
+@cache
+def careful_factor(size: int) -> Callable:
+    """Return `factor(a)`: the lower triangular L of a positive semidefinite a, for `row_solver`.
+
+    Where a pivot is zero the diagonal of L is infinite, so that solving gives zero there.
+    """
+    return pivoted_factor(size, f"{{d}} ** 0.5 if {{d}} > {NEGLIGIBLE} * {{a}} else infinity", infinity=math.inf)
 
 
 @cache

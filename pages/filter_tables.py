@@ -86,6 +86,7 @@ def calls(name: str) -> str:
 
     def counted(letter: str, function: Callable) -> Callable:
         def call(*arguments):
+            int(arguments[0][0])  # so that it cannot be traced: it is called
             count[letter] += 1
             return function(*arguments)
 

@@ -3,76 +3,41 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import ClassVar
 
-from filters.adaptive.noise_moments import measurement_noise_moment, mixer, trace_of
-from filters.engine.belief import Kernels
-from filters.engine.layout import memory_places, own_place, row_access
-from filters.filter import Filter
-from filters.gaussian.extended import extended_kernels, gaussian_update, kernels_of
-from numerics import matrices
+from filters.adaptive.noise import noise_moment
+from filters.gaussian.extended import advance, settle
+from filters.pages.page import Page, PageFilter
+from numerics.algebra.densities import log_density
+from numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
+from numerics.algebra.scalars import constant, count, ratio, trace
 from numerics.checks import at_least, positive
-from numerics.compiled import inlined
-from numerics.sources import Source
-from numerics.tuples import matrix_reader, vector_reader
-from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape, observation_slopes
 
-MOST_ITERATIONS = 1000
+MOST_ITERATIONS = 50  # that are written out
 
 
-@lru_cache(maxsize=64)
-def robust_kernels(functions: Functions, shape: Shape) -> Kernels:
-    """Kernels for a model's functions and shape; extras: the last weight."""
-    n, m, observe = shape.n, shape.m, functions.observe
-    places, source, own = memory_places(n, m), number_places(n, m), own_place(shape)
-    iterations_place, weight_place, likelihood_place = own + 1, places.extras, places.log_likelihood
-    read_r, factor, solve = matrix_reader(m, m, source.r), matrices.cholesky_factor(m), matrices.row_solver(m, m)
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
-    measured, read_scales = vector_reader(m), vector_reader(n, source.scales)
-    constants, observation_matrix = constants_reader(shape), observation_slopes(functions, shape)
-    plain = extended_kernels(functions, shape)
-    begin, predict, nothing_to_summarise = plain.start, plain.predict, plain.summarise
-    condition, expect, mix, mask = (
-        gaussian_update(shape),
-        measurement_noise_moment(shape),
-        mixer(m),
-        matrices.masked(m),
-    )
-    of_present, trace, counting = matrices.present_part(m), trace_of(m), Source("count", "z", z=(m,))
-    ones = (f"(1.0 if z[{i}] == z[{i}] else 0.0)" for i in counting.range(m))
-    count = counting.function(counting.sum(ones))
+def start(model):
+    """The weight of nothing."""
+    return {"weight": constant(1.0, model.own.degrees_of_freedom)}
 
-    @inlined
-    def start(memory, numbers, size):
-        begin(memory, numbers, size)
-        memory[0][weight_place] = 1.0
 
-    @inlined
-    def update(memory, z, numbers, size):
-        row, _, _ = memory
-        mean, p, r, freedom = read_mean(row), read_cov(row), read_r(numbers), numbers[own]
-        c, present = constants(numbers), measured(z)
-        predicted, h = observe(mean, c), observation_matrix(mean, read_scales(numbers), c)
-        _, _, innovation, s, row[likelihood_place] = condition(mean, p, present, predicted, h, r)
-        store_innovation(row, innovation)
-        store_s(row, s)
-        channels, root, weight = count(present), factor(mask(r, present)), 1.0
-        if channels > 0.0:
-            for _ in range(int(numbers[iterations_place])):
-                moment = expect(p, present, predicted, h, mix(1.0 / weight, r, 0.0, r))
-                weight = (freedom + channels) / (freedom + trace(solve(of_present(moment, present), root)))
-        row[weight_place] = weight
-        mean, p, _, _, _ = condition(mean, p, present, predicted, h, mix(1.0 / weight, r, 0.0, r))
-        store_mean(row, mean)
-        store_cov(row, p)
-
-    return Kernels(n, m, n, 0, start, predict, update, nothing_to_summarise, extras=1)
+def update(model, x, P, z):
+    """The measurement z; channels that are NaN are missing."""
+    d, seen, weight = model.own.degrees_of_freedom, present(z), 1.0
+    H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
+    v, HPH = only(seen, wrap(z - model.h(x), model.measurement_angles)), sym(H @ P @ H.T)
+    S = HPH + R
+    for _ in range(model.own.iterations):
+        E = only(seen, noise_moment(seen, HPH, ratio(R, weight), v))
+        weight = ratio(d + count(seen), d + trace(divide(E, R)))
+    R = ratio(R, weight)
+    K = divide(P @ H.T, HPH + R)
+    x = wrap(x + K @ v, model.state_angles)
+    return x, joseph(P, K, H, R), v, S, log_density(v, S, seen), {"weight": weight}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class RobustExtendedKalmanFilter(Filter):
+class RobustExtendedKalmanFilter(PageFilter):
     """Extended Kalman filter for Student-t measurement noise: outliers have little weight.
 
         predict: the extended filter's
@@ -88,7 +53,7 @@ class RobustExtendedKalmanFilter(Filter):
 
     Attributes:
         degrees_of_freedom: d, positive; as it grows the filter becomes the extended one.
-        iterations: of the fixed point, at least 1.
+        iterations: of the fixed point, 1 to 50.
 
     Raises:
         ValueError: if a parameter is out of its range.
@@ -99,6 +64,8 @@ class RobustExtendedKalmanFilter(Filter):
     """
 
     name: ClassVar[str] = "ekf-robust"
+    page: ClassVar[Page] = Page(advance, settle, update, start=start)
+    unrolled: ClassVar[tuple[str, ...]] = ("iterations",)
     degrees_of_freedom: float = 4.0
     iterations: int = 5
 
@@ -106,12 +73,3 @@ class RobustExtendedKalmanFilter(Filter):
         """Check the parameters; raise ValueError that states the rule and the value."""
         object.__setattr__(self, "degrees_of_freedom", positive("degrees_of_freedom", self.degrees_of_freedom))
         object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1, MOST_ITERATIONS))
-
-    @property
-    def own_numbers(self) -> tuple[float, ...]:
-        """The degrees of freedom and the iterations."""
-        return self.degrees_of_freedom, float(self.iterations)
-
-    def kernels(self) -> Kernels:
-        """Kernels for the model's functions; see `Filter.kernels`."""
-        return kernels_of(self.kernel_model, robust_kernels)

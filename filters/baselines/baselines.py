@@ -11,7 +11,7 @@ from filters.baselines.inverse import component_solver
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
-from filters.gaussian.extended import nothing_to_summarise
+from filters.pages.kernels import nothing_to_summarise
 from numerics.angles import wrapped
 from numerics.checks import at_least, positive
 from numerics.compiled import inlined

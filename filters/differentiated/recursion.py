@@ -12,12 +12,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.differentiated.equations import Equations
-from filters.differentiated.kinds import EXTENDED, Kind
 from filters.differentiated.memory import Memory
 from filters.differentiated.scores import LIKELIHOOD, LOG_SCORE, SQUARES, Wanted, density_of, score_of_truth
-from filters.differentiated.stages import Stage, as_calls, as_programs, stage_of
-from filters.differentiated.traced import MOST
+from filters.gaussian.extended import ExtendedKalmanFilter
+from filters.pages.equations import Equations
+from filters.pages.page import Page
+from filters.pages.stages import Stage, as_calls, as_programs, stage_of
+from filters.pages.traced import MOST
 from numerics.algebra.matrices import Matrix
 from numerics.algebra.operations import only, present, uncorrelated, wrap
 from numerics.algebra.programs import callable_of
@@ -27,6 +28,7 @@ from plants.shape import Functions, Shape, observation_slopes, transition_slopes
 
 __all__ = ["LIKELIHOOD", "LOG_SCORE", "SQUARES", "Recursion", "Wanted", "recursion_of", "stages_of"]
 
+EXTENDED = ExtendedKalmanFilter.page
 AT_ONCE = 4  # runs of a program: of eight each would take a fifth less, but a run alone twice as long
 
 
@@ -44,17 +46,17 @@ class Recursion(NamedTuple):
         return (self.length * self.at_once,), changes, (parameters, parameters, self.at_once), (self.at_once,)
 
 
-def recursion_of(functions: Functions, shape: Shape, wanted: Wanted, kind: Kind = EXTENDED) -> Recursion:
-    """The recursion of a kind of filter for a model's functions and sizes."""
-    return _recursion_of(functions, shape, wanted, kind, is_interpreting())
+def recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page = EXTENDED) -> Recursion:
+    """The recursion of a filter's page for a model's functions and sizes."""
+    return _recursion_of(functions, shape, wanted, page, is_interpreting())
 
 
 @cache
-def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, kind: Kind, interpreting: bool) -> Recursion:
-    memory = Memory(shape, kind.points(shape.n), kind.own)
+def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page, interpreting: bool) -> Recursion:
+    memory = Memory(shape, page)
     try:
         model = Equations(functions, memory, constants_move=wanted.constants, trace=True)
-        stages = stages_of(memory, model, wanted, kind)
+        stages = stages_of(memory, model, wanted, page)
         made = [as_programs(stage, memory.length, MOST) for stage in stages]
         works = [callable_of(program, AT_ONCE) for one in made for program in one[:2]]
         fingerprint, at_once = function_fingerprint(within=__name__), AT_ONCE
@@ -63,16 +65,16 @@ def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, kind: Kind
         readers = {memory.constants: constants_reader(shape)}
         made = [
             as_calls(stage, memory.length, model.called, readers)
-            for stage in stages_of(memory, model, wanted, kind)
+            for stage in stages_of(memory, model, wanted, page)
         ]
         works = [work for one in made for work in one[:2]]
         slopes = transition_slopes(functions, shape), observation_slopes(functions, shape)
         fingerprint = function_fingerprint(functions.transition, functions.observe, *slopes, within=__name__)
         at_once = 1
     length = max(one.length for one in made)
-    if kind.begin is None:
+    if page.begin is None:
         works[:0] = nothing, nothing
-    run = CompiledOrPython(_accumulator(memory, works, wanted, kind, at_once, fingerprint))
+    run = CompiledOrPython(_accumulator(memory, works, wanted, page, at_once, fingerprint))
     return Recursion(run, at_once, length, memory.depth)
 
 
@@ -81,11 +83,12 @@ def nothing(rows, change, numbers, move):
     """In place of the first stage of filters whose belief is the same during a step."""
 
 
-def stages_of(memory: Memory, model: Equations, wanted: Wanted, kind: Kind = EXTENDED) -> list[Stage]:
+def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXTENDED) -> list[Stage]:
     """The stages of a step, and what is done with channels that are predicted only."""
     n, (x, p) = memory.shape.n, (memory.x, memory.P)
     moves = dict(memory.moves)
     if wanted.constants:
+        assert memory.constants_slope is not None
         moves[memory.constants] = memory.constants_slope
 
     def moved(mean: Matrix, cov: Matrix, more: dict | None = None, slopes: dict | None = None) -> Stage:
@@ -93,13 +96,13 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, kind: Kind = EXT
         found = stage_of(left | (more or {}), {0: mean, n: cov}, moves)
         return found._replace(slopes=found.slopes | (slopes or {}))
 
-    if kind.begin is None:
-        stages = [moved(*kind.advance(model, x, p, memory.u)), moved(*kind.settle(model, x, p))]
+    if page.begin is None:
+        stages = [moved(*page.advance(model, x, p, memory.u)), moved(*page.settle(model, x, p))]
     else:
-        points = kind.begin(model, x, p), kind.advance(model, memory.X, memory.u)
+        points = page.begin(model, x, p), page.advance(model, memory.X, memory.u)
         stages = [stage_of({memory.left: one}, {0: one}, moves) for one in points]
-        stages.append(moved(*kind.settle(model, memory.X)))
-    mean, cov, v, s, _ = kind.update(model, x, p, memory.z)
+        stages.append(moved(*page.settle(model, memory.X)))
+    mean, cov, v, s, _ = page.update(model, x, p, memory.z)
     if wanted.of_truth:
         known = present(memory.truth)
         off = only(known, wrap(memory.truth - mean, model.state_angles))
@@ -114,12 +117,12 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, kind: Kind = EXT
 
 
 def _accumulator(
-    memory: Memory, works: list[Callable], wanted: Wanted, kind: Kind, at_once: int, fingerprint: str
+    memory: Memory, works: list[Callable], wanted: Wanted, page: Page, at_once: int, fingerprint: str
 ) -> Callable:
     """The recursion over steps of some runs."""
     begin, begin_slopes, advance, advance_slopes, settle, settle_slopes, update, update_slopes = works[:8]
     predicted, predicted_slopes = works[8:] or works[6:8]  # not called, if there are none
-    begun, state, left, first_part = memory.begun, memory.state, memory.left, 0 if kind.begin is None else -1
+    begun, state, left, first_part = memory.begun, memory.state, memory.left, 0 if page.begin is None else -1
     first_input, first_measured, level, slope = memory.input, memory.measured, memory.level, memory.slope
     prior, noted, weighed, notes = memory.prior, memory.noted, memory.weighed, memory.notes
     inputs_count, channels, informative = memory.shape.inputs, memory.shape.m, wanted.information

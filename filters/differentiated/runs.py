@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.differentiated.kinds import differentiable
+from filters.differentiated.differentiable import differentiable
 from filters.differentiated.recursion import Wanted, recursion_of
 from filters.filter import Filter
 from filters.starts import Starts, as_the_prior_says
@@ -76,14 +76,14 @@ def derivatives(
     is used with the model in place of its own. Of what is not wanted there is nothing: (B, 0, 0).
     """
     count, parameters, m, functions = len(measurements), len(slopes.constants), model.m, model.functions
-    model, kind, own_numbers = differentiable(model, used)
+    model, page, own_numbers = differentiable(model, used)
     if model.functions != functions:  # those of an affine approximation, with constants of its own
         if wanted.constants:
             raise ValueError(
                 "slopes along constants must be of a filter of the model itself, but got 'kf' of another"
             )
         slopes = slopes._replace(constants=np.zeros((parameters, len(model.constants))))
-    recursion = recursion_of(model.functions, model.shape, wanted, kind)
+    recursion = recursion_of(model.functions, model.shape, wanted, page)
     begun = as_the_prior_says(model, count) if starts is None else starts
     own = 1.0 - (begun.free & begun.held).astype(np.float64)  # of runs whose priors parameters move
     given = density or Density(np.inf, np.ones(m))

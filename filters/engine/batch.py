@@ -6,11 +6,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from filters.engine.compile import batch, lanes, new_memory
+from filters.engine.compile import batch, new_memory, vectors
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from numerics.checks import as_floats, covariance, shown
-from numerics.sources import is_array
 from numerics.streams import filter_keys
 from numerics.threads import spread
 from plants.layout import LANES, with_root
@@ -84,8 +83,7 @@ def run(
     if isinstance(filter_, ForeignFilter):
         filter_.fill(keys, inputs, z, tuple(out))
         return out
-    alone = filter_.size or is_array(n, n) or is_array(m, m)  # large ones fill vector registers by themselves
-    run_all = _run_one_by_one if alone else _run_side_by_side
+    run_all = _run_side_by_side if filter_.kernels().vectors else _run_one_by_one
     run_all(filter_, (keys, inputs, z), noise, out)
     return out
 
@@ -102,14 +100,12 @@ def _run_one_by_one(filter_: Filter, data: tuple, noise: tuple, out: Estimates) 
 
 
 def _run_side_by_side(filter_: Filter, data: tuple, noise: tuple, out: Estimates) -> None:
-    count, numbers, run_part = len(out.means), filter_.numbers, lanes(filter_.kernels())
-    together = 1 if run_part.in_python else LANES
+    count, numbers, run_part = len(out.means), filter_.numbers, vectors(filter_.kernels())
 
     def part(first: int, last: int) -> None:
-        last = min(last * together, count)
-        run_part(together, *data, numbers, noise, tuple(out), first * together, last)
+        run_part(*data, numbers, noise, tuple(out), first * LANES, min(last * LANES, count))
 
-    spread(part, -(-count // together))
+    spread(part, -(-count // LANES))
 
 
 def trajectories(

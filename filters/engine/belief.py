@@ -60,8 +60,9 @@ class Kernels(NamedTuple):
     the table and `extras` values of the row, from `memory_places(n, m).extras` on; `scratch` values that are not
     kept follow.
 
-    `stages`, where given, are what `predict` does before its substeps, in each of them, and after them, as
-    functions of the same arguments: batches then run every stage over many beliefs at once (`engine.simd`).
+    `vectors`, where given, are what `predict` does before its substeps, in each of them and after them, and
+    `update`, each for eight beliefs that lie together, as functions (rows, given, numbers): batches then run them
+    (`engine.side_by_side`).
     """
 
     n: int
@@ -75,7 +76,7 @@ class Kernels(NamedTuple):
     extras: int = 0
     extra_kept_rows: int = 0  # rows of the table, after the n of members, that belong to the belief
     scratch: int = 0
-    stages: tuple[Callable, Callable, Callable] | None = None
+    vectors: tuple[Callable, ...] = ()
 
     @property
     def kept_rows(self) -> int:

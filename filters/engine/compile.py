@@ -10,7 +10,7 @@ import numpy as np
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
 from filters.engine.restart import restart_if_lost
-from filters.engine.simd import build_lanes
+from filters.engine.side_by_side import build_side_by_side
 from numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
 from numerics.streams import GROUP
 from plants.layout import LANES, number_places, padded
@@ -115,9 +115,9 @@ def batch(kernels: Kernels) -> CompiledOrPython:
     return _runner(_build_batch, kernels, is_interpreting())
 
 
-def lanes(kernels: Kernels) -> CompiledOrPython:
-    """The same for filters without an ensemble, in SIMD batches of trajectories; see `engine.simd.build_lanes`."""
-    return _runner(build_lanes, kernels, is_interpreting())
+def vectors(kernels: Kernels) -> CompiledOrPython:
+    """The same for kernels that have vectors, of eight trajectories at a time."""
+    return _runner(build_side_by_side, kernels, is_interpreting())
 
 
 @lru_cache(maxsize=128)

@@ -13,16 +13,16 @@ from filters.baselines.baselines import place_of
 from filters.engine.belief import Belief, Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
-from filters.gaussian.extended import gaussian_update, nothing_to_summarise
-from filters.gaussian.mixture import blender, part_constants, part_matrix, part_vector
+from filters.gaussian.mixture import blender, rule_programs
+from filters.pages.kernels import nothing_to_summarise, prior_start
 from numerics import matrices
 from numerics.checks import one_of, shown, vector
 from numerics.compiled import inlined
 from numerics.sources import tuple_of, written_out
-from numerics.tuples import matrix_reader, vector_reader
+from numerics.tuples import vector_reader
 from plants.affine import AffineModel, affine_functions, linearize
 from plants.layout import number_places
-from plants.shape import Shape
+from plants.shape import Functions, Shape
 
 MOST_STATES = 8  # that rules ask for: 256 rules
 BLENDINGS = ("weights", "moments", "output")
@@ -64,38 +64,27 @@ def fuzzy_kernels(shape: Shape, blending: str, premises: tuple[int, ...]) -> Ker
         2 ** len(premises),
         rule_length(n, m),
     )
-    means = places.extras
-    covs, weights, seen = means + n, means + n + n * n, means + n + n * n + 1
-    seen_covs = seen + m
-    (rule_mean, store_rule_mean), (rule_cov, store_rule_cov) = (
-        part_vector(n, means, stride),
-        part_matrix(n, covs, stride),
-    )
-    (_, store_seen), (_, store_seen_cov) = part_vector(m, seen, stride), part_matrix(m, seen_covs, stride)
+    mean_place, first = places.mean, places.extras
+    weights, seen = first + n + n * n, first + n + n * n + 1
     between, restarts = blending != "weights", blending != "output"
-    of_states = blender(n, means, covs, weights, stride, shape.state_angles, between)
-    of_innovations = blender(m, seen, seen_covs, weights, stride, shape.measurement_angles, between)
-    transition, observe, transition_jacobian, observe_jacobian = affine_functions(n, m, inputs).values()
-    length = n * (n + inputs + 1) + m * (n + 1)  # of an affine model's constants
-    rule_constants, low, high = (
-        part_constants(length, own + 2 * n, length),
-        vector_reader(n, own),
-        vector_reader(n, own + n),
-    )
+    of_states = blender(n, first, first + n, weights, stride, shape.state_angles, between)
+    of_innovations = blender(m, seen, seen + m, weights, stride, shape.measurement_angles, between)
+    length, belief, prior = n * (n + inputs + 1) + m * (n + 1), n + n * n, source.prior_mean
+    functions = Functions(**affine_functions(n, m, inputs))
+    predict_rule, update_rule = rule_programs(functions, shape._replace(form=length))
+    models, low, high = own + 2 * n, vector_reader(n, own), vector_reader(n, own + n)
+    given_place = first + rules * stride
     weigh = memberships(premises)
     store_weights = written_out(
         "store_weights", "row, w", *(f"row[{weights + stride * r}] = w[{r}]" for r in range(rules)), "None"
     )
-    read_q, read_r = matrix_reader(n, n, source.q), matrix_reader(m, m, source.r)
-    prior_mean, prior_cov = vector_reader(n, source.prior_mean), matrix_reader(n, n, source.prior_cov)
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
-    factor, likelihood = matrices.cholesky_factor(m), matrices.innovation_likelihood(m)
-    control, measured, condition = vector_reader(inputs), vector_reader(m), gaussian_update(shape)
-    times, times_transposed, add = (
-        matrices.multiplier(n, n, n),
-        matrices.transposed_multiplier(n, n, n),
-        matrices.symmetric_sum(n),
+    (read_mean, _), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
+    factor, likelihood, measured = (
+        matrices.cholesky_factor(m),
+        matrices.innovation_likelihood(m),
+        vector_reader(m),
     )
+    start_gaussian = prior_start(shape)
 
     @inlined
     def take_memberships(row, numbers):
@@ -108,57 +97,53 @@ def fuzzy_kernels(shape: Shape, blending: str, premises: tuple[int, ...]) -> Ker
         store_cov(row, cov)
 
     @inlined
-    def own_belief(row, j):
-        return rule_mean(row, j), rule_cov(row, j)
-
-    @inlined
-    def common_belief(row, j):
-        return read_mean(row), read_cov(row)
-
-    last_belief = common_belief if restarts else own_belief
+    def rule_and_given(row, numbers, j, values):
+        """The memory of a rule; and its model's constants with u or z, behind all rules."""
+        given = row[given_place : given_place + length + values.shape[0]]
+        for i in range(length):
+            given[i] = numbers[models + j * length + i]
+        for i in range(values.shape[0]):
+            given[length + i] = values[i]
+        return row[first + j * stride : first + (j + 1) * stride], given
 
     @inlined
     def start(memory, numbers, size):
         row, _, _ = memory
+        start_gaussian(memory, numbers, size)
         for j in range(rules):
-            store_rule_mean(row, j, prior_mean(numbers))
-            store_rule_cov(row, j, prior_cov(numbers))
-        store_mean(row, prior_mean(numbers))
-        store_cov(row, prior_cov(numbers))
+            for i in range(belief):
+                row[first + j * stride + i] = numbers[prior + i]
         take_memberships(row, numbers)
 
     @inlined
     def predict(memory, u, numbers, size):
         row, _, _ = memory
-        v, q = control(u), read_q(numbers)
         take_memberships(row, numbers)
         for j in range(rules):
-            c, (mean, p) = rule_constants(numbers, j), last_belief(row, j)
-            f = transition_jacobian(mean, v, c)
-            store_rule_mean(row, j, transition(mean, v, c))
-            store_rule_cov(row, j, add(times_transposed(times(f, p), f), q))
+            rule, given = rule_and_given(row, numbers, j, u)
+            if restarts:
+                for i in range(belief):
+                    rule[i] = row[mean_place + i]
+            predict_rule(rule, given, numbers)
         blend(row)
         row[step_place] += 1.0
 
     @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
-        present, r = measured(z), read_r(numbers)
         for j in range(rules):
-            c, mean = rule_constants(numbers, j), rule_mean(row, j)
-            predicted, h = observe(mean, c), observe_jacobian(mean, c)
-            mean, p, innovation, s, _ = condition(mean, rule_cov(row, j), present, predicted, h, r)
-            store_rule_mean(row, j, mean)
-            store_rule_cov(row, j, p)
-            store_seen(row, j, innovation)
-            store_seen_cov(row, j, s)
+            rule, given = rule_and_given(row, numbers, j, z)
+            update_rule(rule, given, numbers)
         blend(row)
         innovation, s = of_innovations(row, rules)
         store_innovation(row, innovation)
         store_s(row, s)
-        row[likelihood_place] = likelihood(innovation, factor(s), present)
+        row[likelihood_place] = likelihood(innovation, factor(s), measured(z))
 
-    return Kernels(n, m, n, 0, start, predict, update, nothing_to_summarise, extras=rules * stride)
+    scratch = length + max(inputs, m)
+    return Kernels(
+        n, m, n, 0, start, predict, update, nothing_to_summarise, extras=rules * stride, scratch=scratch
+    )
 
 
 def rule_length(n: int, m: int) -> int:

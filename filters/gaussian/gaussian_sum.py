@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from typing import ClassVar
 
 import numpy as np
 
-from filters.adaptive.noise_moments import mixer, outer
 from filters.baselines.baselines import place_of
 from filters.engine.belief import Belief, Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
-from filters.gaussian.extended import extended_kernels, gaussian_update, kernels_of
-from filters.gaussian.mixture import blender, part_matrix, part_vector
+from filters.gaussian import extended
+from filters.gaussian.mixture import blender, part_update
+from filters.pages.kernels import nothing_to_summarise, page_kernels
 from filters.particles.weighted import anything_measured
 from numerics.checks import at_least
 from numerics.compiled import inlined
-from numerics.sources import entrywise
-from numerics.tuples import matrix_reader, scaled_sum, vector_reader
-from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape, observation_slopes
+from plants.shape import Functions, Shape
 
 FEWEST_PARTS, MOST_PARTS = 7, 1000
 REACH = 4.5  # of the outermost parts, in standard deviations of the split component
@@ -32,25 +29,19 @@ OVERLAP = 0.6  # standard deviation of a part, over the distance from one to the
 @lru_cache(maxsize=64)
 def gaussian_sum_kernels(functions: Functions, shape: Shape, *, parts) -> Kernels:
     """Kernels for model functions, sizes and a number of parts; extras as the class says."""
-    n, m, observe = shape.n, shape.m, functions.observe
-    places, source, own = memory_places(n, m), number_places(n, m), own_place(shape)
+    n, m = shape.n, shape.m
+    places, own = memory_places(n, m), own_place(shape)
     stride, likelihood_place = n + n * n + 1 + m + m * m + 1, places.log_likelihood
-    means = places.extras
+    mean_place, cov_place, means = places.mean, places.cov, places.extras
     covs, weights, seen = means + n, means + n + n * n, means + n + n * n + 1
     seen_covs, likelihoods = seen + m, seen + m + m * m
-    (_, store_part), (_, store_part_cov) = part_vector(n, means, stride), part_matrix(n, covs, stride)
-    (_, store_seen), (_, store_seen_cov) = part_vector(m, seen, stride), part_matrix(m, seen_covs, stride)
     of_states = blender(n, means, covs, weights, stride, shape.state_angles)
     of_innovations = blender(m, seen, seen_covs, weights, stride, shape.measurement_angles)
     component_place, variance_place, nodes_place, shares_place = own, own + 1, own + 2, own + 2 + parts
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
-    read_r = matrix_reader(m, m, source.r)
-    column = entrywise("column", "row, i, factor", (n,), lambda j: f"factor * row[{j * n + places.cov} + i]")
-    measured, read_scales = vector_reader(m), vector_reader(n, source.scales)
-    constants, observation_matrix = constants_reader(shape), observation_slopes(functions, shape)
-    plain = extended_kernels(functions, shape)
-    condition, move, square, mix = gaussian_update(shape), scaled_sum(n), outer(n), mixer(n)
-    begin, predict, nothing_to_summarise = plain.start, plain.predict, plain.summarise
+    _, (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
+    condition = part_update(functions, shape)
+    plain = page_kernels(extended.ExtendedKalmanFilter.page, functions, shape)
+    begin, predict = plain.start, plain.predict
 
     @inlined
     def start(memory, numbers, size):
@@ -60,24 +51,23 @@ def gaussian_sum_kernels(functions: Functions, shape: Shape, *, parts) -> Kernel
             row[means + k] = 0.0
 
     @inlined
-    def update_parts(row, present, numbers):
+    def update_parts(row, z, numbers):
         """Split the belief and update each part by itself; its weight is still that before the measurement."""
-        mean, p, r, c = read_mean(row), read_cov(row), read_r(numbers), constants(numbers)
         i = int(numbers[component_place])
-        variance = p[i][i]
-        along = column(row, i, variance**-0.5 if variance > 0.0 else 0.0)
-        narrow = mix(1.0, p, numbers[variance_place] - 1.0, square(along))
+        variance = row[cov_place + i * (n + 1)]
+        narrower = (numbers[variance_place] - 1.0) / variance if variance > 0.0 else 0.0
         for k in range(parts):
-            x = move(mean, numbers[nodes_place + k], along)
-            predicted, h = observe(x, c), observation_matrix(x, read_scales(numbers), c)
-            x, part_p, innovation, s, row[likelihoods + stride * k] = condition(
-                x, narrow, present, predicted, h, r
-            )
-            row[weights + stride * k] = numbers[shares_place + k]
-            store_part(row, k, x)
-            store_part_cov(row, k, part_p)
-            store_seen(row, k, innovation)
-            store_seen_cov(row, k, s)
+            part = row[means + k * stride : means + (k + 1) * stride]
+            step = numbers[nodes_place + k] * variance**-0.5 if variance > 0.0 else 0.0
+            for a in range(n):
+                along = row[cov_place + a * n + i]
+                part[a] = row[mean_place + a] + step * along
+                for b in range(n):
+                    part[n + a * n + b] = (
+                        row[cov_place + a * n + b] + narrower * along * row[cov_place + b * n + i]
+                    )
+            part[n + n * n] = numbers[shares_place + k]
+            condition(part, z, numbers)
 
     @inlined
     def weigh(row):
@@ -96,7 +86,7 @@ def gaussian_sum_kernels(functions: Functions, shape: Shape, *, parts) -> Kernel
     @inlined
     def update(memory, z, numbers, size):
         row, _, _ = memory
-        update_parts(row, measured(z), numbers)
+        update_parts(row, z, numbers)
         innovation, s = of_innovations(row, parts)
         store_innovation(row, innovation)
         store_s(row, s)
@@ -168,7 +158,7 @@ class GaussianSumFilter(Filter):
 
     def kernels(self) -> Kernels:
         """Kernels for the model's functions; see `Filter.kernels`."""
-        return kernels_of(self.kernel_model, partial(gaussian_sum_kernels, parts=self.parts))
+        return gaussian_sum_kernels(self.kernel_model.functions, self.kernel_model.shape, parts=self.parts)
 
     def part_estimates(self, belief: Belief) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Means (parts, n), covariances (parts, n, n) and weights (parts,) that the last update merged."""

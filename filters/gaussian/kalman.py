@@ -8,25 +8,20 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters.engine.belief import Kernels
-from filters.filter import Filter
-from filters.gaussian.extended import extended_kernels, kernels_of
-from filters.gaussian.information import information_kernels
-from filters.gaussian.schedule import scheduled_kernels
-from filters.gaussian.square_root import square_root_kernels
+from filters.gaussian.extended import ExtendedKalmanFilter
+from filters.gaussian.information import INFORMATION
+from filters.gaussian.schedule import SCHEDULED
+from filters.gaussian.square_root import SQUARE_ROOT
+from filters.pages.page import Page, PageFilter
 from numerics.checks import at_least, covariance, one_of
 from plants.affine import AffineModel, linearize
 
-MOST_POINTS = 200  # of a schedule; the source is written out for them
-FORMS = {
-    "covariance": extended_kernels,
-    "information": information_kernels,
-    "square-root": square_root_kernels,
-}
+MOST_POINTS = 200  # of a schedule; programs are written out for them
+FORMS = {"covariance": ExtendedKalmanFilter.page, "information": INFORMATION, "square-root": SQUARE_ROOT}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class AffineFilter(Filter):
+class AffineFilter(PageFilter):
     """Base of filters that run on an affine model, or on the affine approximation of a model about one point."""
 
     def __post_init__(self):
@@ -73,6 +68,7 @@ class KalmanFilter(AffineFilter):
     """
 
     name: ClassVar[str] = "kf"
+    page: ClassVar[Page] = ExtendedKalmanFilter.page
     form: str = "covariance"
     schedule: int = 1
 
@@ -92,20 +88,20 @@ class KalmanFilter(AffineFilter):
         _ = self.own_numbers  # an operating point that does not exist shows here
 
     @cached_property
-    def own_numbers(self) -> tuple[float, ...]:
-        """The inputs of a schedule, then the constants of the affine model at each."""
+    def parameters(self) -> dict[str, np.ndarray]:
+        """The inputs of a schedule, and the constants of the affine model at each."""
         operating_points = self.model.operating_points
         if self.schedule == 1 or operating_points is None:
-            return ()
+            return {}
         points = operating_points(self.schedule)
         inputs = [float(u) for _, (u,) in points]
         if not (np.diff(inputs) > 0).all():
             raise ValueError(f"the inputs of operating points must increase, but got {inputs}")
         models = [linearize(self.model, state, control) for state, control in points]
-        return (*inputs, *(number for model in models for number in model.constants))
+        return {"inputs": np.array(inputs), "models": np.array([model.constants for model in models])}
 
-    def kernels(self) -> Kernels:
-        """Kernels of the extended filter, or those of another form or a schedule, on the affine model."""
-        if self.schedule > 1:
-            return scheduled_kernels(self.schedule, self.kernel_model.shape)
-        return kernels_of(self.kernel_model, FORMS[self.form])
+    @property
+    def written_page(self) -> Page:
+        """The page of the form, or of a schedule."""
+        form = SCHEDULED if self.schedule > 1 else FORMS[self.form]
+        return form._replace(own=super().written_page.own)

@@ -3,46 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 
+from filters.gaussian import extended
+from filters.pages.equations import Equations
+from filters.pages.memory import RowMemory
+from filters.pages.programs import programs_of, stored
+from filters.pages.stages import Stage
 from numerics.angles import NAMES, places_of
 from numerics.compiled import inlined
-from numerics.sources import Source, lower_pairs, tuple_of, written_out
-from plants.shape import constants_are_array
-
-
-@cache
-def part_vector(count: int, first: int, stride: int) -> tuple[Callable, Callable]:
-    """Functions `read(row, j)` and `store(row, j, x)`: the entries of part j from row[first + stride j] on."""
-    read, store = Source("read", "row, j", result=(count,)), Source("store", "row, j, x", x=(count,))
-    for source in (read, store):
-        source.line(f"k = {first} + {stride} * j")
-    for i in store.range(count):
-        store.line(f"row[k + {i}] = x[{i}]")
-    return read.function(read.vector(count, lambda i: f"row[k + {i}]")), store.function()
-
-
-@cache
-def part_constants(count: int, first: int, stride: int) -> Callable:
-    """Return `read(row, j)`: the constants of an affine model, a part of a filter's numbers."""
-    if constants_are_array(count):
-        place = f"{first} + {stride} * j"
-        return written_out("read", "row, j", f"row[{place} : {place} + {count}]")
-    entries = tuple_of(f"row[k + {i}]" for i in range(count))
-    return written_out("read", "row, j", f"k = {first} + {stride} * j", entries)
-
-
-@cache
-def part_matrix(size: int, first: int, stride: int) -> tuple[Callable, Callable]:
-    """Functions `read(row, j)` and `store(row, j, a)`: a square matrix of part j, by rows."""
-    shape = size, size
-    read, store = Source("read", "row, j", result=shape), Source("store", "row, j, a", a=shape)
-    for source in (read, store):
-        source.line(f"k = {first} + {stride} * j")
-    for i in store.range(size):
-        for j in store.range(size):
-            store.line(f"row[k + {i * size + j}] = a[{i}][{j}]")
-    return read.function(read.matrix(size, size, lambda i, j: f"row[k + {i * size + j}]")), store.function()
+from numerics.sources import Source, lower_pairs, written_out
+from plants.shape import Functions, Shape
 
 
 @cache
@@ -128,3 +99,41 @@ def part_aligner(means: int, weights: int, stride: int, angles: tuple[bool, ...]
         "        row[k] -= whole_turns(row[k] - middle)",
     )
     return written_out("align", "row, parts", *lines, "None", **NAMES)
+
+
+@lru_cache(maxsize=64)
+def part_update(functions: Functions, shape: Shape) -> Callable:
+    """Return `condition(part, z, numbers)`: the extended filter's update of a part of a mixture.
+
+    A part is mean, covariance, weight, innovation, its covariance and log-likelihood.
+    """
+    n, m = shape.n, shape.m
+
+    def stages(memory: RowMemory, model: Equations) -> list[Stage]:
+        x, p = memory.beside("rows", 0, n), memory.beside("rows", n, n, n, symmetric=True)
+        seen = n + n * n + 1
+        return [stored(extended.update(model, x, p, memory.z), (x, p, seen, seen + m, seen + m + m * m))]
+
+    return programs_of(extended.ExtendedKalmanFilter.page, functions, shape, stages).works[0]
+
+
+@lru_cache(maxsize=64)
+def rule_programs(functions: Functions, shape: Shape) -> tuple[Callable, Callable]:
+    """Functions `predict(rule, given, numbers)` and `update(rule, given, numbers)` of one rule's Kalman filter.
+
+    A rule is its mean, covariance, membership, innovation and the covariance of that; given are the constants of
+    its affine model, then u or z.
+    """
+    n, m, count = shape.n, shape.m, shape.constants
+
+    def stages(memory: RowMemory, model: Equations) -> list[Stage]:
+        x, p = memory.beside("rows", 0, n), memory.beside("rows", n, n, n, symmetric=True)
+        rule = model.at(memory.beside("given", 0, count))
+        u, z = memory.beside("given", count, shape.inputs), memory.beside("given", count, m)
+        predicted = extended.settle(rule, *extended.advance(rule, x, p, u))
+        *updated, _ = extended.update(rule, x, p, z)
+        seen = n + n * n + 1
+        return [stored(predicted, (x, p)), stored(tuple(updated), (x, p, seen, seen + m))]
+
+    predict, update = programs_of(extended.ExtendedKalmanFilter.page, functions, shape, stages).works
+    return predict, update

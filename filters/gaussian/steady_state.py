@@ -3,54 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
-from filters.bounds import riccati_covariances
-from filters.engine.belief import Kernels
-from filters.engine.layout import memory_places, own_place, row_access
-from filters.gaussian.extended import extended_kernels, gaussian_innovation, joseph_form, kernels_of
+from filters.gaussian.extended import advance, settle
 from filters.gaussian.kalman import AffineFilter
-from filters.gaussian.sigma_points import silenced_columns
-from numerics import matrices
-from numerics.compiled import inlined
-from numerics.tuples import matrix_reader, scaled_sum, vector_reader
-from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape
+from filters.pages.page import Page
+from numerics.algebra.densities import log_density
+from numerics.algebra.operations import joseph, only, present, sym, uncorrelated, wrap
 
 STABLE = 1.0 - 1e-7  # magnitude of an eigenvalue of A (I - K C): an error lasts for less than ten million steps
 
 
-@lru_cache(maxsize=64)
-def steady_kernels(functions: Functions, shape: Shape) -> Kernels:
-    """Kernels for an affine model's functions and shape; the filter's own numbers are the gain (n, m)."""
-    n, m, observe, observe_jacobian = shape.n, shape.m, functions.observe, functions.observe_jacobian
-    assert observe_jacobian is not None  # of an affine model it is known
-    places, source = memory_places(n, m), number_places(n, m)
-    (read_mean, read_cov), (store_mean, store_cov), (store_innovation, store_s) = row_access(shape)
-    constants, measured, read_r = constants_reader(shape), vector_reader(m), matrix_reader(m, m, source.r)
-    read_gain, likelihood_place = matrix_reader(n, m, own_place(shape)), places.log_likelihood
-    gain_of_present = silenced_columns(n, m)
-    compare, reduce, likelihood = gaussian_innovation(shape), joseph_form(n, m), matrices.innovation_likelihood(m)
-    apply, moved = matrices.vector_multiplier(n, m), scaled_sum(n)
-
-    @inlined
-    def update(memory, z, numbers, size):
-        row, _, _ = memory
-        mean, p, c, z = read_mean(row), read_cov(row), constants(numbers), measured(z)
-        innovation, s, s_root, _, h, r = compare(
-            p, z, observe(mean, c), observe_jacobian(mean, c), read_r(numbers)
-        )
-        k = gain_of_present(read_gain(numbers), z)
-        store_mean(row, moved(mean, 1.0, apply(k, innovation)))
-        store_cov(row, reduce(p, k, h, r))
-        store_innovation(row, innovation)
-        store_s(row, s)
-        row[likelihood_place] = likelihood(innovation, s_root, z)
-
-    return extended_kernels(functions, shape)._replace(update=update)
+def update(model, x, P, z):
+    """The measurement z; channels that are NaN are missing, and so are their columns of the gain."""
+    seen = present(z)
+    H, R, K = only(seen, model.H(x)), uncorrelated(seen, model.R), only(seen, model.own.gain.T).T
+    v = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    S = sym(H @ P @ H.T + R)
+    return wrap(x + K @ v, model.state_angles), joseph(P, K, H, R), v, S, log_density(v, S, seen)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,6 +53,7 @@ class SteadyStateKalmanFilter(AffineFilter):
     """
 
     name: ClassVar[str] = "kf-steady"
+    page: ClassVar[Page] = Page(advance, settle, update)
     varying_noise: ClassVar[bool] = False
 
     def __post_init__(self):
@@ -99,16 +73,14 @@ class SteadyStateKalmanFilter(AffineFilter):
     @cached_property
     def gain(self) -> np.ndarray:
         """The gain K (n, m)."""
+        from filters.bounds import riccati_covariances  # which runs filters of this room
+
         model = self.kernel_model
         predicted, _ = riccati_covariances(model)
         c = model.matrices()[3]
         return np.linalg.solve(c @ predicted @ c.T + model.measurement_noise_cov, c @ predicted).T
 
     @property
-    def own_numbers(self) -> tuple[float, ...]:
-        """The gain, by rows."""
-        return tuple(self.gain.ravel())
-
-    def kernels(self) -> Kernels:
-        """Kernels for the model's functions; see `Filter.kernels`."""
-        return kernels_of(self.kernel_model, steady_kernels)
+    def parameters(self) -> dict[str, np.ndarray]:
+        """The gain."""
+        return {"gain": self.gain}

@@ -1,27 +1,74 @@
-"""The unscented Kalman filter: moments from the model's values at a few points, without derivatives."""
+"""The unscented Kalman filter: moments from the model's values at a few points, without Jacobians."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import ClassVar
 
-from filters.engine.belief import Kernels
-from filters.filter import Filter
-from filters.gaussian.sigma_points import PointSet, kernels_of
+from filters.pages.page import Page, PageFilter
+from numerics.algebra.densities import log_density
+from numerics.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
+from numerics.algebra.points import first, ones, others, outer, root, square, units
 from numerics.checks import finite, positive
 
 
+def begin(model, x, P):
+    """The points of a belief."""
+    return points(model, x, root(P))
+
+
+def points(model, x, L):
+    """The mean, and the points around it."""
+    return outer(x, ones(units(x))) + (L * model.own.spread) @ units(x)
+
+
+def moments(model, Y, angles):
+    """Mean and shift of values at the points, and their deviations."""
+    D = wrap(others(Y) - outer(first(Y), ones(others(Y))), angles)
+    s = (D @ ones(D)) * model.own.weight
+    return first(Y) + s, s, D
+
+
+def scatter(model, D, s):
+    """The covariance of such deviations."""
+    return square(D) * model.own.weight + outer(s, s) * model.own.shift_weight
+
+
+def advance(model, X, u):
+    """One of the model's substeps, of each point."""
+    return model.f(X, u)
+
+
+def settle(model, X):
+    """The end of a step."""
+    x, s, D = moments(model, X, model.state_angles)
+    return wrap(x, model.state_angles), scatter(model, D, s) + model.Q
+
+
+def update(model, x, P, z):
+    """The measurement z; channels that are NaN are missing."""
+    (g, w, _), L, U, seen = model.own, root(P), others(units(x)), present(z)
+    y, s, D = moments(model, model.h(points(model, x, L)), model.measurement_angles)
+    s, D, R = only(seen, s), only(seen, D), uncorrelated(seen, model.R)
+    v = only(seen, wrap(z - y, model.measurement_angles))
+    C = (L @ (U @ D.T)) * (w * g)
+    S = scatter(model, D, s) + R
+    K = divide(C, S)
+    rest = scatter(model, (L * g) @ U - K @ D, K @ s) + sym(K @ R @ K.T)
+    return wrap(x + K @ v, model.state_angles), of_best_gain(rest, P, C, S, K), v, S, log_density(v, S, seen)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
-class UnscentedKalmanFilter(Filter):
+class UnscentedKalmanFilter(PageFilter):
     """Unscented Kalman filter with the scaled transform and additive noise.
 
-        points:  x_0 = mean,  x_i = mean + g L_i,  x_{n+i} = mean - g L_i,  L L' = P,  g = alpha sqrt(n + kappa)
-        moments: of values y_i = f(x_i), with d_i = y_i - y_0, w = 1/(2 g^2) and i = 1 ... 2n,
-                 s = w sum d_i,  mean(y) = y_0 + s,  cov(y) = w sum d_i d_i' + (beta - alpha^2) s s'
-        predict: mean, P = mean(f(x, u)), cov(f(x, u)) + Q
-        update:  points anew from the predicted mean and P,  innovation = z - mean(h(x)),  S = cov(h(x)) + R,
-                 K = cov(x, h(x)) S^-1,  mean += K innovation,  and with e_i = h(x_i) - h(x_0), s = w sum e_i,
-                 P = w sum (x_i - x_0 - K e_i)(x_i - x_0 - K e_i)' + (beta - alpha^2) K s (K s)' + K R K'
+        points:  X = x 1' + g L U,  L L' = P,  U = [0, I, -I],  g = alpha sqrt(n + kappa)
+        moments: of values Y, with D = [y_i - y_0], i = 1 ... 2n, w = 1/(2 g^2) and b = beta - alpha^2:
+                 s = w D 1,  mean y_0 + s,  cov w D D' + b s s'
+        predict: x, P = mean(f(X, u)), cov(f(X, u)) + Q
+        update:  points again, from the predicted x and P;  v = z - mean(h(X)),  S = cov(h(X)) + R,
+                 K = w g L U h(X)' S^-1,  x += K v,
+                 P = w (g L U - K D) (g L U - K D)' + b K s (K s)' + K R K'
 
     These are the moments of the usual weights, W_0 = 1 - n/g^2 for the mean, W_0 + 1 - alpha^2 + beta for the
     covariance and W_i = w, with the point in the centre taken out of the sums: a negative weight, which alpha
@@ -43,6 +90,7 @@ class UnscentedKalmanFilter(Filter):
     """
 
     name: ClassVar[str] = "ukf"
+    page: ClassVar[Page] = Page(advance, settle, update, begin)
     alpha: float = 1.0
     beta: float = 2.0
     kappa: float = 0.0
@@ -62,11 +110,7 @@ class UnscentedKalmanFilter(Filter):
             object.__setattr__(self, name, value)
 
     @property
-    def own_numbers(self) -> PointSet:
+    def parameters(self) -> dict[str, float]:
         """Where the points lie, and their weights."""
         square = self.alpha**2 * (self.model.n + self.kappa)
-        return PointSet(spread=square**0.5, weight=0.5 / square, shift_weight=self.beta - self.alpha**2)
-
-    def kernels(self) -> Kernels:
-        """Kernels for the model's functions; see `Filter.kernels`."""
-        return kernels_of(self.kernel_model, centre=True)
+        return {"spread": square**0.5, "weight": 0.5 / square, "shift_weight": self.beta - self.alpha**2}

@@ -15,8 +15,9 @@ from filters.engine.layout import memory_places
 from filters.engine.restart import restart_if_lost
 from filters.ensembles.ensemble import EnsembleFilter
 from filters.ensembles.members import row_covariances, row_means
-from filters.smoothers.rts import step_writers
+from numerics.angles import NAMES, short_way
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from numerics.sources import Source
 from numerics.threads import spread
 from numerics.tuples import joiner, vector_part, written_out
 from plants.state_space import StateSpaceModel
@@ -80,6 +81,18 @@ def _paired_functions(transition: Callable, observe: Callable, n: int) -> tuple[
     names: dict[str, Any] = {"now": now, "past": past, "join": joiner(n, n)}
     moves = written_out("moves", "x, u, c", "join(f(now(x), u, c), past(x))", f=transition, **names)
     return moves, written_out("observe", "x, c", "h(now(x), c)", h=observe, now=now)
+
+
+@cache
+def step_writers(n: int, angles: tuple[bool, ...]) -> tuple[Callable, Callable]:
+    """Functions `write(a, b, k, x)`: a vector (n,), its angles in (-pi, pi], and a matrix (n, n), into a[b, k]."""
+    vector, matrix = Source("write", "a, b, k, x", x=(n,)), Source("write", "a, b, k, x", x=(n, n))
+    for i in vector.range(n):
+        vector.line(f"a[b, k, {i}] = {short_way(f'x[{i}]', i, angles)}")
+    for i in matrix.range(n):
+        for j in matrix.range(n):
+            matrix.line(f"a[b, k, {i}, {j}] = x[{i}][{j}]")
+    return vector.function(**NAMES), matrix.function()
 
 
 @lru_cache(maxsize=64)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -15,14 +14,19 @@ from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.gaussian.iterated import IteratedExtendedKalmanFilter
 from filters.gaussian.kalman import KalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
+from filters.pages.page import PageFilter
 from filters.smoothers.ensemble import smooth_ensembles
-from filters.smoothers.rts import extended_relation, scheduled_relation, smooth_backwards
-from filters.smoothers.sigma_relation import sigma_relation
+from filters.smoothers.points import CUBATURE, UNSCENTED
+from filters.smoothers.rts import LINEARISED, SCHEDULED, Relation, smooth_backwards
 from numerics.checks import at_least
 
-LINEARISED: tuple[type[Filter], ...] = (KalmanFilter, ExtendedKalmanFilter, IteratedExtendedKalmanFilter)
-# Filters with sigma points, and whether the mean is one of them.
-WITH_POINTS: dict[type[Filter], bool] = {UnscentedKalmanFilter: True, CubatureKalmanFilter: False}
+RELATIONS: dict[type[Filter], Relation] = {
+    KalmanFilter: LINEARISED,
+    ExtendedKalmanFilter: LINEARISED,
+    IteratedExtendedKalmanFilter: LINEARISED,
+    UnscentedKalmanFilter: UNSCENTED,
+    CubatureKalmanFilter: CUBATURE,
+}
 
 
 class Smoothed(NamedTuple):
@@ -81,20 +85,19 @@ def smooth(
     lag = steps if lag is None else min(at_least("lag", lag, 0), steps)
     if isinstance(filter_, EnsembleFilter):
         return Smoothed(*smooth_ensembles(filter_, keys, inputs, measurements, lag))
-    relate = relation_of(filter_)
-    return Smoothed(*smooth_backwards(filter_, relate, run(filter_, keys, inputs, measurements), inputs, lag))
+    relation = relation_of(filter_)
+    assert isinstance(filter_, PageFilter)
+    return Smoothed(*smooth_backwards(filter_, relation, run(filter_, keys, inputs, measurements), inputs, lag))
 
 
-def relation_of(filter_: Filter) -> Callable:
+def relation_of(filter_: Filter) -> Relation:
     """What `smooth_backwards` needs to know of a filter; ValueError if it has no such smoother."""
-    model, kind = filter_.kernel_model, type(filter_)
+    kind = type(filter_)
     if isinstance(filter_, KalmanFilter) and kind is KalmanFilter and filter_.schedule > 1:
-        return scheduled_relation(filter_.schedule, model.shape)
-    if kind in LINEARISED:
-        return extended_relation(model.functions, model.shape)
-    if kind in WITH_POINTS:
-        return sigma_relation(model.functions.transition, model.shape, WITH_POINTS[kind])
-    known = ", ".join(known.name for known in (*LINEARISED, *WITH_POINTS))
+        return SCHEDULED
+    if kind in RELATIONS:
+        return RELATIONS[kind]
+    known = ", ".join(known.name for known in RELATIONS)
     raise ValueError(
         f"a smoother needs a filter of {known} or an ensemble Kalman filter, but got {filter_.name!r}"
     )

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from numerics import matrices as made
-from numerics.algebra import densities, matrices, operations, points_called
+from numerics.algebra import blocks_called, densities, matrices, operations, points_called
 from numerics.algebra.matrices import Matrix, Operation, in_order
 from numerics.algebra.programs import ARRAYS, Place
 from numerics.angles import NAMES, short_way
@@ -29,13 +29,15 @@ def calls_of(
     stores: Sequence[tuple[Place, Matrix]],
     known: Mapping[Matrix, Place | Callable],
     functions: Mapping[Operation, Callable],
+    arrays: Sequence[str] = ARRAYS,
 ) -> Callable:
-    """`work(rows, change, numbers, move)`, which makes some stores for one run; compiled functions may call it.
+    """`work(*arrays)`, which makes some stores for one run; compiled functions may call it.
 
     Args:
         stores: what is to be stored, and from where on.
         known: of each matrix that is given where it begins, or a function of `numbers` that reads it.
         functions: what works out operations that are not ours, those of a model.
+        arrays: names of the arguments.
     """
     lines: list[str] = []
     names: dict[str, Any] = {}
@@ -60,7 +62,7 @@ def calls_of(
     for place, one in stores:
         lines += _stored(place, one.shape, values[one])
     loops = any(is_array(*one.shape) for one in values if one.shape)
-    return written_out("work", ", ".join(ARRAYS), *lines, "None", _loops=loops, **names)
+    return written_out("work", ", ".join(arrays), *lines, "None", _loops=loops, **names)
 
 
 def _read(place: Place, shape: tuple[int, ...]) -> str:
@@ -252,4 +254,5 @@ _FUNCTIONS: dict[Operation, Callable] = {
     densities.heavier: _of_tail(f"({HEAVIER} if tail[0] > 0.0 else 0.0)"),
     densities.outlier_weight: _of_tail(WEIGHT),
     **points_called.FUNCTIONS,
+    **blocks_called.FUNCTIONS,
 }

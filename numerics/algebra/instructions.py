@@ -7,14 +7,14 @@ of numbers, one of each run, so that nobody has to find out whether some loop co
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba.core import types
 from numba.extending import lower_builtin, type_callable
 
 from numerics.algebra.graphs import Number
-from numerics.algebra.programs import ARRAYS, SIDE_BY_SIDE, Place, Program
+from numerics.algebra.programs import SIDE_BY_SIDE, Place, Program
 from numerics.compiled import FASTMATH
 
 FLAGS = tuple(sorted(FASTMATH))
@@ -26,20 +26,20 @@ IN_LIBRARY = {"arctan": "atan", "arctan2": "atan2"}  # other names than NumPy's 
 DOUBLE, LONG = ir.DoubleType(), ir.IntType(64)
 
 
-def teach(work: Callable, program: Program, width: int) -> None:
+def teach(work: Callable, program: Program, width: int, names: Sequence[str]) -> None:
     """Have numba put the instructions of a program in the place of a call of `work`."""
 
     @type_callable(work)
     def of_arrays(context):
-        return lambda rows, change, numbers, move: types.none
+        return eval(f"lambda {', '.join(names)}: none", {"none": types.none})
 
-    @lower_builtin(work, *[types.Array] * len(ARRAYS))
+    @lower_builtin(work, *[types.Array] * len(names))
     def write(context, builder, signature, arrays):
         data = [
             context.make_array(kind)(context, builder, a).data
             for kind, a in zip(signature.args, arrays, strict=True)
         ]
-        _Writer(builder, dict(zip(ARRAYS, data, strict=True)), width).write(program)
+        _Writer(builder, dict(zip(names, data, strict=True)), width).write(program)
         return context.get_dummy_value()
 
 

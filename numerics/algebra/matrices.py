@@ -189,7 +189,8 @@ def _of_difference(result, arguments, slopes):
 
 @scale.derivative
 def _of_multiple(result, arguments, slopes):
-    return through(lambda slope: slope * arguments[1], slopes[0])
+    (a, factor), (da, df) = arguments, (*slopes, None)[:2]
+    return plus(through(lambda slope: slope * factor, da), through(lambda slope: a * slope, df))
 
 
 @transposed.derivative

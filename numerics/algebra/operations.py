@@ -27,7 +27,7 @@ def sym(a):
         return 0.5 * (a + a.T)
     if a.symmetric:
         return a
-    if a.operation.name in ("add", "subtract"):
+    if getattr(a.operation, "name", "") in ("add", "subtract"):
         return a.operation(*map(sym, a.arguments))
     if a.operation is multiply and a.arguments[0].operation is multiply:
         (left, p), right = a.arguments[0].arguments, a.arguments[1]
@@ -103,10 +103,14 @@ def uncorrelated(seen, r):
 @operation(same)
 def factor(s):
     """Unit lower triangular L, and d, with L diag(d) L' = s; NaN where s is not positive definite."""
+    return pivoted(s, lambda d, variance: where(d > 0.0, d, math.nan))
+
+
+def pivoted(s, pivot):
+    """The factor with d = pivot(d, s_ii): Cholesky's method, with a diagonal of one's own."""
     lower, d = np.array(np.eye(len(s)), dtype=s.dtype), np.array(np.diag(s))
     for j in range(len(s)):
-        d[j] = d[j] - sum(lower[j, k] * lower[j, k] * d[k] for k in range(j))
-        d[j] = where(d[j] > 0.0, d[j], math.nan)
+        d[j] = pivot(d[j] - sum(lower[j, k] * lower[j, k] * d[k] for k in range(j)), s[j, j])
         for i in range(j + 1, len(s)):
             lower[i, j] = (s[i, j] - sum(lower[i, k] * lower[j, k] * d[k] for k in range(j))) / d[j]
     return lower, d

@@ -91,6 +91,25 @@ def others(a):
     return a[:, 1:]
 
 
+@operation(lambda u, nodes: nodes)
+def hats(u, nodes):
+    """Weights (s,) of increasing nodes at which something is known, for what is linear between them at u (1,)."""
+    found = []
+    for s in range(len(nodes)):
+        weight = 1.0
+        if s > 0:
+            weight = least(weight, (u[0] - nodes[s - 1]) / (nodes[s] - nodes[s - 1]))
+        if s < len(nodes) - 1:
+            weight = least(weight, (nodes[s + 1] - u[0]) / (nodes[s + 1] - nodes[s]))
+        found.append(where(0.0 < weight, weight, 0.0))
+    return np.array(found)
+
+
+def least(a, b):
+    """The smaller one of two numbers."""
+    return where(b < a, b, a)
+
+
 def on_circle(y, angles):
     """Columns whose rows that are angles (flags) lie within half a turn of their circular mean."""
     return on_one_side(y, tuple(angles)) if any(angles) else y

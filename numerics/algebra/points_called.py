@@ -52,6 +52,16 @@ def _on_one_side(result: tuple, angles: tuple[bool, ...], of: tuple) -> Callable
     return written_out("on_one_side", "y", "back(align(turn(y)))", turn=turn, back=back, align=align)
 
 
+def _hats(result: tuple, u: tuple, nodes: tuple) -> Callable:
+    source = Source("hats", "u, x", result=result, x=nodes)
+    found = source.local("w", *result)
+    for s in range(*result):
+        sides = [f"(u[0] - x[{s - 1}]) / (x[{s}] - x[{s - 1}])"] * (s > 0)
+        sides += [f"(x[{s + 1}] - u[0]) / (x[{s + 1}] - x[{s}])"] * (s < result[0] - 1)
+        source.line(f"{found[s]} = max(0.0, min(1.0, {', '.join(sides)}))")
+    return source.function(source.whole(found))
+
+
 FUNCTIONS: dict[Operation, Callable] = {
     points.root: lambda result, of: made.semidefinite_factor(*result[:1]),
     points.root_slope: _root_slope,
@@ -62,4 +72,5 @@ FUNCTIONS: dict[Operation, Callable] = {
     points.first: lambda result, of: entrywise("first", "a", result, lambda i: f"a[{i}][0]", a=of),
     points.others: _columns,
     points.on_one_side: _on_one_side,
+    points.hats: _hats,
 }

@@ -8,7 +8,8 @@ from typing import ClassVar
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
-from filters.gaussian.extended import ExtendedKalmanFilter, extended_kernels
+from filters.gaussian.extended import ExtendedKalmanFilter
+from filters.pages.kernels import page_kernels
 from numerics.compiled import inlined
 from plants.layout import constants_reader, number_places
 from plants.shape import Functions, Shape
@@ -20,7 +21,7 @@ KEPT = 5  # roll, pitch and the last p, q, r
 @lru_cache(maxsize=64)
 def own_attitude_kernels(functions: Functions, shape: Shape) -> Kernels:
     """Kernels of the extended filter for a model whose last two inputs are roll and pitch."""
-    n, m, inner = shape.n, shape.m, extended_kernels(functions, shape)
+    n, m, inner = shape.n, shape.m, page_kernels(ExtendedKalmanFilter.page, functions, shape)
     places, source, constants = memory_places(n, m), number_places(n, m), constants_reader(shape)
     start_filter, predict_filter, update_filter = inner.start, inner.predict, inner.update
     mean, step, kept, substeps = places.mean, places.step, places.extras, source.substeps
@@ -50,7 +51,7 @@ def own_attitude_kernels(functions: Functions, shape: Shape) -> Kernels:
             row[kept], row[kept + 1] = next_attitude(row[kept], row[kept + 1], before, after, dt)
         row[kept + 2], row[kept + 3], row[kept + 4] = after
 
-    return inner._replace(start=start, predict=predict, update=update, extras=KEPT, stages=None)
+    return inner._replace(start=start, predict=predict, update=update, extras=KEPT, vectors=())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -5,62 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from filters import ExtendedKalmanFilter, run
 from filters.differentiated import recursion
 from filters.differentiated.recursion import Wanted, recursion_of
 from filters.likelihood import information, likelihood
-from filters.pages import extended
 from filters.sensitivity import ModelSlopes, sensitivity
 from numerics.compiled import interpreted
-from numerics.streams import episode_keys
 from tests.filters.test_sensitivity import case, slopes_of
 from tests.filters.test_sensitivity import pendulum as turning_pendulum
 from tests.models import DT, pendulum, simulated, swing, wide_model
 
 PLAIN = Wanted(information=False, constants=False, tails=False)
-
-
-class OfArrays:
-    """A model as a page sees it, of NumPy's arrays."""
-
-    def __init__(self, model, own=()):
-        self._model, self._c, self.own = model, model.constants, own
-        self.Q, self.R = model.process_noise_cov, model.measurement_noise_cov
-        self.state_angles, self.measurement_angles = model.shape.state_angles, model.shape.measurement_angles
-
-    def f(self, x, u):
-        if x.ndim == 2:
-            return np.stack([self.f(point, u) for point in x.T], axis=1)
-        return np.array(self._model.transition(tuple(x), tuple(u), self._c))
-
-    def F(self, x, u):  # noqa: N802
-        return np.array(self._model.transition_jacobian(tuple(x), tuple(u), self._c))
-
-    def h(self, x):
-        if x.ndim == 2:
-            return np.stack([self.h(point) for point in x.T], axis=1)
-        return np.array(self._model.observe(tuple(x), self._c))
-
-    def H(self, x):  # noqa: N802
-        return np.array(self._model.observe_jacobian(tuple(x), self._c))
-
-
-@pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("make", [wide_model, turning_pendulum])
-def test_the_page_of_arrays_is_the_filter(make):
-    model = make()
-    inputs, z = simulated(model, 12, missing=0.3)
-    estimates = run(ExtendedKalmanFilter(model=model), episode_keys([0]), inputs, z)
-    page, x, p = OfArrays(model), model.prior_mean, model.prior_cov
-    for k in range(13):
-        if k:
-            for _ in range(model.substeps):
-                x, p = extended.advance(page, x, p, inputs[0, k - 1])
-            x, p = extended.settle(page, x, p)
-        x, p, v, s, level = extended.update(page, x, p, z[0, k])
-        np.testing.assert_allclose(x, estimates.means[0, k], rtol=1e-11, atol=1e-12)
-        np.testing.assert_allclose(p, estimates.covs[0, k], rtol=1e-11, atol=1e-13)
-        assert level == pytest.approx(estimates.log_likelihoods[0, k], rel=1e-11, abs=1e-13)
 
 
 def swing_if(x, u, c):

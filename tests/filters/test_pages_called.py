@@ -8,10 +8,10 @@ import pytest
 
 from filters import run
 from filters.differentiated import recursion
-from filters.differentiated.at_points import called_at_points
-from filters.differentiated.kinds import differentiable
+from filters.differentiated.differentiable import differentiable
 from filters.differentiated.recursion import Wanted, recursion_of
 from filters.likelihood import likelihood
+from filters.pages.at_points import called_at_points
 from filters.sensitivity import sensitivity
 from filters.state_scores import state_score
 from numerics.streams import episode_keys
@@ -31,8 +31,8 @@ def turn_if(x, u, c):
 
 
 def at_once(model, filter_):
-    used, kind, _ = differentiable(model, filter_)
-    return recursion_of(used.functions, used.shape, PLAIN, kind).at_once
+    used, page, _ = differentiable(model, filter_)
+    return recursion_of(used.functions, used.shape, PLAIN, page).at_once
 
 
 @pytest.mark.usefixtures("as_python")

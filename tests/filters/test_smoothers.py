@@ -20,6 +20,7 @@ from filters.smoothers.smooth import smooth
 from numerics.compiled import interpreted
 from numerics.streams import episode_keys
 from plants import simulate
+from tests.filters.test_differentiated import swing_if
 from tests.models import KEY, held_voltages, pendulum, scalar_model, simulated, swing, wide_model
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario
@@ -260,3 +261,15 @@ def test_what_cannot_be_smoothed_is_refused():
         smooth(ExtendedKalmanFilter(model=model), KEYS, inputs, measurements, lag=-1)
     with pytest.raises(ValueError, match="inputs and measurements must have shapes"):
         smooth(ExtendedKalmanFilter(model=model), KEYS, inputs[:, :2], measurements)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("kind", [ExtendedKalmanFilter, UnscentedKalmanFilter, CubatureKalmanFilter])
+def test_a_model_that_decides_is_smoothed_as_one_that_does_not(kind):
+    found = []
+    for function in (swing, swing_if):
+        model = pendulum(transition=function)
+        inputs, z = simulated(pendulum(), 10, count=2, missing=0.2)
+        found.append(smooth(kind(model=model), None, inputs, z))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)

@@ -134,7 +134,7 @@ def test_a_number_has_neither_truth_nor_hash():
 
 
 PRINT_DIGESTS = """
-from filters.differentiated import recursion, stages
+from filters.differentiated import recursion
 from numerics.algebra import programs
 from thruster_env.model import thruster_model
 model = thruster_model()

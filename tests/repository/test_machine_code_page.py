@@ -1,4 +1,4 @@
-"""docs/machine_code.md shows the code that the program makes, and its example runs."""
+"""docs/machine_code.md shows the code that the program makes, and says of the example what is so."""
 
 import re
 from pathlib import Path
@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pages.machine_code_figure import FIGURES, TABLES
+from filters.likelihood import likelihood
+from numerics.compiled import interpreted
+from pages.machine_code import TABLES, body
 
-DOCS = Path(__file__).parents[2] / "docs"
-PAGE = (DOCS / "machine_code.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "machine_code.md").read_text()
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -17,24 +18,28 @@ def test_a_piece_of_code_is_that_of_the_program(name):
     assert f"<!-- table {name} -->\n{TABLES[name]()}\n<!-- end -->" in PAGE
 
 
-def test_what_is_written_out_for_two_states_is_the_prediction_of_an_extended_filter():
-    written = PAGE.partition("<!-- table prediction -->")[2].partition("<!-- end -->")[0]
-    multiply, transposed, add = re.findall(r"^def .*?(?=^#|^```)", written, flags=re.MULTILINE | re.DOTALL)
-    names = {}
-    for name, text in {"multiply": multiply, "transposed": transposed, "add": add}.items():
-        exec(text.replace(text.split("(")[0], f"def {name}", 1), names)
-    f, p, q = ((1.0, 0.5), (-0.25, 2.0)), ((3.0, 1.0), (1.0, 2.0)), ((0.1, 0.0), (0.0, 0.2))
-    predicted = names["add"](names["transposed"](names["multiply"](f, p), f), q)
-    np.testing.assert_allclose(predicted, ((4.6, 3.125), (3.125, 7.3875)), rtol=1e-15)  # by hand
+def test_the_programs_on_the_page_are_the_prediction():
+    values, _, slopes = TABLES["numbers"]().strip("`\n").removeprefix("python").partition("# slopes")
+    rows, change = np.zeros((60, 1)), np.zeros((4, 1))
+    numbers, move = np.zeros(40), np.zeros(10)
+    names = {"rows": rows, "change": change, "numbers": numbers, "move": move, "abs": abs, "where": np.where}
+    rows[:2, 0], rows[4, 0], change[:2, 0], move[2] = (2.0, 0.5), 1.0, (0.1, 0.2), 0.3
+    numbers[9] = 0.5  # the drag
+    exec(values + slopes, names)
+    f, df = 1 - 0.1 * 2 * 0.5 * 2.0, -0.1 * 2 * (0.3 * 2.0 + 0.5 * 0.1)  # by hand, for x > 0
+    np.testing.assert_allclose(rows[2:4, 0], (2.0 - 0.1 * (0.5 * 4.0 - 1.0), f * f * 0.5), rtol=1e-14)
+    expected = f * 0.1 - 0.1 * 0.3 * 4.0, f * f * 0.2 + 2 * f * df * 0.5
+    np.testing.assert_allclose(change[:2, 0], expected, rtol=1e-14)
 
 
-def test_the_picture_is_there_and_light():
-    assert set(FIGURES) == set(re.findall(r"!\[.*?\]\((.*?)\)", PAGE))
-    assert all((DOCS / name).stat().st_size < 150_000 for name in FIGURES)
+def test_the_body_has_a_likelihood():
+    with interpreted():
+        found = likelihood(body(), np.ones((1, 3, 1)), np.ones((1, 4, 1)), np.eye(1)[None], np.eye(1)[None])
+    assert np.isfinite(found.values).all() and np.isfinite(found.gradients).all()
 
 
 def test_its_example_tells_what_a_compiled_step_tells():
-    (code,) = (block for block in re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL) if "import" in block)
+    (code,) = (part for part in re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL) if "import" in part)
     names = {}
     exec(compile(code, "docs/machine_code.md", "exec"), names)
     expected = names["ekf"].predict(names["ekf"].init(), [12.0])

@@ -20,7 +20,6 @@ LINE = re.compile(r"^(?: {4})?thruster ((?:.*\\\n)*.+)$", flags=re.MULTILINE)
 ELSEWHERE = {  # pages whose programs another test runs
     "plant.md": "test_docs.py",
     "filters.md": "test_docs.py",
-    "algebra.md": "test_algebra_page.py",
     "machine_code.md": "test_machine_code_page.py",
     "policies.md": "../training/test_policies_page.py",
     **{page: "test_examples.py" for page in PAGES if page.startswith("howto/")},

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from filters.differentiated.kinds import KINDS
+from filters.differentiated.differentiable import KINDS
 from filters.differentiated.recursion import LIKELIHOOD, Wanted
 from filters.differentiated.runs import ModelSlopes, Truth, derivatives, same_functions
 from filters.registry import make_filter

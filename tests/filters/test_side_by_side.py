@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, SageHusaFilter, UnscentedKalmanFilter, run, thruster_model
-from filters.engine.simd import BLOCK
+from filters.engine.side_by_side import GROUPS
 from numerics.compiled import interpreted
 from numerics.streams import episode_keys
 from plants import simulate
 from plants.layout import LANES
 
+BLOCK = GROUPS * LANES
 COUNTS = [1, LANES - 1, LANES, LANES + 1, BLOCK, BLOCK + 1, 3 * BLOCK + 5]
 
 

@@ -1,6 +1,6 @@
-"""Take the pieces of code of docs/algebra.md from the program.
+"""Take the pieces of code of docs/machine_code.md from the program.
 
-    python -m pages.algebra_code [FOLDER]
+    python -m pages.machine_code [FOLDER]
 
 What the page shows is made of the extended Kalman filter of a body that its drag slows down.
 """
@@ -11,11 +11,13 @@ import inspect
 from collections.abc import Sequence
 
 from filters import StateSpaceModel
-from filters.differentiated.equations import Equations
 from filters.differentiated.memory import Memory
 from filters.differentiated.recursion import MOST, Wanted, stages_of
-from filters.differentiated.stages import Stage, as_programs
-from filters.pages import extended
+from filters.gaussian import extended
+from filters.pages import kernels
+from filters.pages.equations import Equations
+from filters.pages.memory import RowMemory
+from filters.pages.stages import Stage, as_programs
 from numerics.algebra.matrices import Matrix, in_order
 from numerics.algebra.programs import Place, Program
 from pages.page import make_page
@@ -50,7 +52,7 @@ def body() -> StateSpaceModel:
 def stages() -> tuple[list[Stage], Memory]:
     """Of a step of its filter: advance, settle, update; and where numbers lie."""
     model = body()
-    memory = Memory(model.shape)
+    memory = Memory(model.shape, extended.ExtendedKalmanFilter.page)
     equations = Equations(model.functions, memory, constants_move=True, trace=True)
     return stages_of(memory, equations, WANTED), memory
 
@@ -113,6 +115,15 @@ def numbers() -> str:
     )
 
 
+def program() -> str:
+    """The prediction of the filter that runs, as a program."""
+    model = body()
+    memory = RowMemory(model.shape, extended.ExtendedKalmanFilter.page)
+    equations = Equations(model.functions, memory, constants_move=False, trace=True)
+    advanced = kernels.stages_of(extended.ExtendedKalmanFilter.page, memory, equations)[2]
+    return block("\n".join(_shown(as_programs(advanced, 0, MOST).values)))
+
+
 def _shown(program: Program) -> list[str]:
     """A program's lines, with constants in decimal digits."""
     lines = []
@@ -122,12 +133,12 @@ def _shown(program: Program) -> list[str]:
     return lines
 
 
-TABLES = {"page": page, "graph": graph, "slopes": slopes, "numbers": numbers}
+TABLES = {"page": page, "graph": graph, "program": program, "slopes": slopes, "numbers": numbers}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line."""
-    make_page("algebra", "pages.algebra_code", {}, TABLES, "The code of docs/algebra.md.", arguments)
+    make_page("machine_code", "pages.machine_code", {}, TABLES, "The code of docs/machine_code.md.", arguments)
 
 
 if __name__ == "__main__":

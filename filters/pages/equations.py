@@ -11,11 +11,12 @@ not known of them is found by central differences (`differences`).
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 
-from filters.differentiated.at_points import called_at_points
-from filters.differentiated.differences import called_parts
-from filters.differentiated.memory import Memory
-from filters.differentiated.traced import Traced
+from filters.pages.at_points import called_at_points
+from filters.pages.differences import called_parts
+from filters.pages.memory import NumbersMemory
+from filters.pages.traced import Traced
 from numerics.algebra.matrices import Matrix, Operation, never, plus, through
 from plants.shape import Functions
 
@@ -25,36 +26,47 @@ class Equations:
 
     Attributes:
         Q, R: its covariances.
-        own: the filter's own numbers.
+        Q_root, prior_root: lower triangular roots of Q and of the prior covariance.
+        own: the filter's parameters.
+        kept: what the filter keeps besides mean and covariance, by name.
         state_angles, measurement_angles: flags of components that are angles.
         called: if functions are to be called, those that work out the model's operations.
     """
 
-    def __init__(self, functions: Functions, memory: Memory, *, constants_move: bool, trace: bool):
+    def __init__(self, functions: Functions, memory: NumbersMemory, *, constants_move: bool, trace: bool):
         """Take the model's functions, where its numbers lie, and whether parameters move its constants."""
         shape, f, by_f, h, by_h = memory.shape, *functions
         self.state_angles, self.measurement_angles = shape.state_angles, shape.measurement_angles
         self.Q, self.R, self._scales, self._constants = memory.Q, memory.R, memory.scales, memory.constants
-        self.own = memory.own
+        self.Q_root, self.prior_root = memory.Q_root, memory.prior_root
+        self.own, self.kept = memory.own, memory.kept
         self._moves = (memory.constants_slope, memory.size) if constants_move and shape.constants else ()
         self.called: dict[Operation, Callable] = {}
-        motion: tuple[tuple[Callable, ...], ...]
-        sight: tuple[tuple[Callable, ...], ...]
+        chosen = functions, shape
+        parts: list[tuple[Callable, ...]]
         if trace:
             traced = Traced(f, by_f, 2, shape), Traced(h, by_h, 1, shape)
-            motion, sight = ((one.parts, one.of_points) for one in traced)
+            parts = [one.parts for one in traced]
+            self._parts_at_points: Callable = lambda which, points: traced[which == "sight"].of_points
         else:
-            chosen = ((functions, shape, which, bool(self._moves)) for which in ("motion", "sight"))
-            points = memory.X.shape[1]
-            motion, sight = ((called_parts(*one), called_at_points(*one, points)) for one in chosen)
-        self._f, self._F = self._operations("f", motion[0], shape.n, shape.n, trace)
-        self._h, self._H = self._operations("h", sight[0], shape.m, shape.n, trace)
-        self._f_of_points = self._of_points("f", motion[1], shape.n, trace)
-        self._h_of_points = self._of_points("h", sight[1], shape.m, trace)
+            parts = [called_parts(*chosen, which, bool(self._moves)) for which in ("motion", "sight")]
+            self._parts_at_points = lambda which, points: called_at_points(
+                *chosen, which, bool(self._moves), points
+            )
+        self._f, self._F = self._operations("f", parts[0], shape.n, shape.n, trace)
+        self._h, self._H = self._operations("h", parts[1], shape.m, shape.n, trace)
+        self._traced, self._rows = trace, {"motion": shape.n, "sight": shape.m}
+        self._of_points: dict[tuple[str, int], Operation] = {}
+
+    def at(self, constants: Matrix) -> Equations:
+        """The same model with other constants."""
+        other = copy(self)
+        other._constants = constants
+        return other
 
     def f(self, x: Matrix, u: Matrix) -> Matrix:
         """The state, a substep after x; of points (n, points) that of each."""
-        return (self._f if len(x.shape) == 1 else self._f_of_points)(x, u, self._constants)
+        return (self._f if len(x.shape) == 1 else self._at_points("motion", x))(x, u, self._constants)
 
     def F(self, x: Matrix, u: Matrix) -> Matrix:  # noqa: N802
         """df/dx."""
@@ -62,7 +74,7 @@ class Equations:
 
     def h(self, x: Matrix) -> Matrix:
         """What is measured at x; of points (n, points) at each."""
-        return (self._h if len(x.shape) == 1 else self._h_of_points)(x, self._constants)
+        return (self._h if len(x.shape) == 1 else self._at_points("sight", x))(x, self._constants)
 
     def H(self, x: Matrix) -> Matrix:  # noqa: N802
         """dh/dx."""
@@ -102,13 +114,18 @@ class Equations:
 
         return value, matrix
 
-    def _of_points(self, name: str, parts: tuple[Callable, ...], rows: int, trace: bool) -> Operation:
+    def _at_points(self, which: str, x: Matrix) -> Operation:
         """An equation (X, ..., c) of each column of X; its slope (X, scales, ..., c, dX) is an operation, too."""
+        key = which, x.shape[1]
+        if key in self._of_points:
+            return self._of_points[key]
+        parts, rows = self._parts_at_points(*key), self._rows[which]
         value, slope = (
-            Operation(part if trace else _not_known, lambda x, *_: (rows, x[1]), never) for part in parts
+            Operation(part if self._traced else _not_known, lambda x, *_: (rows, x[1]), never) for part in parts
         )
-        value.name, slope.name = f"{name}_of_points", f"d{name}_of_points"
-        if not trace:
+        value.name, slope.name = f"{which}_of_points", f"d_{which}_of_points"
+        self._of_points[key] = value
+        if not self._traced:
             self.called |= {value: parts[0], slope: parts[1]}
 
         @value.derivative

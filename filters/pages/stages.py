@@ -18,7 +18,7 @@ from numerics.algebra.derivatives import slopes_of
 from numerics.algebra.graphs import Graph, Number, needed_by
 from numerics.algebra.matrices import Matrix, Operation, evaluate, in_order
 from numerics.algebra.operations import present
-from numerics.algebra.programs import DECISIONS, Place, program_of
+from numerics.algebra.programs import ARRAYS, DECISIONS, Place, program_of
 
 OF_PARAMETER = ("change", "move")  # arrays whose numbers are those of a parameter
 FREE = ("given", "constant", *DECISIONS)  # operations whose results are at hand, or cannot be kept as floats
@@ -113,7 +113,13 @@ def _kept(order: Sequence, of: Callable, of_parameter: Callable, free: Callable)
     return list(found.values())
 
 
-def as_calls(stage: Stage, first: int, functions: Mapping[Operation, Callable], readers: Mapping) -> Made:
+def as_calls(
+    stage: Stage,
+    first: int,
+    functions: Mapping[Operation, Callable],
+    readers: Mapping,
+    arrays: Sequence[str] = ARRAYS,
+) -> Made:
     """A stage as functions that call others, whose kept matrices lie in rows from `first` on."""
     values, slopes = stage.stores
     slopes = [(place, one) for place, one in slopes if one.operation != place]
@@ -127,4 +133,5 @@ def as_calls(stage: Stage, first: int, functions: Mapping[Operation, Callable], 
         readers
     )
     values = values + [(place, one) for one, place in rows.items()]
-    return Made(calls_of(values, known, functions), calls_of(slopes, known | rows, functions), first)
+    of_values = calls_of(values, known, functions, arrays)
+    return Made(of_values, calls_of(slopes, known | rows, functions, arrays), first)

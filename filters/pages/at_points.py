@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from filters.differentiated.differences import difference_of_values, slope_of
+from filters.pages.differences import difference_of_values, slope_of
 from numerics.sources import Source, entrywise, tuple_of, written_out
 from plants.shape import Functions, Shape
 

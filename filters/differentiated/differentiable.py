@@ -1,0 +1,50 @@
+"""The filters that have derivatives: those with a page, whose belief is mean and covariance alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+from filters.filter import Filter
+from filters.gaussian.cubature import CubatureKalmanFilter
+from filters.gaussian.extended import ExtendedKalmanFilter
+from filters.gaussian.iterated import IteratedExtendedKalmanFilter
+from filters.gaussian.kalman import KalmanFilter
+from filters.gaussian.unscented import UnscentedKalmanFilter
+from filters.pages.page import Page, PageFilter
+from plants.state_space import StateSpaceModel
+
+KINDS: tuple[type[PageFilter], ...] = (
+    KalmanFilter,
+    ExtendedKalmanFilter,
+    IteratedExtendedKalmanFilter,
+    UnscentedKalmanFilter,
+    CubatureKalmanFilter,
+)
+
+
+class Differentiable(NamedTuple):
+    """What derivatives are taken of."""
+
+    model: StateSpaceModel  # that the filter runs on
+    page: Page
+    own: tuple[float, ...]  # the filter's parameters
+
+
+def differentiable(model: StateSpaceModel, filter_: Filter | None) -> Differentiable:
+    """A filter with another model in place of its own; of None the extended Kalman filter.
+
+    Raises:
+        ValueError: for a filter without a page, or a value of its own that does not go with the model.
+    """
+    if filter_ is None:
+        return Differentiable(model, ExtendedKalmanFilter.page, ())
+    if not isinstance(filter_, Filter):
+        raise ValueError(f"filter must be an object that make_filter returns, but got {filter_!r}")
+    if not isinstance(filter_, KINDS):
+        names = ", ".join(kind.name for kind in KINDS)
+        raise ValueError(f"a filter with derivatives must be one of {names}, but got {filter_.name!r}")
+    if isinstance(filter_, KalmanFilter) and filter_.schedule != 1:
+        raise ValueError(f"a filter with derivatives must have schedule=1, but got {filter_.schedule}")
+    used = replace(filter_, model=model)
+    return Differentiable(used.kernel_model, used.written_page, used.own_numbers)

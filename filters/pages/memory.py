@@ -1,0 +1,72 @@
+"""The matrices that stand for numbers in memory: a model's and a filter's, and those of a belief's row."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import prod
+from typing import Any
+
+from filters.engine.layout import memory_places, own_place
+from filters.pages.page import Page
+from numerics.algebra.matrices import Matrix, given
+from numerics.algebra.programs import Place
+from plants.layout import number_places
+from plants.shape import Shape
+
+
+class NumbersMemory:
+    """What `numbers` holds: Q, R, scales, constants, and the filter's parameters.
+
+    Attributes:
+        own: parameters, as pages find them.
+        kept: what the filter keeps besides mean and covariance, by name.
+        constants_slope, size: along a parameter that moves constants, if there are such.
+    """
+
+    def __init__(self, shape: Shape, page: Page, x: Matrix, p: Matrix, own: int):
+        """Take the sizes, matrices that stand for a belief, and where the filter's parameters begin."""
+        n, m = shape.n, shape.m
+        places = number_places(n, m)
+        self.shape, self.x, self.P = shape, x, p
+        self.Q = self.beside("numbers", places.q, n, n, symmetric=True)
+        self.R = self.beside("numbers", places.r, m, m, symmetric=True)
+        self.Q_root = self.beside("numbers", places.q_root, n, n)
+        self.prior_root = self.beside("numbers", places.prior_root, n, n)
+        self.scales = self.beside("numbers", places.scales, n)
+        self.constants = self.beside("numbers", places.constants, shape.constants)
+        self.own = page.parameters(lambda place, size: self.beside("numbers", own + place, *size))
+        self.kept: Mapping[str, Matrix] = {}
+        self.constants_slope: Matrix | None = None
+        self.size: Matrix | None = None
+
+    def beside(self, array: str, first: int, *shape: int, symmetric: bool = False) -> Matrix:
+        """A matrix that lies in an array from a place on."""
+        return given(Place(array, first), shape, symmetric=symmetric, beside=self.x)
+
+
+class RowMemory(NumbersMemory):
+    """The memory of a filter that runs.
+
+    rows     the row of `filters.engine.layout`: its extras are what the filter keeps, then scratch
+    given    u or z
+    numbers  the model's, then the filter's own
+    """
+
+    def __init__(self, shape: Shape, page: Page):
+        """Take the sizes; what is kept or in flight finds its place when it is known."""
+        row = memory_places(shape.n, shape.m)
+        x = given(Place("rows", row.mean), (shape.n,))
+        p = given(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, beside=x)
+        super().__init__(shape, page, x, p, own_place(shape))
+        self.u, self.z = self.beside("given", 0, shape.inputs), self.beside("given", 0, shape.m)
+        self.end = row.extras
+
+    def keep(self, started: Mapping[str, Any]) -> None:
+        """Give what a filter keeps its place, one behind the other."""
+        self.kept = {name: self.another(one, symmetric=one.symmetric) for name, one in started.items()}
+
+    def another(self, like: Matrix, *, symmetric: bool = False) -> Matrix:
+        """A matrix of the same shape in the next places of the row."""
+        made = self.beside("rows", self.end, *like.shape, symmetric=symmetric)
+        self.end += prod(like.shape)
+        return made

@@ -1,0 +1,74 @@
+"""Stages of a page as programs, or, of models that cannot be traced, as calls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from filters.pages.equations import Equations
+from filters.pages.memory import RowMemory
+from filters.pages.page import Page
+from filters.pages.stages import Stage, as_calls, as_programs
+from filters.pages.traced import MOST
+from numerics.algebra.matrices import Matrix
+from numerics.algebra.programs import OF_STEPS, callable_of
+from plants.layout import LANES, constants_reader
+from plants.shape import Functions, Shape
+
+
+class Programs(NamedTuple):
+    """Stages as functions (rows, given, numbers)."""
+
+    memory: RowMemory
+    works: Sequence[Callable]
+    vectors: tuple[Callable, ...]  # the same for eight beliefs side by side; none if stages are calls
+
+
+def programs_of(
+    page: Page, functions: Functions, shape: Shape, stages: Callable[[RowMemory, Equations], Sequence[Stage]]
+) -> Programs:
+    """Stages of a filter with some page, for a model's functions and shape.
+
+    They are programs without calls where the functions can be traced and a stage has at most some ten thousand
+    operations; else each operation on matrices is a call of a function for its sizes, and so is the model.
+    """
+    try:
+        memory, model = _seen(page, functions, shape, trace=True)
+        programs = [as_programs(one, 0, MOST).values for one in stages(memory, model)]
+        works = [callable_of(program, 1, OF_STEPS) for program in programs]
+        return Programs(memory, works, tuple(callable_of(program, LANES, OF_STEPS) for program in programs))
+    except Exception:  # whatever a user's function raises of numbers that it does not know: it is called, then
+        memory, model = _seen(page, functions, shape, trace=False)
+        made, readers = stages(memory, model), {memory.constants: constants_reader(shape)}
+        works = [as_calls(one, 0, model.called, readers, OF_STEPS).values for one in made]
+        return Programs(memory, works, ())
+
+
+def _seen(page: Page, functions: Functions, shape: Shape, *, trace: bool) -> tuple[RowMemory, Equations]:
+    memory = RowMemory(shape, page)
+    return memory, Equations(functions, memory, constants_move=False, trace=trace)
+
+
+def stored(results: tuple, targets: Sequence[Matrix | int], kept: Mapping[str, Matrix] | None = None) -> Stage:
+    """The stage that leaves results of a page where some matrices lie, or at places.
+
+    Args:
+        results: matrices, behind which a dictionary may say what changes of what is kept.
+        targets: where they are to lie.
+        kept: where what is kept lies.
+    """
+    *values, changed = results if isinstance(results[-1], dict) else (*results, {})
+    places = [*targets, *((kept or {})[name] for name in changed)]
+    stores = {}
+    for place, value in zip(places, (*values, *changed.values()), strict=True):
+        if isinstance(place, Matrix):
+            if place.symmetric and not value.symmetric or place.shape != value.shape:
+                raise TypeError(f"a page must return the symmetric part of {value!r}, by sym, and {place.shape}")
+            place = place.operation.at
+        stores[place] = value
+    return Stage(stores, {})
+
+
+def together(results: Any) -> tuple:
+    """What a page returns, as a tuple."""
+    return results if isinstance(results, tuple) else (results,)
