@@ -13,7 +13,7 @@ from filters.ensembles.ensemble import EnsembleKalmanFilter
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
 from filters.ensembles.serial import SerialSquareRootFilter
 from filters.ensembles.transform import EnsembleTransformFilter
-from filters.estimators.find import foreign_filter, is_foreign, parameters_of
+from filters.estimators.find import foreign_filter, is_foreign, own_filter, parameters_of
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.gaussian.cubature import CubatureKalmanFilter
@@ -59,15 +59,19 @@ FILTERS: dict[str, type[Filter]] = {
 
 
 def filter_class(name: str) -> type[Filter]:
-    """The class of a filter by name, `ForeignFilter` for estimators; ValueError for an unknown name."""
+    """The class of a filter by name, or by "module:class"; `ForeignFilter` for estimators.
+
+    Raises:
+        ValueError: for an unknown name.
+    """
     if is_foreign(name):
-        return ForeignFilter
+        return own_filter(name) or ForeignFilter
     return FILTERS[one_of("filter", name, tuple(FILTERS), LISTED)]
 
 
 def tunable_numbers(name: str) -> tuple[str, ...]:
     """Names of a filter's parameters beside its model, or of those that an estimator declares as tunable."""
-    if is_foreign(name):
+    if is_foreign(name) and own_filter(name) is None:
         return tuple(one.name for one in parameters_of(name))
     return tuple(field.name for field in dataclasses.fields(filter_class(name)) if field.name != "model")
 
@@ -76,8 +80,8 @@ def make_filter(name: str, model: StateSpaceModel, **numbers) -> Filter:
     """Make a filter by name, for a model, with its own parameters.
 
     Args:
-        name: of a filter in `FILTERS`, such as "ekf"; or an estimator, as `filters.estimators.find.foreign_filter`
-            takes it.
+        name: of a filter in `FILTERS`, such as "ekf"; or an estimator or a filter of your own, as
+            `filters.estimators.find.foreign_filter` takes it, such as "module:class".
         model: the model that the filter assumes, with Q, R and the prior.
         **numbers: parameters of the filter beside its model, such as `ensemble_size`; defaults where not given.
 

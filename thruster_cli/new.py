@@ -1,4 +1,4 @@
-"""`thruster new`: a file to start from, for a problem, a model, an env or a thruster of one's own."""
+"""`thruster new`: a file to start from, for a problem, a model, an env, a filter or a thruster of one's own."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from thruster_cli.options import JsonOption, spelt
 from thruster_cli.output import check_targets, emit
 
 TEMPLATES = Path(__file__).parent / "templates"
-FILES = {"problem": "problem.py", "model": "model.py", "env": "env.py", "preset": "preset.toml"}
+FILES = {kind: f"{kind}.py" for kind in ("problem", "model", "env", "filter")} | {"preset": "preset.toml"}
 NAMED = "template"  # what a template calls itself
 NEXT = {
     "problem": "thruster tune --problem {name}:problem --filter ekf --trials 50",
     "model": "python {file}; thruster estimate {name}.csv --model {name}:model --plot estimate.png",
     "env": "python {file}; thruster tune --problem {name}:problem --filter ekf --trials 50",
+    "filter": "thruster compare --filter ekf --filter {name}:{cls} --scenario outliers",
     "preset": "thruster inspect --preset {file} --voltage 12",
 }
 
@@ -34,19 +35,20 @@ def command(
     ],
     json: JsonOption = None,
 ) -> None:
-    """Write a commented, working template of a problem, model, env or thruster of your own.
+    """Write a commented, working template of a problem, model, env, filter or thruster of your own.
 
     problem: a plant that generates data and what filters assume of it, for tune, evaluate and compare. model: a
-    state-space model, for estimate, tune --log and identify. env: a Gymnasium env with a filter around it. preset:
-    a thruster's parameters, for --preset of every command.
+    state-space model, for estimate, tune --log and identify. env: a Gymnasium env with a filter around it.
+    filter: a filter as in a textbook, for every --filter. preset: a thruster's parameters, for every --preset.
 
     Example: thruster new problem pendulum
     """
     file = target(kind, name)
     check_targets((file,), json)
     text = (TEMPLATES / FILES[kind]).read_text(encoding="utf-8").replace(f"{NAMED}.toml", str(file))
-    write_whole(file, text.replace(NAMED, file.stem))
-    following = NEXT[kind].format(name=file.stem, file=file if kind == "preset" else file.name)
+    cls = file.stem.title().replace("_", "")  # of a filter
+    write_whole(file, text.replace(NAMED.title(), cls).replace(NAMED, file.stem))
+    following = NEXT[kind].format(name=file.stem, cls=cls, file=file if kind == "preset" else file.name)
     where = "" if kind == "preset" or file.parent == Path() else f", in {file.parent}"
     emit([f"wrote {file}", f"Try it{where}: {following}"], {"file": str(file), "next": following}, json)
 

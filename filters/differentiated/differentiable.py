@@ -23,6 +23,12 @@ KINDS: tuple[type[PageFilter], ...] = (
 )
 
 
+def has_derivatives(kind: type[Filter]) -> bool:
+    """Whether a class of filters has derivatives: one of `KINDS`, or a user's whose page keeps nothing else."""
+    ours = kind.__module__.startswith("filters.")
+    return kind in KINDS or (not ours and issubclass(kind, PageFilter) and kind.page.start is None)
+
+
 class Differentiable(NamedTuple):
     """What derivatives are taken of."""
 
@@ -41,7 +47,7 @@ def differentiable(model: StateSpaceModel, filter_: Filter | None) -> Differenti
         return Differentiable(model, ExtendedKalmanFilter.page, ())
     if not isinstance(filter_, Filter):
         raise ValueError(f"filter must be an object that make_filter returns, but got {filter_!r}")
-    if not isinstance(filter_, KINDS):
+    if not (isinstance(filter_, PageFilter) and has_derivatives(type(filter_))):
         names = ", ".join(kind.name for kind in KINDS)
         raise ValueError(f"a filter with derivatives must be one of {names}, but got {filter_.name!r}")
     if isinstance(filter_, KalmanFilter) and filter_.schedule != 1:

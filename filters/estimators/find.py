@@ -77,5 +77,11 @@ def _made(make, label: str, model: StateSpaceModel, numbers: dict) -> Any:
     return found
 
 
+def own_filter(given) -> type[Filter] | None:
+    """The class of a user's filter, by itself or by "module:class"; None for estimators and what makes them."""
+    found = estimator_named(given)
+    return found if _is_filter_class(found) else None
+
+
 def _is_filter_class(make) -> bool:
     return isinstance(make, type) and issubclass(make, Filter)

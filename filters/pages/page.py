@@ -68,10 +68,12 @@ class PageFilter(Filter):
         page: its functions.
         unrolled: fields that are whole numbers and say how often something is repeated; each value has a program
             of its own. Other fields are numbers that programs read.
+        ranges: of fields that studies may tune, the smallest and the largest value.
     """
 
     page: ClassVar[Page]
     unrolled: ClassVar[tuple[str, ...]] = ()
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
 
     @property
     def parameters(self) -> Mapping[str, Any]:

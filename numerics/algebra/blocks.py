@@ -1,6 +1,6 @@
 """What pages of square-root and information filters say: inverses, orthogonal triangles, and blocks of matrices.
 
-Their derivatives are those of the covariance form, so they have none of their own.
+Filters in these forms are differentiated in the covariance form, so that most of them have no derivative.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from numerics.algebra.graphs import where
-from numerics.algebra.matrices import operation, same
+from numerics.algebra.matrices import minus, operation, same, through
 from numerics.algebra.operations import factor, forward, mirrored, pivoted
 from numerics.triangles import NEGLIGIBLE
 
@@ -96,3 +96,11 @@ def factor_of(lower):
     """The factor of S = L L', as `operations.factor` makes it of S."""
     d = np.diag(lower)
     return lower * (1.0 / d)[None, :], d * d
+
+
+@forward_quotient.derivative
+def _of_forward_quotient(result, arguments, slopes):
+    """The slope L^-1 (dv - dL y) of y = L^-1 v."""
+    (lower, _), (dl, dv) = arguments, slopes
+    change = minus(dv, through(lambda slope: slope @ result, dl))
+    return through(lambda slope: forward_quotient(lower, slope), change)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
 from numerics import matrices as made
 from numerics.algebra import blocks, scalars
 from numerics.algebra.matrices import Operation
@@ -38,12 +40,33 @@ def _together(result: tuple, a: tuple, b: tuple) -> Callable:
     return assembled("together", "a, b", result, {"a": (a, 0, 0), "b": (b, *at)})
 
 
+def _exponential(result: tuple, v: tuple) -> Callable:
+    if not v:
+        return written_out("exponential", "v", "exp(v)", exp=np.exp)
+    source = Source("exponential", "v", result=result, v=v)
+    return source.function(source.vector(v[0], lambda i: f"exp(v[{i}])"), exp=np.exp)
+
+
+def _diagonal(result: tuple, v: tuple) -> Callable:
+    source = Source("diagonal", "v", result=result, v=v)
+    return source.function(source.matrix(v[0], v[0], lambda i, j: source.if_same(i, j, f"v[{i}]", "0.0")))
+
+
 FUNCTIONS: dict[Operation, Callable] = {
     scalars.reciprocal: lambda result, a: _number("1.0 / a", "a"),
     scalars.exceeds: lambda result, value, a: _number(f"a > {value!r}", "a"),
     scalars.is_number: lambda result, a: _number("a == a", "a"),
     scalars.choose: _chosen,
     scalars.trace: _trace,
+    scalars.exponential: _exponential,
+    scalars.entries_product: lambda result, a, b: entrywise(
+        "product", "a, b", a, lambda i: f"a[{i}] * b[{i}]", a=a, b=b
+    ),
+    scalars.at_most: lambda result, value, v: entrywise("most", "v", v, lambda i: f"min(v[{i}], {value!r})", v=v),
+    scalars.below: lambda result, value, v: entrywise(
+        "below", "v", v, lambda i: f"(0.0 if v[{i}] > {value!r} else 1.0)", v=v
+    ),
+    scalars.diagonal: _diagonal,
     scalars.count: _count,
     scalars.shifted: lambda result, value, a: _number(f"a + {value!r}", "a"),
     blocks.careful: lambda result, s: made.careful_factor(*s[:1]),

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from numerics.algebra.graphs import where
-from numerics.algebra.matrices import Matrix, operation, through
+from numerics.algebra.matrices import Matrix, operation, plus, same, through
 
 
 def ratio(a, b):
@@ -57,6 +57,36 @@ def count(seen):
     return sum(where(one, 1.0, 0.0) for one in seen)
 
 
+@operation(same)
+def exponential(v):
+    """Exp of a number, or of each entry of a vector."""
+    return np.exp(v)
+
+
+@operation(lambda v, value: v)
+def at_most(v, value):
+    """Entries of a vector, none of which is larger than a number that is known now."""
+    return np.array([where(one > value, value, one) for one in v])
+
+
+@operation(lambda v, value: v)
+def below(v, value):
+    """1 for entries of a vector that are not larger than a number that is known now, else 0."""
+    return np.array([where(one > value, 0.0, 1.0) for one in v])
+
+
+@operation(lambda a, b: a)
+def entries_product(a, b):
+    """The products of the entries of two vectors."""
+    return a * b
+
+
+@operation(lambda v: (v[0], v[0]), lambda v: True)
+def diagonal(v):
+    """The diagonal matrix of a vector."""
+    return np.diag(v)
+
+
 def constant(value: float, like):
     """A number that is known, beside a number `like` that may not be."""
     return shifted(like * 0.0, float(value)) if isinstance(like, Matrix) else value
@@ -71,6 +101,29 @@ def shifted(a, value):
 @reciprocal.derivative
 def _of_reciprocal(result, arguments, slopes):
     return through(lambda slope: slope * result * result * -1.0, slopes[0])
+
+
+@exponential.derivative
+def _of_exponential(result, arguments, slopes):
+    return through(lambda slope: entries_product(result, slope) if result.shape else result * slope, slopes[0])
+
+
+@entries_product.derivative
+def _of_entries(result, arguments, slopes):
+    (a, b), (da, db) = arguments, slopes
+    by_a = through(lambda slope: entries_product(slope, b), da)
+    return plus(by_a, through(lambda slope: entries_product(a, slope), db))
+
+
+@at_most.derivative
+def _of_limit(result, arguments, slopes):
+    v, value = arguments
+    return through(lambda slope: entries_product(slope, below(v, value)), slopes[0])
+
+
+@diagonal.derivative
+def _of_diagonal(result, arguments, slopes):
+    return through(diagonal, slopes[0])
 
 
 @shifted.derivative
@@ -90,6 +143,7 @@ def _of_choice(result, arguments, slopes):
     return choose(condition, *moves)
 
 
+@below.derivative
 @exceeds.derivative
 @is_number.derivative
 @count.derivative

@@ -9,6 +9,7 @@ ORDER = (
     "own_model",
     "own_env",
     "own_log",
+    "own_filter",
     "policies",
     "ppo",
     "vehicle",

@@ -1,12 +1,14 @@
 """The pages of filters beside the extended one: they are the filters, and their slopes those of differences."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from filters import FILTERS, KalmanFilter, make_filter, run, thruster_model
+from filters import FILTERS, ExtendedKalmanFilter, KalmanFilter, make_filter, run, thruster_model
 from filters.differentiated.differentiable import KINDS, differentiable
+from filters.gaussian.kalman import FORMS
 from filters.likelihood import information, likelihood
 from filters.pages.page import PageFilter
 from filters.sensitivity import ModelSlopes, sensitivity
@@ -110,6 +112,40 @@ def test_a_page_of_another_form_is_that_form(form):
 @pytest.mark.usefixtures("as_python")
 def test_a_page_of_a_schedule_is_the_scheduled_filter():
     assert_page_is_the_filter(KalmanFilter(model=thruster_model(), schedule=4))
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", ["ekf-robust", "sage-husa", "vb", "square-root", "information"])
+def test_a_filter_of_a_model_that_decides_is_that_of_one_that_does_not(name):
+    forms, inputs_and_z = ("square-root", "information"), simulated(turning_pendulum(), 12, count=2, missing=0.3)
+    found = []
+    for function in (turn, turn_if):
+        model = turning_pendulum().replace(transition=function)
+        if name in forms:
+            filter_ = Formed(model=model, form=name)
+        else:
+            filter_ = make_filter(name, model, **MADE[name])
+        assert bool(filter_.kernels().vectors) is (function is turn)
+        found.append(run(filter_, None, *inputs_and_z))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+
+
+def turn_if(x, u, c):
+    """The pendulum, by a function that decides."""
+    return (0.0, 0.0) if abs(x[1]) > 1e6 else turn(x, u, c)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Formed(ExtendedKalmanFilter):
+    """The extended filter in another form."""
+
+    form: str = "covariance"
+    parameters = {}
+
+    @property
+    def written_page(self):
+        return FORMS[self.form]
 
 
 def test_all_filters_with_pages_are_tried():

@@ -20,6 +20,7 @@ QUICK = {
     "own_model": {"TRIALS": 2, "SEEDS": 4},
     "own_env": {"TRIALS": 2},
     "own_log": {"TRIALS": 2, "ROWS": 400},
+    "own_filter": {"SEEDS": 4},
     "policies": {"COPIES": 4, "TRAINING_STEPS": 256, "EPISODES": 2},
     "vehicle": {"STEPS": 20},
 }

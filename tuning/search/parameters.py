@@ -8,7 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from filters.estimators.find import is_foreign, parameters_of
+from filters.estimators.find import is_foreign, own_filter, parameters_of
+from filters.filter import Filter
 from filters.registry import filter_class, tunable_numbers
 from filters.tuned_file import NOISE
 from filters.tuned_file import PRIOR as PRIOR_FACTOR
@@ -138,12 +139,22 @@ def filter_parameters(name: str, sizes: tuple[int, int] | None, process_noise: b
 
     An estimator declares its own parameters. Some parameters are chosen only without process noise.
     """
+    own = own_filter(name) if is_foreign(name) else None
+    if own is not None:
+        return [_own_of_user(own, number, *ends) for number, ends in getattr(own, "ranges", {}).items()]
     if is_foreign(name):
         return [replace(one, place=FilterParameter(one.name)) for one in parameters_of(name)]
     size = [] if sizes is None else [Parameter("N", *sizes, integer=True, place=FilterParameter("ensemble_size"))]
     known = tunable_numbers(name)
     numbers = FILTER_PARAMETERS if process_noise else FILTER_PARAMETERS | WITHOUT_NOISE
     return size + [one for number, one in numbers.items() if number in known]
+
+
+def _own_of_user(kind: type[Filter], number: str, low: float, high: float) -> Parameter:
+    """A field of a user's filter: a whole number where its default is one, logarithmic over a factor of ten."""
+    default = getattr(kind, number)
+    options = {"integer": True} if isinstance(default, int) else {"log": 0 < 10 * low <= high}
+    return _own(number, low, high, default=default, **options)
 
 
 def model_parameters(

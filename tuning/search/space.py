@@ -90,7 +90,7 @@ def size_ladder(name: str) -> tuple[int, ...]:
 
 def _default_numbers(name: str, problem: Problem) -> dict:
     own = _of_filter(name, has_process_noise(problem))
-    if is_foreign(name):
+    if is_foreign(name):  # also the default of a user's filter
         return {one.name: one.start for one in own}
     numbers: dict[str, Any] = {"ensemble_size": ensemble_sizes_of(name).untuned} if has_ensemble(name) else {}
     others = [one.name for one in own if one.name != "N"]

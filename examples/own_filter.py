@@ -1,0 +1,131 @@
+"""
+A filter of your own
+====================
+
+A filter is a page of a textbook: pure functions of small matrices. Written so, it is compiled, runs over thousands
+of runs side by side, stands around an env, is differentiated, and studies tune it. Here: the maximum correntropy
+Kalman filter of Chen, Liu, Zhao and Principe (2017), which gives outliers little weight.
+"""
+
+# %%
+# The equations
+# -------------
+#
+# The prediction is that of the extended filter. The update weighs the errors of the state and of the measurement,
+# in standard deviations, by the kernel :math:`G(e) = \exp(-e^2/2b^2)`, and repeats the Kalman filter's gain with
+# these weights. With :math:`P = L L'` and :math:`R = M M'`
+#
+# .. math::
+#
+#    \tilde P = L \, \mathrm{diag}\big(1/G(L^{-1} K v)\big) L', \quad
+#    \tilde R = M \, \mathrm{diag}\big(1/G(M^{-1} (v - H K v))\big) M', \quad
+#    K = \tilde P H' (H \tilde P H' + \tilde R)^{-1}
+#
+# Nothing in a page may decide by values that are not known yet (``if``): it is traced once for the sizes of a
+# model. Its parameters are the fields of a class.
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import tuning
+from filters import ExtendedKalmanFilter
+from filters.gaussian.extended import advance, settle
+from filters.pages.page import Page, PageFilter
+from numerics.algebra.blocks import forward_quotient
+from numerics.algebra.densities import log_density
+from numerics.algebra.operations import (
+    divide,
+    joseph,
+    only,
+    present,
+    sym,
+    uncorrelated,
+    wrap,
+)
+from numerics.algebra.points import root
+from numerics.algebra.scalars import (
+    at_most,
+    diagonal,
+    entries_product,
+    exponential,
+    ratio,
+)
+from thruster_env.model import thruster_model
+
+SEEDS = 100
+
+
+def update(model, x, P, z):
+    seen = present(z)  # channels that are NaN are missing
+    H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
+    v = only(seen, wrap(z - model.h(x), model.measurement_angles))
+    S = sym(H @ P @ H.T + R)
+    L, M, K = root(P), root(R), divide(P @ H.T, S)
+    for _ in range(3):
+        spread = sym(L @ diagonal(weights(model, forward_quotient(L, K @ v))) @ L.T)
+        noise = sym(
+            M @ diagonal(weights(model, forward_quotient(M, v - H @ (K @ v)))) @ M.T
+        )
+        K = divide(spread @ H.T, sym(H @ spread @ H.T) + noise)
+    x = wrap(x + K @ v, model.state_angles)
+    return x, joseph(P, K, H, R), v, S, log_density(v, S, seen)
+
+
+def weights(model, e):
+    b = model.own.bandwidth
+    return exponential(at_most(entries_product(e, e) * ratio(0.5, b * b), 100.0))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MaximumCorrentropyFilter(PageFilter):
+    """Maximum correntropy Kalman filter.
+
+    Attributes:
+        bandwidth: of the kernel, in standard deviations.
+    """
+
+    name: ClassVar[str] = "mckf"
+    page: ClassVar[Page] = Page(advance, settle, update)
+    ranges: ClassVar[dict] = {"bandwidth": (1.0, 20.0)}
+    bandwidth: float = 3.0
+
+
+# %%
+# It is a filter like any other. Here it predicts a second at 12 V, and then a measurement is 8 N too large: that
+# moves the extended filter's motor speed and flow velocity, and hardly its own.
+
+model = thruster_model()
+for kind in (ExtendedKalmanFilter, MaximumCorrentropyFilter):
+    filter_ = kind(model=model)
+    belief = filter_.init()
+    for _ in range(20):
+        belief = filter_.predict(belief, [12.0])
+    (thrust,) = model.observe(tuple(belief.mean), model.constants)
+    updated, _ = filter_.update(belief, [thrust + 8.0])
+    print(filter_.name, updated.mean - belief.mean)
+
+# %%
+# Its place
+# ---------
+#
+# On the same held-out runs as filters that come with the package. Each knows the plant's own Q and R, and nothing
+# of the outliers.
+
+comparison = tuning.compare(
+    ["ekf", "ukf", "enkf", "pf", "ekf-robust", MaximumCorrentropyFilter],
+    "outliers",
+    seeds=SEEDS,
+)
+comparison
+
+# %%
+
+figure = comparison.plot_scores()
+
+# %%
+# Where one measurement in twenty is an outlier it is as good as ``ekf-robust``, within five per cent of the bound,
+# and both have half the error of filters that trust each measurement alike.
+#
+# ``thruster new filter my_filter`` writes this filter into a file of your own, with comments. Every command then
+# takes ``--filter my_filter:MyFilter``, and ``EstimateState(env, filter="my_filter:MyFilter")`` puts it around an
+# env. How a page becomes machine code: :doc:`/machine_code`.
