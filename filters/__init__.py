@@ -24,6 +24,7 @@ from filters.particles.auxiliary import AuxiliaryParticleFilter
 from filters.particles.particle import ParticleFilter
 from filters.registry import FILTERS, make_filter
 from filters.smoothers.smooth import Smoothed, smooth
+from filters.tensors import torch
 from filters.wrappers.ids import register_filtered_envs
 from filters.wrappers.single import EstimateState
 from filters.wrappers.vector import EstimateStates
@@ -68,6 +69,7 @@ __all__ = [
     "make_filter",
     "run",
     "smooth",
+    "torch",
 ]
 
 may_be_inlined(__name__, "plants")

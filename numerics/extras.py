@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-OF_ONE_PACKAGE = {"parquet": "pyarrow", "units": "pint", "frames": "pandas", "samplers": "cmaes"}
+OF_ONE_PACKAGE = {"parquet": "pyarrow", "units": "pint", "frames": "pandas", "samplers": "cmaes", "torch": "torch"}
 
 
 def to_install(extra: str) -> str:

@@ -20,22 +20,23 @@ def columns_of(found: LogEstimate) -> dict[str, np.ndarray]:
     log, model = found.log, found.model
     columns = {"time_s": log.start + log.times}
     for one, values in zip(log.input_quantities, log.inputs.T, strict=True):
-        columns[_header("input", one)] = np.append(values, np.nan)
+        columns[header_of("input", one)] = np.append(values, np.nan)
     for one, values in zip(log.measured, log.measurements.T, strict=True):
-        columns[_header("measured", one)] = values
+        columns[header_of("measured", one)] = values
     for key in compared(found):
-        columns[_header("reference", log.referred[key])] = log.references[key]
+        columns[header_of("reference", log.referred[key])] = log.references[key]
     for one, mean, std in zip(model.states, found.means.T, found.stds.T, strict=True):
-        columns[_header("", one)], columns[_header("std", one)] = mean, std
+        columns[header_of("", one)], columns[header_of("std", one)] = mean, std
     for symbol, output in model.outputs.items():
         quantity = output.quantity._replace(symbol=symbol)
-        columns[_header("", quantity)], columns[_header("std", quantity)] = found.output(symbol)
+        columns[header_of("", quantity)], columns[header_of("std", quantity)] = found.output(symbol)
     deviations = np.sqrt(np.maximum(np.einsum("kii->ki", found.innovation_covs), 0.0))
     for one, values, std in zip(log.measured, found.innovations.T, deviations.T, strict=True):
-        columns[_header("innovation", one)], columns[_header("innovation_std", one)] = values, std
+        columns[header_of("innovation", one)], columns[header_of("innovation_std", one)] = values, std
     return columns
 
 
-def _header(what: str, quantity: Quantity) -> str:
+def header_of(what: str, quantity: Quantity) -> str:
+    """The header of a column: "std_omega_m_rad_per_s"."""
     parts = (what, plain(quantity.symbol), suffix(quantity.unit))
     return "_".join(part for part in parts if part)

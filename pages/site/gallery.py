@@ -13,6 +13,7 @@ ORDER = (
     "policies",
     "ppo",
     "vehicle",
+    "networks",
 )
 SHOWN_ONLY = ("ppo",)  # learns for a minute; its own test runs it with few steps
 _shown: WeakSet = WeakSet()

@@ -23,19 +23,23 @@ QUICK = {
     "own_filter": {"SEEDS": 4},
     "policies": {"COPIES": 4, "TRAINING_STEPS": 256, "EPISODES": 2},
     "vehicle": {"STEPS": 20},
+    "networks": {"RUNS": 3, "STEPS": 10, "ROUNDS": 2},
 }
+NEEDS = {"policies": "stable_baselines3", "networks": "torch"}
 DRAWING = set(QUICK) - {"policies"}
-LONG, SLOW = {"own_model", "own_env", "own_log", "vehicle"}, pytest.mark.slow  # they compile models of their own
+LONG = {"own_model", "own_env", "own_log", "vehicle", "networks"}  # they compile models of their own
+SLOW = pytest.mark.slow
 
 
 SHOWN = {  # what a page's code makes
-    "export": {"content"},
+    "export": {"content", "made"},
     "missing": {"belief", "innovation"},
     "noise": {"env"},
     "positive": {"session", "median"},
     "processes": {"rewards"},
     "real_time": {"session", "cart"},
     "stable_baselines": {"model", "normalise", "action"},
+    "torch": {"estimates", "gradient", "learned"},
     "unknown_constant": {"problem"},
 }
 HOW_TO = [
@@ -61,8 +65,8 @@ def test_every_example_is_run():
 @pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW if name in LONG else ()) for name in QUICK])
 def test_an_example_runs(name, capsys, monkeypatch):
     """Under its own file's name, so that what it compiles is kept from run to run."""
-    if name == "policies":
-        pytest.importorskip("stable_baselines3")
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name])
     pytest.importorskip("pandas")
     module = types.ModuleType(f"examples_{name}")
     module.__file__ = str(EXAMPLES / f"{name}.py")
@@ -78,6 +82,8 @@ def test_an_example_runs(name, capsys, monkeypatch):
 
 @pytest.mark.parametrize(("page", "code"), HOW_TO)
 def test_what_a_how_to_page_shows_runs(page, code, tmp_path, monkeypatch):
+    if page == "torch":
+        pytest.importorskip("torch")
     if page == "stable_baselines":
         pytest.importorskip("stable_baselines3")
         code = code.replace("num_envs=64", "num_envs=2").replace("n_steps=64", "n_steps=8")

@@ -44,6 +44,7 @@ TUNING_OF_PLANTS = {
     "tuning/auv": {"auv_env"},
 }  # the rooms of tuning that know a plant
 LEARNING = {"stable_baselines3", "sb3_contrib", "rl_zoo3", "torch"}
+OF_TENSORS = "filters/tensors"  # filters for models with a network in them
 
 
 @cache
@@ -116,7 +117,15 @@ def test_only_tuning_imports_optuna():
 
 
 def test_only_training_imports_packages_that_learn_policies():
-    assert not those(lambda path: packages_of(path) & LEARNING and room_of(path) != "training")
+    assert not those(lambda path: packages_of(path) & LEARNING - {"torch"} and room_of(path) != "training")
+
+
+def test_torch_is_imported_by_training_and_by_filters_on_tensors_alone():
+    knowing = those(lambda path: "torch" in packages_of(path) and room_of(path) != "training")
+    assert knowing and all(name.startswith(f"{OF_TENSORS}/") for name in knowing)
+    outside = [path for path in FILES if not path.relative_to(ROOT).as_posix().startswith(OF_TENSORS)]
+    of_tensors = {name for path in outside for name in imports_of(path) if name.startswith("filters.tensors")}
+    assert of_tensors == {"filters.tensors", "filters.tensors.torch"}  # which imports torch when it is called
 
 
 def test_a_file_is_at_most_300_lines_long():

@@ -53,7 +53,7 @@ def test_every_option_is_in_a_panel(thruster, name):  # noqa: F811
 
 def test_what_is_random_has_a_seed_and_all_write_json(thruster):  # noqa: F811
     without = {name for name in COMMANDS if name != "study" and "--seed " not in thruster(name, "--help").stdout}
-    assert without == {"inspect", "filters", "new", "report", "verify", "log"}
+    assert without == {"inspect", "filters", "new", "report", "verify", "export", "log"}
     for name in (*set(COMMANDS) - {"study"}, "study policies", "study recordings", "study users"):
         assert "--json " in thruster(*name.split(), "--help").stdout
 

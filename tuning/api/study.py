@@ -101,6 +101,16 @@ class Study:
         object.__setattr__(self, "tuning", self.tuning._replace(file=Path(path)))
         return Path(path)
 
+    def export_c(self, folder: str | Path, name: str | None = None, *, single: bool = False) -> Path:
+        """Write the tuned filter as C99 with a program that filters a log; return the folder.
+
+        Arguments and errors are those of `filters.c.project.write_project`.
+        """
+        from filters.c.project import write_project
+
+        write_project(self.filter, folder, name, single=single)
+        return Path(folder)
+
     def to_frame(self) -> pandas.DataFrame:
         """A row a trial: its number, state, objectives, whether it is consistent, seconds, and what it tried.
 

@@ -1,0 +1,7 @@
+"""Filters as C99 for a controller: no heap, no recursion, no library but math.h.
+
+programs    a page's functions as programs, with the numbers of a model in them
+source      NAME.h and NAME.c of these
+project     a folder with these, a program that filters a log (log_program), and how to build them
+single      how far floats in place of doubles move the estimates
+"""

@@ -1,0 +1,66 @@
+"""How far single precision moves the estimates of a filter in C: its programs, run as Python with float32."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from filters.c.programs import FilterPrograms
+from filters.engine.batch import run
+from filters.filter import Filter
+from numerics.algebra.precision import as_single
+from numerics.algebra.programs import Program
+from numerics.angles import difference, wrapped_where
+
+
+class _Single:
+    """In place of `float` in a program's text."""
+
+    @staticmethod
+    def fromhex(text: str) -> np.float32:
+        return np.float32(as_single(float.fromhex(text)))
+
+
+def single_error(filter_: Filter, programs: FilterPrograms, inputs: np.ndarray, z: np.ndarray) -> float:
+    """The largest difference between estimates in single and double precision, in standard deviations.
+
+    Args:
+        filter_: the filter.
+        programs: what it is made of.
+        inputs: u of a run, (K, p).
+        z: its measurements, (K + 1, m).
+    """
+    exact = run(filter_, None, inputs[None], z[None])
+    stds = np.sqrt(np.einsum("kii->ki", exact.covs[0]))
+    with np.errstate(all="ignore"):
+        found = _means(programs, inputs.astype(np.float32), z.astype(np.float32))
+    off = abs(difference(found, exact.means[0], programs.model.shape.state_angles))
+    return float(np.max(off / np.where(stds > 0, stds, 1.0)))
+
+
+def _means(programs: FilterPrograms, inputs: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Means of a run, (K + 1, n), without restarts."""
+    model, n, m = programs.model, programs.model.n, programs.model.m
+    begin = None if programs.begin is None else _compiled(programs.begin)
+    advance, settle, update = map(_compiled, (programs.advance, programs.settle, programs.update))
+    names = {**vars(np), "float": _Single, "X": np.zeros(n * programs.points, np.float32)}
+    names |= {"P": model.prior_cov.ravel().astype(np.float32), "S": np.zeros(m * m, np.float32)}
+    x = names["x"] = wrapped_where(model.prior_mean, model.shape.state_angles).astype(np.float32)
+    names["innovation"], found = np.zeros(m, np.float32), []
+    for k in range(len(z)):
+        if k > 0:
+            names["u"] = inputs[k - 1]
+            if begin:
+                exec(begin, names)
+            for _ in range(model.substeps):
+                for point in names["X"].reshape(-1, n) if begin else [x]:
+                    exec(advance, names | {"x": point})
+            exec(settle, names)
+        names["z"] = z[k]
+        exec(update, names)
+        found.append(x.astype(np.float64))
+    return np.array(found)
+
+
+def _compiled(program: Program):
+    text = "\n".join(program.text).replace("filter->", "")
+    return compile(text, "<a filter in single precision>", "exec")

@@ -1,0 +1,31 @@
+"""Filters on batches of tensors, for models with a network in them and for other devices; this alone needs torch.
+
+algebra     what pages of filters say, of tensors (..., rows, columns)
+equations   a model's functions and their Jacobians, of tensors
+stages      a page as functions of tensors
+filter      `TensorFilter`: init, predict, update, run, and the likelihood by the compiled recursion
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+from numerics.extras import to_install
+
+if TYPE_CHECKING:
+    from filters.filter import Filter
+    from filters.tensors.filter import TensorFilter
+
+
+def torch(filter_: Filter, **arguments: Any) -> TensorFilter:
+    """A filter on batches of tensors, differentiable by torch; arguments are those of `TensorFilter`.
+
+    Raises:
+        ValueError: if torch is not installed, for a filter without a page, or for a wrong argument.
+    """
+    if find_spec("torch") is None:
+        raise ValueError(f"filters.torch needs torch, which is not installed: {to_install('torch')}")
+    from filters.tensors.filter import TensorFilter  # torch takes seconds to import
+
+    return TensorFilter(filter_, **arguments)

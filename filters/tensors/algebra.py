@@ -1,0 +1,157 @@
+"""What pages of filters say, worked out of tensors: a batch (..., rows, columns) in the place of each matrix.
+
+torch's autograd then differentiates it. An operation that nothing is said of here, such as a function of the
+model, computes on tensors itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from numerics.algebra import blocks, densities, matrices, operations, points, scalars
+from numerics.algebra.matrices import Matrix, Operation
+from numerics.angles import TURN
+from numerics.triangles import RESOLUTION
+
+
+def work_out(order: Sequence[Matrix], known: Mapping[Matrix, Tensor], like: Tensor) -> dict[Matrix, Any]:
+    """Values of matrices of a graph, in an order of `matrices.in_order`, given those that are known.
+
+    Args:
+        order: all that is wanted, after what it is made of.
+        known: tensors (..., *shape) for matrices that are given.
+        like: a tensor of the dtype and on the device of all.
+    """
+    values: dict[Matrix, Any] = dict(known)
+    for one in order:
+        if one not in values:
+            arguments = (values[a] if isinstance(a, Matrix) else a for a in one.arguments)
+            if one.operation in CONSTANT:
+                size = one.arguments[0].shape
+                values[one] = torch.as_tensor(one.operation.compute(np.zeros(size)), dtype=like.dtype).to(
+                    like.device
+                )
+            elif one.operation in OF_SHAPE:
+                values[one] = OF_SHAPE[one.operation](len(one.shape), *arguments)
+            else:
+                values[one] = RULES.get(one.operation, one.operation.compute)(*arguments)
+    return values
+
+
+def _wrapped(x: Tensor) -> Tensor:
+    return x - TURN * torch.ceil((x - math.pi) / TURN)
+
+
+def _product(dimensions: int, a: Tensor, b: Tensor) -> Tensor:
+    return a @ b if dimensions == 2 else (a @ b[..., None])[..., 0]
+
+
+def _quotient(dimensions: int, c: Tensor, root: Tensor) -> Tensor:
+    """The quotient C S^-1 by L L' = S."""
+    right = c.mT if dimensions == 2 else c[..., None]
+    found = torch.cholesky_solve(right, root)
+    return found.mT if dimensions == 2 else found[..., 0]
+
+
+def _only(dimensions: int, seen: Tensor, a: Tensor) -> Tensor:
+    return torch.where(seen if dimensions == 1 else seen[..., None], a, 0.0)
+
+
+def wrapped_where(x: Tensor, angles: tuple[bool, ...]) -> Tensor:
+    """Vectors x (..., n), their angles (flags) in (-pi, pi]."""
+    return _on_one_branch(1, x, angles) if any(angles) else x
+
+
+def _on_one_branch(dimensions: int, x: Tensor, angles: tuple[bool, ...]) -> Tensor:
+    return torch.where(_flags(dimensions, angles, x), _wrapped(x), x)
+
+
+def _on_one_side(dimensions: int, y: Tensor, angles: tuple[bool, ...]) -> Tensor:
+    middle = torch.atan2(y.sin().sum(-1, keepdim=True), y.cos().sum(-1, keepdim=True))
+    return torch.where(_flags(dimensions, angles, y), middle + _wrapped(y - middle), y)
+
+
+def _flags(dimensions: int, angles: tuple[bool, ...], like: Tensor) -> Tensor:
+    flags = torch.tensor(angles, device=like.device)
+    return flags if dimensions == 1 else flags[:, None]
+
+
+def _symmetric(a: Tensor) -> Tensor:
+    return 0.5 * (a + a.mT)
+
+
+def _uncorrelated(seen: Tensor, r: Tensor) -> Tensor:
+    alone = torch.eye(r.shape[-1], dtype=torch.bool, device=r.device)
+    return torch.where(seen[..., :, None] & seen[..., None, :] | alone, r, 0.0)
+
+
+def _factor(s: Tensor) -> Tensor:
+    """The lower triangular L with L L' = s; NaN where s is not positive definite."""
+    lower, failed = torch.linalg.cholesky_ex(s)
+    return torch.where((failed == 0)[..., None, None], lower, math.nan)
+
+
+def _density(v: Tensor, root: Tensor, seen: Tensor) -> Tensor:
+    scaled = _forward_quotient(root, v)
+    logs = torch.log(torch.diagonal(root, dim1=-2, dim2=-1)) + densities.LEVEL
+    return -0.5 * (scaled * scaled).sum(-1) - torch.where(seen, logs, 0.0).sum(-1)
+
+
+def _forward_quotient(lower: Tensor, v: Tensor) -> Tensor:
+    return torch.linalg.solve_triangular(lower, v[..., None], upper=False)[..., 0]
+
+
+def _root(p: Tensor) -> Tensor:
+    """`points.root`, column by column."""
+    resolution = RESOLUTION * torch.finfo(p.dtype).eps / torch.finfo(torch.float64).eps
+    columns: list[Tensor] = []
+    for j in range(p.shape[-1]):
+        rest = p[..., j:, j]
+        for column in columns:
+            rest = rest - column[..., j:] * column[..., j, None]
+        singular = rest[..., :1] <= resolution * p[..., j, j, None]
+        pivot = torch.where(singular, 1.0, rest[..., :1]).sqrt()
+        below = torch.where(singular, 0.0, rest / pivot)
+        columns.append(torch.nn.functional.pad(below, (j, 0)))
+    return torch.stack(columns, dim=-1)
+
+
+CONSTANT = {operations.eye, points.units, points.ones}  # depend on the sizes of their arguments alone
+OF_SHAPE: dict[Operation, Callable] = {
+    matrices.multiply: _product,
+    operations.quotient: _quotient,
+    operations.only: _only,
+    operations.on_one_branch: _on_one_branch,
+    points.on_one_side: _on_one_side,
+}
+"""Rules that first take whether the result is a vector or a matrix."""
+RULES: dict[Operation, Callable] = {
+    matrices.transposed: lambda a: a.mT,
+    operations.mirrored: _symmetric,
+    operations.congruence: lambda a, p, pa: _symmetric(a @ pa),
+    operations.present: lambda z: z == z,
+    operations.uncorrelated: _uncorrelated,
+    operations.factor: _factor,
+    densities.density: _density,
+    points.root: _root,
+    points.outer: lambda a, b: a[..., :, None] * b[..., None, :],
+    points.square: lambda a: a @ a.mT,
+    points.first: lambda a: a[..., 0],
+    points.others: lambda a: a[..., 1:],
+    scalars.reciprocal: lambda a: 1.0 / a,
+    scalars.shifted: lambda a, value: a + value,
+    scalars.exponential: torch.exp,
+    scalars.entries_product: lambda a, b: a * b,
+    scalars.at_most: lambda v, value: torch.clamp(v, max=value),
+    scalars.diagonal: torch.diag_embed,
+    blocks.forward_quotient: lambda lower, v: torch.linalg.solve_triangular(lower, v[..., None], upper=False)[
+        ..., 0
+    ],
+}
+"""Rules of others; sums, differences and multiples are those of tensors."""

@@ -1,0 +1,49 @@
+"""What filters on tensors return."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+
+class TensorBelief(NamedTuple):
+    """The estimates of a batch at one time.
+
+    Attributes:
+        mean: of the states, (..., n), in the units of the model.
+        cov: covariances of the errors, (..., n, n).
+        divergences: restarts from the prior, (...,).
+    """
+
+    mean: Tensor
+    cov: Tensor
+    divergences: Tensor
+
+
+class TensorInnovation(NamedTuple):
+    """Innovations of an update, as `Innovation` has them: (..., m), (..., m, m) and (...,)."""
+
+    value: Tensor
+    cov: Tensor
+    log_likelihood: Tensor
+
+
+class TensorEstimates(NamedTuple):
+    """A filter's output over a batch of trajectories; as `Estimates` has it, but tensors.
+
+    Attributes:
+        means: (..., K + 1, n).
+        covs: (..., K + 1, n, n).
+        innovations: (..., K + 1, m); zero in missing channels.
+        innovation_covs: S, (..., K + 1, m, m).
+        log_likelihoods: (..., K + 1).
+        divergences: restarts from the prior, (...,).
+    """
+
+    means: Tensor
+    covs: Tensor
+    innovations: Tensor
+    innovation_covs: Tensor
+    log_likelihoods: Tensor
+    divergences: Tensor

@@ -1,0 +1,151 @@
+"""A model's equations on batches of tensors: graphs of numbers where they can be traced, else as they stand.
+
+A component of a state is a tensor (...,), so that an operation of the graph is one of torch for a whole batch, and
+the points of a sigma-point filter are one more dimension. Of an equation that is called, a network for instance,
+the Jacobian is found forwards, by `torch.func.jvp` along each component, unless somebody gives it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from filters.pages.paged import Equation
+from filters.pages.traced import MOST, Traced
+from filters.tensors.graphs import order_of, values_of
+from numerics.algebra.graphs import Graph, Number
+from numerics.sources import is_array
+from plants.shape import Shape, constants_are_array
+
+
+def sizes_of(others: int, shape: Shape) -> tuple[int, ...]:
+    """How many components the arguments (x, u, c) or (x, c) have."""
+    return (shape.n, shape.inputs, shape.constants) if others == 2 else (shape.n, shape.constants)
+
+
+class OfGraph:
+    """An equation whose function can be traced; the Jacobian shares with the value what it can."""
+
+    def __init__(self, function: Callable, jacobian: Callable | None, others: int, shape: Shape):
+        """Trace the function, and raise whatever it raises of numbers that are not known yet."""
+        value, matrix, *_ = Traced(function, jacobian, others, shape).parts
+        graph = Graph(MOST)
+        x, *rest = (
+            np.array([graph.given((part, k)) for k in range(size)], dtype=object)
+            for part, size in enumerate(sizes_of(others, shape))
+        )
+        self._value = [graph.number(one) for one in value(x, *rest)]
+        self._both = self._value + [graph.number(one) for one in matrix(x, None, *rest).ravel()]
+        self._orders = [order_of(wanted) for wanted in (self._value, self._both)]
+
+    def of_points(self, x: Tensor, *others: Tensor) -> Tensor:
+        """The values (..., rows, points) at points (..., n, points)."""
+        found = self._stacked(self._value, self._orders[0], _components_of_points(x, *others))
+        return found.movedim(-1, -2)
+
+    def with_jacobian(self, x: Tensor, *others: Tensor) -> tuple[Tensor, Tensor]:
+        """The value (..., rows), and dy/dx (..., rows, n), at x (..., n)."""
+        both = self._stacked(self._both, self._orders[1], _components(x, *others))
+        rows = len(self._value)
+        return both[..., :rows], both[..., rows:].unflatten(-1, (rows, x.shape[-1]))
+
+    @staticmethod
+    def _stacked(wanted: Sequence[Number], order: Sequence[Number], parts: list[tuple[Tensor, ...]]) -> Tensor:
+        given = {(p, k): one for p, part in enumerate(parts) for k, one in enumerate(part)}
+        return stacked(values_of(wanted, order, given, parts[0][0]), parts)
+
+
+class Called:
+    """An equation whose function takes tensors (...,) in the places of floats."""
+
+    def __init__(self, name: str, function: Callable, jacobian: Callable | None, shape: Shape):
+        """Take the function and its Jacobian, as a model has them."""
+        self._name, self._function, self._jacobian, self._shape = name, function, jacobian, shape
+
+    def _value(self, x: Tensor, *others: Tensor) -> Tensor:
+        return self._called(self._function, _components(x, *others))
+
+    def of_points(self, x: Tensor, *others: Tensor) -> Tensor:
+        """The values (..., rows, points) at points (..., n, points)."""
+        return self._called(self._function, _components_of_points(x, *others)).movedim(-1, -2)
+
+    def with_jacobian(self, x: Tensor, *others: Tensor) -> tuple[Tensor, Tensor]:
+        """The value (..., rows), and dy/dx (..., rows, n), at x (..., n)."""
+        if self._jacobian is not None:
+            matrix = self._called(self._entries, _components(x, *others))
+            return self._value(x, *others), matrix.unflatten(-1, (-1, x.shape[-1]))
+        x, columns = x.contiguous(), []  # jvp takes no tensor that is one number many times
+        for unit in torch.eye(x.shape[-1], dtype=x.dtype, device=x.device):
+            tangent = unit.expand_as(x).contiguous()
+            value, column = torch.func.jvp(lambda x: self._value(x, *others), (x,), (tangent,))[:2]
+            columns.append(column)
+        return value, torch.stack(columns, -1)
+
+    def _entries(self, *given) -> list[Tensor | float]:
+        """The Jacobian's entries, by rows."""
+        return [entry for row in self._jacobian(*given) for entry in row]  # type: ignore[misc]
+
+    def _called(self, function: Callable, parts: list[tuple[Tensor, ...]]) -> Tensor:
+        x, *u, c = parts
+        u = [tuple(one.expand_as(x[0]) for one in part) for part in u]  # so that they can be stacked with x
+        states, *inputs = (torch.stack(part) if is_array(len(part)) else part for part in (x, *u))
+        try:
+            return stacked(function(states, *inputs, self._constants(c)), parts)
+        except (TypeError, ValueError, AttributeError, RuntimeError) as error:
+            raise ValueError(
+                f"{self._name} must be a function of tensors, or of arithmetic that decides nothing, but raised "
+                f"{type(error).__name__}: {str(error).splitlines()[0]}"
+            ) from error
+
+    def _constants(self, c: tuple[Tensor, ...]):
+        form = self._shape.form
+        if constants_are_array(form):
+            return torch.stack(c)
+        return c if isinstance(form, int) else form(*c)
+
+
+def _components(*arguments: Tensor) -> list[tuple[Tensor, ...]]:
+    return [one.unbind(-1) for one in arguments]
+
+
+def _components_of_points(x: Tensor, *others: Tensor) -> list[tuple[Tensor, ...]]:
+    return [x.unbind(-2), *(one[..., None].unbind(-2) for one in others)]
+
+
+def stacked(values: Sequence[Tensor | float], parts: list[tuple[Tensor, ...]]) -> Tensor:
+    """Components of a result as one tensor (..., rows), for the batch of all arguments."""
+    like, known = parts[0][0], [one for part in parts for one in part]
+    shapes = (one.shape for one in (*known, *values) if isinstance(one, Tensor))
+    batch = torch.broadcast_shapes(*shapes)
+    rows = (one if isinstance(one, Tensor) else like.new_tensor(one) for one in values)
+    return torch.stack([one.expand(batch) for one in rows], -1)
+
+
+def equation_of(
+    name: str,
+    of_model: tuple[Callable, Callable | None],
+    given: tuple[Callable | None, Callable | None],
+    others: int,
+    shape: Shape,
+) -> Equation:
+    """The equation of a model's function and Jacobian, or of those that are given in their place.
+
+    Args:
+        name: of the function in the model.
+        of_model: its function, and its Jacobian or None.
+        given: functions of tensors; None for the model's.
+        others: how many arguments it has beside x.
+        shape: of the model.
+    """
+    function, jacobian = given
+    if function is not None:
+        return Called(name, function, jacobian, shape)
+    if jacobian is not None:
+        raise ValueError(f"{name}_jacobian must come with {name}, but got it alone")
+    try:
+        return OfGraph(*of_model, others, shape)
+    except Exception:  # whatever a user's function raises of numbers that it does not know: it is called, then
+        return Called(name, *of_model, shape)

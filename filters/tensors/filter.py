@@ -1,0 +1,240 @@
+"""`TensorFilter`: a filter on batches of tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from filters.differentiated.differentiable import differentiable
+from filters.filter import Filter
+from filters.tensors.algebra import wrapped_where
+from filters.tensors.belief import TensorBelief, TensorEstimates, TensorInnovation
+from filters.tensors.equations import equation_of
+from filters.tensors.likelihood import compiled_likelihood
+from filters.tensors.stages import Stages
+from numerics.algebra.matrices import Matrix
+from numerics.checks import one_of
+
+DIMENSIONS = {
+    "process_noise_cov": 2,
+    "measurement_noise_cov": 2,
+    "prior_mean": 1,
+    "prior_cov": 2,
+    "constants": 1,
+}
+"""A filter's numbers, those of its model, and how many dimensions each has beside those of a batch."""
+
+
+class TensorFilter:
+    """A filter on batches of tensors, which torch differentiates; `filters.torch` makes one.
+
+    Its estimates are those of `filters.run` to rounding: angles, substeps, missing channels and restarts are the
+    same. It has derivatives along everything that is a tensor: the attributes below, inputs, measurements, and
+    whatever its functions contain. A trajectory that restarts from the prior has estimates; its gradient is NaN.
+
+    Attributes:
+        process_noise_cov: Q (n, n), or one for each trajectory (..., n, n); of a step, as the model's.
+        measurement_noise_cov: R (m, m) or (..., m, m).
+        prior_mean: (n,) or (..., n).
+        prior_cov: (n, n) or (..., n, n).
+        constants: c (count,) or (..., count); the model's functions get it in the form that they have.
+    """
+
+    process_noise_cov: Tensor
+    measurement_noise_cov: Tensor
+    prior_mean: Tensor
+    prior_cov: Tensor
+    constants: Tensor
+
+    def __init__(
+        self,
+        filter_: Filter,
+        *,
+        transition: Callable | None = None,
+        observe: Callable | None = None,
+        transition_jacobian: Callable | None = None,
+        observe_jacobian: Callable | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ):
+        """Make the filter for tensors.
+
+        Args:
+            filter_: a filter "kf", "ekf", "iekf", "ukf" or "ckf".
+            transition: f(x, u, c) in place of the model's, a function of tuples of tensors (...,) that returns one
+                for each state; it may contain a network. x, u and c are those of `StateSpaceModel`.
+            observe: h(x, c) in place of the model's.
+            transition_jacobian: df/dx of such a transition, by rows; by `torch.func.jvp` if None.
+            observe_jacobian: dh/dx of such a function.
+            dtype: torch.float64, or torch.float32.
+            device: of all tensors.
+
+        Raises:
+            ValueError: for a filter without a page, another dtype, or functions that are to replace those of an
+                affine approximation.
+        """
+        if dtype not in (torch.float64, torch.float32):
+            raise ValueError(f"dtype must be torch.float64 or torch.float32, but got {dtype}")
+        self.filter, self._given = filter_, (transition, transition_jacobian, observe, observe_jacobian)
+        self._make()
+        if self._model is not filter_.model and any(self._given):
+            raise ValueError(
+                f"functions of tensors must be given to a filter of the model itself, but got {filter_.name!r}, "
+                "which has an affine approximation"
+            )
+        for name in DIMENSIONS:
+            setattr(self, name, torch.as_tensor(getattr(self._model, name), dtype=dtype, device=device))
+
+    def _make(self) -> None:
+        """Make the graphs of the page for the model."""
+        self._model, page, self._own = differentiable(self.filter.model, self.filter)
+        shape, (f, by_f, h, by_h) = self._model.shape, self._model.functions
+        transition, by_transition, observe, by_observe = self._given
+        motion = equation_of("transition", (f, by_f), (transition, by_transition), 2, shape)
+        sight = equation_of("observe", (h, by_h), (observe, by_observe), 1, shape)
+        self._stages = Stages(motion, sight, shape, page)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but graphs, which are made again."""
+        return {name: value for name, value in vars(self).items() if name not in ("_model", "_own", "_stages")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make the graphs."""
+        vars(self).update(state)
+        self._make()
+
+    def replace(self, **numbers: Any) -> Self:
+        """The filter with other numbers, such as `process_noise_cov=Q`, along which derivatives go on.
+
+        Raises:
+            ValueError: for a name that is none of a filter's numbers, or a value whose shape does not fit.
+        """
+        found = object.__new__(type(self))
+        vars(found).update(vars(self))
+        for name, value in numbers.items():
+            own = getattr(self, one_of("a number of a filter", name, tuple(DIMENSIONS)))
+            setattr(found, name, self._tensor(name, value, own.shape[-DIMENSIONS[name] :]))
+        return found
+
+    def init(self, batch: int | tuple[int, ...] = ()) -> TensorBelief:
+        """The prior, for a batch of so many trajectories, or of such a shape."""
+        batch = (batch,) if isinstance(batch, int) else tuple(batch)
+        whole = torch.broadcast_shapes(batch, self.prior_mean.shape[:-1], self.prior_cov.shape[:-2])
+        mean = wrapped_where(self.prior_mean, self._model.shape.state_angles)
+        mean, cov = mean.expand(*whole, -1), self.prior_cov.expand(*whole, -1, -1)
+        return TensorBelief(mean, cov, torch.zeros(whole, dtype=torch.int64, device=mean.device))
+
+    def predict(self, belief: TensorBelief, u: Any) -> TensorBelief:
+        """The belief a step later, under inputs u (..., p) in the units of the model's inputs."""
+        u = self._tensor("u", u, (self._model.inputs,))
+        mean, cov = self._stages.predict(self._known(), belief.mean, belief.cov, u, self._model.substeps)
+        return TensorBelief(mean, cov, belief.divergences)
+
+    def update(self, belief: TensorBelief, z: Any) -> tuple[TensorBelief, TensorInnovation]:
+        """The belief after measurements z (..., m), NaN where missing, and the innovations.
+
+        A belief that is not finite, or has a negative variance, becomes the prior, and this is counted.
+        """
+        z = self._tensor("z", z, (self._model.m,))
+        mean, cov, v, s, level = self._stages.update(self._known(), belief.mean, belief.cov, z)
+        lost = ~_all_finite(mean, cov, v, s, level)
+        batch = lost.shape
+        counted = belief.divergences.expand(batch) + lost
+        if lost.any():
+            prior = self.init(batch)
+            mean, v = torch.where(lost[..., None], prior.mean, mean), torch.where(lost[..., None], 0.0, v)
+            cov = torch.where(lost[..., None, None], prior.cov, cov)
+            s = torch.where(lost[..., None, None], self.measurement_noise_cov, s)
+            level = torch.where(lost, 0.0, level)
+        return TensorBelief(mean, cov, counted), TensorInnovation(v, s, level)
+
+    def run(self, inputs: Any = None, measurements: Any = None) -> TensorEstimates:
+        """Filter trajectories, as `filters.run` does.
+
+        Args:
+            inputs: u (..., K, p), in the units of the model's inputs; None for a model without.
+            measurements: z (..., K + 1, m), NaN where missing; z[..., 0, :] updates the prior.
+
+        Raises:
+            ValueError: if shapes do not fit.
+        """
+        z = self._tensor("measurements", measurements, (self._model.m,))
+        if inputs is None:
+            inputs = z.new_zeros(*z.shape[:-2], z.shape[-2] - 1, 0)
+        u = self._tensor("inputs", inputs, (self._model.inputs,))
+        if z.ndim < 2 or u.ndim < 2 or u.shape[:-1] != (*z.shape[:-2], z.shape[-2] - 1):
+            raise ValueError(
+                "inputs and measurements must have shapes (..., K, p) and (..., K + 1, m), but got "
+                f"{tuple(u.shape)} and {tuple(z.shape)}"
+            )
+        belief, told = self.init(z.shape[:-2]), []
+        for k in range(z.shape[-2]):
+            if k > 0:
+                belief = self.predict(belief, u[..., k - 1, :])
+            belief, innovation = self.update(belief, z[..., k, :])
+            told.append((belief.mean, belief.cov, *innovation))
+        means, covs, values, innovation_covs, levels = zip(*told, strict=True)
+        return TensorEstimates(
+            torch.stack(means, -2),
+            torch.stack(covs, -3),
+            torch.stack(values, -2),
+            torch.stack(innovation_covs, -3),
+            torch.stack(levels, -1),
+            belief.divergences,
+        )
+
+    def log_likelihood(self, inputs: Any = None, measurements: Any = None) -> Tensor:
+        """Log-likelihoods (B,) of trajectories by the compiled recursion, with its exact gradient along Q and R.
+
+        It is what `run` sums up, some thousand times as fast, for `process_noise_cov` (n, n) and
+        `measurement_noise_cov` (m, m). Other numbers are those of the filter's model.
+
+        Args:
+            inputs: (B, K, p); None for a model without.
+            measurements: (B, K + 1, m), NaN where missing.
+
+        Raises:
+            ValueError: if shapes do not fit, or the filter has functions or other numbers than its model.
+        """
+        others = {name: getattr(self, name) for name in ("prior_mean", "prior_cov", "constants")}
+        if any(self._given) or not all(_is(one, getattr(self._model, name)) for name, one in others.items()):
+            raise ValueError(
+                "the compiled log-likelihood must be that of a filter whose functions, prior and constants are "
+                "its model's, but got others: use run"
+            )
+        noise = self.process_noise_cov, self.measurement_noise_cov
+        return compiled_likelihood(self.filter, inputs, measurements, *noise)
+
+    def _known(self) -> dict[Matrix, Tensor]:
+        """Tensors of the numbers that pages read."""
+        given, like = self._stages.given, self.prior_mean
+        own = {one: like.new_tensor(value) for one, value in zip(given.own, self._own, strict=False)}
+        numbers = {given.Q: self.process_noise_cov, given.R: self.measurement_noise_cov}
+        return own | numbers | {given.constants: self.constants}
+
+    def _tensor(self, name: str, value: Any, shape: tuple[int, ...]) -> Tensor:
+        """A value as a tensor (..., *shape) of the filter's dtype and on its device."""
+        like = self.prior_mean
+        try:
+            found = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+        except (TypeError, ValueError, RuntimeError):
+            raise ValueError(f"{name} must be a tensor of numbers, but got {value!r}") from None
+        if found.shape[-len(shape) :] != shape:
+            wanted = ", ".join(("...", *map(str, shape)))
+            raise ValueError(f"{name} must have shape ({wanted}), but got {tuple(found.shape)}")
+        return found
+
+
+def _all_finite(mean: Tensor, cov: Tensor, *others: Tensor) -> Tensor:
+    """Which beliefs (...,) and innovations consist of finite numbers, with variances that are not negative."""
+    v, s, level = others
+    sums = mean.abs().sum(-1) + cov.abs().sum((-2, -1)) + v.abs().sum(-1) + s.abs().sum((-2, -1)) + level.abs()
+    return sums.isfinite() & (torch.diagonal(cov, dim1=-2, dim2=-1) >= 0).all(-1)
+
+
+def _is(one: Tensor, value: Any) -> bool:
+    """Whether a tensor is a model's own number, and no derivative is asked for."""
+    return not one.requires_grad and torch.equal(one, one.new_tensor(value))

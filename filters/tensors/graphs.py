@@ -1,0 +1,64 @@
+"""Graphs of numbers, worked out of tensors: an operation of torch for each number, for a whole batch."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from numerics.algebra.graphs import Number, needed_by
+from numerics.algebra.precision import as_single
+
+WORK: dict[str, Callable] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "pow": operator.pow,
+    "negative": operator.neg,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "==": operator.eq,
+    "!=": operator.ne,
+    "and": operator.and_,
+}
+"""Operations of tensors and floats; other ones are torch's functions of tensors, by their names."""
+
+
+def order_of(wanted: Sequence[Number]) -> list[Number]:
+    """The numbers that `values_of` works out, in order."""
+    return needed_by(wanted)
+
+
+def values_of(
+    wanted: Sequence[Number], order: Sequence[Number], given: Mapping[Any, Tensor], like: Tensor
+) -> list[Tensor | float]:
+    """Values of numbers, of tensors for those that are given by their names; of constants floats.
+
+    Args:
+        wanted: numbers of one graph.
+        order: `order_of(wanted)`.
+        given: tensors whose shapes broadcast.
+        like: a tensor of the dtype and on the device of all.
+    """
+    values: dict[int, Tensor | float] = {}
+
+    def tensor(value: Tensor | float) -> Tensor:
+        return value if isinstance(value, Tensor) else like.new_tensor(value)
+
+    for one in order:
+        arguments = [values[a.place] for a in one.of]
+        if one.operation == "given":
+            values[one.place] = given[one.arguments[0]]
+        elif one.value is not None:
+            values[one.place] = one.value if like.dtype == torch.float64 else as_single(one.value)
+        elif one.operation in WORK:
+            values[one.place] = WORK[one.operation](*arguments)
+        else:
+            values[one.place] = getattr(torch, one.operation)(*map(tensor, arguments))
+    return [values[one.place] for one in wanted]

@@ -1,0 +1,355 @@
+"""Filters in C: compiled without a warning, and the numbers of `run`."""
+
+import math
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from auv_env.model import auv_model
+from filters import StateSpaceModel, make_filter, run, thruster_model
+from filters.c.programs import programs_of
+from filters.c.project import write_project
+from filters.c.single import single_error
+from filters.c.source import c_filter
+from filters.logs.columns import columns_of
+from filters.logs.estimate import estimate_with
+from numerics.algebra.c_source import literal, statements_of
+from numerics.algebra.graphs import Graph, arctan2, where
+from numerics.algebra.programs import Place, program_of
+from numerics.angles import difference
+from plants.replay import ReplayEnv
+from tests.filters.test_filter_paths import diverging
+from tests.filters.test_pages import wide_pendulum
+from tests.models import lonely_model, random_affine, scalar_model, simulated, wide_model
+from thruster_cli.templates.filter import Template
+
+WARNINGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
+SANITIZERS = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+NAMES = ("kf", "ekf", "iekf", "ukf", "ckf")
+OWN = {"iekf": {"iterations": 3}, "ukf": {"alpha": 0.8, "beta": 1.5, "kappa": 1.0}}
+MODELS = {
+    "thruster": lambda: thruster_model(operating_voltage=3.0),
+    "pendulum": lambda: wide_pendulum().replace(operating_state=[0.3, 0.0], operating_input=[0.5]),
+    "affine": wide_model,
+    "no input": lonely_model,
+}
+MAIN = """\
+#include "{name}.h"
+
+#include <stdio.h>
+
+static int numbers(int count, {real} *to)
+{{
+    for (int i = 0; i < count; i++) {{
+        double number;
+        if (scanf("%lf", &number) != 1) {{
+            return 0;
+        }}
+        to[i] = ({real})number;
+    }}
+    return 1;
+}}
+
+static void show(int count, const {real} *of)
+{{
+    for (int i = 0; i < count; i++) {{
+        printf("%.17g ", (double)of[i]);
+    }}
+}}
+
+int main(void)
+{{
+    {name} filter;
+    {real} u[{inputs} + 1], z[{m}];
+
+    {name}_init(&filter);
+    for (int k = 0; numbers(k > 0 ? {inputs} : 0, u) && numbers({m}, z); k++) {{
+        if (k > 0) {{
+            {name}_predict(&filter{u});
+        }}
+        {name}_update(&filter, z);
+        show({n}, filter.x);
+        show({n} * {n}, filter.P);
+        show({m}, filter.innovation);
+        show({m} * {m}, filter.S);
+        show(1, &filter.log_likelihood);
+        show(1, &filter.nis);
+        printf("%d %lu\\n", filter.channels, filter.restarts);
+    }}
+    return 0;
+}}
+"""
+
+
+def compilers():
+    """gcc, which has to be there, and clang where it is."""
+    return [name for name in ("gcc", "clang") if name == "gcc" or shutil.which(name)]
+
+
+def built(filter_, folder, *, single=False, compiler="gcc", flags=()):
+    """The program MAIN of a filter."""
+    made, model = c_filter(filter_, "one", single=single), filter_.kernel_model
+    u, real = ", u" * (model.inputs > 0), "float" if single else "double"
+    main = MAIN.format(name="one", real=real, inputs=model.inputs, n=model.n, m=model.m, u=u)
+    for name, text in {"one.h": made.header, "one.c": made.source, "main.c": main}.items():
+        (folder / name).write_text(text)
+    command = [compiler, *WARNINGS, *flags, "one.c", "main.c", "-lm", "-o", "one"]
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    return folder / "one"
+
+
+def estimated(program, model, inputs, z):
+    """Estimates of one run, NIS, channels and restarts of each step."""
+    rows = [z[0], *np.concatenate([inputs, z[1:]], axis=1)]
+    text = "\n".join(" ".join(f"{number:.17g}" for number in row) for row in rows)
+    result = subprocess.run([program], input=text, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    found = np.array([[float(word) for word in line.split()] for line in result.stdout.splitlines()])
+    n, m = model.n, model.m
+    x, p, v, s, level, nis, channels, restarts = np.split(found, np.cumsum([n, n * n, m, m * m, 1, 1, 1]), axis=1)
+    return (x, p.reshape(-1, n, n), v, s.reshape(-1, m, m), level[:, 0]), nis[:, 0], channels[:, 0], restarts[:, 0]
+
+
+def assert_same(found, expected, accuracy):
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=accuracy * abs(other).max())
+
+
+def made(name, model):
+    return make_filter(name, model, **OWN.get(name, {}))
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("which", MODELS)
+def test_a_thousand_steps_are_those_of_run(which, name, tmp_path):
+    model = MODELS[which]()
+    inputs, z = simulated(model, 1000, level=1.0, missing=0.2)
+    filter_ = made(name, model)
+    expected = [part[0] for part in run(filter_, None, inputs, z)[:5]]
+    for compiler in compilers():
+        program = built(filter_, tmp_path, compiler=compiler)
+        found, nis, channels, restarts = estimated(program, filter_.kernel_model, inputs[0], z[0])
+        assert_same(found, expected, 1e-12)
+        v, s = expected[2:4]
+        np.testing.assert_allclose(
+            nis, (v * np.linalg.solve(s, v[..., None])[..., 0]).sum(-1), rtol=1e-8, atol=1e-10
+        )
+        assert channels.tolist() == np.isfinite(z[0]).sum(-1).tolist() and not restarts.any()
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("which", ["thruster", "pendulum", "affine"])
+def test_a_users_filter_is_that_of_run(which, tmp_path):
+    filter_ = Template(model=MODELS[which](), bandwidth=2.0)
+    inputs, z = simulated(filter_.model, 200, level=1.0, missing=0.2)
+    found, *_ = estimated(built(filter_, tmp_path), filter_.kernel_model, inputs[0], z[0])
+    assert_same(found, [one[0] for one in run(filter_, None, inputs, z)[:5]], 1e-10)
+
+
+@pytest.mark.parametrize("name", ["ekf", "ukf"])
+def test_a_vehicle_and_many_states(name, tmp_path):
+    for model in (auv_model(states="velocities"), random_affine(9, 4, 1)):
+        inputs, z = simulated(model, 100, level=1.0, missing=0.2)
+        filter_ = made(name, model)
+        found, *_ = estimated(built(filter_, tmp_path), model, inputs[0], z[0])
+        assert_same(found, [part[0] for part in run(filter_, None, inputs, z)[:5]], 1e-12)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # Python says so when a number overflows
+@pytest.mark.parametrize("name", NAMES)
+def test_a_belief_that_is_lost_becomes_the_prior_and_no_sanitizer_complains(name, tmp_path):
+    filter_, inputs, z = diverging(name)
+    program = built(filter_, tmp_path, flags=SANITIZERS)
+    found, nis, _, restarts = estimated(program, filter_.kernel_model, inputs[0], z[0])
+    expected = run(filter_, None, inputs, z)
+    assert restarts[-1] == expected.divergences[0] > 0 and nis[np.diff(restarts, prepend=0) > 0].tolist()[0] == 0.0
+    assert_same(found, [part[0] for part in expected[:5]], 1e-12)
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", NAMES)
+def test_single_precision(name, tmp_path):
+    for which in ("thruster", "pendulum"):
+        model = MODELS[which]()
+        inputs, z = simulated(model, 300, level=1.0, missing=0.2)
+        filter_ = made(name, model)
+        program = built(filter_, tmp_path, single=True, flags=["-Wdouble-promotion", *SANITIZERS])
+        found, *_, restarts = estimated(program, filter_.kernel_model, inputs[0], z[0])
+        assert_same(found, [part[0] for part in run(filter_, None, inputs, z)[:5]], 1e-3)
+        assert not restarts.any()
+        exact = run(filter_, None, inputs, z)
+        off = abs(difference(found[0], exact.means[0], filter_.kernel_model.shape.state_angles))
+        compiled = (off / np.sqrt(np.einsum("kii->ki", exact.covs[0]))).max()
+        told = single_error(filter_, programs_of(filter_), inputs[0], z[0])
+        assert 1e-8 < told < 1e-3 and told / 10 < compiled < 10 * told
+
+
+def test_a_program_computes_in_c_what_it_computes_in_python(tmp_path):
+    """Every operation, at a few numbers."""
+    graph = Graph()
+    x, y = (graph.given(Place("given", k)) for k in range(2))
+    functions = [getattr(abs(x), name)() for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "arctan", "tanh")]
+    functions += [x.sinh(), x.cosh(), x.floor(), x.ceil(), abs(x), arctan2(y, x), abs(x) ** y, abs(x) ** 1.7, -x]
+    functions += [x + y, x - y, x * y, x / y, 0.1 * x, x - 3e-7, x * 1e300, x % 2.0]
+    functions += [where(x < y, 1.0, -2.5), where(x <= y, x, y), where(x > y, x, y), where(x >= y, math.nan, y)]
+    functions += [where(x == y, x, math.inf), where(x != y, x, -math.inf), where((x == x) & (y == y), x, 7.0)]
+    program = program_of([(Place("out", k), one) for k, one in enumerate(functions)], {})
+    body = "".join(f"    {line}\n" for line in statements_of(program))
+    shown = f'    for (int i = 0; i < {len(functions)}; i++) printf("%.17g\\n", out[i]);\n'
+    source = "#include <math.h>\n#include <stdio.h>\n#include <stdlib.h>\nint main(int count, char **words)\n{\n"
+    source += f"    double out[{len(functions)}], given[2] = {{atof(words[1]), atof(words[count - 1])}};\n"
+    (tmp_path / "main.c").write_text(source + body + shown + "    return 0;\n}\n")
+    command = ["gcc", *WARNINGS, "main.c", "-lm", "-o", "main"]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    for a, b in ((0.3, 1.2), (-1.7, 0.4), (2.5, 2.5), (math.nan, 1.0)):
+        printed = subprocess.run([tmp_path / "main", repr(a), repr(b)], capture_output=True, text=True, check=True)
+        with np.errstate(all="ignore"):
+            expected = evaluated(program, len(functions), [a, b])
+        np.testing.assert_allclose([float(line) for line in printed.stdout.split()], expected, rtol=1e-14)
+
+
+def evaluated(program, count, numbers):
+    names = {**vars(np), "given": np.array(numbers), "out": np.empty(count)}
+    exec("\n".join(program.text), names)
+    return names["out"]
+
+
+def test_numbers_are_written_with_all_their_digits():
+    rng = np.random.default_rng(0)
+    for value in map(float, [*(rng.normal(size=50) * 10.0 ** rng.integers(-300, 300, 50)), 0.1, 1.0, 0.0]):
+        assert float(literal(value).strip("()")) == value
+        with np.errstate(over="ignore"):
+            single = np.float32(value)
+        text = literal(value, single=True).strip("()")
+        if 2e-38 < abs(single) < math.inf:
+            assert text.endswith("f") and np.float32(text[:-1]) == single
+    assert [literal(value, single=True) for value in (1e-200, -1e-200, 1e200)] == [
+        "1.1754944e-38f",
+        "(-1.1754944e-38f)",
+        "INFINITY",
+    ]
+    assert literal(math.nan) == "NAN" and literal(-math.inf) == "(-INFINITY)"
+
+
+def decides(x, u, c):
+    return (x[0] if x[0] > 1.0 else u[0],)
+
+
+def looked_up(x, c):
+    return ([3.0, 4.0][int(x[0])],)
+
+
+def plain(x, u, c):
+    return (0.5 * x[0] + u[0],)
+
+
+def sight(x, c):
+    return (x[0],)
+
+
+def small(**functions):
+    chosen = {"transition": plain, "observe": sight, **functions}
+    return StateSpaceModel(
+        **chosen,
+        process_noise_cov=[0.1],
+        measurement_noise_cov=[0.1],
+        prior_mean=[0.2],
+        prior_cov=[1.0],
+        inputs=1,
+        states=[("a */ b", "level", "\N{DEGREE SIGN}")],
+    )
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda: c_filter(make_filter("enkf", scalar_model())),
+            "must be one of kf, ekf, iekf, ukf, ckf, but got 'enkf'",
+        ),
+        (lambda: c_filter(made("ekf", scalar_model()), "a b"), "no keyword, but got 'a b'"),
+        (lambda: c_filter(made("ekf", scalar_model()), "double"), "no keyword, but got 'double'"),
+        (
+            lambda: c_filter(made("ekf", small(transition=decides))),
+            "transition must .* but decides raised TypeError",
+        ),
+        (
+            lambda: c_filter(made("ukf", small(observe=looked_up))),
+            "observe must .* but looked_up raised TypeError",
+        ),
+    ],
+)
+def test_an_error_names_what_is_wrong(make, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_comments_hold_any_unit():
+    header = c_filter(made("ekf", small())).header
+    assert header.isascii() and header.count("*/") == header.count("/*")
+
+
+def test_a_filter_is_the_same_text_each_time():
+    assert c_filter(made("ukf", thruster_model())) == c_filter(made("ukf", thruster_model()))
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("single", [False, True])
+@pytest.mark.parametrize("which", ["thruster", "no input"])
+def test_a_project_filters_a_log_as_estimate_does(which, single, tmp_path):
+    model = MODELS[which]()
+    inputs, z = simulated(model, 40, level=1.0, missing=0.2)
+    filter_ = made("ekf", model)
+    files = write_project(filter_, tmp_path / "c", "one", single=single)
+    assert [file.name for file in files] == ["one.h", "one.c", "main.c", "CMakeLists.txt", "README.md"]
+    command = ["gcc", *WARNINGS, *SANITIZERS, "one.c", "main.c", "-lm", "-o", "one_log"]
+    result = subprocess.run(command, cwd=tmp_path / "c", capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    log = log_of(model, inputs[0], z[0])
+    printed = subprocess.run([tmp_path / "c" / "one_log"], input=log, capture_output=True, text=True, check=True)
+    headers, *rows = (line.split(",") for line in printed.stdout.splitlines())
+    recorded = tmp_path / "log.csv"
+    recorded.write_text(log)
+    found = estimate_with(filter_, ReplayEnv(recorded, model).log)
+    wanted = columns_of(found)
+    assert set(headers) <= set(wanted) and len(rows) == 41
+    for header, column in zip(headers, zip(*rows, strict=True), strict=True):
+        numbers = [float(word) if word else math.nan for word in column]
+        atol = (1e-4 if single else 1e-8) * np.nanmax(abs(wanted[header]))
+        np.testing.assert_allclose(numbers, wanted[header], rtol=0, atol=atol, equal_nan=True)
+
+
+def log_of(model, inputs, z):
+    """A log as CSV, with a column that nobody asked for."""
+    names = ["time_s", "other", *["voltage_V"] * model.inputs]
+    names += ["measured_thrust_N"] if model.inputs else ["z_1"]
+    rows = [",".join(names)]
+    for k, measured in enumerate(z):
+        u = inputs[min(k, len(inputs) - 1)].tolist()
+        words = [f"{one:.17g}" if one == one else "" for one in (0.01 * k, 7.0, *u, *measured)]
+        rows.append(",".join(words))
+    return "\r\n".join(rows) + "\r\n"
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_log_without_a_column_is_refused(tmp_path):
+    write_project(made("ekf", thruster_model()), tmp_path, "one")
+    command = ["gcc", *WARNINGS, "one.c", "main.c", "-lm", "-o", "one_log"]
+    assert subprocess.run(command, cwd=tmp_path).returncode == 0
+    for words, log, told in [
+        ([], "time_s,voltage_V\n", "a log must have a column measured_thrust_N\n"),
+        (["u", "z"], "u,thrust\n", "a log must have a column z\n"),
+        (["u"], "u,z\n", "give no header, or 2, inputs first\n"),
+        (["u", "z"], "u,z\n1,2\n,3\n4,5\n", "row 2 has no u\n"),
+        ([], "", "a log must have a line of headers\n"),
+    ]:
+        result = subprocess.run([tmp_path / "one_log", *words], input=log, capture_output=True, text=True)
+        assert (result.returncode, result.stderr) == (2, told)

@@ -1,0 +1,57 @@
+"""`thruster export`: a tuned filter as C code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from filters.c.programs import programs_of
+from filters.c.project import write_project
+from filters.c.single import single_error
+from numerics.checks import one_of
+from thruster_cli.options import OUTPUT, CodeOption, JsonOption, LogModelOption
+from thruster_cli.output import announce_compilation, check_targets, emit
+from tuning.evaluation.tuned import read_tuned
+from tuning.logs.problem import problems_in
+from tuning.problems.find import find_problem
+
+LANGUAGES = ("c",)
+
+
+def command(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Tuned file, as `thruster tune` writes it.")],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the files.", rich_help_panel=OUTPUT)],
+    language: Annotated[str, typer.Option(help="Only c.", rich_help_panel=OUTPUT)] = "c",
+    name: Annotated[
+        str | None, typer.Option(help="Of the C type and files; the filter's by default.", rich_help_panel=OUTPUT)
+    ] = None,
+    single: Annotated[
+        bool, typer.Option("--single", help="Floats in place of doubles.", rich_help_panel=OUTPUT)
+    ] = False,
+    problem: CodeOption = None,
+    model: LogModelOption = None,
+    json: JsonOption = None,
+) -> None:
+    """Write a tuned kf, ekf, iekf, ukf or ckf as C99: model, Q and R in it, and a program that filters a log.
+
+    The code has fixed sizes and needs math.h alone. With --single the largest change of an estimate on a training
+    run is printed. docs/howto/export.md says how to use it.
+
+    Example: thruster export out/ekf-mismatch-seed0.json --out boat
+    """
+    one_of("a language", language, LANGUAGES)
+    check_targets((out / "README.md",), json, read=(file,))
+    choice, found, seed = read_tuned(file, [*map(find_problem, problem or []), *problems_in(file, model)])
+    filter_ = choice.filter(found)
+    files = [str(one) for one in write_project(filter_, out, name, single=single)]
+    lines, error = [f"wrote {one}" for one in files], None
+    if single:
+        announce_compilation()
+        data = found.data(found.training_seeds(seed, 2)[:1])
+        error = single_error(filter_, programs_of(filter_), data.inputs[0], data.measurements[0])
+        lines.append(
+            f"Floats move an estimate by at most {error:.1g} of its standard deviation on a training run."
+        )
+    emit(lines, {"files": files, "single_error": error}, json)
