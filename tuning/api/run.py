@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import optuna
 from rich.console import Console
 
 from filters.estimators.find import label_of
@@ -27,6 +25,7 @@ from tuning.problems.problem import Problem
 from tuning.reporting.choice_words import choice_sentences
 from tuning.search.objectives import LIKELIHOOD, SCORE
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
+from tuning.search.quiet import quiet_optuna
 from tuning.search.storage import open_storage
 from tuning.search.study import FINISHED, StudyResult, checked, finished_trials, open_study, run_study, run_trials
 from tuning.search.validation import as_data
@@ -205,14 +204,3 @@ def file_name(name: str) -> str:
     paths = [Path(part.removesuffix(")")) for part in name.split(" (")]
     text = "-".join(path.stem if path.suffix == ".toml" else path.name for path in paths)
     return re.sub(r"[^\w.+-]+", "-", text).strip("-")
-
-
-@contextmanager
-def quiet_optuna() -> Iterator[None]:
-    """Within this context Optuna reports errors only: there is progress of our own."""
-    before = optuna.logging.get_verbosity()
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    try:
-        yield
-    finally:
-        optuna.logging.set_verbosity(before)

@@ -71,10 +71,14 @@ def noise_estimated(name: str, scenario: Problem, seed: int = 0) -> Choice | Non
     found = noise_estimation(scenario, seed)
     if found.process_cov is None or found.measurement_cov is None:
         return None
-    q, r = rows_argument(found.process_cov), as_argument(found.measurement_cov)
-    noise = {"process_noise_cov": q, "measurement_noise_cov": r}
-    rule = rule_of_thumb(name, scenario)
-    return rule._replace(model={**rule.model, **noise})
+    return with_covariances(rule_of_thumb(name, scenario), found.process_cov, found.measurement_cov)
+
+
+def with_covariances(choice: Choice, q: np.ndarray | None, r: np.ndarray | None) -> Choice:
+    """The same choice with another Q (n, n) and R (m, m), each as it was if None."""
+    noise = {} if q is None else {"process_noise_cov": rows_argument(q)}
+    noise |= {} if r is None else {"measurement_noise_cov": as_argument(r)}
+    return choice._replace(model={**choice.model, **noise})
 
 
 def oracle(name: str, scenario: Problem) -> Choice | None:

@@ -28,6 +28,8 @@ class Residuals(NamedTuple):
 
     process: np.ndarray  # (N, n), x_{k+1} - f(x_k, u_k)
     measurement: np.ndarray  # (N', m), z_k - h(x_k), of the times at which all channels were measured
+    process_pairs: tuple[np.ndarray, np.ndarray]  # those of which the next one is there, too, and the next ones
+    measurement_pairs: tuple[np.ndarray, np.ndarray]
 
 
 class Estimated(NamedTuple):
@@ -37,6 +39,8 @@ class Estimated(NamedTuple):
     measurement_cov: np.ndarray | None = None  # (m, m)
     process_mean: np.ndarray | None = None  # (n,): what the model lacks in the mean, which no Q can stand for
     measurement_mean: np.ndarray | None = None  # (m,)
+    process_correlation: np.ndarray | None = None  # (n,), of each w_k with w_{k+1}: noise that is white has none
+    measurement_correlation: np.ndarray | None = None  # (m,)
     reason: str = ""
 
 
@@ -51,13 +55,22 @@ def residuals(model: StateSpaceModel, data: Data) -> Residuals:
     """
     states = np.ascontiguousarray(data.known_states[:, data.late])
     inputs = np.ascontiguousarray(data.inputs[:, data.late], dtype=np.float64)
+    expected, seen = predicted(model, states, inputs)
+    shape, measured = model.shape, data.late_scored(data.measurements)
+    process = difference(states[:, 1:], expected, shape.state_angles)
+    measurement = difference(measured, seen, shape.measurement_angles)
+    there = [np.isfinite(one).all(axis=-1) for one in (process, measurement)]
+    both = [one[:, :-1] & one[:, 1:] for one in there]
+    pairs = [(one[:, :-1][mask], one[:, 1:][mask]) for one, mask in zip((process, measurement), both, strict=True)]
+    return Residuals(process[there[0]], measurement[there[1]], *pairs)
+
+
+def predicted(model: StateSpaceModel, states: np.ndarray, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """F along states (B, T, n) and inputs (B, T - 1, p), (B, T - 1, n), and h, (B, T, m)."""
     expected, seen = np.empty_like(states[:, 1:]), np.empty((*states.shape[:2], model.m))
     steps = _steps(model.functions, model.shape, is_interpreting())
-    steps(states, inputs, model.numbers, expected, seen)
-    shape, measured = model.shape, data.late_scored(data.measurements)
-    process = difference(states[:, 1:], expected, shape.state_angles).reshape(-1, model.n)
-    measurement = difference(measured, seen, shape.measurement_angles).reshape(-1, model.m)
-    return Residuals(*(rows[np.isfinite(rows).all(axis=1)] for rows in (process, measurement)))
+    steps(np.ascontiguousarray(states), inputs, model.numbers, expected, seen)
+    return expected, seen
 
 
 @lru_cache(maxsize=16)
@@ -69,20 +82,34 @@ def noise_estimation(problem: Problem, seed: int = 0) -> Estimated:
     """
     if problem.scale is None:
         return Estimated(reason="there is no truth")
-    model = problem.model(**problem.untuned)
     data = data_of(problem, problem.training_seeds(seed, TRAINING_SEEDS))
+    return estimated_from(problem.model(**problem.untuned), data)
+
+
+def estimated_from(model: StateSpaceModel, data: Data) -> Estimated:
+    """Sample covariances of a model's residuals on some runs, or the reason why there are none."""
+    if data.states is None:
+        return Estimated(reason="there is no truth")
     if data.known_states.shape[-1] != model.n:
         return Estimated(reason=f"of the model's {model.n} states only {data.known_states.shape[-1]} are known")
     found = residuals(model, data)
-    for rows, what in ((found.process, "states"), (found.measurement, "channels")):
+    for rows, what in zip(found[:2], ("states", "channels"), strict=True):
         if len(rows) < FEWEST * rows.shape[1]:
             return Estimated(reason=f"there are too few steps at which all {what} are known")
-    q, r = (np.atleast_2d(np.cov(rows, rowvar=False)) for rows in found)
+    q, r = (np.atleast_2d(np.cov(rows, rowvar=False)) for rows in found[:2])
     if (np.sqrt(np.diag(q)) <= ROUNDING * np.nanmax(np.abs(data.known_states), axis=(0, 1))).all():
         q = np.zeros_like(q)
     if not _is_regular(r):
         return Estimated(reason="the measurements have no noise")
-    return Estimated(q, r, found.process.mean(axis=0), found.measurement.mean(axis=0))
+    means = (rows.mean(axis=0) for rows in found[:2])
+    return Estimated(q, r, *means, *(_correlation(rows) for rows in found[2:]))
+
+
+def _correlation(pairs: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Correlation of each component of residuals (N, n) with that a step later, (n,); 0 where they do not vary."""
+    now, later = (one - one.mean(axis=0) for one in pairs)
+    spread = np.sqrt((now**2).sum(axis=0) * (later**2).sum(axis=0))
+    return np.divide((now * later).sum(axis=0), spread, out=np.zeros(now.shape[1]), where=spread > 0)
 
 
 def _is_regular(cov: np.ndarray) -> bool:

@@ -77,7 +77,30 @@ class Family:
 
         The lead-in of runs, in which the filter settles, is left out; so is what a run was padded with.
         """
-        model, slopes = self.at(point)
+        return self._along(*self.at(point), data, score, information, truth)
+
+    def by_noise(
+        self, choice: Choice, data: Data, *, score: str = LIKELIHOOD, truth: Truth | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Scores of B runs, (B,), and the derivatives of their sum by the matrices Q, (n, n), and R, (m, m).
+
+        d score = tr(G_Q dQ) + tr(G_R dR),   G symmetric
+        """
+        model = self._model(choice)
+        q, r = symmetric_units(model.n), symmetric_units(model.m)
+        still = np.zeros((len(r), model.n, model.n)), np.zeros((len(q), model.m, model.m))
+        moves = {"process_noise_cov": np.concatenate([q, still[0]])}
+        moves["measurement_noise_cov"] = np.concatenate([still[1], r])
+        found, _ = self._along(model, ModelSlopes.of(model, len(q) + len(r), **moves), data, score, False, truth)
+        total = found[:, 1:].sum(axis=0)
+        halves = [np.tensordot(one, unit, 1) for one, unit in ((total[: len(q)], q), (total[len(q) :], r))]
+        by_q, by_r = (0.5 * (one + np.diag(np.diag(one))) for one in halves)
+        return found[:, 0], by_q, by_r
+
+    def _along(
+        self, model: StateSpaceModel, slopes: ModelSlopes, data: Data, score: str, information: bool, truth
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """What `derivatives` returns, of a model with its slopes."""
         wanted = Wanted(information, constants=bool(slopes.constants.any()), tails=False, score=score)
 
         def of(some: Data) -> tuple[np.ndarray, np.ndarray]:
@@ -118,6 +141,15 @@ class Family:
 
     def _model(self, choice: Choice) -> StateSpaceModel:
         return make_filter(choice.name, self._problem.model(**choice.model)).kernel_model
+
+
+def symmetric_units(size: int) -> np.ndarray:
+    """The symmetric matrices with one entry, or two mirrored ones, of 1: (n (n + 1) / 2, n, n)."""
+    pairs = [(i, j) for i in range(size) for j in range(i + 1)]
+    found = np.zeros((len(pairs), size, size))
+    for one, (i, j) in zip(found, pairs, strict=True):
+        one[i, j] = one[j, i] = 1.0
+    return found
 
 
 def known_information(

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from filters.consistency.intervals import pooled_mean
 from filters.differentiated import recursion
-from filters.differentiated.runs import Truth
+from filters.differentiated.runs import ModelSlopes, Truth
 from filters.likelihood import Likelihood
 from numerics.checks import one_of
 from numerics.sources import is_array
+from plants.state_space import StateSpaceModel
 from tuning.evaluation.runs import metrics_of_all
 from tuning.likelihood.family import Family
 from tuning.problems.data import Data
@@ -42,6 +43,7 @@ class Goal:
         data: of each problem.
         parameters: the p parameters.
         objective: "likelihood", "score", "mse" or "log-score".
+        watch: called with this goal, the coordinates and what was found there, after each evaluation.
 
     Raises:
         ValueError: for another objective, one on true states without these, or a parameter that has no gradient.
@@ -54,8 +56,10 @@ class Goal:
         data: Sequence[Data],
         parameters: Sequence[Parameter],
         objective: str = LIKELIHOOD,
+        watch: Callable[[Goal, np.ndarray, Likelihood], None] = lambda goal, point, found: None,
     ):
         """Find the truth that counts."""
+        self._watch = watch
         self.objective = one_of("objective", objective, (LIKELIHOOD, *OF_STATES))
         self._choice, self._problems, self._data = choice, tuple(problems), tuple(data)
         self._families = [Family(choice, problem, parameters) for problem in problems]
@@ -76,16 +80,36 @@ class Goal:
         runs = np.concatenate(found)
         if self.objective == SCORE:
             runs[:, 1:] *= 0.5
-        return Likelihood(runs[:, 0], runs[:, 1:])
+        likelihood = Likelihood(runs[:, 0], runs[:, 1:])
+        self._watch(self, point, likelihood)
+        return likelihood
+
+    def by_noise(self, choice: Choice) -> tuple[float, np.ndarray, np.ndarray]:
+        """The sum over all runs at a choice, and its derivatives by the matrices Q (n, n) and R (m, m).
+
+        They are those of `Family.by_noise`, for every objective but the score, which is no sum over runs.
+        """
+        if self.objective == SCORE:
+            raise ValueError(f"an objective whose slopes by matrices are known must not be {SCORE!r}")
+        score, parts = OF_STATES.get(self.objective, recursion.LIKELIHOOD), []
+        for data, family, truth in zip(self._data, self._families, self._truths, strict=True):
+            values, by_q, by_r = family.by_noise(choice, data, score=score, truth=truth)
+            parts.append([self._weight(data) * one for one in (values.sum(), by_q, by_r)])
+        value, by_q, by_r = (sum(of_all) for of_all in zip(*parts, strict=True))
+        return float(value), by_q, by_r
+
+    def model_at(self, point: np.ndarray) -> tuple[StateSpaceModel, ModelSlopes]:
+        """The model of the first problem at coordinates, and its derivatives by them."""
+        return self._families[0].at(point)
 
     def of_few(self, runs: int) -> Goal:
         """The same of the first runs of each problem."""
         few = [one.slice(0, runs) for one in self._data]
-        return Goal(self._choice, self._problems, few, self.coordinates.free, self.objective)
+        return Goal(self._choice, self._problems, few, self.coordinates.free, self.objective, self._watch)
 
     def of(self, objective: str) -> Goal:
         """Another objective of the same runs."""
-        return Goal(self._choice, self._problems, self._data, self.coordinates.free, objective)
+        return Goal(self._choice, self._problems, self._data, self.coordinates.free, objective, self._watch)
 
     @property
     def is_of_squares(self) -> bool:

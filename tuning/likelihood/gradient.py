@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ from numerics.checks import one_of
 from tuning.likelihood.family import DIFFERENTIABLE
 from tuning.likelihood.goal import Goal
 from tuning.likelihood.identifiability import KNOWN_WITHIN, TWO_SIDED
+from tuning.problems.coordinates import Coordinates
 from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
@@ -195,23 +196,38 @@ def _bad(parameter: Parameter) -> float:
 
 def _minimum(goal: Goal, first: np.ndarray, large: bool, prior: float, centre: np.ndarray):
     """The minimum of minus the sum over all runs and of a prior about a centre, from a start."""
-    from scipy.optimize import minimize
 
     def negative(point: np.ndarray) -> tuple[float, np.ndarray]:
-        away = point - centre
+        away, found = point - centre, goal(point)
+        return 0.5 * prior * (away @ away) - found.values.sum(), prior * away - found.gradients.sum(axis=0)
+
+    options = {"ftol": COARSE, "maxcor": 2 * len(first)} if large else {}
+    return minimum_within(goal.coordinates, negative, first, **options)
+
+
+def minimum_within(
+    coordinates: Coordinates,
+    function: Callable[[np.ndarray], tuple[float, np.ndarray]],
+    first: np.ndarray,
+    **options,
+):
+    """The result of L-BFGS-B on a function of coordinates that returns its value and gradient, within the ranges.
+
+    Where a filter diverges, or a covariance is singular by rounding, the line search takes a shorter step.
+    """
+    from scipy.optimize import minimize
+
+    def finite(point: np.ndarray) -> tuple[float, np.ndarray]:
         try:
-            found = goal(point)
-        except ValueError:  # a covariance is singular by rounding
+            value, gradient = function(point)
+        except ValueError:
             return DIVERGED, np.zeros_like(point)
-        value = 0.5 * prior * (away @ away) - found.values.sum()
-        gradient = prior * away - found.gradients.sum(axis=0)
         if np.isfinite(value) and np.isfinite(gradient).all():
             return value, gradient
-        return DIVERGED, np.zeros_like(gradient)  # the line search takes a shorter step
+        return DIVERGED, np.zeros_like(point)
 
-    bounds = list(zip(goal.coordinates.low, goal.coordinates.high, strict=True))
-    options = {"ftol": COARSE, "maxcor": 2 * len(first)} if large else {"ftol": PRECISE}
-    return minimize(negative, first, jac=True, bounds=bounds, method="L-BFGS-B", options=options)
+    bounds = list(zip(coordinates.low, coordinates.high, strict=True))
+    return minimize(finite, first, jac=True, bounds=bounds, method="L-BFGS-B", options={"ftol": PRECISE} | options)
 
 
 def _standard_errors(goal: Goal, point: np.ndarray, unit: float = 1.0) -> np.ndarray:

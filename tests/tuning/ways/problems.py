@@ -1,0 +1,58 @@
+"""Problems of the ways' tests: runs drawn in NumPy, whose filters are those of textbooks."""
+
+import numpy as np
+
+from filters import affine_model
+from tuning.problems.runs_problem import RunsProblem
+from tuning.ways.task import Task
+
+A = np.array([[1.0, 0.3], [0.0, 0.9]])
+C = np.array([[1.0, 0.0], [0.5, 1.0]])
+Q, R = np.diag([0.05, 0.2]), np.diag([0.4, 0.1])
+P0 = np.diag([1.0, 0.5])
+
+
+def drawn(a, c, q, r, p0, steps, runs, seed, missing=0.0):
+    """Runs of a linear model as mappings of measurements and states."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(runs):
+        x = rng.multivariate_normal(np.zeros(len(a)), p0)
+        states, seen = [], []
+        for _ in range(steps + 1):
+            states.append(x)
+            seen.append(c @ x + rng.multivariate_normal(np.zeros(len(c)), r))
+            x = a @ x + rng.multivariate_normal(np.zeros(len(a)), q)
+        z = np.array(seen)
+        z[rng.random(z.shape) < missing] = np.nan
+        found.append({"measurements": z, "states": np.array(states)})
+    return found
+
+
+def linear(a=A, c=C, q=Q, r=R, p0=P0, steps=60, runs=4, seed=0, missing=0.0, truth=True, **options):
+    """A `RunsProblem` whose training runs are all that are drawn but two, and whose model is the plant's."""
+    some = drawn(a, c, q, r, p0, steps, runs + 2, seed, missing)
+    if not truth:
+        some = [{"measurements": one["measurements"]} for one in some]
+    model = affine_model(
+        a=a,
+        b=np.zeros((len(a), 0)),
+        c=c,
+        process_noise_cov=q,
+        measurement_noise_cov=r,
+        prior_mean=np.zeros(len(a)),
+        prior_cov=p0,
+    )
+    given = {"scale": (1.0,) * len(a)} if truth else {}
+    return RunsProblem(some, model, held_out=[runs, runs + 1], name="a linear model", **(given | options))
+
+
+def task_of(problem, runs=4, filter_name="kf", **options):
+    """A task on the first runs of a problem."""
+    return Task(filter_name, problem, problem.data(range(runs)), **options)
+
+
+def at(task, q, r):
+    """The start of a task with other diagonals of Q and R."""
+    numbers = {"process_noise_cov": tuple(q), "measurement_noise_cov": tuple(r) if len(r) > 1 else float(r[0])}
+    return task.start._replace(model={**task.start.model, **numbers})

@@ -1,0 +1,199 @@
+"""Ways whose answers are known: closed forms, published figures, integrals on a grid."""
+
+import numpy as np
+import pytest
+
+from filters import affine_model
+from plants.simulate import simulate
+from tests.tuning.ways.problems import Q, linear, task_of
+from tuning.evaluation.residuals import estimated_from
+from tuning.problems.model_problem import ModelProblem
+from tuning.problems.parameter import Parameter
+from tuning.problems.runs_problem import RunsProblem
+from tuning.search.objectives import LIKELIHOOD
+from tuning.ways.als import autocovariances, lagged, stationary, steady_gain
+from tuning.ways.registry import find_way
+from tuning.ways.task import Budget, Task
+
+# Flow of the Nile at Aswan, 1871 to 1970 [1e8 m^3]: Durbin, Koopman (2012), "Time series analysis by state space
+# methods", 2nd ed., where Q is 1469.1 and R 15099 (section 2.10).
+NILE = """
+1120 1160 963 1210 1160 1160 813 1230 1370 1140 995 935 1110 994 1020 960 1180 799 958 1140 1100 1210 1150
+1250 1260 1220 1030 1100 774 840 874 694 940 833 701 916 692 1020 1050 969 831 726 456 824 702 1120 1100 832
+764 821 768 845 864 862 698 845 744 796 1040 759 781 865 845 944 984 897 822 1010 771 676 649 846 812 742 801
+1040 860 874 848 890 744 749 838 1050 918 986 797 923 975 815 1020 906 901 1170 912 746 919 718 714 740
+"""
+
+
+def level(q=1000.0, r=10000.0, start=0.0, wide=1e7):
+    """A level that wanders, seen with noise."""
+    one = np.eye(1)
+    noise = {"process_noise_cov": [q], "measurement_noise_cov": r}
+    return affine_model(a=one, b=np.zeros((1, 0)), c=one, prior_mean=[start], prior_cov=[wide], **noise)
+
+
+def nile():
+    flow = np.array(NILE.split(), dtype=float)
+    runs = [
+        {"measurements": one} for one in (flow, flow, flow[::-1] + 1.0, flow[::-1] + 1.0)
+    ]  # the last are held out
+    return RunsProblem(runs, level(), held_out=[2, 3], name="the Nile")
+
+
+@pytest.mark.parametrize("way", ["likelihood", "em", "squarem"])
+def test_the_nile_has_the_variances_that_durbin_and_koopman_print(way):
+    task = task_of(nile(), 1)
+    find_way(way).run(way, task)
+    found = task.best.model
+    assert found["process_noise_cov"][0] == pytest.approx(1469.1, rel=2e-3)
+    assert found["measurement_noise_cov"] == pytest.approx(15099, rel=2e-3)
+
+
+def test_noise_estimation_is_the_covariance_of_what_the_equations_leave():
+    problem = linear(runs=8, steps=200)
+    task = task_of(problem, 8)
+    find_way("noise-estimation").run("noise-estimation", task)
+    data, model = task.data[0], problem.model()
+    a, _, _, c, _ = model.matrices()
+    w = (data.states[:, 1:] - data.states[:, :-1] @ a.T).reshape(-1, 2)
+    v = (data.measurements - data.states @ c.T).reshape(-1, 2)
+    np.testing.assert_allclose(task.best.model["process_noise_cov"], np.cov(w.T), rtol=1e-10)
+    np.testing.assert_allclose(task.best.model["measurement_noise_cov"], np.cov(v.T), rtol=1e-10)
+    assert np.diag(task.best.model["process_noise_cov"]) == pytest.approx(np.diag(Q), rel=0.15)
+    assert task.runs == 8
+
+
+def test_means_and_correlation_over_time_tell_a_wrong_model():
+    right = estimated_from(linear(steps=400).model(), task_of(linear(steps=400)).data[0])
+    assert abs(right.process_correlation).max() < 0.1 and abs(right.process_mean).max() < 0.05
+    wrong = linear(a=np.array([[1.0, 0.1], [0.0, 0.6]]), steps=400).model()
+    found = estimated_from(wrong, task_of(linear(steps=400)).data[0])
+    assert found.process_correlation.max() > 0.3
+
+
+def test_map_of_noise_of_a_known_state_is_the_mode_of_an_inverse_wishart_distribution():
+    still = {"prior_mean": [0.0], "prior_cov": [1e-14], "process_noise_cov": [1e-14]}
+    one = np.eye(1)
+    model = affine_model(a=one, b=np.zeros((1, 0)), c=one, measurement_noise_cov=2.0, **still)
+    z = 1.3 * np.random.default_rng(0).standard_normal((4, 12))
+    problem = RunsProblem([{"measurements": run} for run in z], model, held_out=[2, 3], name="noise")
+    task = Task("kf", problem, problem.data([0]))
+    find_way("map").run("map", task)
+    scale = task.start.model["measurement_noise_cov"]  # nu = 3: density r^(-5/2) exp(-scale / 2 r)
+    expected = (scale + (z[0] ** 2).sum()) / (z[0].size + 5)
+    assert task.best.model["measurement_noise_cov"] == pytest.approx(expected, rel=1e-5)
+
+
+def test_map_of_a_full_q_that_is_seen_is_the_mode_of_an_inverse_wishart_distribution():
+    a, c, r = np.array([[0.9, 0.2], [0.0, 0.8]]), np.eye(2), 1e-10 * np.eye(2)
+    q = np.array([[0.5, 0.2], [0.2, 0.3]])
+    problem = linear(a=a, c=c, q=q, r=r, p0=np.eye(2), steps=20)
+    task = task_of(problem, options={"full_q": True, "hold_r": True})
+    find_way("map").run("map", task)
+    z = task.data[0].measurements
+    w = (z[:, 1:] - z[:, :-1] @ a.T).reshape(-1, 2)
+    centre = task.model(task.start).process_noise_cov
+    expected = (centre + w.T @ w) / (len(w) + 4 + 2 + 1)  # nu = n + 2
+    np.testing.assert_allclose(task.best.model["process_noise_cov"], expected, rtol=1e-4)
+
+
+def test_the_posterior_mean_is_that_of_an_integral_on_a_grid():
+    still = {"prior_mean": [0.0], "prior_cov": [1e-14], "process_noise_cov": [0.0]}
+    one = np.eye(1)
+    model = affine_model(a=one, b=np.zeros((1, 0)), c=one, measurement_noise_cov=2.0, **still)
+    z = 1.3 * np.random.default_rng(1).standard_normal((4, 8))
+    problem = RunsProblem([{"measurements": run} for run in z], model, held_out=[2, 3], name="noise")
+    task = Task("kf", problem, problem.data([0]), start=None)
+    assert [parameter.name for parameter in task.free] == ["R"]
+    find_way("posterior").run("posterior", task)
+    grid = np.linspace(-8.0, 8.0, 4001)
+    log = -0.5 * (z[0].size * grid + (z[0] ** 2).sum() * np.exp(-grid))
+    log -= 0.5 * ((grid - np.log(2.0)) / np.log(10.0)) ** 2
+    weights = np.exp(log - log.max())
+    mean, second = ((weights * power).sum() / weights.sum() for power in (grid, grid**2))
+    error = 4 * np.sqrt((second - mean**2) / 300)  # of 2000 draws that go together over some steps
+    assert np.log(task.best.model["measurement_noise_cov"]) == pytest.approx(mean, abs=error)
+
+
+MOTIVATING = {  # of the ALS toolbox: Odelson, Rajamani, Rawlings
+    "a": np.array([[0.1, 0.0, 0.1], [0.0, 0.2, 0.0], [0.0, 0.0, 0.3]]),
+    "g": np.array([1.0, 2.0, 3.0]),
+    "c": np.array([[0.1, 0.2, 0.0]]),
+}
+
+
+def motivating(q=0.2, r=0.4):
+    """The example's model, at the Q and R of its first gain."""
+    g = MOTIVATING["g"]
+    return affine_model(
+        a=MOTIVATING["a"],
+        b=np.zeros((3, 0)),
+        c=MOTIVATING["c"],
+        process_noise_cov=q * np.outer(g, g),
+        measurement_noise_cov=r,
+        prior_mean=[10.0] * 3,
+        prior_cov=[1e-12] * 3,
+    )
+
+
+def test_als_has_the_scatter_of_the_toolboxs_example():
+    free = [Parameter("q", 1e-6, 1e3, default=0.2), Parameter("r", 1e-6, 1e3, default=0.4)]
+    truth = motivating(0.5, 0.1)
+    problem = ModelProblem(truth, motivating, steps=1000, parameters=free, scale=(1.0,) * 3, name="motivating")
+    found = []
+    for repetition in range(60):
+        task = Task("kf", problem, problem.data([repetition]))
+        find_way("als").run("als", task)
+        found.append([task.kept[1].choice.model[name] for name in ("q", "r")])  # with the gain of the example
+    means, deviations = np.mean(found, axis=0), np.std(found, axis=0)
+    errors = np.array([0.135, 0.033]) / np.sqrt(60)
+    assert (abs(means - [0.495, 0.100]) < 4 * errors).all(), (means, deviations)
+    np.testing.assert_allclose(deviations, [0.135, 0.033], rtol=0.4)
+
+
+def test_lagged_covariances_are_those_of_many_innovations():
+    model = motivating(0.5, 0.1)
+    linear_model = stationary(model, "motivating")
+    gain = steady_gain(linear_model, 0.2 * np.outer(MOTIVATING["g"], MOTIVATING["g"]), np.array([[0.4]]))
+    keys = np.array([[one, 7] for one in range(200)], dtype=np.uint32)
+    z = simulate(model, keys, np.zeros((200, 1000, 0))).measurements
+    mean, innovations = np.zeros((200, 3)) + 10.0, []
+    for k in range(1000):
+        e = z[:, k] - mean @ linear_model.c.T
+        innovations.append(e)
+        mean = (mean + e @ gain.T) @ linear_model.a.T
+    runs = list(np.array(innovations).transpose(1, 0, 2)[:, 100:])
+    expected = lagged(linear_model, gain, model.process_noise_cov, model.measurement_noise_cov, 5)
+    np.testing.assert_allclose(autocovariances([runs], 5), expected, atol=4e-3 * expected[0] + 2e-3)
+
+
+def test_als_refuses_what_it_cannot_do():
+    from tuning.thruster.find import find_scenario
+
+    problem = find_scenario("nominal")
+    task = Task("ekf", problem, problem.data(range(2)))
+    with pytest.raises(ValueError, match="way 'als' needs a linear model"):
+        find_way("als").run("als", task)
+    task = task_of(linear(), options={"full_q": True})
+    with pytest.raises(ValueError, match="way 'als' must come without full_q"):
+        find_way("als").run("als", task)
+
+
+def test_what_ways_need_is_said_in_a_line():
+    blind = task_of(linear(truth=False))
+    assert blind.objective == LIKELIHOOD
+    with pytest.raises(ValueError, match="way 'mse' needs true states, but a linear model has none"):
+        find_way("mse").run("mse", blind)
+    with pytest.raises(ValueError, match="way must be one of .*, but got 'magic'"):
+        find_way("magic")
+    ensemble = task_of(linear(), filter_name="enkf")
+    with pytest.raises(ValueError, match="a filter for way 'em' must be one of kf"):
+        find_way("em").run("em", ensemble)
+
+
+def test_runs_are_counted_and_end_a_way():
+    task = task_of(linear(), budget=Budget(runs=40))
+    find_way("random").run("random", task)
+    assert task.runs == 44 and task.kept[-1].runs <= 40  # the evaluation that went beyond is not taken
+    assert task.best_within(runs=0) == task.start
+    assert [one.runs for one in task.kept] == sorted(one.runs for one in task.kept)

@@ -1,0 +1,182 @@
+"""Ways that search: their steps against naive ones, and where they end against where gradients end."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tests.tuning.ways.problems import P0, A, C, Q, R, at, linear, task_of
+from tuning.evaluation.evaluate import values_of
+from tuning.likelihood.gradient import tune_by_gradient
+from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
+from tuning.thruster.find import find_scenario
+from tuning.ways.descents import BACKWARD, FORWARD
+from tuning.ways.masked import _squares
+from tuning.ways.okf import Factors
+from tuning.ways.registry import WAYS, find_way
+from tuning.ways.task import Budget, Task
+
+FULL = {"full_q": True, "full_r": True}
+
+
+@pytest.mark.parametrize("objective", [LIKELIHOOD, MSE, LOG_SCORE])
+def test_slopes_by_matrices_are_differences(objective):
+    task = task_of(linear(missing=0.1))
+    goal = task.goal(objective, keeps=False)
+    q, r = np.array([[0.3, 0.1], [0.1, 0.2]]), np.array([[0.4, -0.1], [-0.1, 0.3]])
+
+    def choice(q, r):
+        noise = {"process_noise_cov": tuple(map(tuple, q)), "measurement_noise_cov": tuple(map(tuple, r))}
+        return task.start._replace(model={**task.start.model, **noise})
+
+    _, by_q, by_r = goal.by_noise(choice(q, r))
+    for by, which in ((by_q, 0), (by_r, 1)):
+        for i, j in ((0, 0), (1, 0), (1, 1)):
+            step = np.zeros((2, 2))
+            step[i, j] = step[j, i] = 1e-5
+            sides = [(q + sign * step, r) if which == 0 else (q, r + sign * step) for sign in (1, -1)]
+            above, below = (goal.by_noise(choice(*one))[0] for one in sides)
+            expected = (above - below) / 2e-5
+            assert np.trace(by @ step) / 1e-5 == pytest.approx(expected, rel=1e-6, abs=1e-6 * abs(by).max())
+
+
+def test_slopes_by_matrices_of_diagonals_are_those_of_coordinates():
+    task = task_of(linear())
+    goal = task.goal(LIKELIHOOD, keeps=False)
+    point = goal.coordinates.of(goal.untuned)
+    _, by_q, by_r = goal.by_noise(goal.choice_at(point))
+    slopes = np.concatenate([np.diag(by_q), np.diag(by_r)]) * goal.untuned
+    np.testing.assert_allclose(goal(point).gradients.sum(axis=0), slopes, rtol=1e-9)
+    with pytest.raises(ValueError, match="must not be 'score'"):
+        goal.of(SCORE).by_noise(task.start)
+
+
+def test_a_way_by_gradients_ends_where_the_gradient_method_ends():
+    problem = find_scenario("mismatch")
+    data = problem.data(range(8))
+    for objective in (LIKELIHOOD, LOG_SCORE):
+        task = Task("ekf", problem, data)
+        find_way(objective).run(objective, task)
+        expected = tune_by_gradient("ekf", problem, data, objective=objective)
+        found, other = (task.value(one, objective) for one in (task.best, expected.choice))
+        assert found == pytest.approx(other, rel=1e-8)
+
+
+def test_slopes_of_cholesky_factors_are_differences():
+    rng = np.random.default_rng(0)
+    q, r = (one @ one.T + np.eye(len(one)) for one in (rng.standard_normal((3, 3)), rng.standard_normal((2, 2))))
+    factors = Factors(q, r)
+    weights = [one + one.T for one in (rng.standard_normal((3, 3)), rng.standard_normal((2, 2)))]
+
+    def value(point):
+        return sum((weight * cov).sum() for weight, cov in zip(weights, factors.matrices(point), strict=True))
+
+    slopes = factors.slopes(factors.first, *weights)
+    steps = 1e-6 * np.eye(len(factors.first))
+    expected = [(value(factors.first + one) - value(factors.first - one)) / 2e-6 for one in steps]
+    np.testing.assert_allclose(slopes, expected, rtol=1e-6)
+    np.testing.assert_allclose(factors.matrices(factors.first)[0], q + 1e-6 * np.eye(3), rtol=1e-12)
+
+
+def test_okf_goes_below_noise_estimation_where_the_model_is_wrong_and_not_below_the_gradient_of_the_same_error():
+    problem = find_scenario("mismatch")
+    values = {}
+    for name in ("noise-estimation", "okf", MSE):
+        task = Task("ekf", problem, problem.data(range(20)), options=FULL)
+        find_way(name).run(name, task)
+        values[name] = task.value(task.best, MSE)
+    assert values[MSE] <= values["okf"] * 1.0001
+    assert values["okf"] < values["noise-estimation"]
+
+
+def test_coordinate_steps_go_up_by_a_tenth_or_down_by_half_and_nowhere_else():
+    task = task_of(linear(runs=8))
+    find_way("coordinate-steps").run("coordinate-steps", task)
+    first = np.log([*task.start.model["process_noise_cov"], *task.start.model["measurement_noise_cov"]])
+    values = []
+    for kept in task.kept:
+        model = kept.choice.model
+        moved = np.log([*model["process_noise_cov"], *model["measurement_noise_cov"]]) - first
+        for one in moved:  # a sum of whole numbers of both steps
+            ups = (one - BACKWARD * np.arange(21)) / FORWARD
+            assert abs(ups - ups.round()).min() < 1e-9
+        values.append(task.value(kept.choice))
+    assert values == sorted(values, reverse=True) and len(values) > 3
+    assert task.runs <= 8 * (2 * 4 * 20 + 1 + len(values))
+
+
+WITHIN = {"nelder-mead": 1.002, "tpe": 1.08, "cma-es": 1.03, "random": 1.2}
+
+
+@pytest.mark.parametrize(("name", "within"), WITHIN.items())
+def test_searches_come_near_the_least_score(name, within):
+    problem = linear(runs=8)
+    best = task_of(problem, 8)
+    find_way(SCORE).run(SCORE, best)
+    task = task_of(problem, 8, budget=Budget(runs=1600))
+    find_way(name).run(name, task)
+    ratio = _score(task.best, problem) / _score(best.best, problem)
+    assert 0.9999 < ratio < within
+
+
+def _score(choice, problem):
+    return values_of(choice.filter(problem), problem.data(range(8)), problem.scale).score.value
+
+
+def test_the_error_of_masked_measurements_is_that_of_a_naive_filter_which_does_not_see_them():
+    problem = linear(steps=20)
+    task = task_of(problem)
+    hidden = np.random.default_rng(3).random((4, 21)) < 0.5
+    total, count = np.zeros(2), 0
+    for z, gone in zip(task.data[0].measurements, hidden, strict=True):
+        mean, cov = np.zeros(2), P0
+        for k in range(21):
+            if k:
+                mean, cov = A @ mean, A @ cov @ A.T + Q
+            if gone[k]:
+                total, count = total + (z[k] - C @ mean) ** 2, count + 1
+            else:
+                gain = cov @ C.T @ np.linalg.inv(C @ cov @ C.T + R)
+                mean, cov = mean + gain @ (z[k] - C @ mean), cov - gain @ C @ cov
+    right = at(task, np.diag(Q), np.diag(R))
+    np.testing.assert_allclose(_squares(task, right, 0, hidden), total / count, rtol=1e-9)
+
+
+def test_masked_measurements_find_the_ratio_of_q_and_r():
+    problem = linear(a=np.eye(1), c=np.eye(1), q=[[1.0]], r=[[4.0]], p0=np.eye(1), steps=400, runs=8)
+    task = task_of(problem, 8)
+    find_way("masked").run("masked", task)
+    model = task.best.model
+    assert model["process_noise_cov"][0] / model["measurement_noise_cov"] == pytest.approx(0.25, rel=0.3)
+
+
+@pytest.mark.parametrize(("name", "within"), [("vb", 0.1), ("sage-husa", 0.3)])  # the latter moves Q, too
+def test_adaptive_filters_converge_to_the_r_of_a_level(name, within):
+    problem = linear(a=np.eye(1), c=np.eye(1), q=[[1.0]], r=[[4.0]], p0=np.eye(1), steps=600, runs=8)
+    task = task_of(problem, 8)
+    task.start = at(task, [1.0], [1.0])
+    find_way(name).run(name, task)
+    assert task.best.model["measurement_noise_cov"] == pytest.approx(4.0, rel=within)
+    assert task.runs == 8
+
+
+def test_innovations_of_ensembles_tell_r_and_a_factor_on_q():
+    problem = find_scenario("nominal")
+    task = Task("enkf", problem, problem.data(range(16)), start=None)
+    true = problem.true
+    task.start = task.start._replace(
+        model={
+            "process_noise_cov": tuple(4.0 * q for q in true["process_noise_cov"]),
+            "measurement_noise_cov": 0.5,
+        }
+    )
+    find_way("desroziers").run("desroziers", task)
+    found = task.best.model
+    assert found["measurement_noise_cov"] == pytest.approx(true["measurement_noise_cov"], rel=0.1)
+    ratios = np.divide(found["process_noise_cov"], true["process_noise_cov"])
+    assert ratios == pytest.approx(np.full(2, ratios[0])) and abs(math.log(ratios[0])) < math.log(1.6)
+
+
+def test_every_way_says_what_it_is_and_whose():
+    for name, way in WAYS.items():
+        assert way.about and way.when and way.source and name == name.lower()

@@ -1,0 +1,142 @@
+"""Autocovariance least squares: Q and R from how the innovations of a fixed gain go together over time."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from plants.affine import linearize
+from tuning.likelihood.family import Family
+from tuning.problems.data import Data
+from tuning.ways.task import Task
+
+LAGS = 15
+DROPPED = 100  # rows at the beginning, at most a fifth of a run
+ITERATIONS = 3  # the gain of each is that of the Q and R found before
+ALIKE = 1e-9  # relative difference, up to which two linearisations are the same
+LINEAR = 1e-6  # part of Q or R that numbers may not stand for: slopes of a model's own numbers are differences
+
+
+class Stationary(NamedTuple):
+    """A linear model x' = A x + B u + a, z = C x + d."""
+
+    a: np.ndarray
+    b: np.ndarray
+    offset: np.ndarray
+    c: np.ndarray
+    zero: np.ndarray
+
+
+def als(task: Task) -> None:
+    """Least squares of lagged covariances of innovations, with variances not below zero; three times over.
+
+        e_k = z_k - C x^_k,   x^' = A (x^ + L e),   C_j = E[e_{k+j} e_k'],   Ab = A - A L C
+        b = (C x O)(I - Ab x Ab)^-1 [vec Q + (A L x A L) vec R] + (I x Gam) vec R,   b = vec(C_0; C_1; ...)
+        O = (C; C Ab; ...),   Gam = (I; -C A L; -C Ab A L; ...),   x the product of Kronecker
+
+    Q and R have to be linear in the numbers that are tuned. The first gain is that of the start. It needs one pass
+    of a filter an iteration. With more unknowns in Q than n m the answer is not unique.
+
+    Source: Odelson, Rajamani, Rawlings (2006), "A new autocovariance least-squares method for estimating noise
+    covariances", Automatica 42(2); Rajamani, Rawlings (2009), Automatica 45(1).
+    """
+    from scipy.optimize import nnls
+
+    family = Family(task.start, task.problems[0], task.free)
+    coordinates = family.coordinates
+    if not coordinates.log.all():
+        raise ValueError("way 'als' needs Q and R linear in positive numbers, but a number is on a linear scale")
+    model = task.model(task.start)
+    linear = stationary(model, task.problems[0].name)
+    point = np.clip(coordinates.of(task.values_of(task.start, task.free)), coordinates.low, coordinates.high)
+    for _ in range(ITERATIONS):
+        model, slopes = family.at(point)
+        each = np.exp(point)
+        q_units = slopes.process_noise_cov / each[:, None, None]
+        r_units = slopes.measurement_noise_cov / each[:, None, None]
+        of_model = model.process_noise_cov, model.measurement_noise_cov
+        rest = [of - np.tensordot(each, units, 1) for of, units in zip(of_model, (q_units, r_units), strict=True)]
+        if any(abs(one).max() > LINEAR * abs(of).max() for one, of in zip(rest, of_model, strict=True)):
+            if not task.options.get("hold_r"):
+                raise ValueError("way 'als' needs Q and R linear in the numbers that are tuned, but they are not")
+        gain = steady_gain(linear, *of_model)
+        lags = min(LAGS, *(max(2, int(one.rows.min()) // 4) for one in task.data))
+        design = np.column_stack([lagged(linear, gain, q, r, lags) for q, r in zip(q_units, r_units, strict=True)])
+        known = lagged(linear, gain, rest[0], rest[1], lags)
+        seen = autocovariances([_innovations(linear, gain, one, model.prior_mean) for one in task.data], lags)
+        task.charge(task.passes)
+        scale = np.maximum(abs(design).max(axis=0), 1e-300)
+        found, _ = nnls(design / scale, seen - known)
+        point = np.clip(
+            coordinates.of(np.maximum(found / scale, np.exp(coordinates.low))), coordinates.low, coordinates.high
+        )
+        task.keep(family.choice_at(point))
+
+
+def stationary(model, name: str) -> Stationary:
+    """The matrices of a linear model; ValueError for another one."""
+    about = np.zeros(model.n), np.zeros(model.inputs)
+    away = np.ones(model.n) * model.scales, np.ones(model.inputs)
+    found, other = (linearize(model, *one).matrices() for one in (about, away))
+    pairs = zip(found, other, strict=True)
+    if not all(
+        np.allclose(one, two, rtol=ALIKE, atol=ALIKE * max(abs(one).max(initial=0), 1.0)) for one, two in pairs
+    ):
+        raise ValueError(
+            f"way 'als' needs a linear model, such as that of the filter kf, but {name} has another one"
+        )
+    return Stationary(*found)
+
+
+def steady_gain(linear: Stationary, q: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """The gain L (n, m) of the stationary Kalman filter."""
+    from scipy.linalg import solve_discrete_are
+
+    try:
+        p = solve_discrete_are(linear.a.T, linear.c.T, q, r)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(f"way 'als' needs a model with a stationary filter, but {error}") from None
+    s = linear.c @ p @ linear.c.T + r
+    return np.linalg.solve(s, linear.c @ p).T
+
+
+def lagged(linear: Stationary, gain: np.ndarray, q: np.ndarray, r: np.ndarray, lags: int) -> np.ndarray:
+    """vec(C_0; C_1; ...; C_{N-1}) of a gain's innovations, under a Q and R, (lags m m,)."""
+    from scipy.linalg import solve_discrete_lyapunov
+
+    a, c = linear.a, linear.c
+    through = a @ gain
+    closed = a - through @ c
+    p = solve_discrete_lyapunov(closed, q + through @ r @ through.T)
+    blocks, power = [c @ p @ c.T + r], np.eye(len(a))
+    for _ in range(1, lags):
+        blocks.append(c @ (closed @ power @ p @ c.T - power @ through @ r))
+        power = closed @ power
+    return np.concatenate([one.ravel() for one in blocks])
+
+
+def _innovations(linear: Stationary, gain: np.ndarray, data: Data, prior_mean: np.ndarray) -> list[np.ndarray]:
+    """The innovations of each run, (rows, m), without those of the beginning."""
+    seen, measurements = data.seen, data.measurements
+    times = measurements.shape[1]
+    means, found = np.tile(prior_mean, (len(measurements), 1)), np.empty(measurements.shape)
+    for k in range(times):
+        found[:, k] = measurements[:, k] - means @ linear.c.T - linear.zero
+        if k < times - 1:
+            after = means + np.nan_to_num(found[:, k]) @ gain.T
+            means = after @ linear.a.T + seen.inputs[:, k] @ linear.b.T + linear.offset
+    return [run[min(DROPPED, rows // 5) : rows] for run, rows in zip(found, data.rows.tolist(), strict=True)]
+
+
+def autocovariances(parts: list[list[np.ndarray]], lags: int) -> np.ndarray:
+    """Means of e_{k+j} e_k' over all times at which both were measured, stacked as `lagged` does."""
+    runs = [run for part in parts for run in part]
+    found = []
+    for j in range(lags):
+        pairs = [(run[j:], run[: len(run) - j]) for run in runs if len(run) > j]
+        ahead, behind = (np.concatenate(side) for side in zip(*pairs, strict=True))
+        there = np.isfinite(ahead)[:, :, None] & np.isfinite(behind)[:, None, :]
+        products = np.nan_to_num(ahead)[:, :, None] * np.nan_to_num(behind)[:, None, :]
+        found.append((products.sum(axis=0) / np.maximum(there.sum(axis=0), 1)).ravel())
+    return np.concatenate(found)

@@ -1,0 +1,251 @@
+"""`Task`: what a way of tuning works on: it runs the filter, counts what that takes, and keeps the best so far."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from filters.likelihood import Likelihood
+from filters.registry import filter_class
+from plants.state_space import StateSpaceModel
+from tuning.evaluation.baselines import same_filter
+from tuning.evaluation.evaluate import compute_metrics
+from tuning.evaluation.runs import metrics_of_all
+from tuning.likelihood.goal import Goal
+from tuning.problems.data import Data
+from tuning.problems.parameter import Parameter
+from tuning.problems.problem import Problem
+from tuning.search.objectives import LIKELIHOOD, LOG_SCORES, NEES, SCORE, VARIANCES, find_objective, penalised
+from tuning.search.parameters import first_range, model_parameters
+from tuning.search.space import Choice, neutral, parameters, untuned_choice
+
+FEW = 32  # runs, by which passes are priced
+TIMED = 3  # calls, of which the shortest counts, of what is priced
+SMOOTHER = 2.0  # passes that a smoother counts
+
+
+class Budget(NamedTuple):
+    """What a way may take."""
+
+    runs: float = math.inf  # passes of the filter over one run each
+    seconds: float = math.inf  # of processor time, without compilation
+
+
+class Kept(NamedTuple):
+    """A choice that was the best so far from a time on."""
+
+    runs: float
+    seconds: float
+    choice: Choice
+
+
+class Spent(Exception):
+    """The budget is spent: the way ends here."""
+
+
+class Task:
+    """A filter to be tuned on the runs of some problems, within a budget.
+
+    Every pass of the filter over a run counts 1, a smoother's 2, and a pass with gradients as much as it was
+    measured to take. Compilation takes no time. A way calls `keep` for each choice that it would now give; what it
+    would give for less than the whole budget is `best`.
+
+    Args:
+        filter_name: name of a filter.
+        problems: make the models that it assumes.
+        data: the training runs of each problem.
+        options: hold_r, full_q, full_r and prior of `model_parameters`.
+        objective: what ways that search minimise; the score, or without truth the likelihood, if None.
+        budget: what the way may take.
+        start: where it begins; the rule of thumb if None.
+        seed: of a way's own random numbers.
+    """
+
+    def __init__(
+        self,
+        filter_name: str,
+        problems: Problem | Sequence[Problem],
+        data: Data | Sequence[Data],
+        *,
+        options: Mapping[str, bool] | None = None,
+        objective: str | None = None,
+        budget: Budget = Budget(),  # noqa: B008 - a value that nothing changes
+        start: Choice | None = None,
+        seed: int = 0,
+    ):
+        """Begin with the start."""
+        self.filter = filter_name
+        self.problems = (problems,) if isinstance(problems, Problem) else tuple(problems)
+        self.data = (data,) if isinstance(data, Data) else tuple(data)
+        self.options = dict(options or {})
+        self.objective = objective or (SCORE if self.has_truth else LIKELIHOOD)
+        self.budget, self.seed = budget, seed
+        self.start = untuned_choice(filter_name, self.problems[0]) if start is None else start
+        self.runs, self._excluded, self._prices = 0.0, 0.0, {}
+        self.kept = [Kept(0.0, 0.0, self.start)]
+        self._seen: set[tuple] = set()
+        self._begun = time.process_time()
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether the true states are known, on all problems."""
+        pairs = zip(self.problems, self.data, strict=True)
+        return all(problem.scale is not None and data.states is not None for problem, data in pairs)
+
+    @property
+    def passes(self) -> int:
+        """Runs of all problems: what one evaluation takes."""
+        return sum(len(one.seeds) for one in self.data)
+
+    @property
+    def seconds(self) -> float:
+        """Processor time so far, without compilation [s]."""
+        return time.process_time() - self._begun - self._excluded
+
+    @property
+    def best(self) -> Choice:
+        """The last choice that was kept."""
+        return self.kept[-1].choice
+
+    def best_within(self, runs: float = math.inf, seconds: float = math.inf) -> Choice:
+        """The choice that the way would have given for a smaller budget."""
+        return [one for one in self.kept if one.runs <= runs and one.seconds <= seconds][-1].choice
+
+    @cached_property
+    def generator(self) -> np.random.Generator:
+        """A way's own random numbers."""
+        return np.random.default_rng([self.seed, len(self.data[0].seeds)])
+
+    @cached_property
+    def free(self) -> list[Parameter]:
+        """The numbers of the model that are tuned, in the part of their ranges in which a search begins."""
+        return model_parameters(self.problems[0], **self.options)
+
+    @cached_property
+    def searched(self) -> list[Parameter]:
+        """What a search without gradients tunes: the same and the filter's own numbers, but no ensemble size."""
+        if not filter_class(self.filter).has_covariance:
+            return [one for one in parameters(self.filter, self.problems[0]) if not one.integer]
+        found = parameters(self.filter, self.problems[0], **self.options)
+        return [within_first_range(one) for one in found if not one.integer]
+
+    def values_of(self, choice: Choice, parameters: Sequence[Parameter]) -> list[float]:
+        """The values of parameters in a choice."""
+        pairs = ((one, one.get(choice)) for one in parameters)
+        return [neutral(one.name) if value is None else value for one, value in pairs]  # type: ignore[misc]
+
+    def with_values(self, values: Sequence[float] | np.ndarray, parameters: Sequence[Parameter]) -> Choice:
+        """The start with other values of some parameters."""
+        found = self.start
+        for one, value in zip(parameters, values, strict=True):
+            found = one.set(found, float(value))
+        return found
+
+    def keep(self, choice: Choice) -> None:
+        """From now on this is what the way would give; Spent once the budget is over."""
+        self.check()
+        if not same_filter(choice, self.best):
+            self.kept.append(Kept(self.runs, self.seconds, choice))
+
+    def charge(self, runs: float) -> None:
+        """Count passes of the filter; Spent once the budget is over."""
+        self.runs += runs
+        self.check()
+
+    def check(self) -> None:
+        """Raise Spent once the budget is over."""
+        if self.runs > self.budget.runs or self.seconds > self.budget.seconds:
+            raise Spent
+
+    @contextmanager
+    def uncounted(self) -> Iterator[None]:
+        """Within this context no time passes: it is that of compilation, or of measuring prices."""
+        begin, before = time.process_time(), self._excluded
+        try:
+            yield
+        finally:
+            self._excluded = before + time.process_time() - begin  # what was within this is part of it
+
+    def value(self, choice: Choice, objective: str | None = None) -> float:
+        """An objective of a choice on all training runs, the mean over problems, as a study has it."""
+        name = self.objective if objective is None else objective
+        if ("value", name) not in self._seen:
+            self._seen.add(("value", name))
+            with self.uncounted():
+                self._value(self.start, name, [one.slice(0, 1) for one in self.data])
+        found = self._value(choice, name, self.data)
+        self.charge(self.passes)
+        return found
+
+    def _value(self, choice: Choice, name: str, data: Sequence[Data]) -> float:
+        objective, found = find_objective(name), []
+        for problem, one in zip(self.problems, data, strict=True):
+            filter_, needs = choice.filter(problem), objective.needs
+            scale = problem.scale if LOG_SCORES in needs else None
+            runs = metrics_of_all(filter_, one, NEES in needs, bool(objective.output), scale)
+            evaluation = compute_metrics(filter_, runs, one, problem.scale, False, VARIANCES in needs)
+            found.append(penalised(objective.value(evaluation, math.nan), evaluation))
+        return float(np.mean(found))
+
+    def goal(self, objective: str, keeps: bool = True) -> Goal:
+        """What gradients of an objective lead to: each evaluation counts; by default the best point is kept."""
+        best: dict[tuple, float] = {}
+        last = objective, self.passes
+
+        def watch(goal: Goal, point: np.ndarray, found: Likelihood) -> None:
+            self.charge(prices[goal.objective] * len(found.values))
+            if not keeps:
+                return
+            value, key = float(found.values.sum()), (goal.objective, len(found.values))
+            if np.isfinite(value) and value > best.get(key, -math.inf) and (key == last or last not in best):
+                best[key] = value
+                self.keep(goal.choice_at(point))
+
+        with self.uncounted():
+            goal = Goal(self.start, self.problems, self.data, self.free, objective, watch)
+            needed = {objective, LIKELIHOOD} if goal.is_of_squares else {objective}
+            prices = {one: self._price_of_gradients(one) for one in needed}
+        return goal
+
+    def _price_of_gradients(self, objective: str) -> float:
+        plain = Goal(self.start, self.problems, self.data, self.free, objective)
+        few, point = plain.of_few(FEW), plain.coordinates.of(plain.untuned)
+        return self.price(objective, lambda: few(point))
+
+    def price(self, name: str, call: Callable[[], object]) -> float:
+        """What a call over the first 32 runs takes, in passes of the filter, at least 1: measured once a name."""
+        if name not in self._prices:
+            with self.uncounted():
+                some = [one.slice(0, FEW) for one in self.data]
+                plain = shortest(lambda: self._value(self.start, LIKELIHOOD, some))
+                self._prices[name] = max(shortest(call) / plain, 1.0)
+        return self._prices[name]
+
+    def model(self, choice: Choice, place: int = 0) -> StateSpaceModel:
+        """The model that a choice's filter assumes: of a linear filter its affine approximation."""
+        return choice.filter(self.problems[place]).kernel_model
+
+
+def shortest(call: Callable[[], object]) -> float:
+    """The shortest of some calls, after one that may compile [s of processor time]."""
+    call()
+    found = []
+    for _ in range(TIMED):
+        begin = time.process_time()
+        call()
+        found.append(time.process_time() - begin)
+    return max(min(found), 1e-6)
+
+
+def within_first_range(one: Parameter) -> Parameter:
+    """A parameter of Q or R in the part of its range in which a search begins."""
+    part = first_range(one)
+    if part is None:
+        return one
+    return Parameter(one.name, *part, unit=one.unit, log=one.log, place=one.place)

@@ -1,0 +1,57 @@
+"""`Way`: a published method of tuning, as a value."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from filters.registry import filter_class
+from numerics.checks import one_of
+from tuning.likelihood.family import DIFFERENTIABLE
+from tuning.search.parameters import Q, R
+from tuning.search.space import has_search_space
+from tuning.ways.task import Spent, Task
+
+TRUTH = "truth"  # true states
+GRADIENT = "gradient"  # a Kalman filter with derivatives
+COVARIANCE = "covariance"  # a filter with a covariance
+NOISE = "noise"  # that Q and R are tuned, and not a model's own parameters
+
+
+class Way(NamedTuple):
+    """A method that finds a filter's numbers."""
+
+    about: str  # what it does, in one sentence
+    when: str  # when to use it
+    follow: Callable[[Task], None]  # keeps choices of a task until it is done, or the task raises Spent
+    source: str
+    needs: tuple[str, ...] = ()  # of TRUTH, GRADIENT, COVARIANCE, NOISE
+    options: tuple[str, ...] = ("hold_r", "full_q", "full_r", "prior")  # of the model's numbers, that it can tune
+
+    def check(self, name: str, task: Task) -> None:
+        """Raise ValueError if a task lacks what the way needs."""
+        if not has_search_space(task.filter):
+            raise ValueError(f"filter must be one that has something to tune, but got {task.filter!r}")
+        if GRADIENT in self.needs:
+            one_of(f"a filter for way {name!r}", task.filter, DIFFERENTIABLE)
+        if COVARIANCE in self.needs and not filter_class(task.filter).has_covariance:
+            raise ValueError(f"way {name!r} needs a filter with a covariance, but got {task.filter!r}")
+        if TRUTH in self.needs and not task.has_truth:
+            lacking = next(one.name for one in task.problems if one.scale is None)
+            raise ValueError(f"way {name!r} needs true states, but {lacking} has none")
+        if NOISE in self.needs and not {Q, R} <= set(task.start.model):
+            raise ValueError(f"way {name!r} tunes Q and R, but {task.problems[0].name} has parameters of its own")
+        unable = [option for option, wanted in task.options.items() if wanted and option not in self.options]
+        if unable:
+            raise ValueError(f"way {name!r} must come without {', '.join(unable)}")
+
+    def run(self, name: str, task: Task) -> None:
+        """Follow the way until it is done or the budget spent; ValueError if the task lacks what it needs.
+
+        What it found is `task.best`, and what it would have found for less is `task.kept`.
+        """
+        self.check(name, task)
+        try:
+            self.follow(task)
+        except Spent:
+            pass
