@@ -37,7 +37,8 @@ class Way(NamedTuple):
         if COVARIANCE in self.needs and not filter_class(task.filter).has_covariance:
             raise ValueError(f"way {name!r} needs a filter with a covariance, but got {task.filter!r}")
         if TRUTH in self.needs and not task.has_truth:
-            lacking = next(one.name for one in task.problems if one.scale is None)
+            pairs = zip(task.problems, task.data, strict=True)
+            lacking = next(one.name for one, data in pairs if one.scale is None or data.states is None)
             raise ValueError(f"way {name!r} needs true states, but {lacking} has none")
         if NOISE in self.needs and not {Q, R} <= set(task.start.model):
             raise ValueError(f"way {name!r} tunes Q and R, but {task.problems[0].name} has parameters of its own")
