@@ -41,6 +41,7 @@ from tuning.evaluation.tuned import check_keepable
 from tuning.search.objectives import OBJECTIVES
 from tuning.search.plan import Plan
 from tuning.search.samplers import SAMPLERS
+from tuning.ways.registry import WAYS
 
 DEFAULT_STORAGE = "out/studies.journal"
 NONE_CONSISTENT = 3  # exit code
@@ -116,6 +117,14 @@ def command(
             rich_help_panel=SEARCH,
         ),
     ] = "optuna",
+    way: Annotated[
+        str | None,
+        typer.Option(
+            help="Another way of tuning in place of the study; `thruster ways` lists them, and when to use which.",
+            callback=spelt(WAYS),
+            rich_help_panel=SEARCH,
+        ),
+    ] = None,
     workers: Annotated[
         int, typer.Option(help="Processes on this host that share the study.", rich_help_panel=RUNS)
     ] = 1,
@@ -167,12 +176,19 @@ def command(
     the trial with the best log score among the best ones is taken. If no trial is in the band, the one with the
     least error is taken, the report and the file say so, and the exit code is 3.
 
+    With --way a published method finds the numbers instead, within as many passes over the training runs as the
+    trials would take. With a model that is right and true states: noise-estimation. With true states, if the
+    covariance counts, too: log-score; if the estimate alone counts: mse. Without true states: likelihood. Of an
+    ensemble: this study, or desroziers without true states. `thruster ways` lists all of them.
+
     With --log it uses recorded runs instead, cut into blocks of which every third is held out. It minimises the
     negative log-likelihood of the innovations, unless the logs contain the true states.
 
     Example: thruster tune --filter ekf --scenario mismatch --scenario outliers --trials 100
 
     Example: thruster tune --filter ekf --log run1.csv --log run2.csv --trials 100
+
+    Example: thruster tune --filter ekf --way log-score --scenario mismatch
 
     Example: thruster tune --filter auto --budget 2 --scenario published_noise --trials 100
     """
@@ -198,7 +214,7 @@ def command(
         full_r=full_r,
         worst=worst,
     )
-    tuning = tune(plan, trials, storage, study, out, by_gradient=aim, workers=workers)
+    tuning = tune(plan, trials, storage, study, out, by_gradient=aim, way=way, workers=workers)
     emit(report(tuning), as_json(tuning), json)
     if tuning.result.interrupted:
         sys.exit(130)
@@ -214,12 +230,12 @@ def tune(
     out: Path | None = None,
     *,
     by_gradient: str | None = None,
+    way: str | None = None,
     workers: int = 1,
 ) -> Tuning:
     """Run or resume a study with a progress bar, evaluate its choice and write the tuned file."""
-    name = study_name or name_of(plan, by_gradient)
+    name = study_name or name_of(plan, by_gradient, way)
     file = out or Path("out") / f"{name}.json"
     announce_compilation()
-    return run_tuning(
-        plan, trials, progress_console, storage, name, file, by_gradient=by_gradient, workers=workers
-    )
+    options: dict[str, Any] = {"by_gradient": by_gradient, "way": way, "workers": workers}
+    return run_tuning(plan, trials, progress_console, storage, name, file, **options)

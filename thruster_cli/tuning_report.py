@@ -80,7 +80,7 @@ def way_out(tuning: Tuning) -> list[str]:
     """Advice if the tuned filter is worse than the best baseline; empty otherwise."""
     ratios = [next(iter(proof.ratios.items())) for proof in tuning.proofs if proof.tuned.has_truth]
     worse = [name for name, ratio in ratios if ratio.low > 1 and not slightly(ratio)]
-    if not worse or tuning.gradient is not None:
+    if not worse or tuning.gradient is not None or tuning.way is not None:
         return []
     pruning = ", or without pruning (--no-pruning)" if tuning.plan.prune else ""
     pruning += ", or maximum likelihood (--method gradient)" if tuning.plan.filter in DIFFERENTIABLE else ""
@@ -230,6 +230,8 @@ def as_json(tuning: Tuning) -> dict:
         "held_out": held_out,
         "file": str(tuning.file),
     }
+    if tuning.way is not None:
+        data["way"] = {"name": tuning.way.name, "runs": tuning.way.runs, "seconds": tuning.way.seconds}
     if tuning.known is not None:
         data["innovations_alone"] = as_data(tuning.known)
     if tuning.gradient is not None and tuning.rival is not None:

@@ -34,6 +34,11 @@ class Case(NamedTuple):
     truth: bool = True  # whether they have true states
     about: str = ""
 
+    @property
+    def model(self) -> str:
+        """A name of the filter and what it is of, which cases that differ in their data alone share."""
+        return f"{self.name.split(',')[0]} {self.filter}"
+
 
 GROUPS = {
     "A": "linear, right",

@@ -21,7 +21,8 @@ OnResult = Callable[[str, int, int], None]  # what is done, results so far, all
 
 def jobs_of(protocol: Protocol) -> Iterator[tuple[Case, str, int]]:
     """All that there is to do, one data set after the other, so that an early end leaves whole ones."""
-    yield from ((case, REFERENCE, 0) for case in protocol.cases)
+    models = {case.model: case for case in reversed(protocol.cases)}
+    yield from ((case, REFERENCE, 0) for case in protocol.cases if models[case.model] is case)
     for place in range(protocol.sets):
         yield from ((case, way, place) for case in protocol.cases for way in protocol.ways)
 
@@ -80,7 +81,7 @@ def file_of(folder: Path, case: Case, way: str, place: int, protocol: Protocol) 
         return "".join(one if one.isalnum() else "-" for one in text)
 
     if way == REFERENCE:
-        return folder / plain(case.name) / f"{way}-{protocol.many}-{protocol.starts}-{protocol.held_out}.json"
+        return folder / plain(case.model) / f"{way}-{protocol.many}-{protocol.starts}-{protocol.held_out}.json"
     budget = f"{protocol.runs:g}-{protocol.seconds:g}-{protocol.held_out}"
     return folder / plain(case.name) / f"{plain(way)}-{place}-{budget}.json"
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from filters.estimators.find import label_of
 from numerics.checks import at_least, one_of, shown
 from numerics.files import check_target
+from tuning.api.by_way import Followed, answered, check_way, follow, way_sentence
 from tuning.api.progress import trial_bar, working
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
@@ -47,6 +48,7 @@ class Tuning(NamedTuple):
     gradient: GradientResult | None = None  # where the choice is the optimum that gradients lead to ...
     rival: Comparison | None = None  # ... and what an Optuna study in its stead would have chosen
     known: Identifiability | None = None  # what the innovations determine; None without a covariance
+    way: Followed | None = None  # where the choice is the answer of a way
 
     @property
     def scenario(self) -> Problem:
@@ -61,13 +63,15 @@ class Tuning(NamedTuple):
     @property
     def chosen(self) -> tuple[str, ...]:
         """Which trial was chosen and what gave way, in sentences; none where gradients led to the choice."""
+        if self.way is not None:
+            return (way_sentence(self.way, self.scenario.seed_word),)
         if self.gradient is not None:
             return ()
         return tuple(choice_sentences(as_data(self.result.validation), self.plan))
 
     def write(self, file: str | Path) -> None:
         """Write the tuned file."""
-        method = METHODS[self.gradient is not None]
+        method = METHODS[self.gradient is not None] if self.way is None else self.way.name
         write_tuned(file, self.plan, self.result, self.proofs, self.study, method)
 
 
@@ -80,6 +84,7 @@ def run_tuning(
     out: Path | None = None,
     *,
     by_gradient: str | None = None,
+    way: str | None = None,
     workers: int = 1,
 ) -> Tuning:
     """Run or resume a study with a progress bar, evaluate its choice and, if requested, write the tuned file.
@@ -92,6 +97,7 @@ def run_tuning(
         name: of the study; from the plan if None.
         out: the tuned file; none is written if None.
         by_gradient: the objective whose gradient leads to the choice, beside a study; None where the study does.
+        way: the way of tuning whose answer is the choice, one of `tuning.ways.registry.WAYS`; None for a study.
         workers: processes that share the study.
 
     Raises:
@@ -100,12 +106,16 @@ def run_tuning(
     """
     trials, workers = at_least("trials", trials, 1, MOST_TRIALS), at_least("workers", workers, 1, MOST_WORKERS)
     _check_method(plan, by_gradient)
+    if way is not None:
+        if by_gradient is not None:
+            raise ValueError("a way (--way) must come without method='gradient' (--method)")
+        check_way(plan, way, workers)
     if workers > 1 and storage is None:
         raise ValueError(
             f"workers must be 1 without a storage that they share, such as "
             f"storage='studies.journal', but got {workers}"
         )
-    name = name or name_of(plan, by_gradient)
+    name = name or name_of(plan, by_gradient, way)
     if not isinstance(name, str) or "/" in name:
         raise ValueError(f"study must be a name without slashes, but got {shown(name)}")
     if out is not None:
@@ -122,8 +132,12 @@ def run_tuning(
             run = partial(run_trials, on_choice=lambda choice: show_kinds([choice.name]))
             if storage is not None and workers > 1:
                 run = partial(run_in_workers, storage=storage, workers=workers)
+            if way is not None:
+                run = partial(follow, name=way)
             result = run_study(study, plan, trials, advance, run)
-    gradient = rival = None
+    gradient = rival = followed = None
+    if way is not None:
+        result, followed = answered(study, result, plan, way)
     if by_gradient is not None:
         with working(f"following the gradient of the {by_gradient}", console):
             data, options = plan.training_data(), plan.options
@@ -139,7 +153,7 @@ def run_tuning(
                 f"study {name!r} keeps its trials: the same command continues with the held-out evaluation"
             )
         raise
-    tuning = Tuning(name, plan, result, proofs, out, gradient, rival)
+    tuning = Tuning(name, plan, result, proofs, out, gradient, rival, way=followed)
     if out is not None:
         tuning.write(out)
     if gradient is not None:
@@ -173,7 +187,7 @@ def _check_method(plan: Plan, by_gradient: str | None) -> None:
         raise ValueError("method='gradient' (--method) must come without a budget, but got budget (--budget)")
 
 
-def name_of(plan: Plan, by_gradient: str | None = None) -> str:
+def name_of(plan: Plan, by_gradient: str | None = None, way: str | None = None) -> str:
     """A name for a study of a plan, with everything that differs from the default."""
     parts = [
         re.sub(r"[^\w.+-]+", "-", label_of(plan.filter)),
@@ -186,6 +200,7 @@ def name_of(plan: Plan, by_gradient: str | None = None) -> str:
     parts += [] if plan.budget is None else [f"budget{plan.budget:g}"]
     parts += ["any-nis"] * (not plan.consistent) + [plan.sampler] * (plan.sampler != "tpe")
     parts += [] if by_gradient is None else ["gradient-score" if by_gradient == SCORE else "gradient"]
+    parts += [] if way is None else ["way", way]
     return "-".join(parts)
 
 

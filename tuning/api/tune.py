@@ -30,6 +30,7 @@ def tune(
     sampler: str = "tpe",
     prune: bool = True,
     method: str = "optuna",
+    way: str | None = None,
     workers: int = 1,
     storage: str | Path | None = None,
     name: str | None = None,
@@ -81,6 +82,8 @@ def tune(
         prune: end a trial that is significantly worse than the best on the same seeds.
         method: "optuna"; or "gradient", for kf, ekf, iekf, ukf and ckf: maximum likelihood, or the best
             "score", "mse" or "log-score" where that is the objective.
+        way: another way of tuning in place of the study, such as "em", as `thruster ways` lists them: it takes as
+            many passes over the training runs as so many trials do.
         workers: processes on this host that share the study; several need a storage.
         storage: journal file or URL of a database that saves the study, so that the same call continues it; by
             default it ends with the process.
@@ -131,4 +134,4 @@ def tune(
     )
     where = None if storage is None else str(storage)
     console = console_for(progress)
-    return Study(run_tuning(plan, trials, console, where, name, by_gradient=aim, workers=workers))
+    return Study(run_tuning(plan, trials, console, where, name, by_gradient=aim, way=way, workers=workers))

@@ -53,7 +53,7 @@ def write_tuned(
         result: its result, with the choice.
         comparisons: held-out evaluations, one for each scenario.
         study_name: name of the study.
-        method: how the choice was made, "optuna" or "gradient".
+        method: how the choice was made, "optuna", "gradient", or the name of a way.
 
     Raises:
         ValueError: if the folder cannot be written, or the filter is an estimator, which is code.

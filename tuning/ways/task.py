@@ -86,6 +86,7 @@ class Task:
         self.options = dict(options or {})
         self.objective = objective or (SCORE if self.has_truth else LIKELIHOOD)
         self.budget, self.seed = budget, seed
+        self.stop: Callable[[], bool] = lambda: False  # whether somebody asked for an end
         self.start = untuned_choice(filter_name, self.problems[0]) if start is None else start
         self.runs, self._excluded, self._prices = 0.0, 0.0, {}
         self.kept = [Kept(0.0, 0.0, self.start)]
@@ -159,8 +160,8 @@ class Task:
         self.check()
 
     def check(self) -> None:
-        """Raise Spent once the budget is over."""
-        if self.runs > self.budget.runs or self.seconds > self.budget.seconds:
+        """Raise Spent once the budget is over, or an end is asked for."""
+        if self.runs > self.budget.runs or self.seconds > self.budget.seconds or self.stop():
             raise Spent
 
     @contextmanager

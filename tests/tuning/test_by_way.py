@@ -1,0 +1,69 @@
+"""Ways of tuning by the functions and commands of users: a study whose choice is the way's answer."""
+
+import json
+
+import numpy as np
+import pytest
+
+import tuning
+from tests.linear_problem import LinearProblem
+from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from tuning.evaluation.tuned import read_tuned
+from tuning.likelihood.gradient import tune_by_gradient
+from tuning.problems.find import find_problem
+from tuning.search.plan import TRAINING_SEEDS
+
+SHORT = find_problem("nominal").replace(steps=70, name="short")
+
+
+def test_a_way_gives_its_answer_its_file_and_its_held_out_table(tmp_path):
+    study = tuning.tune(SHORT, "ekf", way="likelihood", trials=40, progress=False)
+    data = SHORT.data(SHORT.training_seeds(0, TRAINING_SEEDS))
+    expected = tune_by_gradient("ekf", SHORT, data).choice
+    for name in ("process_noise_cov", "measurement_noise_cov"):
+        np.testing.assert_allclose(study.choice.model[name], expected.model[name], rtol=1e-4)
+    assert "Way likelihood: maximum likelihood" in str(study) and "held-out" in str(study)
+    assert 0 < len(study.trials) <= 40 and study.consistent is None
+    file = study.save(tmp_path / "tuned.json")
+    written = json.loads(file.read_text())
+    assert written["study"]["method"] == "likelihood"
+    choice, *_ = read_tuned(file, [SHORT])
+    np.testing.assert_allclose(choice.model["process_noise_cov"], study.choice.model["process_noise_cov"])
+    assert study.report(tmp_path / "page.html").is_file()
+
+
+def test_the_same_command_goes_on_with_the_answer_that_is_there(tmp_path):
+    storage = tmp_path / "studies.journal"
+    options = {"filter": "kf", "trials": 6, "progress": False, "storage": storage}
+    first = tuning.tune("published_tunnel", way="noise-estimation", **options)
+    again = tuning.tune("published_tunnel", way="noise-estimation", **options)
+    assert again.choice == first.choice and len(again.trials) == len(first.trials)
+    assert again.tuning.way.runs == first.tuning.way.runs == TRAINING_SEEDS
+    assert np.shape(first.choice.model["process_noise_cov"]) == (2, 2)  # of the way, where trials have diagonals
+
+
+@pytest.mark.parametrize(
+    ("problem", "options", "words"),
+    [
+        (LinearProblem(truth=False), {"way": "mse"}, "way 'mse' needs true states, but linear-3 has none"),
+        ("nominal", {"way": "em", "filter": "enkf"}, "a filter for way 'em' must be one of kf"),
+        ("nominal", {"way": "als"}, "way 'als' needs a linear model"),
+        ("nominal", {"way": "magic"}, "way must be one of"),
+        ("nominal", {"way": "em", "method": "gradient"}, "must come without method='gradient'"),
+        ("nominal", {"way": "em", "worst": True}, "must count the mean of problems"),
+        ("nominal", {"way": "squarem", "full_q": True}, "must come without full_q"),
+    ],
+)
+def test_what_a_way_lacks_is_said_in_one_line(problem, options, words):
+    with pytest.raises(ValueError, match=words) as said:
+        tuning.tune(problem, **{"filter": "ekf", **options}, trials=3, progress=False)
+    assert "\n" not in str(said.value)
+
+
+def test_the_command_follows_a_way(as_json, thruster):  # noqa: F811
+    told = as_json("tune", "--filter", "enkf", "--problem", "nominal", "--way", "desroziers", "--trials", 4)
+    assert told["way"]["name"] == "desroziers" and 32 < told["way"]["runs"] <= 5 * 32
+    assert told["file"].endswith("enkf-nominal-seed0-way-desroziers.json") and told["trials"] <= 4
+    assert "true states" in thruster("ways").stdout
+    shown = thruster("ways", "EM").stdout
+    assert "Shumway" in shown and "dlog L/dq" in shown

@@ -1,0 +1,119 @@
+"""A way of tuning as a study: what it kept on its path are the trials, and its answer is the choice."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import optuna
+from optuna.trial import FrozenTrial
+
+from filters.registry import filter_class
+from tuning.problems.data import Data
+from tuning.search.interruption import stop_on_interrupt
+from tuning.search.measures import measured
+from tuning.search.plan import Plan
+from tuning.search.space import AUTO, Choice, trial_parameters
+from tuning.search.study import FINISHED, OnTrial, StudyResult
+from tuning.search.trials import run_trial
+from tuning.ways.registry import WAYS, find_way
+from tuning.ways.task import Budget, Task
+
+ANSWER = "answer of the way"  # attribute of a study
+
+
+class Followed(NamedTuple):
+    """What a way found, and what it took."""
+
+    name: str
+    choice: Choice
+    runs: float  # passes of the filter over one run each
+    seconds: float  # of processor time, without compilation
+
+
+def check_way(plan: Plan, name: str, workers: int) -> None:
+    """Raise ValueError for a way that there is not, or a plan that none can serve."""
+    find_way(name)
+    if plan.worst:
+        raise ValueError("a way (--way) must count the mean of problems, but got worst (--worst)")
+    if plan.budget is not None or plan.filter == AUTO:
+        raise ValueError("a way (--way) must be of one filter and without a budget of microseconds a step")
+    if len(plan.objectives) > 1:
+        raise ValueError(f"a way (--way) must have one objective, but got {list(plan.objectives)}")
+    if workers > 1:
+        raise ValueError(f"workers (--workers) must be 1 with a way (--way), but got {workers}")
+
+
+def follow(
+    study: optuna.Study, plan: Plan, data: Sequence[Data], trials: int, on_trial: OnTrial, *, name: str
+) -> bool:
+    """Follow a way with as many passes as a study of so many trials has: `run` of `run_study`.
+
+    Returns:
+        Whether Ctrl-C ended it; what it had found until then is kept.
+
+    Raises:
+        ValueError: if the plan lacks what the way needs.
+    """
+    if ANSWER in study.user_attrs:
+        return False
+    options = plan.options if filter_class(plan.filter).has_covariance else {}
+    with stop_on_interrupt() as interrupted:
+        given: dict[str, Any] = {"options": options, "objective": plan.objectives[0]}
+        given["budget"] = Budget(trials * sum(len(one.seeds) for one in data))
+        task = Task(plan.filter, plan.scenarios, data, **given)
+        task.seed, task.stop = plan.seed, interrupted
+        find_way(name).run(name, task)
+        stopped = interrupted()
+    space = plan.space()
+    for choice in _some([one.choice for one in task.kept[1:]], trials - 1):
+        study.enqueue_trial(_within(trial_parameters(choice, space), space))
+    waiting = len(study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.WAITING,)))
+
+    def after(study: optuna.Study, trial: FrozenTrial) -> None:
+        on_trial(study, len(study.get_trials(deepcopy=False, states=FINISHED)))
+
+    study.optimize(lambda trial: run_trial(trial, plan, data, space), n_trials=waiting, callbacks=[after])
+    answer = {"choice": task.best._asdict(), "runs": task.runs, "seconds": task.seconds}
+    study.set_user_attr(ANSWER, answer)
+    return stopped
+
+
+def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) -> tuple[StudyResult, Followed]:
+    """The result of a study of a way with its answer in place of the best trial, and what the way took."""
+    answer = study.user_attrs[ANSWER]
+    found = answer["choice"]
+    choice = Choice(found["name"], _tuples(found["model"]), _tuples(found["numbers"]))
+    value = measured(choice, plan, plan.training_data()).value
+    nothing: dict[str, Any] = {"consistent": None, "nis": (), "validation": None, "sizes": [], "free_value": None}
+    return (
+        result._replace(choice=choice, best_value=value, **nothing),
+        Followed(name, choice, answer["runs"], answer["seconds"]),
+    )
+
+
+def way_sentence(found: Followed, word: str) -> str:
+    """What found the numbers, and what it took."""
+    way = WAYS[found.name]
+    took = f"It took {found.seconds:.2g} s and as much as {found.runs:.0f} passes of the filter over one of the"
+    return f"Way {found.name}: {way.about} ({way.source}). {took} training {word}."
+
+
+def _some(choices: Sequence[Choice], count: int) -> list[Choice]:
+    """At most so many of some choices, the last one among them, without two that are the same."""
+    if len(choices) <= count or count < 1:
+        return list(choices) if count >= 1 else []
+    places = sorted({round((i + 1) * len(choices) / count) - 1 for i in range(count)})
+    return [choices[place] for place in places]
+
+
+def _within(parameters: dict[str, Any], space: dict[str, Any]) -> dict[str, Any]:
+    """The parameters of a trial, those that are numbers within their ranges."""
+    return {key: min(max(value, space[key].low), space[key].high) for key, value in parameters.items()}
+
+
+def _tuples(content: Any) -> Any:
+    """What JSON kept, with tuples in place of lists, as choices have it."""
+    if isinstance(content, dict):
+        return {key: _tuples(value) for key, value in content.items()}
+    return tuple(map(_tuples, content)) if isinstance(content, list | tuple) else content
