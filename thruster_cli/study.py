@@ -15,7 +15,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from thruster_cli import recordings, users
+from thruster_cli import recordings, users, ways_study
 from thruster_cli.options import OUTPUT, RUNS, JsonOption
 from thruster_cli.output import announce_compilation, emit, progress_console, table
 
@@ -31,6 +31,7 @@ def _callback() -> None:
 
 app.command("recordings")(recordings.command)
 app.command("users")(users.command)
+app.command("ways")(ways_study.command)
 
 
 @app.command("policies")

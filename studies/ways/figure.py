@@ -1,0 +1,62 @@
+"""The picture of the study of ways: regrets by group, at each budget of passes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from numerics.plots import new_figure, save_figure, tidy
+from studies.ways.entries import Result
+from studies.ways.problems import GROUPS
+from studies.ways.protocol import RUNS, START, STUDY, Protocol
+from studies.ways.statistics import regrets
+
+LEAST, MOST = 1e-4, 3.0  # of log ratios, at which points are clipped
+MARKS = dict(zip(RUNS, (("o", "0.75"), ("o", "C0"), ("o", "C3")), strict=True))
+
+
+def figure(results: Sequence[Result], protocol: Protocol, path: str | Path) -> Path:
+    """A panel a group: the mean log ratio of each way over the cases, after each budget of passes."""
+    groups = [key for key in GROUPS if any(case.group == key for case in protocol.cases)]
+    rows = -(-len(groups) // 2)
+    drawn = new_figure((11.0, 4.6 * rows))
+    axes = drawn.subplots(rows, 2, squeeze=False)
+    tidy(axes.flat)
+    for axis in axes.flat[len(groups) :]:
+        axis.set_visible(False)
+    for axis, group in zip(axes.flat, groups, strict=False):
+        cases = [case for case in protocol.cases if case.group == group]
+        budgets = [one for one in RUNS if one <= protocol.runs]
+        points: dict[float, dict[str, float]] = {}
+        for budget in budgets:
+            key = f"{budget:g}"
+            found = [regrets(results, case, lambda one, key=key: one.by_runs.get(key)) for case in cases]
+            ways = dict.fromkeys(one.way for each in found for one in each)
+            points[budget] = {
+                way: float(
+                    np.mean([math.log(one.ratio.value) for each in found for one in each if one.way == way])
+                )
+                for way in ways
+            }
+        if not points or not points[budgets[-1]]:
+            continue
+        order = sorted(points[budgets[-1]], key=points[budgets[-1]].__getitem__, reverse=True)
+        for budget in budgets:
+            mark, colour = MARKS[budget]
+            values = [100.0 * np.clip(points[budget].get(way, np.nan), LEAST, MOST) for way in order]
+            axis.plot(values, range(len(order)), mark, color=colour, markersize=4, label=f"{budget:g} passes")
+        axis.set_xscale("log")
+        axis.set_yticks(range(len(order)), order, fontsize=7)
+        for label in axis.get_yticklabels():
+            label.set_fontweight("bold" if label.get_text() in (STUDY, START) else "normal")
+        axis.set_title(f"{group}: {GROUPS[group]}", fontsize=10)
+        axis.set_xlabel("regret [%]")
+    if axes.flat[0].lines:
+        axes.flat[0].legend(fontsize=8, loc="lower right", frameon=False)
+    drawn.suptitle(
+        "Score over that of the best constant numbers, held out; left of 0.01 % is drawn there", fontsize=11
+    )
+    return save_figure(drawn, path)

@@ -1,0 +1,194 @@
+"""Tables of the study of ways: what to use when, and the regret of every way in every case."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from numerics.markdown import table
+from studies.ways.entries import Result, Scored
+from studies.ways.problems import GROUPS, Case
+from studies.ways.protocol import ORACLE, SCALED, START, STUDY, STUDY_LOG_SCORE, Protocol
+from studies.ways.statistics import Regret, regrets
+from tuning.ways.registry import WAYS
+from tuning.ways.way import TRUTH
+
+BLIND = tuple(name for name, way in WAYS.items() if TRUTH not in way.needs)  # those that look at no truth ...
+SEARCHES = (
+    "nelder-mead",
+    "coordinate-steps",
+    "tpe",
+    "gp",
+    "cma-es",
+    "random",
+)  # ... unless they minimise an error
+NO_WAYS = (START, ORACLE)  # nobody has these
+
+
+class Situation(NamedTuple):
+    """What somebody has, and the cases that stand for it."""
+
+    text: str
+    has: Callable[[Case], bool]
+    truth: bool
+
+
+SITUATIONS = (
+    Situation("true states, a model that is right", lambda case: case.group in "AB", True),
+    Situation("true states, a model that is wrong", lambda case: case.group == "C", True),
+    Situation("true states, outliers or a dead band", lambda case: case.group == "D", True),
+    Situation("true states, eight to ten states", lambda case: case.group == "F", True),
+    Situation("true states of one to ten runs", lambda case: case.group == "H", True),
+    Situation("true states, a small ensemble", lambda case: case.group == "E", True),
+    Situation(
+        "no truth, a model that is right", lambda case: case.group in "ABH" or case.name == "nominal, blind", False
+    ),
+    Situation(
+        "no truth, a model that is wrong", lambda case: case.group == "C" or case.name == "mismatch, blind", False
+    ),
+    Situation("no truth, a small ensemble", lambda case: case.group == "E", False),
+)
+
+
+def is_blind(way: str, case: Case) -> bool:
+    """Whether a way looks at no true state in a case."""
+    return way in BLIND and (way not in SEARCHES or not case.truth)
+
+
+def what_to_use(results: Sequence[Result], protocol: Protocol) -> str:
+    """The way of least error, and that of the best log score, in each situation."""
+    heads = [
+        "you have",
+        "least error",
+        "regret, mean and worst case",
+        "NEES / n",
+        "best log score",
+        "regret",
+        "NEES / n",
+    ]
+    rows = []
+    for situation in SITUATIONS:
+        cases = [case for case in protocol.cases if situation.has(case)]
+        found = [regrets(results, case) for case in cases]
+        some = [
+            [one for one in each if _may(one.way, case, situation)]
+            for each, case in zip(found, cases, strict=True)
+        ]
+        some = [one for one in some if one]
+        if not some:
+            continue
+        everywhere = set.intersection(*({one.way for one in each} for each in some)) - {SCALED}
+        if not everywhere:
+            continue
+        error = min(everywhere, key=lambda way: _mean(some, way, lambda one: math.log(one.ratio.value)))
+        proper = min(everywhere, key=lambda way: _mean(some, way, lambda one: _finite(one.log_score)))
+        rows.append(
+            [
+                situation.text,
+                f"`{error}`",
+                _both(some, error),
+                _nees(some, error),
+                f"`{proper}`",
+                _both(some, proper),
+                _nees(some, proper),
+            ]
+        )
+    return table(heads, rows)
+
+
+def _may(way: str, case: Case, situation: Situation) -> bool:
+    return way not in NO_WAYS and (situation.truth or is_blind(way, case))
+
+
+def _of(some: Sequence[Sequence[Regret]], way: str) -> list[Regret]:
+    return [one for each in some for one in each if one.way == way]
+
+
+def _mean(some: Sequence[Sequence[Regret]], way: str, of: Callable[[Regret], float]) -> float:
+    return float(np.mean([of(one) for one in _of(some, way)]))
+
+
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else 1e6
+
+
+def _both(some: Sequence[Sequence[Regret]], way: str) -> str:
+    values = [one.ratio.value for one in _of(some, way)]
+    return f"{percent(math.exp(np.mean(np.log(values))))}, {percent(max(values))}"
+
+
+def _nees(some: Sequence[Sequence[Regret]], way: str) -> str:
+    values = [one.nees for one in _of(some, way)]
+    return f"{min(values):.3g}" if len(values) == 1 else f"{min(values):.3g} to {max(values):.3g}"
+
+
+def percent(ratio: float) -> str:
+    """A ratio as what is above 1, in percent; as a factor from 2 on."""
+    return f"x {ratio:.3g}" if ratio >= 2.0 else f"{100.0 * (ratio - 1.0):+.1f} %"
+
+
+def group_table(results: Sequence[Result], protocol: Protocol, group: str) -> str:
+    """Regrets of all ways in the cases of a group, in percent; significantly worse than the best: in italics."""
+    cases = [case for case in protocol.cases if case.group == group]
+    columns = [{one.way: one for one in regrets(results, case)} for case in cases]
+    ways = dict.fromkeys(way for column in columns for way in column)
+    order = sorted(ways, key=lambda way: _rank(columns, way))
+    heads = ["way", *(f"`{case.name}`" for case in cases), "NEES / n", "passes", "seconds"]
+    return table(heads, [_row(way, columns) for way in order])
+
+
+def _rank(columns: Sequence[Mapping[str, Regret]], way: str) -> float:
+    return float(np.mean([math.log(one[way].ratio.value) if way in one else 9.0 for one in columns]))
+
+
+def _row(way: str, columns: Sequence[Mapping[str, Regret]]) -> list[str]:
+    there = [one[way] for one in columns if way in one]
+    cells = [_cell(one.get(way)) for one in columns]
+    nees = [one.nees for one in there]
+    spread = f"{min(nees):.3g}" if len(nees) == 1 else f"{min(nees):.3g} to {max(nees):.3g}"
+    name = f"**{way}**" if way in (STUDY, STUDY_LOG_SCORE) else way
+    taken = f"{np.median([one.runs for one in there]):.0f}", f"{np.median([one.seconds for one in there]):.2g}"
+    return [name, *cells, spread, *taken]
+
+
+def _cell(one: Regret | None) -> str:
+    if one is None:
+        return "-"
+    half = 50.0 * (one.ratio.high - one.ratio.low)
+    said = percent(one.ratio.value)
+    if one.ratio.value < 2.0 and math.isfinite(half):
+        said = f"{said[:-2]} ± {half:.1f} %"
+    failed = f", {one.failures} of {one.sets} failed" if one.failures else ""
+    said = f"*{said}*" if one.worse else said
+    return f"**{said}**{failed}" if one.equal else f"{said}{failed}"
+
+
+def budget_table(results: Sequence[Result], protocol: Protocol) -> str:
+    """Mean regret over the cases of groups A to D and F, at each budget of passes and of seconds."""
+    cases = [case for case in protocol.cases if case.group in "ABCDF"]
+    by_runs = [f"{one:g}" for one in (1e3, 1e4, 1e5) if one <= protocol.runs]
+    by_seconds = [f"{one:g}" for one in (1.0, 10.0, 100.0) if one <= protocol.seconds]
+    looks: list[tuple[str, Callable[[Result], Scored | None]]] = []
+    looks += [(f"{key} passes", lambda one, key=key: one.by_runs.get(key)) for key in by_runs]
+    looks += [(f"{key} s", lambda one, key=key: one.by_seconds.get(key)) for key in by_seconds]
+    found = {name: [{one.way: one for one in regrets(results, case, at)} for case in cases] for name, at in looks}
+    rows = []
+    for way in (*WAYS, STUDY, STUDY_LOG_SCORE):
+        logs = [[math.log(one[way].ratio.value) for one in columns if way in one] for columns in found.values()]
+        if logs and all(logs):
+            means = [float(np.mean(some)) for some in logs]
+            rows.append((means[-1], [way, str(len(logs[-1])), *(percent(math.exp(one)) for one in means)]))
+    return table(["way", "cases", *found], [row for _, row in sorted(rows, key=lambda one: one[0])])
+
+
+def tables(results: Sequence[Result], protocol: Protocol) -> dict[str, Callable[[], str]]:
+    """The tables of the page, by name."""
+    of_groups = {f"group {key}": (lambda key=key: group_table(results, protocol, key)) for key in GROUPS}
+    return {
+        "what to use": lambda: what_to_use(results, protocol),
+        "budgets": lambda: budget_table(results, protocol),
+        **of_groups,
+    }
