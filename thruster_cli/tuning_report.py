@@ -24,6 +24,7 @@ from tuning.logs.problem import model_named_in
 from tuning.problems.rooms import built_in
 from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.gains import gains
+from tuning.reporting.residual_words import residual_sentences
 from tuning.reporting.units import apart
 from tuning.search.filter_types import filter_types_tried
 from tuning.search.objectives import LIKELIHOOD, NIS_BAND
@@ -57,7 +58,7 @@ def report(tuning: Tuning) -> list[RenderableType]:
             choice_table(choices, scenario),
             comparison_table(proof.evaluations, proof.bound, where, scenario.scale_about),
         ]
-        shown.append(_consistency_sentence(proof.tuned))
+        shown += [_consistency_sentence(proof.tuned), *residual_sentences(scenario, plan.seed)]
     shown += at_ends(result.choice, plan)
     shown += sentences(tuning.known) if tuning.known else too_many(result.choice, plan.space())
     shown += _search_sentences(tuning)

@@ -41,6 +41,8 @@ from tuning.search.study import open_study, run_study
 from tuning.ways.registry import WAYS, find_way
 from tuning.ways.task import Budget, Kept, Task
 
+SIMPLEX = 400  # evaluations of a descent to the reference of an ensemble, which has no gradient
+
 
 class Scored(NamedTuple):
     """A choice on the held-out runs."""
@@ -210,9 +212,10 @@ def reference(case: Case, protocol: Protocol) -> Result:
         choice = goal.choice_at(coordinates.of(best.parameters))
     else:
         least, choice = math.inf, start
-        for turn in range(min(protocol.starts, 5)):
-            some = data.slice(0, min(protocol.many, 200))
-            one = Task(case.filter, problem, some, options=case.options, start=start_of(case, turn))
+        some = data.slice(0, min(protocol.many, 200))
+        budget = Budget(SIMPLEX * len(some.seeds))
+        for turn in range(min(protocol.starts, len(STARTS))):
+            one = Task(case.filter, problem, some, options=case.options, start=start_of(case, turn), budget=budget)
             find_way("nelder-mead").run("nelder-mead", one)
             value = one.value(one.best)
             if value < least:

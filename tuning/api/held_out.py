@@ -24,6 +24,7 @@ from tuning.evaluation.worth import scaling_sentence, without_truth
 from tuning.problems.problem import Problem
 from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.gains import gains
+from tuning.reporting.residual_words import residual_sentences
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
 
@@ -193,7 +194,7 @@ class HeldOut:
         """The table of errors and the gain of tuning, for a terminal."""
         where = f"held-out {self.problem.seed_word} {self.seeds.start} to {self.seeds.stop - 1}"
         table = comparison_table(self.evaluations, self.bound, f"{where}, scenario {self.problem.name}")
-        return [table, *self.sentences()]
+        return [table, *self.sentences(), *residual_sentences(self.problem, self.seed)]
 
     def sentences(self) -> list[str]:
         """The gain of tuning over each baseline; for an untuned filter a description of the scaled default."""
