@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from studies.ways.problems import LIDAR_RUNS, LIDAR_SETS, Case, lidar
+from studies.ways.problems import FULL, LIDAR_RUNS, LIDAR_SETS, Case, lidar
 from studies.ways.protocol import (
     ORACLE,
     REFERENCE,
@@ -23,6 +23,7 @@ from studies.ways.protocol import (
     STUDY,
     STUDY_LOG_SCORE,
     TRIALS,
+    WITH_FULL,
     Protocol,
 )
 from tuning.evaluation.baselines import scaled_default
@@ -112,11 +113,16 @@ def start_of(case: Case, place: int) -> Choice:
 
 def run_way(case: Case, way: str, place: int, protocol: Protocol) -> Result:
     """A way on a data set."""
-    data, error = data_set(case, place), ""
+    data, error, label = data_set(case, place), "", way
+    if way.endswith(WITH_FULL):
+        if case.options == FULL:
+            return Result(case.name, label, place, {}, {}, None, 0.0, 0.0, {}, "all ways have full Q and R here")
+        way = way.removesuffix(WITH_FULL)
+        case = case._replace(options=FULL)
     try:
         _check(case, way, _task(case, data, place, Budget()))
     except ValueError as lacking:
-        return Result(case.name, way, place, {}, {}, None, 0.0, 0.0, {}, str(lacking))
+        return Result(case.name, label, place, {}, {}, None, 0.0, 0.0, {}, str(lacking))
     if way in WAYS:  # so that nothing is left to compile
         with suppress(ValueError):
             find_way(way).run(way, _task(case, data.slice(0, 4), place, Budget(60, 5.0)))
@@ -142,13 +148,12 @@ def run_way(case: Case, way: str, place: int, protocol: Protocol) -> Result:
         if one <= protocol.seconds
     }
     taken = task.runs, task.seconds
-    return Result(case.name, way, place, by_runs, by_seconds, at(last), *taken, _plain(last), error)
+    return Result(case.name, label, place, by_runs, by_seconds, at(last), *taken, _plain(last), error)
 
 
 def _task(case: Case, data: Data, place: int, budget: Budget) -> Task:
-    start = start_of(case, place)
-    given = {"options": case.options, "budget": budget, "start": start, "seed": place}
-    return Task(case.filter, case.make(), data, **given)
+    given: dict[str, Any] = {"options": case.options, "budget": budget, "seed": place}
+    return Task(case.filter, case.make(), data, start=start_of(case, place), **given)
 
 
 def _check(case: Case, way: str, task: Task) -> None:
@@ -181,10 +186,12 @@ def _follow(case: Case, way: str, place: int, task: Task) -> None:
 def _study(case: Case, way: str, place: int, task: Task) -> None:
     """What `thruster tune` does, which draws runs of its own to choose among its best trials; in one piece."""
     objective = SCORE if way == STUDY else LOG_SCORE
-    plan = Plan(case.filter, (case.make(),), place, (objective,), **case.options)
+    given: dict[str, Any] = dict(case.options)
+    plan = Plan(case.filter, (case.make(),), place, (objective,), **given)
     with quiet_optuna():
-        with task.uncounted():
-            run_study(open_study("first", plan._replace(seed=place + 1000)), plan._replace(seed=place + 1000), 2)
+        with task.uncounted():  # so that nothing is left to compile
+            other = plan._replace(seed=place + 1000)
+            run_study(open_study("first", other), other, 2)
         result = run_study(open_study("ways", plan), plan, TRIALS)
     task.runs += TRIALS * task.passes
     task.kept.append(Kept(task.runs, task.seconds, result.choice))

@@ -12,7 +12,7 @@ from numerics.plots import new_figure, save_figure, tidy
 from studies.ways.entries import Result
 from studies.ways.problems import GROUPS
 from studies.ways.protocol import RUNS, START, STUDY, Protocol
-from studies.ways.statistics import regrets
+from studies.ways.statistics import regrets, within
 
 LEAST, MOST = 1e-4, 3.0  # of log ratios, at which points are clipped
 MARKS = dict(zip(RUNS, (("o", "0.75"), ("o", "C0"), ("o", "C3")), strict=True))
@@ -32,8 +32,7 @@ def figure(results: Sequence[Result], protocol: Protocol, path: str | Path) -> P
         budgets = [one for one in RUNS if one <= protocol.runs]
         points: dict[float, dict[str, float]] = {}
         for budget in budgets:
-            key = f"{budget:g}"
-            found = [regrets(results, case, lambda one, key=key: one.by_runs.get(key)) for case in cases]
+            found = [regrets(results, case, within("by_runs", f"{budget:g}")) for case in cases]
             ways = dict.fromkeys(one.way for each in found for one in each)
             points[budget] = {
                 way: float(

@@ -13,7 +13,9 @@ REFERENCE = "reference"  # the best constant numbers
 START, SCALED, ORACLE = "start", "scaled default", "oracle"
 STUDY, STUDY_LOG_SCORE = "study", "study of log-score"  # of 50 trials, as `thruster tune` makes them
 TRIALS = 50
-ENTRIES = (*WAYS, START, SCALED, ORACLE, STUDY, STUDY_LOG_SCORE)
+WITH_FULL = ", full"  # behind a way: it tunes full Q and R, where the others of a case tune diagonals
+FULL_WAYS = tuple(f"{way}{WITH_FULL}" for way in ("mse", "log-score", "likelihood"))
+ENTRIES = (*WAYS, *FULL_WAYS, START, SCALED, ORACLE, STUDY, STUDY_LOG_SCORE)
 
 
 class Protocol(NamedTuple):

@@ -16,7 +16,11 @@ from studies.ways.protocol import REFERENCE
 
 LEVEL = 0.05
 EQUAL = 0.01  # of log ratios: "equal" is within 1 %
-LAST, BY_RUNS, BY_SECONDS = "last", "runs", "seconds"  # at what budget
+
+
+def within(kind: str, key: str) -> Callable[[Result], Scored | None]:
+    """What of a result counts: what the way gave for a budget of "by_runs" or "by_seconds"."""
+    return lambda one: getattr(one, kind).get(key)
 
 
 class Regret(NamedTuple):

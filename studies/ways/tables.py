@@ -9,22 +9,28 @@ from typing import NamedTuple
 import numpy as np
 
 from numerics.markdown import table
-from studies.ways.entries import Result, Scored
+from studies.ways.entries import Result
 from studies.ways.problems import GROUPS, Case
-from studies.ways.protocol import ORACLE, SCALED, START, STUDY, STUDY_LOG_SCORE, Protocol
-from studies.ways.statistics import Regret, regrets
+from studies.ways.protocol import (
+    FULL_WAYS,
+    ORACLE,
+    RUNS,
+    SCALED,
+    SECONDS,
+    START,
+    STUDY,
+    STUDY_LOG_SCORE,
+    WITH_FULL,
+    Protocol,
+)
+from studies.ways.statistics import Regret, regrets, within
+from tuning.search.objectives import LIKELIHOOD
 from tuning.ways.registry import WAYS
 from tuning.ways.way import TRUTH
 
-BLIND = tuple(name for name, way in WAYS.items() if TRUTH not in way.needs)  # those that look at no truth ...
-SEARCHES = (
-    "nelder-mead",
-    "coordinate-steps",
-    "tpe",
-    "gp",
-    "cma-es",
-    "random",
-)  # ... unless they minimise an error
+# Ways that look at no true state; but searches minimise an error where there are true states.
+BLIND = (*(name for name, way in WAYS.items() if TRUTH not in way.needs), f"{LIKELIHOOD}{WITH_FULL}")
+SEARCHES = ("nelder-mead", "coordinate-steps", "tpe", "gp", "cma-es", "random")
 NO_WAYS = (START, ORACLE)  # nobody has these
 
 
@@ -169,14 +175,13 @@ def _cell(one: Regret | None) -> str:
 def budget_table(results: Sequence[Result], protocol: Protocol) -> str:
     """Mean regret over the cases of groups A to D and F, at each budget of passes and of seconds."""
     cases = [case for case in protocol.cases if case.group in "ABCDF"]
-    by_runs = [f"{one:g}" for one in (1e3, 1e4, 1e5) if one <= protocol.runs]
-    by_seconds = [f"{one:g}" for one in (1.0, 10.0, 100.0) if one <= protocol.seconds]
-    looks: list[tuple[str, Callable[[Result], Scored | None]]] = []
-    looks += [(f"{key} passes", lambda one, key=key: one.by_runs.get(key)) for key in by_runs]
-    looks += [(f"{key} s", lambda one, key=key: one.by_seconds.get(key)) for key in by_seconds]
+    by_runs = [f"{one:g}" for one in RUNS if one <= protocol.runs]
+    by_seconds = [f"{one:g}" for one in SECONDS if one <= protocol.seconds]
+    looks = [(f"{key} passes", within("by_runs", key)) for key in by_runs]
+    looks += [(f"{key} s", within("by_seconds", key)) for key in by_seconds]
     found = {name: [{one.way: one for one in regrets(results, case, at)} for case in cases] for name, at in looks}
     rows = []
-    for way in (*WAYS, STUDY, STUDY_LOG_SCORE):
+    for way in (*WAYS, *FULL_WAYS, STUDY, STUDY_LOG_SCORE):
         logs = [[math.log(one[way].ratio.value) for one in columns if way in one] for columns in found.values()]
         if logs and all(logs):
             means = [float(np.mean(some)) for some in logs]

@@ -95,7 +95,7 @@ class Goal:
         for data, family, truth in zip(self._data, self._families, self._truths, strict=True):
             values, by_q, by_r = family.by_noise(choice, data, score=score, truth=truth)
             parts.append([self._weight(data) * one for one in (values.sum(), by_q, by_r)])
-        value, by_q, by_r = (sum(of_all) for of_all in zip(*parts, strict=True))
+        value, by_q, by_r = (np.sum(np.array(of_all), axis=0) for of_all in zip(*parts, strict=True))
         return float(value), by_q, by_r
 
     def model_at(self, point: np.ndarray) -> tuple[StateSpaceModel, ModelSlopes]:

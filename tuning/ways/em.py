@@ -64,12 +64,15 @@ def squarem(task: Task) -> None:
 
 def _start(task: Task, goal: Goal) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates of the start, and of how many terms each variance is the mean, (p,)."""
-    places = [one.place for one in goal.coordinates.free]
-    kinds = ProcessVariance, MeasurementVariance
-    if not all(isinstance(one, kinds) for one in places):
-        raise ValueError("EM must be of variances in Q and R, but other numbers are tuned, too")
     transitions, measured = counts_of(task)
-    counts = [transitions if isinstance(one, ProcessVariance) else measured[one.index] for one in places]
+    counts: list[float] = []
+    for one in goal.coordinates.free:
+        if isinstance(one.place, ProcessVariance):
+            counts.append(transitions)
+        elif isinstance(one.place, MeasurementVariance):
+            counts.append(measured[one.place.index])
+        else:
+            raise ValueError(f"EM must be of variances in Q and R, but {one.name} is tuned, too")
     first = np.clip(goal.coordinates.of(goal.untuned), goal.coordinates.low, goal.coordinates.high)
     return first, np.array(counts, dtype=np.float64)
 

@@ -16,7 +16,7 @@ from tuning.ways.noise import noise_estimation
 from tuning.ways.okf import okf
 from tuning.ways.posterior import posterior
 from tuning.ways.samplers import sample
-from tuning.ways.way import COVARIANCE, GRADIENT, NOISE, TRUTH, Way
+from tuning.ways.way import COVARIANCE, GRADIENT, LINEAR, NOISE, TRUTH, Way
 
 ABBEEL = "Abbeel, Coates, Montemerlo, Ng, Thrun (2005)"
 CHEN = "Chen, Heckman, Julier, Ahmed (2018), arXiv 1807.08855"
@@ -93,7 +93,7 @@ WAYS = {
         "without true states, of a linear model on long stationary runs: a few passes",
         als,
         "Odelson, Rajamani, Rawlings (2006)",
-        (GRADIENT,),
+        (GRADIENT, LINEAR),
         DIAGONAL,
     ),
     "desroziers": Way(

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 
 import optuna
+from optuna.distributions import BaseDistribution
 
 from tuning.search.quiet import quiet_optuna
 from tuning.search.samplers import make_sampler
@@ -21,7 +22,7 @@ def sample(sampler: str, objective: str | None = None) -> Callable[[Task], None]
     """
 
     def follow(task: Task) -> None:
-        space = {one.name: one.distribution for one in task.searched}
+        space: dict[str, BaseDistribution] = {one.name: one.distribution for one in task.searched}
         with task.uncounted(), quiet_optuna():  # packages are loaded
             made = make_sampler(sampler, task.seed, 0, space)
             study = optuna.create_study(sampler=made)

@@ -88,7 +88,8 @@ class Task:
         self.budget, self.seed = budget, seed
         self.stop: Callable[[], bool] = lambda: False  # whether somebody asked for an end
         self.start = untuned_choice(filter_name, self.problems[0]) if start is None else start
-        self.runs, self._excluded, self._prices = 0.0, 0.0, {}
+        self.runs, self._excluded = 0.0, 0.0
+        self._prices: dict[str, float] = {}
         self.kept = [Kept(0.0, 0.0, self.start)]
         self._seen: set[tuple] = set()
         self._begun = time.process_time()

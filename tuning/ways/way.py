@@ -10,11 +10,13 @@ from numerics.checks import one_of
 from tuning.likelihood.family import DIFFERENTIABLE
 from tuning.search.parameters import Q, R
 from tuning.search.space import has_search_space
+from tuning.ways.als import stationary
 from tuning.ways.task import Spent, Task
 
 TRUTH = "truth"  # true states
 GRADIENT = "gradient"  # a Kalman filter with derivatives
 COVARIANCE = "covariance"  # a filter with a covariance
+LINEAR = "linear"  # a linear model with a stationary filter
 NOISE = "noise"  # that Q and R are tuned, and not a model's own parameters
 
 
@@ -25,7 +27,7 @@ class Way(NamedTuple):
     when: str  # when to use it
     follow: Callable[[Task], None]  # keeps choices of a task until it is done, or the task raises Spent
     source: str
-    needs: tuple[str, ...] = ()  # of TRUTH, GRADIENT, COVARIANCE, NOISE
+    needs: tuple[str, ...] = ()  # of TRUTH, GRADIENT, COVARIANCE, LINEAR, NOISE
     options: tuple[str, ...] = ("hold_r", "full_q", "full_r", "prior")  # of the model's numbers, that it can tune
 
     def check(self, name: str, task: Task) -> None:
@@ -42,6 +44,8 @@ class Way(NamedTuple):
             raise ValueError(f"way {name!r} needs true states, but {lacking} has none")
         if NOISE in self.needs and not {Q, R} <= set(task.start.model):
             raise ValueError(f"way {name!r} tunes Q and R, but {task.problems[0].name} has parameters of its own")
+        if LINEAR in self.needs:
+            stationary(task.model(task.start), task.problems[0].name)
         unable = [option for option, wanted in task.options.items() if wanted and option not in self.options]
         if unable:
             raise ValueError(f"way {name!r} must come without {', '.join(unable)}")
