@@ -1,6 +1,6 @@
 """OKF's lidar: our ways of tuning beside the package that the example is from, in its own filter, on equal data.
 
-    python -m studies.okf_lidar
+    python -m studies.okf_lidar [docs/ways.md]  # the page, whose table "okf" is written anew
 
 The package is `Optimized-Kalman-Filter` (PyPI), in the extra `peers`; without it the rest is computed.
 """
@@ -10,14 +10,17 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import io
+import sys
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from numerics.markdown import table
+from numerics.files import write_whole
+from numerics.markdown import table, with_tables
 from studies.lidar import Run, drawn, lidar_problem
 from tuning.evaluation.baselines import with_covariances
 from tuning.evaluation.evaluate import Evaluation, evaluate, mse
@@ -130,5 +133,15 @@ def markdown(rows: list[Row]) -> str:
     return table(heads, cells)
 
 
+def main() -> None:
+    """Print the table, or write it on a page."""
+    text = markdown(compared())
+    if len(sys.argv) < 2:
+        print(text)
+        return
+    page = Path(sys.argv[1])
+    write_whole(page, with_tables(page.read_text(encoding="utf-8"), {"okf": lambda: text}))
+
+
 if __name__ == "__main__":
-    print(markdown(compared()))
+    main()

@@ -26,7 +26,7 @@ from studies.ways.protocol import (
 from studies.ways.statistics import Regret, regrets, within
 from tuning.search.objectives import LIKELIHOOD
 from tuning.ways.registry import WAYS
-from tuning.ways.way import TRUTH
+from tuning.ways.way import GRADIENT, TRUTH
 
 # Ways that look at no true state; but searches minimise an error where there are true states.
 BLIND = (*(name for name, way in WAYS.items() if TRUTH not in way.needs), f"{LIKELIHOOD}{WITH_FULL}")
@@ -189,11 +189,29 @@ def budget_table(results: Sequence[Result], protocol: Protocol) -> str:
     return table(["way", "cases", *found], [row for _, row in sorted(rows, key=lambda one: one[0])])
 
 
+def ways_table() -> str:
+    """What the ways are, whose, and when to use which."""
+    rows = [
+        [
+            f"`{name}`",
+            way.about,
+            "yes" if TRUTH in way.needs else "",
+            "yes" if GRADIENT in way.needs else "",
+            way.when,
+        ]
+        for name, way in WAYS.items()
+    ]
+    sources = [way.source for way in WAYS.values()]
+    heads = ["way", "what it does", "truth", "gradient", "use it", "source"]
+    return table(heads, [[*row, source] for row, source in zip(rows, sources, strict=True)])
+
+
 def tables(results: Sequence[Result], protocol: Protocol) -> dict[str, Callable[[], str]]:
     """The tables of the page, by name."""
     of_groups = {f"group {key}": (lambda key=key: group_table(results, protocol, key)) for key in GROUPS}
     return {
         "what to use": lambda: what_to_use(results, protocol),
+        "ways": ways_table,
         "budgets": lambda: budget_table(results, protocol),
         **of_groups,
     }

@@ -27,3 +27,13 @@ def test_the_numbers_are_those_of_the_residuals():
     w = (data.states[:, 1:] - data.states[:, :-1] @ wrong.T)[..., 1]
     correlation = np.corrcoef(w[:, :-1].ravel(), w[:, 1:].ravel())[0, 1]
     assert f"({w.mean() / w.std(ddof=1):+.2g}; {correlation:+.2g})" in said and correlation > 0.1
+
+
+def test_channels_that_are_never_measured_twice_in_a_row_have_no_memory():
+    runs = drawn(np.eye(2), np.eye(2), np.eye(2), np.eye(2), np.eye(2), 600, 8, 1)
+    for one in runs:
+        one["measurements"][::2, 1] = np.nan
+    problem = RunsProblem(
+        runs, linear(a=np.eye(2), c=np.eye(2)).model(), held_out=[6, 7], scale=(1.0, 1.0), name="by turns"
+    )
+    assert "nothing speaks against the model" in residual_sentences(problem)[0]

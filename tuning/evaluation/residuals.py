@@ -106,7 +106,9 @@ def estimated_from(model: StateSpaceModel, data: Data) -> Estimated:
 
 
 def _correlation(pairs: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Correlation of each component of residuals (N, n) with that a step later, (n,); 0 where they do not vary."""
+    """Correlation of each component of residuals (N, n) with that a step later, (n,); 0 where nothing varies."""
+    if len(pairs[0]) < FEWEST:  # channels that are never measured at two steps in a row
+        return np.zeros(pairs[0].shape[1])
     now, later = (one - one.mean(axis=0) for one in pairs)
     spread = np.sqrt((now**2).sum(axis=0) * (later**2).sum(axis=0))
     return np.divide((now * later).sum(axis=0), spread, out=np.zeros(now.shape[1]), where=spread > 0)
