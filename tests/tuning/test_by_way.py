@@ -1,6 +1,7 @@
 """Ways of tuning by the functions and commands of users: a study whose choice is the way's answer."""
 
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -8,10 +9,12 @@ import pytest
 import tuning
 from tests.linear_problem import LinearProblem
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from tuning.api import by_way
 from tuning.evaluation.tuned import read_tuned
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.find import find_problem
 from tuning.search.plan import TRAINING_SEEDS
+from tuning.ways.registry import WAYS
 
 SHORT = find_problem("nominal").replace(steps=70, name="short")
 
@@ -67,3 +70,18 @@ def test_the_command_follows_a_way(as_json, thruster):  # noqa: F811
     assert "true states" in thruster("ways").stdout
     shown = thruster("ways", "EM").stdout
     assert "Shumway" in shown and "dlog L/dq" in shown
+
+
+def test_ctrl_c_ends_a_way_with_what_it_has_found(monkeypatch, tmp_path):
+    def follow(task):
+        task.keep(task.with_values([2.0 * one for one in task.values_of(task.start, task.free)], task.free))
+        signal.raise_signal(signal.SIGINT)
+        task.value(task.best)
+        raise AssertionError("it went on")
+
+    monkeypatch.setattr(by_way, "find_way", lambda name: WAYS["random"]._replace(follow=follow))
+    study = tuning.tune(SHORT, "ekf", way="random", trials=4, progress=False)
+    assert study.interrupted and len(study.trials) == 2
+    before = SHORT.untuned["process_noise_cov"]
+    np.testing.assert_allclose(study.choice.model["process_noise_cov"], np.multiply(2.0, before))
+    assert study.save(tmp_path / "tuned.json").is_file()
