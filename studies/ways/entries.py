@@ -14,6 +14,7 @@ import numpy as np
 
 from studies.ways.problems import FULL, LIDAR_RUNS, LIDAR_SETS, Case, lidar
 from studies.ways.protocol import (
+    FROM_NOISE,
     ORACLE,
     REFERENCE,
     RUNS,
@@ -114,10 +115,11 @@ def start_of(case: Case, place: int) -> Choice:
 def run_way(case: Case, way: str, place: int, protocol: Protocol) -> Result:
     """A way on a data set."""
     data, error, label = data_set(case, place), "", way
-    if way.endswith(WITH_FULL):
-        if case.options == FULL:
+    informed = way.endswith(FROM_NOISE)
+    if informed or way.endswith(WITH_FULL):
+        if case.options == FULL and not informed:
             return Result(case.name, label, place, {}, {}, None, 0.0, 0.0, {}, "all ways have full Q and R here")
-        way = way.removesuffix(WITH_FULL)
+        way = way.removesuffix(FROM_NOISE).removesuffix(WITH_FULL)
         case = case._replace(options=FULL)
     try:
         _check(case, way, _task(case, data, place, Budget()))
@@ -128,6 +130,9 @@ def run_way(case: Case, way: str, place: int, protocol: Protocol) -> Result:
             find_way(way).run(way, _task(case, data.slice(0, 4), place, Budget(60, 5.0)))
     task = _task(case, data, place, Budget(protocol.runs, protocol.seconds))
     try:
+        if informed:
+            find_way("noise-estimation").run("noise-estimation", task)
+            task.start = task.best
         _follow(case, way, place, task)
     except ValueError as problem:
         error = str(problem) or type(problem).__name__

@@ -14,7 +14,11 @@ START, SCALED, ORACLE = "start", "scaled default", "oracle"
 STUDY, STUDY_LOG_SCORE = "study", "study of log-score"  # of 50 trials, as `thruster tune` makes them
 TRIALS = 50
 WITH_FULL = ", full"  # behind a way: it tunes full Q and R, where the others of a case tune diagonals
-FULL_WAYS = tuple(f"{way}{WITH_FULL}" for way in ("mse", "log-score", "likelihood"))
+FROM_NOISE = ", full, from noise estimation"  # the same, and begins there: added after the first results
+FULL_WAYS = (
+    *(f"{way}{WITH_FULL}" for way in ("mse", "log-score", "likelihood")),
+    *(f"{way}{FROM_NOISE}" for way in ("mse", "log-score")),
+)
 ENTRIES = (*WAYS, *FULL_WAYS, START, SCALED, ORACLE, STUDY, STUDY_LOG_SCORE)
 
 

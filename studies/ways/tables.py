@@ -165,8 +165,8 @@ def _cell(one: Regret | None) -> str:
         return "-"
     half = 50.0 * (one.ratio.high - one.ratio.low)
     said = percent(one.ratio.value)
-    if one.ratio.value < 2.0 and math.isfinite(half):
-        said = f"{said[:-2]} ± {half:.1f} %"
+    if one.ratio.value < 2.0 and one.sets > 1:
+        said = f"{said[:-2]} ± {half:.1f} %" if half < 100.0 else f"{said[:-2]} ± 100 % or more"
     failed = f", {one.failures} of {one.sets} failed" if one.failures else ""
     said = f"*{said}*" if one.worse else said
     return f"**{said}**{failed}" if one.equal else f"{said}{failed}"

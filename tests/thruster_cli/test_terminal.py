@@ -53,8 +53,8 @@ def test_every_option_is_in_a_panel(thruster, name):  # noqa: F811
 
 def test_what_is_random_has_a_seed_and_all_write_json(thruster):  # noqa: F811
     without = {name for name in COMMANDS if name != "study" and "--seed " not in thruster(name, "--help").stdout}
-    assert without == {"inspect", "filters", "new", "report", "verify", "export", "log"}
-    for name in (*set(COMMANDS) - {"study"}, "study policies", "study recordings", "study users"):
+    assert without == {"inspect", "filters", "new", "ways", "report", "verify", "export", "log"}
+    for name in (*set(COMMANDS) - {"study"}, "study policies", "study recordings", "study users", "study ways"):
         assert "--json " in thruster(*name.split(), "--help").stdout
 
 
@@ -191,6 +191,7 @@ def test_a_tuning_that_made_it_worse_says_what_to_do_next():
         tuned=SimpleNamespace(has_truth=True), ratios={"scaled default": Interval(1.2, 1.1, 1.3)}
     )
     tuning = SimpleNamespace(
+        way=None,
         proofs=[proof],
         gradient=None,
         plan=SimpleNamespace(prune=True, filter="enkf"),
