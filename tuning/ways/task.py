@@ -217,7 +217,8 @@ class Task:
 
     def _price_of_gradients(self, objective: str) -> float:
         plain = Goal(self.start, self.problems, self.data, self.free, objective)
-        few, point = plain.of_few(FEW), plain.coordinates.of(plain.untuned)
+        few, coordinates = plain.of_few(FEW), plain.coordinates
+        point = np.clip(coordinates.of(plain.untuned), coordinates.low, coordinates.high)
         return self.price(objective, lambda: few(point))
 
     def price(self, name: str, call: Callable[[], object]) -> float:

@@ -180,3 +180,11 @@ def test_innovations_of_ensembles_tell_r_and_a_factor_on_q():
 def test_every_way_says_what_it_is_and_whose():
     for name, way in WAYS.items():
         assert way.about and way.when and way.source and name == name.lower()
+
+
+def test_a_gradient_begins_within_the_ranges_where_the_start_has_a_correlation_of_one():
+    problem = linear()
+    task = task_of(problem, options=FULL)
+    task.start = task.start._replace(model={**task.start.model, "process_noise_cov": ((0.04, 0.08), (0.08, 0.16))})
+    find_way(LOG_SCORE).run(LOG_SCORE, task)
+    assert task.value(task.best, LOG_SCORE) < task.value(task.start, LOG_SCORE)
