@@ -31,6 +31,7 @@ from tuning.ways.way import GRADIENT, TRUTH
 # Ways that look at no true state; but searches minimise an error where there are true states.
 BLIND = (*(name for name, way in WAYS.items() if TRUTH not in way.needs), f"{LIKELIHOOD}{WITH_FULL}")
 SEARCHES = ("nelder-mead", "coordinate-steps", "tpe", "gp", "cma-es", "random")
+ENOUGH, ENOUGH_NATS = 0.005, 0.02  # of log ratios and log scores, up to which the cheaper way is taken
 NO_WAYS = (START, ORACLE)  # nobody has these
 
 
@@ -65,7 +66,7 @@ def is_blind(way: str, case: Case) -> bool:
 
 
 def what_to_use(results: Sequence[Result], protocol: Protocol) -> str:
-    """The way of least error, and that of the best log score, in each situation."""
+    """The cheapest way within 0.5 % of the least error, and that within 0.02 nat of the best log score."""
     heads = [
         "you have",
         "least error",
@@ -89,20 +90,20 @@ def what_to_use(results: Sequence[Result], protocol: Protocol) -> str:
         everywhere = set.intersection(*({one.way for one in each} for each in some)) - {SCALED}
         if not everywhere:
             continue
-        error = min(everywhere, key=lambda way: _mean(some, way, lambda one: math.log(one.ratio.value)))
-        proper = min(everywhere, key=lambda way: _mean(some, way, lambda one: _finite(one.log_score)))
-        rows.append(
-            [
-                situation.text,
-                f"`{error}`",
-                _both(some, error),
-                _nees(some, error),
-                f"`{proper}`",
-                _both(some, proper),
-                _nees(some, proper),
-            ]
-        )
+        error = _cheapest(some, everywhere, lambda one: math.log(one.ratio.value), ENOUGH)
+        proper = _cheapest(some, everywhere, lambda one: _finite(one.log_score), ENOUGH_NATS)
+        cells = [[f"`{way}`", _both(some, way), _nees(some, way)] for way in (error, proper)]
+        rows.append([situation.text, *cells[0], *cells[1]])
     return table(heads, rows)
+
+
+def _cheapest(
+    some: Sequence[Sequence[Regret]], ways: set[str], of: Callable[[Regret], float], enough: float
+) -> str:
+    """The way of the least time among those whose mean is within what is enough of the least mean."""
+    means = {way: _mean(some, way, of) for way in ways}
+    near = [way for way in ways if means[way] <= min(means.values()) + enough]
+    return min(near, key=lambda way: _mean(some, way, lambda one: one.seconds))
 
 
 def _may(way: str, case: Case, situation: Situation) -> bool:
@@ -127,8 +128,15 @@ def _both(some: Sequence[Sequence[Regret]], way: str) -> str:
 
 
 def _nees(some: Sequence[Sequence[Regret]], way: str) -> str:
-    values = [one.nees for one in _of(some, way)]
-    return f"{min(values):.3g}" if len(values) == 1 else f"{min(values):.3g} to {max(values):.3g}"
+    return spread([one.nees for one in _of(some, way)])
+
+
+def spread(values: Sequence[float]) -> str:
+    """The smallest and the largest of some values; nothing of those that are none."""
+    known = [one for one in values if math.isfinite(one)]
+    if not known:
+        return ""
+    return f"{known[0]:.3g}" if len(known) == 1 else f"{min(known):.3g} to {max(known):.3g}"
 
 
 def percent(ratio: float) -> str:
@@ -153,11 +161,9 @@ def _rank(columns: Sequence[Mapping[str, Regret]], way: str) -> float:
 def _row(way: str, columns: Sequence[Mapping[str, Regret]]) -> list[str]:
     there = [one[way] for one in columns if way in one]
     cells = [_cell(one.get(way)) for one in columns]
-    nees = [one.nees for one in there]
-    spread = f"{min(nees):.3g}" if len(nees) == 1 else f"{min(nees):.3g} to {max(nees):.3g}"
     name = f"**{way}**" if way in (STUDY, STUDY_LOG_SCORE) else way
     taken = f"{np.median([one.runs for one in there]):.0f}", f"{np.median([one.seconds for one in there]):.2g}"
-    return [name, *cells, spread, *taken]
+    return [name, *cells, spread([one.nees for one in there]), *taken]
 
 
 def _cell(one: Regret | None) -> str:

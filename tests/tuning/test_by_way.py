@@ -72,6 +72,13 @@ def test_the_command_follows_a_way(as_json, thruster):  # noqa: F811
     assert "Shumway" in shown and "dlog L/dq" in shown
 
 
+def test_gradients_of_full_matrices_begin_at_noise_estimation():
+    study = tuning.tune("deadband", "ekf", way="log-score", full_q=True, trials=60, progress=False)
+    ratios = study.held_out.ratios
+    assert ratios["noise estimation"].high < 0.85 and ratios["scaled default"].high < 0.5
+    assert study.held_out.evaluation.nees.value == pytest.approx(2.0, rel=0.1)
+
+
 def test_ctrl_c_ends_a_way_with_what_it_has_found(monkeypatch, tmp_path):
     def follow(task):
         task.keep(task.with_values([2.0 * one for one in task.values_of(task.start, task.free)], task.free))

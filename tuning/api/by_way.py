@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 import optuna
 from optuna.trial import FrozenTrial
 
 from filters.registry import filter_class
+from tuning.evaluation.baselines import noise_estimated
+from tuning.likelihood.goal import OF_STATES
 from tuning.problems.data import Data
 from tuning.search.interruption import stop_on_interrupt
 from tuning.search.measures import measured
+from tuning.search.parameters import R
 from tuning.search.plan import Plan
-from tuning.search.space import AUTO, Choice, trial_parameters
+from tuning.search.space import AUTO, Choice, trial_parameters, untuned_choice
 from tuning.search.study import FINISHED, OnTrial, StudyResult
 from tuning.search.trials import run_trial
 from tuning.ways.registry import WAYS, find_way
@@ -61,7 +65,7 @@ def follow(
     with stop_on_interrupt() as interrupted:
         given: dict[str, Any] = {"options": options, "objective": plan.objectives[0]}
         given["budget"] = Budget(trials * sum(len(one.seeds) for one in data))
-        task = Task(plan.filter, plan.scenarios, data, **given)
+        task = Task(plan.filter, plan.scenarios, data, start=_start(plan, name), **given)
         task.seed, task.stop = plan.seed, interrupted
         find_way(name).run(name, task)
         stopped = interrupted()
@@ -77,6 +81,21 @@ def follow(
     answer = {"choice": task.best._asdict(), "runs": task.runs, "seconds": task.seconds}
     study.set_user_attr(ANSWER, answer)
     return stopped
+
+
+def _start(plan: Plan, name: str) -> Choice | None:
+    """Noise estimation where gradients of an error follow full matrices; None for the rule of thumb.
+
+    From a start far off these often end elsewhere, and from there they do not (docs/ways.md, groups C and D).
+    """
+    if name not in OF_STATES or not plan.full_q:
+        return None
+    found = noise_estimated(plan.filter, plan.scenarios[0], plan.seed)
+    if found is None or not plan.hold_r and (plan.full_r or np.ndim(found.model[R]) < 2):
+        return found
+    rule = untuned_choice(plan.filter, plan.scenarios[0]).model[R]
+    r = rule if plan.hold_r else tuple(np.diag(np.asarray(found.model[R])).tolist())
+    return found._replace(model={**found.model, R: r})
 
 
 def answered(study: optuna.Study, result: StudyResult, plan: Plan, name: str) -> tuple[StudyResult, Followed]:
