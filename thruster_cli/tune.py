@@ -176,8 +176,8 @@ def command(
     the trial with the best log score among the best ones is taken. If no trial is in the band, the one with the
     least error is taken, the report and the file say so, and the exit code is 3.
 
-    With --way a published method finds the numbers instead, within as many passes over the training runs as the
-    trials would take. With a model that is right and true states: noise-estimation. With true states, if the
+    With --way a published method finds the numbers instead; samplers among them end after so many trials, the
+    others of themselves. With a model that is right and true states: noise-estimation. With true states, if the
     covariance counts, too: log-score; if the estimate alone counts: mse. Without true states: likelihood. Of an
     ensemble: this study, or desroziers without true states. With true states and a wrong model, or a dead
     band, add --full-q (and --full-r) to mse or log-score. `thruster ways` lists all of them.

@@ -20,13 +20,13 @@ SHORT = find_problem("nominal").replace(steps=70, name="short")
 
 
 def test_a_way_gives_its_answer_its_file_and_its_held_out_table(tmp_path):
-    study = tuning.tune(SHORT, "ekf", way="likelihood", trials=40, progress=False)
+    study = tuning.tune(SHORT, "ekf", way="likelihood", trials=10, progress=False)
     data = SHORT.data(SHORT.training_seeds(0, TRAINING_SEEDS))
     expected = tune_by_gradient("ekf", SHORT, data).choice
     for name in ("process_noise_cov", "measurement_noise_cov"):
         np.testing.assert_allclose(study.choice.model[name], expected.model[name], rtol=1e-4)
     assert "Way likelihood: maximum likelihood" in str(study) and "held-out" in str(study)
-    assert 0 < len(study.trials) <= 40 and study.consistent is None
+    assert 0 < len(study.trials) <= 10 and study.consistent is None
     file = study.save(tmp_path / "tuned.json")
     written = json.loads(file.read_text())
     assert written["study"]["method"] == "likelihood"
@@ -65,7 +65,7 @@ def test_what_a_way_lacks_is_said_in_one_line(problem, options, words):
 
 def test_the_command_follows_a_way(as_json, thruster):  # noqa: F811
     told = as_json("tune", "--filter", "enkf", "--problem", "nominal", "--way", "desroziers", "--trials", 4)
-    assert told["way"]["name"] == "desroziers" and 32 < told["way"]["runs"] <= 5 * 32
+    assert told["way"]["name"] == "desroziers" and told["way"]["runs"] % 32 == 0 and told["way"]["runs"] > 4 * 32
     assert told["file"].endswith("enkf-nominal-seed0-way-desroziers.json") and told["trials"] <= 4
     assert "true states" in thruster("ways").stdout
     shown = thruster("ways", "EM").stdout
@@ -73,7 +73,7 @@ def test_the_command_follows_a_way(as_json, thruster):  # noqa: F811
 
 
 def test_gradients_of_full_matrices_begin_at_noise_estimation():
-    study = tuning.tune("deadband", "ekf", way="log-score", full_q=True, trials=60, progress=False)
+    study = tuning.tune("deadband", "ekf", way="log-score", full_q=True, trials=6, progress=False)
     ratios = study.held_out.ratios
     assert ratios["noise estimation"].high < 0.85 and ratios["scaled default"].high < 0.5
     assert study.held_out.evaluation.nees.value == pytest.approx(2.0, rel=0.1)

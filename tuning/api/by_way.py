@@ -51,7 +51,7 @@ def check_way(plan: Plan, name: str, workers: int) -> None:
 def follow(
     study: optuna.Study, plan: Plan, data: Sequence[Data], trials: int, on_trial: OnTrial, *, name: str
 ) -> bool:
-    """Follow a way with as many passes as a study of so many trials has: `run` of `run_study`.
+    """Follow a way to its end, or one by trials for as many as a study has: `run` of `run_study`.
 
     Returns:
         Whether Ctrl-C ended it; what it had found until then is kept.
@@ -64,7 +64,8 @@ def follow(
     options = plan.options if filter_class(plan.filter).has_covariance else {}
     with stop_on_interrupt() as interrupted:
         given: dict[str, Any] = {"options": options, "objective": plan.objectives[0]}
-        given["budget"] = Budget(trials * sum(len(one.seeds) for one in data))
+        passes = sum(len(one.seeds) for one in data)
+        given["budget"] = Budget(trials * passes) if find_way(name).by_trials else Budget()
         task = Task(plan.filter, plan.scenarios, data, start=_start(plan, name), **given)
         task.seed, task.stop = plan.seed, interrupted
         find_way(name).run(name, task)

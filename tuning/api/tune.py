@@ -82,8 +82,8 @@ def tune(
         prune: end a trial that is significantly worse than the best on the same seeds.
         method: "optuna"; or "gradient", for kf, ekf, iekf, ukf and ckf: maximum likelihood, or the best
             "score", "mse" or "log-score" where that is the objective.
-        way: another way of tuning in place of the study, such as "em", as `thruster ways` lists them: it takes as
-            many passes over the training runs as so many trials do.
+        way: another way of tuning in place of the study, such as "em", as `thruster ways` lists them: it ends of
+            itself, or if it is a sampler after so many trials.
         workers: processes on this host that share the study; several need a storage.
         storage: journal file or URL of a database that saves the study, so that the same call continues it; by
             default it ends with the process.

@@ -149,24 +149,28 @@ WAYS = {
         "of any filter and objective; with up to ten numbers",
         sample("tpe"),
         "Bergstra, Bardenet, Bengio, Kegl (2011)",
+        by_trials=True,
     ),
     "gp": Way(
         "Optuna's Gaussian process on the objective",
         "of any filter, if a pass takes seconds",
         sample("gp"),
         "Optuna's GPSampler",
+        by_trials=True,
     ),
     "cma-es": Way(
         "covariance matrix adaptation on the objective",
         "of any filter, with hundreds of trials",
         sample("cma-es"),
         "Hansen (2016), arXiv 1604.00772",
+        by_trials=True,
     ),
     "random": Way(
         "independent draws",
         "to compare: every search has to beat it",
         sample("random"),
         "Bergstra, Bengio (2012)",
+        by_trials=True,
     ),
     "nis": Way(
         "trials that minimise |log(mean NIS / m)|, by the sampler tpe",
@@ -174,6 +178,7 @@ WAYS = {
         sample("tpe", "nis"),
         CHEN,
         (COVARIANCE,),
+        by_trials=True,
     ),
     "c-nis": Way(
         "the same of mean and variance of the NIS",
@@ -181,6 +186,7 @@ WAYS = {
         sample("tpe", "c-nis"),
         "Chen, Biggie, Ahmed, Julier, Heckman, arXiv 2306.07225",
         (COVARIANCE,),
+        by_trials=True,
     ),
     "nees": Way(
         "trials that minimise |log(mean NEES / n)|, by the sampler tpe",
@@ -188,6 +194,7 @@ WAYS = {
         sample("tpe", "nees"),
         CHEN,
         (TRUTH, COVARIANCE),
+        by_trials=True,
     ),
     "c-nees": Way(
         "the same of mean and variance of the NEES",
@@ -195,6 +202,7 @@ WAYS = {
         sample("tpe", "c-nees"),
         "Chen, Biggie, Ahmed, Julier, Heckman, arXiv 2306.07225",
         (TRUTH, COVARIANCE),
+        by_trials=True,
     ),
 }
 

@@ -29,6 +29,7 @@ class Way(NamedTuple):
     source: str
     needs: tuple[str, ...] = ()  # of TRUTH, GRADIENT, COVARIANCE, LINEAR, NOISE
     options: tuple[str, ...] = ("hold_r", "full_q", "full_r", "prior")  # of the model's numbers, that it can tune
+    by_trials: bool = False  # whether it goes on for as many trials as it is given; others end of themselves
 
     def check(self, name: str, task: Task) -> None:
         """Raise ValueError if a task lacks what the way needs."""
