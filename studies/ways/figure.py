@@ -22,7 +22,7 @@ def figure(results: Sequence[Result], protocol: Protocol, path: str | Path) -> P
     """A panel a group: the mean log ratio of each way over the cases, after each budget of passes."""
     groups = [key for key in GROUPS if any(case.group == key for case in protocol.cases)]
     rows = -(-len(groups) // 2)
-    drawn = new_figure((11.0, 4.6 * rows))
+    drawn = new_figure((10.0, 3.9 * rows))
     axes = drawn.subplots(rows, 2, squeeze=False)
     tidy(axes.flat)
     for axis in axes.flat[len(groups) :]:
@@ -48,13 +48,14 @@ def figure(results: Sequence[Result], protocol: Protocol, path: str | Path) -> P
             values = [100.0 * np.clip(points[budget].get(way, np.nan), LEAST, MOST) for way in order]
             axis.plot(values, range(len(order)), mark, color=colour, markersize=4, label=f"{budget:g} passes")
         axis.set_xscale("log")
-        axis.set_yticks(range(len(order)), order, fontsize=7)
+        axis.set_yticks(range(len(order)), order, fontsize=6)
         for label in axis.get_yticklabels():
             label.set_fontweight("bold" if label.get_text() in (STUDY, START) else "normal")
         axis.set_title(f"{group}: {GROUPS[group]}", fontsize=10)
         axis.set_xlabel("regret [%]")
-    if axes.flat[0].lines:
-        axes.flat[0].legend(fontsize=8, loc="lower right", frameon=False)
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    if handles:
+        drawn.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
     drawn.suptitle(
         "Score over that of the best constant numbers, held out; left of 0.01 % is drawn there", fontsize=11
     )

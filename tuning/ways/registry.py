@@ -173,7 +173,7 @@ WAYS = {
         by_trials=True,
     ),
     "nis": Way(
-        "trials that minimise |log(mean NIS / m)|, by the sampler tpe",
+        "trials that minimise abs(log(mean NIS / m)), by the sampler tpe",
         "to compare: it is zero on a curve, and says nothing of error",
         sample("tpe", "nis"),
         CHEN,
@@ -189,7 +189,7 @@ WAYS = {
         by_trials=True,
     ),
     "nees": Way(
-        "trials that minimise |log(mean NEES / n)|, by the sampler tpe",
+        "trials that minimise abs(log(mean NEES / n)), by the sampler tpe",
         "to compare",
         sample("tpe", "nees"),
         CHEN,
