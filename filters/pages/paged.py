@@ -41,7 +41,8 @@ class GivenModel:
         n, m, self.x = shape.n, shape.m, given("x", (shape.n,))
         self.P, self.Q, self.R = self._symmetric("P", n), self._symmetric("Q", n), self._symmetric("R", m)
         self.u, self.z = self._beside("u", shape.inputs), self._beside("z", m)
-        self.constants, self.kept = self._beside("c", shape.constants), {}
+        self.constants = self._beside("c", shape.constants)
+        self.kept: dict[str, Matrix] = {}
         self.own = page.parameters(lambda place, size: self._beside("own", *size))
         points = 0 if page.begin is None else page.begin(self, self.x, self.P).shape[1]
         self.X = self._beside("X", n, points)
