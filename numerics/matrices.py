@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import cache
 
 from numerics import arrays
-from numerics.sources import Source, entrywise, is_array
+from numerics.sources import Source, is_array
 from numerics.triangles import (
     careful_factor,
     cholesky_factor,
@@ -32,7 +32,6 @@ __all__ = [
     "cholesky_factor",
     "factored_inverse",
     "forward_solver",
-    "identity_less",
     "innovation",
     "innovation_likelihood",
     "log_density",
@@ -134,17 +133,6 @@ def symmetric_sum(size: int) -> Callable:
 
 
 @cache
-def identity_less(size: int) -> Callable:
-    """Return `subtract(a)`: I - a."""
-    source = Source("subtract", "a", result=(size, size), a=(size, size))
-
-    def entry(i, j):
-        return f"{source.if_same(i, j, '1.0', '0.0')} - a[{i}][{j}]"
-
-    return source.function(source.matrix(size, size, entry))
-
-
-@cache
 def innovation(size: int, first: int = 0) -> Callable:
     """Return `subtract(z, y)`: z - y[first:], zero in channels that are NaN in z."""
     source = Source("subtract", "z, y", result=(size,), z=(size,), y=(first + size,))
@@ -153,19 +141,6 @@ def innovation(size: int, first: int = 0) -> Callable:
         return f"z[{i}] - y[{first + i}] if z[{i}] == z[{i}] else 0.0"
 
     return source.function(source.vector(size, entry))
-
-
-@cache
-def present_part(size: int) -> Callable:
-    """Return `part(a, z)`: the matrix a with zeros in rows and columns of channels that are NaN in z."""
-    return entrywise(
-        "of_present",
-        "a, z",
-        (size, size),
-        lambda i, j: f"(a[{i}][{j}] if z[{i}] == z[{i}] and z[{j}] == z[{j}] else 0.0)",
-        a=(size, size),
-        z=(size,),
-    )
 
 
 @cache

@@ -52,17 +52,6 @@ def starts_of(*lengths: int) -> list[int]:
 
 
 @cache
-def affine_constants(count: int, start: int) -> tuple[Callable, Callable]:
-    """Functions `read(row)` and `store(row, c)` of an affine model's constants, in a filter's own memory."""
-    if constants_are_array(count):
-        read = written_out("read", "row", f"row[{start}:{start + count}].copy()")
-        lines = f"for i in range({count}):", f"    row[{start} + i] = c[i]"
-        return read, written_out("store", "row, c", *lines, "None", _loops=True)
-    read = written_out("read", "row", tuple_of(f"row[{start + i}]" for i in range(count)))
-    return read, written_out("store", "row, c", *(f"row[{start + i}] = c[{i}]" for i in range(count)), "None")
-
-
-@cache
 def constants_reader(shape: Shape) -> Callable:
     """Return `read(numbers)`: the model's constants as its functions take them."""
     start = number_places(shape.n, shape.m).constants

@@ -18,7 +18,8 @@ from tuning.evaluation.evaluate import Evaluation, likelihood_gain, score_ratio
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.sizes import SIZE_TOLERANCE, left_out
 from tuning.evaluation.tuned import consistency, metrics
-from tuning.likelihood.gradient import DIFFERENTIABLE, GradientResult
+from tuning.likelihood.family import has_gradient
+from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
 from tuning.logs.problem import model_named_in
 from tuning.problems.rooms import built_in
@@ -84,7 +85,7 @@ def way_out(tuning: Tuning) -> list[str]:
     if not worse or tuning.gradient is not None or tuning.way is not None:
         return []
     pruning = ", or without pruning (--no-pruning)" if tuning.plan.prune else ""
-    pruning += ", or maximum likelihood (--method gradient)" if tuning.plan.filter in DIFFERENTIABLE else ""
+    pruning += ", or maximum likelihood (--method gradient)" if has_gradient(tuning.plan.filter) else ""
     return [
         f"What may help: more trials (--trials {2 * tuning.result.finished}){pruning}. The file below still "
         f"contains the tuned filter; Q and R of the {worse[0]} are in the table."

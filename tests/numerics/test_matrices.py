@@ -46,12 +46,6 @@ def test_a_symmetric_sum_is_exactly_symmetric(size):
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_identity_less_a_matrix(size):
-    a = random(size, size)
-    np.testing.assert_array_equal(matrices.identity_less(size)(rows_of(a)), np.eye(size) - a)
-
-
-@pytest.mark.parametrize("size", SIZES)
 def test_a_mask_cuts_correlations_to_missing_channels_only(size):
     r = random_covariance(size)
     for missing in range(size):

@@ -17,7 +17,7 @@ from tuning.api.by_way import Followed, answered, check_way, follow, way_sentenc
 from tuning.api.progress import trial_bar, working
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
-from tuning.likelihood.family import DIFFERENTIABLE
+from tuning.likelihood.family import check_gradient
 from tuning.likelihood.goal import OF_STATES
 from tuning.likelihood.gradient import GradientResult, tune_by_gradient
 from tuning.likelihood.identifiability import Identifiability, identify
@@ -180,7 +180,7 @@ def _check_method(plan: Plan, by_gradient: str | None) -> None:
     """Raise ValueError for a plan that the gradient method cannot serve."""
     if by_gradient is None:
         return
-    one_of("a filter whose likelihood has a gradient", plan.filter, DIFFERENTIABLE)
+    check_gradient(plan.filter, "a filter whose likelihood has a gradient")
     if plan.worst:
         raise ValueError("method='gradient' (--method) must count the mean of problems, but got worst (--worst)")
     if plan.budget is not None:

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from filters.differentiated.differentiable import KINDS
+from filters.differentiated.differentiable import KINDS, has_derivatives
 from filters.differentiated.recursion import LIKELIHOOD, Wanted
 from filters.differentiated.runs import ModelSlopes, Truth, derivatives, same_functions
-from filters.registry import make_filter
+from filters.estimators.find import is_foreign
+from filters.registry import filter_class, make_filter
+from numerics.checks import one_of
 from plants.state_space import StateSpaceModel
 from tuning.likelihood.noise import TunedCovariance
 from tuning.problems.coordinates import Coordinates
@@ -19,9 +21,20 @@ from tuning.problems.problem import Problem
 from tuning.search.parameters import Correlation, MeasurementVariance, ProcessVariance, Q, R, model_parameters
 from tuning.search.space import Choice
 
-DIFFERENTIABLE = tuple(kind.name for kind in KINDS)  # filters
+DIFFERENTIABLE = tuple(kind.name for kind in KINDS)  # filters, and those of users that `has_gradient` knows
 LEAST_NUMBERS = 8  # number of parameters from which the information is faster than differences
 STEP = 1e-4  # in coordinates, of the differences of a model's numbers
+
+
+def has_gradient(name: str) -> bool:
+    """Whether a filter, or a user's by "module:class", has exact gradients."""
+    return name in DIFFERENTIABLE or (is_foreign(name) and has_derivatives(filter_class(name)))
+
+
+def check_gradient(name: str, what: str = "filter") -> None:
+    """Raise ValueError for a filter without exact gradients."""
+    if not has_gradient(name):
+        one_of(what, name, DIFFERENTIABLE)
 
 
 class Family:
@@ -167,7 +180,7 @@ def known_information(
         names: names of the p parameters.
         values: at which the information is taken, (p,).
     """
-    if choice.name not in DIFFERENTIABLE or len(names) < LEAST_NUMBERS:
+    if not has_gradient(choice.name) or len(names) < LEAST_NUMBERS:
         return None
     found = []
     for scenario, one in zip(scenarios, data, strict=True):

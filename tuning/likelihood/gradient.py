@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numerics.checks import one_of
-from tuning.likelihood.family import DIFFERENTIABLE
+from tuning.likelihood.family import check_gradient
 from tuning.likelihood.goal import Goal
 from tuning.likelihood.identifiability import KNOWN_WITHIN, TWO_SIDED
 from tuning.problems.coordinates import Coordinates
@@ -97,7 +96,7 @@ def tune_by_gradient(
 
     Source: Huber (1967), "The behavior of maximum likelihood estimates under nonstandard conditions".
     """
-    one_of("filter", filter_name, DIFFERENTIABLE)
+    check_gradient(filter_name)
     begin = time.perf_counter()
     goal = goal_of(filter_name, problems, data, objective, options)
     free, coordinates = goal.coordinates.free, goal.coordinates

@@ -15,7 +15,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from filters.registry import filter_class
 from tuning.evaluation.baselines import GIVEN, ORACLE, RULE, baselines
-from tuning.likelihood.family import DIFFERENTIABLE
+from tuning.likelihood.family import has_gradient
 from tuning.likelihood.goal import OF_STATES, Goal
 from tuning.likelihood.gradient import goal_of, optimum, start_at, starts_of
 from tuning.search.cost import COST
@@ -229,7 +229,7 @@ def noise_by_gradient(study: optuna.Study, plan: Plan, objective: str = LIKELIHO
     if known is not None:
         return known or None
     small = len(plan.scenarios[0].quantities.states) <= MOST_STATES
-    name = plan.filter if plan.filter == "kf" or (small and plan.filter in DIFFERENTIABLE) else "ekf"
+    name = plan.filter if plan.filter == "kf" or (small and has_gradient(plan.filter)) else "ekf"
     try:
         goal = goal_of(name, plan.scenarios, plan.training_data(), objective, plan.options)
         some = goal.is_large or len(goal.coordinates.free) > MOST_FOR_ALL

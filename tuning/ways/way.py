@@ -6,8 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from filters.registry import filter_class
-from numerics.checks import one_of
-from tuning.likelihood.family import DIFFERENTIABLE
+from tuning.likelihood.family import check_gradient
 from tuning.search.parameters import Q, R
 from tuning.search.space import has_search_space
 from tuning.ways.als import stationary
@@ -36,7 +35,7 @@ class Way(NamedTuple):
         if not has_search_space(task.filter):
             raise ValueError(f"filter must be one that has something to tune, but got {task.filter!r}")
         if GRADIENT in self.needs:
-            one_of(f"a filter for way {name!r}", task.filter, DIFFERENTIABLE)
+            check_gradient(task.filter, f"a filter for way {name!r}")
         if COVARIANCE in self.needs and not filter_class(task.filter).has_covariance:
             raise ValueError(f"way {name!r} needs a filter with a covariance, but got {task.filter!r}")
         if TRUTH in self.needs and not task.has_truth:
