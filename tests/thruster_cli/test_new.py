@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import tuning
 from filters import EstimateState, make_filter, run
 from filters.likelihood import likelihood
 from filters.registry import filter_class
@@ -21,6 +22,7 @@ from thruster_env.model import thruster_model
 from thruster_env.parameters import TUNNEL_PHYSICAL
 from thruster_env.preset_file import read_preset
 from tuning.evaluation.baselines import rule_of_thumb
+from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.find import find_problem
 from tuning.search.parameters import filter_parameters
 
@@ -184,3 +186,13 @@ def test_what_cannot_be_new_is_refused(thruster, tmp_path, arguments, line):  # 
     assert done.returncode == 2 and line in done.stderr
     assert {path.name for path in tmp_path.iterdir()} == {"there.py", "none"}
     assert (tmp_path / "there.py").read_text() == "mine\n"
+
+
+@pytest.mark.slow
+def test_gradients_and_ways_tune_a_users_filter(new):
+    name = f"{new('filter', 'a_new_way')}:ANewWay"
+    study = tuning.tune("nominal", name, way="likelihood", progress=False)
+    evaluated = study.held_out
+    assert evaluated is not None and study.choice.numbers["bandwidth"] == 3.0
+    found = tune_by_gradient(name, find_problem("nominal"), find_problem("nominal").data(range(8)))
+    assert found.agree and found.best.converged
