@@ -30,7 +30,7 @@ from typing import ClassVar
 import tuning
 from filters import ExtendedKalmanFilter
 from filters.gaussian.extended import advance, settle
-from filters.pages.page import Page, PageFilter
+from filters.pages.page_filter import Page, PageFilter
 from numerics.algebra.blocks import forward_quotient
 from numerics.algebra.densities import log_density
 from numerics.algebra.operations import (

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from filters.adaptive.noise import noise_moment
 from filters.gaussian.extended import advance, settle
-from filters.pages.page import Page, PageFilter
+from filters.pages.page_filter import Page, PageFilter
 from numerics.algebra.densities import log_density
 from numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
 from numerics.algebra.scalars import constant, count, ratio, trace

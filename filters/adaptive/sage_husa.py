@@ -9,7 +9,7 @@ import numpy as np
 
 from filters.engine.belief import Belief
 from filters.gaussian.extended import advance
-from filters.pages.page import Page, PageFilter
+from filters.pages.page_filter import Page, PageFilter
 from numerics.algebra.densities import log_density
 from numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
 from numerics.algebra.points import outer

@@ -11,7 +11,7 @@ from filters.adaptive.noise import noise_moment
 from filters.adaptive.sage_husa import part_that_is_kept
 from filters.engine.belief import Belief
 from filters.gaussian.extended import advance, settle
-from filters.pages.page import Page, PageFilter
+from filters.pages.page_filter import Page, PageFilter
 from numerics.algebra.densities import log_density
 from numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
 from numerics.algebra.scalars import choose, count, exceeds, ratio, shifted

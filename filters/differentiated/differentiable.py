@@ -11,7 +11,7 @@ from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.gaussian.iterated import IteratedExtendedKalmanFilter
 from filters.gaussian.kalman import KalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
-from filters.pages.page import Page, PageFilter
+from filters.pages.page_filter import Page, PageFilter
 from plants.state_space import StateSpaceModel
 
 KINDS: tuple[type[PageFilter], ...] = (

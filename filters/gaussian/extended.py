@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from filters.pages.page import Page, PageFilter
+from filters.pages.page_filter import Page, PageFilter
 from numerics.algebra.densities import log_density
 from numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
 

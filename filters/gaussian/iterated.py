@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from filters.gaussian.extended import advance, settle
-from filters.pages.page import Page, PageFilter
+from filters.pages.page_filter import Page, PageFilter
 from numerics.algebra.densities import log_density
 from numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
 from numerics.checks import at_least

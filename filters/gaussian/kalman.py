@@ -12,7 +12,7 @@ from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.gaussian.information import INFORMATION
 from filters.gaussian.schedule import SCHEDULED
 from filters.gaussian.square_root import SQUARE_ROOT
-from filters.pages.page import Page, PageFilter
+from filters.pages.page_filter import Page, PageFilter
 from numerics.checks import at_least, covariance, one_of
 from plants.affine import AffineModel, linearize
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from filters.pages.page import Page, PageFilter
+from filters.pages.page_filter import Page, PageFilter
 from numerics.algebra.densities import log_density
 from numerics.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
 from numerics.algebra.points import first, ones, others, outer, root, square, units

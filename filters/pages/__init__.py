@@ -1,7 +1,9 @@
 """Filters as pages of a textbook, pure functions of small matrices, and what runs them.
 
-page, own         what a page is made of, and a filter that is made of a page
-equations, traced a model as pages see it: f, F, h, H, Q, R of matrices
+page, page_filter       what a page is made of, and a filter that has one
+equations, traced       a model as pages see it: f, F, h, H, Q, R of matrices
 differences, at_points  the same of functions that cannot be traced, which are called
-stages, kernels   a page as programs in the memory of a belief
+memory, stages          where matrices lie, and what a page stores there
+programs, kernels       a page as programs or calls, and as kernels of the engine
+paged                   a page as graphs of matrices, for tensors and C
 """

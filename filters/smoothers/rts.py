@@ -21,7 +21,7 @@ from filters.engine.layout import memory_places
 from filters.gaussian.schedule import constants_at
 from filters.pages.equations import Equations
 from filters.pages.memory import RowMemory
-from filters.pages.page import Page, PageFilter
+from filters.pages.page_filter import Page, PageFilter
 from filters.pages.programs import programs_of, stored, together
 from filters.pages.stages import Stage
 from numerics.algebra.blocks import careful

@@ -14,7 +14,7 @@ from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.gaussian.iterated import IteratedExtendedKalmanFilter
 from filters.gaussian.kalman import KalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
-from filters.pages.page import PageFilter
+from filters.pages.page_filter import PageFilter
 from filters.smoothers.ensemble import smooth_ensembles
 from filters.smoothers.points import CUBATURE, UNSCENTED
 from filters.smoothers.rts import LINEARISED, SCHEDULED, Relation, smooth_backwards

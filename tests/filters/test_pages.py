@@ -10,7 +10,7 @@ from filters import FILTERS, ExtendedKalmanFilter, KalmanFilter, make_filter, ru
 from filters.differentiated.differentiable import KINDS, differentiable
 from filters.gaussian.kalman import FORMS
 from filters.likelihood import information, likelihood
-from filters.pages.page import PageFilter
+from filters.pages.page_filter import PageFilter
 from filters.sensitivity import ModelSlopes, sensitivity
 from filters.state_scores import state_score
 from numerics.compiled import interpreted

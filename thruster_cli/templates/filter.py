@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from filters.gaussian.extended import advance, settle  # the prediction: x = f(x, u), P = F P F' + Q
-from filters.pages.page import Page, PageFilter
+from filters.pages.page_filter import Page, PageFilter
 from numerics.algebra.blocks import forward_quotient
 from numerics.algebra.densities import log_density
 from numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap

@@ -1,0 +1,56 @@
+"""A filter that has a page: a class with its parameters."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from filters.engine.belief import Kernels
+from filters.filter import Filter
+from filters.pages.kernels import page_kernels
+from filters.pages.page import Page
+
+__all__ = ["Page", "PageFilter"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class PageFilter(Filter):
+    """Base of filters that have a page; subclasses name it, and add their parameters as fields.
+
+    Attributes:
+        page: its functions.
+        unrolled: fields that are whole numbers and say how often something is repeated; each value has a program
+            of its own. Other fields are numbers that programs read.
+        ranges: of fields that studies may tune, the smallest and the largest value.
+    """
+
+    page: ClassVar[Page]
+    unrolled: ClassVar[tuple[str, ...]] = ()
+    ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
+
+    @property
+    def parameters(self) -> Mapping[str, Any]:
+        """Numbers and arrays that the page finds in `model.own`: fields, unless a filter says otherwise."""
+        return {name: getattr(self, name) for name in self._fields() if name not in self.unrolled}
+
+    def _fields(self) -> Iterator[str]:
+        return (field.name for field in dataclasses.fields(self) if field.name != "model")
+
+    @cached_property
+    def own_numbers(self) -> tuple[float, ...]:
+        """The parameters, one behind the other."""
+        return tuple(float(number) for value in self.parameters.values() for number in np.ravel(value))
+
+    @property
+    def written_page(self) -> Page:
+        """The page, with the shapes of the parameters."""
+        own = tuple((name, np.shape(value)) for name, value in self.parameters.items())
+        return self.page._replace(own=own, fixed=tuple((name, getattr(self, name)) for name in self.unrolled))
+
+    def kernels(self) -> Kernels:
+        """Kernels of the page for the model's functions; see `Filter.kernels`."""
+        return page_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)
