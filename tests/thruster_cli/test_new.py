@@ -171,7 +171,10 @@ def test_a_preset_is_a_thruster(new, as_json):  # noqa: F811
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (("modle", "x"), "what is new must be one of problem, model, env, preset, but got 'modle'; did you mean"),
+        (
+            ("modle", "x"),
+            "what is new must be one of problem, model, env, filter, preset, but got 'modle'; did you mean",
+        ),
         (("model", "there"), "a new model must not replace a file, but there.py is there"),
         (("preset", "x.py"), "a new preset must end in .toml, but got 'x.py'"),
         (("env", "my-env"), "a module must have a name of letters, digits and _, but got 'my-env'"),

@@ -13,6 +13,7 @@ import numpy as np
 
 from filters.likelihood import Likelihood
 from filters.registry import filter_class
+from numerics.streams import WAY_OF_TUNING, derived_generator
 from plants.state_space import StateSpaceModel
 from tuning.evaluation.baselines import same_filter
 from tuning.evaluation.evaluate import compute_metrics
@@ -122,7 +123,7 @@ class Task:
     @cached_property
     def generator(self) -> np.random.Generator:
         """A way's own random numbers."""
-        return np.random.default_rng([self.seed, len(self.data[0].seeds)])
+        return derived_generator(self.seed, WAY_OF_TUNING, len(self.data[0].seeds))
 
     @cached_property
     def free(self) -> list[Parameter]:

@@ -101,7 +101,7 @@ def test_coordinate_steps_go_up_by_a_tenth_or_down_by_half_and_nowhere_else():
             ups = (one - BACKWARD * np.arange(21)) / FORWARD
             assert abs(ups - ups.round()).min() < 1e-9
         values.append(task.value(kept.choice))
-    assert values == sorted(values, reverse=True) and len(values) > 3
+    assert (np.diff(values) < 1e-12).all() and len(values) > 3  # the first step is the start, but for rounding
     assert task.runs <= 8 * (2 * 4 * 20 + 1 + len(values))
 
 
