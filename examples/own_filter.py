@@ -17,8 +17,8 @@ Kalman filter of Chen, Liu, Zhao and Principe (2017), which gives outliers littl
 #
 # .. math::
 #
-#    \tilde P = L \, \mathrm{diag}\big(1/G(L^{-1} K v)\big) L', \quad
-#    \tilde R = M \, \mathrm{diag}\big(1/G(M^{-1} (v - H K v))\big) M', \quad
+#    \tilde P = L \, \mathrm{diag}\left(1/G(L^{-1} K v)\right) L', \quad
+#    \tilde R = M \, \mathrm{diag}\left(1/G(M^{-1} (v - H K v))\right) M', \quad
 #    K = \tilde P H' (H \tilde P H' + \tilde R)^{-1}
 #
 # Nothing in a page may decide by values that are not known yet (``if``): it is traced once for the sizes of a
