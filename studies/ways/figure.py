@@ -48,6 +48,7 @@ def figure(results: Sequence[Result], protocol: Protocol, path: str | Path) -> P
             values = [100.0 * np.clip(points[budget].get(way, np.nan), LEAST, MOST) for way in order]
             axis.plot(values, range(len(order)), mark, color=colour, markersize=4, label=f"{budget:g} passes")
         axis.set_xscale("log")
+        axis.set_xlim(60.0 * LEAST, 150.0 * MOST)
         axis.set_yticks(range(len(order)), order, fontsize=6)
         for label in axis.get_yticklabels():
             label.set_fontweight("bold" if label.get_text() in (STUDY, START) else "normal")
