@@ -4,9 +4,10 @@ graphs, folding, tracing          what a plain function of floats computes, as a
 slopes                            derivatives of such a graph
 matrices, operations, densities   what is computed of matrices: A @ B.T, divide(C, S), log_density(v, S, seen)
 points                            roots of covariances, and sigma points as columns of a matrix
+scalars, blocks                   numbers, choices and weights; inverses, triangles and blocks of matrices
 derivatives                       of matrices, by the rules of matrix calculus
 precision                         constants in single precision
 programs, instructions            a graph of numbers as machine code, for some runs side by side
 c_source                          the same as C99
-calls, points_called              a graph of matrices as calls of functions for its sizes, for any model
+calls, with *_called              a graph of matrices as calls of functions for its sizes, for any model
 """
