@@ -124,7 +124,8 @@ def open_study(
         study.set_user_attr("identity", plan.identity)
         if start is not None:
             study.enqueue_trial(trial_parameters(start, space))
-    enqueue_what_is_left(study, plan)
+    if not worker:  # several at once would enqueue it twice
+        enqueue_what_is_left(study, plan)
     return study
 
 
