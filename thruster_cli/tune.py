@@ -90,6 +90,15 @@ def command(
     full_r: Annotated[
         bool, typer.Option("--full-r", help="Tune the correlations of R, too.", rich_help_panel=SEARCH)
     ] = False,
+    where: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="RELATION",
+            help="A relation that numbers of the model keep: 'Q22 = 4 Q11', 'Q33 = Q11', 'R = 0.01' (not tuned), "
+            "'Q11 = 1e-6..1e-2' (its range). Give it again for more.",
+            rich_help_panel=SEARCH,
+        ),
+    ] = None,
     budget: Annotated[
         float | None,
         typer.Option(
@@ -213,6 +222,7 @@ def command(
         budget=budget,
         full_q=full_q,
         full_r=full_r,
+        where=tuple(where or ()),
         worst=worst,
     )
     tuning = tune(plan, trials, storage, study, out, by_gradient=aim, way=way, workers=workers)

@@ -158,7 +158,8 @@ def run_tuning(
         tuning.write(out)
     if gradient is not None:
         return tuning
-    return tuning._replace(known=identify(result.choice, plan.scenarios, plan.training_data(), plan.space()))
+    known = identify(result.choice, plan.scenarios, plan.training_data(), plan.space(), plan.where)
+    return tuning._replace(known=known)
 
 
 def _draw_first(plan: Plan, console: Console) -> None:
@@ -197,6 +198,7 @@ def name_of(plan: Plan, by_gradient: str | None = None, way: str | None = None) 
     parts += ["+".join(plan.objectives)] * (plan.objectives != ("score",))
     parts += ["hold-r"] * plan.hold_r + ["full-q"] * plan.full_q
     parts += ["full-r"] * plan.full_r
+    parts += [re.sub(r"[^\w.+-]+", "", one.replace("=", "-")) for one in plan.where]
     parts += [] if plan.budget is None else [f"budget{plan.budget:g}"]
     parts += ["any-nis"] * (not plan.consistent) + [plan.sampler] * (plan.sampler != "tpe")
     parts += [] if by_gradient is None else ["gradient-score" if by_gradient == SCORE else "gradient"]

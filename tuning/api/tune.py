@@ -26,6 +26,7 @@ def tune(
     hold_r: bool = False,
     full_q: bool = False,
     full_r: bool = False,
+    where: Sequence[str] = (),
     budget: float | None = None,
     sampler: str = "tpe",
     prune: bool = True,
@@ -77,6 +78,8 @@ def tune(
         hold_r: keep R at the data sheet's value, tune only Q.
         full_q: tune the correlations of Q, too.
         full_r: tune the correlations of R, too.
+        where: relations among the numbers of the model that hold, such as "Q22 = 4 Q11", "Q33 = Q11", "R = 0.01"
+            (not tuned), "Q11 = 1e-6..1e-2" (its range).
         budget: time limit of a step of the filter [microseconds of one core].
         sampler: of Optuna: "tpe", "random", "cma-es", ...
         prune: end a trial that is significantly worse than the best on the same seeds.
@@ -130,8 +133,9 @@ def tune(
         budget=budget,
         full_q=full_q,
         full_r=full_r,
+        where=(where,) if isinstance(where, str) else tuple(where),
         worst=worst,
     )
-    where = None if storage is None else str(storage)
+    place = None if storage is None else str(storage)
     console = console_for(progress)
-    return Study(run_tuning(plan, trials, console, where, name, by_gradient=aim, way=way, workers=workers))
+    return Study(run_tuning(plan, trials, console, place, name, by_gradient=aim, way=way, workers=workers))

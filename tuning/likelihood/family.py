@@ -19,6 +19,7 @@ from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.search.parameters import Correlation, MeasurementVariance, ProcessVariance, Q, R, model_parameters
+from tuning.search.relations import obeying
 from tuning.search.space import Choice
 
 DIFFERENTIABLE = tuple(kind.name for kind in KINDS)  # filters, and those of users that `has_gradient` knows
@@ -52,14 +53,15 @@ class Family:
     def __init__(self, choice: Choice, problem: Problem, parameters: Sequence[Parameter]):
         """Find out whether all parameters are of Q and R, of which derivatives are known."""
         self.coordinates, self._choice, self._problem = Coordinates(parameters), choice, problem
+        if any(one.tied or one.held for one in parameters):
+            self._choice = choice = obeying(choice, parameters)
         self._filter = make_filter(choice.name, self._model(choice), **choice.numbers)
-        self._base, places = self._filter.model, [one.place for one in parameters]
-        kinds = ProcessVariance, MeasurementVariance
-        of_q, of_r = ([one.index if isinstance(one, kind) else None for one in places] for kind in kinds)
-        self._noise = None
-        if all(isinstance(one, (*kinds, Correlation)) for one in places):
-            q = TunedCovariance(self._base.process_noise_cov, Q, of_q, places)
-            self._noise = q, TunedCovariance(self._base.measurement_noise_cov, R, of_r, places)
+        self._base, self._noise = self._filter.model, None
+        moved = [((one.place, 1.0), *one.tied) for one in parameters]  # by each parameter
+        kinds = ProcessVariance, MeasurementVariance, Correlation
+        if all(isinstance(place, kinds) for places in moved for place, _ in places):
+            q = TunedCovariance(self._base.process_noise_cov, Q, ProcessVariance, moved)
+            self._noise = q, TunedCovariance(self._base.measurement_noise_cov, R, MeasurementVariance, moved)
         else:
             self._check_functions()
 
@@ -166,7 +168,12 @@ def symmetric_units(size: int) -> np.ndarray:
 
 
 def known_information(
-    choice: Choice, scenarios: Sequence[Problem], data: Sequence[Data], names: Sequence[str], values: np.ndarray
+    choice: Choice,
+    scenarios: Sequence[Problem],
+    data: Sequence[Data],
+    names: Sequence[str],
+    values: np.ndarray,
+    where: Sequence[str] = (),
 ) -> np.ndarray | None:
     """Fisher information on the logarithms of a Kalman filter's parameters in each of B runs, (B, p, p).
 
@@ -179,12 +186,14 @@ def known_information(
         data: for each scenario, its runs.
         names: names of the p parameters.
         values: at which the information is taken, (p,).
+        where: relations among the model's numbers.
     """
     if not has_gradient(choice.name) or len(names) < LEAST_NUMBERS:
         return None
     found = []
     for scenario, one in zip(scenarios, data, strict=True):
-        known = {parameter.name: parameter for parameter in model_parameters(scenario) if parameter.log}
+        free = model_parameters(scenario, where=where)
+        known = {parameter.name: parameter for parameter in free if parameter.log}
         if not set(names) <= set(known):
             return None
         try:

@@ -98,6 +98,12 @@ class Goal:
         value, by_q, by_r = (np.sum(np.array(of_all), axis=0) for of_all in zip(*parts, strict=True))
         return float(value), by_q, by_r
 
+    def information(self, point: np.ndarray) -> np.ndarray:
+        """Fisher's information on the coordinates in the innovations of all runs, (p, p)."""
+        pairs = zip(self._families, self._data, strict=True)
+        found = [family.derivatives(point, data, information=True)[1] for family, data in pairs]
+        return np.concatenate(found).sum(axis=0)
+
     def model_at(self, point: np.ndarray) -> tuple[StateSpaceModel, ModelSlopes]:
         """The model of the first problem at coordinates, and its derivatives by them."""
         return self._families[0].at(point)

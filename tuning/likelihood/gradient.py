@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -67,7 +67,7 @@ def tune_by_gradient(
     data: Data | Sequence[Data],
     starts: Sequence[Sequence[float] | float] | None = None,
     objective: str = LIKELIHOOD,
-    options: Mapping[str, bool] | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> GradientResult:
     """Find the parameters of a model under which a Kalman filter's innovations are most likely.
 
@@ -128,7 +128,7 @@ def goal_of(
     problems: Problem | Sequence[Problem],
     data: Data | Sequence[Data],
     objective: str = LIKELIHOOD,
-    options: Mapping[str, bool] | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> Goal:
     """What `tune_by_gradient` maximises, with the parameters of the first problem; arguments are its."""
     given = [problems] if isinstance(problems, Problem) else list(problems)

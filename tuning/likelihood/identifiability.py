@@ -59,7 +59,11 @@ class Identifiability(NamedTuple):
 
 
 def identify(
-    choice: Choice, scenarios: Sequence[Problem], data: Sequence[Data], space: Mapping[str, BaseDistribution]
+    choice: Choice,
+    scenarios: Sequence[Problem],
+    data: Sequence[Data],
+    space: Mapping[str, BaseDistribution],
+    where: Sequence[str] = (),
 ) -> Identifiability | None:
     """How well the innovations determine the parameters of a choice's model; None without a covariance.
 
@@ -72,6 +76,7 @@ def identify(
         scenarios: the problems.
         data: for each scenario, the training data.
         space: distributions of the tuned parameters, `Plan.space`.
+        where: relations among the model's numbers.
     """
     own = parameters_of(choice)
     names = _names(choice, space)
@@ -82,7 +87,7 @@ def identify(
         moved = {**own, **{name: float(value) for name, value in zip(names, np.exp(logarithms), strict=True)}}
         parts = []
         for scenario, one in zip(scenarios, data, strict=True):
-            filter_ = choice_of(choice.name, moved, scenario).filter(scenario)
+            filter_ = choice_of(choice.name, moved, scenario, where).filter(scenario)
             some = estimates_in_parts(filter_, one)
             first = one.first_scored if scenario.leads_in else 0
             parts += [_in_run(part, estimates.log_likelihoods)[:, first:].sum(axis=1) for part, estimates in some]
@@ -94,7 +99,7 @@ def identify(
     untuned = parameters_of(untuned_choice(choice.name, scenarios[0]))
     starts = np.log(tuned), np.log([untuned.get(name, own[name]) for name in names])
     best = maximum(log_likelihoods, starts, bounds)
-    known = known_information(choice, scenarios, data, names, np.exp(best))
+    known = known_information(choice, scenarios, data, names, np.exp(best), where)
     cov = covariance(curvatures(log_likelihoods, best) if known is None else known)
     identified = is_identified(log_likelihoods, best, cov, bounds)
     return Identifiability(names, tuned, np.exp(best), cov, identified)

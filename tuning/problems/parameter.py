@@ -53,7 +53,10 @@ class Parameter:
         log: whether it is chosen on a logarithmic scale.
         integer: whether it is a whole number.
         default: the value before any tuning; the middle of the range on its scale if None.
+        first: the part of the range in which a search begins; all of it if None.
         place: where it stands in a choice; the argument of the model of the same name if None.
+        tied: places of numbers in proportion to it, and their factors.
+        held: places of numbers that have a value whatever this one is.
 
     Raises:
         ValueError: for an empty range, or a default outside it.
@@ -66,7 +69,10 @@ class Parameter:
     log: bool = True
     integer: bool = False
     default: float | None = None
+    first: tuple[float, float] | None = None
     place: Place = None  # type: ignore[assignment]  # None is replaced as soon as the parameter is made
+    tied: tuple[tuple[Place, float], ...] = ()
+    held: tuple[tuple[Place, float], ...] = ()
 
     def __post_init__(self):
         """Check the range and fill in defaults."""
@@ -109,7 +115,11 @@ class Parameter:
         return self.place.get(choice)
 
     def set(self, choice, value):
-        """The same choice with another number."""
+        """The same choice with another number, and what is tied to it."""
+        for place, number in self.held:
+            choice = place.set(choice, number)
+        for place, factor in self.tied:
+            choice = place.set(choice, factor * value)
         return self.place.set(choice, value)
 
 

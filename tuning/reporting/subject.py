@@ -18,7 +18,7 @@ from tuning.problems.problem import Problem
 from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.plan import HELD_OUT_SEEDS, Plan
 from tuning.search.sizing import SIZES
-from tuning.search.space import Choice, choice_of
+from tuning.search.space import Choice
 from tuning.search.storage import open_storage
 from tuning.search.storage_url import shown_storage
 from tuning.search.study import chosen_of
@@ -99,7 +99,7 @@ def _of_study(name: str, storage: str, problems: Sequence[Problem]) -> Subject:
     best = best_trial(study.get_trials(deepcopy=False))
     if best is None:
         raise ValueError(f"a study must have a complete trial for a report, but {name!r} has none")
-    choice, met = choice_of(plan.filter, best.params, plan.scenarios[0]), chosen_of(study)
+    choice, met = plan.choice_of(best.params), chosen_of(study)
     if met is not None:
         one = next(one for one in met["met"] if one["name"] == met["chosen"])
         choice = choice_from(one["choice"])
@@ -134,6 +134,7 @@ def _plan(identity, where: str | Path, find: Callable[[str], Problem]) -> Plan:
             budget=identity["budget"],
             full_q=identity["full_q"],
             full_r=identity.get("full_r", False),
+            where=tuple(identity.get("where", ())),
             worst=identity.get("worst", False),
         )
     except (KeyError, TypeError):

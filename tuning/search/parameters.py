@@ -17,6 +17,7 @@ from numerics.checks import covariance
 from tuning.problems.parameter import Argument, Parameter, Place, squared
 from tuning.problems.problem import Problem
 from tuning.search.correlations import correlations_of, full_covariance
+from tuning.search.relations import related
 
 Q, R = NOISE  # arguments of the model
 FACTORS = (1e-10, 1e4)  # range of each variance of Q and R, as factors on that of the rule of thumb
@@ -158,7 +159,13 @@ def _own_of_user(kind: type[Filter], number: str, low: float, high: float) -> Pa
 
 
 def model_parameters(
-    problem: Problem, *, hold_r: bool = False, full_q: bool = False, full_r: bool = False, prior: bool = False
+    problem: Problem,
+    *,
+    hold_r: bool = False,
+    full_q: bool = False,
+    full_r: bool = False,
+    prior: bool = False,
+    where: Sequence[str] = (),
 ) -> list[Parameter]:
     """Parameters of a problem's model that a study may choose: its `parameters`, or the variances of Q and R.
 
@@ -168,7 +175,13 @@ def model_parameters(
         full_q: choose the correlations of Q, too (`correlations.full_covariance`).
         full_r: choose those of R, too.
         prior: choose the scale of P_0, too.
+        where: relations among them (`tuning.search.relations`), which leave fewer of them free.
     """
+    found = _all_parameters(problem, hold_r=hold_r, full_q=full_q, full_r=full_r, prior=prior)
+    return related(found, where) if where else found
+
+
+def _all_parameters(problem: Problem, *, hold_r: bool, full_q: bool, full_r: bool, prior: bool) -> list[Parameter]:
     if problem.parameters is not None:
         return list(problem.parameters)
     untuned, quantities, found = problem.untuned, problem.quantities, []
@@ -180,20 +193,28 @@ def model_parameters(
         if variance > 0:  # otherwise the state has no noise, and no range
             # Where the input hardly moves a state, noise may move it more.
             scale = scales[i] if np.isfinite(scales[i]) else 0.0
-            low, high = _range(variance, given_q[i], max(variance, scale**2))
-            found.append(Parameter(f"Q{i + 1}{i + 1}", low, high, squared(state.unit), place=ProcessVariance(i)))
+            ends = _range(variance, given_q[i], max(variance, scale**2))
+            found.append(_variance(f"Q{i + 1}{i + 1}", ends, Q_FIRST, state.unit, ProcessVariance(i)))
     if full_q:
         found += _correlations(Q, count)
     if not hold_r:
         channels = quantities.measurements
         for i, (variance, channel) in enumerate(zip(_diagonal(untuned[R]), channels, strict=True)):
-            low, high = _range(variance, given_r[i], variance)
-            place = MeasurementVariance(i)
-            found.append(Parameter(r_name(i, len(channels)), low, high, squared(channel.unit), place=place))
+            ends = _range(variance, given_r[i], variance)
+            name, place = r_name(i, len(channels)), MeasurementVariance(i)
+            found.append(_variance(name, ends, R_FIRST, channel.unit, place))
         found += _correlations(R, len(channels)) if full_r else []
     if prior:
         found.append(Parameter("P0", *PRIOR_FACTORS, place=PRIOR))
     return found
+
+
+def _variance(
+    name: str, ends: tuple[float, float], factors: tuple[float, float], unit: str, place: Place
+) -> Parameter:
+    """A variance of Q or R, with the part of its range in which a search begins."""
+    first = ends[0] * factors[0] / FACTORS[0], ends[1] * factors[1] / FACTORS[1]
+    return Parameter(name, *ends, unit=squared(unit), first=first, place=place)
 
 
 def _correlations(covariance: str, size: int) -> list[Parameter]:
@@ -209,12 +230,6 @@ def _range(variance: float, given: float, largest: float) -> tuple[float, float]
     """The range of a variance, by the rule of thumb; what was given lies inside."""
     low, high = FACTORS[0] * variance, FACTORS[1] * largest
     return (min(low, given) if given > 0 else low), max(high, given)
-
-
-def first_range(one: Parameter) -> tuple[float, float] | None:
-    """The part of a number's range in which a search begins; None of a number that is no variance of Q or R."""
-    factors = {ProcessVariance: Q_FIRST, MeasurementVariance: R_FIRST}.get(type(one.place))
-    return factors and (one.low * factors[0] / FACTORS[0], one.high * factors[1] / FACTORS[1])
 
 
 def places_in(choice) -> dict[str, Place]:

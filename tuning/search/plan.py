@@ -5,7 +5,8 @@ NIS is the normalised innovation squared.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import optuna
 from optuna.distributions import BaseDistribution
@@ -20,8 +21,15 @@ from tuning.problems.digest import digest_of
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.search.objectives import COVARIANCE, LOG_SCORE, Objective, check_objectives, find_objective
-from tuning.search.parameters import first_range
-from tuning.search.space import AUTO, AUTO_FILTER_TYPES, has_search_space, joint_distributions, joint_parameters
+from tuning.search.space import (
+    AUTO,
+    AUTO_FILTER_TYPES,
+    Choice,
+    choice_of,
+    has_search_space,
+    joint_distributions,
+    joint_parameters,
+)
 
 TRAINING_SEEDS = 32
 HELD_OUT_SEEDS = 200
@@ -44,6 +52,7 @@ class Plan(NamedTuple):
     full_q: bool = False  # whether Q has correlations
     full_r: bool = False  # whether R has correlations
     worst: bool = False  # of several problems the worst one counts, and not their mean
+    where: tuple[str, ...] = ()  # relations among the numbers of the model, such as "Q22 = 4 Q11"
 
     @property
     def identity(self) -> dict:
@@ -53,6 +62,7 @@ class Plan(NamedTuple):
             **({"estimators": own} if own else {}),
             **({"worst": True} if self.worst else {}),
             **({"full_r": True} if self.full_r else {}),
+            **({"where": list(self.where)} if self.where else {}),
             "filter": self.filter,
             "kinds": list(self.filter_types),
             "budget": self.budget,
@@ -116,6 +126,9 @@ class Plan(NamedTuple):
             raise ValueError(f"a full Q needs a filter with a covariance, but got {self.filter!r}")
         if self.full_r:
             self._check_full_r()
+        if self.where and not self._has_covariance:
+            raise ValueError(f"relations need a filter with a covariance, but got {self.filter!r}")
+        self.space()  # relations are checked
         if self.budget is not None:
             positive("budget", self.budget)
         elif self.filter == AUTO and "cost" not in self.objectives:
@@ -171,8 +184,7 @@ class Plan(NamedTuple):
 
     def first_ranges(self) -> dict[str, tuple[float, float]]:
         """The parts of the ranges of Q and R in which a search begins, by name."""
-        found = {name: first_range(one) for name, one in self.parameters().items()}
-        return {name: part for name, part in found.items() if part is not None}
+        return {name: one.first for name, one in self.parameters().items() if one.first is not None}
 
     @property
     def tunes_noise(self) -> bool:
@@ -180,10 +192,15 @@ class Plan(NamedTuple):
         return self.scenarios[0].parameters is None and self._has_covariance
 
     @property
-    def options(self) -> dict[str, bool]:
+    def options(self) -> dict[str, Any]:
         """What of the model is tuned, as `model_parameters` has it."""
         prior = self.tunes_noise and any(scenario.counts_start_up for scenario in self.scenarios)
-        return {"hold_r": self.hold_r, "full_q": self.full_q, "full_r": self.full_r, "prior": prior}
+        told = {"hold_r": self.hold_r, "full_q": self.full_q, "full_r": self.full_r, "prior": prior}
+        return {**told, "where": self.where}
+
+    def choice_of(self, values: Mapping[str, Any]) -> Choice:
+        """The choice of a trial's parameters."""
+        return choice_of(self.filter, values, self.scenarios[0], self.where)
 
     def training_data(self) -> list[Data]:
         """Data that all trials share, one for each scenario."""

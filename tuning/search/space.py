@@ -110,6 +110,7 @@ def parameters(
     full_q: bool = False,
     full_r: bool = False,
     prior: bool = False,
+    where: Sequence[str] = (),
 ) -> list[Parameter]:
     """The parameters that a study may choose for a filter.
 
@@ -124,10 +125,11 @@ def parameters(
         full_q: choose the correlations of Q, too.
         full_r: choose those of R, too.
         prior: choose the scale of P_0, too.
+        where: relations among the parameters of the model (`tuning.search.relations`).
     """
     found = []
     if filter_class(name).has_covariance:
-        found = model_parameters(problem, hold_r=hold_r, full_q=full_q, full_r=full_r, prior=prior)
+        found = model_parameters(problem, hold_r=hold_r, full_q=full_q, full_r=full_r, prior=prior, where=where)
     return found + _of_filter(name, has_process_noise(problem))
 
 
@@ -166,7 +168,11 @@ def _is_of(filter_type: str | None, key: str) -> bool:
 
 
 def suggest(
-    trial: optuna.trial.BaseTrial, name: str, problem: Problem, space: Mapping[str, BaseDistribution]
+    trial: optuna.trial.BaseTrial,
+    name: str,
+    problem: Problem,
+    space: Mapping[str, BaseDistribution],
+    where: Sequence[str] = (),
 ) -> Choice:
     """Let a trial choose its filter type, and the parameters of a `joint_distributions` space for that type."""
     chosen: dict[str, float | int | str] = {}
@@ -180,7 +186,7 @@ def suggest(
                 chosen[key] = trial.suggest_int(key, distribution.low, distribution.high, log=distribution.log)
             elif isinstance(distribution, FloatDistribution):
                 chosen[key] = trial.suggest_float(key, distribution.low, distribution.high, log=distribution.log)
-    return choice_of(name, chosen, problem)
+    return choice_of(name, chosen, problem, where)
 
 
 def ends_of(distribution: BaseDistribution) -> tuple[float, float]:
@@ -190,8 +196,12 @@ def ends_of(distribution: BaseDistribution) -> tuple[float, float]:
     return distribution.low, distribution.high
 
 
-def choice_of(name: str, values: Mapping[str, float | int | str], problem: Problem) -> Choice:
+def choice_of(
+    name: str, values: Mapping[str, float | int | str], problem: Problem, where: Sequence[str] = ()
+) -> Choice:
     """The choice of a trial's parameters; parameters that it lacks are those of the untuned filter.
+
+    Relations `where` hold for it.
 
     For the name "auto" the parameter "filter" names the filter.
     """
@@ -201,13 +211,13 @@ def choice_of(name: str, values: Mapping[str, float | int | str], problem: Probl
     choice = untuned_choice(name, problem)
     if "N" not in values:
         choice.numbers.pop("ensemble_size", None)
-    for one in parameters(name, problem, **everything_of(problem)):
+    for one in parameters(name, problem, **everything_of(problem), where=where):
         if one.name in values:
             choice = one.set(choice, values[one.name])
     return choice
 
 
-def everything_of(problem: Problem) -> dict[str, bool]:
+def everything_of(problem: Problem) -> dict[str, Any]:
     """The options of `parameters` with which a problem has all that a study may choose."""
     return {} if problem.parameters is not None else {"full_q": True, "full_r": True, "prior": True}
 

@@ -24,7 +24,7 @@ from tuning.search.outcome import best_trial, is_consistent
 from tuning.search.plan import Plan
 from tuning.search.samplers import give_sampler, make_sampler
 from tuning.search.sizing import sized, sizes_of
-from tuning.search.space import Choice, choice_of, trial_parameters
+from tuning.search.space import Choice, trial_parameters
 from tuning.search.storage import PROCESS, retry_orphans, this_process
 from tuning.search.trials import cost_of, make_pruner, measure, run_trial
 from tuning.search.validation import Validation, as_data, validate
@@ -198,7 +198,7 @@ def run_study(
     consistent = plan.is_constrained and is_consistent(best)
     validation, value = validate(plan, present, data, resize), best.values[0]
     if validation is None:
-        choice = resize(choice_of(plan.filter, best.params, plan.scenarios[0]), consistent)
+        choice = resize(plan.choice_of(best.params), consistent)
     else:
         chosen = validation.named(validation.chosen)
         choice = chosen.choice

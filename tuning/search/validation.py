@@ -13,13 +13,15 @@ from optuna.trial import FrozenTrial, TrialState
 from filters.consistency.intervals import Interval
 from filters.registry import filter_class
 from filters.tuned_file import NOISE as NOISE_ARGUMENTS
-from tuning.evaluation.baselines import ORACLE, baselines, same_filter
+from tuning.evaluation.baselines import GIVEN, ORACLE, baselines, same_filter
 from tuning.problems.data import Data
 from tuning.search.measures import Measured, measured, over
 from tuning.search.objectives import MOST_PRICE, MSE, NIS_BAND, OUTPUT, PROPER, SCORE
 from tuning.search.outcome import best_trial, is_consistent
+from tuning.search.parameters import model_parameters
 from tuning.search.plan import Plan
-from tuning.search.space import Choice, choice_of
+from tuning.search.relations import obeying
+from tuning.search.space import Choice
 from tuning.search.trials import cost_of
 
 VALIDATED = (SCORE, "thrust", MSE, *PROPER)  # objectives, beside those of outputs, that each run has
@@ -146,19 +148,22 @@ def finalists_of(plan: Plan, trials: Sequence[FrozenTrial]) -> dict[str, Choice]
     best = best_trial(complete)
     first = [] if best is None else [best]
     chosen = [*first, *complete[:BY_SCORE], *[one for one in complete if is_consistent(one)][:BY_CONSISTENCY]]
-    return {f"trial {one.number + 1}": choice_of(plan.filter, one.params, plan.scenarios[0]) for one in chosen}
+    return {f"trial {one.number + 1}": plan.choice_of(one.params) for one in chosen}
 
 
 def _baselines_of(plan: Plan, kind: str, training: Sequence[Data]) -> dict[str, Choice]:
     """The baselines of a kind of filter but the oracle, within the budget; of several problems those of the first.
 
-    Where R is held none of them changes it.
+    Where R is held none of them changes it, and relations among numbers hold for all but what was given.
     """
     problem = plan.scenarios[0]
     found = {name: one for name, one in baselines(kind, problem, plan.seed).items() if name != ORACLE}
     if plan.hold_r and filter_class(kind).has_covariance:
         held = {"measurement_noise_cov": problem.untuned["measurement_noise_cov"]}
         found = {name: one._replace(model={**one.model, **held}) for name, one in found.items()}
+    if plan.where:
+        free = model_parameters(problem, **plan.options)
+        found = {name: one if name == GIVEN else obeying(one, free) for name, one in found.items()}
     sizes = {(one.model().n, one.model().m) for one in plan.scenarios}
     if len(sizes) > 1:  # a Q or R fits problems of one size alone
         found = {name: one for name, one in found.items() if not set(NOISE_ARGUMENTS) & set(one.model)}

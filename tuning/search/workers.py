@@ -169,7 +169,8 @@ def main() -> None:
         logs = {name: _unpacked(text) for name, text in orders.get("logs", {}).items()}
         pairs = zip(given["scenarios"], orders["digests"], strict=True)
         scenarios = tuple(logs.get(name) or find_same(name, digest) for name, digest in pairs)
-        plan = Plan(**{**given, "scenarios": scenarios, "objectives": tuple(given["objectives"])})
+        several = {name: tuple(given[name]) for name in ("objectives", "where")}
+        plan = Plan(**{**given, **several, "scenarios": scenarios})
         study = open_study(orders["study"], plan, open_storage(orders["storage"]), worker=orders["place"])
         run_trials(study, plan, plan.training_data(), orders["trials"], stop=_parent_says_stop)
     except (ValueError, OSError) as error:

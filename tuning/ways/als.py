@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -41,40 +42,69 @@ def als(task: Task) -> None:
     Source: Odelson, Rajamani, Rawlings (2006), "A new autocovariance least-squares method for estimating noise
     covariances", Automatica 42(2); Rajamani, Rawlings (2009), Automatica 45(1).
     """
+
+    def equations(linear: Stationary, gain: np.ndarray, seen: np.ndarray, noise: Noise):
+        lags = len(seen)
+        design = [lagged(linear, gain, q, r, lags).ravel() for q, r in zip(noise.q, noise.r, strict=True)]
+        return np.column_stack(design), (seen - lagged(linear, gain, *noise.rest, lags)).ravel()
+
+    by_lags(task, "als", equations)
+
+
+class Noise(NamedTuple):
+    """Q and R as sums of numbers times units, and of what no number moves."""
+
+    q: np.ndarray  # units, (p, n, n)
+    r: np.ndarray  # (p, m, m)
+    rest: tuple[np.ndarray, np.ndarray]
+
+
+def by_lags(task: Task, name: str, equations: Callable[..., tuple[np.ndarray, np.ndarray]]) -> None:
+    """Numbers not below zero that solve linear equations in the lagged covariances of innovations, three times.
+
+    Args:
+        task: what is tuned.
+        name: of the way, for errors.
+        equations: (linear, gain, covariances (lags, m, m), noise) returns the matrix (rows, p) and the right side.
+
+    Raises:
+        ValueError: of a model that is not linear, or whose Q and R are not linear in the numbers.
+    """
     from scipy.optimize import nnls
 
     family = Family(task.start, task.problems[0], task.free)
     coordinates = family.coordinates
     if not coordinates.log.all():
-        raise ValueError("way 'als' needs Q and R linear in positive numbers, but a number is on a linear scale")
+        raise ValueError(
+            f"way {name!r} needs Q and R linear in positive numbers, but a number is on a linear scale"
+        )
     model = task.model(task.start)
-    linear = stationary(model, task.problems[0].name)
+    linear = stationary(model, task.problems[0].name, name)
     point = np.clip(coordinates.of(task.values_of(task.start, task.free)), coordinates.low, coordinates.high)
     for _ in range(ITERATIONS):
         model, slopes = family.at(point)
         each = np.exp(point)
-        q_units = slopes.process_noise_cov / each[:, None, None]
-        r_units = slopes.measurement_noise_cov / each[:, None, None]
+        units = [one / each[:, None, None] for one in (slopes.process_noise_cov, slopes.measurement_noise_cov)]
         of_model = model.process_noise_cov, model.measurement_noise_cov
-        rest = [of - np.tensordot(each, units, 1) for of, units in zip(of_model, (q_units, r_units), strict=True)]
-        if any(abs(one).max() > LINEAR * abs(of).max() for one, of in zip(rest, of_model, strict=True)):
+        q, r = (of - np.tensordot(each, one, 1) for of, one in zip(of_model, units, strict=True))
+        if any(abs(one).max() > LINEAR * abs(of).max() for one, of in zip((q, r), of_model, strict=True)):
             if not task.options.get("hold_r"):
-                raise ValueError("way 'als' needs Q and R linear in the numbers that are tuned, but they are not")
+                raise ValueError(
+                    f"way {name!r} needs Q and R linear in the numbers that are tuned, but they are not"
+                )
         gain = steady_gain(linear, *of_model)
         lags = min(LAGS, *(max(2, int(one.rows.min()) // 4) for one in task.data))
-        design = np.column_stack([lagged(linear, gain, q, r, lags) for q, r in zip(q_units, r_units, strict=True)])
-        known = lagged(linear, gain, rest[0], rest[1], lags)
         seen = autocovariances([_innovations(linear, gain, one, model.prior_mean) for one in task.data], lags)
         task.charge(task.passes)
+        design, wanted = equations(linear, gain, seen, Noise(units[0], units[1], (q, r)))
         scale = np.maximum(abs(design).max(axis=0), 1e-300)
-        found, _ = nnls(design / scale, seen - known)
-        point = np.clip(
-            coordinates.of(np.maximum(found / scale, np.exp(coordinates.low))), coordinates.low, coordinates.high
-        )
+        found, _ = nnls(design / scale, wanted)
+        values = np.maximum(found / scale, np.exp(coordinates.low))
+        point = np.clip(coordinates.of(values), coordinates.low, coordinates.high)
         task.keep(family.choice_at(point))
 
 
-def stationary(model, name: str) -> Stationary:
+def stationary(model, name: str, way: str) -> Stationary:
     """The matrices of a linear model; ValueError for another one."""
     about = np.zeros(model.n), np.zeros(model.inputs)
     away = np.ones(model.n) * model.scales, np.ones(model.inputs)
@@ -84,7 +114,7 @@ def stationary(model, name: str) -> Stationary:
         np.allclose(one, two, rtol=ALIKE, atol=ALIKE * max(abs(one).max(initial=0), 1.0)) for one, two in pairs
     ):
         raise ValueError(
-            f"way 'als' needs a linear model, such as that of the filter kf, but {name} has another one"
+            f"way {way!r} needs a linear model, such as that of the filter kf, but {name} has another one"
         )
     return Stationary(*found)
 
@@ -96,13 +126,15 @@ def steady_gain(linear: Stationary, q: np.ndarray, r: np.ndarray) -> np.ndarray:
     try:
         p = solve_discrete_are(linear.a.T, linear.c.T, q, r)
     except np.linalg.LinAlgError as error:
-        raise ValueError(f"way 'als' needs a model with a stationary filter, but {error}") from None
+        raise ValueError(
+            f"ways by lagged covariances need a model with a stationary filter, but {error}"
+        ) from None
     s = linear.c @ p @ linear.c.T + r
     return np.linalg.solve(s, linear.c @ p).T
 
 
 def lagged(linear: Stationary, gain: np.ndarray, q: np.ndarray, r: np.ndarray, lags: int) -> np.ndarray:
-    """vec(C_0; C_1; ...; C_{N-1}) of a gain's innovations, under a Q and R, (lags m m,)."""
+    """C_0, C_1, ..., C_{N-1} of a gain's innovations, under a Q and R, (lags, m, m)."""
     from scipy.linalg import solve_discrete_lyapunov
 
     a, c = linear.a, linear.c
@@ -113,7 +145,7 @@ def lagged(linear: Stationary, gain: np.ndarray, q: np.ndarray, r: np.ndarray, l
     for _ in range(1, lags):
         blocks.append(c @ (closed @ power @ p @ c.T - power @ through @ r))
         power = closed @ power
-    return np.concatenate([one.ravel() for one in blocks])
+    return np.array(blocks)
 
 
 def _innovations(linear: Stationary, gain: np.ndarray, data: Data, prior_mean: np.ndarray) -> list[np.ndarray]:
@@ -130,7 +162,7 @@ def _innovations(linear: Stationary, gain: np.ndarray, data: Data, prior_mean: n
 
 
 def autocovariances(parts: list[list[np.ndarray]], lags: int) -> np.ndarray:
-    """Means of e_{k+j} e_k' over all times at which both were measured, stacked as `lagged` does."""
+    """Means of e_{k+j} e_k' over all times at which both were measured, (lags, m, m)."""
     runs = [run for part in parts for run in part]
     found = []
     for j in range(lags):
@@ -138,5 +170,5 @@ def autocovariances(parts: list[list[np.ndarray]], lags: int) -> np.ndarray:
         ahead, behind = (np.concatenate(side) for side in zip(*pairs, strict=True))
         there = np.isfinite(ahead)[:, :, None] & np.isfinite(behind)[:, None, :]
         products = np.nan_to_num(ahead)[:, :, None] * np.nan_to_num(behind)[:, None, :]
-        found.append((products.sum(axis=0) / np.maximum(there.sum(axis=0), 1)).ravel())
-    return np.concatenate(found)
+        found.append(products.sum(axis=0) / np.maximum(there.sum(axis=0), 1))
+    return np.array(found)

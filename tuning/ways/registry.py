@@ -12,21 +12,31 @@ from tuning.ways.em import em, squarem
 from tuning.ways.innovations import desroziers
 from tuning.ways.map import maximum_a_posteriori
 from tuning.ways.masked import masked
+from tuning.ways.mehra import mehra
 from tuning.ways.noise import noise_estimation
 from tuning.ways.okf import okf
 from tuning.ways.posterior import posterior
 from tuning.ways.samplers import sample
+from tuning.ways.scoring import scoring
 from tuning.ways.way import COVARIANCE, GRADIENT, LINEAR, NOISE, TRUTH, Way
 
 ABBEEL = "Abbeel, Coates, Montemerlo, Ng, Thrun (2005)"
 CHEN = "Chen, Heckman, Julier, Ahmed (2018), arXiv 1807.08855"
 DIAGONAL = ("hold_r", "prior")
+MATRICES = (*DIAGONAL, "full_q", "full_r")  # of ways that find matrices as a whole, and know no relations
 
 WAYS = {
     LIKELIHOOD: Way(
         "maximum likelihood of the innovations by L-BFGS with exact gradients",
         "without true states; and with few runs",
         ascend(LIKELIHOOD),
+        "Gupta, Mehra (1974)",
+        (GRADIENT,),
+    ),
+    "scoring": Way(
+        "maximum likelihood of the innovations by Fisher scoring with the exact information",
+        "to compare: it ends where `likelihood` ends, often in fewer steps",
+        scoring,
         "Gupta, Mehra (1974)",
         (GRADIENT,),
     ),
@@ -64,7 +74,7 @@ WAYS = {
         em,
         "Shumway, Stoffer (1982)",
         (GRADIENT, NOISE),
-        ("hold_r", "full_q", "full_r", "prior"),
+        MATRICES,
     ),
     "squarem": Way(
         "expectation-maximisation with extrapolated steps",
@@ -80,6 +90,7 @@ WAYS = {
         noise_estimation,
         ABBEEL,
         (TRUTH, COVARIANCE, NOISE),
+        MATRICES,
     ),
     "okf": Way(
         "Adam on Cholesky factors of full Q and R, by batches, on the mean square error",
@@ -87,12 +98,21 @@ WAYS = {
         okf,
         "Greenberg, Yannay, Mannor (2023), arXiv 2310.00675",
         (TRUTH, GRADIENT, NOISE),
+        MATRICES,
     ),
     "als": Way(
         "least squares of lagged covariances of the innovations of a fixed gain",
         "without true states, of a linear model on long stationary runs: a few passes",
         als,
         "Odelson, Rajamani, Rawlings (2006)",
+        (GRADIENT, LINEAR),
+        DIAGONAL,
+    ),
+    "mehra": Way(
+        "P H', R and Q in turn from lagged covariances of the innovations of a fixed gain",
+        "to compare: the ancestor of `als`, which scatters less",
+        mehra,
+        "Mehra (1970)",
         (GRADIENT, LINEAR),
         DIAGONAL,
     ),
@@ -110,6 +130,7 @@ WAYS = {
         sage_husa,
         "Sage, Husa (1969)",
         (GRADIENT, NOISE),
+        MATRICES,
     ),
     "vb": Way(
         "the variational Bayesian filter over all runs, then its mean R; Q stays",
@@ -117,6 +138,7 @@ WAYS = {
         vb,
         "Sarkka, Nummenmaa (2009)",
         (GRADIENT, NOISE),
+        MATRICES,
     ),
     "posterior": Way(
         "the mean of the posterior by a Metropolis random walk",

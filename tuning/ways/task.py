@@ -6,8 +6,9 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from tuning.problems.data import Data
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORES, NEES, SCORE, VARIANCES, find_objective, penalised
-from tuning.search.parameters import first_range, model_parameters
+from tuning.search.parameters import model_parameters
 from tuning.search.space import Choice, neutral, parameters, untuned_choice
 
 FEW = 32  # runs, by which passes are priced
@@ -74,7 +75,7 @@ class Task:
         problems: Problem | Sequence[Problem],
         data: Data | Sequence[Data],
         *,
-        options: Mapping[str, bool] | None = None,
+        options: Mapping[str, Any] | None = None,
         objective: str | None = None,
         budget: Budget = Budget(),  # noqa: B008 - a value that nothing changes
         start: Choice | None = None,
@@ -249,7 +250,4 @@ def shortest(call: Callable[[], object]) -> float:
 
 def within_first_range(one: Parameter) -> Parameter:
     """A parameter of Q or R in the part of its range in which a search begins."""
-    part = first_range(one)
-    if part is None:
-        return one
-    return Parameter(one.name, *part, unit=one.unit, log=one.log, place=one.place)
+    return one if one.first is None else replace(one, low=one.first[0], high=one.first[1], default=None)

@@ -27,7 +27,8 @@ class Way(NamedTuple):
     follow: Callable[[Task], None]  # keeps choices of a task until it is done, or the task raises Spent
     source: str
     needs: tuple[str, ...] = ()  # of TRUTH, GRADIENT, COVARIANCE, LINEAR, NOISE
-    options: tuple[str, ...] = ("hold_r", "full_q", "full_r", "prior")  # of the model's numbers, that it can tune
+    # Options of the model's numbers with which it can work.
+    options: tuple[str, ...] = ("hold_r", "full_q", "full_r", "prior", "where")
     by_trials: bool = False  # whether it goes on for as many trials as it is given; others end of themselves
 
     def check(self, name: str, task: Task) -> None:
@@ -45,7 +46,7 @@ class Way(NamedTuple):
         if NOISE in self.needs and not {Q, R} <= set(task.start.model):
             raise ValueError(f"way {name!r} tunes Q and R, but {task.problems[0].name} has parameters of its own")
         if LINEAR in self.needs:
-            stationary(task.model(task.start), task.problems[0].name)
+            stationary(task.model(task.start), task.problems[0].name, name)
         unable = [option for option, wanted in task.options.items() if wanted and option not in self.options]
         if unable:
             raise ValueError(f"way {name!r} must come without {', '.join(unable)}")

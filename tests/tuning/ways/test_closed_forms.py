@@ -5,13 +5,14 @@ import pytest
 
 from filters import affine_model
 from plants.simulate import simulate
-from tests.tuning.ways.problems import Q, linear, task_of
+from tests.tuning.ways.problems import A, Q, R, linear, task_of
 from tuning.evaluation.residuals import estimated_from
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
 from tuning.problems.runs_problem import RunsProblem
 from tuning.search.objectives import LIKELIHOOD
-from tuning.ways.als import autocovariances, lagged, stationary, steady_gain
+from tuning.ways.als import Noise, autocovariances, lagged, stationary, steady_gain
+from tuning.ways.mehra import mehra_equations
 from tuning.ways.registry import find_way
 from tuning.ways.task import Budget, Task
 
@@ -40,7 +41,7 @@ def nile():
     return RunsProblem(runs, level(), held_out=[2, 3], name="the Nile")
 
 
-@pytest.mark.parametrize("way", ["likelihood", "em", "squarem"])
+@pytest.mark.parametrize("way", ["likelihood", "em", "squarem", "scoring"])
 def test_the_nile_has_the_variances_that_durbin_and_koopman_print(way):
     task = task_of(nile(), 1)
     find_way(way).run(way, task)
@@ -153,7 +154,7 @@ def test_als_has_the_scatter_of_the_toolboxs_example():
 
 def test_lagged_covariances_are_those_of_many_innovations():
     model = motivating(0.5, 0.1)
-    linear_model = stationary(model, "motivating")
+    linear_model = stationary(model, "motivating", "als")
     gain = steady_gain(linear_model, 0.2 * np.outer(MOTIVATING["g"], MOTIVATING["g"]), np.array([[0.4]]))
     keys = np.array([[one, 7] for one in range(200)], dtype=np.uint32)
     z = simulate(model, keys, np.zeros((200, 1000, 0))).measurements
@@ -164,7 +165,45 @@ def test_lagged_covariances_are_those_of_many_innovations():
         mean = (mean + e @ gain.T) @ linear_model.a.T
     runs = list(np.array(innovations).transpose(1, 0, 2)[:, 100:])
     expected = lagged(linear_model, gain, model.process_noise_cov, model.measurement_noise_cov, 5)
-    np.testing.assert_allclose(autocovariances([runs], 5), expected, atol=4e-3 * expected[0] + 2e-3)
+    np.testing.assert_allclose(autocovariances([runs], 5), expected, atol=4e-3 * expected[0, 0, 0] + 2e-3)
+
+
+def test_mehra_finds_q_and_r_from_the_covariances_of_a_gain_that_is_not_the_best():
+    linear_model = stationary(linear(a=A).model(), "a chain", "mehra")
+    gain = steady_gain(linear_model, np.diag([0.5, 0.01]), np.diag([0.1, 2.0]))
+    seen = lagged(linear_model, gain, Q, R, 6)
+    q_units = np.array([np.diag([1.0, 0.0]), np.diag([0.0, 1.0]), np.zeros((2, 2))])
+    r_units = np.array([np.zeros((2, 2)), np.zeros((2, 2)), np.diag([1.0, 0.0])])
+    noise = Noise(q_units, r_units, (np.zeros((2, 2)), np.diag([0.0, R[1, 1]])))
+    matrix, right = mehra_equations(linear_model, gain, seen, noise)
+    np.testing.assert_allclose(matrix @ [Q[0, 0], Q[1, 1], R[0, 0]], right, atol=1e-10)
+    assert np.linalg.matrix_rank(matrix) == 3
+
+
+def test_mehra_scatters_more_than_als():
+    problem, found = linear(a=A, steps=400, runs=40), {"mehra": [], "als": []}
+    truth = np.array([Q[0, 0], Q[1, 1], R[0, 0], R[1, 1]])
+    for place in range(40):
+        for way, values in found.items():
+            task = Task("kf", problem, problem.data([place]))
+            find_way(way).run(way, task)
+            values.append(task.values_of(task.best, task.free))
+    means = {way: np.mean(values, axis=0) for way, values in found.items()}
+    errors = {way: np.std(values, axis=0) for way, values in found.items()}
+    for way in found:
+        assert (abs(means[way] - truth) < 4 * errors[way] / np.sqrt(40)).all(), (way, means[way])
+    ratios = errors["mehra"] / errors["als"]
+    assert ratios.max() > 1.3 and ratios.min() > 0.9, ratios
+
+
+def test_fisher_scoring_ends_where_l_bfgs_ends():
+    problem = linear(runs=4, steps=80)
+    tasks = {way: task_of(problem, 4, options={"full_q": True}) for way in ("scoring", "likelihood")}
+    for way, task in tasks.items():
+        find_way(way).run(way, task)
+    by_scoring, by_l_bfgs = (task.value(task.best, LIKELIHOOD) for task in tasks.values())
+    assert by_scoring == pytest.approx(by_l_bfgs, rel=1e-8)
+    assert len(tasks["scoring"].kept) < len(tasks["likelihood"].kept)
 
 
 def test_als_refuses_what_it_cannot_do():

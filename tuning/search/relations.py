@@ -1,0 +1,115 @@
+"""Relations among the numbers of a model that a search keeps: equal, in proportion, fixed, bounded.
+
+What depends on a free number is set with it, so that nothing else has to know of relations. They are written so:
+
+    Q22 = 4 Q11         four times Q11, whatever Q11 is
+    Q33 = Q11           the same
+    R = 0.01            not tuned
+    Q11 = 1e-6..1e-2    within this range
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+from numerics.checks import shown
+from tuning.problems.parameter import Parameter
+
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+FORM = re.compile(
+    rf"\s*(?P<name>[^\s=]+)\s*=\s*"
+    rf"(?:(?P<low>{NUMBER})\s*\.\.\s*(?P<high>{NUMBER})"
+    rf"|(?P<factor>{NUMBER})\s*\*?\s*(?P<in_proportion>[^\W\d]\w*)"
+    rf"|(?P<value>{NUMBER})"
+    rf"|(?P<equal>[^\W\d]\w*))\s*"
+)
+RULE = "a relation must be NAME = [FACTOR] NAME, NAME = VALUE or NAME = LOW..HIGH"
+
+
+class Relation(NamedTuple):
+    """What is said of one number: that it is in proportion to another one, has a value, or lies in a range."""
+
+    name: str
+    of: str | None = None
+    factor: float = 1.0
+    value: float | None = None
+    ends: tuple[float, float] | None = None
+
+
+def relation_of(text: str) -> Relation:
+    """A relation from its text; ValueError for another form."""
+    found = FORM.fullmatch(text) if isinstance(text, str) else None
+    if found is None:
+        raise ValueError(f"{RULE}, but got {shown(text)}")
+    name, of = found["name"], found["in_proportion"] or found["equal"]
+    if found["value"]:
+        return Relation(name, value=float(found["value"]))
+    if found["low"]:
+        return Relation(name, ends=(float(found["low"]), float(found["high"])))
+    return Relation(name, of, float(found["factor"] or 1.0))
+
+
+def related(parameters: Sequence[Parameter], relations: Sequence[str]) -> list[Parameter]:
+    """The parameters that are free under some relations; what they set in a choice obeys these.
+
+    Args:
+        parameters: all parameters.
+        relations: texts, such as "Q22 = 4 Q11".
+
+    Raises:
+        ValueError: for another form, an unknown name, a number with two relations or in proportion to one that is
+            not free, a value that the number cannot have, and where nothing is left to tune.
+    """
+    found = [relation_of(text) for text in relations]
+    known = {one.name: one for one in parameters}
+    names = [one.name for one in found]
+    for relation, text in zip(found, relations, strict=True):
+        unknown = next((one for one in (relation.name, relation.of) if one and one not in known), None)
+        if unknown is not None:
+            raise ValueError(f"relations must be among {', '.join(known)}, but got {shown(text)}")
+        if names.count(relation.name) > 1:
+            raise ValueError(f"each number must have one relation at most, but {relation.name} has more")
+        _check(known[relation.name], relation, text)
+    bound = {one.name for one in found if one.ends is None}
+    for relation, text in zip(found, relations, strict=True):
+        if relation.of in bound:
+            raise ValueError(f"numbers must be in proportion to one that is free, but got {shown(text)}")
+    free = {one.name: one for one in parameters if one.name not in bound}
+    if not free:
+        raise ValueError(f"relations must leave a number to tune, but got {', '.join(relations)}")
+    for relation in found:
+        if relation.of:
+            root = free[relation.of]
+            free[relation.of] = replace(root, tied=(*root.tied, (known[relation.name].place, relation.factor)))
+        elif relation.ends:
+            low, high = relation.ends
+            free[relation.name] = replace(free[relation.name], low=low, high=high, first=None, default=None)
+    held = tuple((known[one.name].place, one.value) for one in found if one.value is not None)
+    return [replace(one, held=held) for one in free.values()]
+
+
+def _check(one: Parameter, relation: Relation, text: str) -> None:
+    """Raise ValueError unless a number can be what its relation says."""
+    least = 0.0 if one.place.is_variance else -1.0 if "correlation" in one.name else None
+    most = -least if least is not None and least < 0 else None
+    for value in (relation.value, *(relation.ends or ())):
+        if value is None or least is None:
+            continue
+        if value <= least or (most is not None and value >= most):
+            rule = "positive" if most is None else "within -1 and 1"
+            raise ValueError(f"{one.name} must be {rule}, but got {shown(text)}")
+    if relation.of and one.place.is_variance and relation.factor <= 0:
+        raise ValueError(f"a variance must be a positive multiple, but got {shown(text)}")
+    if relation.ends and not relation.ends[0] < relation.ends[1]:
+        raise ValueError(f"a range must be LOW..HIGH with LOW below HIGH, but got {shown(text)}")
+
+
+def obeying(choice, parameters: Sequence[Parameter]):
+    """The choice with the same free numbers, within their ranges, and all that is tied to these or held."""
+    for one in parameters:
+        if (value := one.get(choice)) is not None:
+            choice = one.set(choice, min(max(value, one.low), one.high))
+    return choice
