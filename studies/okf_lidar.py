@@ -12,7 +12,7 @@ import importlib.util
 import io
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,7 +29,8 @@ from tuning.search.space import Choice, untuned_choice
 from tuning.ways.registry import find_way
 from tuning.ways.task import Task
 
-LEARN, TEST = 700, 300  # runs
+LEARN, TEST = 700, 300  # runs of a draw
+DRAWS = 5
 FULL = {"full_q": True, "full_r": True}
 OKF, NOISE, GRADIENT = "OKF, default", "noise estimation", "MSE by its gradient"
 IN_A_FIFTH = "the same in a fifth of OKF's time"
@@ -47,13 +48,13 @@ RESAMPLES = 2000
 
 
 class Row(NamedTuple):
-    """A way on the runs that are held out."""
+    """A way on the runs that are held out, of D draws with B runs each."""
 
     name: str
-    choice: Choice
-    seconds: float  # of processor time, without compilation
-    squares: np.ndarray  # (B,) sum over the steps of a run of squared errors of the position
-    steps: np.ndarray  # (B,)
+    choices: tuple[Choice, ...]  # of each draw
+    seconds: float  # of processor time for a draw, without compilation
+    squares: np.ndarray  # (D, B) sum over the steps of a run of squared errors of the position
+    steps: np.ndarray  # (D, B)
     nis: float  # over the number of channels
     nees: float  # over the number of states
     log_likelihood: float  # of a held-out run
@@ -64,16 +65,35 @@ class Row(NamedTuple):
         return float(self.squares.sum() / self.steps.sum())
 
     def over(self, other: Row) -> Interval:
-        """The ratio of mean square errors, with a 95 % interval by bootstrap over runs."""
-        places = np.random.default_rng(0).integers(len(self.steps), size=(RESAMPLES, len(self.steps)))
-        ratios = self.squares[places].sum(axis=1) / other.squares[places].sum(axis=1)
-        return Interval(self.mse / other.mse, *np.quantile(ratios, (0.025, 0.975)).tolist())
+        """The ratio of mean square errors, with a 95 % interval by bootstrap over draws, and over runs of each."""
+        generator, (draws, runs) = np.random.default_rng(0), self.steps.shape
+        of_draws = generator.integers(draws, size=(RESAMPLES, draws))[..., None]
+        of_runs = generator.integers(runs, size=(RESAMPLES, draws, runs))
+        ours, theirs = (one.squares[of_draws, of_runs].sum(axis=(1, 2)) for one in (self, other))
+        return Interval(self.mse / other.mse, *np.quantile(ours / theirs, (0.025, 0.975)).tolist())
+
+    @classmethod
+    def pooled(cls, rows: Sequence[Row]) -> Row:
+        """One way on all draws: means of what is not of a run."""
+        of_rows: dict[str, list] = {name: [getattr(one, name) for one in rows] for name in cls._fields[2:]}
+        means = {name: float(np.mean(of_rows[name])) for name in ("seconds", "nis", "nees", "log_likelihood")}
+        of_runs = {name: np.concatenate(of_rows[name]) for name in ("squares", "steps")}
+        return cls(rows[0].name, tuple(one.choices[0] for one in rows), **means, **of_runs)
 
 
 def compared(
-    learn: int = LEARN, test: int = TEST, seed: int = 0, ways: Mapping[str, tuple[str, Mapping[str, bool]]] = WAYS
+    learn: int = LEARN,
+    test: int = TEST,
+    draws: int = DRAWS,
+    ways: Mapping[str, tuple[str, Mapping[str, bool]]] = WAYS,
 ) -> list[Row]:
-    """All ways, and OKF itself where it is installed, on the same runs."""
+    """All ways, and OKF itself where it is installed, on the same runs of some draws."""
+    found = [of_draw(learn, test, seed, ways) for seed in range(draws)]
+    return [Row.pooled(rows) for rows in zip(*found, strict=True)]
+
+
+def of_draw(learn: int, test: int, seed: int, ways: Mapping[str, tuple[str, Mapping[str, bool]]]) -> list[Row]:
+    """All ways on the runs of one seed."""
     runs = drawn(learn + test, seed)
     problem, rows = lidar_problem(runs, test), []
     data, held_out = problem.data(range(learn)), problem.data(range(learn, learn + test))
@@ -99,7 +119,7 @@ def row_of(name: str, choice: Choice, seconds: float, problem: RunsProblem, held
     steps = held_out.scored_counts
     squares = steps * np.array([mse(one[None], found.scale) for one in found.mean_squares])
     nis, nees = found.nis.value / found.expected_nis, found.nees.value / len(found.rmse)
-    return Row(name, choice, seconds, squares, steps, nis, nees, found.log_likelihood)
+    return Row(name, (choice,), seconds, squares[None], steps[None], nis, nees, found.log_likelihood)
 
 
 def is_installed() -> bool:
