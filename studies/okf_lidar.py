@@ -75,10 +75,11 @@ class Row(NamedTuple):
     @classmethod
     def pooled(cls, rows: Sequence[Row]) -> Row:
         """One way on all draws: means of what is not of a run."""
-        of_rows: dict[str, list] = {name: [getattr(one, name) for one in rows] for name in cls._fields[2:]}
-        means = {name: float(np.mean(of_rows[name])) for name in ("seconds", "nis", "nees", "log_likelihood")}
-        of_runs = {name: np.concatenate(of_rows[name]) for name in ("squares", "steps")}
-        return cls(rows[0].name, tuple(one.choices[0] for one in rows), **means, **of_runs)
+        columns = zip(*rows, strict=True)
+        names, choices, seconds, squares, steps, *means = (list(column) for column in columns)
+        together = np.concatenate(squares), np.concatenate(steps)
+        nis, nees, likelihood = (float(np.mean(one)) for one in means)
+        return cls(names[0], sum(choices, ()), float(np.mean(seconds)), *together, nis, nees, likelihood)
 
 
 def compared(

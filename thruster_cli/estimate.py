@@ -10,10 +10,12 @@ from typing import Annotated, Any
 import typer
 from rich.console import RenderableType
 
+from filters.logs.alarms import LogAlarms, alarms_of, episode_sentence, episodes
 from filters.logs.columns import columns_of
 from filters.logs.estimate import LogEstimate, estimate
 from filters.logs.findings import LogFindings, Residual, findings
 from filters.logs.verdict import ALPHA, verdict
+from filters.monitoring.monitor import monitor_of
 from plants.logs.write import check_suffix, write_columns
 from thruster_cli.options import (
     FILTER,
@@ -33,6 +35,8 @@ from thruster_cli.options import (
 )
 from thruster_cli.output import announce_compilation, check_picture, check_targets, emit, table
 from tuning.logs.read import read_named
+
+MOST_EPISODES = 8  # that are shown
 
 
 def command(
@@ -70,6 +74,23 @@ def command(
             rich_help_panel=RUNS,
         ),
     ] = None,
+    monitor: Annotated[
+        float | None,
+        typer.Option(
+            metavar="STEPS",
+            help="Test for outliers, biases, changed noise, stuck and missing readings, with one false alarm in "
+            "so many steps (docs/monitoring.md).",
+            rich_help_panel=RUNS,
+        ),
+    ] = None,
+    isolate: Annotated[
+        bool,
+        typer.Option(
+            "--isolate",
+            help="Run the filter without each channel, too, and name the faulty one.",
+            rich_help_panel=RUNS,
+        ),
+    ] = False,
     out: Annotated[
         Path | None,
         typer.Option(help="Estimates, bands and innovations as .csv, .parquet or .npz.", rich_help_panel=OUTPUT),
@@ -102,6 +123,9 @@ def command(
         check_picture(plot, "--plot")
     if out is not None:
         check_suffix(out)
+    watch = monitor_of(monitor)
+    if isolate and watch is None:
+        raise ValueError("--isolate must come with --monitor STEPS, whose alarms it counts")
     recorded, offer = read_named(log, preset, model, sensor, column, clock_offset, dt)
     check_targets((out, plot), json, read=(log, tuned, preset))
     announce_compilation()
@@ -109,20 +133,23 @@ def command(
     options: dict[str, Any] = {"tuned": tuned, "smoother": smoother, "lag": lag, "seed": seed, **numbers}
     found = estimate(recorded, filter_name, offer, **options)
     told = findings(found, skip)
+    alarms = None if watch is None else alarms_of(found, watch, told.first, isolate=isolate)
     if out is not None:
-        write_columns(out, columns_of(found), again=True)
+        write_columns(out, columns_of(found, alarms), again=True)
     if plot is not None:
         from filters.logs.figure import log_figure
 
-        log_figure(plot, found, f"{_title(found)} on {log.name}")
-    emit(_shown(found, told, out, plot), _as_json(found, told, out, plot), json)
+        log_figure(plot, found, f"{_title(found)} on {log.name}", alarms)
+    files = [str(path) for path in (out, plot) if path is not None]
+    shown = [*_shown(found, told), *_alarms(found, alarms), *[f"wrote {path}" for path in files]]
+    emit(shown, {**_as_json(found, told), **_alarms_as_json(found, alarms), "files": files}, json)
 
 
 def _title(found: LogEstimate) -> str:
     return f"{found.filter.name}, smoothed," if found.smoothed else found.filter.name
 
 
-def _shown(found: LogEstimate, told: LogFindings, out: Path | None, plot: Path | None) -> list[RenderableType]:
+def _shown(found: LogEstimate, told: LogFindings) -> list[RenderableType]:
     log = found.log
     about = f"{log.steps + 1} rows, dt {log.dt:g} s" + (", put on a grid" if log.irregular else "")
     title = f"{_title(found)} on {log.name} ({about}); scored: rows {told.first} to {log.steps}"
@@ -142,15 +169,45 @@ def _shown(found: LogEstimate, told: LogFindings, out: Path | None, plot: Path |
     if told.references:
         what = "Smoother" if found.smoothed else "Estimate"
         shown.append(table(f"{what} less reference, not seen", columns, list(map(_row, told.references))))
-    shown += verdict(found, told)
-    return shown + [f"wrote {path}" for path in (out, plot) if path is not None]
+    return shown + verdict(found, told)
+
+
+def _alarms(found: LogEstimate, told: LogAlarms | None) -> list[RenderableType]:
+    """The first alarms in words, and the channel at fault."""
+    if told is None:
+        return []
+    log, times = found.log, found.log.start + found.log.times
+    rows, expected = log.steps + 1 - told.first, (log.steps + 1 - told.first) / told.monitor.steps_between
+    what = f"{rows} rows, {expected:.2g} false alarms expected if the model is right"
+    if not told.alarms:
+        return [f"No alarm in {what}."]
+    some = episodes(told.alarms, told.monitor.memory)
+    shown: list[RenderableType] = [f"Alarms: {len(told.alarms)} in {what}."]
+    shown += [f"- {episode_sentence(one, log.measured[one[0].channel], times)}" for one in some[:MOST_EPISODES]]
+    shown += [f"- and {len(some) - MOST_EPISODES} more stretches"] * (len(some) > MOST_EPISODES)
+    if told.without is not None:
+        counts = ", ".join(f"{one.symbol} {count}" for one, count in zip(log.measured, told.without, strict=True))
+        place = told.at_fault
+        fault = "no single channel is at fault" if place is None else f"{log.measured[place].symbol} is at fault"
+        shown.append(f"Alarms left without a channel: {counts}: {fault}.")
+    return shown
+
+
+def _alarms_as_json(found: LogEstimate, told: LogAlarms | None) -> dict[str, Any]:
+    if told is None:
+        return {}
+    measured = found.log.measured
+    alarms = [{**one._asdict(), "channel": measured[one.channel].symbol} for one in told.alarms]
+    left = told.without and {one.symbol: n for one, n in zip(measured, told.without, strict=True)}
+    fault = None if told.at_fault is None else measured[told.at_fault].symbol
+    return {"monitor": told.monitor.as_mapping(), "alarms": alarms, "left_without": left, "at_fault": fault}
 
 
 def _row(one: Residual) -> list[str]:
     return [one.quantity.short_label, f"{one.rmse:.4g}", f"{one.bias:+.4g}", str(one.rows)]
 
 
-def _as_json(found: LogEstimate, told: LogFindings, out: Path | None, plot: Path | None) -> dict:
+def _as_json(found: LogEstimate, told: LogFindings) -> dict:
     log, white = found.log, told.whiteness
     return {
         "log": log.name,
@@ -170,5 +227,4 @@ def _as_json(found: LogEstimate, told: LogFindings, out: Path | None, plot: Path
         "references": {one.quantity.symbol: one._asdict() for one in told.references},
         "findings": [asdict(one) for one in log.findings],
         "sentences": verdict(found, told),
-        "files": [str(path) for path in (out, plot) if path is not None],
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from filters.logs.alarms import LogAlarms
 from filters.logs.estimate import LogEstimate
 from filters.logs.findings import compared
 from plants.logs.columns import plain
@@ -11,11 +12,12 @@ from plants.logs.units import suffix
 from plants.quantities import Quantity
 
 
-def columns_of(found: LogEstimate) -> dict[str, np.ndarray]:
+def columns_of(found: LogEstimate, told: LogAlarms | None = None) -> dict[str, np.ndarray]:
     """Columns (K + 1,) by header: time, inputs and measurements, then the filter's output, all by symbol.
 
     Of a state or output "omega_m" it is "omega_m_rad_per_s" and "omega_m_std_rad_per_s"; of a channel "thrust"
-    "measured_thrust_N", "innovation_thrust_N" and "innovation_std_thrust_N"; of a reference "reference_T_N".
+    "measured_thrust_N", "innovation_thrust_N" and "innovation_std_thrust_N"; of a reference "reference_T_N". With
+    a monitor "alarm_thrust" counts the tests that raise an alarm at a row.
     """
     log, model = found.log, found.model
     columns = {"time_s": log.start + log.times}
@@ -33,6 +35,11 @@ def columns_of(found: LogEstimate) -> dict[str, np.ndarray]:
     deviations = np.sqrt(np.maximum(np.einsum("kii->ki", found.innovation_covs), 0.0))
     for one, values, std in zip(log.measured, found.innovations.T, deviations.T, strict=True):
         columns[header_of("innovation", one)], columns[header_of("innovation_std", one)] = values, std
+    if told is not None:
+        for channel, one in enumerate(log.measured):
+            rows = [alarm.step for alarm in told.alarms if alarm.channel == channel]
+            counts = np.bincount(rows, minlength=log.steps + 1)
+            columns[header_of("alarm", one._replace(unit=""))] = counts.astype(np.float64)
     return columns
 
 

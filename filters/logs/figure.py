@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from filters.logs.alarms import LogAlarms, episodes
 from filters.logs.estimate import SKIPPED, LogEstimate
 from filters.logs.findings import compared, estimated
 from filters.looks import TRUTH, colour_of
@@ -23,21 +24,22 @@ TWO_SIDED = 1.96
 MOST_PANELS = 6  # of states and outputs
 TALL, LOW, WIDTH = 1.5, 1.1, 9.0  # [inch]
 ROOM = 0.6  # for title and legend [inch]
+ALARM = "tab:red"
 MARGIN = 0.06  # of an axis above and below what it shows
 DOTS: dict[str, Any] = {"color": "0.5", "s": 4.0, "linewidths": 0, "label": "measurement", "zorder": 1.5}
 
 
-def log_figure(path: str | Path, found: LogEstimate, title: str) -> Path:
+def log_figure(path: str | Path, found: LogEstimate, title: str, told: LogAlarms | None = None) -> Path:
     """Save what `draw_log` draws; return the path."""
-    return save_figure(draw_log(found, title), path)
+    return save_figure(draw_log(found, title, told=told), path)
 
 
-def draw_log(found: LogEstimate, title: str, *, states: bool = True) -> Figure:
+def draw_log(found: LogEstimate, title: str, *, states: bool = True, told: LogAlarms | None = None) -> Figure:
     """Estimates beside the reference channels, and the innovations below; without `states` these alone.
 
     A measurement of a state or an output stands there as dots. References come first; of many states and outputs
     the first six are drawn. Bands of the first rows, in which a filter settles from its prior, do not widen the
-    axes.
+    axes. The first alarm of a stretch is a line in the innovations, the stretch shaded.
     """
     model, references, colour = found.model, compared(found), colour_of(found.filter.name)
     values = [f"{STATE}:{one.symbol}" for one in model.states] + [f"{OUTPUT}:{symbol}" for symbol in model.outputs]
@@ -69,6 +71,11 @@ def draw_log(found: LogEstimate, title: str, *, states: bool = True) -> Figure:
         _band(axis, times, np.zeros_like(std), std, colour)
         _limit(axis, np.zeros_like(std), std, found.innovations[:, j])
         axis.plot(times, found.innovations[:, j], color=colour, linewidth=0.8, label="innovation")
+        for some in episodes(told.alarms, told.monitor.memory) if told else ():
+            if some[0].channel == j:
+                span = min(one.since for one in some), some[-1].step
+                axis.axvspan(*times[list(span)], color=ALARM, alpha=0.2, linewidth=0, zorder=0)
+                axis.axvline(times[some[0].step], color=ALARM, linewidth=1.2, label="alarm")
         axis.set_ylabel(f"innovation of\n{one.symbol}" + (f"\n[{verbatim(one.unit)}]" if one.unit else ""))
     axes[0].set_title(verbatim(title, most=TITLE), fontsize=11)
     axes[-1].set_xlabel("time [s]")

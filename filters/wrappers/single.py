@@ -12,6 +12,7 @@ from numpy.ma import MaskedArray
 from filters.engine.checks import checked_actions
 from filters.estimators.estimator import Estimator
 from filters.filter import Filter
+from filters.monitoring.monitor import Monitor, monitor_of, watch_of
 from filters.wrappers.arguments import (
     APPENDED,
     OBSERVATIONS,
@@ -49,7 +50,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
     `measurement_valid` is false), else the observation. Where a measurement is missing, the observation repeats
     the last one (0 at first). The filter predicts with the action clipped to the action space or, if an env
     replays a log, with `info["recorded_input"]`. The filter's random numbers come from the reset seed through a
-    separate stream; the env's generator is never used.
+    separate stream; the env's generator is never used. With a monitor it also gains `health`, whether all is `ok`
+    and the `alarms` of the step (`filters.monitoring.Health`).
 
     Args:
         env: any env with Box actions and observations.
@@ -64,6 +66,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
             `StateSpaceModel` (which the env's spec cannot hold as JSON).
         tuned: path of a tuned file, which gives filter, parameters and model arguments; or what `tuning.tune`
             returns, whose `filter` is then taken with its model.
+        monitor: tests on the innovations, as a `filters.monitoring.Monitor`, a mapping of its attributes, its
+            number of steps between false alarms, or True for its defaults; None for none.
         model_arguments: mapping of arguments of the env's own model or of the factory: for a bow thruster
             `process_noise_cov`, `measurement_noise_cov`, `prior_cov_factor`, `parameter_factors`,
             `operating_voltage`.
@@ -81,6 +85,7 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         model: str | StateSpaceModel | None = None,
         tuned: Any = None,
         model_arguments: Mapping | None = None,
+        monitor: Monitor | Mapping | float | None = None,
         **numbers,
     ):
         """Build model and filter; see the class for the arguments."""
@@ -91,6 +96,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         kept = filter if filter is None or isinstance(filter, str) else EstimatorInSpec(filter)
         recorded = {"filter": kept, "observation": observation, "model": held, "tuned": tuned, **numbers}
         recorded["model_arguments"] = model_arguments
+        watches = monitor_of(monitor)
+        recorded["monitor"] = watches and watches.as_mapping()
         gym.utils.RecordConstructorArgs.__init__(self, **recorded)
         gym.Wrapper.__init__(self, env)
         self._form = one_of("observation", observation, OBSERVATIONS)
@@ -104,7 +111,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
         session = self.filter.session()
         self._session = WithMeasuredInputs(session, split) if split.inputs else session
-        self._channels = split.channels
+        self._channels, self._measurements = split.channels, list(split.measurements)
+        self._watch = watch_of(watches, self.filter)
         self._generator = filter_generator(None)
         base: Any = env.unwrapped
         if hasattr(base, "overlay"):  # it draws the estimate beside the truth
@@ -125,6 +133,8 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
             raise ValueError(f"a measurement must have the model's {m} entries, but got {shown(z)}")
         self._held = np.zeros(m)
         self._session.start(draw_key(self._generator), z)
+        if self._watch is not None:
+            self._watch.restart()
         return self._observe(observation, z, info), info
 
     def step(self, action):
@@ -163,6 +173,9 @@ class EstimateState(gym.Wrapper, gym.utils.RecordConstructorArgs):
         info["innovation"] = session.innovation.copy()
         info["innovation_cov"] = session.innovation_cov.copy()
         info["estimate_divergences"] = np.int64(session.divergences)  # clients may ask for a dtype
+        if self._watch is not None:
+            seen = as_floats(z)[self._measurements]
+            info["health"] = self._watch.step(info["innovation"], info["innovation_cov"], seen)
         if self._form == "estimate" and not self._appended:
             return mean.astype(FLOAT32)
         parts = [mean]

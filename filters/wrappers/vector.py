@@ -16,6 +16,7 @@ from filters.estimators.estimator import Estimator
 from filters.estimators.foreign import ForeignFilter
 from filters.estimators.session import EstimatorBeliefs
 from filters.filter import Filter
+from filters.monitoring.monitor import Monitor, monitor_of, watch_of
 from filters.wrappers.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for, given_filter
 from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
 from numerics.checks import as_floats, one_of, shown
@@ -33,11 +34,12 @@ class EstimateStates(gym.vector.VectorWrapper):
     `final_obs` and `final_info` hold the last estimate; in DISABLED where `options["reset_mask"]` is true.
 
     The info dictionary gains, with one row for each copy, `estimate` (N, n), `estimate_cov` (N, n, n),
-    `innovation` (N, m), `innovation_cov` (N, m, m) and `estimate_divergences` (N,).
+    `innovation` (N, m), `innovation_cov` (N, m, m) and `estimate_divergences` (N,); with a monitor `health`, an
+    array of N objects.
 
     Args:
         env: any vector env with Box actions and observations.
-        filter, observation, model, tuned, model_arguments, **numbers: those of `EstimateState`.
+        filter, observation, model, tuned, model_arguments, monitor, **numbers: those of `EstimateState`.
 
     Raises:
         ValueError: if an argument is unknown or wrong, or spaces and model do not fit.
@@ -51,6 +53,7 @@ class EstimateStates(gym.vector.VectorWrapper):
         model: str | StateSpaceModel | None = None,
         tuned: Any = None,
         model_arguments: Mapping | None = None,
+        monitor: Monitor | Mapping | float | None = None,
         **numbers,
     ):
         """Build model and filter; see the class for the arguments."""
@@ -75,6 +78,10 @@ class EstimateStates(gym.vector.VectorWrapper):
         self._beliefs = WithMeasuredInputs(beliefs, split) if inputs else beliefs
         self._keys = EpisodeKeys(self.num_envs, filter_generator)
         self._held = np.zeros((self.num_envs, self._m))
+        watches = monitor_of(monitor)
+        found = [watch_of(watches, self.filter) for _ in range(self.num_envs)]
+        self._watches = [one for one in found if one is not None]  # of all copies, or of none
+        self._measured = list(split.measurements)
         self._done = np.zeros(self.num_envs, dtype=bool)
         self._low, self._high = actions.low.ravel(), actions.high.ravel()
 
@@ -119,6 +126,8 @@ class EstimateStates(gym.vector.VectorWrapper):
     def _start(self, mask: np.ndarray, z: np.ndarray) -> None:
         which = np.flatnonzero(mask)
         self._held[which] = 0.0
+        for i in which if self._watches else ():
+            self._watches[i].restart()
         self._beliefs.start(which, self._keys.draw(which), z)
 
     def _end(self, u, z, done, info) -> None:
@@ -160,6 +169,8 @@ class EstimateStates(gym.vector.VectorWrapper):
             "innovation_cov": beliefs.part("innovation_cov", m, m),
             "estimate_divergences": beliefs.part("divergences").astype(np.int64),
         }
+        if self._watches:
+            added["health"] = self._health(added["innovation"], added["innovation_cov"], z, there)
         info |= added
         info |= {f"_{key}": there for key in added}
         parts = [mean]
@@ -171,3 +182,10 @@ class EstimateStates(gym.vector.VectorWrapper):
         if self._appended:
             parts.append(observations[:, -self._appended :])
         return np.concatenate(parts, axis=1).astype(np.float32)
+
+    def _health(self, innovations: np.ndarray, covs: np.ndarray, z: np.ndarray, there: np.ndarray) -> np.ndarray:
+        """What the monitors of copies that are there say, (N,) of objects."""
+        found = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(there):
+            found[i] = self._watches[i].step(innovations[i], covs[i], z[i, self._measured])
+        return found

@@ -163,3 +163,21 @@ def test_recorders_of_two_rates_are_told_the_option(folder, thruster):  # noqa: 
 def test_a_command_without_its_command_says_so(thruster):  # noqa: F811
     done = thruster("study")
     assert done.returncode == 2 and done.stderr.startswith("thruster: a command must follow thruster study, but ")
+
+
+def test_estimate_tells_of_alarms(folder, thruster, as_json):  # noqa: F811
+    data = as_json("estimate", "stuck.csv", *MODEL, "--monitor", "100000", "--out", "e.csv", "--plot", "e.png")
+    tests = {one["test"] for one in data["alarms"]}
+    assert "stuck" in tests and {one["channel"] for one in data["alarms"]} == {"z"}
+    assert min(one["step"] for one in data["alarms"]) in range(300, 310)
+    assert "alarm_z" in (folder / "e.csv").read_text().splitlines()[0] and (folder / "e.png").is_file()
+    shown = thruster("estimate", "stuck.csv", *MODEL, "--monitor", "100000").stdout
+    assert "Alarms:" in shown and "- z: " in shown and "false alarms expected if the model is right" in shown
+    assert "No alarm in" in thruster("estimate", "whole.csv", *MODEL, "--monitor", "1e9").stdout
+    for wrong, rule in (
+        (("--isolate",), "--isolate must come with --monitor STEPS"),
+        (("--monitor", "1000", "--isolate"), "can be isolated among two or more, but the filter has one"),
+        (("--monitor", "3"), "steps_between must be from 100 to 1e12, but got 3"),
+    ):
+        done = thruster("estimate", "whole.csv", *MODEL, *wrong)
+        assert done.returncode == 2 and rule in done.stderr

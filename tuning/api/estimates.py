@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isnan
 from pathlib import Path
@@ -10,10 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from filters.filter import Filter
+from filters.logs.alarms import LogAlarms, alarms_of
 from filters.logs.columns import columns_of
 from filters.logs.estimate import LogEstimate
 from filters.logs.findings import LogFindings
 from filters.logs.verdict import verdict
+from filters.monitoring.monitor import Monitor, monitor_of
 from plants.logs.log import Log
 from plants.logs.write import write_columns
 from tuning.api.showing import drawn, frame, html, number
@@ -68,6 +71,18 @@ class LogEstimates:
     def sentences(self) -> list[str]:
         """Findings in the log, and what the innovations say about filter and model."""
         return verdict(self.found, self.findings)
+
+    def alarms(self, monitor: Monitor | Mapping | float = 100_000.0, *, isolate: bool = False) -> LogAlarms:
+        """What tests on the innovations say of the sensors (docs/monitoring.md).
+
+        Args:
+            monitor: a `filters.monitoring.Monitor`, a mapping of its attributes, or steps between false alarms.
+            isolate: whether to run the filter without each channel, too, and name the faulty one.
+
+        Raises:
+            ValueError: for a wrong monitor, a filter without a covariance, and to isolate the only channel.
+        """
+        return alarms_of(self.found, monitor_of(monitor) or Monitor(), self.findings.first, isolate=isolate)
 
     def output(self, symbol: str) -> tuple[np.ndarray, np.ndarray]:
         """An output of the model, such as "T", at the estimates, (K + 1,), and its standard deviation."""

@@ -267,7 +267,6 @@ def run_trials(
     """
     if stop() or finished_trials(study) >= trials:
         return False
-
     space = plan.space()
 
     def objective(trial: optuna.Trial) -> list[float]:

@@ -1,0 +1,242 @@
+"""Alarms: thresholds beside published run lengths, tests beside a naive text, and the rate that is stated."""
+
+import json
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import thruster_env  # noqa: F401 - registers its envs
+from filters import EstimateState, EstimateStates
+from filters.logs.alarms import alarms_of, episode_sentence, episodes
+from filters.logs.columns import columns_of
+from filters.logs.estimate import estimate_with
+from filters.monitoring.monitor import TESTS, Alarm, Monitor, monitor_of
+from filters.monitoring.thresholds import (
+    chi_square,
+    cusum_run_length,
+    cusum_threshold,
+    glr_run_length,
+    glr_threshold,
+)
+from filters.registry import make_filter
+from plants.logs.log import Log
+from plants.quantities import Quantity
+from tuning.problems.find import find_problem
+
+
+@pytest.mark.parametrize(
+    "threshold, shift, length",  # Montgomery, Introduction to Statistical Quality Control, table 9.3: k = 0.5
+    [(4.0, 0.0, 168.0), (5.0, 0.0, 465.0), (4.0, 0.5, 26.6), (5.0, 1.0, 10.4), (4.0, 2.0, 3.34), (5.0, 4.0, 2.01)],
+)
+def test_run_lengths_of_the_cusum_are_those_of_the_textbook(threshold, shift, length):
+    assert cusum_run_length(threshold, 0.5, shift) == pytest.approx(length, rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    "reference, threshold",  # Montgomery, section 9.1.3, after Hawkins (1993): a run length of 370
+    [(0.25, 8.01), (0.5, 4.77), (0.75, 3.34), (1.0, 2.52), (1.25, 1.99), (1.5, 1.61)],
+)
+def test_thresholds_of_the_cusum_are_those_of_the_textbook(reference, threshold):
+    assert cusum_threshold(370.0, reference) == pytest.approx(threshold, abs=0.006)
+
+
+def test_thresholds_have_the_run_lengths_that_are_asked_for():
+    assert cusum_run_length(cusum_threshold(4e5, 0.5), 0.5) == pytest.approx(4e5, rel=1e-6)
+    assert glr_run_length(glr_threshold(4e5, 50), 50) == pytest.approx(4e5, rel=1e-6)
+    assert chi_square(20.0, 1) == pytest.approx(1.959964**2, rel=1e-6)
+
+
+def drawn(steps, m, seed=0):
+    """White innovations with a covariance that has correlations, and measurements."""
+    rng = np.random.default_rng(seed)
+    root = np.tril(rng.standard_normal((m, m))) + 2.0 * np.eye(m)
+    v = rng.standard_normal((steps, m)) @ root.T
+    return v, np.broadcast_to(root @ root.T, (steps, m, m)).copy(), rng.standard_normal((steps, m))
+
+
+@pytest.mark.parametrize("channels", [1, 2])
+def test_false_alarms_are_as_rare_as_is_said(channels):
+    found = Monitor(steps_between=500.0).alarms(*drawn(1_000_000, channels))
+    counts = [sum(one.test == test for one in found) for test in TESTS]
+    assert len(found) == pytest.approx(2000, rel=0.1)
+    assert counts[:4] == pytest.approx([500] * 4, rel=0.2)  # four deviations of a count are 18 %
+    assert counts[4:] == [0, 0]
+
+
+def naive(v, s, z, monitor):
+    """All tests as one would write them for one channel."""
+    e, found, seen = v[:, 0] / np.sqrt(s[:, 0, 0]), [], []
+    each = 4 * monitor.steps_between
+    h, g = cusum_threshold(each, 0.5 * monitor.bias), glr_threshold(each, monitor.window)
+    sums, began, since_glr, block = {1: 0.0, -1: 0.0}, {1: 0, -1: 0}, 0, []
+    for k in range(len(e)):
+        if math.isnan(z[k, 0]):
+            if k >= monitor.missing - 1 and np.isnan(z[k - monitor.missing + 1 : k + 1, 0]).all():
+                if k == monitor.missing - 1 or not math.isnan(z[k - monitor.missing, 0]):
+                    found.append(("missing", k))
+            continue
+        seen.append(k)
+        if e[k] ** 2 >= chi_square(each, 1):
+            found.append(("outlier", k))
+        for sign in (1, -1):
+            began[sign] = k if sums[sign] == 0.0 else began[sign]
+            sums[sign] = max(0.0, sums[sign] + sign * e[k] - 0.5 * monitor.bias)
+            if sums[sign] >= h:
+                found.append(("cusum", k, began[sign]))
+                sums[sign] = 0.0
+        last = [e[j] for j in seen if j >= since_glr][-monitor.window :]
+        ratios = [abs(sum(last[-n:])) / math.sqrt(n) for n in range(1, len(last) + 1)]
+        if max(ratios) >= g:
+            found.append(("glr", k, np.argmax(ratios) + 1))
+            since_glr = k + 1
+        block.append(e[k] ** 2)
+        if len(block) == monitor.block:
+            low, high = monitor.limits(1)[3:5]
+            if not low <= sum(block) <= high:
+                found.append(("variance", k))
+            block = []
+        equal = [j for j in seen[-monitor.stuck :] if z[j, 0] == z[k, 0]]
+        before = seen[-1 - monitor.stuck] if len(seen) > monitor.stuck else None
+        if len(equal) == monitor.stuck and (before is None or z[before, 0] != z[k, 0]):
+            found.append(("stuck", k))
+    return found
+
+
+def test_the_tests_are_those_of_a_naive_text():
+    v, s, z = drawn(3000, 1, seed=3)
+    v[1000:1100] += 2.0
+    v[1500:1700] *= 2.5
+    z[2000:2030], z[2100:2125], z[2200] = z[2000], np.nan, np.nan
+    monitor = Monitor(steps_between=200.0, window=20, block=30)
+    found = monitor.alarms(v, s, z)
+    expected = naive(v, s, z, monitor)
+    assert sorted((one.test, one.step) for one in found) == sorted(one[:2] for one in expected)
+    cusums = {one.step: one.since for one in found if one.test == "cusum"}
+    assert cusums == {one[1]: one[2] for one in expected if one[0] == "cusum"}
+    lengths = {one.step: one.step - one.since + 1 for one in found if one.test == "glr" and one.step < 2000}
+    assert lengths == {one[1]: one[2] for one in expected if one[0] == "glr" and one[1] < 2000}
+    assert {one.test for one in found} == set(TESTS)
+
+
+def test_a_bias_is_found_with_its_beginning_its_size_and_its_channel():
+    v, s, z = drawn(600, 2, seed=1)
+    v[300:, 1] -= 4.0 * np.sqrt(s[0, 1, 1])
+    first = [one for one in Monitor().alarms(v, s, z) if one.test in ("glr", "cusum")][0]
+    assert first.channel == 1 and abs(first.since - 300) <= 1 and first.step < 305
+    assert first.size == pytest.approx(-4.0 * np.sqrt(s[0, 1, 1]), rel=0.5)
+
+
+def test_noise_that_shrinks_or_grows_is_told_by_its_variance():
+    v, s, z = drawn(500, 1)
+    v[100:200], v[300:400] = 0.3 * v[100:200], 2.0 * v[300:400]
+    found = [one for one in Monitor().alarms(v, s, z) if one.test == "variance"]
+    assert found[0].step == 149 and found[0].since == 100 and found[0].size == pytest.approx(0.09, rel=0.5)
+    assert {one.step for one in found} <= {149, 199, 349, 399} and found[-1].size == pytest.approx(4.0, rel=0.5)
+
+
+def test_the_joint_test_of_outliers_counts_the_channels_that_are_there():
+    v, s, z = drawn(3, 3)
+    v[:] = 0.0
+    v[1] = np.linalg.cholesky(s[1]) @ [0.0, 0.0, 7.0]
+    z[2, 2] = np.nan
+    v[2] = v[1]  # of what is not there nothing is said
+    found = Monitor().alarms(v, s, z)
+    assert [(one.test, one.step) for one in found if one.test == "outlier"] == [("outlier", 1)]
+
+
+def test_a_filter_that_is_lost_says_nothing_of_a_sensor():
+    v, s, z = drawn(200, 1)
+    v[50:60] = np.nan
+    assert all(one.test != "outlier" for one in Monitor(steps_between=1e9).alarms(v, s, z))
+
+
+def test_a_watch_step_by_step_says_the_same():
+    v, s, z = drawn(800, 2, seed=5)
+    v[400:, 0] += 1.5
+    monitor = Monitor(steps_between=1000.0, memory=30)
+    watch = monitor.watch(2)
+    for _ in range(2):  # a restart forgets everything
+        told = [watch.step(*those) for those in zip(v, s, z, strict=True)]
+        assert [alarm for one in told for alarm in one.alarms] == monitor.alarms(v, s, z)
+        last = None
+        for k, one in enumerate(told):
+            last = k if one.alarms else last
+            assert one.ok == (last is None or k - last >= 30)
+        assert watch.latest[0].channel == 0
+        watch.restart()
+
+
+def test_wrappers_tell_of_health_and_copies_as_one_env_does():
+    env = EstimateState(gym.make("BowThruster-v0"), "ekf", monitor=200.0)
+    several = EstimateStates(gym.make_vec("BowThruster-v0", 2), "ekf", monitor={"steps_between": 200.0})
+    assert json.loads(env.spec.to_json())["additional_wrappers"][-1]["kwargs"]["monitor"]["steps_between"] == 200.0
+    env.reset(seed=8)
+    several.reset(seed=[7, 8])
+    action, alarms = np.array([3.0], dtype=np.float32), 0
+    for k in range(300):
+        action[:] = 10.0 * math.sin(0.05 * k)
+        _, _, _, _, info = env.step(action)
+        _, _, _, _, infos = several.step(np.array([-action, action]))
+        assert info["health"] == infos["health"][1] and infos["_health"].all()
+        alarms += len(info["health"].alarms)
+    assert alarms > 0
+    env.reset(seed=9)
+    assert env.step(action)[-1]["health"].ok
+
+
+@pytest.mark.parametrize(
+    "given, rule",
+    [
+        ({"window": 5}, "window must be a whole number of at least 10, but got 5"),
+        ({"horizon": 5}, "an attribute of a monitor must be one of steps_between, .* but got 'horizon'"),
+        (10.0, "steps_between must be from 100 to 1e12, but got 10"),
+        ({"bias": 0.0}, "bias must be positive"),
+    ],
+)
+def test_monitors_that_cannot_be(given, rule):
+    with pytest.raises(ValueError, match=rule):
+        monitor_of(given)
+
+
+def test_a_filter_without_a_covariance_has_no_innovations_to_test():
+    with pytest.raises(ValueError, match="a monitor needs a filter with a covariance, but 'low-pass' has none"):
+        EstimateState(gym.make("BowThruster-v0"), "low-pass", monitor=True)
+    assert EstimateState(gym.make("BowThruster-v0"), "low-pass").reset(seed=0)
+
+
+def vehicle_log(spoil):
+    """A log of the vehicle with all its instruments, and a filter that knows the truth."""
+    problem = find_problem("auv:motion")
+    model = problem.model(**problem.true)
+    data = problem.data([5])
+    z = data.measurements[0].copy()
+    spoil(z)
+    told = problem.quantities
+    log = Log("dive", problem.dt, data.inputs[0], z, model.input_quantities, told.measurements)
+    return estimate_with(make_filter("ekf", model), log)
+
+
+def test_the_faulty_channel_is_the_one_without_which_alarms_end():
+    def spoil(z):
+        z[400:, 5] += 0.02  # r [rad/s], of deviation 0.003
+
+    found = vehicle_log(spoil)
+    told = alarms_of(found, Monitor(), 50, isolate=True)
+    assert told.at_fault == 5 and told.without[5] == min(told.without)
+    assert min(one.step for one in told.alarms) >= 400
+    columns = columns_of(found, told)
+    assert columns["alarm_r"][400:].sum() > 0 and columns["alarm_r"][:400].sum() == 0
+    whole = alarms_of(vehicle_log(lambda z: None), Monitor(), 50, isolate=True)
+    assert whole.at_fault is None and len(whole.alarms) <= 2
+
+
+def test_episodes_are_told_in_words():
+    times, thrust = 0.1 * np.arange(100), Quantity("thrust", "T", "N")
+    alarms = [Alarm("cusum", 0, 30, 20, 0.5), Alarm("glr", 0, 40, 21, 0.6), Alarm("outlier", 0, 95, 95, -4.0)]
+    first, second = episodes(alarms, 50)
+    assert episode_sentence(first, thrust, times) == (
+        "T: a bias of +0.5 N since 2 s, found at 3 s (cusum); 1 more until 4 s (glr)"
+    )
+    assert episode_sentence(second, thrust, times) == "T: an outlier -4 N off at 9.5 s (outlier)"
