@@ -19,6 +19,7 @@ from filters.pages.equations import Equations
 from filters.pages.page import Page
 from filters.pages.stages import Stage, as_calls, as_programs, stage_of
 from filters.pages.traced import MOST
+from numerics.algebra.graphs import uncollected
 from numerics.algebra.matrices import Matrix
 from numerics.algebra.operations import only, present, uncorrelated, wrap
 from numerics.algebra.programs import callable_of
@@ -52,6 +53,7 @@ def recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page 
 
 
 @cache
+@uncollected()
 def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page, interpreting: bool) -> Recursion:
     memory = Memory(shape, page)
     try:

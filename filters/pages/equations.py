@@ -16,7 +16,7 @@ from copy import copy
 from filters.pages.at_points import called_at_points
 from filters.pages.differences import called_parts
 from filters.pages.memory import NumbersMemory
-from filters.pages.traced import Traced
+from filters.pages.traced import traced_model
 from numerics.algebra.matrices import Matrix, Operation, never, plus, through
 from plants.shape import Functions
 
@@ -35,7 +35,7 @@ class Equations:
 
     def __init__(self, functions: Functions, memory: NumbersMemory, *, constants_move: bool, trace: bool):
         """Take the model's functions, where its numbers lie, and whether parameters move its constants."""
-        shape, f, by_f, h, by_h = memory.shape, *functions
+        shape = memory.shape
         self.state_angles, self.measurement_angles = shape.state_angles, shape.measurement_angles
         self.Q, self.R, self._scales, self._constants = memory.Q, memory.R, memory.scales, memory.constants
         self.Q_root, self.prior_root = memory.Q_root, memory.prior_root
@@ -45,7 +45,7 @@ class Equations:
         chosen = functions, shape
         parts: list[tuple[Callable, ...]]
         if trace:
-            traced = Traced(f, by_f, 2, shape), Traced(h, by_h, 1, shape)
+            traced = traced_model(functions, shape)
             parts = [one.parts for one in traced]
             self._parts_at_points: Callable = lambda which, points: traced[which == "sight"].of_points
         else:

@@ -10,6 +10,7 @@ from filters.pages.memory import RowMemory
 from filters.pages.page import Page
 from filters.pages.stages import Stage, as_calls, as_programs
 from filters.pages.traced import MOST
+from numerics.algebra.graphs import uncollected
 from numerics.algebra.matrices import Matrix
 from numerics.algebra.programs import OF_STEPS, callable_of
 from plants.layout import LANES, constants_reader
@@ -24,6 +25,7 @@ class Programs(NamedTuple):
     vectors: tuple[Callable, ...]  # the same for eight beliefs side by side; none if stages are calls
 
 
+@uncollected()
 def programs_of(
     page: Page, functions: Functions, shape: Shape, stages: Callable[[RowMemory, Equations], Sequence[Stage]]
 ) -> Programs:

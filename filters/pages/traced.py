@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -13,10 +14,17 @@ from numerics.algebra.slopes import along
 from numerics.algebra.tracing import traced
 from numerics.derivatives import by_complex_step
 from numerics.sources import is_array
-from plants.shape import Shape, constants_are_array
+from plants.shape import Functions, Shape, constants_are_array
 
 MOST = 30_000  # operations of a stage: beyond, instructions take longer to compile than calls
 POINTS = ((0.1, 0.5), (1.0, 1.0), (1.0, 2.5), (10.0, 4.0))  # magnitudes and phases, where graphs are compared
+
+
+@lru_cache(maxsize=64)
+def traced_model(functions: Functions, shape: Shape) -> tuple[Traced, Traced]:
+    """A model's f and h, traced once for all filters; TypeError where they cannot be."""
+    f, by_f, h, by_h = functions
+    return Traced(f, by_f, 2, shape), Traced(h, by_h, 1, shape)
 
 
 class Traced:
@@ -48,13 +56,13 @@ class Traced:
         if self._jacobian is not None:
             graphs.append(self._matrix(x, None, *others))
         numbers = [graph.number(one) for part in graphs for one in part.ravel()]
-        for magnitude, phase in POINTS:
-            point = magnitude * np.sin(phase + np.arange(ends[-1]))
-            point[ends[-2] :] = 0.1 + abs(point[ends[-2] :])  # constants
+        points = np.array([magnitude * np.sin(phase + np.arange(ends[-1])) for magnitude, phase in POINTS])
+        points[:, ends[-2] :] = 0.1 + abs(points[:, ends[-2] :])  # constants
+        with np.errstate(all="ignore"):
+            all_found = values_of(numbers, points.T).T
+        for point, found in zip(points, all_found, strict=True):
             expected = _values_at(self._given(*np.split(point, ends[:-1])), functions[: len(graphs)])
             if np.isfinite(expected).all():
-                with np.errstate(all="ignore"):
-                    found = values_of(numbers, point)
                 agreed = np.allclose(found, expected, rtol=1e-9, atol=1e-9 * abs(expected).max(initial=0.0))
                 if not agreed:
                     raise TypeError("a function does something else with numbers that are not known yet")

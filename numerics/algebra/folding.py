@@ -15,16 +15,10 @@ if TYPE_CHECKING:
     from numerics.algebra.graphs import Number
 
 
-def _values(*numbers: Number) -> list[float] | None:
-    """Values of constants, if all are."""
-    values = [number.value for number in numbers]
-    return None if None in values else values  # type: ignore[return-value]
-
-
 def worked_out(operation: str, *numbers: Number) -> Number:
     """An operation of one or two numbers; that of constants is done."""
-    values, graph = _values(*numbers), numbers[0].graph
-    if values is None:
+    values, graph = [number.value for number in numbers], numbers[0].graph
+    if None in values:
         return graph.make(operation, *numbers)
     try:
         return graph.constant((_OF_CONSTANTS.get(operation) or getattr(math, operation))(*values))
@@ -50,9 +44,9 @@ def negative(a: Number) -> Number:
 
 def total(a: Number, b: Number) -> Number:
     """A sum: nothing is added to zero, and of a negative number the difference is taken."""
-    if (values := _values(a, b)) is not None:
-        return a.graph.constant(sum(values))
-    if 0.0 in (a.value, b.value):
+    if a.value is not None and b.value is not None:
+        return a.graph.constant(a.value + b.value)
+    if a.value == 0.0 or b.value == 0.0:
         return b if a.value == 0.0 else a
     if b.operation == "negative":
         return difference(a, b.arguments[0])
@@ -61,8 +55,8 @@ def total(a: Number, b: Number) -> Number:
 
 def difference(a: Number, b: Number) -> Number:
     """A difference, as a sum has it."""
-    if (values := _values(a, b)) is not None:
-        return a.graph.constant(values[0] - values[1])
+    if a.value is not None and b.value is not None:
+        return a.graph.constant(a.value - b.value)
     if b.value == 0.0:
         return a
     if b.operation == "negative":
@@ -72,14 +66,15 @@ def difference(a: Number, b: Number) -> Number:
 
 def product(a: Number, b: Number) -> Number:
     """A product: zero with zero, the other one with one; signs stand before it."""
-    if (values := _values(a, b)) is not None:
-        return a.graph.constant(values[0] * values[1])
+    if a.value is not None and b.value is not None:
+        return a.graph.constant(a.value * b.value)
     for one, other in ((a, b), (b, a)):
-        if one.value == 0.0:
-            return one
-        if one.value in (1.0, -1.0):
-            return other if one.value > 0 else negative(other)
-        if one.operation == "negative":
+        if one.value is not None:
+            if one.value == 0.0:
+                return one
+            if abs(one.value) == 1.0:
+                return other if one.value > 0 else negative(other)
+        elif one.operation == "negative":
             return negative(product(one.arguments[0], other))
     return a.graph.make("*", a, b)
 

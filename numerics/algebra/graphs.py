@@ -18,8 +18,10 @@ instead. `where(condition, a, b)` works out both sides.
 
 from __future__ import annotations
 
+import gc
 import math
-from collections.abc import Callable, Container, Hashable, Iterable
+from collections.abc import Callable, Container, Hashable, Iterable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -33,6 +35,18 @@ class TooLarge(TypeError):
     """A graph has more operations than it may have: code written out for it would take long to compile."""
 
 
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Within this context Python looks for no garbage: a graph has none, and the search took half the time."""
+    was = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was:
+            gc.enable()
+
+
 class Graph:
     """The operations on some numbers that are given, in the order in which they were first asked for."""
 
@@ -44,15 +58,16 @@ class Graph:
 
     def make(self, operation: str, *arguments: Number | Hashable) -> Number:
         """The number that an operation makes of others; the same one if it has been made before."""
-        key = (operation, *(a.place if isinstance(a, Number) else a for a in arguments))
-        if key not in self._made:
+        key = (operation, *[a.place if isinstance(a, Number) else a for a in arguments])
+        found = self._made.get(key)
+        if found is None:
             if len(self.numbers) >= self._most:
                 raise TooLarge(f"a graph must have at most {self._most} operations")
-            made = self._made[key] = Number(self, operation, arguments, len(self.numbers))
+            found = self._made[key] = Number(self, operation, arguments, len(self.numbers))
             if operation in TWO_SIDED:
-                self._made[(operation, key[2], key[1])] = made
-            self.numbers.append(made)
-        return self._made[key]
+                self._made[(operation, key[2], key[1])] = found
+            self.numbers.append(found)
+        return found
 
     def given(self, name: Hashable) -> Number:
         """A number that is known when the graph is worked out: its name, or where it lies."""
@@ -68,9 +83,16 @@ class Graph:
 
 
 class Number:
-    """A float64 that an operation makes of others."""
+    """A float64 that an operation makes of others.
 
-    __slots__ = ("graph", "operation", "arguments", "place")
+    Attributes:
+        operation, arguments: what makes it, and of what: Numbers, or the name or value of one that is known.
+        of: the Numbers among the arguments.
+        place: its index in the graph.
+        value: what a constant is; None for others.
+    """
+
+    __slots__ = ("graph", "operation", "arguments", "of", "place", "value")
     sqrt: Callable[[], Number]  # and so on, as UNARY has them
     log: Callable[[], Number]
     floor: Callable[[], Number]
@@ -79,16 +101,8 @@ class Number:
     def __init__(self, graph: Graph, operation: str, arguments: tuple, place: int):
         """For `Graph.make` alone."""
         self.graph, self.operation, self.arguments, self.place = graph, operation, arguments, place
-
-    @property
-    def value(self) -> float | None:
-        """What a constant is; None for others."""
-        return float.fromhex(self.arguments[0]) if self.operation == "constant" else None
-
-    @property
-    def of(self) -> tuple[Number, ...]:
-        """The numbers that it is made of."""
-        return tuple(a for a in self.arguments if isinstance(a, Number))
+        self.of: tuple[Number, ...] = tuple([a for a in arguments if isinstance(a, Number)])
+        self.value = float.fromhex(arguments[0]) if operation == "constant" else None
 
     def __repr__(self) -> str:
         return f"<number {self.place}: {self.operation}>"

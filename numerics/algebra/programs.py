@@ -89,11 +89,16 @@ def program_of(stores: Sequence[tuple[Place, Number]], known: Mapping[int, Place
 
 
 def values_of(numbers: Sequence[Number], given: np.ndarray) -> np.ndarray:
-    """Values of numbers, of the values of those that are given in the array `numbers`."""
-    rows = np.empty((len(numbers), 1))
+    """Values of numbers at some points, (len(numbers), points), of those that are given in the array `numbers`.
+
+    Args:
+        numbers: that are wanted.
+        given: (places, points).
+    """
+    rows = np.empty((len(numbers), given.shape[1]))
     program = program_of([(Place("rows", k), one) for k, one in enumerate(numbers)], {})
     _in_python(program.text)(rows, rows, given, given)
-    return rows[:, 0]
+    return rows
 
 
 def callable_of(program: Program, width: int, arrays: Sequence[str] = ARRAYS) -> Callable:

@@ -113,7 +113,7 @@ def _traced(value: Any, copies: dict[int, Any]) -> Any:
         return FUNCTIONS.get(OTHER_NAMES.get(name, name), value) if ours else value
     if id(function) not in copies:
         cells = tuple(types.CellType() for _ in function.__closure__ or ())
-        names = dict(vars(builtins)) | BUILTINS
+        names = vars(builtins) | BUILTINS | {"__builtins__": builtins}  # which what NumPy imports late asks for
         copy = types.FunctionType(function.__code__, names, function.__name__, function.__defaults__, cells)
         copy.__kwdefaults__ = function.__kwdefaults__
         copies[id(function)] = copy

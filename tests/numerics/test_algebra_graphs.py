@@ -37,7 +37,7 @@ def test_a_traced_function_is_the_function_and_its_slope_the_derivative(name):
     z = traced(function)(x, y)
     slopes = along([z], {x.place: x.graph.constant(1.0)}) + along([z], {y.place: x.graph.constant(1.0)})
     for point in POINTS:
-        found = values_of([z, *slopes], np.array(point))
+        found = values_of([z, *slopes], np.array(point)[:, None])[:, 0]
         assert found[0] == pytest.approx(function(*point), rel=1e-14)
         for k, slope in enumerate(found[1:]):
             at = [np.array(point) + step * np.eye(2)[k] for step in (1e-3, -1e-3, 2e-3, -2e-3)]
@@ -116,7 +116,7 @@ def test_functions_that_are_called_are_traced_too_and_arrays_may_be_filled():
         return (out @ np.array([x, y])).sum() + sum(nested(one) for one in (x, y))
 
     x, y = pair()
-    assert values_of([traced(function)(x, y)], np.array([1.3, 0.6]))[0] == pytest.approx(function(1.3, 0.6))
+    assert values_of([traced(function)(x, y)], np.array([[1.3], [0.6]]))[0, 0] == pytest.approx(function(1.3, 0.6))
     assert helper(4.0) == 4.0  # the function itself is as before
 
 
