@@ -8,7 +8,7 @@ single steps and whole batches, compiled or not, is made from these in `filters.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from filters.engine.gated import GatedSession
 from filters.engine.session import Running, Session
 from numerics.compiled import is_interpreting
 from plants.state_space import StateSpaceModel
+
+if TYPE_CHECKING:
+    from filters.live import Live
 
 SPARE, SPARE_IN_PYTHON = "_spare", "_spare_in_python"  # attributes: sessions that are not in use
 
@@ -157,3 +160,9 @@ class Filter:
         Raises ValueError for a gate that is not a positive number.
         """
         return Session(self) if gate is None else GatedSession(self, gate)
+
+    def live(self, **options: Any) -> Live:
+        """This filter on real clocks, with steps of any length and each sensor at its own times; see `Live`."""
+        from filters.live import Live
+
+        return Live(self, **options)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -118,7 +119,7 @@ class Session:
     def set_noise(self, *, process_noise_cov=None, measurement_noise_cov=None) -> None:
         """Replace the model's Q or R, with its root."""
         n, m, at = len(self.mean), len(self.innovation), self._noise_places
-        self._noise_was = self._numbers.copy()
+        self._remember_noise()
         if process_noise_cov is not None:
             q = covariance("process_noise_cov", process_noise_cov, n)
             self._numbers[at.q : at.q + 2 * n * n] = with_root(q)
@@ -127,19 +128,54 @@ class Session:
             self._numbers[at.r : at.r + 2 * m * m] = with_root(r)
 
     def set_dt(self, dt: float) -> None:
-        """Use another sample time from here on, for a model that has a constant named "dt".
+        """Use another sample time from here on, for a model that has a constant named "dt", or "substep", a part.
 
         Q does not change: covariances are per step and do not scale with dt; `set_noise` sets another.
 
         Raises ValueError for a model without such a constant, or if it is not a positive number.
         """
-        names = getattr(self._filter.kernel_model.constants, "_fields", ())
-        if "dt" not in names:
-            raise ValueError(
-                f"set_dt must be called on a model with a constant dt, but got {', '.join(names) or 'none'}"
-            )
-        place = self._noise_places.constants + names.index("dt")
-        self._numbers[place] = positive("dt", dt)
+        place, parts = self._dt_place
+        self._numbers[place] = positive("dt", dt) / parts
+
+    @property
+    def sample_time(self) -> float:
+        """That of the model [s]; ValueError for one without a constant that says it."""
+        place, parts = self._dt_place
+        return float(self._filter.numbers[place]) * parts
+
+    @cached_property
+    def _dt_place(self) -> tuple[int, int]:
+        """Where the constant lies, and how many of it are a step."""
+        model = self._filter.kernel_model
+        names = getattr(model.constants, "_fields", ())
+        for name, parts in (("dt", 1), ("substep", model.substeps)):
+            if name in names:
+                return self._noise_places.constants + names.index(name), parts
+        raise ValueError(
+            f"set_dt must be called on a model with a constant dt, but got {', '.join(names) or 'none'}"
+        )
+
+    def scale_process_noise(self, factor: float) -> None:
+        """Use Q of the model times a factor above zero from here on."""
+        n, at = len(self.mean), self._noise_places.q
+        self._remember_noise()
+        scales = self._q_scales
+        scales[: n * n], scales[n * n :] = factor, factor**0.5
+        np.multiply(self._given_q, scales, out=self._numbers[at : at + 2 * n * n])
+
+    def _remember_noise(self) -> None:
+        """Keep the first numbers, with which `clear` begins again."""
+        if self._noise_was is None:
+            self._noise_was = self._numbers.copy()
+
+    @cached_property
+    def _q_scales(self) -> np.ndarray:
+        return np.empty(2 * len(self.mean) ** 2)
+
+    @cached_property
+    def _given_q(self) -> np.ndarray:
+        n, at = len(self.mean), self._noise_places.q
+        return self._filter.numbers[at : at + 2 * n * n]
 
     def start(self, key, z) -> None:
         """Set the prior with a random key (2,) and update it with a first measurement z (m,)."""

@@ -1,0 +1,219 @@
+"""A filter on real clocks: steps of any length, each sensor at its own times, late samples put in order."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from filters.engine.belief import Belief
+from filters.engine.session import Session
+from filters.monitoring.monitor import Health, Monitor, monitor_of, watch_of
+from numerics.checks import as_floats, finite, one_of, positive, shown
+
+if TYPE_CHECKING:
+    from filters.filter import Filter
+
+ROUNDING = 1e-9  # of the model's sample time: two stamps that are no further apart are one
+
+
+class Event(NamedTuple):
+    """Something that was done, and the belief before it."""
+
+    begin: float
+    end: float  # a prediction from `begin` to here; the same for an update
+    given: np.ndarray  # u (p,) of a prediction, z (m,) of an update
+    before: Belief
+
+    @property
+    def is_prediction(self) -> bool:
+        """Whether time goes on in it."""
+        return self.end > self.begin
+
+
+class Live:
+    """One belief, moved on to any time and updated with any sensor.
+
+        live = make_filter("ekf", thruster_model()).live(late=0.5)
+        live.start(12.30)
+        live.predict_to(12.314, u=[11.0])     # what acted since 12.30
+        live.update(12.314, "thrust", 3.2)
+
+    The sample time has to be one of the model's constants, by the name `dt`, or `substep` for a part of it. A
+    longer step is divided into equal ones that are at most as long. Q of a step of length dt is that of the model
+    for its own sample time, times the ratio of the two, unless `noise` says otherwise.
+
+    Args:
+        filter_: any filter of such a model.
+        noise: Q (n, n) of a step by its length [s], as `ContinuousModel.noise`; None for Gaussian diffusion.
+        late: samples that are so late [s] are put in order: the filter goes back, takes them, and repeats what
+            came after. The estimate is that of the right order.
+        skip_missing: whether a NaN is left out; else it is refused.
+        monitor: tests on the innovations, as wrappers take them.
+
+    Attributes:
+        time: of the belief [s].
+        mean, cov: views on its mean (n,) and covariance (n, n).
+        innovation, innovation_cov: of the last update.
+        health: what the monitor said at the last update; None without one.
+
+    Raises:
+        ValueError: for a model without such a constant, or a wrong argument.
+    """
+
+    def __init__(
+        self,
+        filter_: Filter,
+        *,
+        noise: Callable[[float], Any] | None = None,
+        late: float = 0.0,
+        skip_missing: bool = True,
+        monitor: Monitor | Mapping | float | None = None,
+    ):
+        """Find the sample time; `start` comes next."""
+        self._session = Session(filter_)
+        self._step = self._session.sample_time
+        self._late = positive("late", late, zero_allowed=True)
+        self._noise, self._skips = noise, skip_missing
+        self._watch = watch_of(monitor_of(monitor), filter_)
+        model = filter_.model
+        self._channels = {one.symbol: i for i, one in enumerate(model.measurements)}
+        self._nothing, self._inputs = np.full(model.m, np.nan), model.inputs
+        self._events: list[Event] = []
+        self._held = np.zeros(0)  # the input that acts
+        self.time = math.nan
+        self.health: Health | None = None
+        self.mean, self.cov = self._session.mean, self._session.cov
+        self.innovation, self.innovation_cov = self._session.innovation, self._session.innovation_cov
+
+    @property
+    def divergences(self) -> int:
+        """Restarts from the prior, so far."""
+        return self._session.divergences
+
+    def start(self, time: float, z: Sequence[float] | np.ndarray | None = None, key=(0, 0)) -> None:
+        """Begin with the prior at a time [s], updated with a measurement z (m,) if there is one."""
+        time = finite("time", time)
+        given = self._nothing if z is None else self._checked(np.broadcast_to(as_floats(z), self._nothing.shape))
+        self._session.start(key, given)
+        self._events, self.time, self._held = [], time, np.zeros(0)
+        if self._watch is not None:
+            self._watch.restart()
+            self.health = self._watch.step(self.innovation, self.innovation_cov, given)
+
+    def predict_to(self, time: float, u: Sequence[float] | np.ndarray | None = None) -> None:
+        """Move the belief on to a time [s], under the input u (p,) that has acted since the last one.
+
+        Raises ValueError for an earlier time, or an input that is not finite numbers.
+        """
+        self._has_begun()
+        time = finite("time", time)
+        if time < self.time - ROUNDING * self._step:
+            raise ValueError(f"time must not step back behind {self.time:.9g} s, but got {time:.9g}")
+        given = as_floats(() if u is None else u).reshape(-1)
+        if given.shape != (self._inputs,) or not np.isfinite(given).all():
+            raise ValueError(f"u must be {self._inputs} finite numbers, but got {shown(u)}")
+        if time > self.time + ROUNDING * self._step:
+            self._predict(time, given)
+
+    def update(self, time: float, sensor: str | Sequence[str] | None, z: float | Sequence[float]) -> None:
+        """Take what a sensor measured at a time [s].
+
+        A later time than that of the belief is first predicted to, under the last input. An earlier one is put in
+        order, if it is not later than `late`.
+
+        Args:
+            time: at which it was measured, not at which it arrived.
+            sensor: symbol of a channel, several, or None for all.
+            z: as many numbers.
+
+        Raises:
+            ValueError: for an unknown sensor, NaN where that is refused, or a sample that is too late.
+        """
+        self._has_begun()
+        time, given = finite("time", time), self._measured(sensor, z)
+        if time > self.time + ROUNDING * self._step:
+            self._predict(time, self._held)
+        if time >= self.time - ROUNDING * self._step:
+            self._update(given)
+        elif time < self.time - self._late - ROUNDING * self._step:
+            raise ValueError(
+                f"a sample must be at most late = {self._late:g} s late, but one of {time:.9g} s came at "
+                f"{self.time:.9g} s"
+            )
+        else:
+            self._insert(time, given)
+        if self._watch is not None:
+            self.health = self._watch.step(self.innovation, self.innovation_cov, given)
+
+    def _has_begun(self) -> None:
+        if math.isnan(self.time):
+            raise ValueError("start(time) must come before predict_to and update")
+
+    def _measured(self, sensor: str | Sequence[str] | None, z: float | Sequence[float]) -> np.ndarray:
+        values = as_floats(z).reshape(-1)
+        names = [sensor] if isinstance(sensor, str) else list(self._channels) if sensor is None else list(sensor)
+        if len(values) != len(names):
+            raise ValueError(f"z must have a number for each of {', '.join(names)}, but got {shown(z)}")
+        given = self._nothing.copy()
+        for name, value in zip(names, values.tolist(), strict=True):
+            given[self._channels[one_of("sensor", name, tuple(self._channels))]] = value
+        self._checked(values)
+        return given
+
+    def _checked(self, values: np.ndarray) -> np.ndarray:
+        if not self._skips and np.isnan(values).any():
+            raise ValueError(f"z must not be NaN with skip_missing=False, but got {shown(values.tolist())}")
+        return values
+
+    def _predict(self, time: float, u: np.ndarray) -> None:
+        """Steps of equal length up to a time."""
+        session = self._session
+        if len(u) != self._inputs:
+            raise ValueError(
+                f"predict_to(time, u) must tell the input before a sample of {time:.9g} s, a later time"
+            )
+        self._remember(time, u)
+        count = max(1, math.ceil((time - self.time) / self._step - 1e-6))
+        length = (time - self.time) / count
+        session.set_dt(length)
+        if self._noise is None:
+            session.scale_process_noise(length / self._step)
+        else:
+            session.set_noise(process_noise_cov=self._noise(length))
+        for _ in range(count):
+            session.run("predict", u=u)
+        self.time, self._held = time, u
+
+    def _update(self, z: np.ndarray) -> None:
+        self._remember(self.time, z)
+        self._session.run("update", z=z)
+
+    def _remember(self, end: float, given: np.ndarray) -> None:
+        """Keep what is about to be done as long as a late sample may come before it."""
+        if self._late > 0.0:
+            self._events.append(Event(self.time, end, given, self._session.belief()))
+            oldest = end - self._late
+            while self._events[0].end < oldest:
+                del self._events[0]
+
+    def _insert(self, time: float, z: np.ndarray) -> None:
+        """Go back to a time, take what was measured there, and do again what came after it."""
+        near = ROUNDING * self._step
+        place = next((i for i, one in enumerate(self._events) if one.end > time + near), None)
+        if place is None or self._events[place].begin > time + near:
+            raise ValueError(f"a sample must not be from before the start, but got one of {time:.9g} s")
+        again, self._events = self._events[place:], self._events[:place]
+        first = again[0]
+        self._session.load(first.before)
+        self.time = first.begin
+        if time > first.begin + near:
+            self._predict(time, first.given)
+        self._update(z)
+        for one in again:
+            if one.is_prediction:
+                self._predict(one.end, one.given)
+            else:
+                self._update(one.given)

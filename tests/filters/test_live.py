@@ -1,0 +1,213 @@
+"""Real clocks: any dt, sensors at their own times, late samples in order; the same numbers as on a grid."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from filters import make_filter, thruster_model
+from plants.continuous import ContinuousModel
+from plants.diffusion import noise_for_dt
+
+A = np.array([[0.0, 1.0], [-4.0, -0.6]])
+S = np.diag([0.01, 0.5])
+
+
+class Constants(NamedTuple):
+    substep: float
+    stiffness: float = 4.0
+    damping: float = 0.6
+
+
+def rates(x, u, c):
+    return x[1], u[0] - c.stiffness * x[0] - c.damping * x[1]
+
+
+def both(x, c):
+    return x[0], x[1]
+
+
+def oscillator(**changes):
+    arguments = {
+        "prior_mean": [0.5, 0.0],
+        "prior_cov": [0.3, 0.2],
+        "measurement_noise_cov": [0.02, 0.1],
+        "inputs": 1,
+    }
+    arguments |= {"measurements": ["position", "rate"]}
+    return ContinuousModel(
+        rates=rates, observe=both, densities=S, constants=Constants(0.01), arguments=arguments | changes
+    )
+
+
+def of_grid(filter_, inputs, z):
+    session = filter_.session()
+    session.start((0, 0), z[0])
+    for u, one in zip(inputs, z[1:], strict=True):
+        session.step(u, one)
+    return session.mean.copy(), session.cov.copy()
+
+
+def drawn(steps, channels, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(steps, 1)), rng.normal(size=(steps + 1, channels))
+
+
+@pytest.mark.parametrize("name", ["ekf", "ukf", "enkf", "pf"])
+def test_on_the_grid_it_is_the_session(name):
+    filter_ = make_filter(name, thruster_model())
+    inputs, z = drawn(30, 1)
+    live = filter_.live(late=0.1)
+    live.start(5.0, z[0])
+    for k in range(30):
+        live.predict_to(5.0 + 0.01 * (k + 1), 10 * inputs[k])
+        live.update(5.0 + 0.01 * (k + 1), None, z[k + 1])
+    mean, cov = of_grid(filter_, 10 * inputs, z)
+    np.testing.assert_allclose(live.mean, mean, rtol=1e-9)
+    np.testing.assert_allclose(live.cov, cov, rtol=1e-9, atol=1e-15)
+    assert live.time == pytest.approx(5.3) and live.divergences == 0
+
+
+def test_any_dt_is_the_exact_filter_of_a_linear_plant():
+    """Beside a Kalman filter by matrix exponentials, on the very stamps."""
+    plant, rng = oscillator(), np.random.default_rng(1)
+    live = make_filter("ekf", plant.at(0.02, substeps=4)).live(noise=plant.noise)
+    live.start(0.0)
+    x, p, t = np.array([0.5, 0.0]), np.diag([0.3, 0.2]), 0.0
+    whole = np.zeros((3, 3))
+    whole[:2, :2], whole[1, 2] = A, 1.0
+    for k in range(60):
+        dt, u, sensor = rng.uniform(0.001, 0.1), rng.normal(), k % 2
+        f = expm(whole * dt)
+        t, x, p = t + dt, f[:2, :2] @ x + f[:2, 2] * u, f[:2, :2] @ p @ f[:2, :2].T + exact_noise(dt)
+        z, r = x[sensor] + rng.normal(), (0.02, 0.1)[sensor]
+        gain = p[:, sensor] / (p[sensor, sensor] + r)
+        x, p = x + gain * (z - x[sensor]), p - np.outer(gain, p[sensor])
+        live.predict_to(t, [u])
+        live.update(t, ("position", "rate")[sensor], z)
+        np.testing.assert_allclose(live.mean, x, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(live.cov, p, rtol=1e-6, atol=1e-10)
+
+
+def exact_noise(dt, points=400):
+    """int_0^dt e^{A s} S e^{A' s} ds by Gauss-Legendre."""
+    nodes, weights = np.polynomial.legendre.leggauss(20)
+    found = np.zeros((2, 2))
+    for s, w in zip(0.5 * dt * (nodes + 1.0), 0.5 * dt * weights, strict=True):
+        found += w * expm(A * s) @ S @ expm(A.T * s)
+    return found
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.3, 2.0])
+def test_van_loan_is_the_integral(dt):
+    np.testing.assert_allclose(oscillator().noise(dt), exact_noise(dt), rtol=1e-6)
+    np.testing.assert_allclose(oscillator().slope, A, atol=1e-7)
+    if dt == 0.001:
+        np.testing.assert_allclose(oscillator().noise(dt), noise_for_dt(S, 1.0, dt), rtol=2e-2, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["ekf", "ukf", "enkf", "ekf-robust", "pf"])
+def test_late_samples_give_what_the_right_order_gives(name):
+    plant = oscillator()
+    filter_ = make_filter(name, plant.at(0.05))
+    rng = np.random.default_rng(2)
+    ticks = 0.05 * np.arange(1, 30)
+    events = [(t, "predict", rng.normal()) for t in ticks]
+    events += [(t, "position", rng.normal()) for t in ticks] + [(t - 0.013, "rate", rng.normal()) for t in ticks]
+    arrival = [t + (0.31 if kind == "rate" else 0.0) for t, kind, _ in events]
+
+    def followed(order, late):
+        live = filter_.live(late=late)
+        live.start(0.0, [0.4, 0.1])
+        inputs = {t: u for t, kind, u in events if kind == "predict"}
+        for place in order:
+            t, kind, value = events[place]
+            if kind == "predict":
+                live.predict_to(t, [value])
+            elif t > live.time:  # on time: under the input that acts
+                live.predict_to(t, [inputs[min(one for one in inputs if one >= t)]])
+                live.update(t, kind, value)
+            else:
+                live.update(t, kind, value)
+        return live
+
+    order = sorted(range(len(events)), key=lambda place: events[place][0])  # stable: predictions first
+    by_arrival = sorted(range(len(events)), key=lambda place: arrival[place])
+    early, late = followed(order, 0.0), followed(by_arrival, 0.4)
+    np.testing.assert_allclose(late.mean, early.mean, rtol=1e-9)
+    np.testing.assert_allclose(late.cov, early.cov, rtol=1e-9)
+    assert len(late._events) < 60
+
+
+def test_a_gap_is_gone_through_in_the_models_own_steps():
+    model = thruster_model()
+    live, session = make_filter("ekf", model).live(), make_filter("ekf", model).session()
+    live.start(0.0, [0.2])
+    session.start((0, 0), [0.2])
+    live.predict_to(1.0, [12.0])
+    for _ in range(100):
+        session.step([12.0], [math.nan])
+    np.testing.assert_allclose(live.mean, session.mean, rtol=1e-9)
+    np.testing.assert_allclose(live.cov, session.cov, rtol=1e-9)
+
+
+def test_a_monitor_watches_what_comes_in():
+    live = make_filter("ekf", thruster_model()).live(monitor={"stuck": 3})
+    live.start(0.0)
+    for k in range(1, 6):
+        live.predict_to(0.01 * k, [3.0])
+        live.update(0.01 * k, "thrust", 0.25)
+        found = [one.test for one in live.health.alarms]
+        assert ("stuck" in found) == (k == 3)
+
+
+def started(**options):
+    live = make_filter("ekf", thruster_model()).live(**options)
+    live.start(1.0)
+    live.predict_to(1.02, [4.0])
+    return live
+
+
+@pytest.mark.parametrize(
+    "call, rule",
+    [
+        (lambda live: live.predict_to(1.0, [4.0]), "time must not step back behind 1.02 s, but got 1"),
+        (lambda live: live.predict_to(math.inf, [4.0]), "time must be a finite number"),
+        (lambda live: live.predict_to(1.03), "u must be 1 finite numbers, but got None"),
+        (lambda live: live.update(1.0, "thrust", 0.1), "at most late = 0 s late, but one of 1 s came at 1.02 s"),
+        (
+            lambda live: live.update(1.02, "speed", 0.1),
+            "sensor must be .*thrust, but got 'speed'",
+        ),
+        (lambda live: live.update(1.02, None, [0.1, 0.2]), "z must have a number for each of thrust"),
+    ],
+)
+def test_what_cannot_be_is_said_in_a_line(call, rule):
+    with pytest.raises(ValueError, match=rule):
+        call(started())
+
+
+def test_samples_from_before_the_start_nan_and_models_without_a_dt_are_refused():
+    with pytest.raises(ValueError, match="must not be from before the start, but got one of 0.9 s"):
+        started(late=5.0).update(0.9, "thrust", 0.1)
+    with pytest.raises(ValueError, match="z must not be NaN with skip_missing=False"):
+        started(skip_missing=False).update(1.02, "thrust", math.nan)
+    skipped = started()
+    before = skipped.mean.copy()
+    skipped.update(1.02, "thrust", math.nan)
+    np.testing.assert_array_equal(skipped.mean, before)
+    with pytest.raises(ValueError, match=r"start\(time\) must come before"):
+        make_filter("ekf", thruster_model()).live().predict_to(1.0, [0.0])
+    with pytest.raises(ValueError, match="must tell the input before a sample of 2 s"):
+        live = make_filter("ekf", thruster_model()).live()
+        live.start(1.0)
+        live.update(2.0, "thrust", 0.1)
+    with pytest.raises(ValueError, match="a model with a constant dt"):
+        make_filter("kf", thruster_model()).live()
+
+
+def test_a_continuous_model_needs_a_substep():
+    with pytest.raises(ValueError, match="constants must be a NamedTuple with a field substep"):
+        ContinuousModel(rates=rates, observe=both, densities=S, constants=(), arguments={"prior_mean": [0.0, 0.0]})
