@@ -66,6 +66,7 @@ def command(
     from benchmarks import (
         assimilation,
         batches,
+        c_code,
         policies,
         processes,
         steps,
@@ -85,6 +86,7 @@ def command(
             vectors,
             vector_filters,
             batches,
+            c_code,
             vehicles,
             trajectories,
             studies,

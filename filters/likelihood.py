@@ -27,6 +27,7 @@ def likelihood(
     q_slopes,
     r_slopes,
     filter: Filter | None = None,
+    own_slopes: np.ndarray | None = None,
 ) -> Likelihood:
     """Log-likelihood of a filter's innovations, by default the (extended) Kalman filter's, with its gradient.
 
@@ -46,8 +47,10 @@ def likelihood(
         measurements: (B, K + 1, m); NaN where missing.
         q_slopes: dQ/dparameter, (parameters, n, n), symmetric.
         r_slopes: dR/dparameter, (parameters, m, m), symmetric.
-        filter: a filter "kf", "ekf", "iekf", "ukf" or "ckf", of which the type and its own parameters count: it is
-            used with `model` in place of its own.
+        filter: a Kalman filter but "kf-steady", "gsf" and "fuzzy", of which the type and its own parameters count:
+            it is used with `model` in place of its own.
+        own_slopes: how the filter's own numbers (`own_numbers`, count of them) change, (parameters, count); not at
+            all if None.
 
     Raises:
         ValueError: if shapes do not fit, or for another filter.
@@ -55,7 +58,7 @@ def likelihood(
     Source: Gupta, Mehra (1974), "Computational aspects of maximum likelihood estimation and reduction in
     sensitivity function calculations", IEEE Trans. Automatic Control 19(6).
     """
-    out, _ = _derivatives(model, (inputs, measurements, q_slopes, r_slopes), False, filter)
+    out, _ = _derivatives(model, (inputs, measurements, q_slopes, r_slopes), False, filter, own_slopes)
     return Likelihood(out[:, 0], out[:, 1:])
 
 
@@ -81,7 +84,11 @@ def information(
 
 
 def _derivatives(
-    model: StateSpaceModel, given: tuple, informative: bool, used: Filter | None
+    model: StateSpaceModel,
+    given: tuple,
+    informative: bool,
+    used: Filter | None,
+    own_slopes: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log-likelihood with gradient, (B, 1 + p), and the information, (B, p, p), or nothing in its place."""
     inputs, measurements, q_slopes, r_slopes = (np.ascontiguousarray(as_floats(value)) for value in given)
@@ -90,7 +97,7 @@ def _derivatives(
     check_shapes(arrays, model, (p, n, n), (p, m, m))
     slopes = ModelSlopes.of(model, p, process_noise_cov=q_slopes, measurement_noise_cov=r_slopes)
     wanted = Wanted(information=informative, constants=False, tails=False)
-    out, found = derivatives(model, inputs, measurements, slopes, wanted, used=used)
+    out, found = derivatives(model, inputs, measurements, slopes, wanted, used=used, own_slopes=own_slopes)
     return out[:, 0], found
 
 

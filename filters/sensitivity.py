@@ -39,6 +39,7 @@ def sensitivity(
     predicted: Sequence[bool] | None = None,
     starts: Starts | None = None,
     filter: Filter | None = None,
+    own_slopes: np.ndarray | None = None,
 ) -> Sensitivity:
     """`likelihood`, and Fisher's information, for parameters that move all numbers of a model.
 
@@ -62,6 +63,7 @@ def sensitivity(
             (unless they are not held), and the innovations of their lead-ins do not count. That is the likelihood
             of what follows, given them.
         filter: as `likelihood` takes it; the (extended) Kalman filter by default.
+        own_slopes: as `likelihood` takes them.
 
     Raises:
         ValueError: if shapes do not fit, degrees are not above 2, or for another filter.
@@ -82,7 +84,12 @@ def sensitivity(
     wanted = Wanted(information=True, constants=True, tails=True)
     density = Density(float(degrees), seen)
     out, information = derivatives(
-        model, inputs, measurements, slopes, wanted, density=density, blocks=blocks, starts=starts, used=filter
+        *(model, inputs, measurements, slopes, wanted),
+        density=density,
+        blocks=blocks,
+        starts=starts,
+        used=filter,
+        own_slopes=own_slopes,
     )
     total = out.sum(axis=1)
     return Sensitivity(total[:, 0], total[:, 1:], information, out[:, :, 1:])

@@ -24,6 +24,7 @@ def state_score(
     score: str = LOG_SCORE,
     weights: Sequence[float] | np.ndarray | None = None,
     filter: Filter | None = None,
+    own_slopes: np.ndarray | None = None,
 ) -> Likelihood:
     """A score of a filter's estimate at the true states, larger is better, and its gradient.
 
@@ -43,6 +44,7 @@ def state_score(
         score: "log-score" or "squares".
         weights: of the squares, (n,), one by default; those of a log score are one.
         filter: as `filters.likelihood.likelihood` takes it; the (extended) Kalman filter by default.
+        own_slopes: as `filters.likelihood.likelihood` takes them.
 
     Raises:
         ValueError: if shapes do not fit, or for another score or filter.
@@ -62,5 +64,6 @@ def state_score(
         raise ValueError(f"weights must have the shape ({n},), but got {of_squares.shape}")
     slopes = ModelSlopes.of(model, p, process_noise_cov=q_slopes, measurement_noise_cov=r_slopes)
     wanted = Wanted(information=False, constants=False, tails=False, score=score)
-    out, _ = derivatives(model, inputs, measurements, slopes, wanted, truth=Truth(states, of_squares), used=filter)
+    truth, arguments = Truth(states, of_squares), (model, inputs, measurements, slopes, wanted)
+    out, _ = derivatives(*arguments, truth=truth, used=filter, own_slopes=own_slopes)
     return Likelihood(out[:, 0, 0], out[:, 0, 1:])

@@ -34,10 +34,10 @@ def command(
     model: LogModelOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Write a tuned kf, ekf, iekf, ukf or ckf as C99: model, Q and R in it, and a program that filters a log.
+    """Write a tuned Kalman filter as C99: model, Q and R in it, and a program that filters a log.
 
-    The code has fixed sizes and needs math.h alone. With --single the largest change of an estimate on a training
-    run is printed. docs/howto/export.md says how to use it.
+    Any one but gsf and fuzzy. The code has fixed sizes and needs math.h alone; a class of C++ lies beside it. With
+    --single the largest change of an estimate on a training run is printed. docs/howto/export.md says more.
 
     Example: thruster export out/ekf-mismatch-seed0.json --out boat
     """

@@ -21,8 +21,8 @@ def command(
 ) -> None:
     """List the ways of tuning that `thruster tune --way` follows; or show one with its equations and source.
 
-    Those that need a gradient take the filters kf, ekf, iekf, ukf and ckf; the others take any filter with a
-    covariance, and searches any filter at all.
+    Those that need a gradient take kf, ekf, iekf, ukf, ckf, ekf-robust, sage-husa and vb; the others
+    take any filter with a covariance, and searches any filter at all.
 
     Example: thruster ways em
     """

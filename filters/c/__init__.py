@@ -2,6 +2,8 @@
 
 programs    a page's functions as programs, with the numbers of a model in them
 source      NAME.h and NAME.c of these
+cpp         NAME.hpp, a class of C++ around them
+sizes       bytes of the struct, the stack and the code
 project     a folder with these, a program that filters a log (log_program), and how to build them
 single      how far floats in place of doubles move the estimates
 """

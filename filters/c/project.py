@@ -1,11 +1,13 @@
-"""A folder with a filter in C: NAME.h, NAME.c, a program that filters a log, CMakeLists.txt and README.md."""
+"""A folder with a filter in C: NAME.h, NAME.c, NAME.hpp, a program that filters a log, and how to build them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from filters.c.cpp import class_of
 from filters.c.log_program import log_program
 from filters.c.programs import programs_of
+from filters.c.sizes import COMPILERS, Sizes, sizes_of
 from filters.c.source import c_filter
 from filters.filter import Filter
 from numerics.files import check_target, write_whole
@@ -21,6 +23,7 @@ target_link_libraries({name} PUBLIC m)
 add_executable({name}_log main.c)
 target_link_libraries({name}_log PRIVATE {name})
 """
+LABELS = {"gcc": "this computer's gcc", "arm-none-eabi-gcc": "Cortex-M4"}
 README = """\
 # The filter {filter} in C99, {precision} precision
 
@@ -31,15 +34,16 @@ README = """\
 
 or `cmake -B build && cmake --build build`. Do not compile with -ffast-math, which takes NaN for a number.
 `{name}.h` says what each function does; there is no heap and no recursion, and of libraries math.h alone.
+`{name}.hpp` is a class of C++11 around it.
 
-| | |
-|---|--:|
-| memory of a filter | about {memory} bytes |
-| operations of a prediction | {predict} |
-| operations of an update | {update} |
+| bytes with -Os | {compilers} |
+|---|{rules}|
+| struct | {struct} |
+| stack, without that of math.h | {stack} |
+| code and constants | {code} |
 
-Code and stack: `cc -std=c99 -Os -fstack-usage -c {name}.c && size {name}.o && cat {name}.su`, with the compiler
-of the controller.
+A prediction is {predict} operations of floating point, an update {update}. With another compiler:
+`cc -std=c99 -Os -fstack-usage -c {name}.c && size {name}.o && cat {name}.su`.
 """
 
 
@@ -47,6 +51,9 @@ def write_project(
     filter_: Filter, folder: str | Path, name: str | None = None, *, single: bool = False
 ) -> list[Path]:
     """Write a filter in C, a program that filters a log with it, and how to build them; return the files.
+
+    README.md has the bytes of the struct, of the stack and of the code for the compilers that are installed: gcc,
+    and arm-none-eabi-gcc for a Cortex-M4.
 
     Args:
         filter_: as `c_filter` takes it, like the other arguments.
@@ -58,23 +65,29 @@ def write_project(
         ValueError: as `c_filter`, or if a file cannot be written.
     """
     made, programs = c_filter(filter_, name, single=single), programs_of(filter_)
-    model, n, m = programs.model, programs.model.n, programs.model.m
-    points = programs.points or 1
-    steps = [programs.advance.operations * points * model.substeps, programs.settle.operations]
-    steps.append(0 if programs.begin is None else programs.begin.operations)
+    model = programs.model
+    substeps = model.substeps * max(programs.points, 1)
+    steps = [programs.begin.operations, programs.advance.operations * substeps, programs.settle.operations]
+    sizes = {one: found for one in COMPILERS if (found := sizes_of(made, one)) is not None}
     labels = (", ".join(one.short_label for one in some) or "none" for some in model.quantities)
     about = {
         "name": made.name,
         "filter": filter_.name,
         "precision": "single" if single else "double",
         "states": "State: {}. Inputs: {}. Measurements: {}.".format(*labels),
-        "memory": (n + n * n + m + m * m + 2) * (4 if single else 8) + 16,
+        "compilers": " | ".join(LABELS[one] for one in sizes) or "any",
+        "rules": "|".join("--:" for _ in sizes) or "--:",
+        **{
+            key: " | ".join(str(getattr(one, key)) for one in sizes.values()) or "not measured"
+            for key in Sizes._fields
+        },
         "predict": sum(steps),
         "update": programs.update.operations,
     }
     texts = {
         f"{made.name}.h": made.header,
         f"{made.name}.c": made.source,
+        f"{made.name}.hpp": class_of(made.name, programs, single=single),
         "main.c": log_program(made.name, model, single=single),
         "CMakeLists.txt": CMAKE.format(name=made.name),
         "README.md": README.format(**about),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import prod
+
 import numpy as np
 
 from filters.c.programs import FilterPrograms
@@ -40,19 +42,19 @@ def single_error(filter_: Filter, programs: FilterPrograms, inputs: np.ndarray, 
 def _means(programs: FilterPrograms, inputs: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Means of a run, (K + 1, n), without restarts."""
     model, n, m = programs.model, programs.model.n, programs.model.m
-    begin = None if programs.begin is None else _compiled(programs.begin)
-    advance, settle, update = map(_compiled, (programs.advance, programs.settle, programs.update))
-    names = {**vars(np), "float": _Single, "X": np.zeros(n * programs.points, np.float32)}
+    start, begin, advance, settle, update = map(_compiled, programs[:5])
+    names = {**vars(np), "float": _Single, "X": np.zeros(programs.flying, np.float32)}
     names |= {"P": model.prior_cov.ravel().astype(np.float32), "S": np.zeros(m * m, np.float32)}
+    names |= {name: np.zeros(prod(shape), np.float32) for name, shape in programs.kept.items()}
     x = names["x"] = wrapped_where(model.prior_mean, model.shape.state_angles).astype(np.float32)
     names["innovation"], found = np.zeros(m, np.float32), []
+    exec(start, names)
     for k in range(len(z)):
         if k > 0:
             names["u"] = inputs[k - 1]
-            if begin:
-                exec(begin, names)
+            exec(begin, names)
             for _ in range(model.substeps):
-                for point in names["X"].reshape(-1, n) if begin else [x]:
+                for point in names["X"].reshape(-1, n) if programs.points else [x]:
                     exec(advance, names | {"x": point})
             exec(settle, names)
         names["z"] = z[k]

@@ -6,11 +6,12 @@ import re
 import sys
 from collections.abc import Iterable
 from inspect import cleandoc
+from math import prod
 from typing import NamedTuple
 
 import numpy as np
 
-from filters.c.programs import FilterPrograms, programs_of
+from filters.c.programs import FilterPrograms, is_name, programs_of
 from filters.engine.restart import LARGEST
 from filters.filter import Filter
 from numerics.algebra.c_source import literal, statements_of
@@ -19,11 +20,6 @@ from numerics.angles import wrapped_where
 from plants.quantities import Quantity
 
 LARGEST_FLOAT = 1e30  # what is LARGEST in single precision
-KEYWORDS = frozenset(
-    "auto break case char const continue default do double else enum extern float for goto if inline int long "
-    "main register restrict return short signed sizeof static struct switch typedef union unsigned void volatile "
-    "while".split()
-)
 
 
 class CFilter(NamedTuple):
@@ -48,7 +44,7 @@ def c_filter(filter_: Filter, name: str | None = None, *, single: bool = False) 
     has fixed sizes, no heap and no recursion, and needs math.h alone.
 
     Args:
-        filter_: a filter "kf", "ekf", "iekf", "ukf" or "ckf".
+        filter_: a filter with a page, any Kalman filter but "gsf" and "fuzzy".
         name: of the type, and before all names; the filter's by default.
         single: floats in place of doubles.
 
@@ -56,8 +52,8 @@ def c_filter(filter_: Filter, name: str | None = None, *, single: bool = False) 
         ValueError: for another filter, a name that C does not take, or a model whose functions decide, look
             numbers up, or have too many operations.
     """
-    name = filter_.name if name is None else name
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name, flags=re.ASCII) or name in KEYWORDS:
+    name = filter_.name.replace("-", "_") if name is None else name
+    if not is_name(name):
         raise ValueError(f"a name in C must be letters, digits and _, and no keyword, but got {name!r}")
     programs = programs_of(filter_)
     writer = _Writer(name, programs, single)
@@ -107,7 +103,7 @@ typedef struct {{
     {real} S[{m * m}];            /* covariance of the innovation, by rows */
     {real} nis;             /* v' S^-1 v of the innovation v: chi-square of `channels` degrees of freedom */
     {real} log_likelihood;  /* log N(v; 0, S) */
-    int channels;           /* that were measured */
+{self._kept()}    int channels;           /* that were measured */
     unsigned long restarts; /* from the prior, after an estimate that was not finite or had a negative variance */
 }} {name};
 
@@ -127,6 +123,15 @@ void {name}_update({name} *filter{z});
 #endif
 """
 
+    def _kept(self) -> str:
+        """The members of the struct for what the filter keeps besides."""
+        members = ""
+        for name, shape in self._programs.kept.items():
+            size = f"[{prod(shape)}]" * bool(shape)
+            how = ", by rows" * (len(shape) == 2)
+            members += f"    {self._real} {name}{size}; /* kept besides x and P{how} */\n"
+        return members
+
     def source(self) -> str:
         name, model, real, programs = self._name, self._model, self._real, self._programs
         n, m, zero = model.n, model.m, literal(0.0, self._single)
@@ -135,23 +140,22 @@ void {name}_update({name} *filter{z});
         arrays = {"prior_mean": mean, "prior_cov": model.prior_cov, "R": model.measurement_noise_cov}
         (u, z), of_u = self._given, ", u" * (model.inputs > 0)
         belief, points = f"{name} *filter", programs.points
-        if programs.begin is None:
-            functions = [
-                self._function("advance", f"{belief}{self._u}", programs.advance),
-                self._function("settle", belief, programs.settle),
-            ]
-            begin, step, settle = "", f"        advance(filter{of_u});\n", "settle(filter)"
-        else:
-            functions = [
-                self._function("begin", f"const {belief}, {real} *X", programs.begin),
-                self._function("advance", f"{real} *x{self._u}", programs.advance),
-                self._function("settle", f"{belief}, const {real} *X", programs.settle),
-            ]
-            begin = f"    {real} X[{n * points}];\n\n    begin(filter, X);\n"
+        predicted, flying = (f", {real} *X", ", X") if programs.flying else ("", "")
+        functions = [self._function("advance", f"{belief}{predicted}{self._u}", programs.advance)]
+        functions.append(self._function("settle", f"{belief}{predicted}", programs.settle))
+        functions.append(self._function("correct", f"{belief}, const {real} *z", programs.update))
+        begin, step = "", f"        advance(filter{flying}{of_u});\n"
+        if programs.flying:
+            functions.insert(0, self._function("begin", f"{belief}{predicted}", programs.begin))
+            begin = f"    {real} X[{programs.flying}];\n\n    begin(filter, X);\n"
+        if points:
+            functions[1] = self._function("advance", f"{real} *x{self._u}", programs.advance)
             move = f"            advance(X + {n} * i{of_u});\n"
             step = f"        for (int i = 0; i < {points}; i++) {{\n{move}        }}\n"
-            settle = "settle(filter, X)"
-        functions.append(self._function("correct", f"{name} *filter, const {real} *z", programs.update))
+        start = ""
+        if programs.kept:
+            functions.insert(0, self._function("start", belief, programs.start))
+            start = "    start(filter);\n"
         written = "\n".join(functions)
         constants = "\n".join(self._array(key, np.ravel(value)) for key, value in arrays.items())
         return f"""\
@@ -178,7 +182,7 @@ static void become_prior({name} *filter)
     }}
     filter->nis = {zero};
     filter->log_likelihood = {zero};
-}}
+{start}}}
 
 /* Whether a number is not finite, or a variance negative. */
 static int is_lost(const {name} *filter)
@@ -214,7 +218,7 @@ void {name}_predict({name} *filter{u})
 {{
 {begin}    for (int k = 0; k < {model.substeps}; k++) {{
 {step}    }}
-    {settle};
+    settle(filter{flying});
 }}
 
 void {name}_update({name} *filter{z})

@@ -1,10 +1,13 @@
-"""The filters that have derivatives: those with a page, whose belief is mean and covariance alone."""
+"""The filters that have derivatives: those with a page, but for a schedule of gains and the steady one."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import NamedTuple
 
+from filters.adaptive.robust import RobustExtendedKalmanFilter
+from filters.adaptive.sage_husa import SageHusaFilter
+from filters.adaptive.variational import VariationalBayesFilter
 from filters.filter import Filter
 from filters.gaussian.cubature import CubatureKalmanFilter
 from filters.gaussian.extended import ExtendedKalmanFilter
@@ -20,13 +23,15 @@ KINDS: tuple[type[PageFilter], ...] = (
     IteratedExtendedKalmanFilter,
     UnscentedKalmanFilter,
     CubatureKalmanFilter,
+    RobustExtendedKalmanFilter,
+    SageHusaFilter,
+    VariationalBayesFilter,
 )
 
 
 def has_derivatives(kind: type[Filter]) -> bool:
-    """Whether a class of filters has derivatives: one of `KINDS`, or a user's whose page keeps nothing else."""
-    ours = kind.__module__.startswith("filters.")
-    return kind in KINDS or (not ours and issubclass(kind, PageFilter) and kind.page.start is None)
+    """Whether a class of filters has derivatives: one of `KINDS`, or a user's that has a page."""
+    return kind in KINDS or (not kind.__module__.startswith("filters.") and issubclass(kind, PageFilter))
 
 
 class Differentiable(NamedTuple):
@@ -52,5 +57,6 @@ def differentiable(model: StateSpaceModel, filter_: Filter | None) -> Differenti
         raise ValueError(f"a filter with derivatives must be one of {names}, but got {filter_.name!r}")
     if isinstance(filter_, KalmanFilter) and filter_.schedule != 1:
         raise ValueError(f"a filter with derivatives must have schedule=1, but got {filter_.schedule}")
-    used = replace(filter_, model=model)
+    form = {"form": "covariance"} if isinstance(filter_, KalmanFilter) else {}  # of the same estimates
+    used = replace(filter_, model=model, **form)
     return Differentiable(used.kernel_model, used.written_page, used.own_numbers)

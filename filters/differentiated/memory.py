@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from math import prod
 
+from filters.pages.equations import PagedModel
 from filters.pages.memory import NumbersMemory
 from filters.pages.page import Page
+from filters.pages.programs import together
 from numerics.algebra.matrices import Matrix, given
+from numerics.algebra.points import root
 from numerics.algebra.programs import Place
 from plants.layout import number_places, starts_of
 from plants.shape import Shape
@@ -15,13 +18,18 @@ from plants.shape import Shape
 class Memory(NumbersMemory):
     """The arrays of `numerics.algebra.programs`, for a model's sizes.
 
-        rows      x, P; x and P as a stage leaves them; u, z; the score; the true x; what derivatives need
-        change    of a parameter: dx, dP; d score; of the information what `notes` says, twice
+        rows      x, P, what is kept; the same as a stage leaves it; u, z; the score; the true x; what slopes need
+        change    of a parameter: dx, dP, d of what is kept; d score; of the information what `notes` says, twice
         numbers   the model's; tails of two densities (`densities.tail_of`); the filter's own; weights of errors
-        move      of a parameter: dQ, dR, dc, the relative size of dc; dx and dP at the start
+        move      of a parameter: dQ, dR, dc, the relative size of dc; dx and dP at the start; of the filter's own
 
     Matrices lie by rows. Of what lies in `rows` and `change` there is one number for each run. A filter of points
-    has these during a step, X in the place of x and P.
+    has these during a step, in the place of x and P.
+
+    Attributes:
+        flying: what is predicted: x and P, or the points.
+        moves: the slope of each matrix that a parameter may move, but those of the next two.
+        constants_slope, own_slopes: those of the constants, and of the filter's own parameters.
     """
 
     def __init__(self, shape: Shape, page: Page):
@@ -32,16 +40,21 @@ class Memory(NumbersMemory):
         own = self.predicted_tail + m + 2
         x = given(Place("rows", 0), (n,))
         super().__init__(shape, page, x, given(Place("rows", n), (n, n), symmetric=True, beside=x), own)
-        points = 0 if page.begin is None else page.begin(SimpleNamespace(own=self.own), x, self.P).shape[1]
+        self.Q_root, self.prior_root = root(self.Q), root(self.P)  # where a filter starts P is that of the prior
+        model = PagedModel(self)
+        flying = (x, self.P) if page.begin is None else together(page.begin(model, x, self.P))
+        started = {} if page.start is None else page.start(model)
         self.begun, self.notes = n + n * n, m + m * m
-        self.state = max(self.begun, n * points)
+        starts = starts_of(*(prod(one.shape) for one in flying))
+        self.kept_from = max(self.begun, starts[-1])
+        of_kept = starts_of(self.kept_from, *(prod(one.shape) for one in started.values()))[1:]
+        self.state = of_kept[-1]
         self.left, self.input, self.measured, self.level, self.true, self.length = starts_of(
             self.state, self.state, shape.inputs, m, 1, n
         )[1:]
         self.slope = self.state  # of the score
         self.noted, self.weighed, self.depth = starts_of(self.state + 1, self.notes, self.notes)[1:]
-        r, c, size, self.prior, self.width = starts_of(n * n, m * m, shape.constants, 1, self.begun)[1:]
-        self.X = self.beside("rows", 0, n, points)
+        r, c, size, self.prior, own_slopes = starts_of(n * n, m * m, shape.constants, 1, self.begun)[1:]
         self.u, self.z = self.beside("rows", self.input, shape.inputs), self.beside("rows", self.measured, m)
         self.tails = [self.beside("numbers", first, m + 2) for first in (tail, self.predicted_tail)]
         self.truth = self.beside("rows", self.true, n)
@@ -54,5 +67,19 @@ class Memory(NumbersMemory):
             self.Q: self.beside("move", 0, n, n, symmetric=True),
             self.R: self.beside("move", r, m, m, symmetric=True),
         }
-        if points:
-            self.moves[self.X] = self.beside("change", 0, n, points)
+        self.flying = [self.x, self.P]
+        if page.begin is not None:
+            self.flying = [self._moving(*one) for one in zip(starts, flying, strict=False)]
+        self.kept = {
+            name: self._moving(at, one) for at, (name, one) in zip(of_kept, started.items(), strict=False)
+        }
+        slopes = page.parameters(lambda place, size: self.beside("move", own_slopes + place, *size))
+        self.own_slopes = dict(zip(self.own[: len(page.own)], slopes, strict=False))
+
+    def _moving(self, at: int, like: Matrix) -> Matrix:
+        """A matrix like another one that lies in `rows`, and its slope at the same place in `change`."""
+        made, slope = (
+            self.beside(array, at, *like.shape, symmetric=like.symmetric) for array in ("rows", "change")
+        )
+        self.moves[made] = slope
+        return made

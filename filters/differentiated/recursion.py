@@ -6,9 +6,10 @@ that it does not matter which of them lie together.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
-from typing import NamedTuple
+from math import prod
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from filters.differentiated.scores import LIKELIHOOD, LOG_SCORE, SQUARES, Wanted
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.pages.equations import Equations
 from filters.pages.page import Page
+from filters.pages.programs import with_kept
 from filters.pages.stages import Stage, as_calls, as_programs, stage_of
 from filters.pages.traced import MOST
 from numerics.algebra.graphs import uncollected
@@ -24,7 +26,7 @@ from numerics.algebra.matrices import Matrix
 from numerics.algebra.operations import only, present, uncorrelated, wrap
 from numerics.algebra.programs import callable_of
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from plants.layout import constants_reader, number_places
+from plants.layout import constants_reader, number_places, starts_of
 from plants.shape import Functions, Shape, observation_slopes, transition_slopes
 
 __all__ = ["LIKELIHOOD", "LOG_SCORE", "SQUARES", "Recursion", "Wanted", "recursion_of", "stages_of"]
@@ -74,43 +76,56 @@ def _recursion_of(functions: Functions, shape: Shape, wanted: Wanted, page: Page
         fingerprint = function_fingerprint(functions.transition, functions.observe, *slopes, within=__name__)
         at_once = 1
     length = max(one.length for one in made)
-    if page.begin is None:
+    if page.start is None:
         works[:0] = nothing, nothing
+    if page.begin is None:
+        works[2:2] = nothing, nothing
     run = CompiledOrPython(_accumulator(memory, works, wanted, page, at_once, fingerprint))
     return Recursion(run, at_once, length, memory.depth)
 
 
 @inlined
 def nothing(rows, change, numbers, move):
-    """In place of the first stage of filters whose belief is the same during a step."""
+    """In place of a stage that a filter does not have."""
 
 
 def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXTENDED) -> list[Stage]:
     """The stages of a step, and what is done with channels that are predicted only."""
-    n, (x, p) = memory.shape.n, (memory.x, memory.P)
+    x, p = memory.x, memory.P
     moves = dict(memory.moves)
     if wanted.constants:
         assert memory.constants_slope is not None
         moves[memory.constants] = memory.constants_slope
+    if wanted.own:
+        moves |= memory.own_slopes
 
-    def moved(mean: Matrix, cov: Matrix, more: dict | None = None, slopes: dict | None = None) -> Stage:
-        left = {memory.left: mean, memory.left + n: cov}
-        found = stage_of(left | (more or {}), {0: mean, n: cov}, moves)
-        return found._replace(slopes=found.slopes | (slopes or {}))
+    def moved(results: Any, more: dict | None = None, slopes: dict | None = None) -> Stage:
+        """What is predicted or kept, where it lies after the stage, and its slopes."""
+        *values, changed = with_kept(results)
+        kept = {name: changed.get(name, one) for name, one in memory.kept.items()}
+        starts = starts_of(*(prod(one.shape) for one in values))
+        left = dict(zip(starts, values, strict=False)) | _by_place(memory, kept)
+        found = stage_of({memory.left + at: one for at, one in left.items()} | (more or {}), left, moves)
+        still = {at: one * 0.0 for at, one in _by_place(memory, changed).items() if at not in found.slopes}
+        return found._replace(slopes=still | found.slopes | (slopes or {}))
 
-    if page.begin is None:
-        stages = [moved(*page.advance(model, x, p, memory.u)), moved(*page.settle(model, x, p))]
-    else:
-        points = page.begin(model, x, p), page.advance(model, memory.X, memory.u)
-        stages = [stage_of({memory.left: one}, {0: one}, moves) for one in points]
-        stages.append(moved(*page.settle(model, memory.X)))
-    mean, cov, v, s, _ = page.update(model, x, p, memory.z)
+    stages = []
+    if page.start is not None:
+        started = _by_place(memory, page.start(model))
+        found = stage_of(started, started, moves)
+        stages.append(found._replace(slopes={at: one * 0.0 for at, one in started.items()} | found.slopes))
+    model.kept = memory.kept
+    if page.begin is not None:
+        stages.append(moved(page.begin(model, x, p)))
+    stages += [moved(page.advance(model, *memory.flying, memory.u)), moved(page.settle(model, *memory.flying))]
+    mean, cov, v, s, _, changed = with_kept(page.update(model, x, p, memory.z))
     if wanted.of_truth:
         known = present(memory.truth)
         off = only(known, wrap(memory.truth - mean, model.state_angles))
-        stages.append(moved(mean, cov, *score_of_truth(memory, off, cov, moves, wanted.score)))
+        of_truth = score_of_truth(memory, off, cov, moves, wanted.score)
+        stages.append(moved((mean, cov, changed), *of_truth))
         return stages
-    stages.append(moved(mean, cov, *density_of(memory, v, s, moves, memory.tails[0], wanted)))
+    stages.append(moved((mean, cov, changed), *density_of(memory, v, s, moves, memory.tails[0], wanted)))
     if wanted.tails:
         seen = present(memory.z)
         v = only(seen, wrap(memory.z - model.h(x), model.measurement_angles))
@@ -118,12 +133,17 @@ def stages_of(memory: Memory, model: Equations, wanted: Wanted, page: Page = EXT
     return stages
 
 
+def _by_place(memory: Memory, kept: Mapping[str, Matrix]) -> dict[int, Matrix]:
+    return {memory.kept[name].operation.at: one for name, one in kept.items()}
+
+
 def _accumulator(
     memory: Memory, works: list[Callable], wanted: Wanted, page: Page, at_once: int, fingerprint: str
 ) -> Callable:
     """The recursion over steps of some runs."""
-    begin, begin_slopes, advance, advance_slopes, settle, settle_slopes, update, update_slopes = works[:8]
-    predicted, predicted_slopes = works[8:] or works[6:8]  # not called, if there are none
+    start, start_slopes, begin, begin_slopes, advance, advance_slopes, settle, settle_slopes = works[:8]
+    update, update_slopes = works[8:10]
+    predicted, predicted_slopes = works[10:] or works[8:10]  # not called, if there are none
     begun, state, left, first_part = memory.begun, memory.state, memory.left, 0 if page.begin is None else -1
     first_input, first_measured, level, slope = memory.input, memory.measured, memory.level, memory.slope
     prior, noted, weighed, notes = memory.prior, memory.noted, memory.weighed, memory.notes
@@ -162,7 +182,9 @@ def _accumulator(
                     rows[i * at_once + j] = begins[run, i]
                     for q in range(count):
                         changes[q, i * at_once + j] = moves[q, prior + i] * own[run]
+            start(rows, changes[0], numbers, moves[0])
             for q in range(count):
+                start_slopes(rows, changes[q], numbers, moves[q])
                 for r in range(count):
                     for j in range(at_once):
                         told[q, r, j] = 0.0

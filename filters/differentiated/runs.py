@@ -69,11 +69,13 @@ def derivatives(
     starts: Starts | None = None,
     truth: Truth | None = None,
     used: Filter | None = None,
+    own_slopes: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Scores and gradients of parts of B runs, (B, blocks, 1 + p), and their information, (B, p, p).
 
     Arguments are those of `filters.sensitivity.sensitivity`, of which shapes have been checked; and the filter
-    is used with the model in place of its own. Of what is not wanted there is nothing: (B, 0, 0).
+    is used with the model in place of its own. Along a parameter its own numbers (`Filter.own_numbers`) may move
+    by `own_slopes`, (p, their count). Of what is not wanted there is nothing: (B, 0, 0).
     """
     count, parameters, m, functions = len(measurements), len(slopes.constants), model.m, model.functions
     model, page, own_numbers = differentiable(model, used)
@@ -83,6 +85,13 @@ def derivatives(
                 "slopes along constants must be of a filter of the model itself, but got 'kf' of another"
             )
         slopes = slopes._replace(constants=np.zeros((parameters, len(model.constants))))
+    if own_slopes is None:
+        own_slopes = np.zeros((parameters, len(own_numbers)))
+    if own_slopes.shape != (parameters, len(own_numbers)):
+        raise ValueError(
+            f"own_slopes must have the shape {(parameters, len(own_numbers))}, but got {own_slopes.shape}"
+        )
+    wanted = wanted._replace(own=bool(own_slopes.any()))
     recursion = recursion_of(model.functions, model.shape, wanted, page)
     begun = as_the_prior_says(model, count) if starts is None else starts
     own = 1.0 - (begun.free & begun.held).astype(np.float64)  # of runs whose priors parameters move
@@ -97,7 +106,7 @@ def derivatives(
     arguments = (
         *(np.ascontiguousarray(one) for one in (inputs, measurements, states, _begins(model, begun))),
         numbers,
-        _moves(slopes, model),
+        _moves(slopes, own_slopes, model),
         own,
         begun.counted_from.astype(np.int64),
         given.seen,
@@ -128,12 +137,13 @@ def _begins(model: StateSpaceModel, starts: Starts) -> np.ndarray:
     return np.concatenate([means, covs.reshape(count, model.n**2)], axis=1)
 
 
-def _moves(slopes: ModelSlopes, model: StateSpaceModel) -> np.ndarray:
+def _moves(slopes: ModelSlopes, own_slopes: np.ndarray, model: StateSpaceModel) -> np.ndarray:
     """Rows of parameters, as `Memory` has them; at least one, for compiled code reads it."""
     p, nn, mm = len(slopes.constants), model.n**2, model.m**2
     noise = slopes.process_noise_cov.reshape(p, nn), slopes.measurement_noise_cov.reshape(p, mm)
     prior = slopes.prior_mean, slopes.prior_cov.reshape(p, nn)
-    rows = np.concatenate([*noise, slopes.constants, _relative(slopes.constants, model)[:, None], *prior], axis=1)
+    of_constants = slopes.constants, _relative(slopes.constants, model)[:, None]
+    rows = np.concatenate([*noise, *of_constants, *prior, own_slopes], axis=1)
     return rows if p else np.zeros((1, rows.shape[1]))
 
 

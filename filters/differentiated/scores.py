@@ -20,6 +20,7 @@ class Wanted(NamedTuple):
     constants: bool  # slopes along the model's constants
     tails: bool  # densities with more outliers than the normal one, and channels that are predicted only
     score: str = LIKELIHOOD  # of the innovations; or of the true states, which are given then
+    own: bool = False  # slopes along the filter's own parameters
 
     @property
     def of_truth(self) -> bool:

@@ -5,5 +5,4 @@ equations, traced       a model as pages see it: f, F, h, H, Q, R of matrices
 differences, at_points  the same of functions that cannot be traced, which are called
 memory, stages          where matrices lie, and what a page stores there
 programs, kernels       a page as programs or calls, and as kernels of the engine
-paged                   a page as graphs of matrices, for tensors and C
 """

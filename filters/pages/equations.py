@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
+from typing import Self
 
 from filters.pages.at_points import called_at_points
 from filters.pages.differences import called_parts
@@ -21,8 +22,8 @@ from numerics.algebra.matrices import Matrix, Operation, never, plus, through
 from plants.shape import Functions
 
 
-class Equations:
-    """A model whose functions take Matrices.
+class PagedModel:
+    """What pages find in a model besides its equations f, F, h and H.
 
     Attributes:
         Q, R: its covariances.
@@ -30,16 +31,34 @@ class Equations:
         own: the filter's parameters.
         kept: what the filter keeps besides mean and covariance, by name.
         state_angles, measurement_angles: flags of components that are angles.
+    """
+
+    def __init__(self, memory: NumbersMemory):
+        """Take where the model's numbers lie."""
+        shape, self._constants = memory.shape, memory.constants
+        self.state_angles, self.measurement_angles = shape.state_angles, shape.measurement_angles
+        self.Q, self.R, self.Q_root, self.prior_root = memory.Q, memory.R, memory.Q_root, memory.prior_root
+        self.own, self.kept = memory.own, memory.kept
+
+    def at(self, constants: Matrix) -> Self:
+        """The same model with other constants."""
+        other = copy(self)
+        other._constants = constants
+        return other
+
+
+class Equations(PagedModel):
+    """A model whose functions take Matrices.
+
+    Attributes:
         called: if functions are to be called, those that work out the model's operations.
     """
 
     def __init__(self, functions: Functions, memory: NumbersMemory, *, constants_move: bool, trace: bool):
         """Take the model's functions, where its numbers lie, and whether parameters move its constants."""
         shape = memory.shape
-        self.state_angles, self.measurement_angles = shape.state_angles, shape.measurement_angles
-        self.Q, self.R, self._scales, self._constants = memory.Q, memory.R, memory.scales, memory.constants
-        self.Q_root, self.prior_root = memory.Q_root, memory.prior_root
-        self.own, self.kept = memory.own, memory.kept
+        super().__init__(memory)
+        self._scales = memory.scales
         self._moves = (memory.constants_slope, memory.size) if constants_move and shape.constants else ()
         self.called: dict[Operation, Callable] = {}
         chosen = functions, shape
@@ -57,12 +76,6 @@ class Equations:
         self._h, self._H = self._operations("h", parts[1], shape.m, shape.n, trace)
         self._traced, self._rows = trace, {"motion": shape.n, "sight": shape.m}
         self._of_points: dict[tuple[str, int], Operation] = {}
-
-    def at(self, constants: Matrix) -> Equations:
-        """The same model with other constants."""
-        other = copy(self)
-        other._constants = constants
-        return other
 
     def f(self, x: Matrix, u: Matrix) -> Matrix:
         """The state, a substep after x; of points (n, points) that of each."""

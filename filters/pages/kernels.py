@@ -8,7 +8,7 @@ from math import prod
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, row_access
-from filters.pages.equations import Equations
+from filters.pages.equations import PagedModel
 from filters.pages.memory import RowMemory
 from filters.pages.page import Page
 from filters.pages.programs import programs_of, stored, together
@@ -19,7 +19,7 @@ from plants.layout import number_places
 from plants.shape import Functions, Shape
 
 
-def stages_of(page: Page, memory: RowMemory, model: Equations) -> list[Stage]:
+def stages_of(page: Page, memory: RowMemory, model: PagedModel) -> list[Stage]:
     """What a page stores: at the start, where a prediction begins, in each substep, at its end, in an update."""
     places, x, p = memory_places(memory.shape.n, memory.shape.m), memory.x, memory.P
     started = {} if page.start is None else page.start(model)

@@ -54,3 +54,10 @@ class PageFilter(Filter):
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
         return page_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)
+
+
+def with_page(filter_: Filter, what: str) -> PageFilter:
+    """A filter that has a page; of another one raise ValueError, which says what it was to be."""
+    if not isinstance(filter_, PageFilter):
+        raise ValueError(f"{what} must be a filter with a page, such as 'ekf', but got {filter_.name!r}")
+    return filter_

@@ -59,7 +59,7 @@ def stored(results: tuple, targets: Sequence[Matrix | int], kept: Mapping[str, M
         targets: where they are to lie.
         kept: where what is kept lies.
     """
-    *values, changed = results if isinstance(results[-1], dict) else (*results, {})
+    *values, changed = with_kept(results)
     places = [*targets, *((kept or {})[name] for name in changed)]
     stores = {}
     for place, value in zip(places, (*values, *changed.values()), strict=True):
@@ -69,6 +69,12 @@ def stored(results: tuple, targets: Sequence[Matrix | int], kept: Mapping[str, M
             place = place.operation.at
         stores[place] = value
     return Stage(stores, {})
+
+
+def with_kept(results: Any) -> tuple:
+    """What a page returns, with what changes of what is kept behind it."""
+    found = together(results)
+    return found if found and isinstance(found[-1], dict) else (*found, {})
 
 
 def together(results: Any) -> tuple:

@@ -58,8 +58,7 @@ def as_programs(stage: Stage, first: int, most: int) -> Made:
         TypeError: if a function cannot be traced, or there are more than `most` operations.
     """
     graph, wanted = Graph(most), [one for stores in stage.stores for _, one in stores]
-    known = {one: _numbers(graph, one) for one in in_order(wanted) if isinstance(one.operation, Place)}
-    entries = iter(evaluate(wanted, known))
+    entries = iter(evaluate(wanted, numbers_of(wanted, graph.given)))
     values, slopes = (
         [
             (Place(array, start + k), graph.number(number))
@@ -76,13 +75,20 @@ def as_programs(stage: Stage, first: int, most: int) -> Made:
     return Made(program_of(values, {}), program_of(slopes, rows), first + len(kept))
 
 
-def _numbers(graph: Graph, one: Matrix) -> Any:
-    """The entries of a matrix that is given; of a symmetric one those on and below the diagonal are read."""
+def numbers_of(wanted: Sequence[Matrix], number: Callable[[Place], Number]) -> dict[Matrix, Any]:
+    """The entries `number(place)` of all matrices that are given of which some are made.
+
+    Of a symmetric one those on and below the diagonal are read.
+    """
+    return {one: _entries(one, number) for one in in_order(wanted) if isinstance(one.operation, Place)}
+
+
+def _entries(one: Matrix, number: Callable[[Place], Number]) -> Any:
     array, start = one.operation
     found = np.empty(one.shape, dtype=object)
     for at in np.ndindex(*one.shape):
         there = tuple(sorted(at, reverse=True)) if one.symmetric else at
-        found[at] = graph.given(Place(array, start + int(np.ravel_multi_index(there, one.shape)) if at else start))
+        found[at] = number(Place(array, start + int(np.ravel_multi_index(there, one.shape)) if at else start))
     return found if one.shape else found[()]
 
 

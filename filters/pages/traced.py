@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from numerics.algebra.graphs import Graph
+from numerics.algebra.graphs import Graph, Number
 from numerics.algebra.programs import Place, values_of
 from numerics.algebra.slopes import along
 from numerics.algebra.tracing import traced
@@ -72,6 +72,9 @@ class Traced:
     def _given(self, x, *others) -> list:
         """Arguments in the form in which the model takes them."""
         *u, c = others
+        for one in (*x, *c):  # along which slopes are taken
+            if isinstance(one, Number):
+                one.graph.whole.add(one.place)
         plain = [one if is_array(len(one)) else tuple(one) for one in (x, *u)]
         form = self._shape.form
         return [*plain, c if constants_are_array(form) else tuple(c) if isinstance(form, int) else form(*c)]

@@ -107,7 +107,7 @@ def _forward_quotient(lower: Tensor, v: Tensor) -> Tensor:
     return torch.linalg.solve_triangular(lower, v[..., None], upper=False)[..., 0]
 
 
-def _root(p: Tensor) -> Tensor:
+def root(p: Tensor) -> Tensor:
     """`points.root`, column by column."""
     resolution = RESOLUTION * torch.finfo(p.dtype).eps / torch.finfo(torch.float64).eps
     columns: list[Tensor] = []
@@ -122,6 +122,45 @@ def _root(p: Tensor) -> Tensor:
     return torch.stack(columns, dim=-1)
 
 
+def where(condition: Tensor, a: Tensor, b: Tensor, dimensions: int) -> Tensor:
+    """`a` or `b`, each with so many dimensions beside those of the batch, which the condition has alone."""
+    return torch.where(condition[(..., *[None] * dimensions)], a, b)
+
+
+def _multiple(dimensions: int, a: Tensor, factor: Tensor | float) -> Tensor:
+    return a * (factor[(..., *[None] * dimensions)] if isinstance(factor, Tensor) else factor)
+
+
+def _reciprocal(a: Tensor) -> Tensor:
+    """1/a; infinite, and without a slope, where a is zero, so that what is not chosen has no NaN for a slope."""
+    return torch.where(a == 0, math.inf, 1.0 / torch.where(a == 0, 1.0, a))
+
+
+def _triangle(a: Tensor) -> Tensor:
+    """`blocks.triangle`, row by row."""
+    rows, columns = list(a.unbind(-2)), []
+    for i, row in enumerate(rows):
+        square = (row * row).sum(-1, keepdim=True)
+        length = torch.where(square > 0, square, 1.0).sqrt()
+        direction = torch.where(square > 0, row / length, 0.0)
+        below = [(direction * other).sum(-1, keepdim=True) for other in rows[i + 1 :]]
+        rows[i + 1 :] = [other - part * direction for other, part in zip(rows[i + 1 :], below, strict=True)]
+        column = torch.cat([torch.where(square > 0, length, 0.0), *below], -1)
+        columns.append(torch.nn.functional.pad(column, (i, 0)))
+    return torch.stack(columns, -1)
+
+
+def _joined(dimension: int, a: Tensor, b: Tensor) -> Tensor:
+    batch = torch.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    return torch.cat([one.expand(*batch, -1, -1) for one in (a, b)], dimension)
+
+
+def _hats(u: Tensor, nodes: Tensor) -> Tensor:
+    """`points.hats`: of neighbours the part of the way between them."""
+    part = ((u - nodes[..., :-1]) / nodes.diff(dim=-1)).clamp(0.0, 1.0)
+    return torch.nn.functional.pad(part, (1, 0), value=1.0) - torch.nn.functional.pad(part, (0, 1))
+
+
 CONSTANT = {operations.eye, points.units, points.ones}  # depend on the sizes of their arguments alone
 OF_SHAPE: dict[Operation, Callable] = {
     matrices.multiply: _product,
@@ -129,6 +168,8 @@ OF_SHAPE: dict[Operation, Callable] = {
     operations.only: _only,
     operations.on_one_branch: _on_one_branch,
     points.on_one_side: _on_one_side,
+    matrices.scale: _multiple,
+    scalars.choose: lambda dimensions, condition, a, b: where(condition, a, b, dimensions),
 }
 """Rules that first take whether the result is a vector or a matrix."""
 RULES: dict[Operation, Callable] = {
@@ -139,19 +180,29 @@ RULES: dict[Operation, Callable] = {
     operations.uncorrelated: _uncorrelated,
     operations.factor: _factor,
     densities.density: _density,
-    points.root: _root,
+    points.root: root,
     points.outer: lambda a, b: a[..., :, None] * b[..., None, :],
     points.square: lambda a: a @ a.mT,
     points.first: lambda a: a[..., 0],
     points.others: lambda a: a[..., 1:],
-    scalars.reciprocal: lambda a: 1.0 / a,
+    scalars.reciprocal: _reciprocal,
+    scalars.exceeds: lambda a, value: a > value,
+    scalars.is_number: lambda a: a == a,
+    scalars.trace: lambda a: torch.diagonal(a, dim1=-2, dim2=-1).sum(-1),
+    scalars.count: lambda seen: seen.sum(-1),  # a whole number, which leaves the precision of others
     scalars.shifted: lambda a, value: a + value,
     scalars.exponential: torch.exp,
     scalars.entries_product: lambda a, b: a * b,
     scalars.at_most: lambda v, value: torch.clamp(v, max=value),
     scalars.diagonal: torch.diag_embed,
-    blocks.forward_quotient: lambda lower, v: torch.linalg.solve_triangular(lower, v[..., None], upper=False)[
-        ..., 0
-    ],
+    points.hats: _hats,
+    blocks.inverted: lambda root: _symmetric(torch.cholesky_inverse(root)),
+    blocks.triangle: _triangle,
+    blocks.beside: lambda a, b: _joined(-1, a, b),
+    blocks.above: lambda a, b: _joined(-2, a, b),
+    blocks.part: lambda a, top, left, rows, columns: a[..., top : top + rows, left : left + columns],
+    blocks.zeros: lambda a, *shape: a.new_zeros(shape),
+    blocks.factor_of: lambda lower: lower,
+    blocks.forward_quotient: _forward_quotient,
 }
 """Rules of others; sums, differences and multiples are those of tensors."""

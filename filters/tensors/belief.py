@@ -14,11 +14,13 @@ class TensorBelief(NamedTuple):
         mean: of the states, (..., n), in the units of the model.
         cov: covariances of the errors, (..., n, n).
         divergences: restarts from the prior, (...,).
+        kept: what else the filter keeps, by the names of its page, such as an estimate of R.
     """
 
     mean: Tensor
     cov: Tensor
     divergences: Tensor
+    kept: dict[str, Tensor]
 
 
 class TensorInnovation(NamedTuple):

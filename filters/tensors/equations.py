@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filters.pages.paged import Equation
 from filters.pages.traced import MOST, Traced
 from filters.tensors.graphs import order_of, values_of
+from filters.tensors.stages import Equation
 from numerics.algebra.graphs import Graph, Number
 from numerics.sources import is_array
 from plants.shape import Shape, constants_are_array

@@ -8,14 +8,14 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from filters.differentiated.differentiable import differentiable
 from filters.filter import Filter
-from filters.tensors.algebra import wrapped_where
+from filters.pages.page_filter import with_page
+from filters.tensors.algebra import root, where, wrapped_where
 from filters.tensors.belief import TensorBelief, TensorEstimates, TensorInnovation
 from filters.tensors.equations import equation_of
 from filters.tensors.likelihood import compiled_likelihood
 from filters.tensors.stages import Stages
-from numerics.algebra.matrices import Matrix
+from numerics.algebra.programs import Place
 from numerics.checks import one_of
 
 DIMENSIONS = {
@@ -63,7 +63,7 @@ class TensorFilter:
         """Make the filter for tensors.
 
         Args:
-            filter_: a filter "kf", "ekf", "iekf", "ukf" or "ckf".
+            filter_: a filter with a page, any Kalman filter but "gsf" and "fuzzy".
             transition: f(x, u, c) in place of the model's, a function of tuples of tensors (...,) that returns one
                 for each state; it may contain a network. x, u and c are those of `StateSpaceModel`.
             observe: h(x, c) in place of the model's.
@@ -90,7 +90,8 @@ class TensorFilter:
 
     def _make(self) -> None:
         """Make the graphs of the page for the model."""
-        self._model, page, self._own = differentiable(self.filter.model, self.filter)
+        paged = with_page(self.filter, "a filter on tensors")
+        self._model, page, self._own = paged.kernel_model, paged.written_page, paged.parameters
         shape, (f, by_f, h, by_h) = self._model.shape, self._model.functions
         transition, by_transition, observe, by_observe = self._given
         motion = equation_of("transition", (f, by_f), (transition, by_transition), 2, shape)
@@ -125,13 +126,15 @@ class TensorFilter:
         whole = torch.broadcast_shapes(batch, self.prior_mean.shape[:-1], self.prior_cov.shape[:-2])
         mean = wrapped_where(self.prior_mean, self._model.shape.state_angles)
         mean, cov = mean.expand(*whole, -1), self.prior_cov.expand(*whole, -1, -1)
-        return TensorBelief(mean, cov, torch.zeros(whole, dtype=torch.int64, device=mean.device))
+        kept = self._stages.start(self._known(), self.prior_mean)
+        return TensorBelief(mean, cov, torch.zeros(whole, dtype=torch.int64, device=mean.device), kept)
 
     def predict(self, belief: TensorBelief, u: Any) -> TensorBelief:
         """The belief a step later, under inputs u (..., p) in the units of the model's inputs."""
         u = self._tensor("u", u, (self._model.inputs,))
-        mean, cov = self._stages.predict(self._known(), belief.mean, belief.cov, u, self._model.substeps)
-        return TensorBelief(mean, cov, belief.divergences)
+        known = belief.mean, belief.cov, belief.kept
+        mean, cov, kept = self._stages.predict(self._known(), known, u, self._model.substeps)
+        return TensorBelief(mean, cov, belief.divergences, kept)
 
     def update(self, belief: TensorBelief, z: Any) -> tuple[TensorBelief, TensorInnovation]:
         """The belief after measurements z (..., m), NaN where missing, and the innovations.
@@ -139,17 +142,19 @@ class TensorFilter:
         A belief that is not finite, or has a negative variance, becomes the prior, and this is counted.
         """
         z = self._tensor("z", z, (self._model.m,))
-        mean, cov, v, s, level = self._stages.update(self._known(), belief.mean, belief.cov, z)
+        known = belief.mean, belief.cov, belief.kept
+        (mean, cov, kept), (v, s, level) = self._stages.update(self._known(), known, z)
         lost = ~_all_finite(mean, cov, v, s, level)
         batch = lost.shape
         counted = belief.divergences.expand(batch) + lost
         if lost.any():
             prior = self.init(batch)
-            mean, v = torch.where(lost[..., None], prior.mean, mean), torch.where(lost[..., None], 0.0, v)
-            cov = torch.where(lost[..., None, None], prior.cov, cov)
-            s = torch.where(lost[..., None, None], self.measurement_noise_cov, s)
+            mean, v = where(lost, prior.mean, mean, 1), where(lost, torch.zeros_like(v), v, 1)
+            cov, s = where(lost, prior.cov, cov, 2), where(lost, self.measurement_noise_cov, s, 2)
             level = torch.where(lost, 0.0, level)
-        return TensorBelief(mean, cov, counted), TensorInnovation(v, s, level)
+            of = self._stages.memory.kept
+            kept = {name: where(lost, prior.kept[name], one, len(of[name].shape)) for name, one in kept.items()}
+        return TensorBelief(mean, cov, counted, kept), TensorInnovation(v, s, level)
 
     def run(self, inputs: Any = None, measurements: Any = None) -> TensorEstimates:
         """Filter trajectories, as `filters.run` does.
@@ -208,12 +213,21 @@ class TensorFilter:
         noise = self.process_noise_cov, self.measurement_noise_cov
         return compiled_likelihood(self.filter, inputs, measurements, *noise)
 
-    def _known(self) -> dict[Matrix, Tensor]:
+    def _known(self) -> dict[Place, Tensor]:
         """Tensors of the numbers that pages read."""
-        given, like = self._stages.given, self.prior_mean
-        own = {one: like.new_tensor(value) for one, value in zip(given.own, self._own, strict=False)}
-        numbers = {given.Q: self.process_noise_cov, given.R: self.measurement_noise_cov}
-        return own | numbers | {given.constants: self.constants}
+        memory, like = self._stages.memory, self.prior_mean
+        own = {
+            one: torch.as_tensor(value, dtype=like.dtype, device=like.device)
+            for one, value in zip(memory.own, self._own.values(), strict=False)
+        }
+        numbers = {
+            memory.Q: self.process_noise_cov,
+            memory.R: self.measurement_noise_cov,
+            memory.constants: self.constants,
+        }
+        covs = {memory.Q_root: self.process_noise_cov, memory.prior_root: self.prior_cov}
+        numbers |= {one: root(cov) for one, cov in covs.items() if one in self._stages.reads}
+        return {one.operation: value for one, value in (own | numbers).items()}
 
     def _tensor(self, name: str, value: Any, shape: tuple[int, ...]) -> Tensor:
         """A value as a tensor (..., *shape) of the filter's dtype and on its device."""

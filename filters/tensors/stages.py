@@ -1,50 +1,130 @@
-"""A page as functions of tensors: of a belief, an input, a measurement, and the numbers of a model."""
+"""A page's stages as functions of tensors: of a belief, an input, a measurement, and the numbers of a model."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
 from torch import Tensor
 
+from filters.engine.layout import memory_places
+from filters.pages.equations import PagedModel
+from filters.pages.kernels import stages_of
+from filters.pages.memory import RowMemory
 from filters.pages.page import Page
-from filters.pages.paged import Equation, Paged
+from filters.pages.stages import Stage
 from filters.tensors.algebra import work_out
-from numerics.algebra.matrices import Matrix, in_order
+from numerics.algebra.matrices import Matrix, Operation, in_order, never
+from numerics.algebra.programs import Place
 from plants.shape import Shape
 
 
-class Part:
-    """A function of a page, which tensors in the places of matrices that are given work out."""
+class Equation(Protocol):
+    """An equation of a model, y = f(x, u, c) or h(x, c), of tensors."""
 
-    def __init__(self, *wanted: Matrix):
-        """Take what it returns."""
-        self._wanted, self._order = wanted, in_order(wanted)
+    @property
+    def with_jacobian(self) -> Callable[..., Any]:
+        """A function (x, ..., c) of x (..., n) that returns y (..., rows) and dy/dx (..., rows, n)."""
 
-    def __call__(self, known: Mapping[Matrix, Tensor], like: Tensor) -> list[Tensor]:
-        """What it returns, given what that is made of."""
-        found = work_out(self._order, known, like)
-        return [found[one] for one in self._wanted]
+    @property
+    def of_points(self) -> Callable[..., Any]:
+        """A function (X, ..., c) of points X (..., n, points) that returns the values (..., rows, points)."""
+
+
+class TensorModel(PagedModel):
+    """A model as a page sees it, whose equations are those of tensors."""
+
+    def __init__(self, f: Equation, h: Equation, memory: RowMemory):
+        """Take the equations, and where all numbers lie."""
+        super().__init__(memory)
+        n, m = memory.shape.n, memory.shape.m
+        self._f, self._h = _Operations(f, n, n), _Operations(h, m, n)
+
+    def f(self, x: Matrix, u: Matrix) -> Matrix:
+        """The state, a substep after x; of points (n, points) that of each."""
+        return self._f.value_at(x, u, self._constants)
+
+    def F(self, x: Matrix, u: Matrix) -> Matrix:  # noqa: N802
+        """df/dx."""
+        return self._f.matrix(self._f.both(x, u, self._constants))
+
+    def h(self, x: Matrix) -> Matrix:
+        """What is measured at x; of points (n, points) at each."""
+        return self._h.value_at(x, self._constants)
+
+    def H(self, x: Matrix) -> Matrix:  # noqa: N802
+        """dh/dx."""
+        return self._h.matrix(self._h.both(x, self._constants))
+
+
+class _Operations:
+    """An equation as operations on Matrices; its value and its Jacobian are worked out together."""
+
+    def __init__(self, equation: Equation, rows: int, n: int):
+        self.both = Operation(equation.with_jacobian, lambda *_: (), never)
+        self.of_points = Operation(equation.of_points, lambda x, *_: (rows, x[1]), never)
+        self.value = Operation(lambda both: both[0], lambda _: (rows,), never)
+        self.matrix = Operation(lambda both: both[1], lambda _: (rows, n), never)
+
+    def value_at(self, x: Matrix, *others: Matrix) -> Matrix:
+        return self.value(self.both(x, *others)) if len(x.shape) == 1 else self.of_points(x, *others)
+
+
+class _Part:
+    """A stage, of tensors in the places that it reads."""
+
+    def __init__(self, stage: Stage):
+        self._wanted = {Place("rows", at): one for at, one in stage.values.items()}
+        self._order = in_order(list(self._wanted.values()))
+        self.given = [one for one in self._order if isinstance(one.operation, Place)]
+
+    def __call__(self, tensors: Mapping[Place, Tensor], like: Tensor) -> dict[Place, Tensor]:
+        found = work_out(self._order, {one: tensors[one.operation] for one in self.given}, like)
+        return {place: found[one] for place, one in self._wanted.items()}
 
 
 class Stages:
-    """The functions of a page, for a model's equations."""
+    """The functions of a page, for a model's equations.
+
+    Attributes:
+        memory: where a filter's numbers lie.
+        reads: which of them the page reads.
+    """
 
     def __init__(self, f: Equation, h: Equation, shape: Shape, page: Page):
         """Make graphs of matrices of the page."""
-        paged = Paged(f, h, shape, page)
-        self.given, self._state = paged.given, paged.state
-        self._begin, self._advance = Part(*paged.begin), Part(*paged.advance)
-        self._settle, self._update = Part(*paged.settle), Part(*paged.update)
+        self.memory = memory = RowMemory(shape, page)
+        stages = stages_of(page, memory, TensorModel(f, h, memory))
+        parts = self._start, self._begin, self._advance, self._settle, self._update = [*map(_Part, stages)]
+        self.reads = {one for part in parts for one in part.given}
+        places = memory_places(shape.n, shape.m)
+        self._belief = Place("rows", places.mean), Place("rows", places.cov)
+        told = places.innovation, places.innovation_cov, places.log_likelihood
+        self._told = [Place("rows", at) for at in told]
+        self._kept = {name: one.operation for name, one in memory.kept.items()}
 
-    def predict(
-        self, known: Mapping[Matrix, Tensor], mean: Tensor, cov: Tensor, u: Tensor, substeps: int
-    ) -> list[Tensor]:
-        """Mean and covariance a step later."""
-        known = {**known, self.given.x: mean, self.given.P: cov, self.given.u: u}
-        for part in (self._begin, *[self._advance] * substeps):
-            known |= dict(zip(self._state, part(known, mean), strict=False))
-        return self._settle(known, mean)
+    def start(self, numbers: Mapping[Place, Tensor], like: Tensor) -> dict[str, Tensor]:
+        """What the filter keeps besides mean and covariance, at the prior."""
+        found = self._start(numbers, like)
+        return {name: found[place] for name, place in self._kept.items()}
 
-    def update(self, known: Mapping[Matrix, Tensor], mean: Tensor, cov: Tensor, z: Tensor) -> list[Tensor]:
-        """Mean and covariance after the measurement z, the innovation, its covariance and its log density."""
-        return self._update({**known, self.given.x: mean, self.given.P: cov, self.given.z: z}, mean)
+    def predict(self, numbers: Mapping[Place, Tensor], belief: tuple, u: Tensor, substeps: int) -> tuple:
+        """Mean, covariance and what is kept, a step later."""
+        tensors = self._tensors(numbers, belief, u)
+        for part in (self._begin, *[self._advance] * substeps, self._settle):
+            tensors |= part(tensors, belief[0])
+        return self._belief_of(tensors)
+
+    def update(self, numbers: Mapping[Place, Tensor], belief: tuple, z: Tensor) -> tuple[tuple, list[Tensor]]:
+        """The same after the measurement z; then the innovation, its covariance and its log density."""
+        tensors = self._tensors(numbers, belief, z)
+        tensors |= self._update(tensors, belief[0])
+        return self._belief_of(tensors), [tensors[place] for place in self._told]
+
+    def _tensors(self, numbers: Mapping[Place, Tensor], belief: tuple, given: Tensor) -> dict[Place, Tensor]:
+        *known, kept = belief
+        rows = dict(zip(self._belief, known, strict=True)) | {self._kept[name]: one for name, one in kept.items()}
+        return {**numbers, **rows, Place("given", 0): given}
+
+    def _belief_of(self, tensors: Mapping[Place, Tensor]) -> tuple:
+        return *(tensors[at] for at in self._belief), {name: tensors[at] for name, at in self._kept.items()}

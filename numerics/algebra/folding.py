@@ -2,6 +2,9 @@
 
 A matrix of a model has zeros and ones in places that are known when it is traced. Products with them vanish
 here, so that no program multiplies by zero: of an A P A' with a sparse A little is left.
+
+Numbers along which something is to be differentiated are left whole (`Graph.whole`): of a - b that moves
+-(a - b) stays what it is, for b - a would not show that it moves.
 """
 
 from __future__ import annotations
@@ -35,11 +38,16 @@ _OF_CONSTANTS: dict[str, Callable] = {
 }
 
 
+def _is(a: Number, operation: str) -> bool:
+    """Whether an operation made a number that may be taken apart."""
+    return a.operation == operation and a.place not in a.graph.whole
+
+
 def negative(a: Number) -> Number:
     """-a."""
-    if a.operation == "-":
+    if _is(a, "-"):
         return difference(a.arguments[1], a.arguments[0])
-    return a.arguments[0] if a.operation == "negative" else worked_out("negative", a)
+    return a.arguments[0] if _is(a, "negative") else worked_out("negative", a)
 
 
 def total(a: Number, b: Number) -> Number:
@@ -48,9 +56,9 @@ def total(a: Number, b: Number) -> Number:
         return a.graph.constant(a.value + b.value)
     if a.value == 0.0 or b.value == 0.0:
         return b if a.value == 0.0 else a
-    if b.operation == "negative":
+    if _is(b, "negative"):
         return difference(a, b.arguments[0])
-    return difference(b, a.arguments[0]) if a.operation == "negative" else a.graph.make("+", a, b)
+    return difference(b, a.arguments[0]) if _is(a, "negative") else a.graph.make("+", a, b)
 
 
 def difference(a: Number, b: Number) -> Number:
@@ -59,7 +67,7 @@ def difference(a: Number, b: Number) -> Number:
         return a.graph.constant(a.value - b.value)
     if b.value == 0.0:
         return a
-    if b.operation == "negative":
+    if _is(b, "negative"):
         return total(a, b.arguments[0])
     return negative(b) if a.value == 0.0 else a.graph.make("-", a, b)
 
@@ -74,7 +82,7 @@ def product(a: Number, b: Number) -> Number:
                 return one
             if abs(one.value) == 1.0:
                 return other if one.value > 0 else negative(other)
-        elif one.operation == "negative":
+        elif _is(one, "negative"):
             return negative(product(one.arguments[0], other))
     return a.graph.make("*", a, b)
 

@@ -53,6 +53,7 @@ class Graph:
     def __init__(self, most: int = 1_000_000):
         """Begin without numbers; more operations than `most` raise TooLarge."""
         self.numbers: list[Number] = []
+        self.whole: set[int] = set()  # places of numbers that are not taken apart, as along them slopes are taken
         self._made: dict[tuple, Number] = {}
         self._most = most
 

@@ -1,6 +1,8 @@
 """Filters in C: compiled without a warning, and the numbers of `run`."""
 
+import dataclasses
 import math
+import re
 import shutil
 import subprocess
 
@@ -27,8 +29,20 @@ from thruster_cli.templates.filter import Template
 
 WARNINGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
 SANITIZERS = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-NAMES = ("kf", "ekf", "iekf", "ukf", "ckf")
-OWN = {"iekf": {"iterations": 3}, "ukf": {"alpha": 0.8, "beta": 1.5, "kappa": 1.0}}
+OWN = {
+    "kf": {},
+    "kf information": {"form": "information"},
+    "kf square-root": {"form": "square-root"},
+    "kf-steady": {},
+    "ekf": {},
+    "iekf": {"iterations": 3},
+    "ukf": {"alpha": 0.8, "beta": 1.5, "kappa": 1.0},
+    "ckf": {},
+    "ekf-robust": {"degrees_of_freedom": 3.0, "iterations": 3},
+    "sage-husa": {"forgetting_factor": 0.9, "process_forgetting_factor": 0.8},
+    "vb": {"forgetting_factor": 0.9, "prior_weight": 6.0, "iterations": 2},
+}
+KEPT = {"kf square-root": ["L"], "ekf-robust": ["weight"], "sage-husa": ["R", "Q", "predicted"], "vb": ["V", "nu"]}
 MODELS = {
     "thruster": lambda: thruster_model(operating_voltage=3.0),
     "pendulum": lambda: wide_pendulum().replace(operating_state=[0.3, 0.0], operating_input=[0.5]),
@@ -76,7 +90,7 @@ int main(void)
         show({m} * {m}, filter.S);
         show(1, &filter.log_likelihood);
         show(1, &filter.nis);
-        printf("%d %lu\\n", filter.channels, filter.restarts);
+        {kept}printf("%d %lu\\n", filter.channels, filter.restarts);
     }}
     return 0;
 }}
@@ -92,7 +106,11 @@ def built(filter_, folder, *, single=False, compiler="gcc", flags=()):
     """The program MAIN of a filter."""
     made, model = c_filter(filter_, "one", single=single), filter_.kernel_model
     u, real = ", u" * (model.inputs > 0), "float" if single else "double"
-    main = MAIN.format(name="one", real=real, inputs=model.inputs, n=model.n, m=model.m, u=u)
+    kept = "".join(
+        f"show({math.prod(shape)}, {'' if shape else '&'}filter.{name});\n        "
+        for name, shape in programs_of(filter_).kept.items()
+    )
+    main = MAIN.format(name="one", real=real, inputs=model.inputs, n=model.n, m=model.m, u=u, kept=kept)
     for name, text in {"one.h": made.header, "one.c": made.source, "main.c": main}.items():
         (folder / name).write_text(text)
     command = [compiler, *WARNINGS, *flags, "one.c", "main.c", "-lm", "-o", "one"]
@@ -101,15 +119,20 @@ def built(filter_, folder, *, single=False, compiler="gcc", flags=()):
     return folder / "one"
 
 
-def estimated(program, model, inputs, z):
-    """Estimates of one run, NIS, channels and restarts of each step."""
+def printed(program, inputs, z):
+    """The numbers that the program prints of each step, (K + 1, ...)."""
     rows = [z[0], *np.concatenate([inputs, z[1:]], axis=1)]
     text = "\n".join(" ".join(f"{number:.17g}" for number in row) for row in rows)
-    result = subprocess.run([program], input=text, capture_output=True, text=True)
+    result = subprocess.run(program, input=text, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
-    found = np.array([[float(word) for word in line.split()] for line in result.stdout.splitlines()])
-    n, m = model.n, model.m
-    x, p, v, s, level, nis, channels, restarts = np.split(found, np.cumsum([n, n * n, m, m * m, 1, 1, 1]), axis=1)
+    return np.array([[float(word) for word in line.split()] for line in result.stdout.splitlines()])
+
+
+def estimated(program, model, inputs, z):
+    """Estimates of one run, NIS, channels and restarts of each step."""
+    found, n, m = printed(program, inputs, z), model.n, model.m
+    found, channels, restarts = found[:, :-2], found[:, -2:-1], found[:, -1:]
+    x, p, v, s, level, nis, _ = np.split(found, np.cumsum([n, n * n, m, m * m, 1, 1]), axis=1)
     return (x, p.reshape(-1, n, n), v, s.reshape(-1, m, m), level[:, 0]), nis[:, 0], channels[:, 0], restarts[:, 0]
 
 
@@ -119,18 +142,18 @@ def assert_same(found, expected, accuracy):
 
 
 def made(name, model):
-    return make_filter(name, model, **OWN.get(name, {}))
+    return make_filter(name.split()[0], model, **OWN[name])
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", OWN)
 @pytest.mark.parametrize("which", MODELS)
 def test_a_thousand_steps_are_those_of_run(which, name, tmp_path):
     model = MODELS[which]()
     inputs, z = simulated(model, 1000, level=1.0, missing=0.2)
     filter_ = made(name, model)
     expected = [part[0] for part in run(filter_, None, inputs, z)[:5]]
-    for compiler in compilers():
+    for compiler in compilers() if which == "thruster" else ["gcc"]:
         program = built(filter_, tmp_path, compiler=compiler)
         found, nis, channels, restarts = estimated(program, filter_.kernel_model, inputs[0], z[0])
         assert_same(found, expected, 1e-12)
@@ -139,6 +162,25 @@ def test_a_thousand_steps_are_those_of_run(which, name, tmp_path):
             nis, (v * np.linalg.solve(s, v[..., None])[..., 0]).sum(-1), rtol=1e-8, atol=1e-10
         )
         assert channels.tolist() == np.isfinite(z[0]).sum(-1).tolist() and not restarts.any()
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", [*KEPT, "schedule"])
+def test_what_a_filter_keeps_has_a_name_and_the_numbers_of_the_belief(name, tmp_path):
+    model = thruster_model()
+    filter_ = make_filter("kf", model, schedule=4) if name == "schedule" else made(name, model)
+    inputs, z = simulated(model, 60, level=10.0, missing=0.2)
+    header = c_filter(filter_, "one").header
+    assert all(re.search(rf"double {one}\W", header) for one in KEPT.get(name, ["c"]))
+    belief, extras = filter_.init(), []
+    for k, seen in enumerate(z[0]):
+        belief = filter_.predict(belief, inputs[0, k - 1]) if k else belief
+        belief, _ = filter_.update(belief, seen)
+        extras.append(belief.extras)
+    program = built(filter_, tmp_path)
+    found, *_ = estimated(program, filter_.kernel_model, inputs[0], z[0])
+    assert_same(found, [part[0] for part in run(filter_, None, inputs, z)[:5]], 1e-12)
+    assert_same(printed(program, inputs[0], z[0])[:, -2 - len(belief.extras) : -2].T, np.transpose(extras), 1e-12)
 
 
 @pytest.mark.usefixtures("as_python")
@@ -161,9 +203,10 @@ def test_a_vehicle_and_many_states(name, tmp_path):
 
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # Python says so when a number overflows
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", OWN)
 def test_a_belief_that_is_lost_becomes_the_prior_and_no_sanitizer_complains(name, tmp_path):
-    filter_, inputs, z = diverging(name)
+    filter_, inputs, z = diverging(name.split()[0])
+    filter_ = dataclasses.replace(filter_, **{key: value for key, value in OWN[name].items() if key == "form"})
     program = built(filter_, tmp_path, flags=SANITIZERS)
     found, nis, _, restarts = estimated(program, filter_.kernel_model, inputs[0], z[0])
     expected = run(filter_, None, inputs, z)
@@ -172,7 +215,7 @@ def test_a_belief_that_is_lost_becomes_the_prior_and_no_sanitizer_complains(name
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", OWN)
 def test_single_precision(name, tmp_path):
     for which in ("thruster", "pendulum"):
         model = MODELS[which]()
@@ -272,7 +315,7 @@ def small(**functions):
     [
         (
             lambda: c_filter(make_filter("enkf", scalar_model())),
-            "must be one of kf, ekf, iekf, ukf, ckf, but got 'enkf'",
+            "a filter in C must be a filter with a page, such as 'ekf', but got 'enkf'",
         ),
         (lambda: c_filter(made("ekf", scalar_model()), "a b"), "no keyword, but got 'a b'"),
         (lambda: c_filter(made("ekf", scalar_model()), "double"), "no keyword, but got 'double'"),
@@ -309,7 +352,7 @@ def test_a_project_filters_a_log_as_estimate_does(which, single, tmp_path):
     inputs, z = simulated(model, 40, level=1.0, missing=0.2)
     filter_ = made("ekf", model)
     files = write_project(filter_, tmp_path / "c", "one", single=single)
-    assert [file.name for file in files] == ["one.h", "one.c", "main.c", "CMakeLists.txt", "README.md"]
+    assert [file.name for file in files] == ["one.h", "one.c", "one.hpp", "main.c", "CMakeLists.txt", "README.md"]
     command = ["gcc", *WARNINGS, *SANITIZERS, "one.c", "main.c", "-lm", "-o", "one_log"]
     result = subprocess.run(command, cwd=tmp_path / "c", capture_output=True, text=True)
     assert result.returncode == 0, result.stderr

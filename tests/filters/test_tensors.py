@@ -15,6 +15,7 @@ from auv_env.model import auv_model
 from filters import StateSpaceModel, make_filter, run, thruster_model
 from filters.likelihood import likelihood
 from numerics.compiled import interpreted
+from tests.filters.test_c import KEPT, OWN, made
 from tests.filters.test_filter_paths import diverging
 from tests.filters.test_likelihood import directions, two_channels
 from tests.filters.test_pages import wide_pendulum
@@ -22,7 +23,6 @@ from tests.models import lonely_model, plane_model, random_affine, scalar_model,
 from thruster_cli.templates.filter import Template
 
 NAMES = ("kf", "ekf", "iekf", "ukf", "ckf")
-OWN = {"iekf": {"iterations": 3}, "ukf": {"alpha": 0.8, "beta": 1.5, "kappa": 1.0}}
 MODELS = {
     "thruster": thruster_model,
     "pendulum": wide_pendulum,
@@ -41,10 +41,6 @@ def one_thread():
     torch.set_num_threads(before)
 
 
-def made(name, model):
-    return make_filter(name, model, **OWN.get(name, {}))
-
-
 def assert_same(found, expected, accuracy=1e-10):
     """Each array to an accuracy relative to its largest number."""
     for one, other in zip(found, expected, strict=True):
@@ -52,15 +48,37 @@ def assert_same(found, expected, accuracy=1e-10):
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", OWN)
 @pytest.mark.parametrize("which", MODELS)
 def test_estimates_are_those_of_run(name, which):
     model = MODELS[which]()
-    if name == "kf" and MODELS[which] is wide_pendulum:
+    if name.startswith("kf") and MODELS[which] is wide_pendulum:
         model = model.replace(operating_state=[0.3, 0.0], operating_input=[0.5])
     inputs, z = simulated(model, 12, count=3, level=1.0, missing=0.3)
     filter_ = made(name, model)
     assert_same(filters.torch(filter_).run(inputs, z), run(filter_, None, inputs, z))
+
+
+@pytest.mark.usefixtures("as_python")
+def test_a_schedule_of_gains_is_that_of_run():
+    filter_ = make_filter("kf", thruster_model(), schedule=5)
+    inputs, z = simulated(filter_.model, 12, count=3, level=15.0, missing=0.3)
+    assert_same(filters.torch(filter_).run(inputs, z), run(filter_, None, inputs, z))
+
+
+@pytest.mark.usefixtures("as_python")
+@pytest.mark.parametrize("name", KEPT)
+def test_what_a_filter_keeps_is_that_of_its_belief(name):
+    filter_ = made(name, wide_model())
+    inputs, z = simulated(filter_.model, 6, missing=0.3)
+    tensors = filters.torch(filter_)
+    belief, beliefs = filter_.init(), tensors.init(2)
+    for u, seen in zip(inputs[0], z[0, 1:], strict=True):
+        belief, beliefs = filter_.predict(belief, u), tensors.predict(beliefs, u)
+        (belief, _), (beliefs, _) = filter_.update(belief, seen), tensors.update(beliefs, seen)
+    assert list(beliefs.kept) == KEPT[name]
+    found = torch.cat([one.expand(2, *one.shape[1:]).reshape(2, -1) for one in beliefs.kept.values()], -1)
+    assert_same(found, np.array([belief.extras] * 2))
 
 
 @pytest.mark.usefixtures("as_python")
@@ -79,7 +97,7 @@ def test_estimates_are_those_of_compiled_code_over_many_steps():
 
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("make", [two_channels, wide_pendulum])
-@pytest.mark.parametrize("name", NAMES[1:])
+@pytest.mark.parametrize("name", [*NAMES[1:], "ekf-robust", "sage-husa", "vb"])
 def test_gradients_along_q_and_r_are_those_of_the_likelihood(name, make):
     model = make()
     inputs, z = simulated(model, 12, count=3, missing=0.3)
@@ -101,7 +119,7 @@ def test_gradients_along_q_and_r_are_those_of_the_likelihood(name, make):
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", NAMES[1:])
+@pytest.mark.parametrize("name", [*NAMES[1:], "ekf-robust", "sage-husa", "vb"])
 def test_everything_that_is_a_tensor_has_derivatives(name):
     model = wide_pendulum(start=0.5, spread=0.2)
     inputs, z = map(torch.tensor, simulated(model, 2, count=2, level=0.3))
@@ -206,7 +224,7 @@ def test_a_network_in_a_model_has_a_gradient(name):
 
 
 def test_a_belief_that_is_lost_becomes_the_prior():
-    for name in ("ekf", "ukf"):
+    for name in ("ekf", "ukf", "kf-steady", "ekf-robust", "sage-husa", "vb"):
         filter_, inputs, z = diverging(name)
         with interpreted(), np.errstate(all="ignore"):
             expected = run(filter_, None, inputs, z)
@@ -244,7 +262,7 @@ def test_a_state_that_is_known_has_a_root():
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", NAMES[1:])
+@pytest.mark.parametrize("name", [*NAMES[1:], "ekf-robust", "sage-husa", "vb"])
 def test_single_precision_and_devices(name):
     for model in (wide_pendulum(), thruster_model()):  # which begins at rest, where a constant of 1e-200 matters
         inputs, z = simulated(model, 20, count=3, missing=0.3)
@@ -282,7 +300,10 @@ def if_fast(x, u, c):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: filters.torch(make_filter("enkf", scalar_model())), "must be one of kf, ekf, iekf, ukf, ckf"),
+        (
+            lambda: filters.torch(make_filter("enkf", scalar_model())),
+            "on tensors must be a filter with a page",
+        ),
         (lambda: filters.torch(made("ekf", scalar_model()), dtype=torch.int64), "torch.float64 or torch.float32"),
         (lambda: filters.torch(made("kf", thruster_model()), transition=if_fast), "a filter of the model itself"),
         (lambda: filters.torch(made("ekf", scalar_model()), observe_jacobian=if_fast), "must come with observe"),

@@ -20,7 +20,7 @@ from thruster_env.plant import make_plant
 
 PARTS = (
     *("vectors", "steps", "vector_filters", "batches", "vehicles", "trajectories", "studies", "assimilation"),
-    *("policies", "processes"),
+    *("policies", "processes", "c_code"),
 )
 
 

@@ -18,7 +18,7 @@ def test_the_program_writes_what_estimate_writes(thruster, as_json, tmp_path):  
     assert thruster("simulate", "--steps", 60, "--out", "run.csv").returncode == 0
     assert thruster("estimate", "run.csv", tuned, "--out", "estimate.csv").returncode == 0
     found = as_json("export", tuned, "--out", "boat", "--name", "bow")
-    assert found["single_error"] is None and len(found["files"]) == 5
+    assert found["single_error"] is None and len(found["files"]) == 6
     build = ["gcc", "-std=c99", "-O2", "-Werror", "-Wall", "bow.c", "main.c", "-lm", "-o", "bow_log"]
     assert subprocess.run(build, cwd=tmp_path / "boat").returncode == 0
     with open(tmp_path / "run.csv") as log, open(tmp_path / "c.csv", "w") as out:

@@ -15,7 +15,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from filters.registry import filter_class
 from tuning.evaluation.baselines import GIVEN, ORACLE, RULE, baselines
-from tuning.likelihood.family import has_gradient
+from tuning.likelihood.family import has_gradient, keeps_more
 from tuning.likelihood.goal import OF_STATES, Goal
 from tuning.likelihood.gradient import goal_of, optimum, start_at, starts_of
 from tuning.search.cost import COST
@@ -217,10 +217,11 @@ def _enqueue_minimum(study: optuna.Study, plan: Plan, start: dict) -> None:
 def noise_by_gradient(study: optuna.Study, plan: Plan, objective: str = LIKELIHOOD) -> dict[str, float] | None:
     """The Q and R, or own parameters, to which gradients of an objective lead, kept with the study.
 
-    They are those of the tuned filter where it has gradients and the model few states, else of an extended Kalman
-    filter, by an ascent: of models of few states from three starts. Near the best Q and R the score is so flat
-    that a sampler finds the place late, and among many correlations never; where the model is wrong the trial is
-    one among many. None for parameters that change functions of the model, which have no such gradient.
+    They are those of the tuned filter where it has gradients, learns no noise, and the model has few states, else
+    of an extended Kalman filter, by an ascent: of models of few states from three starts. Near the best Q and R
+    the score is so flat that a sampler finds the place late, and among many correlations never; where the model is
+    wrong the trial is one among many. None for parameters that change functions of the model, which have no such
+    gradient.
     """
     if not all(filter_class(name).has_covariance for name in plan.filter_types):
         return None
@@ -229,7 +230,8 @@ def noise_by_gradient(study: optuna.Study, plan: Plan, objective: str = LIKELIHO
     if known is not None:
         return known or None
     small = len(plan.scenarios[0].quantities.states) <= MOST_STATES
-    name = plan.filter if plan.filter == "kf" or (small and has_gradient(plan.filter)) else "ekf"
+    own = small and has_gradient(plan.filter) and not keeps_more(plan.filter)
+    name = plan.filter if plan.filter == "kf" or own else "ekf"
     try:
         goal = goal_of(name, plan.scenarios, plan.training_data(), objective, plan.options)
         some = goal.is_large or len(goal.coordinates.free) > MOST_FOR_ALL
