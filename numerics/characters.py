@@ -8,6 +8,7 @@ import unicodedata
 
 HANDLER = "thruster: other characters"  # name among Python's error handlers of encodings
 OTHERS = {"±": "+-", "×": "x", "µ": "u", "ω": "w", "–": "-", "—": "-", "−": "-", "•": "*", "‘": "'", "’": "'"}
+OTHERS |= dict(zip("▁▂▃▄▅▆▇█", "_.:-=+*#", strict=True))  # heights
 OTHERS |= {"“": '"', "”": '"', "≤": "<=", "≥": ">=", "→": "->", "·": "*", "✓": "x"}
 TITLE = 90  # characters for which a figure has room
 STRAIGHT = {"HORIZONTAL": "-", "LEFT": "-", "RIGHT": "-", "VERTICAL": "|"}  # ends of names of box drawings

@@ -76,11 +76,16 @@ def _keep_words_whole(out: Table) -> None:
             column.min_width = width
 
 
-def plain_text(parts: Iterable[RenderableType]) -> str:
-    """What the terminal would show of tables and lines, without colours."""
+def plain_text(parts: Iterable[RenderableType], width: int | None = None) -> str:
+    """What the terminal would show of tables and lines, without colours; also one of another width."""
     stream = StringIO()
     plain = Console(
-        file=stream, width=console.width, color_system=None, force_jupyter=False, markup=False, highlight=False
+        file=stream,
+        width=width or console.width,
+        color_system=None,
+        force_jupyter=False,
+        markup=False,
+        highlight=False,
     )
     for part in parts:
         plain.print(part)

@@ -18,6 +18,7 @@ from filters.logs.verdict import ALPHA, verdict
 from filters.monitoring.monitor import monitor_of
 from plants.logs.write import check_suffix, write_columns
 from thruster_cli.options import (
+    A_LOG,
     FILTER,
     FILTER_HELP,
     OUTPUT,
@@ -40,7 +41,7 @@ MOST_EPISODES = 8  # that are shown
 
 
 def command(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="A .csv, .parquet or .npz file with a header.")],
+    log: Annotated[Path, typer.Argument(metavar="LOG", help=A_LOG)],
     file: Annotated[Path | None, typer.Argument(metavar="FILE", help="Tuned file, with filter, Q and R.")] = None,
     filter_name: Annotated[
         str | None,

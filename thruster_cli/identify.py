@@ -12,6 +12,7 @@ from rich.text import Text
 
 from thruster_cli.identified import as_json, report, write_files
 from thruster_cli.options import (
+    A_LOG,
     FILTER,
     INPUT,
     OUTPUT,
@@ -41,9 +42,7 @@ DEFAULT_OUT = Path("out/identified.toml")
 
 
 def command(
-    logs: Annotated[
-        list[Path] | None, typer.Argument(metavar="LOG...", help="Recorded runs, .csv, .parquet or .npz.")
-    ] = None,
+    logs: Annotated[list[Path] | None, typer.Argument(metavar="LOG...", help=f"Recorded runs. {A_LOG}")] = None,
     free: Annotated[
         str | None,
         typer.Option(

@@ -11,7 +11,10 @@ from rich.console import RenderableType
 
 from plants.logs.findings import sentences
 from plants.logs.log import Log
+from thruster_cli.fields import as_json, as_table, found_in, is_listed
 from thruster_cli.options import (
+    A_LOG,
+    INPUT,
     OUTPUT,
     ClockOption,
     ColumnOption,
@@ -21,18 +24,26 @@ from thruster_cli.options import (
     ModelOption,
     SensorOption,
 )
-from thruster_cli.output import check_picture, check_targets, emit, table
+from thruster_cli.output import check_picture, check_targets, console, emit, table
 from tuning.logs.read import read_named
 
 
 def command(
-    log: Annotated[Path, typer.Argument(metavar="LOG", help="A .csv, .parquet or .npz file with a header.")],
+    log: Annotated[Path, typer.Argument(metavar="LOG", help=A_LOG)],
     preset: LogPresetOption = None,
     model: ModelOption = None,
     sensor: SensorOption = None,
     column: ColumnOption = None,
     clock_offset: ClockOption = None,
     dt: DtOption = None,
+    only: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TEXT",
+            help="Of a recorder's file, list the fields whose names contain this.",
+            rich_help_panel=INPUT,
+        ),
+    ] = None,
     plot: Annotated[
         Path | None,
         typer.Option(
@@ -47,10 +58,23 @@ def command(
 
     Other commands that read logs print the same before their results. docs/logs.md has the rules.
 
+    A recorder's file (PX4's .ulg, ArduPilot's .bin, bags of ROS, MATLAB, HDF5) has its topics and fields listed if
+    no other option says how to read it. docs/recorders.md has the formats.
+
     Example: thruster log run.csv --plot run.png
 
     Example: thruster log run.csv --sensor speed --column speed=motor_rpm --column voltage=u_cmd_V
+
+    Example: thruster log flight.ulg --only actuator
     """
+    if is_listed(log, only, any(one for one in (preset, model, sensor, column, clock_offset, dt, plot))):
+        check_targets((), json, read=(log,))
+        some = found_in(log, only)
+        shown = as_table(log, some, console.is_terminal)
+        emit([shown] if console.is_terminal else [], as_json(log, some), json)
+        if isinstance(shown, str) and json != "-":
+            typer.echo(shown)
+        return
     if plot is not None:
         check_picture(plot, "--plot")
     recorded, _ = read_named(log, preset, model, sensor, column, clock_offset, dt)

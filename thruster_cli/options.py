@@ -81,6 +81,7 @@ def filter_option(help_text: str):
 
 
 # Of recorded runs
+A_LOG = "A .csv, .parquet or .npz file with a header, or a recorder's: .ulg, .bin, .bag, .db3, .mcap, .mat, .h5."
 LogPresetOption = Annotated[
     str | None,
     typer.Option(
@@ -136,7 +137,7 @@ LogOption = Annotated[
     list[Path] | None,
     typer.Option(
         "--log",
-        help="In place of a problem: a recorded run, .csv, .parquet or .npz; may be repeated.",
+        help=f"In place of a problem: a recorded run; may be repeated. {A_LOG}",
         rich_help_panel=INPUT,
     ),
 ]

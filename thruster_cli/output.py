@@ -20,6 +20,7 @@ from numerics.progress import listening
 from numerics.text_tables import BEST as BEST
 from numerics.text_tables import console
 from numerics.text_tables import table as table  # for the commands, beside what follows
+from plants.logs.recorders.registry import ENDINGS
 from plants.logs.table import SUFFIXES
 from plants.logs.write import check_not_beside, check_suffix
 from thruster_cli.options import JsonOption, SeedOption  # noqa: F401 - for `demo`
@@ -43,7 +44,7 @@ def emit(shown: Sequence[RenderableType], data: dict, json_target: str | None) -
 
 def _check_json(target: str | None) -> None:
     """Raise ValueError for a path that would be a log, or the description of one."""
-    if target is not None and Path(target).suffix in (*SUFFIXES, ".toml"):
+    if target is not None and Path(target).suffix in (*SUFFIXES, *ENDINGS, ".toml"):
         raise ValueError(f"--json must be no log, nor what is said of one, but got {target!r}")
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
 from typing import NamedTuple
 
-from numerics.checks import listed, shown
+from numerics.checks import FEW, listed, shown
 from plants.logs.units import parted
 from plants.quantities import Quantity
 from plants.state_space import StateSpaceModel
@@ -67,8 +68,16 @@ def column_of(text: str, headers: Sequence[str], units: Mapping[str, str], what:
         same = [header for header in headers if parted(header)[0] == bare]
         bare = same[0] if len(same) == 1 else bare
     if bare not in headers:
-        raise ValueError(f"the column for {what} must be one of {listed(headers)}, but got {shown(bare)} ({file})")
-    return Column(bare, unit or units.get(bare) or parted(bare)[1])
+        near = get_close_matches(text, headers, n=3) if len(headers) > FEW else []
+        told = f"; near it are {', '.join(near)}" if near else ""
+        rule = f"the column for {what} must be one of {listed(headers)}"
+        raise ValueError(f"{rule}, but got {shown(text)} ({file}){told}")
+    return Column(bare, unit or _unit(bare, units))
+
+
+def _unit(header: str, units: Mapping[str, str]) -> str | None:
+    """The unit that is said of a header, else that in it; None where it is said that there is none."""
+    return units[header] or None if header in units else parted(header)[1]
 
 
 def find_columns(
@@ -155,7 +164,7 @@ def _by_headers(found: dict, wanted: Sequence[Wanted], headers: Sequence[str], u
     def take(key: str, fitting: Sequence[str], without_unit: bool = True) -> None:
         header = None if key in found else next((one for one in fitting if one in bare), None)
         if header is not None:
-            found[key] = Column(header, units.get(header) or (bare[header][1] if without_unit else None))
+            found[key] = Column(header, _unit(header, units) if without_unit or header in units else None)
             del bare[header]
 
     times = [header for header in left if bare[header][0] in TIME_NAMES]

@@ -52,8 +52,20 @@ class Grid(NamedTuple):
     moved: np.ndarray = np.empty(0)  # (rows of the file,) [s], how far stamps were from the grid
 
 
-def grid_of(stamps: np.ndarray, dt: float | None = None) -> Grid:
-    """The grid of non-decreasing stamps [s], with the requested sample time or the one of the stamps."""
+def grid_of(stamps: np.ndarray, dt: float | None = None, clock: np.ndarray | None = None) -> Grid:
+    """The grid of non-decreasing stamps [s], with the requested sample time or the one of the stamps.
+
+    Args:
+        stamps: (rows,).
+        dt: sample time [s].
+        clock: rows whose stamps the grid is made for (rows,), the first among them; the others are shifted as the
+            stamps around them are. All rows by default.
+    """
+    if clock is not None and not clock.all():
+        since, own = stamps - stamps[0], grid_of(stamps[clock], dt)
+        times = since + np.interp(since, since[clock], own.times - since[clock])
+        times[clock] = own.times
+        return own._replace(times=np.maximum.accumulate(times), irregular=True)
     since, place = np.unique(stamps - stamps[0], return_inverse=True)
     usual = _usual(since)
     pieces = _pieces(since, usual)

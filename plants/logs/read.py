@@ -1,4 +1,4 @@
-"""Logs from files: CSV, Parquet or npz, and an optional TOML file beside it that describes the columns."""
+"""Logs from tables and recorders' files, and an optional TOML file beside one that describes its columns."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from plants.logs.columns import INPUT, MEASUREMENT, TIME, Column, Wanted, find_c
 from plants.logs.findings import Recording
 from plants.logs.grid import MOST_HELD, TOLERANCE, Grid, Series, grid_of, held, sampled
 from plants.logs.log import FEWEST_STEPS, Log
+from plants.logs.recorders.merged import Recorded
+from plants.logs.recorders.registry import format_of
 from plants.logs.table import Table, read_table, table_of
 from plants.logs.units import converted
 from plants.state_space import StateSpaceModel
@@ -68,8 +70,8 @@ def read_log(
     and the arguments take precedence over it.
 
     Args:
-        path: a file that ends in .csv, .parquet or .npz; or a table itself: a mapping from headers to arrays
-            (rows,), or a pandas.DataFrame.
+        path: a file that ends in .csv, .parquet or .npz, or a recorder's (`plants.logs.recorders.registry`); or a
+            table itself: a mapping from headers to arrays (rows,), or a pandas.DataFrame.
         model: its inputs and measurements must be in the file.
         columns: headers by the symbol or name of a quantity, or "kind:symbol"; "HEADER[UNIT]" with another unit.
         clock_offset: how far a channel's clock is ahead [s].
@@ -80,15 +82,21 @@ def read_log(
         ValueError: if a column is missing, or a value is wrong; it names file, line and column.
     """
     is_file = isinstance(path, (str, PathLike))
-    table = read_table(path) if is_file else table_of(path, name)
-    file = table.file
     for what, given in (("columns", columns), ("clock offsets", clock_offset)):
         if not isinstance(given, Mapping | None):
             raise ValueError(f"{what} must be a mapping from quantities, but got {shown(given)}")
     beside = _described(Path(path)) if is_file else Description()
     said = beside.updated(Description(columns or {}, {}, clock_offset or {}, dt))
     wanted = quantities_of(model)
-    found = find_columns(wanted, table.names, said.columns, said.units, file, needs_time=said.dt is None)
+    form = format_of(path) if is_file else None
+    if form is not None:
+        asked = [text for text in said.columns.values() if isinstance(text, str)]
+        recorded = Recorded(path, form, asked)
+        table, found = recorded.table(recorded.columns(wanted, said.columns, said.units, said.dt is None))
+    else:
+        table = read_table(path) if is_file else table_of(path, name)
+        found = find_columns(wanted, table.names, said.columns, said.units, table.file, said.dt is None)
+    file = table.file
     grid, start = _grid(table, found.get(TIME), said.dt, file)
     offsets = _offsets(said.clock_offset, wanted, found, grid, file)
     source, parts, last = {}, {}, grid.rows - 1
@@ -189,21 +197,22 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str) -> t
         raise ValueError(f"every row must have a time, but there is none in {table.place(row, column.header)}")
     if count <= FEWEST_STEPS:
         raise ValueError(f"a log must have at least {FEWEST_STEPS + 1} rows, but {file} has {count}")
-    steps = np.diff(stamps)
+    own = stamps if table.clock is None else stamps[table.clock]
+    steps = np.diff(own)
     doubled = (steps == 0).sum() > MOST_DOUBLED * len(steps) or len(steps) - (steps == 0).sum() < FEWEST_STEPS
     back = np.flatnonzero(steps <= 0 if doubled else steps < 0)
     if len(back):
         row = int(back[0]) + 1
         raise ValueError(
-            f"times must increase from row to row, but {stamps[row]:.10g} s follows {stamps[row - 1]:.10g} s in "
+            f"times must increase from row to row, but {own[row]:.10g} s follows {own[row - 1]:.10g} s in "
             f"{table.place(row, column.header)}"
         )
-    count = (stamps[-1] - stamps[0]) / (float(np.median(steps[steps > 0])) if dt is None else dt)
+    count = (own[-1] - own[0]) / (float(np.median(steps[steps > 0])) if dt is None else dt)
     if count > MOST_STEPS:
         raise ValueError(
             f"a log must be at most {MOST_STEPS} steps long, but {file} has {count:.3g} from first to last time"
         )
-    return grid_of(stamps, dt), float(stamps[0])
+    return grid_of(stamps, dt, table.clock), float(stamps[0])
 
 
 def _offsets(

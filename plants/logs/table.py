@@ -35,12 +35,14 @@ class Table:
         cells: of each column by name: texts, or an array.
         lines: of the file in which the rows are, counted from 1.
         line_word: the word for a line.
+        clock: rows whose times make the grid, where that are not all (rows,).
     """
 
     file: str
     cells: Mapping[str, Sequence[str] | np.ndarray]
     lines: Sequence[int]
     line_word: str = "line"
+    clock: np.ndarray | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -119,7 +121,10 @@ def read_table(path: str | Path) -> Table:
         raise ValueError(f"a log must be the path of a file, but got {shown(path)}")
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
-        raise ValueError(f"a log must be a file that ends in {', '.join(SUFFIXES)}, but got {shown(str(path))}")
+        from plants.logs.recorders.registry import ENDINGS  # which knows tables
+
+        endings = ", ".join((*SUFFIXES, *ENDINGS))
+        raise ValueError(f"a log must be a file that ends in {endings}, but got {shown(str(path))}")
     try:
         return {".csv": _read_csv, ".parquet": _read_parquet, ".npz": _read_npz}[suffix](Path(path))
     except OSError as error:

@@ -15,6 +15,7 @@ from numerics.extras import to_install
 from numerics.files import write_whole
 from plants.logs.columns import plain
 from plants.logs.log import Log
+from plants.logs.recorders.registry import ENDINGS
 from plants.logs.table import SUFFIXES, read_table
 from plants.logs.units import suffix
 from plants.quantities import Quantity
@@ -35,7 +36,7 @@ def check_suffix(path: str | Path, option: str = "--out", suffixes: tuple[str, .
 def check_not_beside(path: str | Path) -> None:
     """Raise ValueError if a file is, or would be, the description of a log, as run.toml is of run.csv."""
     path = Path(path)
-    logs = [path.with_suffix(suffix) for suffix in SUFFIXES if path.suffix == ".toml"]
+    logs = [path.with_suffix(suffix) for suffix in (*SUFFIXES, *ENDINGS) if path.suffix == ".toml"]
     for log in logs:
         if log.is_file():
             raise ValueError(

@@ -236,7 +236,8 @@ def test_columns_that_are_told_have_to_be_there(tmp_path):
     with pytest.raises(ValueError, match="a log must be a file that can be read, but nowhere.csv is not: No such"):
         read_log("nowhere.csv", MODEL)
     with pytest.raises(
-        ValueError, match="a log must be a file that ends in .csv, .parquet, .npz, but got 'run.txt'"
+        ValueError,
+        match="a log must be a file that ends in .csv, .parquet, .npz, .ulg, .*.h5, .*but got 'run.txt'",
     ):
         read_log("run.txt", MODEL)
 

@@ -48,8 +48,8 @@ def estimate(
         estimates.plot_states()
 
     Args:
-        log: the path of a .csv, .parquet or .npz file; a table, as a pandas.DataFrame or a mapping from headers to
-            arrays; or a `Log`; or a pair (model, log).
+        log: the path of a .csv, .parquet or .npz file, or of a recorder's; a table, as a pandas.DataFrame or a
+            mapping from headers to arrays; or a `Log`; or a pair (model, log).
         tuned: a tuned file or a `Study`: filter, Q, R and the like.
         filter: without these, the name of a filter, or another package's estimator; "ekf" if None.
         model: whose log it is, in place of a thruster: a `StateSpaceModel`, what makes or offers one,

@@ -60,8 +60,8 @@ def identify(
         found.save("mine.toml")
 
     Args:
-        logs: one recorded run or several: paths of .csv, .parquet or .npz files, tables, or `Log`s; or a pair
-            (model, logs).
+        logs: one recorded run or several: paths of .csv, .parquet or .npz files, or of recorders', tables, or
+            `Log`s; or a pair (model, logs).
         free: names of the free parameters; for a thruster its damping, gain and lift by default.
         model: in place of a thruster: a function that returns a `StateSpaceModel` (called with dt, if it takes
             it), a model, "module:object" for either, or a thruster's preset.

@@ -8,6 +8,7 @@ from typing import Any
 from numerics.checks import shown
 from numerics.modules import is_code
 from plants.logs.log import Log
+from plants.logs.recorders.registry import ENDINGS
 from plants.logs.table import SUFFIXES
 from plants.state_space import StateSpaceModel
 from tuning.problems.rooms import room_of_logs
@@ -41,7 +42,7 @@ def whose_logs(logs: Any, model: Any, preset: str | Path | None) -> tuple[Any, A
 def _is_model(one: Any) -> bool:
     """Whether something is a model, what makes or offers one, code, or a thruster's preset, but no log."""
     if isinstance(one, str | Path):
-        if Path(one).suffix in SUFFIXES:  # a log in a folder of Windows has a colon, too
+        if Path(one).suffix in (*SUFFIXES, *ENDINGS):  # a log in a folder of Windows has a colon, too
             return False
         return is_code(str(one)) or room_of_logs().is_preset(one)
     return isinstance(one, StateSpaceModel) or hasattr(one, "state_space_model") or _makes_one(one)
