@@ -44,6 +44,8 @@ class Counted(NDArrayOperatorsMixin):
         self.graph, self.value, self.kind, self.operands = graph, value, kind, operands
 
     def __array_ufunc__(self, ufunc, method, *inputs, out=None):
+        if any(isinstance(x, np.ndarray) and x.ndim for x in inputs):
+            return ufunc(*(x if isinstance(x, np.ndarray) else _entry(x) for x in inputs))
         name, value = ufunc.__name__, ufunc(*(x.value if isinstance(x, Counted) else x for x in inputs))
         if name in COMPARISONS:
             return value
@@ -65,6 +67,21 @@ class Counted(NDArrayOperatorsMixin):
     def view(self, kind: _Converter) -> Counted:
         """The same bits as a number of another type."""
         return self.graph.number(f"as {kind.type.__name__}", (self,), self.value.view(kind.type), None)
+
+
+def _method(name: str) -> Callable:
+    return lambda self: getattr(np, name)(self)
+
+
+for _name in ("sqrt", "sin", "cos", "tan", "exp", "log", "floor", "ceil"):  # NumPy asks entries of arrays for them
+    setattr(Counted, _name, _method(_name))
+
+
+def _entry(x) -> np.ndarray:
+    """A number as an array without axes, so that NumPy takes it for one beside an array's entries."""
+    out = np.array(None)
+    out[()] = x
+    return out
 
 
 class Graph:

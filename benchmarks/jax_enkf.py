@@ -1,8 +1,8 @@
 """The ensemble Kalman filter by hand in JAX: jit, vmap over trajectories, scan over steps, float64 on the CPU.
 
 What a user of JAX would write, but for the equations of motion: these are our own, plain operators that JAX traces
-as they stand. The filter is that of `filters.ensembles.ensemble`, in array code that knows no JAX, so that a test
-can run it on NumPy's arrays.
+as they stand. The filter is that of `filters.ensembles.stochastic`, in array code that knows no JAX, so that a
+test can run it on NumPy's arrays.
 """
 
 from __future__ import annotations

@@ -8,9 +8,9 @@ from filters.baselines.baselines import Inversion, LowPass, OpenLoop
 from filters.engine.batch import Estimates, run
 from filters.engine.belief import Belief, Innovation
 from filters.ensembles.deterministic import DeterministicEnsembleKalmanFilter
-from filters.ensembles.ensemble import EnsembleKalmanFilter
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
 from filters.ensembles.serial import SerialSquareRootFilter
+from filters.ensembles.stochastic import EnsembleKalmanFilter
 from filters.ensembles.transform import EnsembleTransformFilter
 from filters.gaussian.cubature import CubatureKalmanFilter
 from filters.gaussian.extended import ExtendedKalmanFilter

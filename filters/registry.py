@@ -9,9 +9,9 @@ from filters.adaptive.sage_husa import SageHusaFilter
 from filters.adaptive.variational import VariationalBayesFilter
 from filters.baselines.baselines import Inversion, LowPass, OpenLoop
 from filters.ensembles.deterministic import DeterministicEnsembleKalmanFilter
-from filters.ensembles.ensemble import EnsembleKalmanFilter
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
 from filters.ensembles.serial import SerialSquareRootFilter
+from filters.ensembles.stochastic import EnsembleKalmanFilter
 from filters.ensembles.transform import EnsembleTransformFilter
 from filters.estimators.find import foreign_filter, is_foreign, own_filter, parameters_of
 from filters.estimators.foreign import ForeignFilter

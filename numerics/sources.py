@@ -154,16 +154,6 @@ class Source:
         yield
         self._depth -= 1
 
-    def rows_of_members(self, count: int) -> Iterator:
-        """Rows 0 ... count - 1 of a table, for each of its columns j: rows run within columns, or round them."""
-        members = "for j in range(table.shape[1]):"
-        if self.loops:
-            for i in self.range(count):
-                yield from (i for _ in self.inside(members))
-        else:
-            for _ in self.inside(members):
-                yield from range(count)
-
     def totals(self, size: str, places, term: Callable, each: Iterable[str] = ()) -> Local:
         """Sums of terms over members j < size, one for each place.
 

@@ -13,11 +13,15 @@ from collections.abc import Sequence
 from filters import StateSpaceModel
 from filters.differentiated.memory import Memory
 from filters.differentiated.recursion import MOST, Wanted, stages_of
+from filters.ensembles import deterministic, ensemble, stochastic
 from filters.gaussian import extended
 from filters.pages import kernels
 from filters.pages.equations import Equations
+from filters.pages.members import MembersMemory
+from filters.pages.members import stages_of as stages_of_members
 from filters.pages.memory import RowMemory
 from filters.pages.stages import Stage, as_programs
+from numerics.algebra.loops import cut
 from numerics.algebra.matrices import Matrix, in_order
 from numerics.algebra.programs import Place, Program
 from pages.page import make_page
@@ -124,6 +128,36 @@ def program() -> str:
     return block("\n".join(_shown(as_programs(advanced, 0, MOST).values)))
 
 
+def members() -> str:
+    """The ensemble Kalman filter as it stands in a textbook."""
+    functions = ensemble.advance, ensemble.settle, ensemble.compare, stochastic.update
+    return block("\n\n\n".join(inspect.getsource(one).rstrip() for one in functions))
+
+
+def loops() -> str:
+    """The loops of a deterministic ensemble's update, of what they do for each member."""
+    model, kind = body(), deterministic.DeterministicEnsembleKalmanFilter
+    memory = MembersMemory(model.shape, kind.page)
+    equations = Equations(model.functions, memory, constants_move=False, trace=True)
+    update = as_programs(stages_of_members(kind.page, memory, equations)["analyse"], 0, MOST).values
+    ordered = [*(one for _, one in update.reads), *update.works]
+    names = {one.place: f"t{k}" for k, one in enumerate(ordered)}
+    texts = dict(line.split(" = ", 1) for line in _shown(update) if line.startswith("t"))
+    parts = cut(update, model.n)
+    lines = [f"{names[one.place]} = {place}" for place, one in parts.reads]
+    for turn in parts.turns:
+        once = (names[one.place] for one in turn.works if one.operation != "sum")
+        lines += [f"{name} = {texts[name]}" for name in once]
+        for loop in turn.bodies:
+            lines.append("for each member:")
+            inside = [f"{names[one.place]} = {place}" for place, one in loop.reads]
+            inside += [f"{names[one.place]} = {texts[names[one.place]]}" for one in loop.works]
+            inside += [f"{place} = {names[one.place]}" for place, one in loop.stores]
+            inside += [f"{names[one.place]} += {names[one.of[0].place]}" for one in loop.sums]
+            lines += [f"    {line}" for line in inside]
+    return block("\n".join(lines), "text")
+
+
 def _shown(program: Program) -> list[str]:
     """A program's lines, with constants in decimal digits."""
     lines = []
@@ -134,6 +168,7 @@ def _shown(program: Program) -> list[str]:
 
 
 TABLES = {"page": page, "graph": graph, "program": program, "slopes": slopes, "numbers": numbers}
+TABLES |= {"members": members, "loops": loops}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

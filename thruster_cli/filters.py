@@ -13,7 +13,7 @@ import typer
 from rich.console import RenderableType
 from rich.text import Text
 
-from filters.ensembles.ensemble import EnsembleKalmanFilter
+from filters.ensembles.stochastic import EnsembleKalmanFilter
 from filters.filter import Filter
 from filters.registry import FILTERS, filter_class, tunable_numbers
 from thruster_cli.fitting import fit_table, fits_of

@@ -86,7 +86,7 @@ def programs_of(filter_: Filter) -> FilterPrograms:
         _check_traced("transition", f, by_f, 2, shape)
         _check_traced("observe", h, by_h, 1, shape)
         equations = Equations(model.functions, memory, constants_move=False, trace=True)
-        stages = [dict(one.values) for one in stages_of(page, memory, equations)]
+        stages = [one.of_rows for one in stages_of(page, memory, equations)]
         kept = {name: one.shape for name, one in memory.kept.items()}
         if wrong := [name for name in kept if name in TOLD or not is_name(name)]:
             raise ValueError(f"what a filter in C keeps must have a name that is free there, but got {wrong[0]!r}")

@@ -2,120 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, lru_cache
 from typing import ClassVar
 
-from filters.engine.layout import own_place
-from filters.ensembles.deterministic import member_mover, moved_member
-from filters.ensembles.ensemble import EnsembleFilter, measurement_moments, silencer
-from filters.ensembles.members import row_covariances, row_means
-from filters.ensembles.transform import geometric_mean, transform_gain
-from numerics import matrices
+from filters.ensembles.ensemble import EnsembleFilter, advance, compare, expect, settle
+from filters.pages.page_filter import Page
+from numerics.algebra.geometric import geometric_mean
+from numerics.algebra.members import covariance, mean
+from numerics.algebra.operations import divide, only, present, wrap
 from numerics.checks import at_least
-from numerics.compiled import inlined
-from numerics.sources import Source, entrywise, is_array
-from numerics.tuples import column_writer, vector_reader, zeros_of
-from plants.layout import constants_reader
-from plants.shape import Shape, innovation_of
 
-MOST_ITERATIONS = 1000
+MOST_ITERATIONS = 20  # that are written out
 
 
-@cache
-def transform_undone(n: int, m: int) -> Callable:
-    """Return `undone(table, j, means, d)`: y_j - mean(y) + D Y_j, (m,), with y in rows n ... and Y after them.
-
-    The means are those of the rows, d is (m, m).
-    """
-    source = Source("undone", "table, j, means, d", result=(m,), means=(n + 2 * m,), d=(m, m))
-
-    def entry(i):
-        first = f"table[{n + i}, j] - means[{n + i}]"
-        return source.less(first, (f"d[{i}][{k}] * table[{n + m + k}, j]" for k in source.range(m)), "+")
-
-    return source.function(source.vector(m, entry))
-
-
-@cache
-def linear_prediction(m: int) -> Callable:
-    """Return `predict(e, d, s, r, w)`: (E + D (S - R)) w, (m,), what the latest slopes make of the last move."""
-    square = m, m
-    source = Source("predict", "e, d, s, r, w", result=(m,), e=square, d=square, s=square, r=square, w=(m,))
-    v = source.local("v", m)
-    for i in source.range(m):
-        terms = (f"(s[{i}][{k}] - r[{i}][{k}]) * w[{k}]" for k in source.range(m))
-        source.line(f"{v[i]} = {source.sum(terms)}")
-
-    def entry(i):
-        return source.sum(f"e[{i}][{k}] * w[{k}] + d[{i}][{k}] * {v[k]}" for k in source.range(m))
-
-    return source.function(source.vector(m, entry))
-
-
-@lru_cache(maxsize=64)
-def iterated_analysis(observe: Callable, shape: Shape) -> Callable:
-    """The analysis of the iterated ensemble Kalman filter; see `ensemble_kernels`."""
-    n, m = shape.n, shape.m
-    slopes, iterations_place = n + m, own_place(shape) + 2  # Y lies in rows n + m ... of the table
-    compare, gain, geometric = measurement_moments(observe, shape), transform_gain(n, m), geometric_mean(m)
-    constants, measured, difference = constants_reader(shape), vector_reader(m), innovation_of(shape, n)
-    store_predicted, store_slopes = column_writer(m, n), column_writer(m, slopes)
-    move, moved, undone, predict = (
-        member_mover(n, m, slopes),
-        moved_member(n, m, slopes),
-        transform_undone(n, m),
-        linear_prediction(m),
-    )
-    add, factor, solve = matrices.symmetric_sum(m), matrices.cholesky_factor(m), matrices.row_solver(m, m)
-    apply, solve_one, means_of = matrices.vector_multiplier(n, m), matrices.vector_solver(m), row_means(n + m)
-    of_predicted_and_slopes, of_slopes = row_covariances(n, m, slopes, m), row_covariances(slopes, m, slopes, m)
-    of_states_and_slopes, none = row_covariances(0, n, slopes, m), zeros_of(m)
-    silence = silencer(n, shape.measurement_angles)
-    total = entrywise("total", "a, b", (m,), lambda i: f"a[{i}] + b[{i}]", a=(m,), b=(m,))
-    source = Source("with_slopes", "means", result=(n + 2 * m,), means=(n + m,))
-    known = source.local("known", n + 2 * m)
-    for i in source.range(n + m):
-        source.line(f"{known[i]} = means[{i}]")
-    for i in source.range(n + m, n + 2 * m):
-        source.line(f"{known[i]} = 0.0")
-    with_slopes = source.function(source.whole(known))
-
-    at_once, store_state = is_array(n, m), column_writer(n)
-
-    @inlined
-    def analyse(memory, z, numbers, size):
-        expected, innovation, cross, s, r, root = compare(memory, z, numbers, size)
-        _, table, _ = memory
-        for i in range(m):
-            for j in range(table.shape[1]):
-                table[slopes + i, j] = table[n + i, j] - expected[i]
-        c, present = constants(numbers), measured(z)
-        w = solve_one(innovation, root)
-        shift, g = apply(cross, w), gain(cross, s, r, root)
-        for _ in range(1, int(numbers[iterations_place])):
-            for j in range(table.shape[1]):
-                store_predicted(table, j, observe(moved(table, j, shift, g, none()), c))
-            silence(table, z, size)
-            means = with_slopes(means_of(table, size))
-            e = of_predicted_and_slopes(table, size, means)
-            d = solve(e, factor(add(r, geometric(r, s))))
-            for j in range(table.shape[1]):
-                store_slopes(table, j, undone(table, j, means, d))
-            misfit = total(difference(present, means), predict(e, d, s, r, w))
-            cross = of_states_and_slopes(table, size, means)
-            s = add(of_slopes(table, size, means), r)
-            root = factor(s)
-            w = solve_one(misfit, root)
-            shift, g = apply(cross, w), gain(cross, s, r, root)
-        if at_once:
-            move(table, shift, g, none())
-        else:
-            for j in range(table.shape[1]):
-                store_state(table, j, moved(table, j, shift, g, none()))
-
-    return analyse
+def update(model, x, z, e):
+    """The measurement z; channels that are NaN are missing. Y are the slopes of h along the members' distances."""
+    Y, C, v, S, R, level = compare(model, x, z)
+    told = v, S, level
+    for _ in range(1, model.own.iterations):
+        middle = geometric_mean(R, S)
+        y = expect(model, x + (divide(C, S) @ v - divide(C, S + middle) @ Y), z)
+        E = covariance(y, Y)
+        D = divide(E, R + middle)
+        moved = divide(E + D @ (S - R), S) @ v
+        v = only(present(z), wrap(z - mean(y), model.measurement_angles)) + moved
+        Y = y - mean(y) + D @ Y
+        C, S = covariance(x, Y), covariance(Y, Y) + R
+    return x + (divide(C, S) @ v - divide(C, S + geometric_mean(R, S)) @ Y), *told
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,7 +52,7 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     magnifies any nonlinearity of h along unobserved directions, and iterations gain little.
 
     Attributes:
-        iterations: evaluations of h by all members in an update, at least 1. The others are those of
+        iterations: evaluations of h by all members in an update, 1 to 20. The others are those of
             `EnsembleFilter`.
 
     Raises:
@@ -152,19 +65,11 @@ class IteratedEnsembleKalmanFilter(EnsembleFilter):
     """
 
     name: ClassVar[str] = "ienkf"
+    page: ClassVar[Page] = Page(advance, settle, update)
+    unrolled: ClassVar[tuple[str, ...]] = ("iterations",)
     iterations: int = 3
-
-    @property
-    def analysis(self) -> Callable:
-        """The update, as `ensemble_kernels` takes it."""
-        return iterated_analysis
 
     def __post_init__(self):
         """Check the parameters; raise ValueError that states the rule and the value."""
         super().__post_init__()
         object.__setattr__(self, "iterations", at_least("iterations", self.iterations, 1, MOST_ITERATIONS))
-
-    @property
-    def own_numbers(self) -> tuple[float, ...]:
-        """Inflation, relaxation, iterations."""
-        return (*super().own_numbers, float(self.iterations))

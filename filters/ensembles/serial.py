@@ -2,39 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import ClassVar
 
-from filters.ensembles.deterministic import DeterministicUpdateFilter, deterministic_analysis
-from numerics import matrices
-from numerics.compiled import inlined
-from numerics.sources import entrywise
-from plants.shape import Shape
+from filters.ensembles.deterministic import DeterministicUpdateFilter
+from filters.ensembles.ensemble import advance, compare, settle
+from filters.pages.page_filter import Page
+from numerics.algebra.blocks import triangle_quotient
+from numerics.algebra.operations import divide
+from numerics.algebra.points import root
 
 
-@cache
-def serial_gain(n: int, m: int) -> Callable:
-    """Return `gain(cross, s, r, root)`: G = K L (L + M)^-1 with L and M the lower triangular roots of S and R.
-
-    Shapes: cross (n, m), s, r and root (m, m).
-    """
-    solve, times, divide = matrices.row_solver(n, m), matrices.multiplier(n, m, m), matrices.triangle_divider(n, m)
-    factor = matrices.cholesky_factor(m)
-    add = entrywise("add", "a, b", (m, m), lambda i, j: f"a[{i}][{j}] + b[{i}][{j}]", a=(m, m), b=(m, m))
-
-    @inlined
-    def gain(cross, s, r, root):
-        return divide(times(solve(cross, root), root), add(root, factor(r)))
-
-    return gain
-
-
-@cache
-def serial_analysis(observe: Callable, shape: Shape) -> Callable:
-    """The analysis of the serial ensemble square root filter; see `ensemble_kernels`."""
-    return deterministic_analysis(serial_gain(shape.n, shape.m), observe, shape)
+def update(model, x, z, e):
+    """The measurement z; channels that are NaN are missing."""
+    d, C, v, S, R, level = compare(model, x, z)
+    K, L, M = divide(C, S), root(S), root(R)
+    return x + (K @ v - triangle_quotient(K @ L, L + M) @ d), v, S, level
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -61,8 +44,4 @@ class SerialSquareRootFilter(DeterministicUpdateFilter):
     """
 
     name: ClassVar[str] = "ensrf"
-
-    @property
-    def analysis(self) -> Callable:
-        """The update, as `ensemble_kernels` takes it."""
-        return serial_analysis
+    page: ClassVar[Page] = Page(advance, settle, update)

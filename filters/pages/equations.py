@@ -17,7 +17,7 @@ from typing import Self
 from filters.pages.at_points import called_at_points
 from filters.pages.differences import called_parts
 from filters.pages.memory import NumbersMemory
-from filters.pages.traced import traced_model
+from filters.pages.traced import not_known, traced_model
 from numerics.algebra.matrices import Matrix, Operation, never, plus, through
 from plants.shape import Functions
 
@@ -27,7 +27,8 @@ class PagedModel:
 
     Attributes:
         Q, R: its covariances.
-        Q_root, prior_root: lower triangular roots of Q and of the prior covariance.
+        Q_root, R_root, prior_root: lower triangular roots of Q, R and the prior covariance.
+        prior_mean: of the state.
         own: the filter's parameters.
         kept: what the filter keeps besides mean and covariance, by name.
         state_angles, measurement_angles: flags of components that are angles.
@@ -37,7 +38,8 @@ class PagedModel:
         """Take where the model's numbers lie."""
         shape, self._constants = memory.shape, memory.constants
         self.state_angles, self.measurement_angles = shape.state_angles, shape.measurement_angles
-        self.Q, self.R, self.Q_root, self.prior_root = memory.Q, memory.R, memory.Q_root, memory.prior_root
+        self.Q, self.R, self.Q_root, self.R_root = memory.Q, memory.R, memory.Q_root, memory.R_root
+        self.prior_mean, self.prior_root = memory.prior_mean, memory.prior_root
         self.own, self.kept = memory.own, memory.kept
 
     def at(self, constants: Matrix) -> Self:
@@ -54,8 +56,20 @@ class Equations(PagedModel):
         called: if functions are to be called, those that work out the model's operations.
     """
 
-    def __init__(self, functions: Functions, memory: NumbersMemory, *, constants_move: bool, trace: bool):
-        """Take the model's functions, where its numbers lie, and whether parameters move its constants."""
+    def __init__(
+        self,
+        functions: Functions,
+        memory: NumbersMemory,
+        *,
+        constants_move: bool,
+        trace: bool,
+        partly: bool = False,
+    ):
+        """Take the model's functions, where its numbers lie, and whether parameters move its constants.
+
+        They are traced, or to be called. If they are traced `partly`, what needs one that cannot be traced raises
+        TypeError when it is worked out; else that is raised here.
+        """
         shape = memory.shape
         super().__init__(memory)
         self._scales = memory.scales
@@ -64,7 +78,7 @@ class Equations(PagedModel):
         chosen = functions, shape
         parts: list[tuple[Callable, ...]]
         if trace:
-            traced = traced_model(functions, shape)
+            traced = traced_model(functions, shape, partly)
             parts = [one.parts for one in traced]
             self._parts_at_points: Callable = lambda which, points: traced[which == "sight"].of_points
         else:
@@ -99,7 +113,7 @@ class Equations(PagedModel):
         """An equation (x, ..., c) and its Jacobian (x, scales, ..., c); their derivatives are operations, too."""
         shapes = (rows,), (rows, n), (rows,), (rows, n), (n, rows, n), (rows, n)
         made = [
-            Operation(part if trace else _not_known, lambda *_, shape=shape: shape, never)
+            Operation(part if trace else not_known, lambda *_, shape=shape: shape, never)
             for part, shape in zip(parts, shapes, strict=False)
         ]
         value, matrix, by_constants, slope, *curved = made
@@ -134,7 +148,7 @@ class Equations(PagedModel):
             return self._of_points[key]
         parts, rows = self._parts_at_points(*key), self._rows[which]
         value, slope = (
-            Operation(part if self._traced else _not_known, lambda x, *_: (rows, x[1]), never) for part in parts
+            Operation(part if self._traced else not_known, lambda x, *_: (rows, x[1]), never) for part in parts
         )
         value.name, slope.name = f"{which}_of_points", f"d_{which}_of_points"
         self._of_points[key] = value
@@ -147,7 +161,3 @@ class Equations(PagedModel):
             return slope(x, self._scales, *others, slopes[0], *self._moves)
 
         return value
-
-
-def _not_known(*arguments):
-    raise TypeError("a function that is called computes nothing of numbers that are not known yet")

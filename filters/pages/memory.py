@@ -31,6 +31,8 @@ class NumbersMemory:
         self.Q = self.beside("numbers", places.q, n, n, symmetric=True)
         self.R = self.beside("numbers", places.r, m, m, symmetric=True)
         self.Q_root = self.beside("numbers", places.q_root, n, n)
+        self.R_root = self.beside("numbers", places.r_root, m, m)
+        self.prior_mean = self.beside("numbers", places.prior_mean, n)
         self.prior_root = self.beside("numbers", places.prior_root, n, n)
         self.scales = self.beside("numbers", places.scales, n)
         self.constants = self.beside("numbers", places.constants, shape.constants)

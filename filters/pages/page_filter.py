@@ -14,12 +14,12 @@ from filters.filter import Filter
 from filters.pages.kernels import page_kernels
 from filters.pages.page import Page
 
-__all__ = ["Page", "PageFilter"]
+__all__ = ["FilterWithPage", "Page", "PageFilter"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class PageFilter(Filter):
-    """Base of filters that have a page; subclasses name it, and add their parameters as fields.
+class FilterWithPage(Filter):
+    """What filters that have a page share; subclasses name it, and add their parameters as fields.
 
     Attributes:
         page: its functions.
@@ -51,6 +51,11 @@ class PageFilter(Filter):
         own = tuple((name, np.shape(value)) for name, value in self.parameters.items())
         return self.page._replace(own=own, fixed=tuple((name, getattr(self, name)) for name in self.unrolled))
 
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class PageFilter(FilterWithPage):
+    """Base of filters that have a page of mean and covariance; see `FilterWithPage`."""
+
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""
         return page_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)
@@ -59,5 +64,5 @@ class PageFilter(Filter):
 def with_page(filter_: Filter, what: str) -> PageFilter:
     """A filter that has a page; of another one raise ValueError, which says what it was to be."""
     if not isinstance(filter_, PageFilter):
-        raise ValueError(f"{what} must be a filter with a page, such as 'ekf', but got {filter_.name!r}")
+        raise ValueError(f"{what} must have a page of mean and covariance, as 'ekf' has, but got {filter_.name!r}")
     return filter_

@@ -12,7 +12,7 @@ from filters.pages.stages import Stage, as_calls, as_programs
 from filters.pages.traced import MOST
 from numerics.algebra.graphs import uncollected
 from numerics.algebra.matrices import Matrix
-from numerics.algebra.programs import OF_STEPS, callable_of
+from numerics.algebra.programs import BY_MEMBERS, OF_STEPS, Place, callable_of
 from plants.layout import LANES, constants_reader
 from plants.shape import Functions, Shape
 
@@ -61,12 +61,14 @@ def stored(results: tuple, targets: Sequence[Matrix | int], kept: Mapping[str, M
     """
     *values, changed = with_kept(results)
     places = [*targets, *((kept or {})[name] for name in changed)]
-    stores = {}
+    stores: dict[int | Place, Matrix] = {}
     for place, value in zip(places, (*values, *changed.values()), strict=True):
         if isinstance(place, Matrix):
             if place.symmetric and not value.symmetric or place.shape != value.shape:
                 raise TypeError(f"a page must return the symmetric part of {value!r}, by sym, and {place.shape}")
-            place = place.operation.at
+            place = place.operation
+        if value.member and not (isinstance(place, Place) and place.array in BY_MEMBERS):
+            raise TypeError(f"a page must return {value!r} of all members, such as a mean, not of each")
         stores[place] = value
     return Stage(stores, {})
 

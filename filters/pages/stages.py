@@ -27,20 +27,26 @@ FREE = ("given", "constant", *DECISIONS)  # operations whose results are at hand
 class Stage(NamedTuple):
     """What a stage leaves in memory: values in `rows`, and in `change` what is a parameter's."""
 
-    values: dict[int, Matrix]
+    values: dict[int | Place, Matrix]
     slopes: dict[int, Matrix]
+
+    @property
+    def of_rows(self) -> dict[int, Matrix]:
+        """Values in `rows` by their places: all of a filter without an ensemble."""
+        return {at: one for at, one in self.values.items() if not isinstance(at, Place)}
 
     @property
     def stores(self) -> tuple[list[tuple[Place, Matrix]], list[tuple[Place, Matrix]]]:
         """Places of all values, then of all slopes."""
-        values = [(Place("rows", at), one) for at, one in self.values.items()]
+        values = [(at if isinstance(at, Place) else Place("rows", at), one) for at, one in self.values.items()]
         return values, [(Place("change", at), one) for at, one in self.slopes.items()]
 
 
 def stage_of(values: Mapping[int, Matrix], slopes: Mapping[int, Matrix], moves: Mapping[Matrix, Matrix]) -> Stage:
     """A stage that stores matrices at some places, and slopes of matrices at others."""
     found = slopes_of(list(slopes.values()), moves)
-    return Stage(dict(values), {at: one for at, one in zip(slopes, found, strict=True) if one is not None})
+    kept: dict[int | Place, Matrix] = {at: one for at, one in values.items()}
+    return Stage(kept, {at: one for at, one in zip(slopes, found, strict=True) if one is not None})
 
 
 class Made(NamedTuple):
@@ -75,20 +81,21 @@ def as_programs(stage: Stage, first: int, most: int) -> Made:
     return Made(program_of(values, {}), program_of(slopes, rows), first + len(kept))
 
 
-def numbers_of(wanted: Sequence[Matrix], number: Callable[[Place], Number]) -> dict[Matrix, Any]:
+def numbers_of(wanted: Sequence[Matrix], number: Callable[..., Number]) -> dict[Matrix, Any]:
     """The entries `number(place)` of all matrices that are given of which some are made.
 
-    Of a symmetric one those on and below the diagonal are read.
+    Of a symmetric one those on and below the diagonal are read; of a member's `number` is told `member=True`.
     """
     return {one: _entries(one, number) for one in in_order(wanted) if isinstance(one.operation, Place)}
 
 
-def _entries(one: Matrix, number: Callable[[Place], Number]) -> Any:
+def _entries(one: Matrix, number: Callable[..., Number]) -> Any:
     array, start = one.operation
     found = np.empty(one.shape, dtype=object)
     for at in np.ndindex(*one.shape):
         there = tuple(sorted(at, reverse=True)) if one.symmetric else at
-        found[at] = number(Place(array, start + int(np.ravel_multi_index(there, one.shape)) if at else start))
+        place = Place(array, start + int(np.ravel_multi_index(there, one.shape)) if at else start)
+        found[at] = number(place, member=True) if one.member else number(place)
     return found if one.shape else found[()]
 
 

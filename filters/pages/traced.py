@@ -21,10 +21,11 @@ POINTS = ((0.1, 0.5), (1.0, 1.0), (1.0, 2.5), (10.0, 4.0))  # magnitudes and pha
 
 
 @lru_cache(maxsize=64)
-def traced_model(functions: Functions, shape: Shape) -> tuple[Traced, Traced]:
-    """A model's f and h, traced once for all filters; TypeError where they cannot be."""
+def traced_model(functions: Functions, shape: Shape, partly: bool = False) -> tuple[Traced | Untraced, ...]:
+    """A model's f and h, traced once for all filters; where one cannot be, TypeError or, `partly`, a stand-in."""
     f, by_f, h, by_h = functions
-    return Traced(f, by_f, 2, shape), Traced(h, by_h, 1, shape)
+    make: Callable = traced_if_possible if partly else Traced
+    return make(f, by_f, 2, shape), make(h, by_h, 1, shape)
 
 
 class Traced:
@@ -104,6 +105,27 @@ class Traced:
         of_constants = [(given[-1], dc) for dc in moves[:1]]
         pairs = zip(points.T, changes.T, strict=True)
         return np.array([_along(self._value(x, *given), (x, dx), *of_constants) for x, dx in pairs]).T
+
+
+class Untraced:
+    """A function of a model that cannot be traced."""
+
+    def __init__(self):
+        """Nothing is known of it."""
+        self.parts, self.of_points = (not_known,) * 4, (not_known,) * 2
+
+
+def traced_if_possible(*arguments) -> Traced | Untraced:
+    """A function traced, as `Traced` takes it; of one that cannot be traced a stand-in."""
+    try:
+        return Traced(*arguments)
+    except Exception:  # whatever a user's function raises of numbers that it does not know
+        return Untraced()
+
+
+def not_known(*arguments):
+    """In place of a function that can only be called."""
+    raise TypeError("a function that is called computes nothing of numbers that are not known yet")
 
 
 def _values_at(arguments: list, functions: Sequence[Callable | None]) -> np.ndarray:

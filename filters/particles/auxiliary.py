@@ -9,7 +9,7 @@ from typing import ClassVar
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
-from filters.ensembles.members import add_noise, ensemble_motion
+from filters.particles.motion import add_noise, ensemble_motion
 from filters.particles.regularisation import kernel_spreader
 from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
 from filters.particles.weights import (

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
-from filters.ensembles.members import ensemble_motion
+from filters.particles.motion import ensemble_motion
 from filters.particles.regularisation import kernel_spreader
 from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
 from filters.particles.weights import read_weights, systematic_resampler

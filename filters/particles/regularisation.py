@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import cache
 
 from filters.engine.layout import memory_places, own_place
-from filters.ensembles.members import add_noise, drawer
+from filters.particles.motion import add_noise, drawer
 from numerics import matrices
 from numerics.compiled import inlined
 from numerics.streams import FILTER_KERNEL

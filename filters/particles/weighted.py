@@ -10,8 +10,9 @@ from typing import ClassVar, NamedTuple
 
 from filters.engine.belief import Belief
 from filters.engine.layout import memory_places, row_access
-from filters.ensembles.ensemble import LARGEST_ENSEMBLE, silencer
+from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.filter import Filter
+from filters.particles.motion import silencer
 from filters.particles.weights import normalise, read_weights, weighted_covariances, weighted_means
 from numerics import matrices
 from numerics.angles import row_aligner

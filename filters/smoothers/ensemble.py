@@ -14,10 +14,7 @@ from filters.engine.compile import new_memory
 from filters.engine.layout import memory_places
 from filters.engine.restart import restart_if_lost
 from filters.ensembles.ensemble import EnsembleFilter
-from filters.ensembles.members import row_covariances, row_means
-from numerics.angles import NAMES, short_way
 from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from numerics.sources import Source
 from numerics.threads import spread
 from numerics.tuples import joiner, vector_part, written_out
 from plants.state_space import StateSpaceModel
@@ -41,11 +38,11 @@ def smooth_ensembles(
         raise ValueError(f"a smoothed filter must have rotations 0, but got {rotations}")
     paired = dataclasses.replace(filter_, model=_paired_model(filter_.kernel_model))
     kernels, pair_kernels, size = filter_.kernels(), paired.kernels(), filter_.size
-    analyse_pair = filter_.analysis(paired.model.functions.observe, paired.model.shape)
+    analyse_pair = filter_.analysis(paired.model.functions, paired.model.shape)
     count, times, _ = measurements.shape
     n = kernels.n
     means, covs = np.empty((count, times, n)), np.empty((count, times, n, n))
-    smooth = _smoother(kernels, analyse_pair, filter_.kernel_model.shape.state_angles, is_interpreting())
+    smooth = _smoother(kernels, analyse_pair, is_interpreting())
 
     def part(first: int, last: int) -> None:
         now, pair = new_memory(kernels, size), new_memory(pair_kernels, size)
@@ -83,29 +80,14 @@ def _paired_functions(transition: Callable, observe: Callable, n: int) -> tuple[
     return moves, written_out("observe", "x, c", "h(now(x), c)", h=observe, now=now)
 
 
-@cache
-def step_writers(n: int, angles: tuple[bool, ...]) -> tuple[Callable, Callable]:
-    """Functions `write(a, b, k, x)`: a vector (n,), its angles in (-pi, pi], and a matrix (n, n), into a[b, k]."""
-    vector, matrix = Source("write", "a, b, k, x", x=(n,)), Source("write", "a, b, k, x", x=(n, n))
-    for i in vector.range(n):
-        vector.line(f"a[b, k, {i}] = {short_way(f'x[{i}]', i, angles)}")
-    for i in matrix.range(n):
-        for j in matrix.range(n):
-            matrix.line(f"a[b, k, {i}, {j}] = x[{i}][{j}]")
-    return vector.function(**NAMES), matrix.function()
-
-
 @lru_cache(maxsize=64)
-def _smoother(
-    kernels: Kernels, analyse_pair: Callable, angles: tuple[bool, ...], interpreting: bool
-) -> CompiledOrPython:
+def _smoother(kernels: Kernels, analyse_pair: Callable, interpreting: bool) -> CompiledOrPython:
     n, m = kernels.n, kernels.m
     start, predict, update, restart = kernels.start, kernels.predict, kernels.update, restart_if_lost(kernels)
     places, pair_places = memory_places(n, m), memory_places(2 * n, m)
     key_0, key_1, step, divergences = places.key_0, places.key_1, places.step, places.divergences
     pair_key_0, pair_key_1, pair_step = pair_places.key_0, pair_places.key_1, pair_places.step
-    means_of, covariances_of = row_means(n), row_covariances(0, n, 0, n)
-    write_mean, write_cov = step_writers(n, angles)
+    mean, cov, summarise = places.mean, places.cov, kernels.summarise
     fingerprint = function_fingerprint(start, predict, update, analyse_pair, within=__name__)
 
     @inlined
@@ -161,8 +143,10 @@ def _smoother(
                     keep(history, past, pair_table, n)
             for k in range(times):
                 recall(table, 0, history, k)
-                mean = means_of(table, size)
-                write_mean(means, b, k, mean)
-                write_cov(covs, b, k, covariances_of(table, size, mean))
+                summarise(now, size)
+                for i in range(n):
+                    means[b, k, i] = row[mean + i]
+                    for j in range(n):
+                        covs[b, k, i, j] = row[cov + i * n + j]
 
     return CompiledOrPython(smooth)

@@ -74,7 +74,7 @@ class _Part:
     """A stage, of tensors in the places that it reads."""
 
     def __init__(self, stage: Stage):
-        self._wanted = {Place("rows", at): one for at, one in stage.values.items()}
+        self._wanted = {Place("rows", at): one for at, one in stage.of_rows.items()}
         self._order = in_order(list(self._wanted.values()))
         self.given = [one for one in self._order if isinstance(one.operation, Place)]
 

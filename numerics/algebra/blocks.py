@@ -92,6 +92,16 @@ def forward_quotient(lower, v):
 
 
 @operation(same)
+def triangle_quotient(a, lower):
+    """A L^-1 of a lower triangular L."""
+    found = np.array(a)
+    for i in reversed(range(len(lower))):
+        rest = found[:, i] - sum(found[:, k] * lower[k, i] for k in range(i + 1, len(lower)))
+        found[:, i] = rest * (1.0 / lower[i, i])
+    return found
+
+
+@operation(same)
 def factor_of(lower):
     """The factor of S = L L', as `operations.factor` makes it of S."""
     d = np.diag(lower)

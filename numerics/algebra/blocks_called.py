@@ -77,5 +77,6 @@ FUNCTIONS: dict[Operation, Callable] = {
     blocks.part: lambda result, top, left, rows, columns, a: part_of(rows, columns, a, top, left),
     blocks.zeros: lambda result, *others: written_out("zeros", "a", "zero()", zero=zeros_of(*result)),
     blocks.forward_quotient: lambda result, lower, v: made.forward_solver(*v),
+    blocks.triangle_quotient: lambda result, a, lower: made.triangle_divider(*a),
     blocks.factor_of: lambda result, lower: written_out("same", "a", "a"),
 }

@@ -18,7 +18,15 @@ from typing import Any
 import numpy as np
 
 from numerics import matrices as made
-from numerics.algebra import blocks_called, densities, matrices, operations, points_called
+from numerics.algebra import (
+    blocks_called,
+    densities,
+    geometric,
+    matrices,
+    members_called,
+    operations,
+    points_called,
+)
 from numerics.algebra.matrices import Matrix, Operation, in_order
 from numerics.algebra.programs import ARRAYS, Place
 from numerics.angles import NAMES, short_way
@@ -54,20 +62,35 @@ def calls_of(
             continue
         if one in known:
             at = known[one]
-            text = _read(at, one.shape) if isinstance(at, Place) else call(f"read_{value}", at, "numbers")
+            text = _read(at, one) if isinstance(at, Place) else call(f"read_{value}", at, "numbers")
+        elif any(a.member for a in one.of):
+            function, sized = _of_members(one, functions)
+            text = call(f"work_{value}", function, *(values[a] for a in one.of), *["size"] * sized)
         else:
             function = functions[one.operation] if one.operation in functions else function_of(one)
             text = call(f"work_{value}", function, *(values[a] for a in arguments_of(one)))
         lines.append(f"{value} = {text}")
     for place, one in stores:
-        lines += _stored(place, one.shape, values[one])
-    loops = any(is_array(*one.shape) for one in values if one.shape)
+        lines += _stored(place, one, values[one])
+    loops = any(one.member or is_array(*one.shape) for one in values if one.shape)
     return written_out("work", ", ".join(arrays), *lines, "None", _loops=loops, **names)
 
 
-def _read(place: Place, shape: tuple[int, ...]) -> str:
+def _of_members(one: Matrix, functions: Mapping[Operation, Callable]) -> tuple[Callable, bool]:
+    """The function of an operation on members, and whether it takes their number, too."""
+    if one.operation not in functions:
+        return members_called.function_of(one)
+    n, others = one.arguments[0].shape[0], len(one.of) - 1
+    return members_called.each(functions[one.operation], n, one.shape[0], others), False
+
+
+def _read(place: Place, one: Matrix) -> str:
     """Source of what lies at a place: tuples of its numbers, or a part of the memory itself."""
-    array, first = place
+    (array, first), shape = place, one.shape
+    if one.member:
+        if array == "table":
+            return f"table[{first}:{first + shape[0]}]"
+        return f"{array}[: {shape[0]} * table.shape[1]].reshape(({shape[0]}, table.shape[1]))"
     if not shape:
         return f"{array}[{first}]"
     if _is_array(shape):
@@ -78,9 +101,12 @@ def _read(place: Place, shape: tuple[int, ...]) -> str:
     return matrix_of(rows[0], columns, lambda i, j: f"{array}[{first + i * columns + j}]")
 
 
-def _stored(place: Place, shape: tuple[int, ...], value: str) -> list[str]:
+def _stored(place: Place, one: Matrix, value: str) -> list[str]:
     """Lines that store a value."""
-    array, first = place
+    (array, first), shape = place, one.shape
+    if array == "table":
+        loops = [f"for i in range({shape[0]}):", "    for j in range(table.shape[1]):"]
+        return [*loops, f"        table[{first} + i, j] = {value}[{'i, j' if one.member else 'i'}]"]
     if _is_array(shape):
         names, strides = "ijk"[: len(shape)], (prod(shape[k + 1 :]) for k in range(len(shape)))
         at = " + ".join(f"{name} * {stride}" for name, stride in zip(names, strides, strict=True))
@@ -255,4 +281,6 @@ _FUNCTIONS: dict[Operation, Callable] = {
     densities.outlier_weight: _of_tail(WEIGHT),
     **points_called.FUNCTIONS,
     **blocks_called.FUNCTIONS,
+    **members_called.FUNCTIONS,
+    **geometric.FUNCTIONS,
 }

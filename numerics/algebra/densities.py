@@ -27,7 +27,7 @@ def log_density(v, s, seen):
 def density(v, of, seen):
     """The same, of the factor of S."""
     lower, d = of
-    y = forward(v, lower)
+    y = forward(np.ravel(v), lower)
     logs = (where(seen[i], 0.5 * np.log(d[i]) + LEVEL, 0.0) for i in range(len(d)))
     return -sum(0.5 * y[i] * y[i] / d[i] for i in range(len(d))) - sum(logs)
 

@@ -70,9 +70,11 @@ class Graph:
             self.numbers.append(found)
         return found
 
-    def given(self, name: Hashable) -> Number:
+    def given(self, name: Hashable, *, member: bool = False) -> Number:
         """A number that is known when the graph is worked out: its name, or where it lies."""
-        return self.make("given", name)
+        found = self.make("given", name)
+        found.member = member
+        return found
 
     def constant(self, value: float) -> Number:
         """A number that is known now."""
@@ -91,9 +93,10 @@ class Number:
         of: the Numbers among the arguments.
         place: its index in the graph.
         value: what a constant is; None for others.
+        member: whether it is one number for each member of an ensemble.
     """
 
-    __slots__ = ("graph", "operation", "arguments", "of", "place", "value")
+    __slots__ = ("graph", "operation", "arguments", "of", "place", "value", "member")
     sqrt: Callable[[], Number]  # and so on, as UNARY has them
     log: Callable[[], Number]
     floor: Callable[[], Number]
@@ -104,6 +107,7 @@ class Number:
         self.graph, self.operation, self.arguments, self.place = graph, operation, arguments, place
         self.of: tuple[Number, ...] = tuple([a for a in arguments if isinstance(a, Number)])
         self.value = float.fromhex(arguments[0]) if operation == "constant" else None
+        self.member: bool = operation != "sum" and any([a.member for a in self.of])
 
     def __repr__(self) -> str:
         return f"<number {self.place}: {self.operation}>"
@@ -227,6 +231,23 @@ def arctan2(y, x):
     if known is None:
         return np.arctan2(y, x)
     return worked_out("arctan2", known.graph.number(y), known.graph.number(x))
+
+
+def over_members(a: Number) -> Number:
+    """The sum of a number that each member of an ensemble has."""
+    return a.graph.make("sum", a) if a.member else a * size_of(a)
+
+
+def size_of(a: Number) -> Number:
+    """The number of members, beside a number."""
+    return a.graph.make("size")
+
+
+def called(name: str, count: int, *numbers: Number) -> list[Number]:
+    """What a function that is compiled as it is makes of numbers; its name is that in `programs.CALLED`."""
+    graph = numbers[0].graph
+    call = graph.make("call", name, count, *numbers)
+    return [graph.make("entry", call, k) for k in range(count)]
 
 
 def needed_by(numbers: Iterable[Number], known: Container[int] = ()) -> list[Number]:

@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from llvmlite import ir  # type: ignore[import-untyped]
-from numba.core import types
+from numba.core import cgutils, types, typing
 from numba.extending import lower_builtin, type_callable
+from numba.np.arrayobj import populate_array
 
 from numerics.algebra.graphs import Number
-from numerics.algebra.programs import SIDE_BY_SIDE, Place, Program
+from numerics.algebra.programs import BY_MEMBERS, CALLED, SIDE_BY_SIDE, Place, Program
 from numerics.compiled import FASTMATH
 
 FLAGS = tuple(sorted(FASTMATH))
@@ -39,27 +40,54 @@ def teach(work: Callable, program: Program, width: int, names: Sequence[str]) ->
             context.make_array(kind)(context, builder, a).data
             for kind, a in zip(signature.args, arrays, strict=True)
         ]
-        _Writer(builder, dict(zip(names, data, strict=True)), width).write(program)
+        Writer(context, builder, dict(zip(names, data, strict=True)), width).write(program)
         return context.get_dummy_value()
 
 
-class _Writer:
-    """Writes instructions."""
+class Writer:
+    """Writes instructions.
 
-    def __init__(self, builder: ir.IRBuilder, arrays: dict, width: int):
+    Attributes:
+        values: of numbers of a graph, by their places.
+        values_of: of operations without arguments, by their names.
+        pointer_of: where a place lies, as a pointer to vectors or numbers.
+    """
+
+    def __init__(self, context, builder: ir.IRBuilder, arrays: dict, width: int):
         """Begin; arrays are pointers to their first numbers."""
-        self._builder, self._arrays, self._width = builder, arrays, width
+        self._context, self._builder, self._arrays, self._width = context, builder, arrays, width
         self._vector = ir.VectorType(DOUBLE, width)
-        self._values: dict[int, ir.Value] = {}
+        self.values: dict[int, ir.Value] = {}
+        self.values_of: dict[str, ir.Value] = {}
+        self.pointer_of: Callable[[Place], ir.Value] = self._pointer
 
     def write(self, program: Program) -> None:
         """All instructions of a program."""
-        for place, number in program.reads:
-            self._values[number.place] = self._read(place)
-        for number in program.works:
-            self._values[number.place] = self._worked_out(number)
-        for place, number in program.stores:
-            self._builder.store(self._values[number.place], self._pointer(place), align=8)
+        self.read(program.reads)
+        self.work(program.works)
+        self.store(program.stores)
+
+    def read(self, places: Sequence[tuple[Place, Number]]) -> None:
+        """Read numbers."""
+        for place, number in places:
+            self.values[number.place] = self._read(place)
+
+    def work(self, numbers: Sequence[Number]) -> None:
+        """Work numbers out."""
+        for number in numbers:
+            if number.place not in self.values:
+                self.values[number.place] = self._worked_out(number)
+
+    def store(self, places: Sequence[tuple[Place, Number]]) -> None:
+        """Store numbers."""
+        for place, number in places:
+            self._builder.store(self.values[number.place], self.pointer_of(place), align=8)
+
+    def same_for_all(self, value: ir.Value, number: Number) -> ir.Value:
+        """The vector of a number that is the same for all; a constant is one already."""
+        if number.operation == "constant":
+            return ir.Constant(self._vector, [number.value] * self._width)
+        return self._to_all(value, ir.Constant(value.type, ir.Undefined))
 
     def _pointer(self, place: Place) -> ir.Value:
         of_all = place.array in SIDE_BY_SIDE
@@ -68,26 +96,34 @@ class _Writer:
         return self._builder.bitcast(pointer, self._vector.as_pointer()) if of_all else pointer
 
     def _read(self, place: Place) -> ir.Value:
-        of_all = place.array in SIDE_BY_SIDE
-        value = self._builder.load(self._pointer(place), align=8, typ=self._vector if of_all else DOUBLE)
-        return value if of_all else self._same_for_all(value)
+        of_all = place.array in (*SIDE_BY_SIDE, *BY_MEMBERS)
+        value = self._builder.load(self.pointer_of(place), align=8, typ=self._vector if of_all else DOUBLE)
+        if of_all:
+            return value
+        nothing = ir.Constant(self._vector, ir.Undefined)
+        return self._to_all(self._builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0)), nothing)
 
-    def _same_for_all(self, value: ir.Value) -> ir.Value:
-        places, nothing = ir.VectorType(ir.IntType(32), self._width), ir.Constant(self._vector, ir.Undefined)
-        one = self._builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0))
-        return self._builder.shuffle_vector(one, nothing, ir.Constant(places, [0] * self._width))
+    def _to_all(self, value: ir.Value, nothing: ir.Value) -> ir.Value:
+        places = ir.VectorType(ir.IntType(32), self._width)
+        return self._builder.shuffle_vector(value, nothing, ir.Constant(places, [0] * self._width))
 
     def _worked_out(self, number: Number) -> ir.Value:
         operation, builder = number.operation, self._builder
         if operation == "constant":
             return ir.Constant(self._vector, [number.value] * self._width)
-        values = [self._values[one.place] for one in number.of]
+        if operation in self.values_of:
+            return self.values_of[operation]
+        values = [self.values[one.place] for one in number.of]
         if operation in OF_TWO:
             return getattr(builder, OF_TWO[operation])(*values, flags=FLAGS)
         if operation == "negative":
             return builder.fneg(*values, flags=FLAGS)
         if operation == "where":
             return builder.select(*values)
+        if operation == "call":
+            return self._worked_out_by(number.arguments[0], number.arguments[1], values)
+        if operation == "entry":
+            return values[0][number.arguments[1]]
         if operation == "and":
             return builder.and_(*values)
         if operation == "!=":
@@ -95,6 +131,28 @@ class _Writer:
         if operation in ("<", "<=", ">", ">=", "=="):
             return builder.fcmp_ordered(operation, *values)
         return self._called(operation, values)
+
+    def _worked_out_by(self, name: str, count: int, values: list[ir.Value]) -> list[ir.Value]:
+        """What a function of two arrays makes of numbers, run after run."""
+        builder, context, kind = self._builder, self._context, types.Array(types.float64, 1, "C")
+        arrays = []
+        for length in (len(values), count):
+            one, size = context.make_array(kind)(context, builder), ir.Constant(LONG, length)
+            data, eight = cgutils.alloca_once(builder, DOUBLE, size), ir.Constant(LONG, 8)
+            populate_array(one, data, (size,), (eight,), eight, None)
+            arrays.append(one)
+        signature, work = typing.signature(types.none, kind, kind), CALLED[name]
+        found = [ir.Constant(self._vector, ir.Undefined)] * count
+        for k in range(self._width):
+            at = ir.Constant(ir.IntType(32), k)
+            for i, value in enumerate(values):
+                pointer = builder.gep(arrays[0].data, [ir.Constant(LONG, i)], source_etype=DOUBLE)
+                builder.store(builder.extract_element(value, at), pointer)
+            context.compile_internal(builder, work, signature, [one._getvalue() for one in arrays])
+            for i in range(count):
+                pointer = builder.gep(arrays[1].data, [ir.Constant(LONG, i)], source_etype=DOUBLE)
+                found[i] = builder.insert_element(found[i], builder.load(pointer, typ=DOUBLE), at)
+        return found
 
     def _called(self, name: str, values: list[ir.Value]) -> ir.Value:
         builder, module = self._builder, self._builder.module

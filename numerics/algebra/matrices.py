@@ -23,16 +23,16 @@ class Matrix:
         arguments: what it is made of, Matrices and other values that can be hashed.
         shape: of it.
         symmetric: whether it is its own transpose.
+        member: whether each member of an ensemble has one.
     """
 
     __array_ufunc__ = None  # an array's operator leaves it to ours
-    __slots__ = ("operation", "arguments", "shape", "symmetric", "_made")
+    __slots__ = ("operation", "arguments", "shape", "symmetric", "member", "_made")
 
-    def __init__(
-        self, operation: Any, arguments: tuple = (), shape: tuple = (), symmetric: bool = False, made=None
-    ):
+    def __init__(self, operation: Any, arguments: tuple = (), shape: tuple = (), symmetric=False, made=None):
         """For operations, and for `given`."""
         self.operation, self.arguments, self.shape, self.symmetric = operation, arguments, shape, symmetric
+        self.member: bool = not getattr(operation, "reduces", False) and any(a.member for a in self.of)
         self._made: dict = {} if made is None else made
 
     @property
@@ -73,9 +73,9 @@ class Matrix:
 class Operation:
     """Something that is done with matrices; called with arrays it is done at once."""
 
-    def __init__(self, compute: Callable, shape: Callable, symmetric: Callable):
+    def __init__(self, compute: Callable, shape: Callable, symmetric: Callable, *, reduces: bool = False):
         """For `operation`, and for the functions of a model."""
-        self.compute, self.shape, self.symmetric = compute, shape, symmetric
+        self.compute, self.shape, self.symmetric, self.reduces = compute, shape, symmetric, reduces
         self.name, self.__doc__ = compute.__name__, compute.__doc__
         self.slope: Callable = _no_rule
 
@@ -105,19 +105,29 @@ def never(*arguments) -> bool:
     return False
 
 
-def operation(shape: Callable, symmetric: Callable = never) -> Callable:
+def operation(shape: Callable, symmetric: Callable = never, *, reduces: bool = False) -> Callable:
     """Decorate a function of arrays.
 
     Args:
         shape: of the result, a function of the arguments' shapes; an argument that is no matrix stands for itself.
         symmetric: whether the result is, a function of the arguments.
+        reduces: whether the result is one for all members of an ensemble, such as their mean.
     """
-    return lambda compute: Operation(compute, shape, symmetric)
+    return lambda compute: Operation(compute, shape, symmetric, reduces=reduces)
 
 
-def given(name: Any, shape: tuple[int, ...], *, symmetric: bool = False, beside: Matrix | None = None) -> Matrix:
+def given(
+    name: Any,
+    shape: tuple[int, ...],
+    *,
+    symmetric: bool = False,
+    member: bool = False,
+    beside: Matrix | None = None,
+) -> Matrix:
     """A matrix that is known when the others are worked out; `beside` one that it occurs together with."""
-    return Matrix(name, (), shape, symmetric, None if beside is None else beside._made)
+    found = Matrix(name, (), shape, symmetric, None if beside is None else beside._made)
+    found.member = member
+    return found
 
 
 def same(shape, *others):

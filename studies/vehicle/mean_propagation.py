@@ -3,32 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import ClassVar
 
-from filters.engine.belief import Kernels
-from filters.ensembles.ensemble import EnsembleKalmanFilter
-from filters.ensembles.members import row_means
-from numerics.compiled import inlined
-from numerics.sources import Source
+from filters.ensembles.stochastic import EnsembleKalmanFilter
+from filters.pages.page import Page
+from numerics.algebra.members import mean
 
 
-@lru_cache(maxsize=64)
-def from_the_mean(kernels: Kernels) -> Kernels:
-    """An ensemble's kernels in which all members are set to their mean before the prediction."""
-    n, predict_members, means_of = kernels.n, kernels.predict, row_means(kernels.n)
-    source = Source("gather", "table, means", means=(n,))
-    for a in source.rows_of_members(n):
-        source.line(f"table[{a}, j] = means[{a}]")
-    gather = source.function()
-
-    @inlined
-    def predict(memory, u, numbers, size):
-        _, table, _ = memory
-        gather(table, means_of(table, size))
-        predict_members(memory, u, numbers, size)
-
-    return kernels._replace(predict=predict)
+def advance_from_the_mean(model, x, u):
+    """One of the model's substeps, of all members at once."""
+    return model.f(mean(x), u)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,7 +32,4 @@ class MeanPropagatingEnKF(EnsembleKalmanFilter):
     """
 
     name: ClassVar[str] = "mean-propagating enkf"
-
-    def kernels(self) -> Kernels:
-        """Kernels for the model's functions; see `Filter.kernels`."""
-        return from_the_mean(super().kernels())
+    page: ClassVar[Page] = EnsembleKalmanFilter.page._replace(advance=advance_from_the_mean)

@@ -315,7 +315,7 @@ def small(**functions):
     [
         (
             lambda: c_filter(make_filter("enkf", scalar_model())),
-            "a filter in C must be a filter with a page, such as 'ekf', but got 'enkf'",
+            "a filter in C must have a page of mean and covariance, as 'ekf' has, but got 'enkf'",
         ),
         (lambda: c_filter(made("ekf", scalar_model()), "a b"), "no keyword, but got 'a b'"),
         (lambda: c_filter(made("ekf", scalar_model()), "double"), "no keyword, but got 'double'"),

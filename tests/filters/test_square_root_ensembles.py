@@ -12,7 +12,7 @@ from filters import (
     make_filter,
     run,
 )
-from filters.ensembles.transform import geometric_mean
+from numerics.algebra.geometric import geometric_mean_of
 from numerics.compiled import interpreted
 from numerics.sources import is_array
 from numerics.streams import filter_keys
@@ -160,7 +160,7 @@ def test_the_geometric_mean_is_the_middle_of_two_covariances(size, decades):
     middle = units @ a @ sqrtm(np.linalg.solve(a, b)).real @ units
     scaled = (units @ c @ units for c in (a, b))
     form = np.array if is_array(size, size) else lambda c: tuple(map(tuple, c))
-    mean = np.array(geometric_mean(size)(*map(form, scaled)))
+    mean = np.array(geometric_mean_of(size)(*map(form, scaled)))
     spread = np.sqrt(np.diag(middle))
     np.testing.assert_allclose(mean / np.outer(spread, spread), middle / np.outer(spread, spread), atol=1e-9)
     np.testing.assert_array_equal(mean, mean.T)

@@ -1,0 +1,191 @@
+"""A page of an ensemble filter as kernels of the engine: what it says of a member is done for each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from math import prod
+from typing import NamedTuple
+
+from filters.engine.belief import Kernels
+from filters.engine.layout import memory_places, own_place
+from filters.pages.equations import Equations
+from filters.pages.memory import NumbersMemory
+from filters.pages.page import Page
+from filters.pages.programs import stored
+from filters.pages.stages import Stage, as_calls, as_programs
+from numerics.algebra.graphs import TooLarge
+from numerics.algebra.loops import cut
+from numerics.algebra.matrices import Matrix, given, in_order
+from numerics.algebra.members import covariance, mean, on_branch
+from numerics.algebra.operations import quotient, wrap
+from numerics.algebra.programs import OF_MEMBERS, Place, callable_of
+from numerics.compiled import inlined
+from numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
+from plants.layout import LANES, constants_reader, number_places
+from plants.shape import Functions, Shape
+
+MOST, MOST_SUMS = (
+    10_000,
+    500,
+)  # operations and sums of a stage: beyond, instructions take longer to compile than calls
+
+
+class MembersMemory(NumbersMemory):
+    """The memory of an ensemble.
+
+    rows     the row of `filters.engine.layout`
+    given    u or z
+    numbers  the model's, then the filter's own
+    table    a row for each component of the members x, then scratch
+    draws    standard normals, w of the process or e of the measurement: a row for each component
+    """
+
+    def __init__(self, shape: Shape, page: Page):
+        """Take the sizes."""
+        row = memory_places(shape.n, shape.m)
+        x = given(Place("table", 0), (shape.n,), member=True)
+        p = given(Place("rows", row.cov), (shape.n, shape.n), symmetric=True, beside=x)
+        super().__init__(shape, page, x, p, own_place(shape))
+        self.u, self.z = self.beside("given", 0, shape.inputs), self.beside("given", 0, shape.m)
+        self.w, self.e = (given(Place("draws", 0), (size,), member=True, beside=x) for size in (shape.n, shape.m))
+        self.mean = self.beside("rows", row.mean, shape.n)
+
+
+def stages_of(page: Page, memory: MembersMemory, model: Equations) -> dict[str, Stage]:
+    """What a page stores: at the start, in each substep, at its end, in an update; and the belief's moments."""
+    x, places = memory.x, memory_places(memory.shape.n, memory.shape.m)
+    told = places.innovation, places.innovation_cov, places.log_likelihood
+    prior = on_branch(model.prior_mean + model.prior_root @ memory.w, model.state_angles)
+    moved, *rest = page.update(model, x, memory.z, memory.e)
+    of_belief = memory.mean, memory.P
+    return {
+        "start": stored((prior,), (x,)),
+        "advance": stored((page.advance(model, x, memory.u),), (x,)),
+        "settle": stored((page.settle(model, x, memory.w),), (x,)),
+        "analyse": stored((moved,), (x,)),
+        "update": stored((moved, *rest, *moments(model, moved)), (x, *told, *of_belief)),
+        "summarise": stored(moments(model, x), of_belief),
+    }
+
+
+def moments(model: Equations, x: Matrix) -> tuple[Matrix, Matrix]:
+    """The mean and the covariance of the members."""
+    return wrap(mean(x), model.state_angles), covariance(x, x)
+
+
+class Works(NamedTuple):
+    """A stage as a function (rows, given, numbers, table, draws, size)."""
+
+    work: Callable
+    rows: int  # of the table that it uses
+    draws: bool  # whether it uses draws
+
+
+@lru_cache(maxsize=64)
+def works_of(page: Page, functions: Functions, shape: Shape) -> dict[str, Works]:
+    """Stages of an ensemble's page, for a model's functions and shape.
+
+    They are programs without calls, as `programs.programs_of` makes them. Of a large model all are calls, and of a
+    function that cannot be traced those that need it.
+    """
+    memory, model, called = _seen(page, functions, shape, trace=False)
+    readers, n = {memory.constants: constants_reader(shape)}, shape.n
+    if not _is_large(called["update"]):
+        _, _, traced = _seen(page, functions, shape, trace=True)
+        try:
+            return {name: _work_of(traced[name], stage, model, readers, n) for name, stage in called.items()}
+        except TooLarge:
+            pass
+    return {name: _as_calls(stage, model, readers, n) for name, stage in called.items()}
+
+
+def _is_large(stage: Stage) -> bool:
+    """Whether a stage has so many sums over members and quotients C S^-1 that calls are compiled sooner."""
+    made = in_order(list(stage.values.values()))
+    sums = sum(prod(one.shape) // (1 + one.symmetric) for one in made if getattr(one.operation, "reduces", False))
+    quotients = sum(2 * prod(one.shape) * one.shape[-1] for one in made if one.operation is quotient)
+    return sums > MOST_SUMS or quotients > MOST
+
+
+def _work_of(traced: Stage, called: Stage, model: Equations, readers: dict, first: int) -> Works:
+    try:
+        return _as_program(traced, first)
+    except TooLarge:
+        raise
+    except TypeError:  # a function that cannot be traced
+        return _as_calls(called, model, readers, first)
+
+
+def _seen(page: Page, functions: Functions, shape: Shape, *, trace: bool):
+    memory = MembersMemory(shape, page)
+    model = Equations(functions, memory, constants_move=False, trace=trace, partly=True)
+    return memory, model, stages_of(page, memory, model)
+
+
+def _as_program(stage: Stage, first: int) -> Works:
+    program = as_programs(stage, 0, MOST).values
+    work = callable_of(program, LANES, OF_MEMBERS, first)
+    return Works(work, cut(program, first).rows, any(place.array == "draws" for place, _ in program.reads))
+
+
+def _as_calls(stage: Stage, model: Equations, readers: dict, first: int) -> Works:
+    work = as_calls(stage, 0, model.called, readers, OF_MEMBERS).values
+    given = [one.operation for one in in_order(list(stage.values.values())) if not one.of]
+    return Works(work, first, any(isinstance(place, Place) and place.array == "draws" for place in given))
+
+
+def analysis_of(page: Page, functions: Functions, shape: Shape) -> Callable:
+    """Return `analyse(memory, z, numbers, size)`, which moves the members by a measurement and does no more."""
+    return _correction(works_of(page, functions, shape)["analyse"], shape)
+
+
+def _correction(work: Works, shape: Shape) -> Callable:
+    places, m = memory_places(shape.n, shape.m), shape.m
+    correct, _, draws_noise = work
+    step, key_0, key_1 = places.step, places.key_0, places.key_1
+
+    @inlined
+    def update(memory, z, numbers, size):
+        row, table, draws = memory
+        correct(row, z, numbers, table, draws, size)
+
+    @inlined
+    def update_with_noise(memory, z, numbers, size):
+        row, table, draws = memory
+        fill_normals(draws, m * table.shape[1], row[step], FILTER_MEASUREMENT, row[key_0], row[key_1])
+        correct(row, z, numbers, table, draws, size)
+
+    return update_with_noise if draws_noise else update
+
+
+@lru_cache(maxsize=64)
+def members_kernels(page: Page, functions: Functions, shape: Shape) -> Kernels:
+    """Kernels of an ensemble's page for a model's functions and shape."""
+    n, m, works = shape.n, shape.m, works_of(page, functions, shape)
+    begin, advance, settle, moments_of = (works[name].work for name in ("start", "advance", "settle", "summarise"))
+    places, substeps_place = memory_places(n, m), number_places(n, m).substeps
+    step, key_0, key_1 = places.step, places.key_0, places.key_1
+
+    @inlined
+    def start(memory, numbers, size):
+        row, table, draws = memory
+        fill_normals(draws, n * table.shape[1], row[step], FILTER_PRIOR, row[key_0], row[key_1])
+        begin(row, numbers, numbers, table, draws, size)
+
+    @inlined
+    def predict(memory, u, numbers, size):
+        row, table, draws = memory
+        for _ in range(int(numbers[substeps_place])):
+            advance(row, u, numbers, table, draws, size)
+        row[step] += 1.0
+        fill_normals(draws, n * table.shape[1], row[step], FILTER_PROCESS, row[key_0], row[key_1])
+        settle(row, u, numbers, table, draws, size)
+
+    @inlined
+    def summarise(memory, size):
+        row, table, draws = memory
+        moments_of(row, row, row, table, draws, size)
+
+    update, rows = _correction(works["update"], shape), max(work.rows for work in works.values())
+    return Kernels(n, m, rows, max(n, m), start, predict, update, summarise)
