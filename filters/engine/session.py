@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from math import prod
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -12,8 +13,8 @@ from numpy.ma import MaskedArray
 from filters.engine.belief import Belief, Innovation, LostBelief
 from filters.engine.checks import check_belief, checked_key, vector_like
 from filters.engine.compile import PREDICT, START, UPDATE, new_memory, operation
-from filters.engine.layout import memory_places
-from numerics.checks import as_floats, covariance, positive
+from filters.engine.layout import memory_places, own_place
+from numerics.checks import as_floats, covariance, finite, positive
 from numerics.direct import direct
 from plants.layout import number_places, with_root
 
@@ -154,6 +155,19 @@ class Session:
         raise ValueError(
             f"set_dt must be called on a model with a constant dt, but got {', '.join(names) or 'none'}"
         )
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """Use another value of one of the filter's numbers from here on; ValueError for one that it lacks."""
+        place, names = own_place(self._filter.kernel_model.shape), []
+        page = getattr(self._filter, "written_page", None)
+        for known, shape in () if page is None else page.own:
+            if known == name and not shape:
+                self._remember_noise()
+                self._numbers[place] = finite(name, value)
+                return
+            names.append(known)
+            place += prod(shape)
+        raise ValueError(f"a number of {self._name!r} must be one of {', '.join(names)}, but got {name!r}")
 
     def scale_process_noise(self, factor: float) -> None:
         """Use Q of the model times a factor above zero from here on."""

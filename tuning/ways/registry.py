@@ -6,6 +6,7 @@ from numerics.checks import one_of
 from tuning.search.objectives import LIKELIHOOD, LOG_SCORE, MSE, SCORE
 from tuning.ways.adaptive import sage_husa, vb
 from tuning.ways.als import als
+from tuning.ways.anderson import anderson
 from tuning.ways.ascents import ascend
 from tuning.ways.descents import coordinate_steps, nelder_mead
 from tuning.ways.em import em, squarem
@@ -18,7 +19,7 @@ from tuning.ways.okf import okf
 from tuning.ways.posterior import posterior
 from tuning.ways.samplers import sample
 from tuning.ways.scoring import scoring
-from tuning.ways.way import COVARIANCE, GRADIENT, LINEAR, NOISE, TRUTH, Way
+from tuning.ways.way import COVARIANCE, GRADIENT, INFLATION, LINEAR, NOISE, TRUTH, Way
 
 ABBEEL = "Abbeel, Coates, Montemerlo, Ng, Thrun (2005)"
 CHEN = "Chen, Heckman, Julier, Ahmed (2018), arXiv 1807.08855"
@@ -123,6 +124,14 @@ WAYS = {
         "Desroziers, Berre, Chapnik, Poli (2005)",
         (COVARIANCE, NOISE),
         DIAGONAL,
+    ),
+    "anderson": Way(
+        "the inflation of an ensemble that its innovations ask for, step by step, then its mean",
+        "of ensembles, without true states, if Q and R are known: one pass",
+        anderson,
+        "Anderson (2007)",
+        (COVARIANCE, INFLATION),
+        (),
     ),
     "sage-husa": Way(
         "Sage and Husa's adaptive filter over all runs, then its mean Q and R",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from filters.registry import filter_class
+from filters.registry import filter_class, tunable_numbers
 from tuning.likelihood.family import check_gradient
 from tuning.search.parameters import Q, R
 from tuning.search.space import has_search_space
@@ -16,6 +16,7 @@ TRUTH = "truth"  # true states
 GRADIENT = "gradient"  # a Kalman filter with derivatives
 COVARIANCE = "covariance"  # a filter with a covariance
 LINEAR = "linear"  # a linear model with a stationary filter
+INFLATION = "inflation"  # an ensemble
 NOISE = "noise"  # that Q and R are tuned, and not a model's own parameters
 
 
@@ -39,6 +40,8 @@ class Way(NamedTuple):
             check_gradient(task.filter, f"a filter for way {name!r}")
         if COVARIANCE in self.needs and not filter_class(task.filter).has_covariance:
             raise ValueError(f"way {name!r} needs a filter with a covariance, but got {task.filter!r}")
+        if INFLATION in self.needs and INFLATION not in tunable_numbers(task.filter):
+            raise ValueError(f"way {name!r} tunes the inflation of an ensemble, but {task.filter!r} has none")
         if TRUTH in self.needs and not task.has_truth:
             pairs = zip(task.problems, task.data, strict=True)
             lacking = next(one.name for one, data in pairs if one.scale is None or data.states is None)

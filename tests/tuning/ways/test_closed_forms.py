@@ -5,13 +5,14 @@ import pytest
 
 from filters import affine_model
 from plants.simulate import simulate
-from tests.tuning.ways.problems import A, Q, R, linear, task_of
+from tests.tuning.ways.problems import A, Q, R, at, linear, task_of
 from tuning.evaluation.residuals import estimated_from
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
 from tuning.problems.runs_problem import RunsProblem
 from tuning.search.objectives import LIKELIHOOD
 from tuning.ways.als import Noise, autocovariances, lagged, stationary, steady_gain
+from tuning.ways.anderson import updated
 from tuning.ways.mehra import mehra_equations
 from tuning.ways.registry import find_way
 from tuning.ways.task import Budget, Task
@@ -236,3 +237,31 @@ def test_runs_are_counted_and_end_a_way():
     assert task.runs == 44 and task.kept[-1].runs <= 40  # the evaluation that went beyond is not taken
     assert task.best_within(runs=0) == task.start
     assert [one.runs for one in task.kept] == sorted(one.runs for one in task.kept)
+
+
+def test_the_level_of_inflation_is_the_mode_of_its_density():
+    for square, spread in ((9.0, 0.3), (0.01, 0.1), (1.5, 0.6)):
+        found, deviation = updated(1.2, spread, square, 0.8, 0.4)
+        grid = np.linspace(0.2, 4.0, 400_001)
+        total = grid * 0.8 + 0.4
+        log = -0.5 * ((grid - 1.2) / spread) ** 2 - 0.5 * np.log(total) - 0.5 * square / total
+        assert found == pytest.approx(grid[log.argmax()], abs=1e-4)
+        assert 0.02 <= deviation <= spread
+
+
+def test_innovations_ask_for_inflation_where_the_spread_is_too_small():
+    found = {}
+    for name, part in (("right", 1.0), ("small", 0.25)):
+        problem = linear(steps=200, runs=6)
+        plain = task_of(problem, 6, "enkf")
+        start = at(plain, part * np.diag(Q), np.diag(R)).with_size(60)
+        task = task_of(problem, 6, "enkf", start=start)
+        find_way("anderson").run("anderson", task)
+        found[name] = task.best.numbers["inflation"]
+        assert task.runs == 6 and task.best.model == start.model
+    assert 1.0 <= found["right"] < 1.03 < found["small"] - 0.03
+
+
+def test_a_filter_without_an_ensemble_has_no_inflation():
+    with pytest.raises(ValueError, match="way 'anderson' tunes the inflation of an ensemble, but 'kf' has none"):
+        find_way("anderson").run("anderson", task_of(linear()))
