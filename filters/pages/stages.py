@@ -32,8 +32,8 @@ class Stage(NamedTuple):
 
     @property
     def of_rows(self) -> dict[int, Matrix]:
-        """Values in `rows` by their places: all of a filter without an ensemble."""
-        return {at: one for at, one in self.values.items() if not isinstance(at, Place)}
+        """Values by their places in `rows`, where all are of a filter without an ensemble."""
+        return {at.at if isinstance(at, Place) else at: one for at, one in self.values.items()}
 
     @property
     def stores(self) -> tuple[list[tuple[Place, Matrix]], list[tuple[Place, Matrix]]]:
