@@ -30,7 +30,7 @@ from tuning.ways.registry import find_way
 from tuning.ways.task import Task
 
 LEARN, TEST = 700, 300  # runs of a draw
-DRAWS = 5
+DRAWS = 3
 FULL = {"full_q": True, "full_r": True}
 OKF, NOISE, GRADIENT = "OKF, default", "noise estimation", "MSE by its gradient"
 IN_A_FIFTH = "the same in a fifth of OKF's time"
