@@ -243,6 +243,6 @@ def test_slopes_along_numbers_that_are_made_of_others_are_found():
     x = np.array([a - b, -a])
     found = Traced(folded, None, 1, shape).parts[1](x, None, np.array([c]))
     numbers = [graph.number(one) for one in found.ravel()]
-    jacobian = values_of(numbers, np.array([0.7, 0.2, 3.0])).reshape(found.shape)
+    jacobian = values_of(numbers, np.array([[0.7], [0.2], [3.0]])).reshape(found.shape)
     expected = [[-1, 0], [0, -1], [0, 1], [0, 3], [-1, 0], [0, -1]]
     np.testing.assert_array_equal(jacobian, expected)
