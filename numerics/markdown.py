@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from numerics.files import write_whole
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -24,3 +27,12 @@ def with_tables(page: str, tables: Mapping[str, Callable[[], str]]) -> str:
         return f"{match[1]}\n{tables[match[2]]()}\n{match[3]}"
 
     return re.sub(r"(<!-- table ([^\n]+?) -->).*?(<!-- end -->)", anew, page, flags=re.DOTALL)
+
+
+def print_or_write(name: str, text: str, arguments: Sequence[str]) -> None:
+    """Print a table, or write it anew on the page whose path is the first argument of a command line."""
+    if not arguments:
+        print(text)
+        return
+    page = Path(arguments[0])
+    write_whole(page, with_tables(page.read_text(encoding="utf-8"), {name: lambda: text}))

@@ -9,7 +9,6 @@ import math
 import sys
 from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -19,8 +18,7 @@ from filters.filter import Filter
 from filters.monitoring.monitor import TESTS, Monitor
 from filters.monitoring.thresholds import cusum_run_length, cusum_threshold
 from filters.registry import make_filter
-from numerics.files import write_whole
-from numerics.markdown import table, with_tables
+from numerics.markdown import print_or_write, table
 from numerics.streams import filter_keys
 from plants.simulate import simulate
 from plants.state_space import StateSpaceModel
@@ -176,12 +174,7 @@ def markdown(runs: int = RUNS) -> str:
 
 def main() -> None:
     """Print the table, or write it on a page."""
-    text = markdown()
-    if len(sys.argv) < 2:
-        print(text)
-        return
-    page = Path(sys.argv[1])
-    write_whole(page, with_tables(page.read_text(encoding="utf-8"), {"delays": lambda: text}))
+    print_or_write("delays", markdown(), sys.argv[1:])
 
 
 if __name__ == "__main__":

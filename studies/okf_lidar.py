@@ -13,14 +13,12 @@ import io
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from numerics.files import write_whole
-from numerics.markdown import table, with_tables
+from numerics.markdown import print_or_write, table
 from studies.lidar import Run, drawn, lidar_problem
 from tuning.evaluation.baselines import with_covariances
 from tuning.evaluation.evaluate import Evaluation, evaluate, mse
@@ -156,12 +154,7 @@ def markdown(rows: list[Row]) -> str:
 
 def main() -> None:
     """Print the table, or write it on a page."""
-    text = markdown(compared())
-    if len(sys.argv) < 2:
-        print(text)
-        return
-    page = Path(sys.argv[1])
-    write_whole(page, with_tables(page.read_text(encoding="utf-8"), {"okf": lambda: text}))
+    print_or_write("okf", markdown(compared()), sys.argv[1:])
 
 
 if __name__ == "__main__":

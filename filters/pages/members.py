@@ -25,10 +25,8 @@ from numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, f
 from plants.layout import LANES, constants_reader, number_places
 from plants.shape import Functions, Shape
 
-MOST, MOST_SUMS = (
-    10_000,
-    500,
-)  # operations and sums of a stage: beyond, instructions take longer to compile than calls
+# Operations and sums of a stage: beyond, instructions take longer to compile than calls.
+MOST, MOST_SUMS = 10_000, 500
 
 
 class MembersMemory(NumbersMemory):

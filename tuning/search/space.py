@@ -102,16 +102,7 @@ def _of_filter(name: str, process_noise: bool = False) -> list[Parameter]:
     return filter_parameters(name, sizes, process_noise)
 
 
-def parameters(
-    name: str,
-    problem: Problem,
-    *,
-    hold_r: bool = False,
-    full_q: bool = False,
-    full_r: bool = False,
-    prior: bool = False,
-    where: Sequence[str] = (),
-) -> list[Parameter]:
+def parameters(name: str, problem: Problem, **options: Any) -> list[Parameter]:
     """The parameters that a study may choose for a filter.
 
     Those of the model are defined by the problem: by default a variance in Q for each state, a variance in R for
@@ -121,15 +112,9 @@ def parameters(
     Args:
         name: name of the filter.
         problem: the ranges follow from its untuned values.
-        hold_r: leave R as on the sensor's data sheet.
-        full_q: choose the correlations of Q, too.
-        full_r: choose those of R, too.
-        prior: choose the scale of P_0, too.
-        where: relations among the parameters of the model (`tuning.search.relations`).
+        **options: of `model_parameters`, what of the model is chosen.
     """
-    found = []
-    if filter_class(name).has_covariance:
-        found = model_parameters(problem, hold_r=hold_r, full_q=full_q, full_r=full_r, prior=prior, where=where)
+    found = model_parameters(problem, **options) if filter_class(name).has_covariance else []
     return found + _of_filter(name, has_process_noise(problem))
 
 

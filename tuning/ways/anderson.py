@@ -7,12 +7,12 @@ import numpy as np
 from filters.engine.session import Session
 from tuning.search.parameters import FILTER_PARAMETERS
 from tuning.ways.task import Task
+from tuning.ways.way import INFLATION
 
 DEVIATION = 0.1  # s at the beginning: how well lambda is known
 LEAST_DEVIATION = 0.02  # below which s does not fall, so that lambda may go on to change
 NEWTON = 8  # steps to the mode
 SETTLED = 0.25  # part of a run whose lambdas do not count
-INFLATION = "inflation"
 
 
 def anderson(task: Task) -> None:
