@@ -6,9 +6,9 @@ from auv_env.env import SegorogeniAUVEnv
 from auv_env.parameters import VehicleParameters
 from auv_env.presets import PRESETS
 from auv_env.tasks import SegorogeniAUVDepthEnv, SegorogeniAUVPathEnv
-from numerics.compiled import may_be_inlined
+from thruster_env.numerics.compiled import may_be_inlined
 
-may_be_inlined(__name__, "plants")
+may_be_inlined(__name__, "thruster_env.plants")
 
 __all__ = ["PRESETS", "SegorogeniAUVDepthEnv", "SegorogeniAUVEnv", "SegorogeniAUVPathEnv", "VehicleParameters"]
 

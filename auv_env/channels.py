@@ -9,10 +9,10 @@ from functools import cache
 from typing import NamedTuple
 
 from auv_env.quantities import STATES, SYMBOLS
-from numerics.checks import one_of
-from numerics.sources import tuple_of, written_out
-from plants.channels import Channel
-from plants.quantities import Quantity
+from thruster_env.numerics.checks import one_of
+from thruster_env.numerics.sources import tuple_of, written_out
+from thruster_env.plants.channels import Channel
+from thruster_env.plants.quantities import Quantity
 
 
 class Instrument(NamedTuple):

@@ -24,8 +24,8 @@ from auv_env.kinematics import (
     in_earth_axes,
     in_earth_axes_tangent,
 )
-from numerics.compiled import inlined
-from numerics.integration import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.integration import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
 
 
 @inlined

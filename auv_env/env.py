@@ -13,10 +13,10 @@ from auv_env.modelled import ModelledVehicle
 from auv_env.plant import Plant, make_plant
 from auv_env.rendering.env import RenderedVehicle
 from auv_env.task import make_task
-from plants.arguments import arguments_of, takes_arguments_of
-from plants.env import PlantEnv
-from plants.memory import TIME
-from plants.report import ReportRows
+from thruster_env.plants.arguments import arguments_of, takes_arguments_of
+from thruster_env.plants.env import PlantEnv
+from thruster_env.plants.memory import TIME
+from thruster_env.plants.report import ReportRows
 
 
 class SegorogeniAUVEnv(ModelledVehicle, RenderedVehicle, PlantEnv):

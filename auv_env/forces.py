@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from numerics.compiled import inlined
+from thruster_env.numerics.compiled import inlined
 
 
 class Constants(NamedTuple):

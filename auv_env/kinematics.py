@@ -7,8 +7,8 @@ and psi are infinite. Source: Fossen (2011), "Handbook of Marine Craft Hydrodyna
 
 from __future__ import annotations
 
-from numerics.compiled import inlined
-from numerics.trigonometry import cosine_and_sine
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.trigonometry import cosine_and_sine
 
 
 @inlined

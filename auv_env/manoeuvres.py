@@ -15,7 +15,7 @@ import numpy as np
 from auv_env.dynamics import navigation_substep
 from auv_env.parameters import derive_constants
 from auv_env.presets import SEGOROGENI
-from numerics.checks import one_of
+from thruster_env.numerics.checks import one_of
 
 CRUISE_THRUST = 2.845  # [N], holds 1 m/s
 CRUISE_TORQUE = -0.017  # [N m]

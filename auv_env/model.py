@@ -16,14 +16,14 @@ from auv_env.operating import cruise_thrust, operating_range
 from auv_env.parameters import VehicleParameters, checked
 from auv_env.plant import CRUISE_SPEED, Plant, make_plant
 from auv_env.quantities import ATTITUDE_INPUTS, CURRENT_STATES, STATES, SYMBOLS
-from numerics.checks import covariance, one_of, positive
-from numerics.compiled import inlined
-from numerics.pickling import makes_functions
-from numerics.sources import tuple_of, written_out
-from plants.channels import functions_of
-from plants.factors import scaled
-from plants.quantities import Quantity
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.checks import covariance, one_of, positive
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.pickling import makes_functions
+from thruster_env.numerics.sources import tuple_of, written_out
+from thruster_env.plants.channels import functions_of
+from thruster_env.plants.factors import scaled
+from thruster_env.plants.quantities import Quantity
+from thruster_env.plants.state_space import StateSpaceModel
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from auv_env.plant import Plant
-from plants.modelled import ModelledEnv
-from plants.split import Split, split
+from thruster_env.plants.modelled import ModelledEnv
+from thruster_env.plants.split import Split, split
 
 if TYPE_CHECKING:
     from auv_env.rendering import Overlay
-    from plants.state_space import StateSpaceModel
+    from thruster_env.plants.state_space import StateSpaceModel
 
 
 class ModelledVehicle(ModelledEnv):
@@ -33,7 +33,7 @@ class ModelledVehicle(ModelledEnv):
         return model_of_plant
 
     def state_space_model(self, **changes) -> StateSpaceModel:
-        """See `plants.modelled`; for "velocities" roll and pitch are as measured, or level without an AHRS."""
+        """See `thruster_env.plants.modelled`; for "velocities" roll and pitch are as measured, else level."""
         attitude = "measured" if {"phi", "theta"} <= set(self.plant.channels) else "level"
         return super().state_space_model(**{"attitude": attitude} | changes)
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from auv_env.forces import Constants
-from numerics.checks import positive, within
+from thruster_env.numerics.checks import positive, within
 
 LARGEST = 1e9  # of any parameter, in units of SI: beyond it floating point may overflow
 

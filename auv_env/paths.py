@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from auv_env.manoeuvres import MANOEUVRES, run
-from numerics.checks import as_floats, one_of, shown
+from thruster_env.numerics.checks import as_floats, one_of, shown
 
 SPACING = 0.2  # [m] between points of a manoeuvre's path: 2 mm from the arc where it turns most tightly
 STRAIGHT_AHEAD = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))

@@ -16,10 +16,10 @@ from auv_env.operating import required_substeps
 from auv_env.parameters import VehicleParameters, derive_constants
 from auv_env.presets import preset_parameters
 from auv_env.quantities import COMMANDS, INPUTS, STATES
-from numerics.checks import at_least, between, covariance, finite, one_of, positive, shown, vector
-from plants.disturbances.effects import Effect, dropping_channels
-from plants.disturbances.missing import SampleEvery
-from plants.quantities import Quantity
+from thruster_env.numerics.checks import at_least, between, covariance, finite, one_of, positive, shown, vector
+from thruster_env.plants.disturbances.effects import Effect, dropping_channels
+from thruster_env.plants.disturbances.missing import SampleEvery
+from thruster_env.plants.quantities import Quantity
 
 DEFAULT_DT = 0.05  # [s]; one Runge-Kutta step follows the vehicle to 2e-5 of its range
 DEFAULT_MAX_THRUST = 4.0  # [N], for 1.19 m/s; with it 14 deg of stern plane, if held, pitch by 80 deg

@@ -9,7 +9,7 @@ from pathlib import Path
 from auv_env.parameters import VehicleParameters
 from auv_env.plant import Plant
 from auv_env.presets import PRESETS
-from plants.plant_data import Entries, check_same, mappings
+from thruster_env.plants.plant_data import Entries, check_same, mappings
 
 ENTRIES = Entries(
     ("preset", "dt", "sensors", "propeller_torque"),

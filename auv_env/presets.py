@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from auv_env.parameters import VehicleParameters, checked, parameters_of
 from auv_env.recipe import GRAVITY, Sizes, recipe
-from numerics.checks import one_of
+from thruster_env.numerics.checks import one_of
 
 SEGOROGENI_SIZES = Sizes(
     mass=15.0,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from plants.quantities import Quantity
+from thruster_env.plants.quantities import Quantity
 
 STATES = (
     Quantity("surge velocity", "u", "m/s"),

@@ -10,7 +10,7 @@ from auv_env.engine.copies import Copies
 from auv_env.engine.memory import CURRENT, READINGS, STATE, VALID, N
 from auv_env.plant import Plant
 from auv_env.task import make_task
-from plants.record import check_finite, record
+from thruster_env.plants.record import check_finite, record
 
 
 class Simulation(NamedTuple):

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 from auv_env.paths import STRAIGHT_AHEAD, Path, make_path
 from auv_env.plant import CRUISE_SPEED
-from numerics.checks import between, positive, within
-from numerics.compiled import inlined
+from thruster_env.numerics.checks import between, positive, within
+from thruster_env.numerics.compiled import inlined
 
 DEFAULT_WEIGHTS = (1.0, 1.0, 0.1, 0.01)  # cross-track, vertical, speed, planes
 LARGEST_WEIGHT = 1e9

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from auv_env.env import SegorogeniAUVEnv
 from auv_env.plant import make_plant
 from auv_env.task import make_depth_task, make_task
-from plants.arguments import arguments_of, takes_arguments_of
+from thruster_env.plants.arguments import arguments_of, takes_arguments_of
 
 
 class SegorogeniAUVPathEnv(SegorogeniAUVEnv):

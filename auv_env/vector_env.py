@@ -7,7 +7,7 @@ from typing import ClassVar
 from auv_env.env import SegorogeniAUVEnv
 from auv_env.modelled import ModelledVehicle
 from auv_env.tasks import SegorogeniAUVDepthEnv, SegorogeniAUVPathEnv
-from plants.vector_env import PlantVectorEnv
+from thruster_env.plants.vector_env import PlantVectorEnv
 
 
 class SegorogeniAUVVectorEnv(ModelledVehicle, PlantVectorEnv):

@@ -12,7 +12,6 @@ import typer
 from benchmarks.rates import rates
 from benchmarks.rows import COLUMNS, machine, machine_lines
 from benchmarks.speed_page import check_page, write_page
-from numerics.threads import cores
 from thruster_cli.output import (
     JsonOption,
     SeedOption,
@@ -22,7 +21,8 @@ from thruster_cli.output import (
     progress_console,
     table,
 )
-from training.extras import check_installed
+from thruster_env.numerics.threads import cores
+from thruster_env.training.extras import check_installed
 
 CAPTION = (
     "A step's time counts env, filter and fresh info arrays; FilterPy's, one predict and update and no env. "

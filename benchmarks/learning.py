@@ -11,14 +11,14 @@ from benchmarks.timing import Measure
 from tuning.problems.seeds import training_seeds
 
 if TYPE_CHECKING:
-    from training.setup import TrainingConfiguration
+    from thruster_env.training.setup import TrainingConfiguration
 
 
 def training(setup: TrainingConfiguration, native: bool, rollouts: int) -> Measure:
     """Seconds a step of a short training, as `thruster train` learns."""
-    from training.environments import make_environments
-    from training.model import new_model
-    from training.torch_settings import learning
+    from thruster_env.training.environments import make_environments
+    from thruster_env.training.model import new_model
+    from thruster_env.training.torch_settings import learning
 
     model = new_model(setup, make_environments(setup, training_seeds(setup.seed, setup.num_envs), native=native))
     return _steps_of(model, lambda: learning(model), rollouts)
@@ -32,8 +32,8 @@ def by_hand(setup: TrainingConfiguration, rollouts: int) -> Measure:
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 
-    from training.environments import make_environments
-    from training.torch_settings import one_thread
+    from thruster_env.training.environments import make_environments
+    from thruster_env.training.torch_settings import one_thread
 
     numbers = dict(setup.hyperparameters)
     envs = VecNormalize(

@@ -14,7 +14,7 @@ from benchmarks.rows import Row
 from benchmarks.timing import Measure, seconds_a_call, side_by_side
 from benchmarks.workloads import step_of_env, step_of_filtered
 from filters.wrappers.single import EstimateState
-from numerics.streams import ACTION_SPACE, derived_seed
+from thruster_env.numerics.streams import ACTION_SPACE, derived_seed
 from thruster_env.plant import Plant
 
 ENSEMBLE_SIZE = 50

@@ -22,9 +22,9 @@ from benchmarks.vectors import vector_steps
 from benchmarks.workloads import step_of_filter, step_of_filtered, times
 from filters import make_filter, run
 from filters.filter import Filter
-from numerics.compiled import compiled, function_fingerprint
-from numerics.threads import cores
-from numerics.tuples import tuple_of, written_out
+from thruster_env.numerics.compiled import compiled, function_fingerprint
+from thruster_env.numerics.threads import cores
+from thruster_env.numerics.tuples import tuple_of, written_out
 from tuning.auv.find import find_scenario
 from tuning.auv.scenario import Scenario
 from tuning.problems.seeds import training_seeds

@@ -22,9 +22,9 @@ import torch
 
 import filters
 from filters import make_filter, run, thruster_model
-from numerics.streams import episode_keys
-from plants.simulate import simulate
 from thruster_env.model import transition
+from thruster_env.numerics.streams import episode_keys
+from thruster_env.plants.simulate import simulate
 
 RUNS = 60
 STEPS = 30

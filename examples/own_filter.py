@@ -31,9 +31,10 @@ import tuning
 from filters import ExtendedKalmanFilter
 from filters.gaussian.extended import advance, settle
 from filters.pages.page_filter import Page, PageFilter
-from numerics.algebra.blocks import forward_quotient
-from numerics.algebra.densities import log_density
-from numerics.algebra.operations import (
+from thruster_env.model import thruster_model
+from thruster_env.numerics.algebra.blocks import forward_quotient
+from thruster_env.numerics.algebra.densities import log_density
+from thruster_env.numerics.algebra.operations import (
     divide,
     joseph,
     only,
@@ -42,15 +43,14 @@ from numerics.algebra.operations import (
     uncorrelated,
     wrap,
 )
-from numerics.algebra.points import root
-from numerics.algebra.scalars import (
+from thruster_env.numerics.algebra.points import root
+from thruster_env.numerics.algebra.scalars import (
     at_most,
     diagonal,
     entries_product,
     exponential,
     ratio,
 )
-from thruster_env.model import thruster_model
 
 SEEDS = 100
 

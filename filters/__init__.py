@@ -28,9 +28,9 @@ from filters.tensors import torch
 from filters.wrappers.ids import register_filtered_envs
 from filters.wrappers.single import EstimateState
 from filters.wrappers.vector import EstimateStates
-from numerics.compiled import may_be_inlined
-from plants.affine import affine_model, linearize
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.compiled import may_be_inlined
+from thruster_env.plants.affine import affine_model, linearize
+from thruster_env.plants.state_space import StateSpaceModel
 
 __all__ = [
     "FILTERS",
@@ -72,7 +72,7 @@ __all__ = [
     "torch",
 ]
 
-may_be_inlined(__name__, "plants")
+may_be_inlined(__name__, "thruster_env.plants")
 register_filtered_envs()
 
 

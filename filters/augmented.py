@@ -8,16 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from numerics.angles import NAMES, short_way
-from numerics.checks import finite, positive
-from numerics.compiled import inlined
-from numerics.derivatives import RELATIVE_STEP
-from numerics.pickling import makes_functions
-from numerics.sources import Source, entrywise, tuple_of, written_out
-from numerics.tuples import assembled, joiner, vector_part
-from plants.quantities import Quantity
-from plants.shape import constants_are_array
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.angles import NAMES, short_way
+from thruster_env.numerics.checks import finite, positive
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.derivatives import RELATIVE_STEP
+from thruster_env.numerics.pickling import makes_functions
+from thruster_env.numerics.sources import Source, entrywise, tuple_of, written_out
+from thruster_env.numerics.tuples import assembled, joiner, vector_part
+from thruster_env.plants.quantities import Quantity
+from thruster_env.plants.shape import constants_are_array
+from thruster_env.plants.state_space import StateSpaceModel
 
 
 class Unknown(NamedTuple):

@@ -11,10 +11,10 @@ from filters.engine.batch import run
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.gaussian.square_root import SQUARE_ROOT
 from filters.pages.page import Page
-from numerics.checks import as_floats
-from plants.affine import AffineModel
-from plants.simulate import simulate
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.checks import as_floats
+from thruster_env.plants.affine import AffineModel
+from thruster_env.plants.simulate import simulate
+from thruster_env.plants.state_space import StateSpaceModel
 
 STIFF = 1e8  # S over R, from which an update of covariances loses half of their digits: roots keep them
 

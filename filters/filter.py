@@ -15,8 +15,8 @@ import numpy as np
 from filters.engine.belief import Belief, Innovation, Kernels
 from filters.engine.gated import GatedSession
 from filters.engine.session import Running, Session
-from numerics.compiled import is_interpreting
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.compiled import is_interpreting
+from thruster_env.plants.state_space import StateSpaceModel
 
 if TYPE_CHECKING:
     from filters.live import Live

@@ -11,7 +11,7 @@ import numpy as np
 from filters.engine.belief import Belief
 from filters.engine.session import Session
 from filters.monitoring.monitor import Health, Monitor, monitor_of, watch_of
-from numerics.checks import as_floats, finite, one_of, positive, shown
+from thruster_env.numerics.checks import as_floats, finite, one_of, positive, shown
 
 if TYPE_CHECKING:
     from filters.filter import Filter

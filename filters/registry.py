@@ -26,8 +26,8 @@ from filters.gaussian.steady_state import SteadyStateKalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
 from filters.particles.auxiliary import AuxiliaryParticleFilter
 from filters.particles.particle import ParticleFilter
-from numerics.checks import one_of
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.checks import one_of
+from thruster_env.plants.state_space import StateSpaceModel
 
 LISTED = "thruster filters"  # the command that lists all
 FILTERS: dict[str, type[Filter]] = {

@@ -14,7 +14,7 @@ from typing import Any
 
 from filters.registry import FILTERS, LISTED, tunable_numbers
 from filters.tuned_model import check_model_data
-from numerics.checks import finite, one_of, positive, shown
+from thruster_env.numerics.checks import finite, one_of, positive, shown
 
 FILE_FORMAT = "tuned filter"
 OLD_FORMAT = "thruster-env tuned filter"  # of versions 2 and 3

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from numerics.checks import shown
-from plants.quantities import Quantity
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.checks import shown
+from thruster_env.plants.quantities import Quantity
+from thruster_env.plants.state_space import StateSpaceModel
 
 VECTORS = {"states": "states", "inputs": "input_quantities", "measurements": "measurements"}
 KEYS = ("digest", "dt", *VECTORS)

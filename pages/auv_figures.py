@@ -18,9 +18,9 @@ import auv_env  # noqa: F401 - registers the envs
 from auv_env.control.depth_and_course import DepthAndCourse
 from auv_env.manoeuvres import MANOEUVRES
 from filters import EstimateState
-from numerics.files import write_whole
 from pages.page import digits, make_page, table
-from plants.observe import ObserveStateVector
+from thruster_env.numerics.files import write_whole
+from thruster_env.plants.observe import ObserveStateVector
 
 
 def frame(path: Path) -> Path:

@@ -15,16 +15,16 @@ from pathlib import Path
 import numpy as np
 
 from pages.page import make_page, table
-from studies import ngatini2017, ngatini2019
-from studies.vehicle.estimators import MEASUREMENTS
-from studies.vehicle.experiment import PathResult, run_tasks
-from studies.vehicle.figure import path_runs, paths_figure
-from studies.vehicle.findings import ENKF, FKF, findings
-from studies.vehicle.printed import POSE, PrintedRow
-from studies.vehicle.scores import Scores, position_ratio
-from studies.vehicle.statements import statements
-from studies.vehicle.tasks import tasks_of
-from studies.vehicle.wording import digits, with_interval
+from thruster_env.studies import ngatini2017, ngatini2019
+from thruster_env.studies.vehicle.estimators import MEASUREMENTS
+from thruster_env.studies.vehicle.experiment import PathResult, run_tasks
+from thruster_env.studies.vehicle.figure import path_runs, paths_figure
+from thruster_env.studies.vehicle.findings import ENKF, FKF, findings
+from thruster_env.studies.vehicle.printed import POSE, PrintedRow
+from thruster_env.studies.vehicle.scores import Scores, position_ratio
+from thruster_env.studies.vehicle.statements import statements
+from thruster_env.studies.vehicle.tasks import tasks_of
+from thruster_env.studies.vehicle.wording import digits, with_interval
 
 RUNS = {"ngatini2019": 50, "ngatini2017": 10}
 

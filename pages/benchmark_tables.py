@@ -13,14 +13,14 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from numerics.files import write_whole
-from numerics.markdown import with_tables
 from pages.page import DOCS, table
-from studies import BENCHMARKS
-from studies.benchmark import find_benchmark
-from studies.lorenz63 import problem as lorenz63
-from studies.pendulum import problem as pendulum
-from studies.tuned_inflation import tune_inflation
+from thruster_env.numerics.files import write_whole
+from thruster_env.numerics.markdown import with_tables
+from thruster_env.studies import BENCHMARKS
+from thruster_env.studies.benchmark import find_benchmark
+from thruster_env.studies.lorenz63 import problem as lorenz63
+from thruster_env.studies.pendulum import problem as pendulum
+from thruster_env.studies.tuned_inflation import tune_inflation
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.search.plan import Plan
 from tuning.search.study import open_study, quiet_optuna, run_study

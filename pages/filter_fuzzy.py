@@ -10,11 +10,11 @@ from filters import FuzzyKalmanFilter, StateSpaceModel, make_filter, run, thrust
 from filters.consistency.intervals import Interval, rmse_ratios
 from filters.filter import Filter
 from filters.gaussian.fuzzy import BLENDINGS
-from numerics.plots import DARK, SKY, new_figure, save_figure, tidy
 from pages.filter_gaussian import FLOW, FLOW_RMSE
 from pages.filter_runs import LOOKS, Runs, held_runs, judged, nees, times
 from pages.page import digits, legend_below, log_ticks, table
 from thruster_env.linear.steady_state import steady_state
+from thruster_env.numerics.plots import DARK, SKY, new_figure, save_figure, tidy
 from thruster_env.parameters import PRESETS
 from tuning.problems.data import FIRST_SCORED_STEP
 

@@ -16,9 +16,9 @@ from filters import (
     thruster_model,
 )
 from filters.posterior import posterior_bound
-from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from pages.filter_runs import LOOKS, PUBLISHED_NOISE, RUNS, deviations, held_runs, judged, rmse, runs_of, times
 from pages.page import legend_below, log_ticks
+from thruster_env.numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from thruster_env.plant import make_plant
 from tuning.problems.data import FIRST_SCORED_STEP
 

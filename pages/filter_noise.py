@@ -16,9 +16,9 @@ from filters import (
     run,
     thruster_model,
 )
-from numerics.plots import BLUE, DARK, MUSTARD, RUST, new_figure, save_figure, tidy
 from pages.filter_runs import LOOKS, RUNS, SEED, Runs, deviations, held_runs, judged, times
 from pages.page import legend_below, log_ticks
+from thruster_env.numerics.plots import BLUE, DARK, MUSTARD, RUST, new_figure, save_figure, tidy
 
 FLOW = "flow velocity $U_a$ [m/s]"
 FLOW_RMSE = "RMSE of $U_a$ [m/s]"

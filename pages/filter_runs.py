@@ -11,8 +11,8 @@ from filters.consistency.nees import normalized_squares
 from filters.filter import Filter
 from filters.looks import TRUTH, look
 from filters.registry import FILTERS
-from numerics.plots import MUSTARD
-from numerics.streams import episode_keys, filter_keys
+from thruster_env.numerics.plots import MUSTARD
+from thruster_env.numerics.streams import episode_keys, filter_keys
 from thruster_env.plant import Plant, make_plant
 from thruster_env.simulation import simulate
 from tuning.problems.data import FIRST_SCORED_STEP

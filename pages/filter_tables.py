@@ -12,11 +12,11 @@ import numpy as np
 from filters import FILTERS, StateSpaceModel, Unknown, augmented_model, make_filter, thruster_model
 from filters.filter import Filter
 from filters.registry import tunable_numbers
-from numerics.compiled import interpreted
 from pages.filter_noise import LOUD, outliers
 from pages.filter_runs import PUBLISHED_NOISE, Runs, held_runs, judged
 from pages.filter_sampled import SIGNLESS, signless_runs
 from pages.page import digits, table
+from thruster_env.numerics.compiled import interpreted
 
 
 class Words(NamedTuple):

@@ -21,10 +21,10 @@ from filters.pages.members import MembersMemory
 from filters.pages.members import stages_of as stages_of_members
 from filters.pages.memory import RowMemory
 from filters.pages.stages import Stage, as_programs
-from numerics.algebra.loops import cut
-from numerics.algebra.matrices import Matrix, in_order
-from numerics.algebra.programs import Place, Program
 from pages.page import make_page
+from thruster_env.numerics.algebra.loops import cut
+from thruster_env.numerics.algebra.matrices import Matrix, in_order
+from thruster_env.numerics.algebra.programs import Place, Program
 
 WANTED = Wanted(information=False, constants=True, tails=False)
 

@@ -15,9 +15,6 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 
-from numerics.files import write_whole
-from numerics.plots import BLUE, DARK, RUST, SKY, new_figure, save_figure, tidy
-from numerics.streams import episode_keys
 from pages.page import label_grid, legend_below, make_page
 from pages.plant_tables import FULL_VOLTAGE, TABLES, thrust_coefficient
 from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
@@ -26,6 +23,9 @@ from thruster_env.effects.reference import REFERENCE_SIGNALS
 from thruster_env.engine.copies import Copies
 from thruster_env.engine.memory import AMBIENT, FIXED_ROWS, READINGS, REFERENCE, THRUST, VALID, VOLTAGE
 from thruster_env.linear.steady_state import steady_state
+from thruster_env.numerics.files import write_whole
+from thruster_env.numerics.plots import BLUE, DARK, RUST, SKY, new_figure, save_figure, tidy
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.parameters import PRESETS
 from thruster_env.plant import Plant, make_plant
 from thruster_env.simulation import simulate

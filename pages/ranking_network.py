@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from numerics.files import write_whole
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.files import write_whole
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 from tuning.problems.seeds import training_seeds

@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from filters.consistency.intervals import Interval
-from numerics.files import write_whole
 from pages.page import DOCS, with_tables
+from thruster_env.numerics.files import write_whole
 from tuning.evaluation.compare import Contender, Leaderboard, Row, compare, contender
 from tuning.problems.excitation import Steps
 from tuning.problems.seeds import held_out_seeds

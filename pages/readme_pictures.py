@@ -21,12 +21,12 @@ from PIL import Image
 import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState
 from filters.engine.batch import run
-from numerics.files import write_whole
-from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from pages.page import DOCS
 from thruster_cli.demo import FILTER, SCENARIO, before_and_after
 from thruster_cli.tune import tune
 from thruster_cli.tuning_report import Tuning
+from thruster_env.numerics.files import write_whole
+from thruster_env.numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from tuning.reporting.panels import axis_label
 from tuning.search.plan import Plan
 from tuning.thruster.find import find_scenario

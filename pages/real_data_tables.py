@@ -12,18 +12,18 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from numerics.files import write_whole
-from numerics.markdown import table, with_tables
-from numerics.toml import as_toml
 from pages.page import DOCS
-from studies.recordings.comparison import estimates_of
-from studies.recordings.identification import CHOSEN
-from studies.recordings.model import IDENTIFIED, model
-from studies.recordings.regime import regimes
-from studies.recordings.results import Task, identify_all
-from studies.recordings.runs import read_recordings
-from studies.recordings.tables import sentences
-from studies.recordings.tables import tables_of as rows_of
+from thruster_env.numerics.files import write_whole
+from thruster_env.numerics.markdown import table, with_tables
+from thruster_env.numerics.toml import as_toml
+from thruster_env.studies.recordings.comparison import estimates_of
+from thruster_env.studies.recordings.identification import CHOSEN
+from thruster_env.studies.recordings.model import IDENTIFIED, model
+from thruster_env.studies.recordings.regime import regimes
+from thruster_env.studies.recordings.results import Task, identify_all
+from thruster_env.studies.recordings.runs import read_recordings
+from thruster_env.studies.recordings.tables import sentences
+from thruster_env.studies.recordings.tables import tables_of as rows_of
 
 
 def tables_of(recordings: Path, results: Path) -> dict[str, Callable[[], str]]:

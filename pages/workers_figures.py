@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from numerics.plots import BLUE, RUST, new_figure, save_figure, tidy
-from numerics.threads import cores
 from pages.page import log_ticks, make_page, table
 from pages.workers_rates import FILTERS, NOTHING, STORAGES, WAITING, WORKS, rates
+from thruster_env.numerics.plots import BLUE, RUST, new_figure, save_figure, tidy
+from thruster_env.numerics.threads import cores
 
 COLOURS = dict(zip(STORAGES, (BLUE, RUST), strict=True))
 MOST = 128  # workers in the picture

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from numerics.compiled import interpreted
+from thruster_env.numerics.compiled import interpreted
 
 # Before anything imports matplotlib or pygame.
 os.environ.setdefault("MPLBACKEND", "Agg")

@@ -8,9 +8,9 @@ import numpy as np
 from filters import StateSpaceModel, affine_model, make_filter, thruster_model
 from filters.registry import tunable_numbers
 from filters.tuned_file import sealed
-from numerics.compiled import interpreted
-from numerics.streams import episode_keys
-from plants import simulate
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import episode_keys
+from thruster_env.plants import simulate
 
 KEY = (123456789, 4294967295)  # of a filter's random numbers
 DT = 0.05  # of the pendulum

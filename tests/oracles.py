@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from filters import run
-from numerics.streams import normal_block
 from tests.models import KEY
+from thruster_env.numerics.streams import normal_block
 
 
 def normals(stream, step, rows, size):

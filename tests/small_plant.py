@@ -11,24 +11,24 @@ from typing import NamedTuple
 import gymnasium as gym
 import numpy as np
 
-from numerics.checks import covariance_root, positive, vector
-from numerics.checks import options as checked_options
-from numerics.compiled import inlined
-from numerics.streams import INITIAL, MEASUREMENT, PROCESS
-from plants.affine import affine_model
-from plants.arguments import arguments_of, takes_arguments_of
-from plants.channels import Channel, reader_of
-from plants.copies import PlantCopies, machine_code_of
-from plants.disturbances.chains import chain_of
-from plants.disturbances.effects import Context, dropping_channels, encoded
-from plants.disturbances.sensors import SENSOR_EFFECTS
-from plants.env import PlantEnv
-from plants.memory import FIRST_REPORTED, FRONT, REWARD, STEP, TERMINATED, TIME
-from plants.modelled import ModelledEnv
-from plants.noise import noise_adder
-from plants.quantities import Quantity
-from plants.report import ReportRows
-from plants.vector_env import PlantVectorEnv
+from thruster_env.numerics.checks import covariance_root, positive, vector
+from thruster_env.numerics.checks import options as checked_options
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.streams import INITIAL, MEASUREMENT, PROCESS
+from thruster_env.plants.affine import affine_model
+from thruster_env.plants.arguments import arguments_of, takes_arguments_of
+from thruster_env.plants.channels import Channel, reader_of
+from thruster_env.plants.copies import PlantCopies, machine_code_of
+from thruster_env.plants.disturbances.chains import chain_of
+from thruster_env.plants.disturbances.effects import Context, dropping_channels, encoded
+from thruster_env.plants.disturbances.sensors import SENSOR_EFFECTS
+from thruster_env.plants.env import PlantEnv
+from thruster_env.plants.memory import FIRST_REPORTED, FRONT, REWARD, STEP, TERMINATED, TIME
+from thruster_env.plants.modelled import ModelledEnv
+from thruster_env.plants.noise import noise_adder
+from thruster_env.plants.quantities import Quantity
+from thruster_env.plants.report import ReportRows
+from thruster_env.plants.vector_env import PlantVectorEnv
 
 STATES = (Quantity("position", "p", "m"), Quantity("speed", "v", "m/s"), Quantity("force", "F", "N"))
 INPUTS = (Quantity("command", "u", "V"), Quantity("slope", "s", "m/s^2"))

@@ -4,7 +4,8 @@ import os
 import sys
 
 # `-m` puts the working folder first, where a `struct.py` beside the data would take the place of Python's. What a
-# user names is found there all the same (`numerics.modules`). It stays if this package itself lies there.
+# user names is found there all the same (`thruster_env.numerics.modules`). It stays if this package itself lies
+# there.
 if sys.path[:1] == [os.getcwd()] != [os.path.dirname(os.path.dirname(os.path.abspath(__file__)))]:
     sys.path.pop(0)
 

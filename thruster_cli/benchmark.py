@@ -8,8 +8,8 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from studies.benchmark import WHY, Benchmark, Row, find_benchmark
 from thruster_cli.output import announce_compilation, console, progress_console, table
+from thruster_env.studies.benchmark import WHY, Benchmark, Row, find_benchmark
 
 
 def reproduce_benchmark(name: str, runs: int, seed: int) -> tuple[list[RenderableType], dict]:

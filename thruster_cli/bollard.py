@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from rich.console import RenderableType
 
-from studies.bollard_fit import FITTED, Identified, identify, relative_errors
-from studies.bollard_table import read_table
 from thruster_cli.output import announce_compilation, check_targets, emit, table
 from thruster_env.logged import Shown
 from thruster_env.parameters import ThrusterParameters, preset_parameters
 from thruster_env.plant import make_plant
 from thruster_env.preset_file import PresetFile, is_file, write_preset
+from thruster_env.studies.bollard_fit import FITTED, Identified, identify, relative_errors
+from thruster_env.studies.bollard_table import read_table
 from tuning.identification.identify import identify as identify_logs
 from tuning.identification.result import Identification
 from tuning.logs.read import read_named

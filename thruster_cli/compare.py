@@ -11,10 +11,10 @@ import typer
 
 from filters.augmented import Unknown
 from filters.registry import FILTERS
-from numerics.checks import at_least
 from thruster_cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption, SeedOption, filter_option
 from thruster_cli.output import announce_compilation, emit, progress_console
 from thruster_cli.problems import PROBLEMS
+from thruster_env.numerics.checks import at_least
 from tuning.api.compare import DEFAULT_FILTERS, compared, contenders_of, knowledge_on, without_unfit
 from tuning.api.comparison import INTERRUPTED, left_out_lines
 from tuning.evaluation.tuned import read_choice, read_tuned

@@ -9,8 +9,8 @@ from filters.consistency.nees import SquaresCheck
 from filters.consistency.report import ConsistencyReport
 from filters.consistency.verdicts import MOST_STATES, comparison_sentence, sentences
 from filters.filter import Filter
-from numerics.files import check_target
 from thruster_cli.output import check_picture
+from thruster_env.numerics.files import check_target
 from tuning.evaluation.baselines import ORACLE
 from tuning.evaluation.evaluate import check_consistency
 from tuning.evaluation.held_out import Comparison

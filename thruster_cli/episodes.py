@@ -14,12 +14,12 @@ import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState
 from filters.logs.estimate import LogEstimate
 from filters.logs.estimate import estimate as estimate_log
-from numerics.checks import at_least, one_of, within
-from numerics.streams import episode_keys
-from plants.logs.log import Log
-from plants.rendering.film import OnStep, Played, steps_a_frame, write_film
 from thruster_cli.output import warn_beyond
 from thruster_env.control.controllers import PIController
+from thruster_env.numerics.checks import at_least, one_of, within
+from thruster_env.numerics.streams import episode_keys
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.rendering.film import OnStep, Played, steps_a_frame, write_film
 from thruster_env.rendering.env import renderer_of
 from thruster_env.rendering.history import Moment, Overlay
 from tuning.problems.excitation import EXCITATIONS, excitation_of

@@ -16,7 +16,6 @@ from filters.logs.estimate import LogEstimate, estimate
 from filters.logs.findings import LogFindings, Residual, findings
 from filters.logs.verdict import ALPHA, verdict
 from filters.monitoring.monitor import monitor_of
-from plants.logs.write import check_suffix, write_columns
 from thruster_cli.options import (
     A_LOG,
     FILTER,
@@ -35,6 +34,7 @@ from thruster_cli.options import (
     one_file,
 )
 from thruster_cli.output import announce_compilation, check_picture, check_targets, emit, table
+from thruster_env.plants.logs.write import check_suffix, write_columns
 from tuning.logs.read import read_named
 
 MOST_EPISODES = 8  # that are shown

@@ -10,9 +10,9 @@ import typer
 from filters.c.programs import programs_of
 from filters.c.project import write_project
 from filters.c.single import single_error
-from numerics.checks import one_of
 from thruster_cli.options import OUTPUT, CodeOption, JsonOption, LogModelOption
 from thruster_cli.output import announce_compilation, check_targets, emit
+from thruster_env.numerics.checks import one_of
 from tuning.evaluation.tuned import read_tuned
 from tuning.logs.problem import problems_in
 from tuning.problems.find import find_problem

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from rich.console import RenderableType
 
-from numerics.text_tables import plain_text, table
-from plants.logs.recorders.registry import ENDINGS, METADATA, Field, fields, format_of
+from thruster_env.numerics.text_tables import plain_text, table
+from thruster_env.plants.logs.recorders.registry import ENDINGS, METADATA, Field, fields, format_of
 
 BLOCKS = "▁▂▃▄▅▆▇█"
 WIDE = 400  # characters of a line that goes into a file or another program: no name is folded there

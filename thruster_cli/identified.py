@@ -7,9 +7,9 @@ from pathlib import Path
 
 from rich.console import RenderableType
 
-from numerics.plots import save_figure
-from plants.logs.log import Log
 from thruster_cli.output import table
+from thruster_env.numerics.plots import save_figure
+from thruster_env.plants.logs.log import Log
 from tuning.identification.profiles import Profile, profile_figure
 from tuning.identification.result import Identification
 from tuning.identification.validation import Validation

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from numerics.checks import within
 from thruster_cli.options import INPUT, OUTPUT, JsonOption, PresetOption
 from thruster_cli.output import check_picture, check_targets, emit, table, warn_beyond
 from thruster_env.linear.analysis import (
@@ -25,6 +24,7 @@ from thruster_env.linear.analysis import (
 from thruster_env.linear.figures import response_figure
 from thruster_env.linear.published import NO_LINEARISATION, SAMPLE_TIME, PublishedLinearModel, published_for
 from thruster_env.linear.steady_state import SteadyState, state_range, steady_state
+from thruster_env.numerics.checks import within
 from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, Plant, make_plant
 from thruster_env.preset_file import is_file
 

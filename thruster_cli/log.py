@@ -9,8 +9,6 @@ from typing import Annotated
 import typer
 from rich.console import RenderableType
 
-from plants.logs.findings import sentences
-from plants.logs.log import Log
 from thruster_cli.fields import as_json, as_table, found_in, is_listed
 from thruster_cli.options import (
     A_LOG,
@@ -25,6 +23,8 @@ from thruster_cli.options import (
     SensorOption,
 )
 from thruster_cli.output import check_picture, check_targets, console, emit, table
+from thruster_env.plants.logs.findings import sentences
+from thruster_env.plants.logs.log import Log
 from tuning.logs.read import read_named
 
 
@@ -80,7 +80,7 @@ def command(
     recorded, _ = read_named(log, preset, model, sensor, column, clock_offset, dt)
     check_targets((plot,), json, read=(log, preset))
     if plot is not None:
-        from plants.logs.figure import findings_figure
+        from thruster_env.plants.logs.figure import findings_figure
 
         findings_figure(plot, recorded)
     emit(_shown(recorded, plot), _as_json(recorded, plot), json)

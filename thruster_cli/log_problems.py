@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from numerics.checks import shown
+from thruster_env.numerics.checks import shown
 from tuning.logs.problem import log_problem
 from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem

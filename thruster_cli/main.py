@@ -52,7 +52,7 @@ def main() -> None:
         Timer(0.05, pthread_kill, (main_thread().ident, SIGINT)).start()  # which also wakes it up
 
     try:
-        from numerics.characters import adapt_standard_streams
+        from thruster_env.numerics.characters import adapt_standard_streams
 
         adapt_standard_streams()
         from thruster_cli.app import app

@@ -9,10 +9,10 @@ from typing import Annotated
 
 import typer
 
-from numerics.checks import one_of
-from numerics.files import write_whole
 from thruster_cli.options import JsonOption, spelt
 from thruster_cli.output import check_targets, emit
+from thruster_env.numerics.checks import one_of
+from thruster_env.numerics.files import write_whole
 
 TEMPLATES = Path(__file__).parent / "templates"
 FILES = {kind: f"{kind}.py" for kind in ("problem", "model", "env", "filter")} | {"preset": "preset.toml"}

@@ -10,8 +10,8 @@ import typer
 
 from filters.registry import FILTERS
 from filters.starts import STARTS
-from numerics.checks import any_case
 from thruster_env.channels import CHANNELS
+from thruster_env.numerics.checks import any_case
 from thruster_env.parameters import PRESETS
 
 # Panels, in the order in which commands declare their options.

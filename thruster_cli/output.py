@@ -14,17 +14,17 @@ import numpy as np
 from rich.console import Console, RenderableType
 from rich.text import Text
 
-from numerics.compiled import tell_when_compiling
-from numerics.files import check_not_read, check_target, write_whole
-from numerics.progress import listening
-from numerics.text_tables import BEST as BEST
-from numerics.text_tables import console
-from numerics.text_tables import table as table  # for the commands, beside what follows
-from plants.logs.recorders.registry import ENDINGS
-from plants.logs.table import SUFFIXES
-from plants.logs.write import check_not_beside, check_suffix
 from thruster_cli.options import JsonOption, SeedOption  # noqa: F401 - for `demo`
+from thruster_env.numerics.compiled import tell_when_compiling
+from thruster_env.numerics.files import check_not_read, check_target, write_whole
+from thruster_env.numerics.progress import listening
+from thruster_env.numerics.text_tables import BEST as BEST
+from thruster_env.numerics.text_tables import console
+from thruster_env.numerics.text_tables import table as table  # for the commands, beside what follows
 from thruster_env.plant import largest_known_voltage
+from thruster_env.plants.logs.recorders.registry import ENDINGS
+from thruster_env.plants.logs.table import SUFFIXES
+from thruster_env.plants.logs.write import check_not_beside, check_suffix
 
 PICTURES = (".png", ".svg", ".pdf")  # which figures are written as
 progress_console = Console(stderr=True, markup=False, highlight=False)

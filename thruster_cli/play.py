@@ -9,9 +9,6 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from numerics.checks import at_least, one_of, shown
-from plants.rendered import LARGEST, SMALLEST
-from plants.rendering.film import Played, check_drawing
 from thruster_cli.options import (
     FILTER,
     FILTER_HELP,
@@ -25,6 +22,9 @@ from thruster_cli.options import (
     filter_option,
 )
 from thruster_cli.output import announce_compilation, check_targets, emit, progress_console
+from thruster_env.numerics.checks import at_least, one_of, shown
+from thruster_env.plants.rendered import LARGEST, SMALLEST
+from thruster_env.plants.rendering.film import Played, check_drawing
 from tuning.problems.seeds import held_out_seeds
 
 STEPS = 500
@@ -181,12 +181,12 @@ def _of_policy(
     size: tuple[int, int] | None,
     json: str | None,
 ) -> tuple:
-    from training.extras import check_installed
+    from thruster_env.training.extras import check_installed
 
     check_installed()
     with progress_console.status("loading torch ..."):
-        from training.play import play
-        from training.saved import find_saved, read_configuration
+        from thruster_env.training.play import play
+        from thruster_env.training.saved import find_saved, read_configuration
     folder = find_saved(model)
     seed = held_out_seeds(read_configuration(folder).seed, 2)[0] if seed is None else seed
     film = None if window else out or model / f"episode-seed{seed}.mp4"

@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from numerics.files import check_target
 from thruster_cli.options import INPUT, OUTPUT, RUNS, JsonOption
 from thruster_cli.output import announce_compilation, emit, progress_console, table
+from thruster_env.numerics.files import check_target
 
 RESULTS = Path("out") / "recordings.json"
 
@@ -48,10 +48,10 @@ def command(
 
     Example: thruster study recordings --data rov_thruster
     """
-    from studies.recordings.comparison import estimates_of
-    from studies.recordings.results import identify_all
-    from studies.recordings.runs import read_recordings
-    from studies.recordings.tables import sentences, tables_of
+    from thruster_env.studies.recordings.comparison import estimates_of
+    from thruster_env.studies.recordings.results import identify_all
+    from thruster_env.studies.recordings.runs import read_recordings
+    from thruster_env.studies.recordings.tables import sentences, tables_of
 
     runs = read_recordings(data)
     if identify:

@@ -9,20 +9,20 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
-from numerics.checks import at_least, one_of
-from numerics.files import check_target
-from studies import BENCHMARKS, STUDIES, VEHICLE_STUDIES
-from studies.benchmark import RUNS as BENCHMARK_RUNS
-from studies.comparison import LARGEST_ENSEMBLE, MEMBERS, MOST_RUNS, RUNS, compare_all
-from studies.findings import findings, general_statements, study_statements
-from studies.series import all_series, series_figure
-from studies.vehicle.experiment import MOST_RUNS as MOST_VEHICLE_RUNS
-from studies.vehicle.printed import RUNS as VEHICLE_RUNS
 from thruster_cli import options
 from thruster_cli.benchmark import fitted, list_of, reproduce_benchmark
 from thruster_cli.options import JsonOption, SeedOption
 from thruster_cli.output import announce_compilation, check_picture, emit, progress_console, table
 from thruster_cli.vehicle import reproduce_vehicle
+from thruster_env.numerics.checks import at_least, one_of
+from thruster_env.numerics.files import check_target
+from thruster_env.studies import BENCHMARKS, STUDIES, VEHICLE_STUDIES
+from thruster_env.studies.benchmark import RUNS as BENCHMARK_RUNS
+from thruster_env.studies.comparison import LARGEST_ENSEMBLE, MEMBERS, MOST_RUNS, RUNS, compare_all
+from thruster_env.studies.findings import findings, general_statements, study_statements
+from thruster_env.studies.series import all_series, series_figure
+from thruster_env.studies.vehicle.experiment import MOST_RUNS as MOST_VEHICLE_RUNS
+from thruster_env.studies.vehicle.printed import RUNS as VEHICLE_RUNS
 
 ALL = "all"
 LINES = "In each cell first omega_m [rad/s], below it U_a [m/s]."

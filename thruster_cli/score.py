@@ -12,14 +12,14 @@ from rich.console import RenderableType
 from rich.text import Text
 
 from filters.consistency.intervals import mean_interval
-from numerics.checks import one_of
 from thruster_cli.options import INPUT, RUNS, JsonOption, OfPresetOption, SeedOption
 from thruster_cli.output import announce_compilation, emit, progress_console, table
 from thruster_cli.train import LEARNABLE
-from training.extras import check_installed
-from training.observations import find_observation_set
-from training.plants.find import plant_of
-from training.setup import TrainingConfiguration, in_scenario
+from thruster_env.numerics.checks import one_of
+from thruster_env.training.extras import check_installed
+from thruster_env.training.observations import find_observation_set
+from thruster_env.training.plants.find import plant_of
+from thruster_env.training.setup import TrainingConfiguration, in_scenario
 from tuning.problems.scenario import BaseScenario
 from tuning.problems.seeds import held_out_seeds
 from tuning.reporting.error_tables import about, unless_blank
@@ -27,7 +27,7 @@ from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.thruster.logs import of_preset
 
 if TYPE_CHECKING:
-    from training.score import Scores
+    from thruster_env.training.score import Scores
 
 SEEN = "seen"  # heads the column of what the policy is shown
 
@@ -85,7 +85,7 @@ def command(
         raise ValueError(f"--preset must come with --scenario, but got --preset {preset} alone")
     held_out = held_out_seeds(seed, seeds)
     with progress_console.status("loading torch ..."):
-        from training.saved import find_saved, read_configuration
+        from thruster_env.training.saved import find_saved, read_configuration
     folders = {model: find_saved(model) for model in models}
     setups = {model: read_configuration(folder) for model, folder in folders.items()}
     kind = plant_of(next(iter(setups.values())).task)
@@ -122,9 +122,9 @@ def check_alike(setups: Sequence[TrainingConfiguration], plant: BaseScenario | N
 def _learnt(
     model: Path, folder: Path, setup: TrainingConfiguration, plant: BaseScenario | None, seeds: Sequence[int]
 ) -> Scored:
-    from training.environments import make_environments
-    from training.saved import load
-    from training.score import score
+    from thruster_env.training.environments import make_environments
+    from thruster_env.training.saved import load
+    from thruster_env.training.score import score
 
     met = setup if plant is None else in_scenario(setup, plant)
     policy = load(folder, make_environments(met, seeds[:1]))
@@ -135,8 +135,8 @@ def _learnt(
 def _classical(
     name: str, setup: TrainingConfiguration, plant: BaseScenario | None, seeds: Sequence[int]
 ) -> Scored:
-    from training.classical import classical_policy
-    from training.score import score
+    from thruster_env.training.classical import classical_policy
+    from thruster_env.training.score import score
 
     setup = replace(setup, controller=None)  # there is no policy to correct it
     met = setup if plant is None else in_scenario(setup, plant)

@@ -8,18 +8,18 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from numerics.checks import at_least, positive, within
-from numerics.streams import episode_keys
-from plants.logs.write import check_suffix, header_of, write_columns
 from thruster_cli.options import INPUT, OUTPUT, RUNS, JsonOption, PresetOption, SeedOption
 from thruster_cli.output import announce_compilation, check_targets, emit, warn_beyond
 from thruster_env.channels import CHANNELS
+from thruster_env.numerics.checks import at_least, positive, within
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.plant import (
     DEFAULT_DT,
     DEFAULT_MEASUREMENT_NOISE,
     DEFAULT_PROCESS_NOISE,
     make_plant,
 )
+from thruster_env.plants.logs.write import check_suffix, header_of, write_columns
 from thruster_env.simulation import simulate
 from tuning.problems.excitation import held_levels
 

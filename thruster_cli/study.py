@@ -90,14 +90,14 @@ def policies(
 
     Example: thruster study policies --quick
     """
-    from training.extras import check_installed
+    from thruster_env.training.extras import check_installed
 
     check_installed()
-    from training.comparison.answers import answers
-    from training.comparison.plan import QUICK, Comparison
-    from training.comparison.report import PAGE, check_page, write_report
-    from training.comparison.runs import run_comparison
-    from training.comparison.tables import HEADER, rows_of, summary_rows
+    from thruster_env.training.comparison.answers import answers
+    from thruster_env.training.comparison.plan import QUICK, Comparison
+    from thruster_env.training.comparison.report import PAGE, check_page, write_report
+    from thruster_env.training.comparison.runs import run_comparison
+    from thruster_env.training.comparison.tables import HEADER, rows_of, summary_rows
 
     comparison = QUICK if quick else Comparison()
     given: dict[str, Any] = {"seeds": seeds, "steps": steps, "recurrent": recurrent or None}

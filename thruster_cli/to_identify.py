@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from numerics.checks import finite, shown
+from thruster_env.numerics.checks import finite, shown
 
 
 def ranges_of(given: Mapping[str, str]) -> dict[str, tuple[float, float]]:

@@ -15,20 +15,20 @@ from rich.console import RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from filters.tuned_file import read_tuned_file
-from numerics.checks import at_least
 from thruster_cli.options import FILTER, INPUT, LEARNING, OUTPUT, JsonOption, OfPresetOption, spelt
 from thruster_cli.output import announce_compilation, emit, progress_console, table
-from training.algorithms import ALGORITHMS
-from training.extras import check_installed
-from training.observations import OBSERVATION_SETS
-from training.plants.find import PLANTS, TASKS, plant_of
-from training.setup import TrainingConfiguration, make_configuration
+from thruster_env.numerics.checks import at_least
+from thruster_env.training.algorithms import ALGORITHMS
+from thruster_env.training.extras import check_installed
+from thruster_env.training.observations import OBSERVATION_SETS
+from thruster_env.training.plants.find import PLANTS, TASKS, plant_of
+from thruster_env.training.setup import TrainingConfiguration, make_configuration
 from tuning.api.run import file_name
 from tuning.problems.plain import plain
 from tuning.thruster.logs import of_preset
 
 if TYPE_CHECKING:
-    from training.learn import Trained
+    from thruster_env.training.learn import Trained
 
 POLICIES = Path("out") / "policies"
 SHOWN_EVALUATIONS = 8
@@ -167,7 +167,7 @@ def command(
             f"{tuned} was tuned on {meant}, and its filter keeps the assumptions of that scenario."
         )
     with progress_console.status("loading torch ..."):
-        from training.learn import train
+        from thruster_env.training.learn import train
     announce_compilation()
     with _bar(f"{algo} on {observe}", setup.steps) as on_progress:
         trained = train(

@@ -9,8 +9,8 @@ from rich.console import RenderableType
 
 from filters.consistency.intervals import slightly, span
 from filters.consistency.verdicts import mean_sentence
-from numerics.modules import is_code
 from thruster_cli.tables import choice_table, front_table, gradient_table, kinds_table
+from thruster_env.numerics.modules import is_code
 from tuning.api.run import Tuning
 from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED, baselines
 from tuning.evaluation.blow_up import blow_up_on

@@ -61,9 +61,9 @@ def command(
 
     Example: thruster study users --quick
     """
-    from numerics.files import check_target, write_whole
-    from studies.users.runs import QUICK, Panel, run_panel
-    from studies.users.tables import csv_text, header, markdown, rows_of, sentences
+    from thruster_env.numerics.files import check_target, write_whole
+    from thruster_env.studies.users.runs import QUICK, Panel, run_panel
+    from thruster_env.studies.users.tables import csv_text, header, markdown, rows_of, sentences
 
     given: dict[str, Any] = {"problems": problem, "filters": filters, "trials": trials, "seed": seed}
     changes: dict[str, Any] = {

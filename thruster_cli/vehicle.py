@@ -8,12 +8,6 @@ from rich.console import RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
-from studies.vehicle.experiment import PathResult, run_tasks
-from studies.vehicle.figure import path_runs, paths_figure
-from studies.vehicle.findings import findings
-from studies.vehicle.printed import RUNS
-from studies.vehicle.statements import statements
-from studies.vehicle.tasks import PAPERS, tasks_of
 from thruster_cli.benchmark import list_of
 from thruster_cli.output import announce_compilation, progress_console
 from thruster_cli.vehicle_tables import (
@@ -25,6 +19,12 @@ from thruster_cli.vehicle_tables import (
     published_table,
     velocity_table,
 )
+from thruster_env.studies.vehicle.experiment import PathResult, run_tasks
+from thruster_env.studies.vehicle.figure import path_runs, paths_figure
+from thruster_env.studies.vehicle.findings import findings
+from thruster_env.studies.vehicle.printed import RUNS
+from thruster_env.studies.vehicle.statements import statements
+from thruster_env.studies.vehicle.tasks import PAPERS, tasks_of
 
 
 def reproduce_vehicle(

@@ -8,16 +8,16 @@ import numpy as np
 from rich.table import Table
 
 from filters.consistency.intervals import Interval, mean_interval
-from studies import ngatini2017, ngatini2019
-from studies.vehicle.estimators import MEASUREMENTS
-from studies.vehicle.experiment import PathResult
-from studies.vehicle.findings import ENKF, FKF, Finding
-from studies.vehicle.paths import PATHS
-from studies.vehicle.printed import POSE, PrintedRow
-from studies.vehicle.scores import Scores, position_ratio
-from studies.vehicle.wording import digits, with_interval
 from thruster_cli.benchmark import fitted
 from thruster_cli.output import table
+from thruster_env.studies import ngatini2017, ngatini2019
+from thruster_env.studies.vehicle.estimators import MEASUREMENTS
+from thruster_env.studies.vehicle.experiment import PathResult
+from thruster_env.studies.vehicle.findings import ENKF, FKF, Finding
+from thruster_env.studies.vehicle.paths import PATHS
+from thruster_env.studies.vehicle.printed import POSE, PrintedRow
+from thruster_env.studies.vehicle.scores import Scores, position_ratio
+from thruster_env.studies.vehicle.wording import digits, with_interval
 
 WHY = "why they differ"
 POSES = "In each cell x, y, z [m] and psi [rad], one below the other."

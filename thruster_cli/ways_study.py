@@ -62,13 +62,13 @@ def command(
 
     Example: thruster study ways --quick
     """
-    from numerics.files import write_whole
-    from numerics.markdown import with_tables
-    from studies.ways.figure import figure
-    from studies.ways.predictions import PREDICTIONS
-    from studies.ways.protocol import FAST, Protocol
-    from studies.ways.runs import run_protocol
-    from studies.ways.tables import tables
+    from thruster_env.numerics.files import write_whole
+    from thruster_env.numerics.markdown import with_tables
+    from thruster_env.studies.ways.figure import figure
+    from thruster_env.studies.ways.predictions import PREDICTIONS
+    from thruster_env.studies.ways.protocol import FAST, Protocol
+    from thruster_env.studies.ways.runs import run_protocol
+    from thruster_env.studies.ways.tables import tables
 
     protocol = FAST if quick else Protocol()
     given: dict[str, Any] = {"sets": sets, "runs": runs, "seconds": seconds, "many": many, "starts": starts}

@@ -2,12 +2,14 @@
 
 from gymnasium.envs.registration import register, registry
 
-from numerics.compiled import may_be_inlined
 from thruster_env.env import BowThrusterEnv
+from thruster_env.numerics.compiled import may_be_inlined
+from thruster_env.old_names import keep_old_names
 from thruster_env.parameters import PRESETS, ThrusterParameters
 from thruster_env.tasks import BowThrusterLinearEnv, BowThrusterReversalEnv, BowThrusterTrackingEnv
 
-may_be_inlined(__name__, "plants")
+keep_old_names()
+may_be_inlined(__name__, "thruster_env.plants")
 
 __version__ = "0.1.0"
 __all__ = [

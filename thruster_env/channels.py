@@ -6,8 +6,8 @@ of the equations of motion; the derivatives of T by the state are dy[0].
 
 from __future__ import annotations
 
-from plants.channels import Channel
-from plants.quantities import Quantity
+from thruster_env.plants.channels import Channel
+from thruster_env.plants.quantities import Quantity
 
 
 def thrust(x, y, u, c):

@@ -14,8 +14,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from numerics.compiled import inlined
-from numerics.integration import runge_kutta
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.integration import runge_kutta
 
 # Keeps 1/V finite at rest, where what it multiplies vanishes faster.
 _REST = 1e-200

@@ -8,18 +8,18 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from numerics.checks import finite
-from plants.arguments import arguments_of, takes_arguments_of
-from plants.env import PlantEnv
-from plants.memory import KEY_0, KEY_1, TIME
-from plants.report import ReportRows
 from thruster_env.effects.reference import Constant
 from thruster_env.effects.uncertainty import drawn_parameters
 from thruster_env.engine.copies import Copies
 from thruster_env.engine.memory import AMBIENT, FLOW, NEXT_REFERENCE, OMEGA, READINGS, REFERENCE, THRUST, VALID
 from thruster_env.modelled import ModelledThruster
+from thruster_env.numerics.checks import finite
 from thruster_env.parameters import ThrusterParameters
 from thruster_env.plant import Plant, make_plant
+from thruster_env.plants.arguments import arguments_of, takes_arguments_of
+from thruster_env.plants.env import PlantEnv
+from thruster_env.plants.memory import KEY_0, KEY_1, TIME
+from thruster_env.plants.report import ReportRows
 from thruster_env.quantities import INPUTS
 from thruster_env.rendering.env import RenderedThruster
 from thruster_env.task import half_thrust, make_task, thrust_scale

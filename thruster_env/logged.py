@@ -18,19 +18,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from numerics.checks import covariance, finite, positive, shown
-from numerics.compiled import inlined
-from numerics.pickling import makes_functions
-from numerics.tuples import matrix_of, tuple_of, written_out
-from plants.diffusion import noise_for_dt, same_dt
-from plants.quantities import Quantity
-from plants.state_space import StateSpaceModel
 from thruster_env.channels import MAX_CHANNELS
 from thruster_env.dynamics import Constants, substep, substep_jacobian
 from thruster_env.effects.amplifier import outside
 from thruster_env.linear.steady_state import steady_state
 from thruster_env.model import channel_functions, model_of_plant, thrust_of
+from thruster_env.numerics.checks import covariance, finite, positive, shown
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.pickling import makes_functions
+from thruster_env.numerics.tuples import matrix_of, tuple_of, written_out
 from thruster_env.plant import Plant, make_plant
+from thruster_env.plants.diffusion import noise_for_dt, same_dt
+from thruster_env.plants.quantities import Quantity
+from thruster_env.plants.state_space import StateSpaceModel
 from thruster_env.preset_file import BY_CHANNEL, checked_band, is_file, read_preset
 from thruster_env.quantities import THRUST
 
@@ -97,7 +97,7 @@ def logged_model(
     Each sensor with a lag adds a state after the two of the thruster: its memory (above). From a preset file the
     recorder is taken, too: bias, lag, ambient flow, Q and R, unless arguments say otherwise. Covariances are per
     step and do not scale with dt; but Q of a preset file, which has the sample time that it belongs to, is that of
-    another one by `plants.diffusion.noise_for_dt`.
+    another one by `thruster_env.plants.diffusion.noise_for_dt`.
 
     Args:
         dead_band: ends (low, high) of the dead band [V], or half the width of a symmetric one.

@@ -9,14 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from numerics.checks import covariance, finite, positive
-from numerics.compiled import inlined
-from numerics.linear_systems import zero_order_hold
-from numerics.pickling import makes_functions
-from plants.affine import affine_model
-from plants.channels import functions_of
-from plants.factors import scaled
-from plants.state_space import StateSpaceModel
 from thruster_env.channels import CHANNELS
 from thruster_env.dynamics import (
     Constants,
@@ -27,8 +19,16 @@ from thruster_env.dynamics import (
 )
 from thruster_env.linear.analysis import LinearModel
 from thruster_env.linear.steady_state import steady_state
+from thruster_env.numerics.checks import covariance, finite, positive
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.linear_systems import zero_order_hold
+from thruster_env.numerics.pickling import makes_functions
 from thruster_env.parameters import ThrusterParameters, checked
 from thruster_env.plant import Plant, make_plant
+from thruster_env.plants.affine import affine_model
+from thruster_env.plants.channels import functions_of
+from thruster_env.plants.factors import scaled
+from thruster_env.plants.state_space import StateSpaceModel
 from thruster_env.quantities import INPUTS, STATES, THRUST
 from thruster_env.rendering import Overlay
 

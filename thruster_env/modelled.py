@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plants.modelled import ModelledEnv
 from thruster_env.plant import Plant
+from thruster_env.plants.modelled import ModelledEnv
 
 if TYPE_CHECKING:
-    from plants.state_space import StateSpaceModel
+    from thruster_env.plants.state_space import StateSpaceModel
     from thruster_env.rendering import Overlay
 
 

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from numerics.checks import between, meant, one_of, positive, shown, within
 from thruster_env.dynamics import Constants
+from thruster_env.numerics.checks import between, meant, one_of, positive, shown, within
 
 LARGEST = 1e12  # of a parameter, and one over it the smallest positive one: floating point overflows far beyond
 ANGLES = ("as-printed", "rotor-plane", "shaft-axis")
@@ -140,7 +140,7 @@ T200 = ThrusterParameters(
     angles="rotor-plane",
     thrust_asymmetry=0.1603,
 )
-"""A Blue Robotics T200, identified from its static bollard table by `studies/t200_identification.py`.
+"""A Blue Robotics T200, identified from its static bollard table by `thruster_env/studies/t200_identification.py`.
 
 Source: Blue Robotics, "T200 Public Performance Data 10-20V September 2019"; 14 and 18 V held out.
 
@@ -164,8 +164,9 @@ ahead and 2.8 / 2.9 % astern; thrust from pulse width and supply 2.7 / 2.6 % ahe
 from measured speed 3.3 / 2.7 % ahead and 4.3 / 3.9 % astern. Nine rows in ten are within 10 %. At 20 V and full
 throttle the model has too little thrust: 8 % ahead and 3 % astern, at the measured speed 8 and 10 %.
 
-V_s is what reaches the motor: 8.3 V at full throttle from 10 V, 13.3 V from 20 V (`studies.t200_identification`
-has the map from pulse width). `max_voltage` should thus be 13 V; the thrust of 140 N at 24 V is extrapolated.
+V_s is what reaches the motor: 8.3 V at full throttle from 10 V, 13.3 V from 20 V
+(`thruster_env.studies.t200_identification` has the map from pulse width). `max_voltage` should thus be 13 V; the
+thrust of 140 N at 24 V is extrapolated.
 """
 
 PRESETS: dict[str, ThrusterParameters] = {

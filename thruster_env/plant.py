@@ -7,9 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numerics.checks import at_least, between, covariance, finite, one_of, positive, shown, vector, within
-from plants.disturbances.effects import Effect, dropping_channels
-from plants.disturbances.sensors import SENSOR_EFFECTS
 from thruster_env.channels import CHANNELS, MAX_CHANNELS
 from thruster_env.dynamics import Constants
 from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS, dead_band_of
@@ -17,7 +14,20 @@ from thruster_env.effects.flow import FLOW_SIGNALS
 from thruster_env.effects.uncertainty import LogNormal, Uniform, extreme_parameters, make_uncertainty
 from thruster_env.linear.analysis import LinearModel
 from thruster_env.linear.steady_state import required_substeps, steady_state
+from thruster_env.numerics.checks import (
+    at_least,
+    between,
+    covariance,
+    finite,
+    one_of,
+    positive,
+    shown,
+    vector,
+    within,
+)
 from thruster_env.parameters import LARGEST_VOLTAGE, ThrusterParameters, derive_constants, preset_and_dead_band
+from thruster_env.plants.disturbances.effects import Effect, dropping_channels
+from thruster_env.plants.disturbances.sensors import SENSOR_EFFECTS
 from thruster_env.preset_file import is_file, read_preset
 
 DEFAULT_DT = 0.01  # [s], the sample time of the published experiments

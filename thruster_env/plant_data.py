@@ -6,10 +6,10 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-from plants import plant_data as data_of_plants
-from plants.plant_data import Entries, mappings
 from thruster_env.parameters import PRESETS, ThrusterParameters
 from thruster_env.plant import Plant
+from thruster_env.plants import plant_data as data_of_plants
+from thruster_env.plants.plant_data import Entries, mappings
 
 # What makes it another plant, on which Q and R mean nothing. The rest disturbs or bounds the same plant.
 ESSENTIAL = ("preset", "system", "dt", "sensors")

@@ -18,12 +18,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from numerics.checks import finite, one_of, positive, shown
-from numerics.files import write_whole
-from numerics.toml import as_toml, read_toml
-from plants.logs.write import check_not_beside
 from thruster_env.channels import CHANNELS
+from thruster_env.numerics.checks import finite, one_of, positive, shown
+from thruster_env.numerics.files import write_whole
+from thruster_env.numerics.toml import as_toml, read_toml
 from thruster_env.parameters import ThrusterParameters, checked
+from thruster_env.plants.logs.write import check_not_beside
 
 SECTIONS = ("thruster", "dead_band", "recorder", "identified")
 BY_CHANNEL = ("measurement_noise_cov", "bias", "lag", "clock_offset")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from plants.quantities import Quantity
+from thruster_env.plants.quantities import Quantity
 
 STATES = (Quantity("motor speed", "omega_m", "rad/s"), Quantity("flow velocity", "U_a", "m/s"))
 INPUTS = (Quantity("voltage", "V_s", "V"),)

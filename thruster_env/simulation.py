@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plants.record import check_finite, record
 from thruster_env.engine.copies import Copies
 from thruster_env.engine.memory import FLOW, OMEGA, READINGS, THRUST, VALID
 from thruster_env.plant import Plant
+from thruster_env.plants.record import check_finite, record
 from thruster_env.task import Task
 
 

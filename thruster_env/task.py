@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numerics.checks import positive, within
-from numerics.compiled import inlined
-from plants.disturbances.effects import Effect
 from thruster_env.effects.reference import REFERENCE_SIGNALS
 from thruster_env.linear.analysis import equilibrium
 from thruster_env.linear.steady_state import state_range, steady_state
+from thruster_env.numerics.checks import positive, within
+from thruster_env.numerics.compiled import inlined
 from thruster_env.plant import Plant
+from thruster_env.plants.disturbances.effects import Effect
 
 DEFAULT_WEIGHTS = (1.0, 0.0, 0.01)  # tracking, energy, voltage rate
 LARGEST_WEIGHT = 1e9

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from plants.arguments import arguments_of, takes_arguments_of
 from thruster_env.env import BowThrusterEnv
 from thruster_env.linear.linear_plant import PUBLISHED_NOISE, make_linear_plant
+from thruster_env.plants.arguments import arguments_of, takes_arguments_of
 from thruster_env.task import make_task
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from plants.vector_env import PlantVectorEnv
 from thruster_env.env import BowThrusterEnv
 from thruster_env.modelled import ModelledThruster
+from thruster_env.plants.vector_env import PlantVectorEnv
 from thruster_env.tasks import BowThrusterLinearEnv, BowThrusterReversalEnv, BowThrusterTrackingEnv
 
 

@@ -16,8 +16,8 @@ from auv_env.operating import cruise_thrust
 from auv_env.plant import Plant
 from auv_env.quantities import SYMBOLS
 from auv_env.task import Task
-from numerics.checks import one_of
-from plants.remembered import remembered
+from thruster_env.numerics.checks import one_of
+from thruster_env.plants.remembered import remembered
 
 APPENDED = 6  # entries that observations of the tasks end with: depth of the path, then errors
 SEEN = ("measurement", "motion", "navigation")
@@ -60,8 +60,9 @@ class DepthAndCourse:
         Args:
             env: `SegorogeniAUVPath-v0` or `SegorogeniAUVDepth-v0`, wrapped or not.
             seen: what its observations begin with: "measurement" for the channels of its sensors, "navigation" for
-                twelve states, true (`plants.observe.ObserveState`) or estimated, "motion" for eight; these have no
-                position, so that the path is compared with the vehicle's own reckoning, as with measurements.
+                twelve states, true (`thruster_env.plants.observe.ObserveState`) or estimated, "motion" for eight;
+                these have no position, so that the path is compared with the vehicle's own reckoning, as with
+                measurements.
             **gains: fields of this class.
 
         Raises:

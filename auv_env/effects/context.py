@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from plants.disturbances.effects import Context
+from thruster_env.plants.disturbances.effects import Context
 
 
 @dataclass(frozen=True)

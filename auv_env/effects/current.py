@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from numerics.checks import shown, within
-from plants.disturbances.effects import Effect, Registry
-from plants.disturbances.signals import ConstantSignal, GaussMarkov, Gusts, RecordedSignal, Sinusoid
+from thruster_env.numerics.checks import shown, within
+from thruster_env.plants.disturbances.effects import Effect, Registry
+from thruster_env.plants.disturbances.signals import ConstantSignal, GaussMarkov, Gusts, RecordedSignal, Sinusoid
 
 DIRECTIONS = ("north", "east", "down")
 FASTEST = 100.0  # [m/s]: beyond it there is no water

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from auv_env.effects.context import VehicleContext
-from numerics.checks import finite
-from numerics.compiled import inlined
-from plants.disturbances.effects import Effect, Registry, set_field
-from plants.disturbances.missing import hold_missing
-from plants.disturbances.sensors import SENSOR_EFFECTS
+from thruster_env.numerics.checks import finite
+from thruster_env.numerics.compiled import inlined
+from thruster_env.plants.disturbances.effects import Effect, Registry, set_field
+from thruster_env.plants.disturbances.missing import hold_missing
+from thruster_env.plants.disturbances.sensors import SENSOR_EFFECTS
 
 VEHICLE_SENSOR_EFFECTS = Registry("sensors")
 for _name, _effect in SENSOR_EFFECTS.effects.items():

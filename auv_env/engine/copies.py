@@ -12,9 +12,9 @@ from auv_env.engine.step import machine_code
 from auv_env.plant import Plant
 from auv_env.plant import state as checked_state
 from auv_env.task import Task
-from numerics.checks import options as checked_options
-from numerics.compiled import CompiledOrPython
-from plants.copies import PlantCopies
+from thruster_env.numerics.checks import options as checked_options
+from thruster_env.numerics.compiled import CompiledOrPython
+from thruster_env.plants.copies import PlantCopies
 
 
 class Copies(PlantCopies):

@@ -14,8 +14,8 @@ from auv_env.engine import memory as at
 from auv_env.plant import Plant
 from auv_env.quantities import SYMBOLS
 from auv_env.task import Task
-from numerics.checks import covariance_root
-from plants.disturbances.effects import Effect, encoded
+from thruster_env.numerics.checks import covariance_root
+from thruster_env.plants.disturbances.effects import Effect, encoded
 
 REGISTRIES = (CURRENT_SIGNALS, VEHICLE_SENSOR_EFFECTS)  # in the order of a step
 STEEPEST = math.radians(80.0)  # near a right angle Euler angles end

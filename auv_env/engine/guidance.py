@@ -48,10 +48,10 @@ from auv_env.engine.memory import (
 from auv_env.kinematics import angle_rates, attitude_of, in_earth_axes
 from auv_env.paths import PIECE as LENGTH
 from auv_env.task import step_cost
-from numerics.compiled import inlined
-from numerics.streams import REFERENCE_SIGNAL, uniform_block
-from numerics.trigonometry import cosine_and_sine
-from plants.memory import KEY_0, KEY_1, REWARD, STEP
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.streams import REFERENCE_SIGNAL, uniform_block
+from thruster_env.numerics.trigonometry import cosine_and_sine
+from thruster_env.plants.memory import KEY_0, KEY_1, REWARD, STEP
 
 LARGEST_ERROR = 1e6  # [m], [m/s]: a reward stays finite when a state does not
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from auv_env.channels import MAX_CHANNELS
 from auv_env.forces import Constants
 from auv_env.quantities import STATES
-from plants.memory import FRONT
-from plants.noise import BLOCK
+from thruster_env.plants.memory import FRONT
+from thruster_env.plants.noise import BLOCK
 
 N = len(STATES)
 U, V, W, P, Q, R, PHI, THETA, PSI, X, Y, Z = range(N)  # places in a state

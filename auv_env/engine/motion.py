@@ -25,8 +25,8 @@ from auv_env.engine.memory import (
     N,
 )
 from auv_env.forces import Constants
-from numerics.compiled import inlined
-from numerics.tuples import tuple_of, written_out
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.tuples import tuple_of, written_out
 
 read_constants = written_out(
     "constants",

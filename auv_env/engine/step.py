@@ -35,13 +35,13 @@ from auv_env.engine.memory import (
     N,
 )
 from auv_env.engine.motion import begin_at_mean, move, read_state, take_commands
-from numerics.compiled import CompiledOrPython, inlined
-from numerics.streams import INITIAL, MEASUREMENT, PROCESS
-from plants.channels import Channel, reader_of
-from plants.copies import machine_code_of
-from plants.disturbances.chains import chain_of
-from plants.memory import FIRST_REPORTED, REWARD, STEP, TERMINATED, TIME
-from plants.noise import add_noise
+from thruster_env.numerics.compiled import CompiledOrPython, inlined
+from thruster_env.numerics.streams import INITIAL, MEASUREMENT, PROCESS
+from thruster_env.plants.channels import Channel, reader_of
+from thruster_env.plants.copies import machine_code_of
+from thruster_env.plants.disturbances.chains import chain_of
+from thruster_env.plants.memory import FIRST_REPORTED, REWARD, STEP, TERMINATED, TIME
+from thruster_env.plants.noise import add_noise
 
 LARGEST = 1e12  # of the sum of a state's magnitudes: beyond it, or where it is no number, an episode ends
 
@@ -64,7 +64,7 @@ def _tell_time_and_end(memory, b, numbers):
 
 
 def machine_code() -> tuple[Callable, CompiledOrPython]:
-    """The compiled `step(first, last, memory, numbers, out, begin)` of all vehicles; see `plants.copies`."""
+    """The compiled `step(first, last, memory, numbers, out, begin)` of vehicles: `thruster_env.plants.copies`."""
     return machine_code_of(_step(known_effects(), tuple(sorted(CHANNELS.values(), key=lambda one: one.code))))
 
 

@@ -4,7 +4,7 @@ Above, the last 500 steps of its path in three dimensions beside the path to fol
 port, from astern and from above; below, strip charts of depth and speed, and gauges of thrust and planes. An
 estimate is blue, with its band of two standard deviations; a filter without a position shows in charts and
 attitude only. The common parts of all plants' pictures, and how a filter shows its estimate, are in
-`plants.rendering`.
+`thruster_env.plants.rendering`.
 """
 
 from auv_env.rendering.history import Moment, Overlay

@@ -7,8 +7,8 @@ from typing import Any
 from auv_env.engine import memory as at
 from auv_env.rendering.history import Moment
 from auv_env.rendering.renderer import MODES, Renderer
-from plants.memory import TIME
-from plants.rendered import RenderedEnv
+from thruster_env.plants.memory import TIME
+from thruster_env.plants.rendered import RenderedEnv
 
 
 class RenderedVehicle(RenderedEnv):

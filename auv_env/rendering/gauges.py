@@ -8,9 +8,9 @@ import numpy as np
 
 from auv_env.rendering.history import Moment
 from auv_env.rendering.view import FIN, HULL, OUTLINE
-from plants.rendering.axis import Axis
-from plants.rendering.canvas import ESTIMATE, FAINT, INK, PANEL, SIZE, SOFT_INK, WHITE, Canvas, number
-from plants.rendering.history import newest
+from thruster_env.plants.rendering.axis import Axis
+from thruster_env.plants.rendering.canvas import ESTIMATE, FAINT, INK, PANEL, SIZE, SOFT_INK, WHITE, Canvas, number
+from thruster_env.plants.rendering.history import newest
 
 LEFT = 498  # of the dials' panel [px]
 DIAL, RADIUS = 548, 27  # their middle and radius [px]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from auv_env.rendering.history import Moment, Overlay
-from numerics.checks import positive
-from plants.rendering.renderer import MODES, PlantRenderer
+from thruster_env.numerics.checks import positive
+from thruster_env.plants.rendering.renderer import MODES, PlantRenderer
 
 __all__ = ["MODES", "Renderer"]
 PANEL = 230  # where the lower part of the picture begins [px]
@@ -59,7 +59,7 @@ class Renderer(PlantRenderer):
     def _make_pictures(self) -> None:
         from auv_env.rendering.gauges import Dials, Gauges
         from auv_env.rendering.view import View
-        from plants.rendering.charts import Charts, Strip
+        from thruster_env.plants.rendering.charts import Charts, Strip
 
         given = self._made_with
         strips = (

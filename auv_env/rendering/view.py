@@ -11,9 +11,19 @@ import math
 import numpy as np
 
 from auv_env.rendering.history import Moment
-from plants.rendering.axis import ROUND
-from plants.rendering.canvas import BAND, ESTIMATE, INK, REFERENCE, SIGMAS, SOFT_INK, WHITE, Canvas, number
-from plants.rendering.history import newest
+from thruster_env.plants.rendering.axis import ROUND
+from thruster_env.plants.rendering.canvas import (
+    BAND,
+    ESTIMATE,
+    INK,
+    REFERENCE,
+    SIGMAS,
+    SOFT_INK,
+    WHITE,
+    Canvas,
+    number,
+)
+from thruster_env.plants.rendering.history import newest
 
 WIDTH, HEIGHT = 498, 230  # [px]
 MARGIN = 30  # [px]

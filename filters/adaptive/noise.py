@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from numerics.algebra.operations import divide, eye, only, sym, uncorrelated
-from numerics.algebra.points import outer
+from thruster_env.numerics.algebra.operations import divide, eye, only, sym, uncorrelated
+from thruster_env.numerics.algebra.points import outer
 
 
 def noise_moment(seen, HPH, R, v):

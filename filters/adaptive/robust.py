@@ -8,10 +8,10 @@ from typing import ClassVar
 from filters.adaptive.noise import noise_moment
 from filters.gaussian.extended import advance, settle
 from filters.pages.page_filter import Page, PageFilter
-from numerics.algebra.densities import log_density
-from numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from numerics.algebra.scalars import constant, count, ratio, trace
-from numerics.checks import at_least, positive
+from thruster_env.numerics.algebra.densities import log_density
+from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
+from thruster_env.numerics.algebra.scalars import constant, count, ratio, trace
+from thruster_env.numerics.checks import at_least, positive
 
 MOST_ITERATIONS = 50  # that are written out
 

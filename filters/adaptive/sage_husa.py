@@ -10,11 +10,11 @@ import numpy as np
 from filters.engine.belief import Belief
 from filters.gaussian.extended import advance
 from filters.pages.page_filter import Page, PageFilter
-from numerics.algebra.densities import log_density
-from numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from numerics.algebra.points import outer
-from numerics.algebra.scalars import choose, constant, exceeds, is_number, ratio, shifted, trace
-from numerics.checks import finite
+from thruster_env.numerics.algebra.densities import log_density
+from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
+from thruster_env.numerics.algebra.points import outer
+from thruster_env.numerics.algebra.scalars import choose, constant, exceeds, is_number, ratio, shifted, trace
+from thruster_env.numerics.checks import finite
 
 
 def bounded_step(A, more, less, d):

@@ -12,10 +12,10 @@ from filters.adaptive.sage_husa import part_that_is_kept
 from filters.engine.belief import Belief
 from filters.gaussian.extended import advance, settle
 from filters.pages.page_filter import Page, PageFilter
-from numerics.algebra.densities import log_density
-from numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from numerics.algebra.scalars import choose, count, exceeds, ratio, shifted
-from numerics.checks import at_least, positive
+from thruster_env.numerics.algebra.densities import log_density
+from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
+from thruster_env.numerics.algebra.scalars import choose, count, exceeds, ratio, shifted
+from thruster_env.numerics.checks import at_least, positive
 
 MOST_ITERATIONS = 50  # that are written out
 

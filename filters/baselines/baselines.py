@@ -12,12 +12,12 @@ from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
 from filters.pages.kernels import nothing_to_summarise
-from numerics.angles import wrapped
-from numerics.checks import at_least, positive
-from numerics.compiled import inlined
-from numerics.tuples import vector_reader, vector_writer, zeros_of
-from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape, innovation_of
+from thruster_env.numerics.angles import wrapped
+from thruster_env.numerics.checks import at_least, positive
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.tuples import vector_reader, vector_writer, zeros_of
+from thruster_env.plants.layout import constants_reader, number_places
+from thruster_env.plants.shape import Functions, Shape, innovation_of
 
 
 @inlined

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from filters.logs.columns import header_of
-from plants.logs.columns import plain
-from plants.logs.units import suffix
-from plants.quantities import Quantity
-from plants.state_space import StateSpaceModel
+from thruster_env.plants.logs.columns import plain
+from thruster_env.plants.logs.units import suffix
+from thruster_env.plants.quantities import Quantity
+from thruster_env.plants.state_space import StateSpaceModel
 
 MAIN = """\
 /* Filter a log: a CSV with a row a step on standard input, estimates on standard output.

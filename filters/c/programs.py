@@ -17,13 +17,13 @@ from filters.pages.memory import RowMemory
 from filters.pages.page_filter import with_page
 from filters.pages.stages import numbers_of
 from filters.pages.traced import MOST, Traced
-from numerics.algebra.densities import dot
-from numerics.algebra.graphs import Graph, TooLarge
-from numerics.algebra.matrices import Matrix, evaluate
-from numerics.algebra.operations import factor, quotient
-from numerics.algebra.programs import Place, Program, program_of
-from plants.shape import Shape
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.algebra.densities import dot
+from thruster_env.numerics.algebra.graphs import Graph, TooLarge
+from thruster_env.numerics.algebra.matrices import Matrix, evaluate
+from thruster_env.numerics.algebra.operations import factor, quotient
+from thruster_env.numerics.algebra.programs import Place, Program, program_of
+from thruster_env.plants.shape import Shape
+from thruster_env.plants.state_space import StateSpaceModel
 
 NIS = -1  # its place in a row, where machine code has none
 TOLD = ("x", "P", "innovation", "S", "nis", "log_likelihood", "channels", "restarts")  # of each filter in C

@@ -10,7 +10,7 @@ from filters.c.programs import programs_of
 from filters.c.sizes import COMPILERS, Sizes, sizes_of
 from filters.c.source import c_filter
 from filters.filter import Filter
-from numerics.files import check_target, write_whole
+from thruster_env.numerics.files import check_target, write_whole
 
 CMAKE = """\
 cmake_minimum_required(VERSION 3.10)

@@ -9,9 +9,9 @@ import numpy as np
 from filters.c.programs import FilterPrograms
 from filters.engine.batch import run
 from filters.filter import Filter
-from numerics.algebra.precision import as_single
-from numerics.algebra.programs import Program
-from numerics.angles import difference, wrapped_where
+from thruster_env.numerics.algebra.precision import as_single
+from thruster_env.numerics.algebra.programs import Program
+from thruster_env.numerics.angles import difference, wrapped_where
 
 
 class _Single:

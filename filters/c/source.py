@@ -14,10 +14,10 @@ import numpy as np
 from filters.c.programs import FilterPrograms, is_name, programs_of
 from filters.engine.restart import LARGEST
 from filters.filter import Filter
-from numerics.algebra.c_source import literal, statements_of
-from numerics.algebra.programs import Program
-from numerics.angles import wrapped_where
-from plants.quantities import Quantity
+from thruster_env.numerics.algebra.c_source import literal, statements_of
+from thruster_env.numerics.algebra.programs import Program
+from thruster_env.numerics.angles import wrapped_where
+from thruster_env.plants.quantities import Quantity
 
 LARGEST_FLOAT = 1e30  # what is LARGEST in single precision
 

@@ -15,7 +15,7 @@ from filters.gaussian.iterated import IteratedExtendedKalmanFilter
 from filters.gaussian.kalman import KalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
 from filters.pages.page_filter import Page, PageFilter
-from plants.state_space import StateSpaceModel
+from thruster_env.plants.state_space import StateSpaceModel
 
 KINDS: tuple[type[PageFilter], ...] = (
     KalmanFilter,

@@ -8,15 +8,15 @@ from filters.pages.equations import PagedModel
 from filters.pages.memory import NumbersMemory
 from filters.pages.page import Page
 from filters.pages.programs import together
-from numerics.algebra.matrices import Matrix, given
-from numerics.algebra.points import root
-from numerics.algebra.programs import Place
-from plants.layout import number_places, starts_of
-from plants.shape import Shape
+from thruster_env.numerics.algebra.matrices import Matrix, given
+from thruster_env.numerics.algebra.points import root
+from thruster_env.numerics.algebra.programs import Place
+from thruster_env.plants.layout import number_places, starts_of
+from thruster_env.plants.shape import Shape
 
 
 class Memory(NumbersMemory):
-    """The arrays of `numerics.algebra.programs`, for a model's sizes.
+    """The arrays of `thruster_env.numerics.algebra.programs`, for a model's sizes.
 
         rows      x, P, what is kept; the same as a stage leaves it; u, z; the score; the true x; what slopes need
         change    of a parameter: dx, dP, d of what is kept; d score; of the information what `notes` says, twice

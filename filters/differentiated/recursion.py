@@ -21,13 +21,13 @@ from filters.pages.page import Page
 from filters.pages.programs import with_kept
 from filters.pages.stages import Stage, as_calls, as_programs, stage_of
 from filters.pages.traced import MOST
-from numerics.algebra.graphs import uncollected
-from numerics.algebra.matrices import Matrix
-from numerics.algebra.operations import only, present, uncorrelated, wrap
-from numerics.algebra.programs import callable_of
-from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from plants.layout import constants_reader, number_places, starts_of
-from plants.shape import Functions, Shape, observation_slopes, transition_slopes
+from thruster_env.numerics.algebra.graphs import uncollected
+from thruster_env.numerics.algebra.matrices import Matrix
+from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
+from thruster_env.numerics.algebra.programs import callable_of
+from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.plants.layout import constants_reader, number_places, starts_of
+from thruster_env.plants.shape import Functions, Shape, observation_slopes, transition_slopes
 
 __all__ = ["LIKELIHOOD", "LOG_SCORE", "SQUARES", "Recursion", "Wanted", "recursion_of", "stages_of"]
 

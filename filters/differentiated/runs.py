@@ -11,10 +11,10 @@ from filters.differentiated.differentiable import differentiable
 from filters.differentiated.recursion import Wanted, recursion_of
 from filters.filter import Filter
 from filters.starts import Starts, as_the_prior_says
-from numerics.algebra.densities import tail_of
-from numerics.angles import wrapped_where
-from numerics.threads import spread
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.algebra.densities import tail_of
+from thruster_env.numerics.angles import wrapped_where
+from thruster_env.numerics.threads import spread
+from thruster_env.plants.state_space import StateSpaceModel
 
 
 class ModelSlopes(NamedTuple):

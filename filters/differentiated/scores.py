@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from filters.differentiated.memory import Memory
-from numerics.algebra.densities import density, density_slope, dot, heavier, outlier_weight
-from numerics.algebra.derivatives import slopes_of
-from numerics.algebra.matrices import Matrix
-from numerics.algebra.operations import factor, inverse, present, quotient, uncorrelated
+from thruster_env.numerics.algebra.densities import density, density_slope, dot, heavier, outlier_weight
+from thruster_env.numerics.algebra.derivatives import slopes_of
+from thruster_env.numerics.algebra.matrices import Matrix
+from thruster_env.numerics.algebra.operations import factor, inverse, present, quotient, uncorrelated
 
 LIKELIHOOD, LOG_SCORE, SQUARES = "likelihood", "log-score", "squares"  # what is summed over steps
 

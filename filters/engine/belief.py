@@ -54,11 +54,11 @@ class Innovation(NamedTuple):
 class Kernels(NamedTuple):
     """A kind of filter for one shape of model, as plain functions on its memory.
 
-    `row` is laid out by `filters.engine.layout`, `numbers` by `plants.layout`; `table` is (table_rows, padded
-    size), its first n rows the members, without columns for filters without an ensemble; `draws` has room for
-    `draws_per_member` normals a member. Besides mean and covariance a belief keeps the first `kept_rows` rows of
-    the table and `extras` values of the row, from `memory_places(n, m).extras` on; `scratch` values that are not
-    kept follow.
+    `row` is laid out by `filters.engine.layout`, `numbers` by `thruster_env.plants.layout`; `table` is
+    (table_rows, padded size), its first n rows the members, without columns for filters without an ensemble;
+    `draws` has room for `draws_per_member` normals a member. Besides mean and covariance a belief keeps the first
+    `kept_rows` rows of the table and `extras` values of the row, from `memory_places(n, m).extras` on; `scratch`
+    values that are not kept follow.
 
     `vectors`, where given, are what `predict` does before its substeps, in each of them and after them, and
     `update`, each for eight beliefs that lie together, as functions (rows, given, numbers): batches then run them

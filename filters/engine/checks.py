@@ -7,7 +7,7 @@ from math import inf, isfinite, sqrt
 import numpy as np
 
 from filters.engine.belief import Belief, LostBelief
-from numerics.checks import as_floats, at_least, covariance, shown
+from thruster_env.numerics.checks import as_floats, at_least, covariance, shown
 
 FEW = 4  # states, up to which a belief is looked at in Python
 ROUNDING = 1e-9  # of a covariance's largest variance: what filters leave of a negative one is below that

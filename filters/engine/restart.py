@@ -7,9 +7,9 @@ from functools import cache
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places
-from numerics.compiled import inlined
-from numerics.sources import Source
-from plants.layout import number_places
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.sources import Source
+from thruster_env.plants.layout import number_places
 
 LARGEST = 1e300  # what the numbers of a belief may add up to
 

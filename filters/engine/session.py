@@ -14,9 +14,9 @@ from filters.engine.belief import Belief, Innovation, LostBelief
 from filters.engine.checks import check_belief, checked_key, vector_like
 from filters.engine.compile import PREDICT, START, UPDATE, new_memory, operation
 from filters.engine.layout import memory_places, own_place
-from numerics.checks import as_floats, covariance, finite, positive
-from numerics.direct import direct
-from plants.layout import number_places, with_root
+from thruster_env.numerics.checks import as_floats, covariance, finite, positive
+from thruster_env.numerics.direct import direct
+from thruster_env.plants.layout import number_places, with_root
 
 if TYPE_CHECKING:
     from filters.filter import Filter

@@ -9,8 +9,8 @@ from filters.engine.belief import Kernels
 from filters.ensembles.ensemble import EnsembleFilter, advance, compare, settle
 from filters.ensembles.rotation import with_rotation
 from filters.pages.page_filter import Page
-from numerics.algebra.operations import divide
-from numerics.checks import switch
+from thruster_env.numerics.algebra.operations import divide
+from thruster_env.numerics.checks import switch
 
 
 def update(model, x, z, e):

@@ -9,11 +9,11 @@ from filters.engine.belief import Kernels
 from filters.ensembles.inflation import inflated, relaxed
 from filters.pages.members import analysis_of, members_kernels
 from filters.pages.page_filter import FilterWithPage, Page
-from numerics.algebra.densities import log_density
-from numerics.algebra.members import covariance, mean, on_branch
-from numerics.algebra.operations import only, present, uncorrelated, wrap
-from numerics.checks import at_least, positive, shown
-from plants.shape import Functions, Shape
+from thruster_env.numerics.algebra.densities import log_density
+from thruster_env.numerics.algebra.members import covariance, mean, on_branch
+from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
+from thruster_env.numerics.checks import at_least, positive, shown
+from thruster_env.plants.shape import Functions, Shape
 
 LARGEST_ENSEMBLE = 1_000_000
 OF_THE_ENGINE = "ensemble_size", "rotations"  # parameters that no page reads
@@ -50,7 +50,7 @@ class EnsembleFilter(FilterWithPage):
         x = settle(model, advance(model, x, u), w),  w ~ N(0, I), advance once for each of the model's substeps
         x, v, S, log N(v; 0, S) = update(model, x, z, e),  e ~ N(0, I)
 
-    What is said of all members together (`numerics.algebra.members`) is the same for each: `mean(x)`,
+    What is said of all members together (`thruster_env.numerics.algebra.members`) is the same for each: `mean(x)`,
     `covariance(x, y)`. Normals that a page does not use are not drawn. The belief's mean and covariance are those
     of the members.
 

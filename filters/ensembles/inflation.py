@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 
-from numerics.algebra.members import mean, stretches, variances
-from numerics.algebra.scalars import entries_product
+from thruster_env.numerics.algebra.members import mean, stretches, variances
+from thruster_env.numerics.algebra.scalars import entries_product
 
 
 @cache

@@ -7,10 +7,10 @@ from typing import ClassVar
 
 from filters.ensembles.ensemble import EnsembleFilter, advance, compare, expect, settle
 from filters.pages.page_filter import Page
-from numerics.algebra.geometric import geometric_mean
-from numerics.algebra.members import covariance, mean
-from numerics.algebra.operations import divide, only, present, wrap
-from numerics.checks import at_least
+from thruster_env.numerics.algebra.geometric import geometric_mean
+from thruster_env.numerics.algebra.members import covariance, mean
+from thruster_env.numerics.algebra.operations import divide, only, present, wrap
+from thruster_env.numerics.checks import at_least
 
 MOST_ITERATIONS = 20  # that are written out
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from filters.engine.session import Session
 from filters.filter import Filter
-from numerics.checks import at_least
+from thruster_env.numerics.checks import at_least
 
 
 class Members(NamedTuple):

@@ -8,9 +8,9 @@ from typing import ClassVar
 from filters.ensembles.deterministic import DeterministicUpdateFilter
 from filters.ensembles.ensemble import advance, compare, settle
 from filters.pages.page_filter import Page
-from numerics.algebra.blocks import triangle_quotient
-from numerics.algebra.operations import divide
-from numerics.algebra.points import root
+from thruster_env.numerics.algebra.blocks import triangle_quotient
+from thruster_env.numerics.algebra.operations import divide
+from thruster_env.numerics.algebra.points import root
 
 
 def update(model, x, z, e):

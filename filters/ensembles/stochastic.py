@@ -7,9 +7,9 @@ from typing import ClassVar
 
 from filters.ensembles.ensemble import EnsembleFilter, advance, compare, settle
 from filters.pages.page_filter import Page
-from numerics.algebra.members import centred
-from numerics.algebra.operations import divide
-from numerics.checks import switch
+from thruster_env.numerics.algebra.members import centred
+from thruster_env.numerics.algebra.operations import divide
+from thruster_env.numerics.checks import switch
 
 
 def update(model, x, z, e):

@@ -8,8 +8,8 @@ from typing import ClassVar
 from filters.ensembles.deterministic import DeterministicUpdateFilter
 from filters.ensembles.ensemble import advance, compare, settle
 from filters.pages.page_filter import Page
-from numerics.algebra.geometric import geometric_mean
-from numerics.algebra.operations import divide
+from thruster_env.numerics.algebra.geometric import geometric_mean
+from thruster_env.numerics.algebra.operations import divide
 
 
 def update(model, x, z, e):

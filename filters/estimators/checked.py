@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from filters.estimators.estimator import Output
-from numerics.checks import as_floats, shown
+from thruster_env.numerics.checks import as_floats, shown
 
 PARTS = {"mean": "n", "cov": "nn", "innovation": "m", "innovation_cov": "mm"}
 CALLED = {

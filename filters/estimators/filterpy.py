@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from filters.estimators.estimator import Estimator, Output
-from numerics.angles import difference, wrapped_where
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.angles import difference, wrapped_where
+from thruster_env.plants.state_space import StateSpaceModel
 
 
 class FilterPyEstimator(Estimator):

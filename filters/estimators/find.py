@@ -7,9 +7,9 @@ from typing import Any
 from filters.estimators.estimator import is_estimator
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
-from numerics.checks import shown
-from numerics.modules import is_code, object_named, said
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.checks import shown
+from thruster_env.numerics.modules import is_code, object_named, said
+from thruster_env.plants.state_space import StateSpaceModel
 
 
 def is_foreign(given) -> bool:

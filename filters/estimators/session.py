@@ -9,9 +9,9 @@ import numpy as np
 from filters.engine.checks import checked_key, vector_like
 from filters.estimators.checked import Checks, absent, without_missing
 from filters.estimators.estimator import steps_alone
-from numerics.global_generators import GlobalGenerators, seeded_copy
-from numerics.modules import said
-from numerics.streams import GLOBAL_GENERATORS, derived_seed
+from thruster_env.numerics.global_generators import GlobalGenerators, seeded_copy
+from thruster_env.numerics.modules import said
+from thruster_env.numerics.streams import GLOBAL_GENERATORS, derived_seed
 
 
 class EstimatorSession:

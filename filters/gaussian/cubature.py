@@ -7,9 +7,9 @@ from typing import ClassVar
 
 from filters.gaussian.unscented import advance
 from filters.pages.page_filter import Page, PageFilter
-from numerics.algebra.densities import log_density
-from numerics.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
-from numerics.algebra.points import on_circle, ones, others, outer, root, square, units
+from thruster_env.numerics.algebra.densities import log_density
+from thruster_env.numerics.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
+from thruster_env.numerics.algebra.points import on_circle, ones, others, outer, root, square, units
 
 
 def begin(model, x, P):

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from filters.pages.page_filter import Page, PageFilter
-from numerics.algebra.densities import log_density
-from numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
+from thruster_env.numerics.algebra.densities import log_density
+from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
 
 
 def advance(model, x, P, u):

@@ -15,14 +15,14 @@ from filters.engine.layout import memory_places, own_place, row_access
 from filters.filter import Filter
 from filters.gaussian.mixture import blender, rule_programs
 from filters.pages.kernels import nothing_to_summarise, prior_start
-from numerics import matrices
-from numerics.checks import one_of, shown, vector
-from numerics.compiled import inlined
-from numerics.sources import tuple_of, written_out
-from numerics.tuples import vector_reader
-from plants.affine import AffineModel, affine_functions, linearize
-from plants.layout import number_places
-from plants.shape import Functions, Shape
+from thruster_env.numerics import matrices
+from thruster_env.numerics.checks import one_of, shown, vector
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.sources import tuple_of, written_out
+from thruster_env.numerics.tuples import vector_reader
+from thruster_env.plants.affine import AffineModel, affine_functions, linearize
+from thruster_env.plants.layout import number_places
+from thruster_env.plants.shape import Functions, Shape
 
 MOST_STATES = 8  # that rules ask for: 256 rules
 BLENDINGS = ("weights", "moments", "output")

@@ -17,9 +17,9 @@ from filters.gaussian import extended
 from filters.gaussian.mixture import blender, part_update
 from filters.pages.kernels import nothing_to_summarise, page_kernels
 from filters.particles.weighted import anything_measured
-from numerics.checks import at_least
-from numerics.compiled import inlined
-from plants.shape import Functions, Shape
+from thruster_env.numerics.checks import at_least
+from thruster_env.numerics.compiled import inlined
+from thruster_env.plants.shape import Functions, Shape
 
 FEWEST_PARTS, MOST_PARTS = 7, 1000
 REACH = 4.5  # of the outermost parts, in standard deviations of the split component

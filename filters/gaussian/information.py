@@ -13,9 +13,9 @@ from __future__ import annotations
 
 from filters.gaussian.extended import advance, settle
 from filters.pages.page import Page
-from numerics.algebra.blocks import inverse_of
-from numerics.algebra.densities import log_density
-from numerics.algebra.operations import divide, only, present, sym, uncorrelated, wrap
+from thruster_env.numerics.algebra.blocks import inverse_of
+from thruster_env.numerics.algebra.densities import log_density
+from thruster_env.numerics.algebra.operations import divide, only, present, sym, uncorrelated, wrap
 
 
 def update(model, x, P, z):

@@ -7,9 +7,9 @@ from typing import ClassVar
 
 from filters.gaussian.extended import advance, settle
 from filters.pages.page_filter import Page, PageFilter
-from numerics.algebra.densities import log_density
-from numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from numerics.checks import at_least
+from thruster_env.numerics.algebra.densities import log_density
+from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
+from thruster_env.numerics.checks import at_least
 
 MOST_ITERATIONS = 20
 

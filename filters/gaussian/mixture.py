@@ -10,10 +10,10 @@ from filters.pages.equations import Equations
 from filters.pages.memory import RowMemory
 from filters.pages.programs import programs_of, stored
 from filters.pages.stages import Stage
-from numerics.angles import NAMES, places_of
-from numerics.compiled import inlined
-from numerics.sources import Source, lower_pairs, written_out
-from plants.shape import Functions, Shape
+from thruster_env.numerics.angles import NAMES, places_of
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.sources import Source, lower_pairs, written_out
+from thruster_env.plants.shape import Functions, Shape
 
 
 @cache
@@ -46,7 +46,8 @@ def blender(
 
     The covariance is that within the parts and that between them: sum of w (P + (x - mean)(x - mean)'), or that
     within them alone, sum of w P. The means, covariances and weights of the first part lie from row[means],
-    row[covs] and row[weights] on. Means of parts that are angles are put on one branch (`numerics.angles`).
+    row[covs] and row[weights] on. Means of parts that are angles are put on one branch
+    (`thruster_env.numerics.angles`).
     """
     mean_of = _mean_blender(count, means, weights, stride)
     source = Source("cov_of", "row, parts, mean", result=(count, count), mean=(count,))

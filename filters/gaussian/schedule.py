@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from filters.gaussian import extended
 from filters.pages.page import Page
-from numerics.algebra.blocks import zeros
-from numerics.algebra.points import hats
+from thruster_env.numerics.algebra.blocks import zeros
+from thruster_env.numerics.algebra.points import hats
 
 
 def constants_at(model, u):

@@ -16,10 +16,10 @@ Trans. Automatic Control 16(6).
 from __future__ import annotations
 
 from filters.pages.page import Page
-from numerics.algebra.blocks import above, beside, factor_of, forward_quotient, part, triangle, zeros
-from numerics.algebra.densities import density
-from numerics.algebra.operations import only, present, uncorrelated, wrap
-from numerics.algebra.points import root, square
+from thruster_env.numerics.algebra.blocks import above, beside, factor_of, forward_quotient, part, triangle, zeros
+from thruster_env.numerics.algebra.densities import density
+from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
+from thruster_env.numerics.algebra.points import root, square
 
 
 def start(model):

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from filters.pages.page_filter import Page, PageFilter
-from numerics.algebra.densities import log_density
-from numerics.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
-from numerics.algebra.points import first, ones, others, outer, root, square, units
-from numerics.checks import finite, positive
+from thruster_env.numerics.algebra.densities import log_density
+from thruster_env.numerics.algebra.operations import divide, of_best_gain, only, present, sym, uncorrelated, wrap
+from thruster_env.numerics.algebra.points import first, ones, others, outer, root, square, units
+from thruster_env.numerics.checks import finite, positive
 
 
 def begin(model, x, P):

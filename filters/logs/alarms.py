@@ -10,7 +10,7 @@ import numpy as np
 
 from filters.logs.estimate import LogEstimate, estimate_with
 from filters.monitoring.monitor import Alarm, Monitor
-from plants.quantities import Quantity
+from thruster_env.plants.quantities import Quantity
 
 
 class LogAlarms(NamedTuple):

@@ -18,8 +18,8 @@ from filters.pages.at_points import called_at_points
 from filters.pages.differences import called_parts
 from filters.pages.memory import NumbersMemory
 from filters.pages.traced import not_known, traced_model
-from numerics.algebra.matrices import Matrix, Operation, never, plus, through
-from plants.shape import Functions
+from thruster_env.numerics.algebra.matrices import Matrix, Operation, never, plus, through
+from thruster_env.plants.shape import Functions
 
 
 class PagedModel:

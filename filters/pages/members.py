@@ -14,16 +14,16 @@ from filters.pages.memory import NumbersMemory
 from filters.pages.page import Page
 from filters.pages.programs import stored
 from filters.pages.stages import Stage, as_calls, as_programs
-from numerics.algebra.graphs import TooLarge
-from numerics.algebra.loops import cut
-from numerics.algebra.matrices import Matrix, given, in_order
-from numerics.algebra.members import covariance, mean, on_branch
-from numerics.algebra.operations import quotient, wrap
-from numerics.algebra.programs import OF_MEMBERS, Place, callable_of
-from numerics.compiled import inlined
-from numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
-from plants.layout import LANES, constants_reader, number_places
-from plants.shape import Functions, Shape
+from thruster_env.numerics.algebra.graphs import TooLarge
+from thruster_env.numerics.algebra.loops import cut
+from thruster_env.numerics.algebra.matrices import Matrix, given, in_order
+from thruster_env.numerics.algebra.members import covariance, mean, on_branch
+from thruster_env.numerics.algebra.operations import quotient, wrap
+from thruster_env.numerics.algebra.programs import OF_MEMBERS, Place, callable_of
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, fill_normals
+from thruster_env.plants.layout import LANES, constants_reader, number_places
+from thruster_env.plants.shape import Functions, Shape
 
 # Operations and sums of a stage: beyond, instructions take longer to compile than calls.
 MOST, MOST_SUMS = 10_000, 500

@@ -8,10 +8,10 @@ from typing import Any
 
 from filters.engine.layout import memory_places, own_place
 from filters.pages.page import Page
-from numerics.algebra.matrices import Matrix, given
-from numerics.algebra.programs import Place
-from plants.layout import number_places
-from plants.shape import Shape
+from thruster_env.numerics.algebra.matrices import Matrix, given
+from thruster_env.numerics.algebra.programs import Place
+from thruster_env.plants.layout import number_places
+from thruster_env.plants.shape import Shape
 
 
 class NumbersMemory:

@@ -10,11 +10,11 @@ from filters.pages.memory import RowMemory
 from filters.pages.page import Page
 from filters.pages.stages import Stage, as_calls, as_programs
 from filters.pages.traced import MOST
-from numerics.algebra.graphs import uncollected
-from numerics.algebra.matrices import Matrix
-from numerics.algebra.programs import BY_MEMBERS, OF_STEPS, Place, callable_of
-from plants.layout import LANES, constants_reader
-from plants.shape import Functions, Shape
+from thruster_env.numerics.algebra.graphs import uncollected
+from thruster_env.numerics.algebra.matrices import Matrix
+from thruster_env.numerics.algebra.programs import BY_MEMBERS, OF_STEPS, Place, callable_of
+from thruster_env.plants.layout import LANES, constants_reader
+from thruster_env.plants.shape import Functions, Shape
 
 
 class Programs(NamedTuple):

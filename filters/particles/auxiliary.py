@@ -20,13 +20,13 @@ from filters.particles.weights import (
     weighted_means,
     weighted_squares,
 )
-from numerics import matrices
-from numerics.angles import kept
-from numerics.compiled import inlined
-from numerics.streams import FILTER_MEASUREMENT, uniform_block
-from numerics.tuples import column_reader, column_writer, matrix_reader, scaled_sum
-from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape
+from thruster_env.numerics import matrices
+from thruster_env.numerics.angles import kept
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.streams import FILTER_MEASUREMENT, uniform_block
+from thruster_env.numerics.tuples import column_reader, column_writer, matrix_reader, scaled_sum
+from thruster_env.plants.layout import constants_reader, number_places
+from thruster_env.plants.shape import Functions, Shape
 
 
 @lru_cache(maxsize=64)

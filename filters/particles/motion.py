@@ -7,12 +7,12 @@ from functools import cache, lru_cache
 from typing import NamedTuple
 
 from filters.engine.layout import memory_places
-from numerics.angles import row_aligner
-from numerics.compiled import inlined
-from numerics.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
-from numerics.tuples import column_reader, column_writer, vector_reader
-from plants.layout import constants_reader, number_places
-from plants.shape import Shape
+from thruster_env.numerics.angles import row_aligner
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.streams import FILTER_PRIOR, FILTER_PROCESS, fill_normals
+from thruster_env.numerics.tuples import column_reader, column_writer, vector_reader
+from thruster_env.plants.layout import constants_reader, number_places
+from thruster_env.plants.shape import Shape
 
 
 @inlined

@@ -12,12 +12,12 @@ from filters.particles.motion import ensemble_motion
 from filters.particles.regularisation import kernel_spreader
 from filters.particles.weighted import WeightedFilter, anything_measured, particle_parts
 from filters.particles.weights import read_weights, systematic_resampler
-from numerics.checks import finite
-from numerics.compiled import inlined
-from numerics.streams import FILTER_MEASUREMENT, uniform_block
-from numerics.tuples import column_reader, matrix_reader
-from plants.layout import number_places
-from plants.shape import Functions, Shape
+from thruster_env.numerics.checks import finite
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.streams import FILTER_MEASUREMENT, uniform_block
+from thruster_env.numerics.tuples import column_reader, matrix_reader
+from thruster_env.plants.layout import number_places
+from thruster_env.plants.shape import Functions, Shape
 
 
 @lru_cache(maxsize=64)

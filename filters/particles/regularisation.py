@@ -7,11 +7,11 @@ from functools import cache
 
 from filters.engine.layout import memory_places, own_place
 from filters.particles.motion import add_noise, drawer
-from numerics import matrices
-from numerics.compiled import inlined
-from numerics.streams import FILTER_KERNEL
-from numerics.tuples import matrix_writer
-from plants.shape import Shape
+from thruster_env.numerics import matrices
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.streams import FILTER_KERNEL
+from thruster_env.numerics.tuples import matrix_writer
+from thruster_env.plants.shape import Shape
 
 
 @cache

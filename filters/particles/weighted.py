@@ -14,13 +14,13 @@ from filters.ensembles.ensemble import LARGEST_ENSEMBLE
 from filters.filter import Filter
 from filters.particles.motion import silencer
 from filters.particles.weights import normalise, read_weights, weighted_covariances, weighted_means
-from numerics import matrices
-from numerics.angles import row_aligner
-from numerics.checks import at_least, positive
-from numerics.compiled import inlined
-from numerics.tuples import column_reader, column_writer, matrix_reader, vector_reader
-from plants.layout import constants_reader, number_places
-from plants.shape import Shape, innovation_of
+from thruster_env.numerics import matrices
+from thruster_env.numerics.angles import row_aligner
+from thruster_env.numerics.checks import at_least, positive
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.tuples import column_reader, column_writer, matrix_reader, vector_reader
+from thruster_env.plants.layout import constants_reader, number_places
+from thruster_env.plants.shape import Shape, innovation_of
 
 
 class ParticleParts(NamedTuple):

@@ -8,10 +8,10 @@ from functools import cache
 
 import numpy as np
 
-from numerics import arrays
-from numerics.compiled import inlined
-from numerics.sources import Source, entrywise, lower_pairs
-from numerics.tuples import column_reader, column_writer
+from thruster_env.numerics import arrays
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.sources import Source, entrywise, lower_pairs
+from thruster_env.numerics.tuples import column_reader, column_writer
 
 _LOWEST = -46.0  # e^-46 = 1e-20 is nothing beside 1, and still tells how far the others are off
 _LN_2, _PER_LN_2 = math.log(2.0), 1.0 / math.log(2.0)

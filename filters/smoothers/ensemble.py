@@ -14,10 +14,10 @@ from filters.engine.compile import new_memory
 from filters.engine.layout import memory_places
 from filters.engine.restart import restart_if_lost
 from filters.ensembles.ensemble import EnsembleFilter
-from numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
-from numerics.threads import spread
-from numerics.tuples import joiner, vector_part, written_out
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, inlined, is_interpreting
+from thruster_env.numerics.threads import spread
+from thruster_env.numerics.tuples import joiner, vector_part, written_out
+from thruster_env.plants.state_space import StateSpaceModel
 
 
 def smooth_ensembles(

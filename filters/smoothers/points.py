@@ -13,9 +13,9 @@ from __future__ import annotations
 
 from filters.gaussian import cubature, unscented
 from filters.smoothers.rts import Relation
-from numerics.algebra.blocks import careful
-from numerics.algebra.operations import quotient, sym
-from numerics.algebra.points import others, root, square, units
+from thruster_env.numerics.algebra.blocks import careful
+from thruster_env.numerics.algebra.operations import quotient, sym
+from thruster_env.numerics.algebra.points import others, root, square, units
 
 
 def link_unscented(model, x, P, X):

@@ -24,13 +24,13 @@ from filters.pages.memory import RowMemory
 from filters.pages.page_filter import Page, PageFilter
 from filters.pages.programs import programs_of, stored, together
 from filters.pages.stages import Stage
-from numerics.algebra.blocks import careful
-from numerics.algebra.operations import eye, quotient, sym, wrap
-from numerics.angles import difference
-from numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
-from numerics.threads import spread
-from plants.layout import number_places
-from plants.shape import Functions, Shape
+from thruster_env.numerics.algebra.blocks import careful
+from thruster_env.numerics.algebra.operations import eye, quotient, sym, wrap
+from thruster_env.numerics.angles import difference
+from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from thruster_env.numerics.threads import spread
+from thruster_env.plants.layout import number_places
+from thruster_env.plants.shape import Functions, Shape
 
 ROUNDING = 1e-12  # of angles that were wrapped [rad]
 

@@ -18,7 +18,7 @@ from filters.pages.page_filter import PageFilter
 from filters.smoothers.ensemble import smooth_ensembles
 from filters.smoothers.points import CUBATURE, UNSCENTED
 from filters.smoothers.rts import LINEARISED, SCHEDULED, Relation, smooth_backwards
-from numerics.checks import at_least
+from thruster_env.numerics.checks import at_least
 
 RELATIONS: dict[type[Filter], Relation] = {
     KalmanFilter: LINEARISED,

@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from numerics.algebra import blocks, densities, matrices, operations, points, scalars
-from numerics.algebra.matrices import Matrix, Operation
-from numerics.angles import TURN
-from numerics.triangles import RESOLUTION
+from thruster_env.numerics.algebra import blocks, densities, matrices, operations, points, scalars
+from thruster_env.numerics.algebra.matrices import Matrix, Operation
+from thruster_env.numerics.angles import TURN
+from thruster_env.numerics.triangles import RESOLUTION
 
 
 def work_out(order: Sequence[Matrix], known: Mapping[Matrix, Tensor], like: Tensor) -> dict[Matrix, Any]:

@@ -16,9 +16,9 @@ from torch import Tensor
 from filters.pages.traced import MOST, Traced
 from filters.tensors.graphs import order_of, values_of
 from filters.tensors.stages import Equation
-from numerics.algebra.graphs import Graph, Number
-from numerics.sources import is_array
-from plants.shape import Shape, constants_are_array
+from thruster_env.numerics.algebra.graphs import Graph, Number
+from thruster_env.numerics.sources import is_array
+from thruster_env.plants.shape import Shape, constants_are_array
 
 
 def sizes_of(others: int, shape: Shape) -> tuple[int, ...]:

@@ -15,8 +15,8 @@ from filters.tensors.belief import TensorBelief, TensorEstimates, TensorInnovati
 from filters.tensors.equations import equation_of
 from filters.tensors.likelihood import compiled_likelihood
 from filters.tensors.stages import Stages
-from numerics.algebra.programs import Place
-from numerics.checks import one_of
+from thruster_env.numerics.algebra.programs import Place
+from thruster_env.numerics.checks import one_of
 
 DIMENSIONS = {
     "process_noise_cov": 2,

@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from numerics.algebra.graphs import Number, needed_by
-from numerics.algebra.precision import as_single
+from thruster_env.numerics.algebra.graphs import Number, needed_by
+from thruster_env.numerics.algebra.precision import as_single
 
 WORK: dict[str, Callable] = {
     "+": operator.add,

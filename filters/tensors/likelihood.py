@@ -11,7 +11,7 @@ from torch.autograd.function import once_differentiable
 
 from filters.filter import Filter
 from filters.likelihood import likelihood
-from numerics.sources import lower_pairs
+from thruster_env.numerics.sources import lower_pairs
 
 
 def compiled_likelihood(filter_: Filter, inputs: Any, measurements: Any, q: Tensor, r: Tensor) -> Tensor:

@@ -14,9 +14,9 @@ from filters.pages.memory import RowMemory
 from filters.pages.page import Page
 from filters.pages.stages import Stage
 from filters.tensors.algebra import work_out
-from numerics.algebra.matrices import Matrix, Operation, in_order, never
-from numerics.algebra.programs import Place
-from plants.shape import Shape
+from thruster_env.numerics.algebra.matrices import Matrix, Operation, in_order, never
+from thruster_env.numerics.algebra.programs import Place
+from thruster_env.plants.shape import Shape
 
 
 class Equation(Protocol):

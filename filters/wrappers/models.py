@@ -8,8 +8,8 @@ from typing import Any
 
 import gymnasium as gym
 
-from numerics.checks import shown
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.checks import shown
+from thruster_env.plants.state_space import StateSpaceModel
 
 
 def maker_of(env, model: str | StateSpaceModel | None) -> tuple[str, Callable | StateSpaceModel]:

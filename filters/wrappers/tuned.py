@@ -10,7 +10,7 @@ from filters.registry import make_filter
 from filters.tuned_file import NOISE, PRIOR, read_tuned_file
 from filters.tuned_model import check_same_model, check_same_quantities
 from filters.wrappers.models import made, maker_of
-from plants.state_space import StateSpaceModel
+from thruster_env.plants.state_space import StateSpaceModel
 
 
 def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:

@@ -19,10 +19,10 @@ from filters.filter import Filter
 from filters.monitoring.monitor import Monitor, monitor_of, watch_of
 from filters.wrappers.arguments import APPENDED, OBSERVATIONS, check_spaces, filter_for, given_filter
 from filters.wrappers.measured_inputs import WithMeasuredInputs, split_of
-from numerics.checks import as_floats, one_of, shown
-from numerics.keys import EpisodeKeys, reset_mask
-from numerics.streams import filter_generator
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.checks import as_floats, one_of, shown
+from thruster_env.numerics.keys import EpisodeKeys, reset_mask
+from thruster_env.numerics.streams import filter_generator
+from thruster_env.plants.state_space import StateSpaceModel
 
 
 class EstimateStates(gym.vector.VectorWrapper):

@@ -6,9 +6,9 @@ import numpy as np
 
 from auv_env.model import auv_model
 from filters.consistency.nees import normalized_squares
-from numerics.angles import difference
-from numerics.streams import episode_keys
-from plants.simulate import simulate
+from thruster_env.numerics.angles import difference
+from thruster_env.numerics.streams import episode_keys
+from thruster_env.plants.simulate import simulate
 
 SETTLED = 100  # steps of 0.05 s that are not scored
 

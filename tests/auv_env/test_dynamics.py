@@ -8,10 +8,10 @@ from auv_env import dynamics
 from auv_env.kinematics import attitude_of, in_earth_axes
 from auv_env.parameters import derive_constants
 from auv_env.presets import PRESETS, SEGOROGENI
-from numerics.compiled import compiled, function_fingerprint
-from numerics.tuples import vector_reader, vector_writer
 from tests.auv_env import textbook
 from tests.auv_env.textbook import random_states
+from thruster_env.numerics.compiled import compiled, function_fingerprint
+from thruster_env.numerics.tuples import vector_reader, vector_writer
 
 SIZES = {"velocity": 6, "motion": 8, "navigation": 12}
 every_preset = pytest.mark.parametrize("k", PRESETS.values(), ids=PRESETS)

@@ -17,8 +17,8 @@ from auv_env.plant import make_plant
 from auv_env.simulation import simulate as simulate_plant
 from auv_env.vector_env import SegorogeniAUVVectorEnv
 from filters import EstimateState
-from numerics.streams import draw_key
-from plants.simulate import simulate
+from thruster_env.numerics.streams import draw_key
+from thruster_env.plants.simulate import simulate
 
 IDS = ["SegorogeniAUV-v0", "SegorogeniAUVPath-v0", "SegorogeniAUVDepth-v0"]
 every_id = pytest.mark.parametrize("name", IDS)

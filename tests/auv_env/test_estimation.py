@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from filters import make_filter, run
-from numerics.compiled import interpreted
 from tests.auv_env.problem import riccati_reference, sailing, sailing_model, scores
+from thruster_env.numerics.compiled import interpreted
 
 RUNS, STEPS = 10, 700
 

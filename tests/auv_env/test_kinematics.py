@@ -10,8 +10,8 @@ from auv_env.kinematics import (
     in_earth_axes,
     planar_kinematics,
 )
-from numerics.compiled import compiled, function_fingerprint
-from numerics.trigonometry import cosine_and_sine
+from thruster_env.numerics.compiled import compiled, function_fingerprint
+from thruster_env.numerics.trigonometry import cosine_and_sine
 
 
 def random_angles(count=100):

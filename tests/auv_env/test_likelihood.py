@@ -4,7 +4,7 @@ import numpy as np
 
 from auv_env.model import auv_model
 from filters.likelihood import likelihood
-from numerics.compiled import interpreted
+from thruster_env.numerics.compiled import interpreted
 
 PLACES = (0, 4, 6)  # of Q; with them one of R
 

@@ -10,8 +10,8 @@ from auv_env.plant import make_plant
 from auv_env.presets import SEGOROGENI
 from filters import FILTERS, make_filter
 from filters.registry import tunable_numbers
-from plants.affine import linearize
 from tests.auv_env.textbook import random_states
+from thruster_env.plants.affine import linearize
 
 SENSORS = {"velocities": "papers", "motion": "motion", "navigation": "usbl", "current": "usbl"}
 

@@ -9,7 +9,7 @@ import pytest
 from auv_env.control.depth_and_course import DepthAndCourse
 from auv_env.manoeuvres import MANOEUVRES, run
 from auv_env.paths import make_path
-from plants.observe import ObserveState, ObserveStateVector
+from thruster_env.plants.observe import ObserveState, ObserveStateVector
 
 PATH, DEPTH = "SegorogeniAUVPath-v0", "SegorogeniAUVDepth-v0"
 SQUARE = [[0, 0, 1], [10, 0, 1], [10, 10, 3], [0, 10, 3]]

@@ -18,7 +18,7 @@ from filters import EstimateState
 pytest.importorskip("pygame")
 
 from auv_env.rendering.view import HULL, PROJECTION, attitude  # noqa: E402
-from plants.rendering.canvas import BAND, ESTIMATE, INK, REFERENCE  # noqa: E402
+from thruster_env.plants.rendering.canvas import BAND, ESTIMATE, INK, REFERENCE  # noqa: E402
 
 ARGUMENTS = {
     "path": make_path("IV").points,

@@ -11,7 +11,7 @@ from auv_env.effects.current import make_current
 from auv_env.effects.sensors import VEHICLE_SENSOR_EFFECTS
 from auv_env.plant import make_plant
 from auv_env.simulation import simulate
-from plants.disturbances.sensors import SENSOR_EFFECTS
+from thruster_env.plants.disturbances.sensors import SENSOR_EFFECTS
 
 pytestmark = pytest.mark.usefixtures("as_python")
 QUIET = {"process_noise_cov": [0.0] * 12, "sensors": "motion"}

@@ -16,11 +16,11 @@ from filters import (
     run,
     thruster_model,
 )
-from numerics.compiled import interpreted
-from numerics.derivatives import jacobian
-from numerics.streams import episode_keys, filter_keys
-from plants import simulate
 from tests.models import held_voltages, scalar_model
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.derivatives import jacobian
+from thruster_env.numerics.streams import episode_keys, filter_keys
+from thruster_env.plants import simulate
 
 
 def test_the_new_states_stand_in_for_the_constants():

@@ -17,15 +17,15 @@ from filters.c.single import single_error
 from filters.c.source import c_filter
 from filters.logs.columns import columns_of
 from filters.logs.estimate import estimate_with
-from numerics.algebra.c_source import literal, statements_of
-from numerics.algebra.graphs import Graph, arctan2, where
-from numerics.algebra.programs import Place, program_of
-from numerics.angles import difference
-from plants.replay import ReplayEnv
 from tests.filters.test_filter_paths import diverging
 from tests.filters.test_pages import wide_pendulum
 from tests.models import lonely_model, random_affine, scalar_model, simulated, wide_model
 from thruster_cli.templates.filter import Template
+from thruster_env.numerics.algebra.c_source import literal, statements_of
+from thruster_env.numerics.algebra.graphs import Graph, arctan2, where
+from thruster_env.numerics.algebra.programs import Place, program_of
+from thruster_env.numerics.angles import difference
+from thruster_env.plants.replay import ReplayEnv
 
 WARNINGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
 SANITIZERS = ["-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]

@@ -9,10 +9,10 @@ from filters.differentiated import recursion
 from filters.differentiated.recursion import Wanted, recursion_of
 from filters.likelihood import information, likelihood
 from filters.sensitivity import ModelSlopes, sensitivity
-from numerics.compiled import interpreted
 from tests.filters.test_sensitivity import case, slopes_of
 from tests.filters.test_sensitivity import pendulum as turning_pendulum
 from tests.models import DT, pendulum, simulated, swing, wide_model
+from thruster_env.numerics.compiled import interpreted
 
 PLAIN = Wanted(information=False, constants=False, tails=False)
 

@@ -6,11 +6,17 @@ import numpy as np
 import pytest
 
 from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, KalmanFilter, run, thruster_model
-from numerics.compiled import interpreted
-from numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys, filter_keys
-from plants import simulate
 from tests.models import KEY, held_voltages, line_model, plane_model, simulated
 from tests.oracles import assert_normal, convergence, normals, relative_errors
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import (
+    FILTER_MEASUREMENT,
+    FILTER_PRIOR,
+    FILTER_PROCESS,
+    episode_keys,
+    filter_keys,
+)
+from thruster_env.plants import simulate
 
 
 @pytest.mark.parametrize("centred", [0, 1])

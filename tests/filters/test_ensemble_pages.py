@@ -10,14 +10,20 @@ from filters import FILTERS, make_filter, run, thruster_model
 from filters.differentiated.differentiable import differentiable
 from filters.ensembles.ensemble import EnsembleFilter, advance, compare, settle
 from filters.pages.page import Page
-from numerics.algebra.members import mean
-from numerics.algebra.operations import divide
-from numerics.checks import covariance_root
-from numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys, fill_normals
-from plants.layout import LANES, padded
 from tests.filters.of_arrays import OfArrays, parameters_of
 from tests.filters.test_pages import turn_if, turning_pendulum, wide_pendulum
 from tests.models import random_affine, simulated, wide_model
+from thruster_env.numerics.algebra.members import mean
+from thruster_env.numerics.algebra.operations import divide
+from thruster_env.numerics.checks import covariance_root
+from thruster_env.numerics.streams import (
+    FILTER_MEASUREMENT,
+    FILTER_PRIOR,
+    FILTER_PROCESS,
+    episode_keys,
+    fill_normals,
+)
+from thruster_env.plants.layout import LANES, padded
 
 SIZE = 11
 CHOICES = {

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from filters import EnsembleTransformFilter, StateSpaceModel, make_filter
-from numerics.compiled import interpreted
 from tests.models import KEY, wide_model
+from thruster_env.numerics.compiled import interpreted
 
 
 def stay(x, u, c):

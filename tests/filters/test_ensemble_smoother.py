@@ -13,10 +13,10 @@ from filters import (
     SerialSquareRootFilter,
 )
 from filters.smoothers.smooth import smooth
-from numerics.compiled import interpreted
-from numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys
 from tests.models import KEY, scalar_model, simulated, wide_model
 from tests.oracles import normals
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, episode_keys
 
 KEYS = np.array([KEY])
 with_gaps = partial(simulated, level=1.0, missing=0.25)

@@ -14,10 +14,10 @@ from filters.estimators.stonesoup import StoneSoupEstimator
 from filters.logs.estimate import estimate
 from filters.logs.findings import findings
 from filters.logs.verdict import verdict
-from numerics.angles import difference
-from plants.logs.log import Log
 from tests.models import scalar_model, simulated
 from tests.numerics.test_angles import STEPS, data_of, rotated, turning
+from thruster_env.numerics.angles import difference
+from thruster_env.plants.logs.log import Log
 
 UNSCENTED = "filters.estimators.filterpy:unscented"
 pytestmark = pytest.mark.usefixtures("as_python")

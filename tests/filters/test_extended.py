@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, KalmanFilter, linearize, run, thruster_model
-from numerics.compiled import interpreted
-from numerics.streams import episode_keys
-from plants import simulate
 from tests import models
 from tests.models import DT, held_voltages, line_model, look, simulated, swing
 from tests.oracles import kalman_update
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import episode_keys
+from thruster_env.plants import simulate
 
 
 def swing_jacobian(x, u, c):

@@ -5,11 +5,11 @@ import pytest
 
 from filters import FILTERS, make_filter, run, thruster_model
 from filters.engine.session import Session
-from numerics.compiled import interpreted
-from numerics.streams import episode_keys, filter_keys
 from tests.filters.test_wrapper import ADDED, infos_of, played, voltages, wrapped
 from tests.models import KEY, MODELS, scalar_model, simulated, small, varying_noise
 from tests.oracles import equal
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import episode_keys, filter_keys
 from thruster_env.plant import make_plant
 from thruster_env.simulation import simulate
 

@@ -8,9 +8,9 @@ from scipy.stats import multivariate_normal
 
 from filters import FuzzyKalmanFilter, KalmanFilter, StateSpaceModel, run, thruster_model
 from filters.gaussian.fuzzy import BLENDINGS, memberships
-from numerics.streams import filter_keys
 from tests.models import pendulum, random_affine, simulated
 from tests.oracles import kalman_update
+from thruster_env.numerics.streams import filter_keys
 
 KEYS = np.zeros((1, 2))
 

@@ -5,8 +5,8 @@ import pytest
 
 from filters import FILTERS, make_filter, run
 from filters.ensembles.ensemble import EnsembleFilter
-from numerics.streams import filter_keys
 from tests.models import KEY, plane_model, rescaled, simulated
+from thruster_env.numerics.streams import filter_keys
 
 NAMES = [name for name, kind in FILTERS.items() if issubclass(kind, EnsembleFilter)]
 STEPS = 12

@@ -6,8 +6,8 @@ from scipy.linalg import inv, sqrtm
 from scipy.optimize import minimize_scalar
 
 from filters import EnsembleTransformFilter, IteratedEnsembleKalmanFilter, StateSpaceModel
-from numerics.compiled import interpreted
 from tests.models import KEY, plane_model
+from thruster_env.numerics.compiled import interpreted
 
 SIZE = 9
 

@@ -7,10 +7,10 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from filters import ExtendedKalmanFilter, KalmanFilter, linearize, run, thruster_model
-from numerics.streams import episode_keys
-from plants import simulate
 from tests.models import held_voltages, random_affine, simulated
 from tests.oracles import kalman_update
+from thruster_env.numerics.streams import episode_keys
+from thruster_env.plants import simulate
 
 KEYS = np.zeros((1, 2))
 

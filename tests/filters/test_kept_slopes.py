@@ -11,9 +11,6 @@ from filters.pages.page_filter import Page
 from filters.pages.traced import Traced
 from filters.sensitivity import sensitivity
 from filters.state_scores import state_score
-from numerics.algebra.graphs import Graph
-from numerics.algebra.programs import Place, values_of
-from numerics.streams import episode_keys
 from tests.filters.test_likelihood import directions, two_channels
 from tests.filters.test_pages import MADE, assert_slopes, wide_pendulum, with_noise
 from tests.filters.test_pages_called import turn_if
@@ -21,6 +18,9 @@ from tests.filters.test_sensitivity import slopes_of
 from tests.filters.test_state_scores import WEIGHTS, data_of, textbook
 from tests.models import simulated
 from thruster_cli.templates.filter import Template
+from thruster_env.numerics.algebra.graphs import Graph
+from thruster_env.numerics.algebra.programs import Place, values_of
+from thruster_env.numerics.streams import episode_keys
 from tuning.auv.find import find_scenario as find_vehicle
 from tuning.likelihood.gradient import tune_by_gradient
 from tuning.problems.seeds import training_seeds

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from filters import EnsembleKalmanFilter, KalmanFilter, run, smooth
-from numerics.streams import filter_keys
-from plants.affine import affine_model
 from tests.models import wide_model
+from thruster_env.numerics.streams import filter_keys
+from thruster_env.plants.affine import affine_model
 
 
 def data(model, count=3, steps=7):

@@ -11,12 +11,6 @@ from filters import StateSpaceModel, bounds, likelihood, make_filter, posterior,
 from filters.augmented import augmented_model
 from filters.registry import FILTERS, tunable_numbers
 from filters.smoothers.smooth import smooth
-from numerics import matrices, sources
-from numerics.compiled import interpreted
-from numerics.streams import episode_keys
-from plants import shape
-from plants.quantities import Quantity
-from plants.simulate import simulate
 from tests.models import (
     lonely_model,
     pendulum,
@@ -27,6 +21,12 @@ from tests.models import (
     wide_model,
 )
 from tests.numerics.test_angles import turned, turning, turntable
+from thruster_env.numerics import matrices, sources
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import episode_keys
+from thruster_env.plants import shape
+from thruster_env.plants.quantities import Quantity
+from thruster_env.plants.simulate import simulate
 from tuning.problems.check import check_model
 from tuning.problems.data import Data
 
@@ -54,7 +54,7 @@ CASES = {**{name: (name, {}) for name in FILTERS}, **FORMS}
 def forget_functions():
     """Empty the caches of all makers, which do not know of limits that a test has changed."""
     for name, module in list(sys.modules.items()):
-        if name.partition(".")[0] in ("numerics", "plants", "filters"):
+        if name.startswith(("thruster_env.numerics", "thruster_env.plants", "filters")):
             for value in list(vars(module).values()):
                 getattr(value, "cache_clear", lambda: None)()
 

@@ -8,8 +8,8 @@ import pytest
 from scipy.linalg import expm
 
 from filters import make_filter, thruster_model
-from plants.continuous import ContinuousModel
-from plants.diffusion import noise_for_dt
+from thruster_env.plants.continuous import ContinuousModel
+from thruster_env.plants.diffusion import noise_for_dt
 
 A = np.array([[0.0, 1.0], [-4.0, -0.6]])
 S = np.diag([0.01, 0.5])

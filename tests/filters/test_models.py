@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, StateSpaceModel, affine_model, make_filter, run, thruster_model
-from numerics.compiled import interpreted
-from numerics.streams import episode_keys
-from plants import simulate
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.plant import make_plant
+from thruster_env.plants import simulate
 from thruster_env.simulation import simulate as simulate_plant
 
 

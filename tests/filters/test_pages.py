@@ -13,8 +13,6 @@ from filters.likelihood import information, likelihood
 from filters.pages.page_filter import PageFilter
 from filters.sensitivity import ModelSlopes, sensitivity
 from filters.state_scores import state_score
-from numerics.compiled import interpreted
-from numerics.streams import episode_keys
 from tests.filters.of_arrays import run_page
 from tests.filters.test_differentiated import units
 from tests.filters.test_likelihood import directions, two_channels
@@ -22,6 +20,8 @@ from tests.filters.test_sensitivity import pendulum as turning_pendulum
 from tests.filters.test_sensitivity import turn
 from tests.filters.test_state_scores import WEIGHTS, data_of, textbook
 from tests.models import plane_model, simulated, wide_model
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import episode_keys
 
 NAMES = ("iekf", "ukf", "ckf")
 CHANGED = {"iekf": {"iterations": 3}, "ukf": {"alpha": 0.8, "beta": 1.5, "kappa": 1.0}, "ckf": {}}

@@ -14,13 +14,13 @@ from filters.likelihood import likelihood
 from filters.pages.at_points import called_at_points
 from filters.sensitivity import sensitivity
 from filters.state_scores import state_score
-from numerics.streams import episode_keys
 from tests.filters.test_differentiated import units
 from tests.filters.test_likelihood import directions
 from tests.filters.test_pages import NAMES, assert_slopes, gaze, gaze_slopes, made, whirl, wide_pendulum
 from tests.filters.test_sensitivity import ring, slopes_of
 from tests.filters.test_state_scores import data_of
 from tests.models import random_affine, simulated
+from thruster_env.numerics.streams import episode_keys
 
 PLAIN = Wanted(information=False, constants=False, tails=False)
 

@@ -8,8 +8,10 @@ from scipy.stats import multivariate_normal
 
 from filters import AuxiliaryParticleFilter, KalmanFilter, ParticleFilter, run, thruster_model
 from filters.engine.session import Session
-from numerics.compiled import interpreted
-from numerics.streams import (
+from tests.models import KEY, held_voltages, line_model, plane_model, simulated
+from tests.oracles import convergence, normals, relative_errors
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import (
     FILTER_KERNEL,
     FILTER_MEASUREMENT,
     FILTER_PRIOR,
@@ -18,9 +20,7 @@ from numerics.streams import (
     filter_keys,
     uniform_block,
 )
-from plants import simulate
-from tests.models import KEY, held_voltages, line_model, plane_model, simulated
-from tests.oracles import convergence, normals, relative_errors
+from thruster_env.plants import simulate
 
 both_kinds = pytest.mark.parametrize("kind", [ParticleFilter, AuxiliaryParticleFilter])
 

@@ -13,9 +13,9 @@ from filters import (
     run,
     thruster_model,
 )
-from numerics.streams import episode_keys, filter_keys
-from plants import simulate
 from tests.models import held_voltages
+from thruster_env.numerics.streams import episode_keys, filter_keys
+from thruster_env.plants import simulate
 
 RUNS = 30
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from filters import KalmanFilter, StateSpaceModel, linearize, run, thruster_model
-from numerics.compiled import interpreted
-from numerics.streams import episode_keys
-from plants import simulate
 from tests.models import held_voltages
 from thruster_env.linear.steady_state import steady_state
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.plant import make_plant
+from thruster_env.plants import simulate
 
 KEYS = np.zeros((1, 2))
 

@@ -14,13 +14,13 @@ import filters
 from auv_env.model import auv_model
 from filters import StateSpaceModel, make_filter, run, thruster_model
 from filters.likelihood import likelihood
-from numerics.compiled import interpreted
 from tests.filters.test_c import KEPT, OWN, made
 from tests.filters.test_filter_paths import diverging
 from tests.filters.test_likelihood import directions, two_channels
 from tests.filters.test_pages import wide_pendulum
 from tests.models import lonely_model, plane_model, random_affine, scalar_model, simulated, wide_model
 from thruster_cli.templates.filter import Template
+from thruster_env.numerics.compiled import interpreted
 
 NAMES = ("kf", "ekf", "iekf", "ukf", "ckf")
 MODELS = {

@@ -14,15 +14,15 @@ from filters import FILTERS, affine_model, make_filter, run
 from filters.bounds import path_bound
 from filters.posterior import posterior_bound
 from filters.wrapped import wrapped_variances
-from numerics.angles import difference, on_one_branch, wrapped
-from numerics.compiled import interpreted
-from numerics.streams import filter_keys
-from plants.logs.log import Log, at_offset
 from tests.filters.test_bounds_at_any_scale import VELOCITY, apart, exact_covariances
 from tests.fuzz.python_interface import _line, _until
 from tests.models import line_model, simulated, small
 from tests.numerics.test_angles import data_of, makers, plain_run, rotated
 from tests.plants.test_logs_of_angles import model, recorded
+from thruster_env.numerics.angles import difference, on_one_branch, wrapped
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import filter_keys
+from thruster_env.plants.logs.log import Log, at_offset
 
 WITHIN = 2e-8  # of angle filters about another heading
 STEPS = 20

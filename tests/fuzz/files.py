@@ -20,8 +20,8 @@ import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState
 from filters.tuned_file import sealed
 from tests.tuned_files import write_untuned
-from training.environments import make_environments
-from training.setup import configuration_from_json, make_configuration
+from thruster_env.training.environments import make_environments
+from thruster_env.training.setup import configuration_from_json, make_configuration
 from tuning.evaluation.tuned import read_tuned
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage

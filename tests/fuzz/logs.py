@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from plants.affine import affine_model
-from plants.logs.figure import draw_findings
-from plants.logs.findings import sentences
-from plants.logs.log import Log, cut_at_gaps
-from plants.logs.read import read_log
-from plants.logs.write import write_columns, write_log
+from thruster_env.plants.affine import affine_model
+from thruster_env.plants.logs.figure import draw_findings
+from thruster_env.plants.logs.findings import sentences
+from thruster_env.plants.logs.log import Log, cut_at_gaps
+from thruster_env.plants.logs.read import read_log
+from thruster_env.plants.logs.write import write_columns, write_log
 from tuning.problems.log_problem import LogProblem
 
 NAMES = ("voltage", "u", r"$\frac$", "[/]", "a,b", 'say "x"', "x;y", "é∞", "n" * 400, "thrust", "1", "t", "=1+1")

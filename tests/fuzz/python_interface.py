@@ -20,9 +20,9 @@ import numpy as np
 from filters import FILTERS, EstimateState, EstimateStates, make_filter, run, thruster_model
 from filters.engine.belief import Belief, LostBelief
 from filters.registry import tunable_numbers
-from numerics.compiled import interpreted
 from tests.robustness.test_copies import assert_alike
 from tests.thruster_env.test_robustness import random_arguments, run_random_episode
+from thruster_env.numerics.compiled import interpreted
 
 WAYS = (
     copy.deepcopy,

@@ -20,8 +20,8 @@ from filters import StateSpaceModel
 from filters.engine.batch import run
 from filters.estimators.estimator import Estimator
 from filters.estimators.find import foreign_filter
-from numerics.streams import SPAWN_KEYS, derived_generator, derived_seed
 from tests.fuzz.python_interface import _until
+from thruster_env.numerics.streams import SPAWN_KEYS, derived_generator, derived_seed
 from tuning.problems.digest import digest_of
 from tuning.problems.env_problem import EnvProblem
 

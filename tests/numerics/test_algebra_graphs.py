@@ -8,11 +8,11 @@ import sys
 import numpy as np
 import pytest
 
-from numerics.algebra.graphs import Graph, TooLarge, where
-from numerics.algebra.programs import Place, callable_of, program_of, values_of
-from numerics.algebra.slopes import along
-from numerics.algebra.tracing import traced
-from numerics.compiled import compiled
+from thruster_env.numerics.algebra.graphs import Graph, TooLarge, where
+from thruster_env.numerics.algebra.programs import Place, callable_of, program_of, values_of
+from thruster_env.numerics.algebra.slopes import along
+from thruster_env.numerics.algebra.tracing import traced
+from thruster_env.numerics.compiled import compiled
 
 FUNCTIONS = {
     "operators": lambda x, y: (x + 2.0) * y - x / y + 3.0 / x - (-x) * (1 - y),
@@ -135,7 +135,7 @@ def test_a_number_has_neither_truth_nor_hash():
 
 PRINT_DIGESTS = """
 from filters.differentiated import recursion
-from numerics.algebra import programs
+from thruster_env.numerics.algebra import programs
 from thruster_env.model import thruster_model
 model = thruster_model()
 recursion.recursion_of(model.functions, model.shape, recursion.Wanted(True, True, True))

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, multivariate_t
 
-from numerics.algebra import densities, operations
-from numerics.algebra.calls import calls_of
-from numerics.algebra.densities import heavier, log_density, outlier_weight, tail_of
-from numerics.algebra.derivatives import slopes_of
-from numerics.algebra.matrices import Matrix, evaluate, given, in_order
-from numerics.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
-from numerics.algebra.points import first, on_circle, ones, others, outer, root, square, units
-from numerics.algebra.programs import Place
+from thruster_env.numerics.algebra import densities, operations
+from thruster_env.numerics.algebra.calls import calls_of
+from thruster_env.numerics.algebra.densities import heavier, log_density, outlier_weight, tail_of
+from thruster_env.numerics.algebra.derivatives import slopes_of
+from thruster_env.numerics.algebra.matrices import Matrix, evaluate, given, in_order
+from thruster_env.numerics.algebra.operations import divide, eye, joseph, only, present, sym, uncorrelated, wrap
+from thruster_env.numerics.algebra.points import first, on_circle, ones, others, outer, root, square, units
+from thruster_env.numerics.algebra.programs import Place
 
 RNG = np.random.default_rng(0)
 N, M = 3, 2

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_triangular
 
-from numerics.algebra.calls import calls_of
-from numerics.algebra.matrices import given
-from numerics.algebra.points import on_circle, root, root_slope
-from numerics.algebra.programs import Place
-from numerics.angles import on_one_branch
+from thruster_env.numerics.algebra.calls import calls_of
+from thruster_env.numerics.algebra.matrices import given
+from thruster_env.numerics.algebra.points import on_circle, root, root_slope
+from thruster_env.numerics.algebra.programs import Place
+from thruster_env.numerics.angles import on_one_branch
 
 RNG = np.random.default_rng(0)
 

@@ -13,12 +13,12 @@ from filters.consistency.report import consistency_report
 from filters.ensembles.recording import record_members
 from filters.gaussian.mixture import part_aligner
 from filters.likelihood import likelihood
-from numerics.angles import difference, row_aligner, wrapped, wrapped_where
-from numerics.compiled import compiled, interpreted
-from numerics.streams import filter_keys
-from plants.quantities import Quantity
-from plants.shape import observation_slopes, transition_slopes
 from tests.models import simulated, small
+from thruster_env.numerics.angles import difference, row_aligner, wrapped, wrapped_where
+from thruster_env.numerics.compiled import compiled, interpreted
+from thruster_env.numerics.streams import filter_keys
+from thruster_env.plants.quantities import Quantity
+from thruster_env.plants.shape import observation_slopes, transition_slopes
 
 DT = 0.1
 RATE = Quantity("rate of turn", "r", "rad/s")

@@ -10,9 +10,9 @@ import numba
 import pytest
 from numba.core import caching
 
-from numerics import code_cache
-from numerics.code_cache import keep_code, private_folder
-from numerics.compiled import compiled
+from thruster_env.numerics import code_cache
+from thruster_env.numerics.code_cache import keep_code, private_folder
+from thruster_env.numerics.compiled import compiled
 
 SOURCE = "def double(x):\n    return x + x\n"
 

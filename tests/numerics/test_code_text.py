@@ -7,8 +7,8 @@ import types
 import numpy as np
 import pytest
 
-from numerics.code_text import code_text
-from numerics.compiled import function_fingerprint
+from thruster_env.numerics.code_text import code_text
+from thruster_env.numerics.compiled import function_fingerprint
 from tuning.problems.digest import digest_of
 
 USERS = """
@@ -55,7 +55,7 @@ def users(monkeypatch, k):
 @pytest.mark.parametrize("name", ["direct", "attribute", "nested", "listed", "closed", "outer"])
 def test_another_number_in_another_file_is_another_code(monkeypatch, name):
     one, same, other = (getattr(users(monkeypatch, k), name) for k in (2.0, 2.0, 3.0))
-    prints = [function_fingerprint(part, within="numerics") for part in (one, same, other)]
+    prints = [function_fingerprint(part, within="thruster_env.numerics") for part in (one, same, other)]
     assert prints[0] == prints[1] != prints[2]
 
 

@@ -5,8 +5,8 @@ import warnings
 import numpy as np
 import pytest
 
-from numerics.compiled import CompiledOrPython, compiled, interpreted
-from numerics.direct import direct
+from thruster_env.numerics.compiled import CompiledOrPython, compiled, interpreted
+from thruster_env.numerics.direct import direct
 
 
 def scaled_sum(values, factor, twice):

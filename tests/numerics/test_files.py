@@ -6,7 +6,7 @@ import stat
 import numpy as np
 import pytest
 
-from numerics.files import check_target, write_whole
+from thruster_env.numerics.files import check_target, write_whole
 
 
 @pytest.fixture(autouse=True)

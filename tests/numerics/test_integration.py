@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from numerics.compiled import CompiledOrPython, function_fingerprint
-from numerics.integration import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
-from numerics.results import array_valued
-from numerics.trigonometry import nearest_whole
+from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint
+from thruster_env.numerics.integration import euler, euler_jacobian, runge_kutta, runge_kutta_jacobian
+from thruster_env.numerics.results import array_valued
+from thruster_env.numerics.trigonometry import nearest_whole
 
 
 class Step:

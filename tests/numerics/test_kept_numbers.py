@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from numerics import kept_numbers as module
-from numerics.kept_numbers import kept_numbers
+from thruster_env.numerics import kept_numbers as module
+from thruster_env.numerics.kept_numbers import kept_numbers
 
 
 class Code:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from numerics.leftovers import remove_leftovers
+from thruster_env.numerics.leftovers import remove_leftovers
 
 ROOT = Path(__file__).parents[2]
 
@@ -29,7 +29,7 @@ import filters.belief
 
 def test_what_holds_caches_alone_is_removed_and_nothing_else(tmp_path):
     site, checkout = tmp_path / "site", tmp_path / "checkout"
-    for name in ("filters", "tuning", "plants"):
+    for name in ("filters", "tuning", "auv_env"):
         (checkout / name).mkdir(parents=True)
         (checkout / name / "__init__.py").touch()
     (checkout / "filters" / "belief.py").touch()
@@ -71,4 +71,4 @@ def test_make_installs_again_where_a_copy_has_taken_the_place_of_the_checkout(tm
     assert "pip" not in planned()
     installed.unlink()  # as `pip install .` does
     again = planned()
-    assert "--no-build-isolation -e" in again and "-m numerics.leftovers" in again
+    assert "--no-build-isolation -e" in again and "-m thruster_env.numerics.leftovers" in again

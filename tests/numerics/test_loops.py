@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from filters.pages.stages import Stage, as_programs
-from numerics.algebra.loops import cut
-from numerics.algebra.matrices import given
-from numerics.algebra.members import covariance, mean, variances
-from numerics.algebra.programs import OF_MEMBERS, Place, callable_of
-from numerics.algebra.scalars import entries_product
-from numerics.compiled import compiled, interpreted
+from thruster_env.numerics.algebra.loops import cut
+from thruster_env.numerics.algebra.matrices import given
+from thruster_env.numerics.algebra.members import covariance, mean, variances
+from thruster_env.numerics.algebra.programs import OF_MEMBERS, Place, callable_of
+from thruster_env.numerics.algebra.scalars import entries_product
+from thruster_env.numerics.compiled import compiled, interpreted
 
 N, COLUMNS, SIZE = 7, 16, 11
 

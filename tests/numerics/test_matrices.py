@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from numerics import matrices
+from thruster_env.numerics import matrices
 
 SIZES = [1, 2, 3, 4]
 

@@ -12,8 +12,8 @@ import pytest
 from numba.core import codegen, event
 from numba.extending import overload
 
-from numerics.compiled import compiled, inlined, kept_apart
-from numerics.optimising import RARELY
+from thruster_env.numerics.compiled import compiled, inlined, kept_apart
+from thruster_env.numerics.optimising import RARELY
 
 
 @kept_apart

@@ -14,10 +14,10 @@ from queue import SimpleQueue
 import numpy as np
 import pytest
 
-from numerics.atomics import LINE, SPIN_ROUNDS, TAKEN, take
-from numerics.compiled import interpreted
-from numerics.threads import BEHIND, CALLER, WorkerThreads, in_parts, spread, worker_threads
-from numerics.wait_policy import waiting
+from thruster_env.numerics.atomics import LINE, SPIN_ROUNDS, TAKEN, take
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.threads import BEHIND, CALLER, WorkerThreads, in_parts, spread, worker_threads
+from thruster_env.numerics.wait_policy import waiting
 
 COUNT = 1000
 
@@ -217,8 +217,8 @@ def test_spread_covers_everything_once():
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
 def test_after_an_exception_no_further_part_of_spread_begins(error, monkeypatch):
     pool, begun, raised = ThreadPoolExecutor(2), [], threading.Event()
-    monkeypatch.setattr("numerics.threads._pool", lambda: pool)
-    monkeypatch.setattr("numerics.threads.cores", lambda: 50)
+    monkeypatch.setattr("thruster_env.numerics.threads._pool", lambda: pool)
+    monkeypatch.setattr("thruster_env.numerics.threads.cores", lambda: 50)
 
     def fail(*_):
         raised.set()
@@ -264,7 +264,7 @@ def test_work_that_is_spread_while_a_module_is_imported_may_import_it(tmp_path, 
     # an import that waits for the worker.
     source = """
 from importlib import import_module
-from numerics.threads import spread
+from thruster_env.numerics.threads import spread
 found = []
 def part(first, last):
     if not found:

@@ -3,8 +3,8 @@ from functools import partial
 import numpy as np
 import pytest
 
-from numerics.compiled import compiled, function_fingerprint, inlined, interpreted, is_interpreting
-from numerics.tuples import (
+from thruster_env.numerics.compiled import compiled, function_fingerprint, inlined, interpreted, is_interpreting
+from thruster_env.numerics.tuples import (
     column_reader,
     column_writer,
     matrix_of,

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 import pytest
 
-from numerics.compiled import compiled, inlined, narrow
+from thruster_env.numerics.compiled import compiled, inlined, narrow
 
 ROOT = Path(__file__).parents[2]
 WIDE = '"prefer-vector-width"="512"'
@@ -22,7 +22,7 @@ def add_squares(out, values):
 ON_INTEL = """\
 import sys
 sys.path.insert(0, sys.argv[1])
-from numerics.compiled import compiled, narrow
+from thruster_env.numerics.compiled import compiled, narrow
 from loop import add_squares
 
 def narrow_squares(out, values):

@@ -4,9 +4,9 @@ import os
 
 import pytest
 
-from numerics import atomics, wait_policy
-from numerics.atomics import new_flags, spin_for_call
-from numerics.wait_policy import VARIABLE, waiting
+from thruster_env.numerics import atomics, wait_policy
+from thruster_env.numerics.atomics import new_flags, spin_for_call
+from thruster_env.numerics.wait_policy import VARIABLE, waiting
 
 
 @pytest.fixture(params=[None, "active", "passive"])

@@ -4,7 +4,7 @@ import runpy
 
 import pytest
 
-import numerics.compiled
+import thruster_env.numerics.compiled
 
 
 def double(x):
@@ -14,7 +14,7 @@ def double(x):
 @pytest.mark.parametrize("value, runs_as_python", [("1", True), ("0", False), ("", False)])
 def test_the_environment_variable_of_numba_leaves_functions_as_they_are(value, runs_as_python, monkeypatch):
     monkeypatch.setenv("NUMBA_DISABLE_JIT", value)
-    found = runpy.run_path(numerics.compiled.__file__)
+    found = runpy.run_path(thruster_env.numerics.compiled.__file__)
     assert found["is_interpreting"]() == runs_as_python
     if runs_as_python:
         assert found["compiled"](double) is double

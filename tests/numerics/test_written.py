@@ -4,7 +4,7 @@ import linecache
 
 from numba.core.serialize import dumps
 
-from numerics.written import written_out
+from thruster_env.numerics.written import written_out
 
 
 def shifted(size, by):

@@ -4,10 +4,10 @@ import pickle
 
 import pytest
 
-from plants.quantities import Output, Quantity
 from tests.models import pendulum, swing
 from tests.plants.test_quantities import turntable
 from thruster_env.model import thruster_model
+from thruster_env.plants.quantities import Output, Quantity
 
 HEADING = Quantity("heading", "psi", "rad", True)
 

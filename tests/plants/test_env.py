@@ -11,8 +11,6 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from filters import EstimateState
-from numerics.streams import draw_key
-from plants.simulate import simulate
 from tests.small_plant import INPUTS, Cart, CartEnv, CartVectorEnv
 from tests.thruster_env.test_vector_env import (
     DISABLED,
@@ -21,6 +19,8 @@ from tests.thruster_env.test_vector_env import (
     assert_copies_are_single_envs,
     every_mode,
 )
+from thruster_env.numerics.streams import draw_key
+from thruster_env.plants.simulate import simulate
 
 LOSING = {
     "sensors": {"speed": [{"name": "dropout", "probability": 0.3}], "position": [{"name": "delay", "steps": 2}]}

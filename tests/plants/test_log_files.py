@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from plants.logs import columns as columns_module
-from plants.logs import table as table_module
-from plants.logs.read import read_log
-from plants.logs.units import parted
-from plants.logs.write import write_columns, write_log
 from tests.plants.test_logs import MODEL, log_of
 from thruster_env.model import thruster_model
+from thruster_env.plants.logs import columns as columns_module
+from thruster_env.plants.logs import table as table_module
+from thruster_env.plants.logs.read import read_log
+from thruster_env.plants.logs.units import parted
+from thruster_env.plants.logs.write import write_columns, write_log
 
 GOOD = "time_s,voltage_V,tach\n0,1,2\n0.1,2,3\n0.2,3,4\n"
 

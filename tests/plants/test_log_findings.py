@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from plants.logs.figure import draw_findings
-from plants.logs.findings import has_outliers, outliers, remarks_on, sentences
-from plants.logs.read import read_log
 from tests.plants.test_logs import MODEL
 from tests.tuning.test_log_problem import logs_of
+from thruster_env.plants.logs.figure import draw_findings
+from thruster_env.plants.logs.findings import has_outliers, outliers, remarks_on, sentences
+from thruster_env.plants.logs.read import read_log
 from tuning.problems.find import find_problem
 
 

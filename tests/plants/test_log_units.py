@@ -5,9 +5,9 @@ import sys
 import numpy as np
 import pytest
 
-from plants.logs.read import read_log
-from plants.logs.units import converted, parted
 from tests.plants.test_logs import MODEL, log_of
+from thruster_env.plants.logs.read import read_log
+from thruster_env.plants.logs.units import converted, parted
 
 
 @pytest.mark.parametrize(

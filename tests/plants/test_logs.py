@@ -5,10 +5,10 @@ import pickle
 import numpy as np
 import pytest
 
-from plants.affine import affine_model
-from plants.logs.grid import Series, grid_of, held, sampled
-from plants.logs.log import Log, at_offset
-from plants.logs.read import read_log
+from thruster_env.plants.affine import affine_model
+from thruster_env.plants.logs.grid import Series, grid_of, held, sampled
+from thruster_env.plants.logs.log import Log, at_offset
+from thruster_env.plants.logs.read import read_log
 
 MODEL = affine_model(
     a=[[0.9]],

@@ -8,12 +8,12 @@ import pytest
 from filters import affine_model, make_filter, run
 from filters.logs.estimate import estimate
 from filters.logs.figure import draw_log
-from numerics.angles import on_one_branch, with_breaks, wrapped
-from numerics.plots import MOST_POINTS, thinned
-from numerics.streams import filter_keys
-from plants.logs.grid import Series, held, sampled
-from plants.logs.log import Log, at_offset
-from plants.logs.read import read_log
+from thruster_env.numerics.angles import on_one_branch, with_breaks, wrapped
+from thruster_env.numerics.plots import MOST_POINTS, thinned
+from thruster_env.numerics.streams import filter_keys
+from thruster_env.plants.logs.grid import Series, held, sampled
+from thruster_env.plants.logs.log import Log, at_offset
+from thruster_env.plants.logs.read import read_log
 from tuning.identification.validation import validation_of
 from tuning.problems.data import Data
 from tuning.problems.log_problem import LogProblem

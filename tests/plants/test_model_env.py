@@ -8,12 +8,12 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from filters import EstimateState
-from numerics.compiled import interpreted
-from numerics.streams import episode_keys
-from plants.model_env import ModelEnv
-from plants.simulate import simulate
-from studies import range_bearing
 from tests.models import lonely_model, plane_model
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import episode_keys
+from thruster_env.plants.model_env import ModelEnv
+from thruster_env.plants.simulate import simulate
+from thruster_env.studies import range_bearing
 
 
 @pytest.fixture(autouse=True)

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from numerics.streams import episode_keys
 from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.plant import make_plant
 from thruster_env.simulation import Simulation, simulate
 

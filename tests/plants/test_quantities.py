@@ -5,12 +5,12 @@ import pickle
 import numpy as np
 import pytest
 
-from plants.affine import affine_model, linearize
-from plants.quantities import Output, Quantity
-from plants.state_space import StateSpaceModel
 from thruster_env.linear.steady_state import steady_state
 from thruster_env.model import thruster_model
 from thruster_env.parameters import PRESETS
+from thruster_env.plants.affine import affine_model, linearize
+from thruster_env.plants.quantities import Output, Quantity
+from thruster_env.plants.state_space import StateSpaceModel
 
 
 def turntable(**names):

@@ -8,10 +8,10 @@ from gymnasium.utils.env_checker import check_env
 import filters  # noqa: F401 - its wrappers
 from filters import EstimateState, EstimateStates
 from filters.logs.estimate import estimate
-from plants.logs.log import Log
-from plants.logs.write import write_log
-from plants.replay import ReplayEnv
 from tests.plants.test_logs import MODEL
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.logs.write import write_log
+from thruster_env.plants.replay import ReplayEnv
 
 
 @pytest.fixture

@@ -19,10 +19,10 @@ from benchmarks.counting import (
 )
 from benchmarks.workloads import normals, step_by_size, step_of_env, step_of_filter, step_of_members, times
 from filters import make_filter, thruster_model
-from numerics import arrays
-from numerics.compiled import interpreted
-from numerics.streams import FILTER_PROCESS, normal_block
 from thruster_env.dynamics import substep
+from thruster_env.numerics import arrays
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import FILTER_PROCESS, normal_block
 from thruster_env.plant import make_plant
 
 

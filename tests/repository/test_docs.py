@@ -18,7 +18,6 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from filters.registry import FILTERS
 from filters.wrappers.arguments import OBSERVATIONS
-from plants.disturbances.sensors import SENSOR_EFFECTS
 from thruster_env.channels import CHANNELS
 from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
 from thruster_env.effects.flow import FLOW_SIGNALS
@@ -27,6 +26,7 @@ from thruster_env.effects.uncertainty import DISTRIBUTIONS
 from thruster_env.env import BowThrusterEnv
 from thruster_env.model import thruster_model
 from thruster_env.parameters import PRESETS
+from thruster_env.plants.disturbances.sensors import SENSOR_EFFECTS
 from thruster_env.tasks import BowThrusterLinearEnv
 from thruster_env.vector_env import BowThrusterVectorEnv
 

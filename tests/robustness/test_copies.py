@@ -215,7 +215,7 @@ def test_a_pickle_loads_in_a_fresh_process():
     env = gym.make("filters:BowThruster-EKF-v0")
     env.reset(seed=1)
     source = (
-        "import pickle, sys; from numerics.compiled import interpreted\n"
+        "import pickle, sys; from thruster_env.numerics.compiled import interpreted\n"
         "with interpreted():\n"
         "    env = pickle.load(sys.stdin.buffer); print(env.step([3.0])[0].tobytes().hex())"
     )

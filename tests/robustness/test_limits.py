@@ -10,11 +10,11 @@ import pytest
 import thruster_env  # noqa: F401 - registers the envs
 from filters import make_filter, thruster_model
 from filters.tuned_file import read_tuned_file
-from numerics.checks import as_floats, shown, vector
-from studies.comparison import compare
 from thruster_cli.simulate import command
+from thruster_env.numerics.checks import as_floats, shown, vector
 from thruster_env.parameters import TUNNEL
-from training.setup import configuration_from_json
+from thruster_env.studies.comparison import compare
+from thruster_env.training.setup import configuration_from_json
 from tuning.problems.files import read_scenario
 from tuning.problems.seeds import held_out_seeds, training_seeds
 from tuning.thruster.scenarios import SCENARIOS

@@ -12,16 +12,16 @@ import pytest
 from filters import FILTERS, EstimateState, make_filter, run
 from filters.logs.estimate import LogEstimate
 from filters.logs.findings import findings
-from numerics.angles import difference
-from numerics.compiled import interpreted
-from numerics.streams import filter_keys
-from plants.logs.log import Log
-from plants.logs.read import read_log
-from plants.replay import ReplayEnv
 from tests.filters.test_filter_paths import assert_paths_agree
 from tests.models import KEY, line_model, scalar_model, simulated, small
 from tests.numerics.test_angles import data_of, makers, plain_run, rotated
 from tests.plants.test_logs import MODEL
+from thruster_env.numerics.angles import difference
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import filter_keys
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.logs.read import read_log
+from thruster_env.plants.replay import ReplayEnv
 
 LOGS, LEVEL = 600, 3.9  # deviations that a binomial share stays within, but once in 10 000 seeds
 

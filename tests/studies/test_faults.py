@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from filters.monitoring.thresholds import cusum_threshold
-from numerics.markdown import with_tables
-from studies.faults import BIASES, LOST_BLADES, PLANTS, best_delay, delays, markdown
+from thruster_env.numerics.markdown import with_tables
+from thruster_env.studies.faults import BIASES, LOST_BLADES, PLANTS, best_delay, delays, markdown
 
 
 def test_larger_faults_of_the_thruster_are_found_sooner_and_none_without_one():

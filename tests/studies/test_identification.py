@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from studies import identification
-from studies.identification import AMPLITUDE, PRESET, SENSORS, TRUTH, coverage, record, report, study
 from thruster_env.logged import Shown
 from thruster_env.plant import make_plant
+from thruster_env.studies import identification
+from thruster_env.studies.identification import AMPLITUDE, PRESET, SENSORS, TRUTH, coverage, record, report, study
 from tuning.identification.objective import Objective
 from tuning.problems.coordinates import Coordinates
 from tuning.thruster.identification import ThrusterFamily

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from studies.lidar import BEARING, RANGE, drawn, lidar_problem
-from studies.okf_lidar import (
+from thruster_env.studies.lidar import BEARING, RANGE, drawn, lidar_problem
+from thruster_env.studies.okf_lidar import (
     GRADIENT,
     IN_A_FIFTH,
     NOISE,

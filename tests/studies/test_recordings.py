@@ -5,18 +5,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from numerics.streams import episode_keys
-from plants.simulate import simulate
-from studies.recordings.clock import clock_offset
-from studies.recordings.comparison import LOOKUP, OURS, OWN, STATIC, estimates_of
-from studies.recordings.identification import CHOSEN, STRUCTURES, Structure, identified, thrusts
-from studies.recordings.measure import averaged, best_rmse, error, ratios, rmse, settled_rmse
-from studies.recordings.model import DT, model, to_identify
-from studies.recordings.regime import after_reversal, regimes
-from studies.recordings.results import identify_all, tasks_of
-from studies.recordings.runs import read_recordings
-from studies.recordings.tables import ladder_rows, number_rows
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from thruster_env.numerics.streams import episode_keys
+from thruster_env.plants.simulate import simulate
+from thruster_env.studies.recordings.clock import clock_offset
+from thruster_env.studies.recordings.comparison import LOOKUP, OURS, OWN, STATIC, estimates_of
+from thruster_env.studies.recordings.identification import CHOSEN, STRUCTURES, Structure, identified, thrusts
+from thruster_env.studies.recordings.measure import averaged, best_rmse, error, ratios, rmse, settled_rmse
+from thruster_env.studies.recordings.model import DT, model, to_identify
+from thruster_env.studies.recordings.regime import after_reversal, regimes
+from thruster_env.studies.recordings.results import identify_all, tasks_of
+from thruster_env.studies.recordings.runs import read_recordings
+from thruster_env.studies.recordings.tables import ladder_rows, number_rows
 from tuning.identification.values import valued
 
 RECORDED = Path(__file__).parents[3] / "shared" / "data" / "rov_thruster"
@@ -138,7 +138,8 @@ def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
 
     asked = []
     monkeypatch.setattr(
-        "studies.recordings.results.identified", lambda structure, *_: asked.append(structure) or Learnt(structure)
+        "thruster_env.studies.recordings.results.identified",
+        lambda structure, *_: asked.append(structure) or Learnt(structure),
     )
     file, told = tmp_path / "results.json", []
     tasks = identify_all(runs, file, progress=lambda *one: told.append(one))
@@ -149,7 +150,7 @@ def test_what_is_done_is_kept_and_not_done_again(runs, tmp_path, monkeypatch):
     assert len(number_rows(runs, tasks)) == len(STRUCTURES[CHOSEN].free)
     assert len(estimates_of(runs, tasks)[OURS]) == 2
     few = {name: one for name, one in STRUCTURES.items() if name in (CHOSEN, "ambient")}
-    monkeypatch.setattr("studies.recordings.tables.STRUCTURES", few)
+    monkeypatch.setattr("thruster_env.studies.recordings.tables.STRUCTURES", few)
     assert [row[0] for row in ladder_rows(runs, tasks)] == [one.about for one in few.values()]
 
 

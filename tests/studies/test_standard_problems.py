@@ -10,10 +10,16 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from filters import EstimateState
-from studies import BENCHMARKS, benchmark, lorenz63, lorenz96, pendulum, range_bearing
-from studies.benchmark import Published, against_published, find_benchmark, mean_of_roots, noise_free_problem
-from studies.tuned_inflation import tune_inflation
 from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
+from thruster_env.studies import BENCHMARKS, benchmark, lorenz63, lorenz96, pendulum, range_bearing
+from thruster_env.studies.benchmark import (
+    Published,
+    against_published,
+    find_benchmark,
+    mean_of_roots,
+    noise_free_problem,
+)
+from thruster_env.studies.tuned_inflation import tune_inflation
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
 from tuning.problems.check import checked_problem
@@ -150,7 +156,7 @@ def test_every_benchmark_is_found_and_its_problem_is_one():
         assert find_benchmark(name).name == name
         assert find_problem(f"{module}:problem").name == f"{module}:problem"
     for other in ("faded", "jittered"):
-        (parameter,) = find_problem(f"studies.lorenz63:{other}").parameters
+        (parameter,) = find_problem(f"thruster_env.studies.lorenz63:{other}").parameters
         assert parameter.name in ("inflation", "jitter")
     with pytest.raises(ValueError, match="benchmark must be one of lorenz63"):
         find_benchmark("lorenz84")
@@ -170,12 +176,12 @@ def test_a_study_tunes_inflation_and_nothing_else():
 
 @pytest.mark.slow
 def test_the_pendulum_goes_from_a_file_to_a_filter_around_the_env(tmp_path, thruster):  # noqa: F811
-    plan = Plan("ekf", (checked_problem(find_problem("studies.pendulum:problem")),))
+    plan = Plan("ekf", (checked_problem(find_problem("thruster_env.studies.pendulum:problem")),))
     result = run_study(open_study("pendulum", plan, optuna.storages.InMemoryStorage()), plan, 4)
     path, proof = tmp_path / "pendulum.json", evaluate_held_out(result.choice, plan.scenarios[0], 0, 4)
     assert proof.tuned.score.value < proof.untuned.score.value
     write_tuned(path, plan, result, [proof], "pendulum")
-    done = thruster("report", path, "--problem", "studies.pendulum:problem")
+    done = thruster("report", path, "--problem", "thruster_env.studies.pendulum:problem")
     assert done.returncode == 0, done.stderr
     env = EstimateState(gym.make("Pendulum-v1"), tuned=path, model=pendulum.model())
     env.reset(seed=3)

@@ -8,15 +8,15 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from filters import KalmanFilter, run
-from plants.simulate import simulate
-from studies import STUDIES
-from studies.comparison import compare, compare_all, discrete_model, optimum
-from studies.findings import findings, study_statements
-from studies.published import NOISE_LEVELS, STEPS, SYSTEMS, H
-from studies.series import series
-from studies.unupdated_ensemble import unupdated_ensemble_means
 from tests.oracles import kalman_update
 from thruster_cli.main import main
+from thruster_env.plants.simulate import simulate
+from thruster_env.studies import STUDIES
+from thruster_env.studies.comparison import compare, compare_all, discrete_model, optimum
+from thruster_env.studies.findings import findings, study_statements
+from thruster_env.studies.published import NOISE_LEVELS, STEPS, SYSTEMS, H
+from thruster_env.studies.series import series
+from thruster_env.studies.unupdated_ensemble import unupdated_ensemble_means
 
 # The Riccati values and the errors of the un-updated ensemble, computed independently of this package.
 OPTIMUM = {

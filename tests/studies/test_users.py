@@ -7,11 +7,11 @@ import pytest
 from scipy.stats import kstest, norm
 
 from filters.consistency.intervals import Interval
-from studies.users import runs, significance, tables
-from studies.users.runs import Beside, Case, Panel, found_problems, run_panel
-from studies.users.significance import chance_if_no_worse, holm
 from tests.linear_problem import LinearProblem
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from thruster_env.studies.users import runs, significance, tables
+from thruster_env.studies.users.runs import Beside, Case, Panel, found_problems, run_panel
+from thruster_env.studies.users.significance import chance_if_no_worse, holm
 from tuning.evaluation.evaluate import score, score_ratio
 
 SAME = Interval(1.0, 1.0, 1.0)

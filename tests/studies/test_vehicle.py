@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from filters import EnsembleKalmanFilter, ExtendedKalmanFilter, affine_model, run
-from studies import VEHICLE_STUDIES, ngatini2017, ngatini2019
-from studies.vehicle import estimators
-from studies.vehicle.estimators import kalman, measured
-from studies.vehicle.experiment import (
+from tests.studies.test_studies import command_line
+from thruster_cli import output
+from thruster_env.studies import VEHICLE_STUDIES, ngatini2017, ngatini2019
+from thruster_env.studies.vehicle import estimators
+from thruster_env.studies.vehicle.estimators import kalman, measured
+from thruster_env.studies.vehicle.experiment import (
     Task,
     along_path,
     keys_of,
@@ -17,17 +19,15 @@ from studies.vehicle.experiment import (
     scores_of,
     true_runs,
 )
-from studies.vehicle.findings import why_different
-from studies.vehicle.mean_propagation import MeanPropagatingEnKF
-from studies.vehicle.models import papers_model
-from studies.vehicle.paths import PATHS, find_path
-from studies.vehicle.pose import full_pose, planar_pose, pose_errors, reckoned_attitude
-from studies.vehicle.printed import DT, NOISE, PrintedRow
-from studies.vehicle.statements import GOLDEN, MEAN_ONLY, unstable_corners
-from studies.vehicle.tasks import PAPERS
-from studies.vehicle.wording import digits
-from tests.studies.test_studies import command_line
-from thruster_cli import output
+from thruster_env.studies.vehicle.findings import why_different
+from thruster_env.studies.vehicle.mean_propagation import MeanPropagatingEnKF
+from thruster_env.studies.vehicle.models import papers_model
+from thruster_env.studies.vehicle.paths import PATHS, find_path
+from thruster_env.studies.vehicle.pose import full_pose, planar_pose, pose_errors, reckoned_attitude
+from thruster_env.studies.vehicle.printed import DT, NOISE, PrintedRow
+from thruster_env.studies.vehicle.statements import GOLDEN, MEAN_ONLY, unstable_corners
+from thruster_env.studies.vehicle.tasks import PAPERS
+from thruster_env.studies.vehicle.wording import digits
 
 ENDS = {  # (north, east, down) [m], of a prototype with other code
     "I": (-2.415, 3.789, 0.114),

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_1samp, ttest_rel
 
-from studies.ways import runs as study_runs
-from studies.ways.entries import Result, Scored, data_set, reference, run_way, start_of
-from studies.ways.predictions import PREDICTIONS
-from studies.ways.problems import CASES, GROUPS, QUICK
-from studies.ways.protocol import ENTRIES, FAST, REFERENCE, Protocol
-from studies.ways.runs import file_of, jobs_of, run_protocol
-from studies.ways.statistics import chance, regrets, student
-from studies.ways.tables import percent, tables
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from thruster_env.studies.ways import runs as study_runs
+from thruster_env.studies.ways.entries import Result, Scored, data_set, reference, run_way, start_of
+from thruster_env.studies.ways.predictions import PREDICTIONS
+from thruster_env.studies.ways.problems import CASES, GROUPS, QUICK
+from thruster_env.studies.ways.protocol import ENTRIES, FAST, REFERENCE, Protocol
+from thruster_env.studies.ways.runs import file_of, jobs_of, run_protocol
+from thruster_env.studies.ways.statistics import chance, regrets, student
+from thruster_env.studies.ways.tables import percent, tables
 
 WALK = QUICK[0]
 

@@ -5,14 +5,14 @@ import csv
 import numpy as np
 import pytest
 
-from numerics.text_tables import plain_text
-from plants.logs.recorders.registry import fields
-from plants.logs.table import read_table
 from tests.plants.recorders.files import h5py, write_bag, write_ulog
 from tests.plants.recorders.test_formats import bag_topics
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.tuned_files import write_untuned
 from thruster_cli.fields import as_table, sparkline
+from thruster_env.numerics.text_tables import plain_text
+from thruster_env.plants.logs.recorders.registry import fields
+from thruster_env.plants.logs.table import read_table
 
 COLUMNS = ("--column", "V_s=actuator_outputs.output[2]", "--column", "thrust=load_cell#1.force")
 

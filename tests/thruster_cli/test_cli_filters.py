@@ -96,7 +96,7 @@ def test_equations_break_where_they_part_and_sentences_fill_the_width():
 
 
 def test_it_tells_which_filters_fit_a_problem_and_what_a_belief_takes(thruster):
-    code, out, _ = thruster("filters", "--problem", "studies.lorenz96:problem", "--json", "-")
+    code, out, _ = thruster("filters", "--problem", "thruster_env.studies.lorenz96:problem", "--json", "-")
     found = {one["name"]: one for one in json.loads(out)["filters"]}
     assert code == 0 and list(found) == list(FILTERS)
     assert "affine model" in found["kf"]["reason"] and found["kf"]["kilobytes"] is None

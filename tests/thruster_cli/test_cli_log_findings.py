@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import tuning
-from plants.logs.write import write_columns
-from plants.state_space import StateSpaceModel
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from thruster_env.plants.logs.write import write_columns
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.logs.problem import log_problem
 
 OWN = """
-from plants.affine import affine_model
+from thruster_env.plants.affine import affine_model
 
 def model(gain=0.5, process_noise_cov=0.01, measurement_noise_cov=0.04):
     return affine_model(

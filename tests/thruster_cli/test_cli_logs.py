@@ -17,7 +17,7 @@ from thruster_env.parameters import PRESETS
 from thruster_env.preset_file import PresetFile, write_preset
 
 TWO_STATES = """
-from plants.affine import affine_model
+from thruster_env.plants.affine import affine_model
 
 def model(dt):
     return affine_model(

@@ -11,8 +11,8 @@ import time
 import pytest
 
 import thruster_cli.app
-from numerics.characters import showable
 from thruster_cli.main import main
+from thruster_env.numerics.characters import showable
 
 INTERRUPTED = "thruster: interrupted\n"
 AT_IMPORT = """

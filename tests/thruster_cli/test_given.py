@@ -2,10 +2,10 @@
 
 import pytest
 
-from plants.logs.write import write_log
-from studies.identification import TRUTH, record
 from tests import altitude_problem
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
+from thruster_env.plants.logs.write import write_log
+from thruster_env.studies.identification import TRUTH, record
 from tuning.evaluation.baselines import given
 from tuning.evaluation.held_out import evaluate_held_out
 

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the env
-from numerics.streams import episode_keys
-from plants.logs.log import Log
-from plants.logs.write import write_log
-from plants.simulate import simulate
-from studies.identification import TRUTH, record
 from tests.models import scalar_model
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from tests.thruster_env.test_t200 import OTHER, recorded_rows, write_table
 from thruster_env.logged import logged_model
 from thruster_env.model import thruster_model
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.parameters import TUNNEL_PHYSICAL
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.logs.write import write_log
+from thruster_env.plants.simulate import simulate
 from thruster_env.preset_file import PresetFile, read_preset, write_preset
+from thruster_env.studies.identification import TRUTH, record
 from tuning.identification.values import with_values
 from tuning.problems.files import scenario_of
 from tuning.problems.find import find_problem

@@ -14,11 +14,11 @@ import tuning
 from filters import EstimateState, make_filter, run
 from filters.likelihood import likelihood
 from filters.registry import filter_class
-from numerics.compiled import interpreted
 from tests.filters.test_differentiated import swing_if
 from tests.models import pendulum, simulated, swing
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_env.model import thruster_model
+from thruster_env.numerics.compiled import interpreted
 from thruster_env.parameters import TUNNEL_PHYSICAL
 from thruster_env.preset_file import read_preset
 from tuning.evaluation.baselines import rule_of_thumb

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from plants.rendering import film
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_cli import episodes
 from thruster_env.model import thruster_model
+from thruster_env.plants.rendering import film
 from thruster_env.rendering.history import Moment, Overlay
 
 

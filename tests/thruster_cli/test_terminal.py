@@ -14,13 +14,13 @@ from optuna.trial import create_trial
 from rich.console import Console
 
 from filters.consistency.intervals import Interval
-from numerics.checks import any_case, meant, one_of
-from numerics.progress import listening
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_cli import output
 from thruster_cli.app import COMMANDS, PANELS, listed
 from thruster_cli.benchmark import fitted
 from thruster_cli.tuning_report import way_out
+from thruster_env.numerics.checks import any_case, meant, one_of
+from thruster_env.numerics.progress import listening
 from tuning.api.progress import trial_bar
 from tuning.api.run import file_name
 from tuning.problems.find import find_problem

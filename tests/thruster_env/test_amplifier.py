@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
-from numerics.streams import episode_keys
-from plants.memory import row
 from thruster_env.engine.copies import Copies
 from thruster_env.engine.memory import COMMAND, FLOW, OMEGA, VOLTAGE
 from thruster_env.linear.steady_state import run_substeps
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.parameters import PRESETS, TUNNEL_PHYSICAL
 from thruster_env.plant import make_plant
+from thruster_env.plants.memory import row
 from thruster_env.task import Task
 
 DT = 0.01

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from numerics.linear_systems import zero_order_hold
 from thruster_env.dynamics import rates, thrust_and_torque_tangent
 from thruster_env.linear.analysis import (
     INPUTS,
@@ -22,6 +21,7 @@ from thruster_env.linear.analysis import (
 from thruster_env.linear.figures import response_figure
 from thruster_env.linear.published import PUBLISHED, SAMPLE_TIME, published_for
 from thruster_env.linear.steady_state import jacobians, state_range, steady_state
+from thruster_env.numerics.linear_systems import zero_order_hold
 from thruster_env.parameters import ANGLES, PRESETS, TUNNEL, derive_constants
 
 every_preset = pytest.mark.parametrize("p", PRESETS.values(), ids=PRESETS.keys())

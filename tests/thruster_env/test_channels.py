@@ -5,13 +5,13 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from numerics.streams import episode_keys
-from plants.channels import Channel, reader_of
-from plants.quantities import Quantity
 from thruster_env.channels import CHANNELS
 from thruster_env.linear.linear_plant import make_linear_plant
 from thruster_env.model import model_of_plant, thruster_model
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.plant import make_plant
+from thruster_env.plants.channels import Channel, reader_of
+from thruster_env.plants.quantities import Quantity
 from thruster_env.simulation import simulate
 
 pytestmark = pytest.mark.usefixtures("as_python")

@@ -6,12 +6,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from plants.observe import ObserveState, ObserveStateVector
 from thruster_env import PRESETS
 from thruster_env.control.controllers import LQRController, PIController
 from thruster_env.control.gains import lambda_gains, quadratic_gain
 from thruster_env.control.predictive import PredictiveController
 from thruster_env.linear.steady_state import steady_state
+from thruster_env.plants.observe import ObserveState, ObserveStateVector
 from thruster_env.task import make_task, thrust_scale
 
 NOISE_FREE = {"process_noise_cov": (0.0, 0.0), "measurement_noise_cov": 0.0, "initial_state": (0.0, 0.0)}

@@ -5,8 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from numerics.compiled import compiled, function_fingerprint
-from numerics.integration import runge_kutta
 from thruster_env.dynamics import (
     rates,
     rates_tangent,
@@ -16,6 +14,8 @@ from thruster_env.dynamics import (
     thrust_and_torque_tangent,
     variational_substep,
 )
+from thruster_env.numerics.compiled import compiled, function_fingerprint
+from thruster_env.numerics.integration import runge_kutta
 from thruster_env.parameters import ANGLES, PRESETS, TUNNEL, TUNNEL_PHYSICAL, derive_constants
 
 CASES = {

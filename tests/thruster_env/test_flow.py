@@ -8,15 +8,15 @@ import pytest
 from scipy import stats
 
 import thruster_env  # noqa: F401 - registers the envs
-from numerics.streams import episode_keys
-from plants.disturbances.recorded import RecordedSeries
-from plants.memory import row
 from thruster_env.effects.flow import FLOW_SIGNALS
 from thruster_env.engine.copies import Copies
 from thruster_env.engine.memory import AMBIENT
 from thruster_env.linear.steady_state import run_substeps, state_range
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.parameters import PRESETS, TUNNEL
 from thruster_env.plant import make_plant
+from thruster_env.plants.disturbances.recorded import RecordedSeries
+from thruster_env.plants.memory import row
 from thruster_env.task import Task
 
 DT = 0.01

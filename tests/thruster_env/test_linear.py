@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from numerics.linear_systems import observability, zero_order_hold
 from thruster_env.dynamics import rates, thrust_and_torque
 from thruster_env.linear.steady_state import jacobians, required_substeps, run_substeps, state_range, steady_state
+from thruster_env.numerics.linear_systems import observability, zero_order_hold
 from thruster_env.parameters import (
     OPEN_BLADED,
     OPEN_BLADED_CORRECTED,

@@ -6,12 +6,12 @@ import pytest
 
 import thruster_env  # noqa: F401 - registers the env
 from filters import ExtendedKalmanFilter, run
-from numerics.streams import episode_keys
-from plants.simulate import simulate
 from thruster_env.logged import Shown, lag_weights, logged_model, with_shown
 from thruster_env.model import model_of_plant, thruster_model
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.parameters import PRESETS, T200, preset_parameters
 from thruster_env.plant import make_plant
+from thruster_env.plants.simulate import simulate
 from thruster_env.preset_file import PresetFile, read_preset, write_preset
 
 PLANT = {"preset": "tunnel_physical", "sensors": ["thrust", "speed"], "substeps": 4}

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the env
-from numerics.checks import at_least, covariance, covariance_root, finite, one_of, positive, vector
-from numerics.compiled import interpreted
-from numerics.streams import draw_key, episode_keys
-from plants.memory import row
 from thruster_env.engine.copies import Copies
 from thruster_env.engine.memory import COMMAND, FLOW, OMEGA, READINGS, THRUST
 from thruster_env.linear.steady_state import run_substeps, steady_state
+from thruster_env.numerics.checks import at_least, covariance, covariance_root, finite, one_of, positive, vector
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.numerics.streams import draw_key, episode_keys
 from thruster_env.parameters import PRESETS, TUNNEL, checked
 from thruster_env.plant import make_plant
+from thruster_env.plants.memory import row
 from thruster_env.simulation import simulate
 from thruster_env.task import Task
 

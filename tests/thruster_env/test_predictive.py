@@ -8,10 +8,10 @@ import pytest
 from scipy.optimize import minimize
 
 import thruster_env  # noqa: F401 - registers the envs
-from numerics.compiled import interpreted
 from thruster_env.control import planning
 from thruster_env.control.planning import Problem, best_voltages, improve_plans
 from thruster_env.control.predictive import HORIZONS, PredictiveController
+from thruster_env.numerics.compiled import interpreted
 from thruster_env.parameters import preset_parameters
 from thruster_env.plant import make_plant
 

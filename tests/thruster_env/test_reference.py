@@ -8,11 +8,11 @@ import pytest
 from scipy import signal, stats
 
 import thruster_env  # noqa: F401 - registers the envs
-from numerics.streams import episode_keys
 from thruster_env.effects.reference import REFERENCE_SIGNALS
 from thruster_env.engine.copies import Copies
 from thruster_env.engine.memory import NEXT_REFERENCE, REFERENCE
 from thruster_env.linear.steady_state import steady_state
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.parameters import PRESETS, TUNNEL
 from thruster_env.plant import make_plant
 from thruster_env.task import Task, make_task

@@ -13,9 +13,9 @@ from thruster_env.rendering import Moment, Overlay, Renderer
 
 pygame = pytest.importorskip("pygame")
 
-from plants.rendering.axis import fitting_axis  # noqa: E402
-from plants.rendering.canvas import BAND  # noqa: E402
-from plants.rendering.window import Window  # noqa: E402
+from thruster_env.plants.rendering.axis import fitting_axis  # noqa: E402
+from thruster_env.plants.rendering.canvas import BAND  # noqa: E402
+from thruster_env.plants.rendering.window import Window  # noqa: E402
 from thruster_env.rendering.propeller import BLADES, end_view  # noqa: E402
 from thruster_env.rendering.scene import (  # noqa: E402
     AXIS,

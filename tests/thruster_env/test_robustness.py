@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import thruster_env
-from numerics.compiled import interpreted
 from thruster_env.effects.uncertainty import UNCERTAIN
+from thruster_env.numerics.compiled import interpreted
 from thruster_env.parameters import PRESETS
 from thruster_env.vector_env import BowThrusterTrackingVectorEnv, BowThrusterVectorEnv
 

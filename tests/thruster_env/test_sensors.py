@@ -8,12 +8,12 @@ import pytest
 from scipy import stats
 
 import thruster_env  # noqa: F401 - registers the envs
-from numerics.streams import episode_keys
-from plants.disturbances.sensors import Bias, Quantisation
 from thruster_env.channels import CHANNELS
 from thruster_env.dynamics import thrust_and_torque
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.parameters import PRESETS, TUNNEL_PHYSICAL, derive_constants
 from thruster_env.plant import make_plant
+from thruster_env.plants.disturbances.sensors import Bias, Quantisation
 from thruster_env.simulation import simulate
 
 NOTHING = {"name": "bias"}  # adds zero, and makes the same machine code run

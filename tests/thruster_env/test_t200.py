@@ -5,12 +5,19 @@ import math
 import numpy as np
 import pytest
 
-from studies.bollard_fit import Identified, PulseWidthMap, identify, predict, relative_errors
-from studies.bollard_table import read_table
-from studies.t200_identification import PRESET, T200_PULSE_WIDTHS, coefficients, identified_numbers, main, study
 from thruster_env.dynamics import thrust_and_torque
 from thruster_env.linear.steady_state import jacobians, required_substeps, steady_state
 from thruster_env.parameters import PRESETS, T200, checked, derive_constants
+from thruster_env.studies.bollard_fit import Identified, PulseWidthMap, identify, predict, relative_errors
+from thruster_env.studies.bollard_table import read_table
+from thruster_env.studies.t200_identification import (
+    PRESET,
+    T200_PULSE_WIDTHS,
+    coefficients,
+    identified_numbers,
+    main,
+    study,
+)
 
 OTHER = Identified(
     T200._replace(

@@ -13,13 +13,13 @@ from scipy.linalg import expm
 
 from filters import KalmanFilter, run
 from filters.consistency.nees import normalized_squares
-from numerics.streams import episode_keys
-from plants.disturbances.sensors import Dropout
 from thruster_env.effects.flow import Sinusoid
 from thruster_env.effects.uncertainty import LogNormal
 from thruster_env.linear.linear_plant import make_linear_plant
 from thruster_env.linear.published import PUBLISHED
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.parameters import TUNNEL_PHYSICAL
+from thruster_env.plants.disturbances.sensors import Dropout
 from thruster_env.simulation import simulate
 from thruster_env.tasks import BowThrusterLinearEnv
 

@@ -9,15 +9,15 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 
 import thruster_env  # noqa: F401 - registers the envs
-from numerics.streams import episode_keys
-from plants.memory import row
 from thruster_env.dynamics import Constants, rates, thrust_and_torque
 from thruster_env.effects.uncertainty import UNCERTAIN, LogNormal, Uniform, drawn_parameters, extreme_parameters
 from thruster_env.engine.copies import Copies
 from thruster_env.engine.memory import CONSTANT_ROWS
 from thruster_env.linear.steady_state import run_substeps, state_range, steady_state
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.parameters import PRESETS, TUNNEL, TUNNEL_PHYSICAL, derive_constants
 from thruster_env.plant import make_plant
+from thruster_env.plants.memory import row
 from thruster_env.simulation import simulate
 from thruster_env.task import Task
 from thruster_env.vector_env import BowThrusterVectorEnv

@@ -10,18 +10,18 @@ import pytest
 pytest.importorskip("stable_baselines3")
 
 from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
-from training.classical import classical_policy
-from training.comparison import runs
-from training.comparison.answers import answers
-from training.comparison.plan import BEST, CLASSICAL, QUICK, VARIANTS, WRONG, Comparison, Run, runs_of
-from training.comparison.runs import Result, run_comparison
-from training.comparison.statistics import as_interval, typical_error, typical_return
-from training.comparison.tables import HEADER, rows_of, summary_rows
-from training.environments import make_environments
-from training.plants.plant import Part
-from training.plants.thruster import FIRST_SCORED_STEP, THRUSTER
-from training.score import Scores, run_episodes, score
-from training.setup import make_configuration
+from thruster_env.training.classical import classical_policy
+from thruster_env.training.comparison import runs
+from thruster_env.training.comparison.answers import answers
+from thruster_env.training.comparison.plan import BEST, CLASSICAL, QUICK, VARIANTS, WRONG, Comparison, Run, runs_of
+from thruster_env.training.comparison.runs import Result, run_comparison
+from thruster_env.training.comparison.statistics import as_interval, typical_error, typical_return
+from thruster_env.training.comparison.tables import HEADER, rows_of, summary_rows
+from thruster_env.training.environments import make_environments
+from thruster_env.training.plants.plant import Part
+from thruster_env.training.plants.thruster import FIRST_SCORED_STEP, THRUSTER
+from thruster_env.training.score import Scores, run_episodes, score
+from thruster_env.training.setup import make_configuration
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario
 

@@ -9,11 +9,11 @@ import pytest
 pytest.importorskip("sb3_contrib")
 
 from tests.learners import COPIES, LIMIT, learn, setup_of, short_episodes  # noqa: F401 - some are fixtures
-from training.classical import classical_policy
-from training.environments import make_environments
-from training.saved import find_saved, load
-from training.score import score
-from training.setup import configuration_from_json
+from thruster_env.training.classical import classical_policy
+from thruster_env.training.environments import make_environments
+from thruster_env.training.saved import find_saved, load
+from thruster_env.training.score import score
+from thruster_env.training.setup import configuration_from_json
 from tuning.problems.seeds import held_out_seeds
 
 SEEDS = list(range(10, 10 + COPIES))

@@ -11,14 +11,14 @@ from gymnasium.spaces import Box
 from stable_baselines3.common.buffers import RolloutBuffer
 from torch.distributions import Distribution
 
-from numerics.wait_policy import wait_policy
 from tests.learners import setup_of, short_episodes  # noqa: F401 - a fixture
-from training.algorithms import ALGORITHMS
-from training.environments import make_environments
-from training.model import new_model
-from training.rollouts import EpochBuffer
-from training.tanh import NumpyTanh, numpys_tanh
-from training.torch_settings import learning
+from thruster_env.numerics.wait_policy import wait_policy
+from thruster_env.training.algorithms import ALGORITHMS
+from thruster_env.training.environments import make_environments
+from thruster_env.training.model import new_model
+from thruster_env.training.rollouts import EpochBuffer
+from thruster_env.training.tanh import NumpyTanh, numpys_tanh
+from thruster_env.training.torch_settings import learning
 
 SEEDS = range(4)
 

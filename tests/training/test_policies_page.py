@@ -8,14 +8,14 @@ import pytest
 pytest.importorskip("stable_baselines3")
 
 from thruster_cli.study import app
-from training.classical import classical_policy
-from training.comparison.answers import GOAL
-from training.comparison.plan import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
-from training.comparison.tables import HEADER, name_of
-from training.observations import OBSERVATION_SETS
-from training.plants.find import TASKS
-from training.score import score
-from training.setup import make_configuration
+from thruster_env.training.classical import classical_policy
+from thruster_env.training.comparison.answers import GOAL
+from thruster_env.training.comparison.plan import BEST, NOISES, TASK, VARIANTS, WRONG, Comparison, runs_of
+from thruster_env.training.comparison.tables import HEADER, name_of
+from thruster_env.training.observations import OBSERVATION_SETS
+from thruster_env.training.plants.find import TASKS
+from thruster_env.training.score import score
+from thruster_env.training.setup import make_configuration
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import training
-from training.algorithms import ALGORITHMS
+import thruster_env.training
+from thruster_env.training.algorithms import ALGORITHMS
 
 FILE = Path(__file__).resolve().parents[2] / "examples" / "ppo.py"
 
@@ -23,21 +23,21 @@ def ppo():
 
 
 def test_the_vec_env_is_public_and_found_lazily():
-    from training import NativeVecEnv
-    from training.vec_env import NativeVecEnv as Same
+    from thruster_env.training import NativeVecEnv
+    from thruster_env.training.vec_env import NativeVecEnv as Same
 
-    assert NativeVecEnv is Same and "NativeVecEnv" in dir(training)
-    with pytest.raises(AttributeError, match="module 'training' has no attribute 'Native'"):
-        training.Native  # noqa: B018
-    code = "import sys, training; print('torch' in sys.modules)"
+    assert NativeVecEnv is Same and "NativeVecEnv" in dir(thruster_env.training)
+    with pytest.raises(AttributeError, match="module 'thruster_env.training' has no attribute 'Native'"):
+        thruster_env.training.Native  # noqa: B018
+    code = "import sys, thruster_env.training; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("training.extras.NEEDED", ("no_such_package",))
+    monkeypatch.setattr("thruster_env.training.extras.NEEDED", ("no_such_package",))
     with pytest.raises(ValueError, match=r"no_such_package, which is not installed: pip install '\.\[rl\]'"):
-        training.NativeVecEnv  # noqa: B018
+        thruster_env.training.NativeVecEnv  # noqa: B018
 
 
 def test_the_example_has_the_numbers_that_thruster_train_takes(ppo):

@@ -1,4 +1,4 @@
-"""The files in `hyperparams/` work in rl_zoo3 as they are, and say what `training.algorithms` says."""
+"""Files in `hyperparams/` work in rl_zoo3 as they are, and say what `thruster_env.training.algorithms` says."""
 
 import importlib.util
 import os
@@ -13,7 +13,7 @@ if importlib.util.find_spec("rl_zoo3") is None:  # importing it would change Gym
 
 import yaml
 
-from training.algorithms import ALGORITHMS
+from thruster_env.training.algorithms import ALGORITHMS
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = {"ppo": "ppo", "sac": "sac", "td3": "td3", "ppo_lstm": "recurrent-ppo"}

@@ -11,13 +11,13 @@ import pytest
 pytest.importorskip("sb3_contrib")
 
 from tests.learners import COPIES, LIMIT, contents, copied, learn, setup_of, short_episodes, steps_of, trained  # noqa: F401 - some are fixtures
-from training.algorithms import ALGORITHMS
-from training.environments import make_environments
-from training.learn import VALIDATION_EPISODES, _episodes_after
-from training.observations import OBSERVATION_SETS
-from training.saved import CHECKPOINTS, FINAL, find_saved, load, read_configuration
-from training.score import score
-from training.setup import configuration_from_json
+from thruster_env.training.algorithms import ALGORITHMS
+from thruster_env.training.environments import make_environments
+from thruster_env.training.learn import VALIDATION_EPISODES, _episodes_after
+from thruster_env.training.observations import OBSERVATION_SETS
+from thruster_env.training.saved import CHECKPOINTS, FINAL, find_saved, load, read_configuration
+from thruster_env.training.score import score
+from thruster_env.training.setup import configuration_from_json
 from tuning.problems.seeds import held_out_seeds
 
 
@@ -59,7 +59,7 @@ def test_a_policy_learns_by_every_algorithm_goes_on_and_acts_the_same_when_loade
 
 
 def test_what_is_saved_acts_as_what_learnt(tmp_path, monkeypatch):
-    import training.learn as module
+    import thruster_env.training.learn as module
 
     kept = {}
     save = module.save
@@ -119,7 +119,7 @@ def test_a_longer_training_that_is_interrupted_is_not_lost(copied):
 
 
 def test_episodes_of_training_evaluation_and_proof_differ(tmp_path, monkeypatch):
-    import training.learn as module
+    import thruster_env.training.learn as module
 
     made, reset = [], []
     make = module.make_environments

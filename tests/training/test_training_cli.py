@@ -13,11 +13,11 @@ pytest.importorskip("sb3_contrib")
 from tests.learners import COPIES, LIMIT, SMALL, contents, setup_of, short_episodes, trained  # noqa: F401 - some are fixtures
 from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
 from thruster_cli.train import name_of
-from training.algorithms import ALGORITHMS
-from training.environments import make_environments
-from training.play import play
-from training.saved import FINAL, load, read_configuration
-from training.score import score
+from thruster_env.training.algorithms import ALGORITHMS
+from thruster_env.training.environments import make_environments
+from thruster_env.training.play import play
+from thruster_env.training.saved import FINAL, load, read_configuration
+from thruster_env.training.score import score
 from tuning.problems.seeds import held_out_seeds
 from tuning.thruster.find import find_scenario
 
@@ -46,7 +46,7 @@ def test_a_window_shows_the_same_episode(trained):
 
 
 def test_the_commands_train_score_and_play(thruster, monkeypatch, tmp_path):
-    monkeypatch.setattr(sys.modules["training.setup"], "find_algorithm", small_algorithm)
+    monkeypatch.setattr(sys.modules["thruster_env.training.setup"], "find_algorithm", small_algorithm)
     options = ("train", "--observe", "ekf", "--steps", 128, "--envs", COPIES, "--evaluations", 2)
     folder = tmp_path / "out" / "policies" / "tracking-medium_noise-ekf-ppo-seed0"
     done = thruster(*options, "--json", "train.json")
@@ -82,7 +82,7 @@ def small_algorithm(name):
 
 
 def test_a_filter_is_trained_beside_as_it_is_told(thruster, monkeypatch, tmp_path):
-    monkeypatch.setattr(sys.modules["training.setup"], "find_algorithm", small_algorithm)
+    monkeypatch.setattr(sys.modules["thruster_env.training.setup"], "find_algorithm", small_algorithm)
     study = ("tune", "--filter", "ekf", "--scenario", "nominal", "--trials", 4, "--out", "mine.json")
     assert thruster(*study).returncode == 0
     numbers = json.loads((tmp_path / "mine.json").read_text())["filter"]["model"]

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("stable_baselines3")
 
 from tests.learners import learn, setup_of, short_episodes  # noqa: E402, F401 - one is a fixture
-from training.learn import EVALUATIONS  # noqa: E402
+from thruster_env.training.learn import EVALUATIONS  # noqa: E402
 
 
 def test_evaluations_that_find_no_room_do_not_spoil_those_before(tmp_path, monkeypatch):

@@ -12,11 +12,11 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormalize, VecVideoRecorder
 
 import thruster_env  # noqa: F401 - registers the envs
+from thruster_env.training.environments import make_environments, make_single
+from thruster_env.training.observations import OBSERVATION_SETS, STACKED
+from thruster_env.training.setup import in_scenario, make_configuration
+from thruster_env.training.vec_env import NativeVecEnv
 from thruster_env.vector_env import BowThrusterTrackingVectorEnv
-from training.environments import make_environments, make_single
-from training.observations import OBSERVATION_SETS, STACKED
-from training.setup import in_scenario, make_configuration
-from training.vec_env import NativeVecEnv
 from tuning.thruster.find import find_scenario
 
 COPIES, LIMIT, STEPS = 3, 12, 30

@@ -12,8 +12,8 @@ pytest.importorskip("sb3_contrib")
 
 from tests.fuzz.checkpoints import kill_training
 from tests.learners import contents, copied, learn, setup_of, short_episodes, steps_of, trained  # noqa: F401 - some are fixtures
-from training.comparison import runs
-from training.saved import BEST, CHECKPOINTS, FINAL, SETUP, find_saved, mend
+from thruster_env.training.comparison import runs
+from thruster_env.training.saved import BEST, CHECKPOINTS, FINAL, SETUP, find_saved, mend
 
 
 class Killed(BaseException):

@@ -12,11 +12,11 @@ pytest.importorskip("sb3_contrib")
 
 from tests.learners import SMALL, contents, copied, learn, setup_of, short_episodes, trained  # noqa: F401 - some are fixtures
 from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
-from training.environments import make_environments
-from training.extras import check_installed
-from training.play import play
-from training.saved import FINAL, find_saved, load
-from training.setup import configuration_from_json, make_configuration
+from thruster_env.training.environments import make_environments
+from thruster_env.training.extras import check_installed
+from thruster_env.training.play import play
+from thruster_env.training.saved import FINAL, find_saved, load
+from thruster_env.training.setup import configuration_from_json, make_configuration
 from tuning.thruster.find import find_scenario
 
 

@@ -10,13 +10,13 @@ pytest.importorskip("sb3_contrib")
 
 import auv_env  # noqa: F401 - registers the envs
 from tests.learners import COPIES, SMALL, learn
-from training.classical import classical_policy
-from training.environments import make_environments, make_single
-from training.plants.find import PLANTS, TASKS, plant_of
-from training.plants.plant import Part
-from training.saved import find_saved, load
-from training.score import run_episodes, score
-from training.setup import configuration_from_json, in_scenario, make_configuration
+from thruster_env.training.classical import classical_policy
+from thruster_env.training.environments import make_environments, make_single
+from thruster_env.training.plants.find import PLANTS, TASKS, plant_of
+from thruster_env.training.plants.plant import Part
+from thruster_env.training.saved import find_saved, load
+from thruster_env.training.score import run_episodes, score
+from thruster_env.training.setup import configuration_from_json, in_scenario, make_configuration
 from tuning.problems.find import find_problem
 from tuning.problems.seeds import held_out_seeds
 

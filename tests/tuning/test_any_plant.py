@@ -9,11 +9,11 @@ from rich.console import Console
 from filters.consistency.nees import normalized_squares
 from filters.consistency.verdicts import NO_TRUTH, sentences
 from filters.engine.batch import run
-from numerics.compiled import interpreted
 from tests.linear_problem import LinearProblem
 from thruster_cli import consistency
 from thruster_cli.tables import choice_table
 from thruster_cli.tuning_report import gains
+from thruster_env.numerics.compiled import interpreted
 from tuning.evaluation.compare import compare, contender
 from tuning.evaluation.evaluate import check_consistency, evaluate, likelihood_gain
 from tuning.evaluation.held_out import Comparison

@@ -8,13 +8,13 @@ import pytest
 import thruster_env  # noqa: F401 - registers the env
 import tuning
 from filters import EstimateState
-from plants.affine import affine_model
-from plants.logs.log import Log
-from plants.logs.read import read_log
-from plants.logs.write import write_log
-from plants.simulate import simulate
 from tests.pendulum_problem import problem as pendulum
 from tests.small_problems import pair
+from thruster_env.plants.affine import affine_model
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.logs.read import read_log
+from thruster_env.plants.logs.write import write_log
+from thruster_env.plants.simulate import simulate
 from tuning.api.problems import problem_of, problems_of
 from tuning.problems.excitation import Dwells, Levels, MultiSine, Steps
 from tuning.problems.find import find_problem

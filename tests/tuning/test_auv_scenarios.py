@@ -8,8 +8,8 @@ import auv_env  # noqa: F401 - registers the envs
 import thruster_env  # noqa: F401 - as well
 from auv_env.manoeuvres import MANOEUVRES
 from filters import EstimateState, make_filter, run
-from numerics.streams import episode_keys
 from tests.tuned_files import write_untuned
+from thruster_env.numerics.streams import episode_keys
 from tuning.auv.find import find_scenario
 from tuning.auv.scale import computed_scale
 from tuning.auv.scenarios import SAILING, SCENARIOS

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from plants.state_space import StateSpaceModel
 from tests import pendulum_problem
 from tests.models import wide_model
 from tests.small_problems import pair, thruster
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.api.run import run_tuning
 from tuning.problems.check import checked_problem
 from tuning.problems.env_problem import EnvProblem

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from studies import lorenz63
-from studies.benchmark import noise_free_problem
 from tests import altitude_problem
 from tests.linear_problem import LinearProblem
 from tests.models import wide_model
 from tests.small_problems import UNITS, pair, thruster
+from thruster_env.studies import lorenz63
+from thruster_env.studies.benchmark import noise_free_problem
 from tuning.evaluation.baselines import (
     GIVEN,
     NOISE,

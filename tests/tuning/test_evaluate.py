@@ -7,8 +7,8 @@ from filters import affine_model, make_filter, thruster_model
 from filters.bounds import riccati_covariances
 from filters.consistency.nees import normalized_squares
 from filters.posterior import posterior_bound
-from numerics.compiled import interpreted
-from plants import simulate
+from thruster_env.numerics.compiled import interpreted
+from thruster_env.plants import simulate
 from tuning.evaluation.evaluate import check_consistency, evaluate, score_ratio
 from tuning.evaluation.runs import _means_over_steps
 from tuning.evaluation.tuned import summary

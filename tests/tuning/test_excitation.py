@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import thruster_env  # noqa: F401 - registers the envs
-from numerics.streams import episode_keys
 from thruster_env.control.controllers import PIController
+from thruster_env.numerics.streams import episode_keys
 from thruster_env.plant import make_plant
 from tuning.problems.excitation import EXCITATIONS, BinarySequence, Dwells, MultiSine, Steps
 from tuning.thruster.excitation import ClosedLoop, voltages_of

@@ -11,7 +11,7 @@ import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState, EstimateStates
 from tests.thruster_cli.test_cli import thruster  # noqa: F401 - a fixture
 from tests.tuned_files import rewrite, write_untuned
-from training.setup import configuration_from_json, in_scenario, make_configuration
+from thruster_env.training.setup import configuration_from_json, in_scenario, make_configuration
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.verify import verify
 from tuning.reporting.report import write_report

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from filters import ExtendedKalmanFilter, run
-from numerics.streams import episode_keys, filter_keys
-from plants import simulate
-from plants.logs.log import Log
 from tests.filters.test_sensitivity import pendulum
+from thruster_env.numerics.streams import episode_keys, filter_keys
+from thruster_env.plants import simulate
+from thruster_env.plants.logs.log import Log
 from tuning.identification import identify, profile_figure, profiles, validate
 from tuning.identification.family import ModelFamily, with_ranges
 from tuning.identification.result import covariance

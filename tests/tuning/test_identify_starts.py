@@ -5,14 +5,14 @@ import pytest
 
 from filters.sensitivity import ModelSlopes, sensitivity
 from filters.starts import Starts
-from numerics.streams import episode_keys, filter_keys
-from plants.logs.log import Log
-from plants.simulate import simulate
 from tests.filters.test_sensitivity import pendulum
 from tests.models import random_affine
 from tests.tuning.test_identify import FREE, TRUTH, recorded
 from thruster_env.logged import Shown, logged_model
+from thruster_env.numerics.streams import episode_keys, filter_keys
 from thruster_env.plant import make_plant
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.simulate import simulate
 from tuning.identification import identify, validate
 from tuning.identification.starts import starts_of
 from tuning.problems.data import Data

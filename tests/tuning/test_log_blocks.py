@@ -5,11 +5,11 @@ import shutil
 import numpy as np
 import pytest
 
-from plants.logs.findings import Recording
-from plants.logs.log import Log, cut_at_gaps
-from plants.logs.read import read_log
-from plants.logs.write import write_columns
 from tests.tuning.test_log_problem import GUESS, MODEL, logs_of
+from thruster_env.plants.logs.findings import Recording
+from thruster_env.plants.logs.log import Log, cut_at_gaps
+from thruster_env.plants.logs.read import read_log
+from thruster_env.plants.logs.write import write_columns
 from tuning.evaluation.evaluate import evaluate
 from tuning.logs.identify import split_runs
 from tuning.logs.problem import log_problem

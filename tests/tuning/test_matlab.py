@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import thruster_cli
-from plants.affine import AffineModel
-from plants.state_space import StateSpaceModel
+from thruster_env.plants.affine import AffineModel
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.find import find_problem
 from tuning.reporting.matlab import function_name, matlab_function
 from tuning.reporting.traced import traced

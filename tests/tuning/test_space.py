@@ -2,7 +2,7 @@ import optuna
 import pytest
 
 from filters.registry import FILTERS
-from studies import lorenz63
+from thruster_env.studies import lorenz63
 from tuning.search.plan import Plan
 from tuning.search.space import (
     choice_of,

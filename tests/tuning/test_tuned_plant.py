@@ -19,7 +19,7 @@ from thruster_env.effects.flow import Gusts
 from thruster_env.parameters import PRESETS
 from thruster_env.plant import make_plant
 from thruster_env.plant_data import differences, plant_data
-from training.setup import make_configuration
+from thruster_env.training.setup import make_configuration
 from tuning.evaluation.tuned import read_tuned
 from tuning.evaluation.verify import verify
 from tuning.problems.files import scenario_of

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from numerics.modules import as_module, object_named, safe_paths
+from thruster_env.numerics.modules import as_module, object_named, safe_paths
 
 TRAPS = "struct tuning numerics optuna filters json pickle selectors cmaes thruster_cli multiprocessing".split()
 PROBLEM = """
@@ -63,7 +63,7 @@ def test_our_main_programs_and_processes_that_are_spawned_do_not_look_there_firs
     assert "JSONDecodeError" in done.stderr, "it is the worker, which was told nothing"
     spawn = """
 import multiprocessing, sys
-from numerics.modules import safe_paths
+from thruster_env.numerics.modules import safe_paths
 sys.path[:] = [one for one in sys.path if one]
 if __name__ == "__main__":
     context = multiprocessing.get_context("spawn")

@@ -10,7 +10,6 @@ from scipy.integrate import solve_ivp
 from scipy.stats import chi2
 
 from filters import make_filter
-from studies.users.runs import PANEL, found_problems, name_of
 from tests.users import (
     altitude,
     battery,
@@ -25,6 +24,7 @@ from tests.users import (
     range_bearing,
     reactor,
 )
+from thruster_env.studies.users.runs import PANEL, found_problems, name_of
 from tuning.evaluation.evaluate import evaluate
 
 PAGES = (

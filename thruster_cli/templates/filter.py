@@ -12,19 +12,19 @@ from typing import ClassVar
 
 from filters.gaussian.extended import advance, settle  # the prediction: x = f(x, u), P = F P F' + Q
 from filters.pages.page_filter import Page, PageFilter
-from numerics.algebra.blocks import forward_quotient
-from numerics.algebra.densities import log_density
-from numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
-from numerics.algebra.points import root
-from numerics.algebra.scalars import at_most, diagonal, entries_product, exponential, ratio
+from thruster_env.numerics.algebra.blocks import forward_quotient
+from thruster_env.numerics.algebra.densities import log_density
+from thruster_env.numerics.algebra.operations import divide, joseph, only, present, sym, uncorrelated, wrap
+from thruster_env.numerics.algebra.points import root
+from thruster_env.numerics.algebra.scalars import at_most, diagonal, entries_product, exponential, ratio
 
 
 def update(model, x, P, z):
     """The measurement z (m,) of a state of mean x (n,) and covariance P (n, n).
 
-    A page computes with small matrices: + - @ *, .T and what `numerics.algebra` offers. It cannot decide (`if`)
-    by their values, only choose (`scalars.choose`). The model has f(x, u), F, h(x), H, Q and R; `model.own` has
-    the fields below. Channels of z that are NaN are missing: `only` makes their rows zero.
+    A page computes with small matrices: + - @ *, .T and what `thruster_env.numerics.algebra` offers. It cannot
+    decide (`if`) by their values, only choose (`scalars.choose`). The model has f(x, u), F, h(x), H, Q and R;
+    `model.own` has the fields below. Channels of z that are NaN are missing: `only` makes their rows zero.
     """
     seen = present(z)
     H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)

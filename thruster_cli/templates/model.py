@@ -64,9 +64,9 @@ def model(dt=0.02, mass=1.0, stiffness=40.0, damping=1.5):
 if __name__ == "__main__":  # a log to try it with: 60 s under a force that changes its sign
     import numpy as np
 
-    from numerics.streams import episode_keys
-    from plants import simulate
-    from plants.logs.write import write_columns
+    from thruster_env.numerics.streams import episode_keys
+    from thruster_env.plants import simulate
+    from thruster_env.plants.logs.write import write_columns
 
     truth, dt, steps = model(), 0.02, 3000
     force = 4.0 * np.sign(np.sin(2.0 * np.arange(steps) * dt))

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from numerics.checks import finite
-from plants.remembered import remembered
 from thruster_env.control.gains import lambda_gains, quadratic_gain
 from thruster_env.linear.operating import OperatingPoints, operating_points, slopes, thrust_of
+from thruster_env.numerics.checks import finite
 from thruster_env.plant import Plant
+from thruster_env.plants.remembered import remembered
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +113,7 @@ class LQRController:
     not. (On `tunnel`, whose flow lags far behind, the three tasks cost 0.4 to 0.6 of their cost with domega_m.)
 
     There is no integral: where the thruster is not the nominal one, an error stays. Observations begin with
-    omega_m and U_a, true (see `plants.observe.ObserveState`) or estimated.
+    omega_m and U_a, true (see `thruster_env.plants.observe.ObserveState`) or estimated.
     """
 
     plant: Plant
@@ -176,5 +176,7 @@ def read_state(observation: np.ndarray, reference: float | None) -> np.ndarray:
     """The state (..., 2) that an observation (..., d) begins with; ValueError if it is too short to hold one."""
     if observation.shape[-1] < 2 + (reference is None):
         rule = "an observation must begin with the state"
-        raise ValueError(f"{rule}, but has {observation.shape[-1]} entries: see plants.observe.ObserveState")
+        raise ValueError(
+            f"{rule}, but has {observation.shape[-1]} entries: see thruster_env.plants.observe.ObserveState"
+        )
     return observation[..., :2]

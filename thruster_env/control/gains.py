@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from numerics.checks import finite, positive
 from thruster_env.linear.operating import sampled_plant
+from thruster_env.numerics.checks import finite, positive
 from thruster_env.plant import Plant
 from thruster_env.task import Task, thrust_scale
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numerics.compiled import compiled, function_fingerprint, inlined, is_interpreting
 from thruster_env.dynamics import Constants, driven_substep, substep, thrust_and_torque, thrust_and_torque_tangent
+from thruster_env.numerics.compiled import compiled, function_fingerprint, inlined, is_interpreting
 from thruster_env.task import step_cost
 
 GRID = 49  # voltages over the range, and as many between the neighbours of the best one

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from numerics.checks import at_least
 from thruster_env.control.controllers import constant_reference, read, read_state, remembered
 from thruster_env.control.planning import Problem, best_voltages, improve_plans
 from thruster_env.dynamics import Constants
+from thruster_env.numerics.checks import at_least
 from thruster_env.task import thrust_scale
 
 HORIZON = 5  # steps; more change no digit of a return
@@ -33,7 +33,8 @@ class PredictiveController:
     minimum can trap. Beyond, Gauss-Newton's method starts from it and the last plan (`planning.improve_plans`).
 
     There is no integral: where the thruster is not the model, an error stays. On an estimate this is certainty
-    equivalence. Observations begin with omega_m and U_a, true (see `plants.observe.ObserveState`) or estimated.
+    equivalence. Observations begin with omega_m and U_a, true (see `thruster_env.plants.observe.ObserveState`) or
+    estimated.
     """
 
     problem: Problem

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from numerics.checks import positive
-from numerics.compiled import inlined
-from plants.disturbances.effects import Context, Effect, Registry, set_field
 from thruster_env.effects.context import ThrusterContext
 from thruster_env.engine.memory import OMEGA
+from thruster_env.numerics.checks import positive
+from thruster_env.numerics.compiled import inlined
+from thruster_env.plants.disturbances.effects import Context, Effect, Registry, set_field
 
 AMPLIFIER_EFFECTS = Registry("amplifier")
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from plants.disturbances.effects import Registry
-from plants.disturbances.signals import GaussMarkov, Gusts, RecordedSignal, Sinusoid
+from thruster_env.plants.disturbances.effects import Registry
+from thruster_env.plants.disturbances.signals import GaussMarkov, Gusts, RecordedSignal, Sinusoid
 
 FLOW_SIGNALS = Registry("flow")
 for _name, _signal in {

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from numerics.checks import finite, positive, shown, vector
-from numerics.compiled import inlined
-from numerics.streams import REFERENCE_SIGNAL, normal_block, uniform_block
-from plants.disturbances.effects import LONGEST, Effect, Registry, set_field
-from plants.disturbances.recorded import RecordedSeries, recorded_value
-from plants.disturbances.signals import constant
-from plants.memory import KEY_0, KEY_1, STEP
 from thruster_env.effects.context import ThrusterContext
 from thruster_env.engine.memory import SAMPLE_TIME
+from thruster_env.numerics.checks import finite, positive, shown, vector
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.streams import REFERENCE_SIGNAL, normal_block, uniform_block
+from thruster_env.plants.disturbances.effects import LONGEST, Effect, Registry, set_field
+from thruster_env.plants.disturbances.recorded import RecordedSeries, recorded_value
+from thruster_env.plants.disturbances.signals import constant
+from thruster_env.plants.memory import KEY_0, KEY_1, STEP
 
 REFERENCE_SIGNALS = Registry("reference")
 

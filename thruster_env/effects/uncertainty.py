@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from numerics.checks import one_of, positive, shown
-from numerics.streams import PARAMETERS, normal_block, uniform_block
-from plants.disturbances.effects import set_field
+from thruster_env.numerics.checks import one_of, positive, shown
+from thruster_env.numerics.streams import PARAMETERS, normal_block, uniform_block
 from thruster_env.parameters import ThrusterParameters, checked
+from thruster_env.plants.disturbances.effects import set_field
 
 UNCERTAIN = tuple(name for name in ThrusterParameters._fields if name not in ("angles", "thrust_asymmetry"))
 

@@ -6,17 +6,17 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from numerics.checks import options as checked_options
-from numerics.compiled import CompiledOrPython
-from plants.copies import PlantCopies
-from plants.memory import set_row
 from thruster_env.effects.uncertainty import drawn_parameters
 from thruster_env.engine.encoding import encode, is_plain, known_effects
 from thruster_env.engine.memory import COMMAND, CONSTANT_COUNT, FIXED_ROWS, REPORTED
 from thruster_env.engine.step import advance, advance_in_parts
+from thruster_env.numerics.checks import options as checked_options
+from thruster_env.numerics.compiled import CompiledOrPython
 from thruster_env.parameters import derive_constants
 from thruster_env.plant import Plant
 from thruster_env.plant import state as checked_state
+from thruster_env.plants.copies import PlantCopies
+from thruster_env.plants.memory import set_row
 from thruster_env.task import Task
 
 

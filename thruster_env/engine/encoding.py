@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from numerics.checks import covariance_root
-from numerics.linear_systems import zero_order_hold
-from plants.disturbances.effects import Effect, encoded
-from plants.disturbances.sensors import SENSOR_EFFECTS
 from thruster_env.channels import CHANNELS, MAX_CHANNELS
 from thruster_env.effects.amplifier import AMPLIFIER_EFFECTS
 from thruster_env.effects.context import ThrusterContext
@@ -15,7 +11,11 @@ from thruster_env.effects.flow import FLOW_SIGNALS
 from thruster_env.effects.reference import REFERENCE_SIGNALS, Constant
 from thruster_env.engine import memory as at
 from thruster_env.linear.analysis import LinearModel
+from thruster_env.numerics.checks import covariance_root
+from thruster_env.numerics.linear_systems import zero_order_hold
 from thruster_env.plant import Plant
+from thruster_env.plants.disturbances.effects import Effect, encoded
+from thruster_env.plants.disturbances.sensors import SENSOR_EFFECTS
 from thruster_env.task import Task, state_limits, thrust_scale
 
 REGISTRIES = (AMPLIFIER_EFFECTS, FLOW_SIGNALS, SENSOR_EFFECTS, REFERENCE_SIGNALS)  # in the order of a step

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from plants.memory import FRONT
 from thruster_env.channels import MAX_CHANNELS
 from thruster_env.dynamics import Constants
+from thruster_env.plants.memory import FRONT
 
 # Behind the rows that all plants have in front, those that every step reports, ...
 OMEGA, FLOW, THRUST, AMBIENT, REFERENCE, NEXT_REFERENCE = range(len(FRONT), len(FRONT) + 6)

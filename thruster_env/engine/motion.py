@@ -6,10 +6,6 @@ The equations of motion are those of `dynamics`; here they meet the memory. Ever
 
 from __future__ import annotations
 
-from numerics.compiled import inlined
-from numerics.streams import INITIAL, PROCESS, normal_block
-from numerics.tuples import vector_reader, written_out
-from plants.memory import KEY_0, KEY_1, REWARD, STEP
 from thruster_env.dynamics import Constants, substep, thrust_and_torque
 from thruster_env.engine.memory import (
     AMBIENT,
@@ -29,6 +25,10 @@ from thruster_env.engine.memory import (
     TOP_VOLTAGE,
     VOLTAGE,
 )
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.streams import INITIAL, PROCESS, normal_block
+from thruster_env.numerics.tuples import vector_reader, written_out
+from thruster_env.plants.memory import KEY_0, KEY_1, REWARD, STEP
 
 read_constants = vector_reader(CONSTANT_COUNT)
 drawn_constants = written_out(

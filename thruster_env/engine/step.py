@@ -13,12 +13,6 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from numerics.compiled import CompiledOrPython, compiled, function_fingerprint, inlined, is_interpreting
-from numerics.streams import MEASUREMENT, normal_block
-from numerics.threads import in_parts
-from plants.channels import Channel, reader_of
-from plants.disturbances.chains import chain_of
-from plants.memory import FIRST_REPORTED, KEY_0, KEY_1, REWARD, STEP, TERMINATED, TIME
 from thruster_env.channels import CHANNELS, MAX_CHANNELS, thrust
 from thruster_env.engine.memory import (
     AMBIENT,
@@ -56,6 +50,18 @@ from thruster_env.engine.motion import (
     move_any,
     move_thruster,
 )
+from thruster_env.numerics.compiled import (
+    CompiledOrPython,
+    compiled,
+    function_fingerprint,
+    inlined,
+    is_interpreting,
+)
+from thruster_env.numerics.streams import MEASUREMENT, normal_block
+from thruster_env.numerics.threads import in_parts
+from thruster_env.plants.channels import Channel, reader_of
+from thruster_env.plants.disturbances.chains import chain_of
+from thruster_env.plants.memory import FIRST_REPORTED, KEY_0, KEY_1, REWARD, STEP, TERMINATED, TIME
 from thruster_env.task import step_cost
 
 LARGEST_ERROR = 1e6  # of thrust over T_max: a reward stays finite when a state does not

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numerics.checks import one_of
-from numerics.linear_systems import observability, zero_order_hold
 from thruster_env.linear.steady_state import jacobians
+from thruster_env.numerics.checks import one_of
+from thruster_env.numerics.linear_systems import observability, zero_order_hold
 from thruster_env.parameters import ThrusterParameters
 
 INPUTS = ("V_s", "U_0")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 from thruster_env.linear.analysis import LinearModel, dc_gain, frequency_response, response_grids, step_response
+from thruster_env.numerics.plots import BLUE, DARK, RUST, new_figure, save_figure, tidy
 
 STATES = (("motor speed $\\omega_m$", "rad/s"), ("flow velocity $U_a$", "m/s"))
 

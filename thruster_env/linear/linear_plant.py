@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from numerics.checks import one_of
-from plants.arguments import takes_arguments_of
 from thruster_env.linear.analysis import LinearModel
 from thruster_env.linear.published import PUBLISHED
+from thruster_env.numerics.checks import one_of
 from thruster_env.plant import Plant, make_plant
+from thruster_env.plants.arguments import takes_arguments_of
 
 PUBLISHED_NOISE = 0.5  # variance of each state a step, and of the measurement, in the published runs
 

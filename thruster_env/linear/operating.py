@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numerics.linear_systems import zero_order_hold
 from thruster_env.dynamics import thrust_and_torque
 from thruster_env.linear.analysis import equilibrium
 from thruster_env.linear.steady_state import SteadyState, jacobians, steady_state
+from thruster_env.numerics.linear_systems import zero_order_hold
 from thruster_env.plant import Plant
 
 # T(V_s) is about a parabola, so a straight line between two points errs by T_max/(POINTS - 1)^2, 2.5e-4 of T_max.

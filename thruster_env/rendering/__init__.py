@@ -4,7 +4,8 @@ Above, the hull cut through at the thruster, with the propeller turning and arro
 the ship; below, strip charts of the last 500 steps and gauges of thrust and voltage, with truth and measurement.
 One step is one frame, so `render_fps = 1/dt` shows true speed.
 
-The common parts of all plants' pictures, and how a filter shows its estimate, are in `plants.rendering`.
+The common parts of all plants' pictures, and how a filter shows its estimate, are in
+`thruster_env.plants.rendering`.
 
 Needs pygame (the extra `render`), which is imported when a `Renderer` is made.
 """

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from plants.rendering.canvas import Canvas
-from plants.rendering.charts import Charts, Strip
+from thruster_env.plants.rendering.canvas import Canvas
+from thruster_env.plants.rendering.charts import Charts, Strip
 
 TOP = 186  # of the lower half of the picture [px]
 

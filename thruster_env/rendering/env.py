@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from plants.memory import TIME
-from plants.rendered import RenderedEnv
 from thruster_env.engine.memory import AMBIENT, COMMAND, FLOW, OMEGA, READINGS, REFERENCE, THRUST
 from thruster_env.linear.steady_state import state_range
 from thruster_env.plant import Plant
+from thruster_env.plants.memory import TIME
+from thruster_env.plants.rendered import RenderedEnv
 from thruster_env.rendering.history import Moment
 from thruster_env.rendering.renderer import MODES, Renderer
 from thruster_env.task import thrust_scale

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from plants.rendering.axis import Axis
-from plants.rendering.canvas import (
+from thruster_env.plants.rendering.axis import Axis
+from thruster_env.plants.rendering.canvas import (
     BAND,
     ESTIMATE,
     INK,
@@ -18,7 +18,7 @@ from plants.rendering.canvas import (
     number,
     with_band,
 )
-from plants.rendering.history import newest
+from thruster_env.plants.rendering.history import newest
 
 TOP, HEIGHT = 210, 122  # of the gauges [px]
 THRUST, VOLTAGE = 538, 612  # their middle [px]

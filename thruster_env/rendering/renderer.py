@@ -6,9 +6,9 @@ from math import isnan
 
 import numpy as np
 
-from numerics.checks import positive
-from plants.rendering.history import ABSURD, newest
-from plants.rendering.renderer import MODES, PlantRenderer
+from thruster_env.numerics.checks import positive
+from thruster_env.plants.rendering.history import ABSURD, newest
+from thruster_env.plants.rendering.renderer import MODES, PlantRenderer
 from thruster_env.rendering.history import Moment, Overlay
 
 __all__ = ["MODES", "Renderer"]

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from plants.rendering.canvas import INK, SIZE, SOFT_INK, Canvas, number
+from thruster_env.plants.rendering.canvas import INK, SIZE, SOFT_INK, Canvas, number
 from thruster_env.rendering.history import Moment
 from thruster_env.rendering.propeller import end_view, side_view
 

@@ -13,7 +13,7 @@ from filters.estimators.find import is_foreign, label_of
 from filters.filter import Filter
 from filters.registry import filter_class
 from filters.tuned_file import read_tuned_file
-from numerics.checks import at_least, shown
+from thruster_env.numerics.checks import at_least, shown
 from tuning.api.comparison import FilterComparison
 from tuning.api.evaluate import NOMINAL
 from tuning.api.own_numbers import DEFAULT_FILTER, is_own, own_choice

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from filters.logs.estimate import estimate as estimate_log
 from filters.logs.findings import findings
-from numerics.checks import shown
+from thruster_env.numerics.checks import shown
 from tuning.api.estimates import LogEstimates
 from tuning.logs.problem import name_of
 from tuning.logs.read import read_named

@@ -8,8 +8,8 @@ from typing import Any
 from filters.estimators.find import is_foreign
 from filters.registry import FILTERS, filter_class
 from filters.tuned_file import read_tuned_file
-from numerics.checks import shown
-from numerics.modules import is_code
+from thruster_env.numerics.checks import shown
+from thruster_env.numerics.modules import is_code
 from tuning.logs.problem import log_problem, problems_in
 from tuning.problems.check import checked_problem
 from tuning.problems.find import find_problem, named

@@ -19,8 +19,8 @@ from rich.progress import (
 from rich.text import Text
 
 from filters.estimators.find import label_of
-from numerics.checks import shown
-from numerics.progress import listening
+from thruster_env.numerics.checks import shown
+from thruster_env.numerics.progress import listening
 from tuning.api.notebook import NotebookLine
 from tuning.search.interruption import STOPPING
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from numerics.checks import shown
+from thruster_env.numerics.checks import shown
 from tuning.api.problems import problems_of
 from tuning.api.progress import console_for
 from tuning.api.run import aim_of, run_tuning

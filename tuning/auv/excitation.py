@@ -8,8 +8,8 @@ import numpy as np
 
 from auv_env.manoeuvres import MANOEUVRES
 from auv_env.plant import Plant
-from numerics.checks import one_of
-from plants.disturbances.effects import set_field
+from thruster_env.numerics.checks import one_of
+from thruster_env.plants.disturbances.effects import set_field
 from tuning.problems.excitation import EXCITATIONS, Excitation
 
 TORQUE = 1  # index of K_prop among the inputs of a manoeuvre

@@ -17,9 +17,9 @@ from auv_env.quantities import STATES
 from auv_env.simulation import simulate
 from filters.bounds import path_bound
 from filters.wrapped import wrapped_variances
-from numerics.checks import one_of, positive, shown, vector
-from numerics.streams import episode_keys, filter_keys
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.checks import one_of, positive, shown, vector
+from thruster_env.numerics.streams import episode_keys, filter_keys
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.auv.excitation import commands_of
 from tuning.problems.data import Data
 from tuning.problems.plain import plain

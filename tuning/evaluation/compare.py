@@ -18,7 +18,7 @@ from filters.estimators.find import is_foreign, label_of
 from filters.filter import Filter
 from filters.particles.weighted import WeightedFilter
 from filters.registry import filter_class, make_filter
-from numerics.checks import one_of
+from thruster_env.numerics.checks import one_of
 from tuning.evaluation.baselines import given, oracle, rule_of_thumb, scaled_default
 from tuning.evaluation.evaluate import (
     Evaluation,

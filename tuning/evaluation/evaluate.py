@@ -23,7 +23,7 @@ from filters.consistency.intervals import (
 from filters.consistency.report import ConsistencyReport, findings, joined, report_of
 from filters.ensembles.recording import record_members
 from filters.filter import Filter
-from plants.quantities import Quantity
+from thruster_env.plants.quantities import Quantity
 from tuning.evaluation.blow_up import blow_up
 from tuning.evaluation.runs import RunMetrics, metrics_of_all, variance_ratios
 from tuning.problems.data import Data

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from filters.augmented import Unknown
-from numerics.checks import one_of, positive
+from thruster_env.numerics.checks import one_of, positive
 
 OF_FILE = "tuned"
 SAID = {

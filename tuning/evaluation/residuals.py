@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numerics.angles import difference
-from numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
-from numerics.tuples import vector_reader, vector_writer
-from plants.layout import constants_reader, number_places
-from plants.shape import Functions, Shape
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.angles import difference
+from thruster_env.numerics.compiled import CompiledOrPython, function_fingerprint, is_interpreting
+from thruster_env.numerics.tuples import vector_reader, vector_writer
+from thruster_env.plants.layout import constants_reader, number_places
+from thruster_env.plants.shape import Functions, Shape
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.check import data_of
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem

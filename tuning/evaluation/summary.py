@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from filters.consistency.intervals import Interval
-from plants.quantities import Quantity
+from thruster_env.plants.quantities import Quantity
 from tuning.evaluation.evaluate import NOTHING, Evaluation
 from tuning.problems.problem import Problem
 

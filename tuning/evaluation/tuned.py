@@ -16,9 +16,9 @@ import numpy as np
 from filters.estimators.find import is_foreign, label_of
 from filters.tuned_file import FACTORS, FILE_FORMAT, FILE_VERSION, NOISE, PRIOR, read_tuned_file, sealed
 from filters.tuned_model import check_same_quantities, model_data
-from numerics.checks import at_least, covariance, positive, shown
-from numerics.files import write_whole
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.checks import at_least, covariance, positive, shown
+from thruster_env.numerics.files import write_whole
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.evaluation.evaluate import Evaluation
 from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.kept import ROLES, comparison_as_data, sizes_as_data

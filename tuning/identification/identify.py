@@ -10,10 +10,10 @@ from functools import partial
 import numpy as np
 
 from filters.starts import Starts
-from numerics.checks import at_least, shown
-from numerics.streams import START_POINTS, derived_generator
-from plants.logs.log import Log
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.checks import at_least, shown
+from thruster_env.numerics.streams import START_POINTS, derived_generator
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.identification.ascent import Ascent, climb
 from tuning.identification.null_tests import NullTest, from_nothing, null_tests
 from tuning.identification.objective import Objective

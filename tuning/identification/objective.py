@@ -14,9 +14,9 @@ from filters.differentiated.runs import same_functions
 from filters.registry import make_filter
 from filters.sensitivity import ModelSlopes, sensitivity
 from filters.starts import Starts
-from numerics.checks import one_of, shown
-from plants.logs.log import Log
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.checks import one_of, shown
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.identification.gates import kept_variance
 from tuning.identification.runs import runs_of
 from tuning.problems.coordinates import Coordinates

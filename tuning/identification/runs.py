@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from numerics.checks import shown
-from numerics.streams import filter_keys
-from plants.diffusion import same_dt
-from plants.logs.log import Log
+from thruster_env.numerics.checks import shown
+from thruster_env.numerics.streams import filter_keys
+from thruster_env.plants.diffusion import same_dt
+from thruster_env.plants.logs.log import Log
 from tuning.problems.data import Data, mask_of, padded
 
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from numerics.checks import shown
-from numerics.modules import object_named
-from plants.logs.findings import has_outliers, remarks_on
-from plants.logs.log import Log, cut_at_gaps
+from thruster_env.numerics.checks import shown
+from thruster_env.numerics.modules import object_named
+from thruster_env.plants.logs.findings import has_outliers, remarks_on
+from thruster_env.plants.logs.log import Log, cut_at_gaps
 from tuning.identification.family import ModelFamily
 from tuning.identification.result import Identification
 from tuning.identification.values import write_values

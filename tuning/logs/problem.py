@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from filters.tuned_file import read_tuned_file
-from numerics.checks import shown
-from plants.logs.log import Log
-from plants.replay import read_for
+from thruster_env.numerics.checks import shown
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.replay import read_for
 from tuning.logs.read import read_named, texts
 from tuning.problems.find import named
 from tuning.problems.log_problem import LogProblem

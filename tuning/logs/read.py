@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from numerics.checks import finite, shown
-from numerics.modules import object_named
-from plants.logs.log import Log
-from plants.replay import ANY_DT, read_for
+from thruster_env.numerics.checks import finite, shown
+from thruster_env.numerics.modules import object_named
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.replay import ANY_DT, read_for
 from tuning.problems.rooms import room_of_logs
 
 Named = Mapping[str, Any] | Sequence[str] | None  # a mapping, or texts NAME=VALUE as on a command line

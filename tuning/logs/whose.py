@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from numerics.checks import shown
-from numerics.modules import is_code
-from plants.logs.log import Log
-from plants.logs.recorders.registry import ENDINGS
-from plants.logs.table import SUFFIXES
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.checks import shown
+from thruster_env.numerics.modules import is_code
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.logs.recorders.registry import ENDINGS
+from thruster_env.plants.logs.table import SUFFIXES
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.rooms import room_of_logs
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from filters.posterior import gathering_code, posterior_variances, sequences_taken
-from numerics.kept_numbers import kept_numbers
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.kept_numbers import kept_numbers
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.digest import digest_of
 

@@ -7,10 +7,10 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from numerics.checks import shown
-from numerics.sources import as_value
-from plants.quantities import Quantities, Quantity
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.checks import shown
+from thruster_env.numerics.sources import as_value
+from thruster_env.plants.quantities import Quantities, Quantity
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.problems.problem import Problem
 

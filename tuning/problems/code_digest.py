@@ -14,10 +14,14 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any
 
-from numerics.compiled import registered_packages
+from thruster_env.numerics.compiled import package_of, registered_packages
 
 Of = Callable[[Any], Iterator[str]]  # texts of a value
-OURS = {"tuning", "training", "thruster_cli"}  # which compile nothing; studies are problems as a user's are
+OURS = {
+    "tuning",
+    "thruster_env.training",
+    "thruster_cli",
+}  # compile nothing; studies are as a user's
 INSTALLED = ("site-packages", "dist-packages")
 ABOUT_A_MODULE = {"__name__", "__file__", "__doc__", "__spec__", "__package__", "__loader__", "__builtins__"}
 NO_MEMBERS = {  # of a class: what Python writes into it
@@ -150,7 +154,7 @@ def within(value: Any) -> Any:
 def is_of_a_library(module: str | None) -> bool:
     """Whether a module is this project's, of the standard library or installed, by its name."""
     name = module or ""
-    package = name.partition(".")[0]
+    package = package_of(name)
     if package == "__main__":
         return False
     if package in OURS or package in registered_packages() or package in sys.stdlib_module_names:
@@ -161,7 +165,7 @@ def is_of_a_library(module: str | None) -> bool:
 
 def keeps_plain_attributes(module: str | None) -> bool:
     """Whether a module is this project's or the user's: what their objects hold says all of them."""
-    package = (module or "").partition(".")[0]
+    package = package_of(module or "")
     return package in OURS or package in registered_packages() or not is_of_a_library(module)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from numerics.checks import finite, shown
+from thruster_env.numerics.checks import finite, shown
 from tuning.problems.parameter import Parameter
 
 PART = 0.1  # fraction of its range that is the unit of a parameter on a linear scale

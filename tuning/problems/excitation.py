@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from numerics.checks import at_least, finite, positive, vector
-from numerics.streams import EXCITATION, uniform_block
-from plants.disturbances.effects import LONGEST, Effect, Registry, set_field
-from plants.disturbances.sensors import probability
+from thruster_env.numerics.checks import at_least, finite, positive, vector
+from thruster_env.numerics.streams import EXCITATION, uniform_block
+from thruster_env.plants.disturbances.effects import LONGEST, Effect, Registry, set_field
+from thruster_env.plants.disturbances.sensors import probability
 
 EXCITATIONS = Registry("excitation")
 MOST_STEPS = int(LONGEST)  # for which a level is held

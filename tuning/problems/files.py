@@ -7,8 +7,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TypeVar
 
-from numerics.checks import any_case, meant, one_of, shown
-from numerics.toml import read_toml
+from thruster_env.numerics.checks import any_case, meant, one_of, shown
+from thruster_env.numerics.toml import read_toml
 from tuning.problems.rooms import ROOMS, room_of
 from tuning.problems.scenario import BaseScenario
 

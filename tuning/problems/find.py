@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from numerics.checks import FEW, any_case, meant, shown
-from numerics.modules import is_code, object_named, said
+from thruster_env.numerics.checks import FEW, any_case, meant, shown
+from thruster_env.numerics.modules import is_code, object_named, said
 from tuning.problems.check import checked_problem
 from tuning.problems.files import read_scenario
 from tuning.problems.problem import Problem

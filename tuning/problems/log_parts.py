@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numerics.checks import at_least, shown
-from plants.logs.log import Log
+from thruster_env.numerics.checks import at_least, shown
+from thruster_env.plants.logs.log import Log
 
 LEAD = 50  # steps at the start of a block that are filtered and not scored
 WANTED = 24  # approximate number of blocks that logs are cut into: standard errors need several
@@ -91,10 +91,10 @@ def parts_of(
 ) -> Parts:
     """Cut logs into blocks for training, for the choice of the ensemble size, and for held-out evaluation.
 
-    Each run is cut at its gaps (`plants.logs.log.Log.pieces`), and each piece into consecutive blocks of nearly
-    equal length; a block's lead-in are the rows before it. A block that is measured in less than a quarter of the
-    usual share of its rows is left out. Held out are the named runs, else every third run of three or
-    more, else every third block.
+    Each run is cut at its gaps (`thruster_env.plants.logs.log.Log.pieces`), and each piece into consecutive blocks
+    of nearly equal length; a block's lead-in are the rows before it. A block that is measured in less than a
+    quarter of the usual share of its rows is left out. Held out are the named runs, else every third run of three
+    or more, else every third block.
 
     Args:
         logs: of at least one run.

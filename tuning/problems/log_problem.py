@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from filters.starts import MEASUREMENT, PRIOR, STARTS, cov_of_measured_starts
-from numerics.checks import at_least, one_of
-from numerics.streams import filter_keys
-from plants.logs.findings import remarks_on
-from plants.logs.log import Log
-from plants.replay import ReplayEnv
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.checks import at_least, one_of
+from thruster_env.numerics.streams import filter_keys
+from thruster_env.plants.logs.findings import remarks_on
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.replay import ReplayEnv
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.assumed import AssumedProblem, rows_of
 from tuning.problems.check import check_quantities
 from tuning.problems.data import Data, mask_of, only, padded

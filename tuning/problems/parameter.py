@@ -8,7 +8,7 @@ from typing import Protocol
 
 from optuna.distributions import FloatDistribution, IntDistribution
 
-from numerics.checks import at_least, finite, shown
+from thruster_env.numerics.checks import at_least, finite, shown
 
 
 class Place(Protocol):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-from numerics.checks import shown
+from thruster_env.numerics.checks import shown
 
 DEEPEST = 10  # levels of mappings and lists
 

@@ -10,8 +10,8 @@ import numpy as np
 from optuna.trial import FrozenTrial, TrialState
 
 from filters.looks import colour_of
-from numerics.characters import TITLE, verbatim
-from numerics.plots import BLUE, DARK, GREEN, GREY, MUSTARD, PALE, RUST, panels, save_figure
+from thruster_env.numerics.characters import TITLE, verbatim
+from thruster_env.numerics.plots import BLUE, DARK, GREEN, GREY, MUSTARD, PALE, RUST, panels, save_figure
 from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED, TUNED
 from tuning.evaluation.held_out import Comparison
 from tuning.reporting.panels import COLUMNS, shown_states

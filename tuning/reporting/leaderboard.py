@@ -9,7 +9,7 @@ from rich.console import RenderableType
 from rich.table import Table
 
 from filters.consistency.intervals import slightly
-from numerics.text_tables import table
+from thruster_env.numerics.text_tables import table
 from tuning.evaluation.compare import Leaderboard, Row, winners
 from tuning.evaluation.knowledge import belief_sentences, noise_sentence
 from tuning.evaluation.tuned import summary

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from numerics.files import check_target, write_whole
+from thruster_env.numerics.files import check_target, write_whole
 from tuning.evaluation.held_out import Comparison, evaluate_held_out
 from tuning.evaluation.kept import kept_comparison, kept_sizes
 from tuning.evaluation.sizes import SizeRow, ensemble_sizes, sufficient_size

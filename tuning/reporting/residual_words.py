@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from plants.quantities import Quantity
+from thruster_env.plants.quantities import Quantity
 from tuning.evaluation.residuals import noise_estimation
 from tuning.problems.problem import Problem
 

@@ -9,11 +9,11 @@ import numpy as np
 
 from filters.filter import Filter
 from filters.looks import MEASURED, colour_of
-from numerics.angles import wrapped, wrapped_where
-from numerics.characters import TITLE, verbatim
-from numerics.plots import GREY, new_figure, thinned, tidy
-from plants.quantities import Quantity
-from plants.state_space import StateSpaceModel
+from thruster_env.numerics.angles import wrapped, wrapped_where
+from thruster_env.numerics.characters import TITLE, verbatim
+from thruster_env.numerics.plots import GREY, new_figure, thinned, tidy
+from thruster_env.plants.quantities import Quantity
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.data import Data
 from tuning.reporting.panels import axis_label, shown_states
 from tuning.reporting.time_figures import TWO_SIDED, WIDTH, draw_in_band, limit_innovations, line_of, one_run

@@ -13,7 +13,7 @@ from filters.filter import Filter
 from filters.registry import filter_class, tunable_numbers
 from filters.tuned_file import NOISE
 from filters.tuned_file import PRIOR as PRIOR_FACTOR
-from numerics.checks import covariance
+from thruster_env.numerics.checks import covariance
 from tuning.problems.parameter import Argument, Parameter, Place, squared
 from tuning.problems.problem import Problem
 from tuning.search.correlations import correlations_of, full_covariance

@@ -13,8 +13,8 @@ from optuna.distributions import BaseDistribution
 
 from filters.estimators.find import estimator_named
 from filters.registry import filter_class
-from numerics.checks import positive, shown
-from numerics.modules import is_code
+from thruster_env.numerics.checks import positive, shown
+from thruster_env.numerics.modules import is_code
 from tuning.problems.check import checked_problem, data_of
 from tuning.problems.data import Data
 from tuning.problems.digest import digest_of

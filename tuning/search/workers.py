@@ -23,8 +23,8 @@ from typing import Any
 
 import optuna
 
-from numerics.modules import as_module, working_folder_last
-from numerics.threads import cores
+from thruster_env.numerics.modules import as_module, working_folder_last
+from thruster_env.numerics.threads import cores
 from tuning.problems.data import Data
 from tuning.problems.find import find_same
 from tuning.problems.log_problem import LogProblem

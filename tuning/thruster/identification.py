@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from numerics.checks import shown
-from plants.logs.grid import NEIGHBOURS
-from plants.logs.log import Log, at_offset
-from plants.state_space import StateSpaceModel
 from thruster_env.logged import NO_BAND, Shown, lag_weights, with_shown
 from thruster_env.model import model_of_plant
+from thruster_env.numerics.checks import shown
 from thruster_env.parameters import ThrusterParameters, checked
 from thruster_env.plant import Plant
+from thruster_env.plants.logs.grid import NEIGHBOURS
+from thruster_env.plants.logs.log import Log, at_offset
+from thruster_env.plants.state_space import StateSpaceModel
 from tuning.problems.parameter import Parameter, squared
 from tuning.search.parameters import r_name
 

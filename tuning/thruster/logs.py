@@ -8,12 +8,12 @@ from typing import Any, overload
 
 import numpy as np
 
-from plants.logs.log import Log
-from plants.state_space import StateSpaceModel
 from thruster_env.logged import NO_BAND, logged_plant, with_shown
 from thruster_env.model import model_of_plant
 from thruster_env.modelled import ModelledThruster
 from thruster_env.parameters import PRESETS
+from thruster_env.plants.logs.log import Log
+from thruster_env.plants.state_space import StateSpaceModel
 from thruster_env.preset_file import is_file, read_preset
 from tuning.problems.files import FILE_SEQUENCES
 from tuning.problems.problem import Problem

@@ -11,16 +11,16 @@ import numpy as np
 
 from filters.posterior import has_bound
 from filters.tuned_file import NOISE
-from numerics.checks import positive, shown, vector
-from numerics.streams import episode_keys, filter_keys
-from plants.state_space import StateSpaceModel
 from thruster_env.channels import CHANNELS
 from thruster_env.linear.analysis import equilibrium
 from thruster_env.linear.linear_plant import make_linear_plant
 from thruster_env.linear.steady_state import state_range
 from thruster_env.model import model_of_plant
+from thruster_env.numerics.checks import positive, shown, vector
+from thruster_env.numerics.streams import episode_keys, filter_keys
 from thruster_env.plant import DEFAULT_DT, DEFAULT_MAX_VOLTAGE, DEFAULT_PROCESS_NOISE, Plant, make_plant
 from thruster_env.plant_data import check_same_plant, plant_data
+from thruster_env.plants.state_space import StateSpaceModel
 from thruster_env.preset_file import is_file, preset_mapping
 from thruster_env.simulation import simulate
 from tuning.problems.bound import average_bound

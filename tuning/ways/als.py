@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plants.affine import linearize
+from thruster_env.plants.affine import linearize
 from tuning.likelihood.family import Family
 from tuning.problems.data import Data
 from tuning.ways.task import Task

@@ -10,12 +10,12 @@ import pytest
 from scipy.io import savemat
 from scipy.io.matlab import MatlabObject
 
-from plants.logs.read import read_log
-from plants.logs.recorders import topics
-from plants.logs.recorders.registry import FORMATS, fields, read
 from tests.plants.recorders.files import dataflash, h5py, write_bag, write_ulog
 from tests.plants.recorders.test_formats import bag_topics
 from tests.plants.test_logs import MODEL
+from thruster_env.plants.logs.read import read_log
+from thruster_env.plants.logs.recorders import topics
+from thruster_env.plants.logs.recorders.registry import FORMATS, fields, read
 
 ENDINGS = [ending for one in FORMATS for ending in one.endings]
 MAGIC = {ending: one.magic for one in FORMATS for ending in one.endings}
@@ -168,7 +168,7 @@ def test_an_array_that_is_said_to_be_huge_is_refused_before_it_is_read(tmp_path)
 
 
 def test_what_unpacks_to_more_than_may_be_read_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("plants.logs.recorders.mat_elements.MOST_BYTES", 10**7)
+    monkeypatch.setattr("thruster_env.plants.logs.recorders.mat_elements.MOST_BYTES", 10**7)
     monkeypatch.setattr(topics, "MOST_BYTES", 10**7)
     packed = zlib.compress(bytes(3 * 10**7))
     header = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
@@ -273,7 +273,7 @@ def test_without_its_package_a_file_is_answered_with_the_extra(tmp_path):
     for ending, name in ((".ulg", "pyulog"), (".bin", "pymavlink"), (".bag", "rosbags"), (".h5", "h5py")):
         path = write_good(tmp_path / f"a{ending}")
         code = f"import sys; sys.modules[{name!r}] = None\n"
-        code += f"from plants.logs.recorders.registry import fields\nfields({str(path)!r})"
+        code += f"from thruster_env.plants.logs.recorders.registry import fields\nfields({str(path)!r})"
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
         assert f"must be read by {name}, which is not installed (pip install '.[recorders]' in" in done.stderr
 
@@ -284,7 +284,7 @@ def test_reading_takes_little_more_memory_than_what_is_read(tmp_path):
     with h5py.File(tmp_path / "a.h5", "a") as file:
         file.create_dataset("huge", (2 * 10**8,), "f8", chunks=(10**6,))
     code = (
-        "import resource, sys, numpy, h5py\nfrom plants.logs.recorders.registry import read\n"
+        "import resource, sys, numpy, h5py\nfrom thruster_env.plants.logs.recorders.registry import read\n"
         "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         f"read({str(tmp_path / 'a.h5')!r}, ['v'])\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"

@@ -7,9 +7,9 @@ import pytest
 import scipy.io
 from scipy.io import loadmat, savemat
 
-from plants.logs.recorders.mat_elements import arrays_of
-from plants.logs.recorders.registry import fields, format_of, read
 from tests.plants.recorders.files import dataflash, h5py, stamped, write_bag, write_ulog
+from thruster_env.plants.logs.recorders.mat_elements import arrays_of
+from thruster_env.plants.logs.recorders.registry import fields, format_of, read
 
 RNG = np.random.default_rng(0)
 EPOCH = 1_700_000_000 * 10**9  # [ns]

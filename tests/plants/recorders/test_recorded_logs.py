@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from plants.logs.read import read_log
-from plants.logs.write import write_columns
 from tests.plants.recorders.files import dataflash, h5py, write_ulog
 from tests.plants.test_logs import MODEL
+from thruster_env.plants.logs.read import read_log
+from thruster_env.plants.logs.write import write_columns
 
 COLUMNS = {"V_s": "cmd.output[0]", "tach": "motor.speed"}
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from filters import affine_model
-from plants.simulate import simulate
 from tests.tuning.ways.problems import A, Q, R, at, linear, task_of
+from thruster_env.plants.simulate import simulate
 from tuning.evaluation.residuals import estimated_from
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter

@@ -1,0 +1,172 @@
+"""Programs as instructions of LLVM, each for as many runs as lie side by side.
+
+numba takes a millisecond to type a line of text, and a program has hundreds. But all that numba has to know of
+a program is that it is called: its instructions are given to LLVM directly. They are instructions for vectors
+of numbers, one of each run, so that nobody has to find out whether some loop could be made of such.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from llvmlite import ir  # type: ignore[import-untyped]
+from numba.core import cgutils, types, typing
+from numba.extending import lower_builtin, type_callable
+from numba.np.arrayobj import populate_array
+
+from thruster_env.numerics.algebra.graphs import Number
+from thruster_env.numerics.algebra.programs import BY_MEMBERS, CALLED, SIDE_BY_SIDE, Place, Program
+from thruster_env.numerics.compiled import FASTMATH
+
+FLAGS = tuple(sorted(FASTMATH))
+OF_TWO = {"+": "fadd", "-": "fsub", "*": "fmul", "/": "fdiv"}
+OF_LLVM = {"sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos", "abs": "fabs", "pow": "pow"} | {
+    name: name for name in ("floor", "ceil")
+}  # functions of vectors; others are called for each run
+IN_LIBRARY = {"arctan": "atan", "arctan2": "atan2"}  # other names than NumPy's in C's library
+DOUBLE, LONG = ir.DoubleType(), ir.IntType(64)
+
+
+def teach(work: Callable, program: Program, width: int, names: Sequence[str]) -> None:
+    """Have numba put the instructions of a program in the place of a call of `work`."""
+
+    @type_callable(work)
+    def of_arrays(context):
+        return eval(f"lambda {', '.join(names)}: none", {"none": types.none})
+
+    @lower_builtin(work, *[types.Array] * len(names))
+    def write(context, builder, signature, arrays):
+        data = [
+            context.make_array(kind)(context, builder, a).data
+            for kind, a in zip(signature.args, arrays, strict=True)
+        ]
+        Writer(context, builder, dict(zip(names, data, strict=True)), width).write(program)
+        return context.get_dummy_value()
+
+
+class Writer:
+    """Writes instructions.
+
+    Attributes:
+        values: of numbers of a graph, by their places.
+        values_of: of operations without arguments, by their names.
+        pointer_of: where a place lies, as a pointer to vectors or numbers.
+    """
+
+    def __init__(self, context, builder: ir.IRBuilder, arrays: dict, width: int):
+        """Begin; arrays are pointers to their first numbers."""
+        self._context, self._builder, self._arrays, self._width = context, builder, arrays, width
+        self._vector = ir.VectorType(DOUBLE, width)
+        self.values: dict[int, ir.Value] = {}
+        self.values_of: dict[str, ir.Value] = {}
+        self.pointer_of: Callable[[Place], ir.Value] = self._pointer
+
+    def write(self, program: Program) -> None:
+        """All instructions of a program."""
+        self.read(program.reads)
+        self.work(program.works)
+        self.store(program.stores)
+
+    def read(self, places: Sequence[tuple[Place, Number]]) -> None:
+        """Read numbers."""
+        for place, number in places:
+            self.values[number.place] = self._read(place)
+
+    def work(self, numbers: Sequence[Number]) -> None:
+        """Work numbers out."""
+        for number in numbers:
+            if number.place not in self.values:
+                self.values[number.place] = self._worked_out(number)
+
+    def store(self, places: Sequence[tuple[Place, Number]]) -> None:
+        """Store numbers."""
+        for place, number in places:
+            self._builder.store(self.values[number.place], self.pointer_of(place), align=8)
+
+    def same_for_all(self, value: ir.Value, number: Number) -> ir.Value:
+        """The vector of a number that is the same for all; a constant is one already."""
+        if number.operation == "constant":
+            return ir.Constant(self._vector, [number.value] * self._width)
+        return self._to_all(value, ir.Constant(value.type, ir.Undefined))
+
+    def _pointer(self, place: Place) -> ir.Value:
+        of_all = place.array in SIDE_BY_SIDE
+        at = ir.Constant(LONG, place.at * (self._width if of_all else 1))
+        pointer = self._builder.gep(self._arrays[place.array], [at], source_etype=DOUBLE)
+        return self._builder.bitcast(pointer, self._vector.as_pointer()) if of_all else pointer
+
+    def _read(self, place: Place) -> ir.Value:
+        of_all = place.array in (*SIDE_BY_SIDE, *BY_MEMBERS)
+        value = self._builder.load(self.pointer_of(place), align=8, typ=self._vector if of_all else DOUBLE)
+        if of_all:
+            return value
+        nothing = ir.Constant(self._vector, ir.Undefined)
+        return self._to_all(self._builder.insert_element(nothing, value, ir.Constant(ir.IntType(32), 0)), nothing)
+
+    def _to_all(self, value: ir.Value, nothing: ir.Value) -> ir.Value:
+        places = ir.VectorType(ir.IntType(32), self._width)
+        return self._builder.shuffle_vector(value, nothing, ir.Constant(places, [0] * self._width))
+
+    def _worked_out(self, number: Number) -> ir.Value:
+        operation, builder = number.operation, self._builder
+        if operation == "constant":
+            return ir.Constant(self._vector, [number.value] * self._width)
+        if operation in self.values_of:
+            return self.values_of[operation]
+        values = [self.values[one.place] for one in number.of]
+        if operation in OF_TWO:
+            return getattr(builder, OF_TWO[operation])(*values, flags=FLAGS)
+        if operation == "negative":
+            return builder.fneg(*values, flags=FLAGS)
+        if operation == "where":
+            return builder.select(*values)
+        if operation == "call":
+            return self._worked_out_by(number.arguments[0], number.arguments[1], values)
+        if operation == "entry":
+            return values[0][number.arguments[1]]
+        if operation == "and":
+            return builder.and_(*values)
+        if operation == "!=":
+            return builder.fcmp_unordered(operation, *values)
+        if operation in ("<", "<=", ">", ">=", "=="):
+            return builder.fcmp_ordered(operation, *values)
+        return self._called(operation, values)
+
+    def _worked_out_by(self, name: str, count: int, values: list[ir.Value]) -> list[ir.Value]:
+        """What a function of two arrays makes of numbers, run after run."""
+        builder, context, kind = self._builder, self._context, types.Array(types.float64, 1, "C")
+        arrays = []
+        for length in (len(values), count):
+            one, size = context.make_array(kind)(context, builder), ir.Constant(LONG, length)
+            data, eight = cgutils.alloca_once(builder, DOUBLE, size), ir.Constant(LONG, 8)
+            populate_array(one, data, (size,), (eight,), eight, None)
+            arrays.append(one)
+        signature, work = typing.signature(types.none, kind, kind), CALLED[name]
+        found = [ir.Constant(self._vector, ir.Undefined)] * count
+        for k in range(self._width):
+            at = ir.Constant(ir.IntType(32), k)
+            for i, value in enumerate(values):
+                pointer = builder.gep(arrays[0].data, [ir.Constant(LONG, i)], source_etype=DOUBLE)
+                builder.store(builder.extract_element(value, at), pointer)
+            context.compile_internal(builder, work, signature, [one._getvalue() for one in arrays])
+            for i in range(count):
+                pointer = builder.gep(arrays[1].data, [ir.Constant(LONG, i)], source_etype=DOUBLE)
+                found[i] = builder.insert_element(found[i], builder.load(pointer, typ=DOUBLE), at)
+        return found
+
+    def _called(self, name: str, values: list[ir.Value]) -> ir.Value:
+        builder, module = self._builder, self._builder.module
+        if name in OF_LLVM:
+            function = _declared(module, f"llvm.{OF_LLVM[name]}.v{self._width}f64", self._vector, len(values))
+            return builder.call(function, values, fastmath=FLAGS)
+        function, found = _declared(module, IN_LIBRARY.get(name, name), DOUBLE, len(values)), values[0]
+        for k in range(self._width):
+            at = ir.Constant(ir.IntType(32), k)
+            one = builder.call(function, [builder.extract_element(value, at) for value in values])
+            found = builder.insert_element(found, one, at)
+        return found
+
+
+def _declared(module: ir.Module, name: str, kind: ir.Type, count: int) -> ir.Function:
+    """The function of some arguments of a kind that returns such a one, by its name."""
+    return module.globals.get(name) or ir.Function(module, ir.FunctionType(kind, [kind] * count), name)

@@ -1,0 +1,152 @@
+"""What pages say of numbers: reciprocals, conditions and choices, traces, how many channels are seen.
+
+A choice works out both sides. So a page that divides guards its divisor, not its quotient.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from thruster_env.numerics.algebra.graphs import where
+from thruster_env.numerics.algebra.matrices import Matrix, operation, plus, same, through
+
+
+def ratio(a, b):
+    """A matrix or number a, divided by the number b."""
+    return a * (reciprocal(b) if isinstance(b, Matrix) else 1.0 / b)
+
+
+@operation(lambda shape: ())
+def reciprocal(a):
+    """1/a of a number."""
+    return 1.0 / a
+
+
+@operation(lambda a, value: ())
+def exceeds(a, value):
+    """Whether a number is larger than one that is known now."""
+    return a > value
+
+
+@operation(lambda a: ())
+def is_number(a):
+    """Whether a number is one, and not NaN."""
+    return a == a
+
+
+@operation(lambda *shapes: shapes[1], lambda condition, a, b: a.symmetric and b.symmetric)
+def choose(condition, a, b):
+    """`a` if the condition holds, else `b`: two numbers, or two matrices of the same shape."""
+    if not np.shape(a):
+        return where(condition, a, b)
+    pairs = zip(np.ravel(a), np.ravel(b), strict=True)
+    return np.array([where(condition, one, other) for one, other in pairs], dtype=np.result_type(a, b)).reshape(
+        a.shape
+    )
+
+
+@operation(lambda shape: ())
+def trace(a):
+    """The sum of the diagonal."""
+    return sum(a[i, i] for i in range(len(a)))
+
+
+@operation(lambda shape: ())
+def count(seen):
+    """How many channels are seen."""
+    return sum(where(one, 1.0, 0.0) for one in seen)
+
+
+@operation(same)
+def exponential(v):
+    """Exp of a number, or of each entry of a vector."""
+    return np.exp(v)
+
+
+@operation(lambda v, value: v)
+def at_most(v, value):
+    """Entries of a vector, none of which is larger than a number that is known now."""
+    return np.array([where(one > value, value, one) for one in v])
+
+
+@operation(lambda v, value: v)
+def below(v, value):
+    """1 for entries of a vector that are not larger than a number that is known now, else 0."""
+    return np.array([where(one > value, 0.0, 1.0) for one in v])
+
+
+@operation(lambda a, b: a)
+def entries_product(a, b):
+    """The products of the entries of two vectors."""
+    return a * b
+
+
+@operation(lambda v: (v[0], v[0]), lambda v: True)
+def diagonal(v):
+    """The diagonal matrix of a vector."""
+    return np.diag(v)
+
+
+def constant(value: float, like):
+    """A number that is known, beside a number `like` that may not be."""
+    return shifted(like * 0.0, float(value)) if isinstance(like, Matrix) else value
+
+
+@operation(lambda a, value: a)
+def shifted(a, value):
+    """A number plus one that is known now."""
+    return a + value
+
+
+@reciprocal.derivative
+def _of_reciprocal(result, arguments, slopes):
+    return through(lambda slope: slope * result * result * -1.0, slopes[0])
+
+
+@exponential.derivative
+def _of_exponential(result, arguments, slopes):
+    return through(lambda slope: entries_product(result, slope) if result.shape else result * slope, slopes[0])
+
+
+@entries_product.derivative
+def _of_entries(result, arguments, slopes):
+    (a, b), (da, db) = arguments, slopes
+    by_a = through(lambda slope: entries_product(slope, b), da)
+    return plus(by_a, through(lambda slope: entries_product(a, slope), db))
+
+
+@at_most.derivative
+def _of_limit(result, arguments, slopes):
+    v, value = arguments
+    return through(lambda slope: entries_product(slope, below(v, value)), slopes[0])
+
+
+@diagonal.derivative
+def _of_diagonal(result, arguments, slopes):
+    return through(diagonal, slopes[0])
+
+
+@shifted.derivative
+def _of_shifted(result, arguments, slopes):
+    return slopes[0]
+
+
+@trace.derivative
+def _of_trace(result, arguments, slopes):
+    return through(trace, slopes[0])
+
+
+@choose.derivative
+def _of_choice(result, arguments, slopes):
+    condition, *values = arguments
+    moves = (a * 0.0 if slope is None else slope for a, slope in zip(values, slopes[1:], strict=True))
+    return choose(condition, *moves)
+
+
+@below.derivative
+@exceeds.derivative
+@is_number.derivative
+@count.derivative
+def _of_decision(result, arguments, slopes):
+    """Of what is constant but for jumps."""
+    return None

@@ -1,0 +1,92 @@
+"""Derivatives of graphs of Numbers, forwards: how results change as the numbers change that they are made of.
+
+Beside each number y of a graph stands y', worked out by the chain rule from those of its arguments. Numbers
+that do not move have none, so that nothing is multiplied by zero, and what the derivative shares with the value
+is there once:
+
+    x' = 1:  (sin(x) * x)' = cos(x) * x + sin(x)     # sin(x) is the number of the value's own graph
+
+Forwards, because a filter's parameters are few, and because Fisher's information asks how each innovation
+changes along each of them, which the other direction does not find.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+from thruster_env.numerics.algebra.graphs import Number, needed_by, where
+
+Slope = Number | None  # None of a number that does not move
+
+
+def added(*slopes: Slope) -> Slope:
+    """The sum of slopes."""
+    moving = [slope for slope in slopes if slope is not None]
+    return sum(moving[1:], moving[0]) if moving else None
+
+
+def along(numbers: Sequence[Number], moves: Mapping[int, Slope]) -> list[Slope]:
+    """Derivatives of numbers in the direction in which the numbers at some places of their graph move.
+
+    Args:
+        numbers: to be differentiated.
+        moves: by the place of each number that moves, its change, or None; what such are made of does not matter.
+    """
+    slopes: dict[int, Slope] = dict(moves)
+    for number in needed_by(numbers, moves):
+        if number.place not in slopes:
+            of = [slopes[one.place] for one in number.of]
+            slopes[number.place] = _RULES[number.operation](number, *number.of, *of) if any_of(of) else None
+    return [slopes[number.place] for number in numbers]
+
+
+def any_of(slopes: Sequence[Slope]) -> bool:
+    """Whether there is a slope among some."""
+    return any(slope is not None for slope in slopes)
+
+
+def times(slope: Slope, factor: Callable[[], Number | float]) -> Slope:
+    """A slope times a factor, which is worked out only if there is a slope."""
+    return None if slope is None else slope * factor()
+
+
+def _of_choice(y, condition, a, b, of_condition, da, db):
+    return where(condition, 0.0 if da is None else da, 0.0 if db is None else db)
+
+
+def _of_power(y, x, e, dx, de):
+    return added(times(dx, lambda: e * x ** (e - 1.0)), times(de, lambda: y * x.log()))
+
+
+def _of_angle(y, a, b, da, db):
+    square = a * a + b * b
+    return added(times(da, lambda: b / square), times(db, lambda: -a / square))
+
+
+def _none(y, *others):
+    """Of what is constant but for jumps."""
+    return None
+
+
+_RULES: dict[str, Callable] = {
+    "+": lambda y, a, b, da, db: added(da, db),
+    "-": lambda y, a, b, da, db: added(da, None if db is None else -db),
+    "*": lambda y, a, b, da, db: added(times(da, lambda: b), times(db, lambda: a)),
+    "/": lambda y, a, b, da, db: added(times(da, lambda: 1.0 / b), times(db, lambda: -y / b)),
+    "negative": lambda y, x, dx: -dx,
+    "abs": lambda y, x, dx: where(x < 0.0, -dx, dx),
+    "sqrt": lambda y, x, dx: 0.5 * dx / y,
+    "exp": lambda y, x, dx: dx * y,
+    "log": lambda y, x, dx: dx / x,
+    "sin": lambda y, x, dx: dx * x.cos(),
+    "cos": lambda y, x, dx: -dx * x.sin(),
+    "tan": lambda y, x, dx: dx * (1.0 + y * y),
+    "arctan": lambda y, x, dx: dx / (1.0 + x * x),
+    "tanh": lambda y, x, dx: dx * (1.0 - y * y),
+    "sinh": lambda y, x, dx: dx * x.cosh(),
+    "cosh": lambda y, x, dx: dx * x.sinh(),
+    "pow": _of_power,
+    "arctan2": _of_angle,
+    "where": _of_choice,
+    **dict.fromkeys(("floor", "ceil", "<", "<=", ">", ">=", "==", "!=", "and"), _none),
+}

@@ -1,0 +1,294 @@
+"""Compilation: plain Python functions in, cached machine code out, one source for both.
+
+Functions marked `inlined` stay ordinary Python and may be called by any function given to `compiled`.
+numba is imported at the first compilation only, which keeps imports light. With the
+environment variable NUMBA_DISABLE_JIT=1 everything runs as Python.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import importlib.util
+import inspect
+import os
+import threading
+import types
+import warnings
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from thruster_env.numerics.code_cache import keep_code
+from thruster_env.numerics.code_text import code_text
+from thruster_env.numerics.optimising import Which, optimise_once
+
+# No "nnan" and "ninf": with them isfinite and isnan are compiled away, and failures would pass unseen.
+FASTMATH = frozenset({"contract", "reassoc", "arcp", "nsz", "afn"})
+
+WITHIN = tuple(f"thruster_env.{name}" for name in ("numerics", "plants", "training", "studies"))  # packages apart
+_packages: dict[str, tuple[str, ...]] = {}  # see `may_be_inlined`
+
+_waiting: list[Callable] = []
+_marked: set[Callable] = set()
+_called: set[Callable] = set()  # of these, functions that are called and not inlined
+_apart: set[Callable] = set()  # of these, functions of which there is one copy
+_narrow: set[Callable] = set()  # functions whose vectors are as wide as LLVM prefers
+_asked: weakref.WeakSet[Callable] = weakref.WeakSet()  # functions that `compiled` has been given
+_lessons: list[Callable[[], None]] = [lambda: optimise_once(_which())]
+_interpreting = os.environ.get("NUMBA_DISABLE_JIT", "").strip() not in ("", "0")
+
+
+def inlined(function: Callable, *, into_callers: bool = True) -> Callable:
+    """Mark a plain function so that compiled functions may call it; it is inlined into all of them.
+
+    So are functions that it calls by name. A loop over members or copies is vectorised only if it contains no
+    call. With into_callers=False the function is called instead of inlined, and so are the functions that call it:
+    loops over large arrays gain nothing from inlining, and would be optimised again in each caller.
+    """
+    if function not in _marked:
+        _marked.add(function)
+        callees = _callees(function)
+        for callee in callees:  # a user's model may call helpers of its own
+            inlined(callee)
+        if not into_callers or not _called.isdisjoint(callees):
+            _called.add(function)
+        _waiting.append(function)
+    return function
+
+
+def kept_apart(function: Callable) -> Callable:
+    """Mark a plain function that is never inlined: there is one copy of it, however many functions call it.
+
+    It is meant for long loops, where the cost of a call does not matter. LLVM may still inline other functions.
+    """
+    _apart.add(function)
+    return inlined(function, into_callers=False)
+
+
+def narrow(function: Callable) -> Callable:
+    """Mark a function whose loops keep the vectors that LLVM prefers: wide ones were measured to take longer."""
+    _narrow.add(function)
+    return function
+
+
+def _which() -> Which:
+    return Which(
+        asked=_asked.__contains__,
+        marked=_marked.__contains__,
+        called=_called.__contains__,
+        large=_is_large,
+        apart=_apart.__contains__,
+        narrow=_narrow.__contains__,
+    )
+
+
+def _is_large(function: Callable) -> bool:
+    """Whether a function calls one that is called and not inlined."""
+    return not _called.isdisjoint(_callees(function))
+
+
+def overloaded(function: Callable) -> Callable:
+    """Mark a plain function in whose place compiled functions have machine code, by `numba.extending.overload`."""
+    _marked.add(function)
+    return function
+
+
+def when_compiling(teach: Callable[[], None]) -> Callable[[], None]:
+    """Mark a function that registers something with numba; it is called once, before the first compilation."""
+    _lessons.append(teach)
+    return teach
+
+
+def _callees(function: Callable) -> list[Callable]:
+    """Plain functions that a function has in its closure or calls by a global name."""
+    if not isinstance(function, types.FunctionType):
+        return []
+    cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    called = [function.__globals__.get(name) for name in function.__code__.co_names]
+    return [part for part in (*cells, *called) if isinstance(part, types.FunctionType)]
+
+
+@contextlib.contextmanager
+def interpreted():
+    """Within this context nothing is compiled: the same sources run as Python, for tests and debugging."""
+    global _interpreting
+    before, _interpreting = _interpreting, True
+    try:
+        yield
+    finally:
+        _interpreting = before
+
+
+def is_interpreting() -> bool:
+    """Whether `compiled` leaves functions as they are."""
+    return _interpreting
+
+
+def compiled(function: Callable) -> Callable:
+    """Compile a function with numba, cached on disk, releasing the interpreter lock while it runs."""
+    if _interpreting:
+        return function
+    import numba
+    from numba.extending import register_jitable
+
+    while _lessons:
+        _lessons.pop()()
+    while _waiting:
+        inner = _waiting.pop()
+        register_jitable(forceinline=inner not in _called, no_cfunc_wrapper=True)(
+            inner
+        )  # by itself LLVM inlines small ones only
+    _asked.add(function)
+    return keep_code(numba.njit(nogil=True, fastmath=set(FASTMATH), error_model="numpy")(function))
+
+
+def tell_when_compiling(tell: Callable[[], None]) -> None:
+    """Call `tell` once, at the first real compilation; loading from the cache does not count."""
+    from numba.core import event
+
+    class Once(event.Listener):
+        waiting = True
+
+        def on_start(self, event):
+            if self.waiting:
+                self.waiting = False
+                tell()
+
+        def on_end(self, event):
+            pass
+
+    event.register("numba:compile", Once())
+
+
+def may_be_inlined(package: str, *below: str) -> None:
+    """Declare, in a package's `__init__`, that its functions inline one another and those of packages below it.
+
+    Cached machine code of such a function is valid as long as no source file of these packages changes. For other
+    packages, only the files of the functions that are called by name are compared.
+    """
+    _packages[package] = below
+
+
+def registered_packages() -> frozenset[str]:
+    """The packages that have called `may_be_inlined`."""
+    return frozenset(_packages)
+
+
+@functools.cache
+def _package_hash(package: str) -> str:
+    digest = hashlib.sha256(package.encode())
+    for below in _packages.get(package, ()):
+        digest.update(_package_hash(below).encode())
+    spec = importlib.util.find_spec(package)
+    for folder in (spec.submodule_search_locations or []) if spec else []:
+        for path in sorted(Path(folder).rglob("*.py")):
+            if package in WITHIN or f"{package}.{path.relative_to(folder).parts[0]}" not in WITHIN:
+                digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def function_fingerprint(*functions: Callable | None, within: str) -> str:
+    """Hash of what a compiled function inlines; numba's cache itself looks at the outermost function only.
+
+    It covers the byte code of `functions` and of all that they call by name, the values that these read by name
+    (from other files, too), and the source files of their packages, of this package, and of the package of the
+    module `within` which the compiled function is written.
+    """
+    digest = hashlib.sha256()
+    packages = {package_of(__name__), package_of(within)}
+    seen: set[Callable] = set()
+    waiting = [function for function in functions if function is not None]
+    while waiting:
+        function = waiting.pop()
+        if function in seen:
+            continue
+        seen.add(function)
+        digest.update(code_text(function).encode())
+        waiting += _callees(function)
+        package = package_of(function.__module__ or "")
+        if package in _packages:
+            packages.add(package)
+            continue
+        try:
+            digest.update(Path(inspect.getsourcefile(function) or "").read_bytes())
+        except (OSError, TypeError):
+            pass  # from a notebook or a prompt: the byte code tells changes apart
+    for package in sorted(packages):
+        digest.update(_package_hash(package).encode())
+    return digest.hexdigest()
+
+
+def package_of(module: str) -> str:
+    """The package that a module belongs to: the first part of its name, or one of thruster_env's own packages."""
+    return ".".join(module.split(".")[: 2 if module.startswith(WITHIN) else 1])
+
+
+class CompiledOrPython:
+    """A function compiled at its first call, or run as Python, with one warning, if numba refuses it."""
+
+    def __init__(self, function: Callable):
+        """Take a plain function; nothing is compiled yet."""
+        self._python, self._run = function, compiled(function)
+        self._proven = self._run is function
+        self._first = threading.Lock()  # one thread compiles, or finds out that numba refuses
+
+    def __call__(self, *arguments):
+        """Call the function."""
+        if not self._proven:
+            with self._first:
+                return self._call_first(*arguments)
+        if self._run is self._python:
+            with np.errstate(all="ignore"):  # compiled code does not warn of overflow either
+                return self._run(*arguments)
+        return self._run(*arguments)
+
+    @property
+    def in_python(self) -> bool:
+        """Whether calls run as Python, as far as is known before the first."""
+        return self._run is self._python
+
+    @property
+    def folder(self) -> str | None:
+        """Where its machine code is kept; None where none is."""
+        return getattr(getattr(self._run, "_cache", None), "cache_path", None)
+
+    @property
+    def direct(self) -> Callable:
+        """The compiled function itself once it has run, so that calls avoid this object; else this object."""
+        return self._run if self._proven and self._run is not self._python else self
+
+    def _call_first(self, *arguments):
+        if not self._proven:
+            try:
+                return self._run(*arguments)
+            except Exception as error:  # numba's, of many classes: compiled code itself raises nothing
+                warnings.warn(
+                    f"the model runs as Python, slowly, for numba refuses it: {_reason(error)}", stacklevel=3
+                )
+                self._run = self._python
+            finally:
+                self._proven = True
+        return self(*arguments)
+
+
+def _reason(error: Exception) -> str:
+    # numba frames its reason with lines on where it was; the first that is none of those says what is wrong.
+    frames = (
+        "Failed in",
+        "TypingError",
+        "During",
+        "There are",
+        "- Of which",
+        "Overload",
+        "With argument",
+        "Rejected",
+    )
+    lines = [line.strip() for line in str(error).splitlines()]
+    telling = [
+        line for line in lines if len(line) > 3 and not line.startswith((*frames, "File", ">>>", "No impl"))
+    ]
+    return telling[0] if telling else type(error).__name__

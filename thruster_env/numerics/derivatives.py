@@ -1,0 +1,141 @@
+"""Jacobians of functions on vectors: analytic where given, else by complex steps or central differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+from weakref import WeakSet
+
+import numpy as np
+
+from thruster_env.numerics.angles import NAMES, short_way
+from thruster_env.numerics.compiled import inlined
+from thruster_env.numerics.pickling import makes_functions
+from thruster_env.numerics.sources import Index, is_array, matrix_of, tuple_of, written_out
+
+RELATIVE_STEP = 6e-6  # cube root of the float64 resolution balances truncation and rounding
+COMPLEX_STEP = 1e-100  # no subtraction, hence no cancellation: it may be this small
+
+_EXACT: WeakSet[Callable] = WeakSet()  # what `complex_step` has returned
+
+
+def _stores(rows: int, entry: Callable) -> list[str]:
+    """Lines that set column j of `out`, of `rows` components with the sources entry(i)."""
+    if is_array(rows):
+        return [f"for i in range({rows}):", f"    out[i, j] = {entry(Index('i'))}"]
+    return [f"out[{i}, j] = {entry(i)}" for i in range(rows)]
+
+
+@makes_functions
+def complex_step(function: Callable, rows: int, columns: int, arguments: str) -> Callable:
+    """Return `jacobian(x, <arguments>)`: df/dx_j = Im f(x + i h e_j) / h, exact to rounding.
+
+    Args:
+        function: an analytic function of a tuple of `columns` components and the arguments, made of arithmetic and
+            numpy functions that take complex numbers. (`abs`, comparisons and `math` are not among them: `abs`
+            would silently give a wrong derivative.)
+        rows: number of components of its result.
+        columns: number of components of x.
+        arguments: names of the other arguments, comma separated.
+
+    Source: Squire, Trapp (1998), "Using complex variables to estimate derivatives of real functions", SIAM Review.
+    """
+    if is_array(rows, columns) or is_array(columns):
+        return _complex_step_in_loops(function, rows, columns, arguments)
+    lines = []
+    for j in range(columns):
+        point = tuple_of(f"complex(x[{i}], {COMPLEX_STEP if i == j else 0.0})" for i in range(columns))
+        lines.append(f"y{j} = function({point}, {arguments})")
+    source = matrix_of(rows, columns, lambda i, j: f"(0j + y{j}[{i}]).imag / {COMPLEX_STEP}")
+    made = written_out("jacobian", f"x, {arguments}", *lines, source, function=inlined(function))
+    _EXACT.add(made)
+    return made
+
+
+def _complex_step_in_loops(function: Callable, rows: int, columns: int, arguments: str) -> Callable:
+    if is_array(columns):
+        point: tuple[str, ...] = "point = x + 0j", f"point[j] = complex(x[j], {COMPLEX_STEP})"
+    else:
+        step = f"{COMPLEX_STEP} if j == {{0}} else 0.0"
+        point = ("point = " + tuple_of(f"complex(x[{i}], {step.format(i)})" for i in range(columns)),)
+    stores = _stores(rows, lambda i: f"(0j + y[{i}]).imag / {COMPLEX_STEP}")
+    body = *point, f"y = function(point, {arguments})", *stores
+    lines = (
+        f"out = np.empty(({rows}, {columns}))",
+        f"for j in range({columns}):",
+        *(f"    {line}" for line in body),
+    )
+    made = written_out(
+        "jacobian", f"x, {arguments}", *lines, "out", _loops=True, function=inlined(function), np=np
+    )
+    _EXACT.add(made)
+    return made
+
+
+def by_complex_step(function: Callable) -> bool:
+    """Whether a Jacobian is one that `complex_step` has returned."""
+    return function in _EXACT
+
+
+def _differences_in_loops(
+    function: Callable, rows: int, columns: int, arguments: str, angles: tuple[bool, ...]
+) -> Callable:
+    sides = []
+    for name, sign in (("above", "+"), ("below", "-")):
+        if is_array(columns):
+            sides += ["point = x.copy()", f"point[j] {sign}= h"]
+        else:
+            shifted = (f"x[{i}] {sign} h if j == {i} else x[{i}]" for i in range(columns))
+            sides.append("point = " + tuple_of(shifted))
+        sides += [f"{name} = function(point, {arguments})"]
+    size = "x[j]" if is_array(columns) else "sizes[j]"
+    scale = "scales[j]" if is_array(columns) else "steps[j]"
+    copies = [] if is_array(columns) else ["sizes, steps = np.array(x), np.array(scales)"]
+    stores = _stores(rows, lambda i: short_way(f"(above[{i}] - below[{i}])", i, angles) + " / (2.0 * h)")
+    body = f"h = {RELATIVE_STEP} * (abs({size}) + {scale})", *sides, *stores
+    start = f"out = np.empty(({rows}, {columns}))", *copies, f"for j in range({columns}):"
+    lines = *start, *(f"    {line}" for line in body)
+    names: dict[str, Any] = {"function": inlined(function), "np": np, **NAMES}
+    return written_out("jacobian", f"x, scales, {arguments}", *lines, "out", _loops=True, **names)
+
+
+@cache
+def jacobian(
+    function: Callable,
+    analytic: Callable | None,
+    rows: int,
+    columns: int,
+    arguments: str,
+    angles: tuple[bool, ...] = (),
+) -> Callable:
+    """Return `jacobian(x, scales, <arguments>)`: d function/dx as a tuple of rows.
+
+    Args:
+        function: takes a tuple of `columns` components and the arguments, returns a tuple of `rows`.
+        analytic: its Jacobian if known, a function of x and the arguments.
+        rows: number of components of the result.
+        columns: number of components of x.
+        arguments: names of the other arguments, comma separated.
+        angles: which components of the result are angles, whose differences are wrapped to (-pi, pi].
+
+    The steps of central differences are relative to |x| + scales, both tuples of `columns` components.
+    """
+    signature = f"x, scales, {arguments}"
+    if analytic is not None:
+        return written_out("jacobian", signature, f"analytic(x, {arguments})", analytic=inlined(analytic))
+    if is_array(rows, columns) or is_array(columns):
+        return _differences_in_loops(function, rows, columns, arguments, angles)
+    lines = []
+    for j in range(columns):
+        lines.append(f"h{j} = {RELATIVE_STEP} * (abs(x[{j}]) + scales[{j}])")
+        for name, sign in (("above", "+"), ("below", "-")):
+            point = tuple_of(f"x[{i}] {sign} h{j}" if i == j else f"x[{i}]" for i in range(columns))
+            lines.append(f"{name}{j} = function({point}, {arguments})")
+
+    def slope(i, j):
+        return short_way(f"(above{j}[{i}] - below{j}[{i}])", i, angles) + f" / (2.0 * h{j})"
+
+    return written_out(
+        "jacobian", signature, *lines, matrix_of(rows, columns, slope), function=inlined(function), **NAMES
+    )

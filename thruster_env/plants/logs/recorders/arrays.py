@@ -1,0 +1,98 @@
+"""Arrays by name, as MATLAB and HDF5 keep them: which are channels, and which vector has their times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thruster_env.plants.logs.columns import TIME_NAMES
+from thruster_env.plants.logs.recorders.topics import MOST_COLUMNS, Refused, Topic, Wanted, check_bytes, columns_of
+from thruster_env.plants.logs.units import converted, parted
+
+NUMERIC = "biuf"  # NumPy's kinds
+FEWEST = 2  # samples; what has fewer is a constant
+SECOND = "s"
+
+
+def topics_of(
+    found: Mapping[str, Any], path: Path, wanted: Wanted = None, unit: Callable[[Any], str] = lambda one: ""
+) -> Iterator[Topic]:
+    """The channels among arrays: a vector, or a matrix whose columns are channels NAME[0], NAME[1] and so on.
+
+    Times are the vector `time` (or t, time_ms and the like) beside an array, or else in a group around it, if it
+    is as long as the array; of a matrix, times may run along either side.
+
+    Args:
+        found: arrays by "GROUP.NAME", with shape, dtype and what `[...]` reads; or a text, why one is refused.
+        path: of the file, for messages.
+        wanted: columns that are read; None for all.
+        unit: of an array, empty where it has none.
+
+    Raises:
+        ValueError: if an array is wanted that is refused, or too large.
+    """
+    sizes = {name: _size(one) for name, one in found.items()}
+    vectors: dict[str, dict[str, int]] = {}  # of times, their lengths by group and name
+    for name, size in sizes.items():
+        if size is not None and size[1] == 1 and _is_time(name):
+            vectors.setdefault(name.rpartition(".")[0], {})[name] = size[0]
+    known: dict[str, np.ndarray] = {}
+    for name, one in found.items():
+        if wanted is not None and not any(each == name or each.startswith(f"{name}[") for each in wanted):
+            continue
+        if isinstance(one, str) or one.dtype.kind not in NUMERIC:
+            if wanted is not None:
+                what = one if isinstance(one, str) else f"of {one.dtype}"
+                raise Refused(f"a field must be an array of numbers, but {name!r} is {what} ({path})")
+            continue
+        if sizes[name] is None:
+            continue
+        clock, along = next(
+            (each for each in _clocks(name, vectors) if each[1] in one.shape), (None, max(one.shape))
+        )
+        if math.prod(one.shape) > MOST_COLUMNS * along:
+            continue
+        group, _, field = name.rpartition(".")
+        values = _read(name, one, path)
+        values = values if values.shape[0] == along else values.T
+        fields = columns_of(field, values)
+        said = unit(one)
+        if clock is not None and clock not in known:
+            whose = found[clock]
+            times = _read(clock, whose, path).astype(np.float64)
+            where = f"{clock!r} of {path}"
+            known = {clock: converted(times, unit(whose) or parted(clock)[1], SECOND, where)}
+        yield Topic(
+            group, known[clock] if clock is not None else None, fields, dict.fromkeys(fields, said) if said else {}
+        )
+
+
+def _size(one: Any) -> tuple[int, int] | None:
+    """The longer and the shorter side of a vector or matrix of numbers, None for anything else."""
+    if isinstance(one, str) or one.dtype.kind not in NUMERIC or len(one.shape) not in (1, 2) or 0 in one.shape:
+        return None
+    longer, shorter = max(one.shape), min(one.shape) if len(one.shape) == 2 else 1
+    return (longer, shorter) if longer >= FEWEST and shorter <= MOST_COLUMNS else None
+
+
+def _is_time(name: str) -> bool:
+    return parted(name.rpartition(".")[2])[0] in TIME_NAMES
+
+
+def _clocks(name: str, vectors: Mapping[str, Mapping[str, int]]) -> Iterator[tuple[str, int]]:
+    """Vectors of times that may be those of an array, and their lengths: beside it, then in groups around it."""
+    group = name
+    while group:
+        group = group.rpartition(".")[0]
+        yield from vectors.get(group, {}).items()
+
+
+def _read(name: str, one: Any, path: Path) -> np.ndarray:
+    """An array, of which sides of one entry are left out."""
+    check_bytes(math.prod(one.shape) * max(one.dtype.itemsize, 8), f"the array {name!r}", path)
+    values = np.asarray(one[...])
+    return values.reshape(-1) if 1 in values.shape else values

@@ -1,0 +1,154 @@
+"""A recorder's file as a table of a log: fields with times of their own, put into rows at all of their times."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from thruster_env.numerics.checks import listed
+from thruster_env.plants.logs.columns import INPUT, MEASUREMENT, TIME, Column, Wanted, find_columns
+from thruster_env.plants.logs.recorders.registry import Format, Samples, read
+from thruster_env.plants.logs.table import Table
+from thruster_env.plants.logs.units import parted
+
+STAMP = "times"  # header of the rows' times
+
+
+class Recorded:
+    """The fields of a recorder's file that may be columns of a log.
+
+    Attributes:
+        path: of the file.
+        samples: by name; of a format with stamps, those that are asked for, as one file may have hundreds.
+    """
+
+    def __init__(self, path: str | Path, form: Format, asked: Collection[str]):
+        """Read the fields that are asked for, "HEADER" or "HEADER[UNIT]"; all of arrays, found by their names."""
+        self.path, self.form = Path(path), form
+        names = {name for text in asked for name in (text, text.rpartition("[")[0].strip()) if name}
+        self.is_whole, self.is_timed = not form.has_stamps, False
+        self.samples = read(path, None if self.is_whole else names)
+
+    def columns(
+        self, wanted: list[Wanted], given: Mapping[str, str], units: Mapping[str, str], needs_time: bool
+    ) -> dict[str, Column]:
+        """The columns of quantities, as `find_columns` finds them; ValueError names all fields."""
+        if self.form.has_stamps and TIME in given:
+            rule = f"times of a {self.form.kind} must be the stamps of its messages"
+            raise ValueError(f"{rule}, but got time={given[TIME]} ({self.path})")
+        self.is_timed = TIME in given  # by a vector for all fields, in place of those beside them
+        while True:
+            said = {name: unit for name, one in self.samples.items() if (unit := _unit(name, one)) is not None}
+            said |= units
+            try:
+                return find_columns(wanted, [*self.samples], given, said, str(self.path), needs_time)
+            except ValueError:
+                if self.is_whole:
+                    raise
+            self.samples, self.is_whole = read(self.path, None), True
+
+    def has_times(self, found: Mapping[str, Column]) -> bool:
+        """Whether all columns but that of times have times of their own."""
+        return all(self.samples[one.header].times is not None for key, one in found.items() if key != TIME)
+
+    def table(self, found: Mapping[str, Column]) -> tuple[Table, dict[str, Column]]:
+        """The rows of a log and their columns: at the times of all samples, from when all inputs are known.
+
+        The measurement with most samples gives the grid: the log begins and ends with it. Before it, an input's
+        last sample counts. Of two samples of a field at one time, the last is used.
+
+        Args:
+            found: columns by quantity.
+
+        Raises:
+            ValueError: if a field has no times, or they run backwards, or inputs and measurements do not overlap.
+        """
+        found = {
+            key: one for key, one in found.items() if key != TIME or self.is_timed or not self.has_times(found)
+        }
+        some = {column.header: self.samples[column.header] for column in found.values()}
+        for name, one in some.items():
+            _check(name, one, self.path)
+        if TIME in found or all(one.times is None for one in some.values()):
+            return _plain(some, self.path), found
+        for name, one in some.items():
+            if one.times is None:
+                raise ValueError(
+                    f"all fields of a log must have times, but there are none beside {name!r} in {self.path} "
+                    f"(use --column time=NAME)"
+                )
+        of = {kind: [some[found[key].header] for key in found if key.startswith(f"{kind}:")] for kind in KINDS}
+        clock = _clock(of[INPUT], of[MEASUREMENT], self.path)
+        apart = np.unique(np.concatenate([_times(one) for one in some.values()]))
+        apart = apart[(apart > clock[0]) & (apart < clock[-1])]
+        stamps = np.sort(np.concatenate([clock, np.setdiff1d(apart, clock)]), kind="stable")
+        cells = {name: _rows(one, stamps) for name, one in some.items()}
+        for name in (found[key].header for key in found if key.startswith(f"{INPUT}:")):
+            cells[name][0] = some[name].values[_times(some[name]) <= stamps[0]][-1]
+        rows = range(1, len(stamps) + 1)
+        table = Table(str(self.path), {STAMP: stamps, **cells}, rows, "row", np.isin(stamps, clock))
+        return table, {**found, TIME: Column(STAMP, None)}
+
+
+KINDS = (INPUT, MEASUREMENT)
+
+
+def _unit(name: str, one: Samples) -> str | None:
+    """The unit that a file gives, None if its name may have one; the brackets of "speed_rpm[0]" hold none."""
+    return one.unit or ((parted(name.rpartition("[")[0])[1] or "") if name.endswith("]") else None)
+
+
+def _times(one: Samples) -> np.ndarray:
+    """Times of samples that have some."""
+    return np.empty(0) if one.times is None else one.times
+
+
+def _check(name: str, one: Samples, path: Path) -> None:
+    """Raise ValueError for times that are missing or run backwards, and for infinite values; it names the time."""
+    times = _times(one)
+    if np.isnan(times).any():
+        raise ValueError(f"every sample must have a time, but one of {name!r} in {path} has none")
+    if (np.diff(times) < 0).any():
+        row = int(np.argmax(np.diff(times) < 0)) + 1
+        raise ValueError(
+            f"times must increase from sample to sample, but {times[row]:.10g} s follows {times[row - 1]:.10g} s "
+            f"in {name!r} of {path}"
+        )
+    if np.isinf(one.values).any():
+        row = int(np.argmax(np.isinf(one.values)))
+        where = f"at {times[row]:.10g} s" if len(times) else f"in row {row + 1}"
+        raise ValueError(f"numbers must be finite, but got {one.values[row]} {where} in {name!r} of {path}")
+
+
+def _plain(some: Mapping[str, Samples], path: Path) -> Table:
+    """A table of fields of equal length, of which one may hold the times."""
+    lengths = {name: len(one.values) for name, one in some.items()}
+    if len(set(lengths.values())) > 1:
+        told = listed(f"{name} {length}" for name, length in lengths.items())
+        raise ValueError(f"fields without times of their own must be of equal length, but {path} has {told}")
+    rows = range(1, next(iter(lengths.values())) + 1)
+    return Table(str(path), {name: one.values for name, one in some.items()}, rows, "row")
+
+
+def _clock(inputs: list[Samples], measured: list[Samples], path: Path) -> np.ndarray:
+    """Times of the measurement with most samples, from when all inputs are known."""
+    begin = max([-np.inf, *(_times(one)[0] for one in inputs if len(one.values))])
+    within = [_times(one)[_times(one) >= begin] for one in measured]
+    clock = max(within, key=len, default=np.empty(0))
+    if len(clock) < 2:
+        raise ValueError(
+            f"measurements must go on after all inputs have begun, at {begin:.10g} s, but {path} has {len(clock)} "
+            "from there on"
+        )
+    return clock
+
+
+def _rows(one: Samples, stamps: np.ndarray) -> np.ndarray:
+    """Samples in the rows of their times, NaN elsewhere; of equal times the last sample, and the last row."""
+    rows = np.full(len(stamps), np.nan)
+    place = np.searchsorted(stamps, _times(one), side="right") - 1
+    there = (place >= 0) & (stamps[np.maximum(place, 0)] == _times(one))
+    rows[place[there]] = one.values[there]
+    return rows

@@ -1,0 +1,98 @@
+"""What readers of recorders' files give: topics, whose fields have samples at the same times; and their limits."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from thruster_env.numerics.extras import to_install
+
+MOST_BYTES = 2**31  # of all arrays that are read at once, and of a file that a package reads whole
+MOST_COLUMNS = 64  # of a field that is an array: pictures and point clouds are no channels
+MOST_FIELDS = 20_000  # of a message
+
+Wanted = Collection[str] | None  # names of columns; None for all
+
+
+class Topic(NamedTuple):
+    """Fields with samples at the same times."""
+
+    name: str  # "actuator_outputs", "actuator_outputs#1"; empty for an array that stands alone
+    times: np.ndarray | None  # (samples,) [s]; None where the file has none for it
+    values: Mapping[str, np.ndarray]  # (samples,) float64 by field: "output[0]"
+    units: Mapping[str, str] = {}  # by field, where the file has them
+
+    def column(self, field: str) -> str:
+        """The name of a field's column: TOPIC.FIELD."""
+        return f"{self.name}.{field}" if self.name else field
+
+
+Reader = Callable[[Path, Wanted], Iterator[Topic]]
+
+
+def wants(wanted: Wanted, topic: str) -> bool:
+    """Whether a column of a topic is wanted."""
+    return wanted is None or any(one.startswith(f"{topic}.") for one in wanted)
+
+
+def package(module: str, kind: str, path: Path) -> Any:
+    """A module of the extra `recorders`; ValueError says how to install it."""
+    try:
+        return import_module(module)
+    except ImportError:
+        name = module.partition(".")[0]
+        rule = f"a {kind} must be read by {name}, which is not installed ({to_install('recorders')})"
+        raise ValueError(f"{rule}, but got {path}") from None
+
+
+class Refused(ValueError):
+    """A file is what its name says, but holds what is not read."""
+
+
+def check_bytes(count: int | float, what: str, path: Path) -> None:
+    """Raise Refused for more than MOST_BYTES, before they are read."""
+    if count > MOST_BYTES:
+        raise Refused(f"{what} must be at most {MOST_BYTES:.3g} bytes, but got {count:.3g} ({path})")
+
+
+def unreadable(kind: str, path: Path, why: object) -> ValueError:
+    """The error for a file that is not what its name says."""
+    said = " ".join(str(why).split())
+    return ValueError(f"a {kind} must be one, but {path} is not: {said[:200] or type(why).__name__}")
+
+
+@contextmanager
+def reading(kind: str, path: Path) -> Iterator[None]:
+    """Make one line of whatever packages raise for bytes that are not as they should be: of a dozen kinds."""
+    try:
+        yield
+    except Refused:
+        raise
+    except Exception as error:
+        raise unreadable(kind, path, error) from None
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """Keep packages from printing, also those in C; nothing may be yielded within."""
+    with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+        kept = os.dup(2)
+        try:
+            os.dup2(nowhere.fileno(), 2)
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+
+
+def columns_of(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """The fields of an array (samples,) or (samples, entries): NAME, or NAME[0], NAME[1] and so on."""
+    if values.ndim == 1:
+        return {name: values.astype(np.float64)}
+    return {f"{name}[{place}]": values[:, place].astype(np.float64) for place in range(values.shape[1])}

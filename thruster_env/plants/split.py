@@ -1,0 +1,34 @@
+"""Channels of an env that a model takes as inputs, such as an attitude from an AHRS, and as measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from thruster_env.plants.state_space import StateSpaceModel
+
+
+class Split(NamedTuple):
+    """Indices of an env's channels that are inputs of a model, and of those that are measurements.
+
+    Attributes:
+        inputs: those of the model's last inputs, in their order.
+        measurements: those that it measures.
+        channels: number of channels that the env has.
+    """
+
+    inputs: tuple[int, ...]
+    measurements: tuple[int, ...]
+    channels: int
+
+
+def split(model: StateSpaceModel, actions: int, channels: Sequence[str]) -> Split | None:
+    """Find a model's inputs beyond the first `actions`, and its measurements, among channels by their symbols.
+
+    None where there are no such inputs, or the model has some that are no channels.
+    """
+    told = [quantity.symbol for quantity in model.input_quantities[actions:]]
+    seen = [quantity.symbol for quantity in model.measurements]
+    if not told or not set(told + seen) <= set(channels):
+        return None
+    return Split(tuple(map(channels.index, told)), tuple(map(channels.index, seen)), len(channels))

@@ -1,0 +1,18 @@
+"""Published experiments and standard problems, with the published numbers beside ours.
+
+Papers are in `authorYEAR.py` each; those on the underwater vehicle are done again in `vehicle`. Standard problems
+are modules with a `BENCHMARK`, and a `problem` for `thruster tune --problem thruster_env.studies.NAME:problem`.
+"""
+
+from thruster_env.studies.kiki2020 import TABLE as KIKI_2020
+from thruster_env.studies.nurhadi2022 import TABLE as NURHADI_2022
+
+STUDIES = {table.name: table for table in (NURHADI_2022, KIKI_2020)}
+BENCHMARKS = {
+    "lorenz63": "thruster_env.studies.lorenz63",
+    "lorenz96": "thruster_env.studies.lorenz96",
+    "range-bearing": "thruster_env.studies.range_bearing",
+}  # modules by name
+VEHICLE_STUDIES = ("ngatini2017", "ngatini2019")  # see `thruster_env.studies.vehicle`
+
+__all__ = ["BENCHMARKS", "KIKI_2020", "NURHADI_2022", "STUDIES", "VEHICLE_STUDIES"]
