@@ -75,18 +75,23 @@ ATTITUDES = ("input", "measured", "level")
 def transition_of(states: str, method: str, torque_is_input: bool, attitude: str) -> tuple[Callable, Callable]:
     """One step of a model, and its Jacobian, as functions of the model's own inputs."""
     step, jacobian = MODELS[states].methods[method]
+    source = f"move(x, {tuple_of(forces_of(states, torque_is_input, attitude != 'level'))}, c)"
+    return (
+        written_out("transition", "x, u, c", source, move=step),
+        written_out("transition_jacobian", "x, u, c", source, _loops=True, move=jacobian),
+    )
+
+
+def forces_of(states: str, torque_is_input: bool, attitude_is_input: bool) -> list[str]:
+    """The inputs of the equations of motion as sources, of the model's own inputs u and constants c."""
     if torque_is_input:
         inputs = ["u[0]", "u[1]", "u[2]", "u[3]"]
     else:
         inputs = ["u[0]", "c.propeller_torque * u[0]", "u[1]", "u[2]"]
     if states == "velocities":
         first = 4 if torque_is_input else 3
-        inputs += [f"u[{first}]", f"u[{first + 1}]"] if attitude != "level" else ["0.0", "0.0"]
-    source = f"move(x, {tuple_of(inputs)}, c)"
-    return (
-        written_out("transition", "x, u, c", source, move=step),
-        written_out("transition_jacobian", "x, u, c", source, _loops=True, move=jacobian),
-    )
+        inputs += [f"u[{first}]", f"u[{first + 1}]"] if attitude_is_input else ["0.0", "0.0"]
+    return inputs
 
 
 @inlined

@@ -93,6 +93,10 @@ class Live:
         """Restarts from the prior, so far."""
         return self._session.divergences
 
+    def told(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+        """Copies of mean, covariance and the last innovation with its covariance, and its log-likelihood."""
+        return self._session.told()
+
     def start(self, time: float, z: Sequence[float] | np.ndarray | None = None, key=(0, 0)) -> None:
         """Begin with the prior at a time [s], updated with a measurement z (m,) if there is one."""
         time = finite("time", time)

@@ -15,7 +15,6 @@ from filters.logs.columns import columns_of
 from filters.logs.estimate import LogEstimate, estimate
 from filters.logs.findings import LogFindings, Residual, findings
 from filters.logs.verdict import ALPHA, verdict
-from filters.monitoring.monitor import monitor_of
 from thruster_cli.options import (
     A_LOG,
     FILTER,
@@ -28,8 +27,11 @@ from thruster_cli.options import (
     JsonOption,
     LogPresetOption,
     ModelOption,
+    MonitorOption,
+    NoGridOption,
     SeedOption,
     SensorOption,
+    asked_monitor,
     filter_option,
     one_file,
 )
@@ -56,6 +58,7 @@ def command(
     column: ColumnOption = None,
     clock_offset: ClockOption = None,
     dt: DtOption = None,
+    no_grid: NoGridOption = False,
     ensemble_size: Annotated[
         int | None,
         typer.Option(
@@ -75,15 +78,7 @@ def command(
             rich_help_panel=RUNS,
         ),
     ] = None,
-    monitor: Annotated[
-        float | None,
-        typer.Option(
-            metavar="STEPS",
-            help="Test for outliers, biases, changed noise, stuck and missing readings, with one false alarm in "
-            "so many steps (docs/monitoring.md).",
-            rich_help_panel=RUNS,
-        ),
-    ] = None,
+    monitor: MonitorOption = None,
     isolate: Annotated[
         bool,
         typer.Option(
@@ -124,10 +119,10 @@ def command(
         check_picture(plot, "--plot")
     if out is not None:
         check_suffix(out)
-    watch = monitor_of(monitor)
+    watch = asked_monitor(monitor, tuned)
     if isolate and watch is None:
         raise ValueError("--isolate must come with --monitor STEPS, whose alarms it counts")
-    recorded, offer = read_named(log, preset, model, sensor, column, clock_offset, dt)
+    recorded, offer = read_named(log, preset, model, sensor, column, clock_offset, dt, grid=not no_grid)
     check_targets((out, plot), json, read=(log, tuned, preset))
     announce_compilation()
     numbers = {} if ensemble_size is None else {"ensemble_size": ensemble_size}
@@ -152,7 +147,8 @@ def _title(found: LogEstimate) -> str:
 
 def _shown(found: LogEstimate, told: LogFindings) -> list[RenderableType]:
     log = found.log
-    about = f"{log.steps + 1} rows, dt {log.dt:g} s" + (", put on a grid" if log.irregular else "")
+    how = ", on its own stamps" if log.stamps is not None else ", put on a grid" if log.irregular else ""
+    about = f"{log.steps + 1} rows, dt {log.dt:g} s{how}"
     title = f"{_title(found)} on {log.name} ({about}); scored: rows {told.first} to {log.steps}"
     rows = [
         ["mean NIS over channels", f"{told.mean_nis:.3g}", f"{told.nis_band[0]:.3g} to {told.nis_band[1]:.3g}"],
@@ -216,6 +212,7 @@ def _as_json(found: LogEstimate, told: LogFindings) -> dict:
         "dt": log.dt,
         "rows": log.steps + 1,
         "irregular": log.irregular,
+        "grid": log.stamps is None,
         "filter": found.filter.name,
         "smoothed": found.smoothed,
         "first_row": told.first,

@@ -10,7 +10,7 @@ import typer
 from filters.c.programs import programs_of
 from filters.c.project import write_project
 from filters.c.single import single_error
-from thruster_cli.options import OUTPUT, CodeOption, JsonOption, LogModelOption
+from thruster_cli.options import OUTPUT, CodeOption, JsonOption, LogModelOption, MonitorOption, asked_monitor
 from thruster_cli.output import announce_compilation, check_targets, emit
 from thruster_env.numerics.checks import one_of
 from tuning.evaluation.tuned import read_tuned
@@ -30,11 +30,18 @@ def command(
     single: Annotated[
         bool, typer.Option("--single", help="Floats in place of doubles.", rich_help_panel=OUTPUT)
     ] = False,
+    monitor: MonitorOption = None,
+    board: Annotated[
+        bool,
+        typer.Option(
+            "--board", help="Also board.c and board.ld, for an emulated Cortex-M4.", rich_help_panel=OUTPUT
+        ),
+    ] = False,
     problem: CodeOption = None,
     model: LogModelOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Write a tuned Kalman filter as C99: model, Q and R in it, and a program that filters a log.
+    """Write a tuned Kalman or ensemble filter as C99: model, Q and R in it, and a program that filters a log.
 
     Any one but gsf and fuzzy. The code has fixed sizes and needs math.h alone; a class of C++ lies beside it. With
     --single the largest change of an estimate on a training run is printed. docs/howto/export.md says more.
@@ -42,10 +49,11 @@ def command(
     Example: thruster export out/ekf-mismatch-seed0.json --out boat
     """
     one_of("a language", language, LANGUAGES)
+    watch = asked_monitor(monitor, file)
     check_targets((out / "README.md",), json, read=(file,))
     choice, found, seed = read_tuned(file, [*map(find_problem, problem or []), *problems_in(file, model)])
     filter_ = choice.filter(found)
-    files = [str(one) for one in write_project(filter_, out, name, single=single)]
+    files = [str(one) for one in write_project(filter_, out, name, single=single, monitor=watch, board=board)]
     lines, error = [f"wrote {one}" for one in files], None
     if single:
         announce_compilation()

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from filters.monitoring.monitor import Monitor, monitor_of
+from filters.monitoring.stored import tuned_monitor
 from filters.registry import FILTERS
 from filters.starts import STARTS
 from thruster_env.channels import CHANNELS
@@ -133,6 +135,25 @@ DtOption = Annotated[
         rich_help_panel=INPUT,
     ),
 ]
+NoGridOption = Annotated[
+    bool,
+    typer.Option(
+        "--no-grid",
+        help="Go by the log's own stamps, for a model in continuous time; variances are per step of --dt.",
+        rich_help_panel=INPUT,
+    ),
+]
+TUNED = "tuned"  # of --monitor
+MonitorOption = Annotated[
+    str | None,
+    typer.Option(
+        "--monitor",
+        metavar="STEPS",
+        help="Test for outliers, biases, changed noise, stuck and missing readings, with one false alarm in so "
+        "many steps, or 'tuned', as the tuned file says (docs/monitoring.md).",
+        rich_help_panel=RUNS,
+    ),
+]
 LogOption = Annotated[
     list[Path] | None,
     typer.Option(
@@ -191,3 +212,15 @@ LogModelOption = Annotated[
         rich_help_panel=INPUT,
     ),
 ]
+
+
+def asked_monitor(given: str | None, tuned: Path | None) -> Monitor | None:
+    """The monitor of --monitor: steps between false alarms, or that of the tuned file."""
+    if given != TUNED:
+        try:
+            return monitor_of(None if given is None else float(given))
+        except ValueError as error:
+            raise ValueError(f"--monitor must be steps, or {TUNED!r}, but got {given}: {error}") from None
+    if tuned is None:
+        raise ValueError(f"--monitor {TUNED} must come with a tuned file, but there is none")
+    return tuned_monitor(tuned)

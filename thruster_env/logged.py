@@ -44,7 +44,10 @@ _FURTHER = (
 _named_tuple: Any = NamedTuple  # type checkers know fields only where they are written out
 LoggedConstants = _named_tuple("LoggedConstants", [(name, float) for name in (*Constants._fields, *_FURTHER)])
 """`dynamics.Constants`, and what logs show beside."""
-
+LaggingConstants = _named_tuple(
+    "LaggingConstants", [*LoggedConstants.__annotations__.items(), ("of_one_dt", float)]
+)
+"""The same of sensors with a lag, whose shares follow from the step: `Session.set_dt` refuses them."""
 
 NO_BAND = 0.0, 0.0
 LONGEST_LAGS = 700.0  # time constants in a step, beyond which nothing is left of the last reading
@@ -146,7 +149,7 @@ def with_shown(base: StateSpaceModel, plant: Plant, seen: Shown, *, always: bool
     lagging = tuple(channel in lags for channel in channels)
     of_plant = Constants(*base.constants)
     step = of_plant.substep
-    constants = LoggedConstants(
+    given = (
         *of_plant,
         seen.dead_band_low,
         seen.dead_band_high,
@@ -154,6 +157,7 @@ def with_shown(base: StateSpaceModel, plant: Plant, seen: Shown, *, always: bool
         *_by_place(lag_weights(lags.get(channel, 0.0), step)[0] for channel in channels),
         *_by_place(lag_weights(lags.get(channel, 0.0), step)[1] for channel in channels),
     )
+    constants = LaggingConstants(*given, 1.0) if any(lagging) else LoggedConstants(*given)
     f, f_slopes, h, h_slopes = _functions(channels, lagging)
     read = channel_functions(channels)[0]
 

@@ -1,7 +1,8 @@
 """Filters as C99 for a controller: no heap, no recursion, no library but math.h.
 
 programs    a page's functions as programs, with the numbers of a model in them
-source      NAME.h and NAME.c of these
+source      NAME.h and NAME.c of these: writer, and of an ensemble's members ensemble
+monitor     tests of the innovations in them
 cpp         NAME.hpp, a class of C++ around them
 sizes       bytes of the struct, the stack and the code
 project     a folder with these, a program that filters a log (log_program), and how to build them

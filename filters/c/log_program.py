@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from filters.c.programs import FilterPrograms
 from filters.logs.columns import header_of
+from filters.logs.estimate import SKIPPED
+from thruster_env.numerics.streams import filter_keys
 from thruster_env.plants.logs.columns import plain
 from thruster_env.plants.logs.units import suffix
 from thruster_env.plants.quantities import Quantity
-from thruster_env.plants.state_space import StateSpaceModel
 
 MAIN = """\
 /* Filter a log: a CSV with a row a step on standard input, estimates on standard output.
@@ -14,7 +16,7 @@ MAIN = """\
        @NAME@_log [HEADER ...] < log.csv > estimates.csv
 
    HEADER names the columns of the inputs, then of the measurements; without any they are those below. An input
-   acts from its row on. An empty cell is a missing measurement. */
+   acts from its row on. An empty cell is a missing measurement.@ABOUT@ */
 #include "@NAME@.h"
 
 #include <math.h>
@@ -22,7 +24,8 @@ MAIN = """\
 #include <stdlib.h>
 #include <string.h>
 
-enum { INPUTS = @INPUTS@, CHANNELS = @CHANNELS@, COLUMNS = INPUTS + CHANNELS, STATES = @STATES@, LONGEST = 65536 };
+enum { INPUTS = @INPUTS@, CHANNELS = @CHANNELS@, COLUMNS = INPUTS + CHANNELS, STATES = @STATES@@TESTED@ };
+enum { LONGEST = 65536 };
 
 static const char *headers[COLUMNS] = {@HEADERS@};
 static int column_of[COLUMNS];
@@ -84,7 +87,7 @@ int main(int count, char **words)
         }
     }
     printf("time_s@TITLES@\\n");
-    @NAME@_init(&filter);
+    @NAME@_init(&filter@KEY@);
     for (long row = 0; fgets(line, LONGEST, stdin) != NULL; row++) {
         const char *time = "";
 
@@ -104,7 +107,7 @@ int main(int count, char **words)
         if (row > 0) {
 @CHECK@            @NAME@_predict(&filter@LAST@);
         }
-        @NAME@_update(&filter, values + INPUTS);
+@BEGIN@        @NAME@_update(&filter, values + INPUTS);
         printf("%s", time);
         for (int i = 0; i < STATES; i++) {
             show((double)filter.x[i]);
@@ -114,7 +117,7 @@ int main(int count, char **words)
             show(isnan(values[INPUTS + i]) ? (double)NAN : (double)filter.innovation[i]);
             show(sqrt((double)filter.S[i * (CHANNELS + 1)]));
         }
-        printf("\\n");
+@ALARMS@        printf("\\n");
     }
     return 0;
 }
@@ -129,17 +132,43 @@ CHECK = """\
 """
 
 
-def log_program(name: str, model: StateSpaceModel, *, single: bool = False) -> str:
-    """The source of the program for a filter in C of this name, on this model.
+ABOUT = """ Columns alarm_... count the tests of a
+   channel that raise an alarm, from row TESTED on."""
+BEGIN = """\
+        if (row == TESTED) {
+            @NAME@_test_anew(&filter);
+        }
+"""
+ALARMS = """\
+        for (int i = 0; i < CHANNELS; i++) {
+            int count = 0;
+            for (unsigned some = row < TESTED ? 0 : filter.channel[i].alarms; some > 0; some >>= 1) {
+                count += (int)(some & 1u);
+            }
+            show((double)count);
+        }
+"""
 
-    The columns of its output are those of `thruster estimate`: the estimate and its standard deviation, then each
-    innovation with its own.
+
+def log_program(name: str, programs: FilterPrograms, *, single: bool = False, tested: bool = False) -> str:
+    """The source of the program for a filter in C of this name.
+
+    An ensemble's random numbers are those of seed 0 in `thruster estimate`, whose columns are those of its output:
+    the estimate and its standard deviation, then each innovation with its own. Where the filter tests its
+    innovations, the number of alarms of each channel follows, from row 50 on, as with `--skip 50`.
     """
+    model, key = programs.model, "".join(f", {int(word)}" for word in filter_keys([0])[0])
     pairs = [(model.states, ("", "std")), (model.measurements, ("innovation", "innovation_std"))]
     titles = [header_of(what, one) for some, kinds in pairs for one in some for what in kinds]
+    titles += [header_of("alarm", one._replace(unit="")) for one in model.measurements if tested]
     headers = [_header(one) for one in (*model.input_quantities, *model.measurements)]
     words = {
+        "ABOUT": ABOUT * tested,
+        "BEGIN": BEGIN * tested,
+        "ALARMS": ALARMS * tested,
+        "TESTED": f", TESTED = {SKIPPED}" * tested,
         "CHECK": CHECK if model.inputs else "            (void)last;\n",
+        "KEY": key * (programs.members > 0),
         "NAME": name,
         "REAL": "float" if single else "double",
         "INPUTS": str(model.inputs),

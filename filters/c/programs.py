@@ -3,30 +3,35 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from math import prod
 from typing import NamedTuple
 
 import numpy as np
 
 from filters.engine.layout import memory_places
+from filters.ensembles.ensemble import EnsembleFilter
 from filters.filter import Filter
 from filters.pages.equations import Equations
 from filters.pages.kernels import stages_of
+from filters.pages.members import MembersMemory
+from filters.pages.members import stages_of as stages_of_members
 from filters.pages.memory import RowMemory
-from filters.pages.page_filter import with_page
+from filters.pages.page_filter import FilterWithPage, with_page
 from filters.pages.stages import numbers_of
 from filters.pages.traced import MOST, Traced
 from thruster_env.numerics.algebra.densities import dot
 from thruster_env.numerics.algebra.graphs import Graph, TooLarge
 from thruster_env.numerics.algebra.matrices import Matrix, evaluate
 from thruster_env.numerics.algebra.operations import factor, quotient
-from thruster_env.numerics.algebra.programs import Place, Program, program_of
+from thruster_env.numerics.algebra.programs import BY_MEMBERS, Place, Program, program_of
 from thruster_env.plants.shape import Shape
 from thruster_env.plants.state_space import StateSpaceModel
 
 NIS = -1  # its place in a row, where machine code has none
-TOLD = ("x", "P", "innovation", "S", "nis", "log_likelihood", "channels", "restarts")  # of each filter in C
+TOLD = frozenset(  # of each filter in C, and by its tests
+    "x P innovation S nis log_likelihood channels restarts channel healthy tested alarmed".split()
+)
 KEYWORDS = frozenset(
     "auto break case char const continue default do double else enum extern float for goto if inline int long "
     "main register restrict return short signed sizeof static struct switch typedef union unsigned void volatile "
@@ -47,14 +52,16 @@ class FilterPrograms(NamedTuple):
     """What the functions of a filter do, as programs whose places are expressions of C.
 
     Attributes:
-        start: what the filter keeps besides mean and covariance, at the prior.
+        start: what the filter keeps besides mean and covariance, at the prior; of an ensemble the members.
         begin: X, which is predicted in place of them: points, one behind the other, or a mean and a root.
-        advance: a substep of the belief or of X under u; of points that of one, x.
+        advance: a substep of the belief or of X under u; of points that of one, x; of an ensemble all members.
         settle: the belief at the end of a step.
         update: the belief after z, the innovation, and what is told of it.
+        summarise: mean and covariance of an ensemble.
         kept: the shapes of what the filter keeps, by name.
         flying: how many numbers X has.
         points: how many there are, if X are points that are moved one by one; else 0.
+        members: how many an ensemble has; else 0.
         model: that the filter runs on.
         page: the module in which the filter's equations stand.
     """
@@ -64,49 +71,97 @@ class FilterPrograms(NamedTuple):
     advance: Program
     settle: Program
     update: Program
+    summarise: Program
     kept: Mapping[str, tuple[int, ...]]
     flying: int
     points: int
+    members: int
     model: StateSpaceModel
     page: str
+
+    @property
+    def all(self) -> tuple[Program, ...]:
+        """The programs."""
+        return self[:6]
+
+    @property
+    def operations(self) -> tuple[int, int]:
+        """How many operations a prediction and an update are, without those of random numbers."""
+        begin, advance, settle, update, summarise = (
+            sum(self.members if one.member else 1 for one in program.works) for program in self[1:6]
+        )
+        substeps = self.model.substeps * max(self.points, 1)
+        return begin + substeps * advance + settle + summarise, update
 
 
 def programs_of(filter_: Filter) -> FilterPrograms:
     """The programs of a filter.
 
     Raises:
-        ValueError: for a filter without a page, a model whose functions cannot be traced or are too large, or a
-            page that keeps something under a name that C does not take.
+        ValueError: for a filter without a page, random rotations, a model whose functions cannot be traced or are
+            too large, or a page that keeps something under a name that C does not take.
     """
     paged = with_page(filter_, "a filter in C")
-    model, page, numbers = paged.kernel_model, paged.written_page, paged.numbers
-    shape, (f, by_f, h, by_h) = model.shape, model.functions
-    places, memory = memory_places(shape.n, shape.m), RowMemory(shape, page)
+    shape, (f, by_f, h, by_h) = paged.kernel_model.shape, paged.kernel_model.functions
     try:
         _check_traced("transition", f, by_f, 2, shape)
         _check_traced("observe", h, by_h, 1, shape)
-        equations = Equations(model.functions, memory, constants_move=False, trace=True)
-        stages = [one.of_rows for one in stages_of(page, memory, equations)]
-        kept = {name: one.shape for name, one in memory.kept.items()}
-        if wrong := [name for name in kept if name in TOLD or not is_name(name)]:
-            raise ValueError(f"what a filter in C keeps must have a name that is free there, but got {wrong[0]!r}")
-        flying = memory.end - places.extras - sum(prod(size) for size in kept.values())
-        points = _points_of(stages[2], equations, memory, flying)
-        if points:
-            stages[2] = {places.mean: equations.f(memory.x, memory.u)}
-        v, s = stages[4][places.innovation], stages[4][places.innovation_cov]
-        stages[4][NIS] = dot(v, quotient(v, factor(s)))
-        means = ["filter->x"] * 2 + ["x" if points else "filter->x"] + ["filter->x"] * 2
-        written = [
-            _program(stage, _where(memory, flying, points, mean, given), numbers)
-            for stage, mean, given in zip(stages, means, "uuuuz", strict=True)
-        ]
+        return _of_members(paged) if isinstance(paged, EnsembleFilter) else _of_rows(paged)
     except TooLarge as error:
         raise ValueError(f"a filter in C must have few operations, but got a model for which {error}") from error
-    start, begin, advance, settle, update = written
-    return FilterPrograms(
-        start, begin, advance, settle, update, kept, flying, points, model, page.update.__module__
+
+
+def _of_rows(paged: FilterWithPage) -> FilterPrograms:
+    """The programs of a filter of mean and covariance."""
+    model, page, numbers = paged.kernel_model, paged.written_page, paged.numbers
+    shape = model.shape
+    places, memory = memory_places(shape.n, shape.m), RowMemory(shape, page)
+    equations = Equations(model.functions, memory, constants_move=False, trace=True)
+    stages = [one.of_rows for one in stages_of(page, memory, equations)]
+    kept = {name: one.shape for name, one in memory.kept.items()}
+    if wrong := [name for name in kept if name in TOLD or not is_name(name)]:
+        raise ValueError(f"what a filter in C keeps must have a name that is free there, but got {wrong[0]!r}")
+    flying = memory.end - places.extras - sum(prod(size) for size in kept.values())
+    points = _points_of(stages[2], equations, memory, flying)
+    if points:
+        stages[2] = {places.mean: equations.f(memory.x, memory.u)}
+    stages[4][NIS] = _nis(stages[4][places.innovation], stages[4][places.innovation_cov])
+    others = [
+        *((one.operation.at, one.shape, f"filter->{name}") for name, one in memory.kept.items()),
+        (memory.end - flying, (flying,), "X"),
+    ]
+    means = ["filter->x"] * 2 + ["x" if points else "filter->x"] + ["filter->x"] * 2
+    start, begin, advance, settle, update = (
+        _program({Place("rows", at): one for at, one in stage.items()}, lies, numbers, Graph(MOST))
+        for stage, mean, given in zip(stages, means, "uuuuz", strict=True)
+        for lies in [_where(shape, mean, given, others, points)]
     )
+    programs = start, begin, advance, settle, update, Program([], [], [])
+    return FilterPrograms(*programs, kept, flying, points, 0, model, page.update.__module__)
+
+
+def _of_members(paged: EnsembleFilter) -> FilterPrograms:
+    """The programs of an ensemble filter."""
+    if getattr(paged, "rotations", 0):
+        raise ValueError("an ensemble in C must have no random rotations, but got rotations=1")
+    model, page, numbers, size = paged.kernel_model, paged.written_page, paged.numbers, paged.size
+    shape, memory = model.shape, MembersMemory(model.shape, page)
+    stages = stages_of_members(page, memory, Equations(model.functions, memory, constants_move=False, trace=True))
+    told = {place: one for name in stages for place, one in stages[name].stores[0]}
+    places = memory_places(shape.n, shape.m)
+    v, s = (told[Place("rows", at)] for at in (places.innovation, places.innovation_cov))
+    stages["update"].values[Place("rows", NIS)] = _nis(v, s)
+    begin = Program([], [], [])
+    start, advance, settle, update, summarise = (
+        _program(dict(stages[name].stores[0]), _where(shape, "filter->x", given, []), numbers, Graph(MOST, size))
+        for name, given in (("start", "u"), ("advance", "u"), ("settle", "u"), ("update", "z"), ("summarise", "z"))
+    )
+    programs = start, begin, advance, settle, update, summarise
+    return FilterPrograms(*programs, {}, 0, 0, size, model, type(paged).page.update.__module__)
+
+
+def _nis(v: Matrix, s: Matrix) -> Matrix:
+    return dot(v, quotient(v, factor(s)))
 
 
 def is_name(text: str) -> bool:
@@ -135,9 +190,11 @@ def _points_of(advance: Mapping[int, Matrix], equations: Equations, memory: RowM
     return moved.shape[1] if moved is equations.f(moved.of[0], memory.u) else 0
 
 
-def _where(memory: RowMemory, flying: int, points: int, mean: str, given: str) -> Callable[[Place], Place]:
+def _where(
+    shape: Shape, mean: str, given: str, others: Sequence[tuple[int, tuple[int, ...], str]], points: int = 0
+) -> Callable[[Place], Place]:
     """Where a place lies in C: in the filter, in X, or in what is given, u or z."""
-    n, m = memory.shape.n, memory.shape.m
+    n, m = shape.n, shape.m
     places = memory_places(n, m)
     parts = [
         (NIS, (), "filter->nis"),
@@ -146,34 +203,36 @@ def _where(memory: RowMemory, flying: int, points: int, mean: str, given: str) -
         (places.innovation, (m,), "filter->innovation"),
         (places.innovation_cov, (m, m), "filter->S"),
         (places.log_likelihood, (), "filter->log_likelihood"),
-        *((one.operation.at, one.shape, f"filter->{name}") for name, one in memory.kept.items()),
-        (memory.end - flying, (flying,), "X"),
+        *others,
     ]
 
     def lies(place: Place) -> Place:
         if place.array == "given":
             return Place(given, place.at)
-        first, shape, name = next(one for one in parts if 0 <= place.at - one[0] < prod(one[1]))
+        if place.array in BY_MEMBERS:
+            return place
+        first, size, name = next(one for one in parts if 0 <= place.at - one[0] < prod(one[1]))
         at = place.at - first
         if name == "X" and points:  # one behind the other
             row, column = divmod(at, points)
             at = column * n + row
-        return Place(name, at) if shape else Scalar(name, at)
+        return Place(name, at) if size else Scalar(name, at)
 
     return lies
 
 
-def _program(stage: Mapping[int, Matrix], lies: Callable[[Place], Place], numbers: np.ndarray) -> Program:
+def _program(
+    stage: Mapping[Place, Matrix], lies: Callable[[Place], Place], numbers: np.ndarray, graph: Graph
+) -> Program:
     """The program of a stage, of the numbers of a model and a filter as constants."""
-    graph = Graph(MOST)
 
-    def number(place: Place):
+    def number(place: Place, **of_member: bool):
         if place.array == "numbers":
             return graph.constant(numbers[place.at])
-        return graph.given(lies(place))
+        return graph.given(lies(place), **of_member)
 
     wanted, stores = list(stage.values()), []
-    for at, value in zip(stage, evaluate(wanted, numbers_of(wanted, number)), strict=True):
+    for (array, first), value in zip(stage, evaluate(wanted, numbers_of(wanted, number)), strict=True):
         for k, one in enumerate(np.ravel(np.array(value, dtype=object))):
-            stores.append((lies(Place("rows", at + k)), graph.number(one)))
+            stores.append((lies(Place(array, first + k)), graph.number(one)))
     return program_of(stores, {})

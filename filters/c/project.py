@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
+from filters.c import board as emulated
 from filters.c.cpp import class_of
 from filters.c.log_program import log_program
+from filters.c.monitor import TestsWriter
 from filters.c.programs import programs_of
 from filters.c.sizes import COMPILERS, Sizes, sizes_of
 from filters.c.source import c_filter
 from filters.filter import Filter
+from filters.monitoring.monitor import Monitor, monitor_of
 from thruster_env.numerics.files import check_target, write_whole
 
 CMAKE = """\
@@ -44,11 +48,23 @@ or `cmake -B build && cmake --build build`. Do not compile with -ffast-math, whi
 
 A prediction is {predict} operations of floating point, an update {update}. With another compiler:
 `cc -std=c99 -Os -fstack-usage -c {name}.c && size {name}.o && cat {name}.su`.
+{draws}{alarms}{board}"""
+DRAWS = """
+`{name}_init` takes a key, two words of 32 bits, from which all random numbers of the {members} members follow by
+Philox4x32-10. The same key gives the estimates of `filter_.init(key)` in Python; drawing is not counted above.
+Members, their random numbers and scratch lie in the struct. `-O3 -fno-math-errno` makes vector instructions of the
+loops over members, and leaves the numbers as they are.
 """
 
 
 def write_project(
-    filter_: Filter, folder: str | Path, name: str | None = None, *, single: bool = False
+    filter_: Filter,
+    folder: str | Path,
+    name: str | None = None,
+    *,
+    single: bool = False,
+    monitor: Monitor | Mapping | float | None = None,
+    board: bool = False,
 ) -> list[Path]:
     """Write a filter in C, a program that filters a log with it, and how to build them; return the files.
 
@@ -60,14 +76,16 @@ def write_project(
         folder: for the files; made if it is not there.
         name: of the filter; that of its type by default.
         single: floats in place of doubles.
+        monitor: tests of the innovations, as wrappers take them.
+        board: whether board.c and board.ld are written as well, for a Cortex-M4 that QEMU emulates.
 
     Raises:
-        ValueError: as `c_filter`, or if a file cannot be written.
+        ValueError: as `c_filter`, for a wrong monitor, or if a file cannot be written.
     """
-    made, programs = c_filter(filter_, name, single=single), programs_of(filter_)
+    watch = monitor_of(monitor)
+    made, programs = c_filter(filter_, name, single=single, monitor=watch), programs_of(filter_)
     model = programs.model
-    substeps = model.substeps * max(programs.points, 1)
-    steps = [programs.begin.operations, programs.advance.operations * substeps, programs.settle.operations]
+    predict, update = programs.operations
     sizes = {one: found for one in COMPILERS if (found := sizes_of(made, one)) is not None}
     labels = (", ".join(one.short_label for one in some) or "none" for some in model.quantities)
     about = {
@@ -81,16 +99,20 @@ def write_project(
             key: " | ".join(str(getattr(one, key)) for one in sizes.values()) or "not measured"
             for key in Sizes._fields
         },
-        "predict": sum(steps),
-        "update": programs.update.operations,
+        "predict": predict,
+        "update": update,
+        "draws": DRAWS.format(name=made.name, members=programs.members) if programs.members else "",
+        "alarms": "" if watch is None else TestsWriter(watch, made.name, model.m, single).readme,
+        "board": _of_board(made.name) if board else "",
     }
     texts = {
         f"{made.name}.h": made.header,
         f"{made.name}.c": made.source,
-        f"{made.name}.hpp": class_of(made.name, programs, single=single),
-        "main.c": log_program(made.name, model, single=single),
+        f"{made.name}.hpp": class_of(made.name, programs, single=single, tested=watch is not None),
+        "main.c": log_program(made.name, programs, single=single, tested=watch is not None),
         "CMakeLists.txt": CMAKE.format(name=made.name),
         "README.md": README.format(**about),
+        **({"board.c": emulated.BOARD, "board.ld": emulated.MEMORY} if board else {}),
     }
     files = [Path(folder) / one for one in texts]
     for file in files:
@@ -98,3 +120,9 @@ def write_project(
     for file, text in zip(files, texts.values(), strict=True):
         write_whole(file, text)
     return files
+
+
+def _of_board(name: str) -> str:
+    """The part of the README on the emulated controller."""
+    build = emulated.BUILD.format(name=name, flags="-std=c99 -O2")
+    return emulated.README.format(build=build, emulate=emulated.EMULATE.format(name=name))

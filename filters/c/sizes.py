@@ -12,7 +12,7 @@ from filters.c.source import CFilter
 
 CORTEX_M4 = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"
 COMPILERS = {"gcc": "", "arm-none-eabi-gcc": CORTEX_M4}  # with arguments
-ONE = '#include "{name}.h"\n\nextern {name} one;\n{name} one;\n'  # a global, which is its size
+ONE = '#include "{name}.h"\n\nextern {name} a_filter;\n{name} a_filter;\n'  # a global, which is its size
 
 
 class Sizes(NamedTuple):
@@ -43,5 +43,14 @@ def sizes_of(made: CFilter, compiler: str = "gcc") -> Sizes | None:
         lines = Path(folder, "filter.su").read_text(encoding="utf-8").splitlines()
     stacks = {line.split("\t")[0].rsplit(":", 1)[1]: int(line.split("\t")[1]) for line in lines}
     own = [stacks.pop(f"{made.name}_{one}", 0) for one in ("init", "predict", "update")]
-    within = stacks.pop("become_prior", 0) + stacks.pop("start", 0), *stacks.values()
+    tested = stacks.pop("test_update", 0) + stacks.pop("test_channel", 0) + stacks.pop("sound", 0)
+    drawn = stacks.pop("draw", 0) + stacks.pop("philox", 0)
+    of_prior = max(drawn, stacks.pop("start", 0), stacks.pop("summarise", 0))
+    of_update = max((stacks.pop(one) for one in [*stacks] if one.startswith("geometric_mean")), default=0)
+    within = (
+        stacks.pop("become_prior", 0) + of_prior,
+        stacks.pop("correct", 0) + of_update,
+        tested,
+        *stacks.values(),
+    )
     return Sizes(struct, max(own) + max(within), code + data + bss)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -33,6 +34,12 @@ class Estimates(NamedTuple):
     innovation_covs: np.ndarray
     log_likelihoods: np.ndarray
     divergences: np.ndarray
+
+
+def estimates_of(rows: Sequence[tuple], divergences: int) -> Estimates:
+    """What `run` gives of one trajectory, from what `Session.told` said of each row."""
+    parts = [np.array(part)[None] for part in zip(*rows, strict=True)]
+    return Estimates._make([*parts, np.array([divergences])])
 
 
 def run(

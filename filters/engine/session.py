@@ -149,6 +149,9 @@ class Session:
         """Where the constant lies, and how many of it are a step."""
         model = self._filter.kernel_model
         names = getattr(model.constants, "_fields", ())
+        if "of_one_dt" in names:
+            rule = "set_dt must be called on a model whose other constants do not follow from dt"
+            raise ValueError(f"{rule}, but got those of lagging sensors")
         for name, parts in (("dt", 1), ("substep", model.substeps)):
             if name in names:
                 return self._noise_places.constants + names.index(name), parts
@@ -261,6 +264,10 @@ class Session:
             total += np.abs(members[: len(self.mean)]).sum()
         kind = Belief if total < np.inf else LostBelief
         return kind(self.mean.copy(), self.cov.copy(), members, key, step, self.divergences, extras)
+
+    def told(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+        """Copies of mean, covariance and the last innovation with its covariance, and its log-likelihood."""
+        return self.mean.copy(), self.cov.copy(), *self.innovation_copy()
 
     def innovation_copy(self) -> Innovation:
         """A copy of the last update's innovation."""

@@ -92,10 +92,14 @@ class EnsembleFilter(FilterWithPage):
     @property
     def written_page(self) -> Page:
         """The page, with what controls the spread where that does something."""
+        return self.page_with(self.inflation != 1.0, self.relaxation != 0.0)
+
+    def page_with(self, inflation: bool = True, relaxation: bool = True) -> Page:
+        """The page, with inflation, relaxation, or both."""
         page = super().written_page
-        if self.inflation != 1.0:
+        if inflation:
             page = page._replace(settle=inflated(page.settle))
-        return page._replace(update=relaxed(page.update)) if self.relaxation else page
+        return page._replace(update=relaxed(page.update)) if relaxation else page
 
     def kernels(self) -> Kernels:
         """Kernels of the page for the model's functions; see `Filter.kernels`."""

@@ -65,7 +65,7 @@ def _without(found: LogEstimate, monitor: Monitor, first: int, channel: int) -> 
     """Alarms of a filter that does not see a channel."""
     measurements = found.log.measurements.copy()
     measurements[:, channel] = np.nan
-    again = estimate_with(found.filter, replace(found.log, measurements=measurements))
+    again = estimate_with(found.filter, replace(found.log, measurements=measurements), noise=found.noise)
     return [one for one in _alarms(again, monitor, first) if one.channel != channel]
 
 

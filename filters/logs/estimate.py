@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from filters.engine.batch import Estimates, run
+from filters.engine.batch import Estimates, estimates_of, run
 from filters.engine.session import Session
 from filters.estimators.estimator import Estimator
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
+from filters.logs.clock import by_the_clock, noise_by_rates
 from filters.smoothers.smooth import smooth
 from filters.wrappers.arguments import filter_for
 from thruster_env.numerics.checks import at_least
@@ -37,6 +38,7 @@ class LogEstimate(NamedTuple):
     log_likelihoods: np.ndarray  # (K + 1,), NaN for filters without a covariance
     divergences: int  # restarts from the prior
     smoothed: bool
+    noise: Callable[[float], np.ndarray] | None = None  # Q by the length of a step [s], on a log's own stamps
 
     @property
     def model(self) -> StateSpaceModel:
@@ -71,6 +73,7 @@ def estimate(
     columns: Mapping[str, str] | None = None,
     clock_offset: Mapping[str, float] | None = None,
     dt: float | None = None,
+    grid: bool = True,
     model_arguments: Mapping | None = None,
     seed: int = 0,
     **numbers,
@@ -78,7 +81,8 @@ def estimate(
     """Run a filter over a log, and a smoother after it if that is asked for.
 
     The numbers are those of `EstimateState(gym.make("Replay-v0", log=log, model=model), ...)` after
-    `reset(seed=seed)`.
+    `reset(seed=seed)`. On its own stamps a log is filtered by the clock, as `filter.live()` does it: Q of a step
+    is that of its length, of a `ContinuousModel` by its rates, else in proportion.
 
     Args:
         log: recorded run, or the path of a file.
@@ -91,6 +95,7 @@ def estimate(
         columns: headers by quantity, as `thruster_env.plants.logs.read.read_log` takes them.
         clock_offset: clock offsets [s] by quantity, as `read_log` takes them.
         dt: sample time [s], as `read_log` takes it. Covariances are per step and do not scale with dt.
+        grid: whether a file is put on a grid, as `read_log` takes it.
         model_arguments: arguments of the function that makes the model, such as `process_noise_cov`.
         seed: of the filter's random numbers.
         **numbers: the filter's own parameters, such as `ensemble_size`.
@@ -98,19 +103,42 @@ def estimate(
     Raises:
         ValueError: if an argument is wrong, or the file, the model and the filter do not fit.
     """
-    env = ReplayEnv(log, model, columns=columns, clock_offset=clock_offset, dt=dt)
+    env = ReplayEnv(log, model, columns=columns, clock_offset=clock_offset, dt=dt, grid=grid)
     filter_ = filter_for(env, filter, None, None if tuned is None else str(tuned), model_arguments, numbers)
-    return estimate_with(filter_, env.log, smoother=smoother, lag=lag, seed=seed)
+    noise = None if env.log.stamps is None else noise_by_rates(env.continuous, filter_.model, env.log.dt)
+    return estimate_with(filter_, env.log, smoother=smoother, lag=lag, seed=seed, noise=noise)
 
 
 def estimate_with(
-    filter_: Filter, log: Log, *, smoother: bool = False, lag: int | None = None, seed: int = 0
+    filter_: Filter,
+    log: Log,
+    *,
+    smoother: bool = False,
+    lag: int | None = None,
+    seed: int = 0,
+    noise: Callable[[float], np.ndarray] | None = None,
 ) -> LogEstimate:
-    """Run a given filter over a log; other arguments are those of `estimate`."""
+    """Run a given filter over a log.
+
+    Args:
+        filter_: the filter.
+        log: the log.
+        smoother: as `estimate` takes it.
+        lag: likewise.
+        seed: likewise.
+        noise: of a log on its own stamps, Q by the length of a step [s]; None for one in proportion to it.
+    """
     if lag is not None and not smoother:
         raise ValueError(f"a lag must be that of a smoother, but got lag {lag} without one")
     data = filter_keys([at_least("seed", seed, 0)]), log.inputs[None], log.measurements[None]
-    found = run(filter_, *data) if isinstance(filter_, ForeignFilter) else _stepped(filter_, *data)
+    if log.stamps is not None:
+        if smoother:
+            raise ValueError(f"a smoother must run on a grid, but log {log.name} has its own stamps")
+        found = by_the_clock(filter_, data[0][0], log, noise)
+    elif isinstance(filter_, ForeignFilter):
+        found = run(filter_, *data)
+    else:
+        found = _stepped(filter_, *data)
     means, covs = smooth(filter_, *data, lag) if smoother else (found.means, found.covs)
     likelihoods = found.log_likelihoods[0]
     return LogEstimate(
@@ -123,6 +151,7 @@ def estimate_with(
         likelihoods if filter_.has_covariance else np.full_like(likelihoods, np.nan),
         int(found.divergences[0]),
         smoother,
+        noise,
     )
 
 
@@ -134,9 +163,5 @@ def _stepped(filter_: Filter, keys: np.ndarray, inputs: np.ndarray, measurements
     for k in range(len(z)):
         if k:
             session.step(inputs[0, k - 1].tolist(), z[k])
-        rows.append((session.mean.copy(), session.cov.copy(), *session.innovation_copy()))
-    means, covs, innovations, innovation_covs, likelihoods = (
-        np.array(part)[None] for part in zip(*rows, strict=True)
-    )
-    counts = np.array([session.divergences])
-    return Estimates(means, covs, innovations, innovation_covs, likelihoods, counts)
+        rows.append(session.told())
+    return estimates_of(rows, session.divergences)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from filters.engine.belief import Kernels
 from filters.engine.layout import memory_places, own_place
-from filters.pages.equations import Equations
+from filters.pages.equations import Equations, PagedModel
 from filters.pages.memory import NumbersMemory
 from filters.pages.page import Page
 from filters.pages.programs import stored
@@ -50,7 +50,7 @@ class MembersMemory(NumbersMemory):
         self.mean = self.beside("rows", row.mean, shape.n)
 
 
-def stages_of(page: Page, memory: MembersMemory, model: Equations) -> dict[str, Stage]:
+def stages_of(page: Page, memory: MembersMemory, model: PagedModel) -> dict[str, Stage]:
     """What a page stores: at the start, in each substep, at its end, in an update; and the belief's moments."""
     x, places = memory.x, memory_places(memory.shape.n, memory.shape.m)
     told = places.innovation, places.innovation_cov, places.log_likelihood
@@ -67,7 +67,7 @@ def stages_of(page: Page, memory: MembersMemory, model: Equations) -> dict[str, 
     }
 
 
-def moments(model: Equations, x: Matrix) -> tuple[Matrix, Matrix]:
+def moments(model: PagedModel, x: Matrix) -> tuple[Matrix, Matrix]:
     """The mean and the covariance of the members."""
     return wrap(mean(x), model.state_angles), covariance(x, x)
 

@@ -21,12 +21,16 @@ class NumbersMemory:
         own: parameters, as pages find them.
         kept: what the filter keeps besides mean and covariance, by name.
         constants_slope, size: along a parameter that moves constants, if there are such.
+        belief: where mean and covariance lie.
+        told: where the innovation, its covariance and its log density lie.
     """
 
     def __init__(self, shape: Shape, page: Page, x: Matrix, p: Matrix, own: int):
         """Take the sizes, matrices that stand for a belief, and where the filter's parameters begin."""
         n, m = shape.n, shape.m
-        places = number_places(n, m)
+        places, row = number_places(n, m), memory_places(n, m)
+        self.belief = Place("rows", row.mean), Place("rows", row.cov)
+        self.told = tuple(Place("rows", at) for at in (row.innovation, row.innovation_cov, row.log_likelihood))
         self.shape, self.x, self.P = shape, x, p
         self.Q = self.beside("numbers", places.q, n, n, symmetric=True)
         self.R = self.beside("numbers", places.r, m, m, symmetric=True)

@@ -61,8 +61,8 @@ class PageFilter(FilterWithPage):
         return page_kernels(self.written_page, self.kernel_model.functions, self.kernel_model.shape)
 
 
-def with_page(filter_: Filter, what: str) -> PageFilter:
+def with_page(filter_: Filter, what: str) -> FilterWithPage:
     """A filter that has a page; of another one raise ValueError, which says what it was to be."""
-    if not isinstance(filter_, PageFilter):
-        raise ValueError(f"{what} must have a page of mean and covariance, as 'ekf' has, but got {filter_.name!r}")
+    if not isinstance(filter_, FilterWithPage):
+        raise ValueError(f"{what} must have a page, as 'ekf' and 'enkf' have, but got {filter_.name!r}")
     return filter_

@@ -1,7 +1,8 @@
 """What pages of filters say, worked out of tensors: a batch (..., rows, columns) in the place of each matrix.
 
-torch's autograd then differentiates it. An operation that nothing is said of here, such as a function of the
-model, computes on tensors itself.
+torch's autograd then differentiates it. A vector of which each member of an ensemble has one is a matrix
+(..., rows, members). An operation that nothing is said of here, such as a function of the model, computes on
+tensors itself.
 """
 
 from __future__ import annotations
@@ -14,7 +15,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from thruster_env.numerics.algebra import blocks, densities, matrices, operations, points, scalars
+from thruster_env.numerics.algebra import (
+    blocks,
+    densities,
+    geometric,
+    matrices,
+    members,
+    operations,
+    points,
+    scalars,
+)
 from thruster_env.numerics.algebra.matrices import Matrix, Operation
 from thruster_env.numerics.angles import TURN
 from thruster_env.numerics.triangles import RESOLUTION
@@ -31,17 +41,23 @@ def work_out(order: Sequence[Matrix], known: Mapping[Matrix, Tensor], like: Tens
     values: dict[Matrix, Any] = dict(known)
     for one in order:
         if one not in values:
-            arguments = (values[a] if isinstance(a, Matrix) else a for a in one.arguments)
+            arguments = (_beside(a, one, values) if isinstance(a, Matrix) else a for a in one.arguments)
             if one.operation in CONSTANT:
                 size = one.arguments[0].shape
                 values[one] = torch.as_tensor(one.operation.compute(np.zeros(size)), dtype=like.dtype).to(
                     like.device
                 )
             elif one.operation in OF_SHAPE:
-                values[one] = OF_SHAPE[one.operation](len(one.shape), *arguments)
+                values[one] = OF_SHAPE[one.operation](len(one.shape) + one.member, *arguments)
             else:
                 values[one] = RULES.get(one.operation, one.operation.compute)(*arguments)
     return values
+
+
+def _beside(a: Matrix, one: Matrix, values: Mapping[Matrix, Any]) -> Any:
+    """The value of an argument; a vector that is added to vectors of members, or multiplies them, is a column."""
+    found = values[a]
+    return found[..., None] if one.member and not a.member and one.operation in BY_ENTRIES else found
 
 
 def _wrapped(x: Tensor) -> Tensor:
@@ -161,6 +177,43 @@ def _hats(u: Tensor, nodes: Tensor) -> Tensor:
     return torch.nn.functional.pad(part, (1, 0), value=1.0) - torch.nn.functional.pad(part, (0, 1))
 
 
+def _covariance(x: Tensor, y: Tensor) -> Tensor:
+    """The sample covariance of members, with the divisor N - 1."""
+    return _deviations(x) @ _deviations(y).mT / (x.shape[-1] - 1)
+
+
+def _deviations(x: Tensor) -> Tensor:
+    return x - x.mean(-1, keepdim=True)
+
+
+def _stretches(before: Tensor, after: Tensor, part: Tensor) -> Tensor:
+    """`members.stretches`; where nothing is left there is no slope."""
+    there = after > 0
+    ratio = torch.where(there & (before > 0), before, 1.0) / torch.where(there, after, 1.0)
+    lost = torch.where(before > 0, ratio.sqrt(), 0.0) - 1.0
+    return torch.where(there, 1.0 + part[..., None] * lost, 1.0)
+
+
+def _geometric_mean(a: Tensor, b: Tensor) -> Tensor:
+    """`geometric.geometric_mean`."""
+    if a.shape[-1] == 1:
+        return (a * b).sqrt()
+    of_a, of_b = _unit(_factor(a)), _unit(_factor(b))
+    a, b = a / of_a, b / of_b
+    for _ in range(geometric.rounds(a.shape[-1])):
+        both = a + b
+        of = _factor(both)
+        unit = _unit(of)
+        a, b = both / unit, _symmetric(_quotient(2, a, of) @ b) * unit
+    return a * (of_a * of_b).sqrt()
+
+
+def _unit(root: Tensor) -> Tensor:
+    """A matrix over this has determinant 1, of its root."""
+    return (2.0 * torch.diagonal(root, dim1=-2, dim2=-1).log().mean(-1)).exp()[..., None, None]
+
+
+BY_ENTRIES = {matrices.add, matrices.subtract, scalars.entries_product}
 CONSTANT = {operations.eye, points.units, points.ones}  # depend on the sizes of their arguments alone
 OF_SHAPE: dict[Operation, Callable] = {
     matrices.multiply: _product,
@@ -168,6 +221,7 @@ OF_SHAPE: dict[Operation, Callable] = {
     operations.only: _only,
     operations.on_one_branch: _on_one_branch,
     points.on_one_side: _on_one_side,
+    members.on_one_branch: _on_one_side,
     matrices.scale: _multiple,
     scalars.choose: lambda dimensions, condition, a, b: where(condition, a, b, dimensions),
 }
@@ -204,5 +258,13 @@ RULES: dict[Operation, Callable] = {
     blocks.zeros: lambda a, *shape: a.new_zeros(shape),
     blocks.factor_of: lambda lower: lower,
     blocks.forward_quotient: _forward_quotient,
+    blocks.triangle_quotient: lambda a, lower: torch.linalg.solve_triangular(lower, a, upper=False, left=False),
+    members.mean: lambda x: x.mean(-1),
+    members.variances: lambda x: x.var(-1),
+    members.cross_covariance: _covariance,
+    members.scatter: lambda x: _covariance(x, x),
+    members.centred: lambda e: _deviations(e) * (e.shape[-1] / (e.shape[-1] - 1.0)) ** 0.5,
+    members.stretches: _stretches,
+    geometric.geometric_mean: _geometric_mean,
 }
 """Rules of others; sums, differences and multiples are those of tensors."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 from torch import Tensor
 
 
@@ -14,13 +15,24 @@ class TensorBelief(NamedTuple):
         mean: of the states, (..., n), in the units of the model.
         cov: covariances of the errors, (..., n, n).
         divergences: restarts from the prior, (...,).
-        kept: what else the filter keeps, by the names of its page, such as an estimate of R.
+        kept: what else the filter keeps, by the names of its page, such as an estimate of R; of an ensemble its
+            `members` (..., n, N).
+        key: on which an ensemble's random numbers depend, (..., 2) whole numbers.
+        step: steps predicted, on which they depend, too.
     """
 
     mean: Tensor
     cov: Tensor
     divergences: Tensor
     kept: dict[str, Tensor]
+    key: np.ndarray = np.zeros(2)
+    step: int = 0
+
+    @property
+    def anomalies(self) -> Tensor:
+        """The distances (..., n, N) of an ensemble's members from their mean."""
+        members = self.kept["members"]
+        return members - members.mean(-1, keepdim=True)
 
 
 class TensorInnovation(NamedTuple):

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import prod
 from typing import Any, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from filters.ensembles.ensemble import EnsembleFilter
 from filters.filter import Filter
 from filters.pages.page_filter import with_page
 from filters.tensors.algebra import root, where, wrapped_where
 from filters.tensors.belief import TensorBelief, TensorEstimates, TensorInnovation
 from filters.tensors.equations import equation_of
 from filters.tensors.likelihood import compiled_likelihood
-from filters.tensors.stages import Stages
+from filters.tensors.stages import Draw, EnsembleStages, Stages, normals_of
 from thruster_env.numerics.algebra.programs import Place
 from thruster_env.numerics.checks import one_of
+from thruster_env.numerics.streams import filter_keys
 
 DIMENSIONS = {
     "process_noise_cov": 2,
@@ -32,8 +36,9 @@ class TensorFilter:
     """A filter on batches of tensors, which torch differentiates; `filters.torch` makes one.
 
     Its estimates are those of `filters.run` to rounding: angles, substeps, missing channels and restarts are the
-    same. It has derivatives along everything that is a tensor: the attributes below, inputs, measurements, and
-    whatever its functions contain. A trajectory that restarts from the prior has estimates; its gradient is NaN.
+    same, and an ensemble's random numbers. It has derivatives along everything that is a tensor: the attributes
+    below, inputs, measurements, and whatever its functions contain; random numbers stay as they are. A trajectory
+    that restarts from the prior has estimates; its gradient is NaN.
 
     Attributes:
         process_noise_cov: Q (n, n), or one for each trajectory (..., n, n); of a step, as the model's.
@@ -41,6 +46,8 @@ class TensorFilter:
         prior_mean: (n,) or (..., n).
         prior_cov: (n, n) or (..., n, n).
         constants: c (count,) or (..., count); the model's functions get it in the form that they have.
+
+    The filter's own parameters, such as `inflation`, may be replaced by tensors () or (...), too.
     """
 
     process_noise_cov: Tensor
@@ -63,7 +70,7 @@ class TensorFilter:
         """Make the filter for tensors.
 
         Args:
-            filter_: a filter with a page, any Kalman filter but "gsf" and "fuzzy".
+            filter_: a filter with a page, any Kalman or ensemble filter but "gsf" and "fuzzy".
             transition: f(x, u, c) in place of the model's, a function of tuples of tensors (...,) that returns one
                 for each state; it may contain a network. x, u and c are those of `StateSpaceModel`.
             observe: h(x, c) in place of the model's.
@@ -73,12 +80,13 @@ class TensorFilter:
             device: of all tensors.
 
         Raises:
-            ValueError: for a filter without a page, another dtype, or functions that are to replace those of an
-                affine approximation.
+            ValueError: for a filter without a page or with random rotations, another dtype, or functions that are
+                to replace those of an affine approximation.
         """
         if dtype not in (torch.float64, torch.float32):
             raise ValueError(f"dtype must be torch.float64 or torch.float32, but got {dtype}")
         self.filter, self._given = filter_, (transition, transition_jacobian, observe, observe_jacobian)
+        self._changed: dict[str, Tensor] = {}
         self._make()
         if self._model is not filter_.model and any(self._given):
             raise ValueError(
@@ -91,12 +99,17 @@ class TensorFilter:
     def _make(self) -> None:
         """Make the graphs of the page for the model."""
         paged = with_page(self.filter, "a filter on tensors")
-        self._model, page, self._own = paged.kernel_model, paged.written_page, paged.parameters
+        self._model, self._own = paged.kernel_model, paged.parameters
         shape, (f, by_f, h, by_h) = self._model.shape, self._model.functions
         transition, by_transition, observe, by_observe = self._given
         motion = equation_of("transition", (f, by_f), (transition, by_transition), 2, shape)
         sight = equation_of("observe", (h, by_h), (observe, by_observe), 1, shape)
-        self._stages = Stages(motion, sight, shape, page)
+        if isinstance(paged, EnsembleFilter):
+            if getattr(paged, "rotations", 0):
+                raise ValueError("an ensemble on tensors must have no random rotations, but got rotations=1")
+            self._stages: Stages = EnsembleStages(motion, sight, shape, paged.page_with())
+        else:
+            self._stages = Stages(motion, sight, shape, paged.written_page)
 
     def __getstate__(self) -> dict[str, Any]:
         """All but graphs, which are made again."""
@@ -115,26 +128,46 @@ class TensorFilter:
         """
         found = object.__new__(type(self))
         vars(found).update(vars(self))
+        own_names = tuple(name for name in self._own if hasattr(self.filter, name))
         for name, value in numbers.items():
-            own = getattr(self, one_of("a number of a filter", name, tuple(DIMENSIONS)))
-            setattr(found, name, self._tensor(name, value, own.shape[-DIMENSIONS[name] :]))
+            if one_of("a number of a filter", name, (*DIMENSIONS, *own_names)) in own_names:
+                found._changed = {**found._changed, name: self._tensor(name, value, np.shape(self._own[name]))}
+            else:
+                own = getattr(self, name)
+                setattr(found, name, self._tensor(name, value, own.shape[-DIMENSIONS[name] :]))
         return found
 
-    def init(self, batch: int | tuple[int, ...] = ()) -> TensorBelief:
-        """The prior, for a batch of so many trajectories, or of such a shape."""
-        batch = (batch,) if isinstance(batch, int) else tuple(batch)
+    def init(self, batch: int | tuple[int, ...] = (), key: Any = (0, 0)) -> TensorBelief:
+        """The prior, for a batch of so many trajectories, or of such a shape.
+
+        Args:
+            batch: its size or shape.
+            key: two whole numbers, or (..., 2) for a batch, on which an ensemble's random numbers depend.
+        """
+        whole, key = (batch,) if isinstance(batch, int) else tuple(batch), np.asarray(key, dtype=np.float64)
+        if key.shape[-1:] != (2,):
+            raise ValueError(f"a key must be two whole numbers, (..., 2), but got shape {key.shape}")
+        if self.filter.size:
+            whole = torch.broadcast_shapes(whole, key.shape[:-1])
+        return self._prior(whole, key, 0)
+
+    def _prior(self, batch: tuple[int, ...], key: np.ndarray, step: int) -> TensorBelief:
         whole = torch.broadcast_shapes(batch, self.prior_mean.shape[:-1], self.prior_cov.shape[:-2])
         mean = wrapped_where(self.prior_mean, self._model.shape.state_angles)
-        mean, cov = mean.expand(*whole, -1), self.prior_cov.expand(*whole, -1, -1)
-        kept = self._stages.start(self._known(), self.prior_mean)
-        return TensorBelief(mean, cov, torch.zeros(whole, dtype=torch.int64, device=mean.device), kept)
+        prior = mean.expand(*whole, -1), self.prior_cov.expand(*whole, -1, -1)
+        mean, cov, kept = self._stages.start(self._known(), prior, self._normals(key, step))
+        return TensorBelief(mean, cov, torch.zeros(whole, dtype=torch.int64, device=mean.device), kept, key, step)
+
+    def _normals(self, key: np.ndarray, step: int) -> Draw:
+        return normals_of(key, step, self.filter.size, self.prior_mean)
 
     def predict(self, belief: TensorBelief, u: Any) -> TensorBelief:
         """The belief a step later, under inputs u (..., p) in the units of the model's inputs."""
         u = self._tensor("u", u, (self._model.inputs,))
-        known = belief.mean, belief.cov, belief.kept
-        mean, cov, kept = self._stages.predict(self._known(), known, u, self._model.substeps)
-        return TensorBelief(mean, cov, belief.divergences, kept)
+        known, step = (belief.mean, belief.cov, belief.kept), belief.step + 1
+        draw, substeps = self._normals(belief.key, step), self._model.substeps
+        mean, cov, kept = self._stages.predict(self._known(), known, u, substeps, draw)
+        return TensorBelief(mean, cov, belief.divergences, kept, belief.key, step)
 
     def update(self, belief: TensorBelief, z: Any) -> tuple[TensorBelief, TensorInnovation]:
         """The belief after measurements z (..., m), NaN where missing, and the innovations.
@@ -143,25 +176,28 @@ class TensorFilter:
         """
         z = self._tensor("z", z, (self._model.m,))
         known = belief.mean, belief.cov, belief.kept
-        (mean, cov, kept), (v, s, level) = self._stages.update(self._known(), known, z)
+        draw = self._normals(belief.key, belief.step)
+        (mean, cov, kept), (v, s, level) = self._stages.update(self._known(), known, z, draw)
         lost = ~_all_finite(mean, cov, v, s, level)
         batch = lost.shape
         counted = belief.divergences.expand(batch) + lost
         if lost.any():
-            prior = self.init(batch)
+            prior = self._prior(batch, belief.key, belief.step)
             mean, v = where(lost, prior.mean, mean, 1), where(lost, torch.zeros_like(v), v, 1)
             cov, s = where(lost, prior.cov, cov, 2), where(lost, self.measurement_noise_cov, s, 2)
             level = torch.where(lost, 0.0, level)
-            of = self._stages.memory.kept
-            kept = {name: where(lost, prior.kept[name], one, len(of[name].shape)) for name, one in kept.items()}
-        return TensorBelief(mean, cov, counted, kept), TensorInnovation(v, s, level)
+            sizes = self._stages.kept
+            kept = {name: where(lost, prior.kept[name], one, sizes[name]) for name, one in kept.items()}
+        belief = TensorBelief(mean, cov, counted, kept, belief.key, belief.step)
+        return belief, TensorInnovation(v, s, level)
 
-    def run(self, inputs: Any = None, measurements: Any = None) -> TensorEstimates:
+    def run(self, inputs: Any = None, measurements: Any = None, keys: Any = None) -> TensorEstimates:
         """Filter trajectories, as `filters.run` does.
 
         Args:
             inputs: u (..., K, p), in the units of the model's inputs; None for a model without.
             measurements: z (..., K + 1, m), NaN where missing; z[..., 0, :] updates the prior.
+            keys: (..., 2), of an ensemble's random numbers; those of `filters.run` if None.
 
         Raises:
             ValueError: if shapes do not fit.
@@ -175,7 +211,10 @@ class TensorFilter:
                 "inputs and measurements must have shapes (..., K, p) and (..., K + 1, m), but got "
                 f"{tuple(u.shape)} and {tuple(z.shape)}"
             )
-        belief, told = self.init(z.shape[:-2]), []
+        batch = z.shape[:-2]
+        if keys is None:
+            keys = filter_keys(range(prod(batch))).reshape(*batch, 2) if self.filter.size else (0, 0)
+        belief, told = self.init(batch, keys), []
         for k in range(z.shape[-2]):
             if k > 0:
                 belief = self.predict(belief, u[..., k - 1, :])
@@ -205,7 +244,11 @@ class TensorFilter:
             ValueError: if shapes do not fit, or the filter has functions or other numbers than its model.
         """
         others = {name: getattr(self, name) for name in ("prior_mean", "prior_cov", "constants")}
-        if any(self._given) or not all(_is(one, getattr(self._model, name)) for name, one in others.items()):
+        if (
+            any(self._given)
+            or self._changed
+            or not all(_is(one, getattr(self._model, name)) for name, one in others.items())
+        ):
             raise ValueError(
                 "the compiled log-likelihood must be that of a filter whose functions, prior and constants are "
                 "its model's, but got others: use run"
@@ -218,14 +261,16 @@ class TensorFilter:
         memory, like = self._stages.memory, self.prior_mean
         own = {
             one: torch.as_tensor(value, dtype=like.dtype, device=like.device)
-            for one, value in zip(memory.own, self._own.values(), strict=False)
+            for one, value in zip(memory.own, {**self._own, **self._changed}.values(), strict=False)
         }
         numbers = {
             memory.Q: self.process_noise_cov,
             memory.R: self.measurement_noise_cov,
             memory.constants: self.constants,
+            memory.prior_mean: self.prior_mean,
         }
         covs = {memory.Q_root: self.process_noise_cov, memory.prior_root: self.prior_cov}
+        covs[memory.R_root] = self.measurement_noise_cov
         numbers |= {one: root(cov) for one, cov in covs.items() if one in self._stages.reads}
         return {one.operation: value for one, value in (own | numbers).items()}
 
@@ -236,7 +281,7 @@ class TensorFilter:
             found = torch.as_tensor(value, dtype=like.dtype, device=like.device)
         except (TypeError, ValueError, RuntimeError):
             raise ValueError(f"{name} must be a tensor of numbers, but got {value!r}") from None
-        if found.shape[-len(shape) :] != shape:
+        if found.shape[found.ndim - len(shape) :] != shape:
             wanted = ", ".join(("...", *map(str, shape)))
             raise ValueError(f"{name} must have shape ({wanted}), but got {tuple(found.shape)}")
         return found

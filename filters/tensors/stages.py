@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
+import numpy as np
+import torch
 from torch import Tensor
 
-from filters.engine.layout import memory_places
 from filters.pages.equations import PagedModel
 from filters.pages.kernels import stages_of
-from filters.pages.memory import RowMemory
+from filters.pages.members import MembersMemory
+from filters.pages.members import stages_of as members_stages
+from filters.pages.memory import NumbersMemory, RowMemory
 from filters.pages.page import Page
 from filters.pages.stages import Stage
 from filters.tensors.algebra import work_out
 from thruster_env.numerics.algebra.matrices import Matrix, Operation, in_order, never
 from thruster_env.numerics.algebra.programs import Place
+from thruster_env.numerics.streams import FILTER_MEASUREMENT, FILTER_PRIOR, FILTER_PROCESS, normal_block
+from thruster_env.plants.layout import LANES, padded
 from thruster_env.plants.shape import Shape
+
+NORMALS = Place("draws", 0)
+Draw = Callable[[int, int], Tensor]
 
 
 class Equation(Protocol):
@@ -34,7 +42,7 @@ class Equation(Protocol):
 class TensorModel(PagedModel):
     """A model as a page sees it, whose equations are those of tensors."""
 
-    def __init__(self, f: Equation, h: Equation, memory: RowMemory):
+    def __init__(self, f: Equation, h: Equation, memory: NumbersMemory):
         """Take the equations, and where all numbers lie."""
         super().__init__(memory)
         n, m = memory.shape.n, memory.shape.m
@@ -63,10 +71,13 @@ class _Operations:
     def __init__(self, equation: Equation, rows: int, n: int):
         self.both = Operation(equation.with_jacobian, lambda *_: (), never)
         self.of_points = Operation(equation.of_points, lambda x, *_: (rows, x[1]), never)
+        self.of_members = Operation(equation.of_points, lambda *_: (rows,), never)
         self.value = Operation(lambda both: both[0], lambda _: (rows,), never)
         self.matrix = Operation(lambda both: both[1], lambda _: (rows, n), never)
 
     def value_at(self, x: Matrix, *others: Matrix) -> Matrix:
+        if x.member:
+            return self.of_members(x, *others)
         return self.value(self.both(x, *others)) if len(x.shape) == 1 else self.of_points(x, *others)
 
 
@@ -74,7 +85,7 @@ class _Part:
     """A stage, of tensors in the places that it reads."""
 
     def __init__(self, stage: Stage):
-        self._wanted = {Place("rows", at): one for at, one in stage.of_rows.items()}
+        self._wanted = dict(stage.stores[0])
         self._order = in_order(list(self._wanted.values()))
         self.given = [one for one in self._order if isinstance(one.operation, Place)]
 
@@ -83,13 +94,31 @@ class _Part:
         return {place: found[one] for place, one in self._wanted.items()}
 
 
+def normals_of(key: np.ndarray, step: int, size: int, like: Tensor) -> Draw:
+    """What draws normals (..., rows, size) of a stream for keys (..., 2), those of `filters.run`."""
+    width = padded(size, LANES)
+
+    def draw(stream: int, rows: int) -> Tensor:
+        words = (key[..., k, None] for k in range(2))
+        found = np.stack(normal_block(np.arange(rows * width // 4), step, stream, *words), axis=-1)
+        found = found.reshape(*key.shape[:-1], rows, width)[..., :size]
+        return torch.as_tensor(found, dtype=like.dtype, device=like.device)
+
+    return draw
+
+
 class Stages:
     """The functions of a page, for a model's equations.
+
+    A belief is mean, covariance and what is kept, by names; `draw(stream, rows)` are an ensemble's normals.
 
     Attributes:
         memory: where a filter's numbers lie.
         reads: which of them the page reads.
+        kept: dimensions of what a filter keeps, beside those of a batch.
     """
+
+    memory: NumbersMemory
 
     def __init__(self, f: Equation, h: Equation, shape: Shape, page: Page):
         """Make graphs of matrices of the page."""
@@ -97,26 +126,26 @@ class Stages:
         stages = stages_of(page, memory, TensorModel(f, h, memory))
         parts = self._start, self._begin, self._advance, self._settle, self._update = [*map(_Part, stages)]
         self.reads = {one for part in parts for one in part.given}
-        places = memory_places(shape.n, shape.m)
-        self._belief = Place("rows", places.mean), Place("rows", places.cov)
-        told = places.innovation, places.innovation_cov, places.log_likelihood
-        self._told = [Place("rows", at) for at in told]
+        self._belief, self._told = memory.belief, memory.told
         self._kept = {name: one.operation for name, one in memory.kept.items()}
+        self.kept = {name: len(one.shape) for name, one in memory.kept.items()}
 
-    def start(self, numbers: Mapping[Place, Tensor], like: Tensor) -> dict[str, Tensor]:
-        """What the filter keeps besides mean and covariance, at the prior."""
-        found = self._start(numbers, like)
-        return {name: found[place] for name, place in self._kept.items()}
+    def start(self, numbers: Mapping[Place, Tensor], prior: tuple[Tensor, Tensor], draw: Draw) -> tuple:
+        """The belief at the prior, of its mean and covariance."""
+        found = self._start(numbers, prior[0])
+        return *prior, {name: found[place] for name, place in self._kept.items()}
 
-    def predict(self, numbers: Mapping[Place, Tensor], belief: tuple, u: Tensor, substeps: int) -> tuple:
-        """Mean, covariance and what is kept, a step later."""
+    def predict(
+        self, numbers: Mapping[Place, Tensor], belief: tuple, u: Tensor, substeps: int, draw: Draw
+    ) -> tuple:
+        """The belief a step later."""
         tensors = self._tensors(numbers, belief, u)
         for part in (self._begin, *[self._advance] * substeps, self._settle):
             tensors |= part(tensors, belief[0])
         return self._belief_of(tensors)
 
-    def update(self, numbers: Mapping[Place, Tensor], belief: tuple, z: Tensor) -> tuple[tuple, list[Tensor]]:
-        """The same after the measurement z; then the innovation, its covariance and its log density."""
+    def update(self, numbers: Mapping[Place, Tensor], belief: tuple, z: Tensor, draw: Draw) -> tuple[tuple, list]:
+        """The belief after the measurement z; then the innovation, its covariance and its log density."""
         tensors = self._tensors(numbers, belief, z)
         tensors |= self._update(tensors, belief[0])
         return self._belief_of(tensors), [tensors[place] for place in self._told]
@@ -128,3 +157,45 @@ class Stages:
 
     def _belief_of(self, tensors: Mapping[Place, Tensor]) -> tuple:
         return *(tensors[at] for at in self._belief), {name: tensors[at] for name, at in self._kept.items()}
+
+
+class EnsembleStages(Stages):
+    """The same of an ensemble, which keeps its members (..., n, N)."""
+
+    def __init__(self, f: Equation, h: Equation, shape: Shape, page: Page):
+        """Make graphs of matrices of the page."""
+        self.memory = memory = MembersMemory(shape, page)
+        parts = {name: _Part(one) for name, one in members_stages(page, memory, TensorModel(f, h, memory)).items()}
+        self._parts = parts
+        self.reads = {one for part in parts.values() for one in part.given}
+        self._belief, self._told = memory.belief, memory.told
+        self._kept, self.kept = {"members": memory.x.operation}, {"members": 2}
+
+    def start(self, numbers: Mapping[Place, Tensor], prior: tuple[Tensor, Tensor], draw: Draw) -> tuple:
+        """The members at the prior, their mean and covariance."""
+        tensors = {**numbers, NORMALS: draw(FILTER_PRIOR, self.memory.shape.n)}
+        mean, cov, kept = self._after(tensors, ("start", "summarise"), prior[0])
+        batch = prior[0].shape[:-1]
+        kept = {name: one.expand(*batch, -1, -1) for name, one in kept.items()}
+        return mean.expand(*batch, -1), cov.expand(*batch, -1, -1), kept
+
+    def predict(
+        self, numbers: Mapping[Place, Tensor], belief: tuple, u: Tensor, substeps: int, draw: Draw
+    ) -> tuple:
+        """The belief a step later."""
+        tensors = self._tensors(numbers, belief, u)
+        tensors[NORMALS] = draw(FILTER_PROCESS, self.memory.shape.n)
+        return self._after(tensors, (*["advance"] * substeps, "settle", "summarise"), belief[0])
+
+    def update(self, numbers: Mapping[Place, Tensor], belief: tuple, z: Tensor, draw: Draw) -> tuple[tuple, list]:
+        """The belief after the measurement z; then the innovation, its covariance and its log density."""
+        tensors = self._tensors(numbers, belief, z)
+        if any(one.operation == NORMALS for one in self._parts["update"].given):
+            tensors[NORMALS] = draw(FILTER_MEASUREMENT, self.memory.shape.m)
+        found = self._after(tensors, ("update",), belief[0])
+        return found, [tensors[place] for place in self._told]
+
+    def _after(self, tensors: dict[Place, Tensor], names: Sequence[str], like: Tensor) -> tuple:
+        for name in names:
+            tensors |= self._parts[name](tensors, like)
+        return self._belief_of(tensors)

@@ -25,6 +25,7 @@ from thruster_env.numerics.algebra.c_source import literal, statements_of
 from thruster_env.numerics.algebra.graphs import Graph, arctan2, where
 from thruster_env.numerics.algebra.programs import Place, program_of
 from thruster_env.numerics.angles import difference
+from thruster_env.numerics.streams import filter_keys
 from thruster_env.plants.replay import ReplayEnv
 
 WARNINGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
@@ -41,6 +42,14 @@ OWN = {
     "ekf-robust": {"degrees_of_freedom": 3.0, "iterations": 3},
     "sage-husa": {"forgetting_factor": 0.9, "process_forgetting_factor": 0.8},
     "vb": {"forgetting_factor": 0.9, "prior_weight": 6.0, "iterations": 2},
+}
+ENSEMBLES = {
+    "enkf": {},
+    "enkf centred": {"centred_perturbations": 1, "inflation": 1.02},
+    "etkf": {"relaxation": 0.3},
+    "ensrf": {"inflation": 1.02},
+    "denkf": {},
+    "ienkf": {"iterations": 2},
 }
 KEPT = {"kf square-root": ["L"], "ekf-robust": ["weight"], "sage-husa": ["R", "Q", "predicted"], "vb": ["V", "nu"]}
 MODELS = {
@@ -78,7 +87,7 @@ int main(void)
     {name} filter;
     {real} u[{inputs} + 1], z[{m}];
 
-    {name}_init(&filter);
+    {name}_init(&filter{key});
     for (int k = 0; numbers(k > 0 ? {inputs} : 0, u) && numbers({m}, z); k++) {{
         if (k > 0) {{
             {name}_predict(&filter{u});
@@ -97,20 +106,16 @@ int main(void)
 """
 
 
-def compilers():
-    """gcc, which has to be there, and clang where it is."""
-    return [name for name in ("gcc", "clang") if name == "gcc" or shutil.which(name)]
-
-
-def built(filter_, folder, *, single=False, compiler="gcc", flags=()):
-    """The program MAIN of a filter."""
+def built(filter_, folder, *, single=False, compiler="gcc", flags=(), key=None):
+    """The program MAIN of a filter; an ensemble has the key of seed 0."""
     made, model = c_filter(filter_, "one", single=single), filter_.kernel_model
+    key = "".join(f", {word:.0f}u" for word in key or filter_keys([0])[0]) if filter_.size else ""
     u, real = ", u" * (model.inputs > 0), "float" if single else "double"
     kept = "".join(
         f"show({math.prod(shape)}, {'' if shape else '&'}filter.{name});\n        "
         for name, shape in programs_of(filter_).kept.items()
     )
-    main = MAIN.format(name="one", real=real, inputs=model.inputs, n=model.n, m=model.m, u=u, kept=kept)
+    main = MAIN.format(name="one", real=real, inputs=model.inputs, n=model.n, m=model.m, u=u, kept=kept, key=key)
     for name, text in {"one.h": made.header, "one.c": made.source, "main.c": main}.items():
         (folder / name).write_text(text)
     command = [compiler, *WARNINGS, *flags, "one.c", "main.c", "-lm", "-o", "one"]
@@ -141,27 +146,32 @@ def assert_same(found, expected, accuracy):
         np.testing.assert_allclose(one, other, rtol=0, atol=accuracy * abs(other).max())
 
 
+CLANG = pytest.param(
+    *("thruster", "clang"),
+    marks=pytest.mark.skipif(shutil.which("clang") is None, reason="there is no clang to compile with"),
+)
+
+
 def made(name, model):
+    if name in ENSEMBLES:
+        return make_filter(name.split()[0], model, ensemble_size=13, **ENSEMBLES[name])
     return make_filter(name.split()[0], model, **OWN[name])
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", OWN)
-@pytest.mark.parametrize("which", MODELS)
-def test_a_thousand_steps_are_those_of_run(which, name, tmp_path):
+@pytest.mark.parametrize("name", [*OWN, *ENSEMBLES])
+@pytest.mark.parametrize(("which", "compiler"), [*((which, "gcc") for which in MODELS), CLANG])
+def test_a_thousand_steps_are_those_of_run(which, compiler, name, tmp_path):
     model = MODELS[which]()
     inputs, z = simulated(model, 1000, level=1.0, missing=0.2)
     filter_ = made(name, model)
     expected = [part[0] for part in run(filter_, None, inputs, z)[:5]]
-    for compiler in compilers() if which == "thruster" else ["gcc"]:
-        program = built(filter_, tmp_path, compiler=compiler)
-        found, nis, channels, restarts = estimated(program, filter_.kernel_model, inputs[0], z[0])
-        assert_same(found, expected, 1e-12)
-        v, s = expected[2:4]
-        np.testing.assert_allclose(
-            nis, (v * np.linalg.solve(s, v[..., None])[..., 0]).sum(-1), rtol=1e-8, atol=1e-10
-        )
-        assert channels.tolist() == np.isfinite(z[0]).sum(-1).tolist() and not restarts.any()
+    program = built(filter_, tmp_path, compiler=compiler)
+    found, nis, channels, restarts = estimated(program, filter_.kernel_model, inputs[0], z[0])
+    assert_same(found, expected, 1e-12)
+    v, s = expected[2:4]
+    np.testing.assert_allclose(nis, (v * np.linalg.solve(s, v[..., None])[..., 0]).sum(-1), rtol=1e-8, atol=1e-10)
+    assert channels.tolist() == np.isfinite(z[0]).sum(-1).tolist() and not restarts.any()
 
 
 @pytest.mark.usefixtures("as_python")
@@ -203,10 +213,12 @@ def test_a_vehicle_and_many_states(name, tmp_path):
 
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # Python says so when a number overflows
-@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("name", [*OWN, *ENSEMBLES])
 def test_a_belief_that_is_lost_becomes_the_prior_and_no_sanitizer_complains(name, tmp_path):
     filter_, inputs, z = diverging(name.split()[0])
-    filter_ = dataclasses.replace(filter_, **{key: value for key, value in OWN[name].items() if key == "form"})
+    own = OWN[name] if name in OWN else {"ensemble_size": 13, **ENSEMBLES[name]}
+    chosen = {key: value for key, value in own.items() if key == "form" or name in ENSEMBLES}
+    filter_ = dataclasses.replace(filter_, **chosen)
     program = built(filter_, tmp_path, flags=SANITIZERS)
     found, nis, _, restarts = estimated(program, filter_.kernel_model, inputs[0], z[0])
     expected = run(filter_, None, inputs, z)
@@ -215,7 +227,7 @@ def test_a_belief_that_is_lost_becomes_the_prior_and_no_sanitizer_complains(name
 
 
 @pytest.mark.usefixtures("as_python")
-@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("name", [*OWN, *ENSEMBLES])
 def test_single_precision(name, tmp_path):
     for which in ("thruster", "pendulum"):
         model = MODELS[which]()
@@ -314,8 +326,12 @@ def small(**functions):
     ("make", "message"),
     [
         (
-            lambda: c_filter(make_filter("enkf", scalar_model())),
-            "a filter in C must have a page of mean and covariance, as 'ekf' has, but got 'enkf'",
+            lambda: c_filter(make_filter("pf", scalar_model())),
+            "a filter in C must have a page, as 'ekf' and 'enkf' have, but got 'pf'",
+        ),
+        (
+            lambda: c_filter(make_filter("etkf", scalar_model(), rotations=1)),
+            "an ensemble in C must have no random rotations, but got rotations=1",
         ),
         (lambda: c_filter(made("ekf", scalar_model()), "a b"), "no keyword, but got 'a b'"),
         (lambda: c_filter(made("ekf", scalar_model()), "double"), "no keyword, but got 'double'"),
@@ -347,10 +363,11 @@ def test_a_filter_is_the_same_text_each_time():
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("single", [False, True])
 @pytest.mark.parametrize("which", ["thruster", "no input"])
-def test_a_project_filters_a_log_as_estimate_does(which, single, tmp_path):
+@pytest.mark.parametrize("name", ["ekf", "enkf"])
+def test_a_project_filters_a_log_as_estimate_does(name, which, single, tmp_path):
     model = MODELS[which]()
     inputs, z = simulated(model, 40, level=1.0, missing=0.2)
-    filter_ = made("ekf", model)
+    filter_ = made(name, model)
     files = write_project(filter_, tmp_path / "c", "one", single=single)
     assert [file.name for file in files] == ["one.h", "one.c", "one.hpp", "main.c", "CMakeLists.txt", "README.md"]
     command = ["gcc", *WARNINGS, *SANITIZERS, "one.c", "main.c", "-lm", "-o", "one_log"]

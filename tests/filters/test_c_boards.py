@@ -9,10 +9,11 @@ import pytest
 
 from benchmarks.c_code import measures
 from filters import make_filter, run, thruster_model
+from filters.c.board import BOARD, BUILD, EMULATE, MEMORY
 from filters.c.project import write_project
-from filters.c.sizes import CORTEX_M4, sizes_of
+from filters.c.sizes import sizes_of
 from filters.c.source import c_filter
-from tests.filters.test_c import OWN, WARNINGS, built, made, printed
+from tests.filters.test_c import ENSEMBLES, OWN, WARNINGS, built, made, printed
 from tests.models import lonely_model, simulated
 
 USE = """\
@@ -33,51 +34,16 @@ int main()
                 double(copy.told().nis), double(filter.estimate(0)));
 }
 """
-BOARD = """\
-extern void _start(void);
-
-static void reset(void)
-{
-    *(volatile unsigned *)0xE000ED88u |= 0xF00000u; /* the floating-point unit */
-    _start();
-}
-
-__attribute__((section(".vectors"), used)) static void (*const vectors[])(void) = {
-    (void (*)(void))0x20400000u, reset};
-"""
-MEMORY = """\
-ENTRY(_start)
-MEMORY
-{
-    CODE (rx) : ORIGIN = 0x00000000, LENGTH = 4M
-    DATA (rwx) : ORIGIN = 0x20000000, LENGTH = 4M
-}
-SECTIONS
-{
-    .vectors : { KEEP(*(.vectors)) } > CODE
-    .text : { *(.text*) *(.rodata*) KEEP(*(.init)) KEEP(*(.fini)) } > CODE
-    .ARM.exidx : { *(.ARM.exidx*) } > CODE
-    .data : {
-        *(.data*) . = ALIGN(8);
-        __preinit_array_start = .; KEEP(*(.preinit_array)) __preinit_array_end = .;
-        __init_array_start = .; KEEP(*(.init_array*)) __init_array_end = .;
-        __fini_array_start = .; KEEP(*(.fini_array*)) __fini_array_end = .;
-    } > DATA
-    .bss : { __bss_start__ = .; *(.bss*) *(COMMON) __bss_end__ = .; } > DATA
-    end = ALIGN(8);
-    __end__ = end;
-}
-"""
-CROSS = "arm-none-eabi-gcc"
-EMULATOR = "qemu-system-arm -M mps2-an386 -nographic -monitor none -serial none".split()
+CROSS, EMULATOR = BUILD.split()[0], EMULATE.split()[0]
 
 
 @pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("single", [False, True])
 @pytest.mark.parametrize("make", [thruster_model, lonely_model])
-def test_a_class_of_cpp_is_the_filter(make, single, tmp_path):
+@pytest.mark.parametrize("name", ["ekf", "enkf"])
+def test_a_class_of_cpp_is_the_filter(name, make, single, tmp_path):
     model = make()
-    filter_ = make_filter("ekf", model)
+    filter_ = made(name, model)
     write_project(filter_, tmp_path, "one", single=single)
     u = "const OneFilter::Real u[OneFilter::inputs] = {12}; filter.predict(u);"
     main = USE.replace("@PREDICT@", u if model.inputs else "filter.predict();")
@@ -121,22 +87,21 @@ def test_a_step_of_casadi_is_that_of_ours(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.skipif(
-    not (shutil.which(CROSS) and shutil.which(EMULATOR[0])),
+    not (shutil.which(CROSS) and shutil.which(EMULATOR)),
     reason="a Cortex-M4 is emulated where gcc-arm-none-eabi and qemu-system-arm of Debian are there",
 )
 @pytest.mark.parametrize("single", [False, True])
-@pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize("name", [*OWN, *ENSEMBLES])
 def test_a_cortex_m4_computes_what_this_computer_does(name, single, tmp_path):
     filter_ = made(name, thruster_model())
     inputs, z = simulated(filter_.model, 100, level=10.0, missing=0.2)
     expected = printed(built(filter_, tmp_path, single=single), inputs[0], z[0])
     (tmp_path / "board.c").write_text(BOARD)
     (tmp_path / "board.ld").write_text(MEMORY)
-    command = [CROSS, *WARNINGS, *CORTEX_M4.split(), "--specs=rdimon.specs", "-T", "board.ld"]
-    command += "one.c main.c board.c -lm -o board".split()
+    command = BUILD.format(name="one", flags=" ".join(WARNINGS)).split()
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    board = [*EMULATOR, "-semihosting-config", "enable=on,target=native", "-kernel", str(tmp_path / "board")]
+    board = EMULATE.format(name=tmp_path / "one").split()
     found = printed(board, inputs[0], z[0])
     accuracy = 2e-4 if single else 1e-12
     for one, other in zip(found.T, expected.T, strict=True):

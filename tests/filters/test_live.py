@@ -208,6 +208,33 @@ def test_samples_from_before_the_start_nan_and_models_without_a_dt_are_refused()
         make_filter("kf", thruster_model()).live()
 
 
+def test_a_channel_may_have_a_function_of_its_own():
+    whole = oscillator()
+    parts = {"position": lambda x, c: x[0], "rate": lambda x, c: x[1]}
+    arguments = {name: value for name, value in whole.arguments.items() if name != "measurements"}
+    named = {"constants": Constants(0.01), "arguments": arguments}
+    plant = ContinuousModel(rates=rates, observe=parts, densities=S, **named)
+    assert plant.at(0.05).digest == whole.at(0.05).digest
+    assert [one.symbol for one in plant.at(0.05).measurements] == ["position", "rate"]
+    live = make_filter("ekf", plant.at(0.05)).live(noise=plant.noise)
+    live.start(0.0)
+    live.update(0.0, "rate", 0.7)
+    assert live.mean[1] == pytest.approx(0.7 * 0.2 / 0.3) and live.mean[0] == pytest.approx(0.5)
+
+
+def test_long_steps_are_divided_as_far_as_accuracy_asks():
+    plant = ContinuousModel.of(oscillator().at(0.02, substeps=2), rates)
+    assert [plant.at(dt).substeps for dt in (0.005, 0.01, 0.02, 0.025, 1.0)] == [1, 1, 2, 3, 100]
+    np.testing.assert_allclose(plant.densities, S, rtol=1e-6, atol=1e-9)
+
+
+def test_noise_of_no_white_noise_is_refused():
+    with pytest.raises(ValueError, match="process_noise_cov must be that of white noise in continuous time"):
+        noise_for_dt([0.0, 1.0], 0.1, 0.2, A)
+    q = exact_noise(0.3)
+    np.testing.assert_allclose(noise_for_dt(q, 0.3, 1.7, A), exact_noise(1.7), rtol=1e-9)
+
+
 def test_a_continuous_model_needs_a_substep():
     with pytest.raises(ValueError, match="constants must be a NamedTuple with a field substep"):
         ContinuousModel(rates=rates, observe=both, densities=S, constants=(), arguments={"prior_mean": [0.0, 0.0]})

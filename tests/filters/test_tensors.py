@@ -301,8 +301,8 @@ def if_fast(x, u, c):
     ("make", "message"),
     [
         (
-            lambda: filters.torch(make_filter("enkf", scalar_model())),
-            "on tensors must have a page of mean and covariance",
+            lambda: filters.torch(make_filter("pf", scalar_model())),
+            "on tensors must have a page, as 'ekf' and 'enkf' have, but got 'pf'",
         ),
         (lambda: filters.torch(made("ekf", scalar_model()), dtype=torch.int64), "torch.float64 or torch.float32"),
         (lambda: filters.torch(made("kf", thruster_model()), transition=if_fast), "a filter of the model itself"),

@@ -20,6 +20,7 @@ import thruster_env  # noqa: F401 - registers the envs
 from filters import EstimateState
 from filters.tuned_file import sealed
 from tests.tuned_files import write_untuned
+from thruster_env.plants.logs.recorders.registry import fields, read
 from thruster_env.training.environments import make_environments
 from thruster_env.training.setup import configuration_from_json, make_configuration
 from tuning.evaluation.tuned import read_tuned
@@ -157,6 +158,34 @@ def journals(rng: np.random.Generator, seconds: float) -> str:
         trial = study.ask(plan.space())
         study.tell(trial, 1.0)
         assert study.get_trials()[trial.number].value == 1.0
+
+    return _attack(rng, seconds, write, use)
+
+
+def recordings(rng: np.random.Generator, seconds: float) -> str:
+    """Recorders' files of all formats, damaged anywhere: listed and read, in part at most, or refused."""
+    from tests.plants.recorders.test_bad_recordings import SOME, write_good
+
+    with tempfile.TemporaryDirectory() as folder:
+        good = {ending: write_good(Path(folder) / f"{ending[1:]}{ending}").read_bytes() for ending in SOME}
+    ending = SOME[0]
+
+    def write(path: Path) -> None:
+        nonlocal ending
+        ending = SOME[rng.integers(len(SOME))]
+        data = good[ending]
+        for _ in range(rng.integers(1, 4)):
+            data = _damaged(rng, data) or data
+        path.write_bytes(data)
+
+    def use(path: Path) -> None:
+        named = path.rename(path.with_suffix(ending))
+        try:
+            for one in fields(named):
+                samples = read(named, [one.name])[one.name]
+                assert len(samples.values) == one.samples, f"{one.name} has {one.samples} samples"
+        finally:
+            named.rename(path)
 
     return _attack(rng, seconds, write, use)
 

@@ -22,6 +22,7 @@ ELSEWHERE = {  # pages whose programs another test runs
     "filters.md": "test_docs.py",
     "machine_code.md": "test_machine_code_page.py",
     "policies.md": "../training/test_policies_page.py",
+    "boat.md": "test_boat_page.py",
     **{page: "test_examples.py" for page in PAGES if page.startswith("howto/")},
 }
 NOT_RUN = {  # programs, by page and what is in them

@@ -16,6 +16,7 @@ import pytest
 import tuning
 from filters import EstimateState
 from filters.c.source import c_filter
+from filters.monitoring import Monitor
 from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtures
 from thruster_cli.tuning_report import as_json as tuning_as_json
 from thruster_cli.tuning_report import report
@@ -55,8 +56,9 @@ def test_the_tuned_filter_is_ready_to_use(study, tmp_path):
     assert study.filter.name == study.choice.name == "ekf"
     belief, innovation = study.filter.update(study.filter.init(), [1.0])
     assert np.isfinite(belief.mean).all() and np.isfinite(innovation.cov).all()
-    made = c_filter(study.filter, "one", single=True)
-    assert (study.export_c(tmp_path / "c", "one", single=True) / "one.c").read_text() == made.source
+    made = c_filter(study.filter, "one", single=True, monitor=Monitor(stuck=5))
+    folder = study.export_c(tmp_path / "c", "one", single=True, monitor={"stuck": 5})
+    assert (folder / "one.c").read_text() == made.source
     file = study.save(tmp_path / "tuned.json")
     wrapped = EstimateState(study.problem.make_env(), tuned=str(file))
     assert wrapped.filter.name == "ekf"

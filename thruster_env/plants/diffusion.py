@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import expm
+
+from thruster_env.numerics.checks import as_floats, covariance, positive, shown
 
 SAME_DT = 1e-6  # relative: sample times of logs that are read off stamps
 
@@ -13,14 +16,62 @@ def same_dt(one: float, other: float) -> bool:
     return abs(one - other) <= SAME_DT * max(abs(one), abs(other))
 
 
-def noise_for_dt(process_noise_cov: ArrayLike, dt_from: float, dt_to: float) -> np.ndarray:
+def noise_for_dt(
+    process_noise_cov: ArrayLike, dt_from: float, dt_to: float, slope: ArrayLike | None = None
+) -> np.ndarray:
     """Q of a step of another sample time: Q dt_to/dt_from, that of Gaussian diffusion.
 
-    It is exact where the states change little within a step; otherwise a first guess.
+    It is exact where the states change little within a step; otherwise a first guess. With the slope A of the
+    rates it is exact for them: white noise of the densities whose Q of `dt_from` is the given one.
 
     Args:
         process_noise_cov: Q a step of `dt_from`, a matrix, variances or one.
         dt_from: sample time that it belongs to [s].
         dt_to: sample time that is wanted [s].
+        slope: A, the derivative of the rates by the state, (n, n); zero if None.
+
+    Raises:
+        ValueError: with a slope, where no white noise has such a Q.
     """
-    return np.asarray(process_noise_cov, dtype=np.float64) * (dt_to / dt_from)
+    if slope is None:
+        return np.asarray(process_noise_cov, dtype=np.float64) * (dt_to / dt_from)
+    return noise_of_densities(densities_of(process_noise_cov, slope, dt_from), slope, dt_to)
+
+
+def noise_of_densities(densities: ArrayLike, slope: ArrayLike, dt: float) -> np.ndarray:
+    """Q of a step of white noise, of the spectral densities S (n, n), that acts on linear rates of the slope A.
+
+        Q = int_0^dt e^{A t} S e^{A' t} dt,   exp([-A, S; 0, A'] dt) = [., G; 0, F'],   Q = F G
+
+    Source: van Loan (1978), "Computing integrals involving the matrix exponential", IEEE Transactions on Automatic
+    Control 23(3).
+    """
+    a, s = as_floats(slope), as_floats(densities)
+    n = len(a)
+    found = expm(np.block([[-a, s], [np.zeros((n, n)), a.T]]) * positive("dt", dt))
+    q = found[n:, n:].T @ found[:n, n:]
+    return 0.5 * (q + q.T)
+
+
+def densities_of(process_noise_cov: ArrayLike, slope: ArrayLike, dt: float) -> np.ndarray:
+    """S (n, n), whose Q of a step dt is the given one: `noise_of_densities`, linear in S, solved for it.
+
+    Raises:
+        ValueError: where S is no covariance: Q is then not that of white noise on such rates.
+    """
+    n = len(as_floats(slope))
+    q, (rows, columns) = covariance("process_noise_cov", process_noise_cov, n), np.triu_indices(n)
+    of_units = np.empty((len(rows), len(rows)))
+    for place, (i, j) in enumerate(zip(rows, columns, strict=True)):
+        unit = np.zeros((n, n))
+        unit[i, j] = unit[j, i] = 1.0
+        of_units[:, place] = noise_of_densities(unit, slope, dt)[rows, columns]
+    s = np.zeros((n, n))
+    s[rows, columns] = s[columns, rows] = np.linalg.solve(of_units, q[rows, columns])
+    try:
+        return covariance("densities", s, n)
+    except ValueError:
+        raise ValueError(
+            "process_noise_cov must be that of white noise in continuous time (a state that others move has some "
+            f"of theirs within a step), but got {shown(q.tolist())} for a step of {dt:g} s"
+        ) from None

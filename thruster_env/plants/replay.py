@@ -15,6 +15,7 @@ from thruster_env.numerics.checks import seed as checked_seed
 from thruster_env.numerics.checks import shown
 from thruster_env.numerics.modules import object_named, said
 from thruster_env.plants.commands import some_numbers
+from thruster_env.plants.continuous import ContinuousModel, continuous_of, in_discrete_time
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.logs.read import read_log
 from thruster_env.plants.model_env import with_noise
@@ -35,11 +36,13 @@ class ReplayEnv(gym.Env):
     Args:
         log: a `Log`, or the path of a file that `thruster_env.plants.logs.read.read_log` reads.
         model: defines the log's columns and is the `state_space_model` offered to filters: a `StateSpaceModel`; a
-            function that makes one, of the log's sample time where it takes `dt`; an object that offers
-            `state_space_model`, such as an env; or "module:object" for any of these.
+            function that makes one, of the log's sample time where it takes `dt`; a `ContinuousModel`, or a
+            function that makes one, at that sample time; an object that offers `state_space_model`, such as an
+            env; or "module:object" for any of these.
         columns: headers by quantity, as `read_log` takes them.
         clock_offset: clock offsets [s] by quantity, as `read_log` takes them.
         dt: sample time [s], as `read_log` takes it.
+        grid: as `read_log` takes it; a log on its own stamps cannot be replayed.
 
     Raises:
         ValueError: if the file cannot be used, or the model is not one or does not fit the log.
@@ -55,9 +58,13 @@ class ReplayEnv(gym.Env):
         columns: Mapping[str, str] | None = None,
         clock_offset: Mapping[str, float] | None = None,
         dt: float | None = None,
+        grid: bool = True,
     ):
         """Read the log and make spaces; see the class for the arguments."""
-        self.log, maker = read_for(log, model, columns=columns, clock_offset=clock_offset, dt=dt)
+        options = {"columns": columns, "clock_offset": clock_offset, "dt": dt, "grid": grid}
+        self.log, maker = read_for(log, model, **options)
+        offer = object_named(model, "model") if isinstance(model, str) else model
+        self.continuous = None if self.log.stamps is None else continuous_of(offer)
         self.dt, self.state_space_model = self.log.dt, maker
         if hasattr(model, "check_tuned_for"):
             self.check_tuned_for = model.check_tuned_for
@@ -67,7 +74,9 @@ class ReplayEnv(gym.Env):
         self._row, self._last = 0, np.zeros(m)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """Go back to the first row."""
+        """Go back to the first row; ValueError for a log on its own stamps, whose steps have no one length."""
+        if self.log.stamps is not None:
+            raise ValueError(f"a log must lie on a grid to be replayed, but {self.log.name} has its own stamps")
         super().reset(seed=checked_seed(seed))
         self._row, self._last = 0, np.zeros_like(self._last)
         return self._observed()
@@ -115,6 +124,7 @@ def read_for(log: Any, model, **options) -> tuple[Log, Callable[..., StateSpaceM
 
 def _maker(offer: Any, dt: float) -> Callable[..., StateSpaceModel]:
     """The function of changes that makes a model of what is offered, at a sample time."""
+    offer = offer.at(dt) if isinstance(offer, ContinuousModel) else in_discrete_time(offer)
     if isinstance(offer, StateSpaceModel):
         return partial(with_noise, offer)
     if hasattr(offer, "state_space_model"):

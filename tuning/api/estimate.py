@@ -32,6 +32,7 @@ def estimate(
     columns: Any = None,
     clock_offset: Any = None,
     dt: float | None = None,
+    grid: bool = True,
     smoother: bool = False,
     lag: int | None = None,
     skip: int | None = None,
@@ -59,6 +60,7 @@ def estimate(
         columns: headers by quantity: {"speed": "motor_rpm", "thrust": "loadcell[kgf]"}.
         clock_offset: seconds by quantity that a channel's clock is ahead.
         dt: sample time [s], of a log without times, or to put it on.
+        grid: whether the log is put on a grid; else it is filtered on its own stamps, by the clock.
         smoother: correct estimates by later measurements.
         lag: how many later ones; all by default.
         skip: first rows that do not count in the findings; 50, or a quarter of a short log, by default.
@@ -75,7 +77,7 @@ def estimate(
         raise ValueError(f"give either a tuned file or a filter, but got both, {shown(tuned)} and {shown(filter)}")
     log, model, preset = whose_logs(log, model, preset)
     named = {"preset": preset, "model": model, "sensors": sensors, "columns": columns}
-    read, offer = read_named(log, **named, clock_offset=clock_offset, dt=dt, name=name_of(log, 0))
+    read, offer = read_named(log, **named, clock_offset=clock_offset, dt=dt, name=name_of(log, 0), grid=grid)
     with _as_file(tuned) as file:
         found = estimate_log(read, filter, offer, tuned=file, smoother=smoother, lag=lag, seed=seed, **numbers)
     return LogEstimates(found, findings(found, skip))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -11,6 +12,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from filters.estimators.find import label_of
 from filters.filter import Filter
+from filters.monitoring.monitor import Monitor
 from thruster_env.numerics.text_tables import plain_text
 from tuning.api.held_out import HeldOut
 from tuning.api.run import Tuning
@@ -101,14 +103,22 @@ class Study:
         object.__setattr__(self, "tuning", self.tuning._replace(file=Path(path)))
         return Path(path)
 
-    def export_c(self, folder: str | Path, name: str | None = None, *, single: bool = False) -> Path:
+    def export_c(
+        self,
+        folder: str | Path,
+        name: str | None = None,
+        *,
+        single: bool = False,
+        monitor: Monitor | Mapping | float | None = None,
+        board: bool = False,
+    ) -> Path:
         """Write the tuned filter as C99 with a program that filters a log; return the folder.
 
         Arguments and errors are those of `filters.c.project.write_project`.
         """
         from filters.c.project import write_project
 
-        write_project(self.filter, folder, name, single=single)
+        write_project(self.filter, folder, name, single=single, monitor=monitor, board=board)
         return Path(folder)
 
     def to_frame(self) -> pandas.DataFrame:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from filters.estimators.find import is_foreign, label_of
+from filters.monitoring.stored import monitor_data, monitor_for
 from filters.tuned_file import FACTORS, FILE_FORMAT, FILE_VERSION, NOISE, PRIOR, read_tuned_file, sealed
 from filters.tuned_model import check_same_quantities, model_data
 from thruster_env.numerics.checks import at_least, covariance, positive, shown
@@ -87,10 +88,19 @@ def write_tuned(
         },
         "held_out": {problem.name: metrics(one) for problem, one in pairs},
         "comparisons": {problem.name: comparison_as_data(one) for problem, one in pairs},
+        "monitor": _monitor_of(choice, plan),
         "choice": as_data(result.validation),
         "ensemble_sizes": sizes_as_data(result.sizes, choice, plan) if result.sizes else None,
     }
     write_whole(Path(path), json.dumps(sealed(content), indent=2) + "\n")
+
+
+def _monitor_of(choice: Choice, plan: Plan) -> dict | None:
+    """The monitor of a filter with a covariance, whose counts follow from the training runs; else None."""
+    if not choice.filter(plan.scenarios[0]).has_covariance:
+        return None
+    seen = plan.training_data()[0].seen.measurements
+    return monitor_data(monitor_for(seen), seen.shape[-1])
 
 
 def check_keepable(name) -> None:

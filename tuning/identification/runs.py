@@ -9,25 +9,24 @@ import numpy as np
 
 from thruster_env.numerics.checks import shown
 from thruster_env.numerics.streams import filter_keys
-from thruster_env.plants.diffusion import same_dt
 from thruster_env.plants.logs.log import Log
 from tuning.problems.data import Data, mask_of, padded
+from tuning.problems.log_checks import check_times
 
 
 def runs_of(data: Data | Log | Sequence[Data | Log]) -> Data:
     """Data and logs as one `Data`; keys and seeds are those of the runs' indices 0, 1, ...
 
     Raises:
-        ValueError: for anything else, for no run, or for runs with different inputs, measurements or sample times.
+        ValueError: for anything else, for no run, for runs with different inputs, measurements or sample times,
+            and for a log on its own stamps.
     """
     given = _listed(data)
     if not given or not all(isinstance(one, Data | Log) for one in given):
         raise ValueError(f"data must be some of Log or Data, but got {shown(data)}")
     if len(given) == 1 and isinstance(given[0], Data):
         return given[0].seen
-    times = sorted({one.dt for one in given if isinstance(one, Log)})
-    if times and not same_dt(times[0], times[-1]):
-        raise ValueError(f"logs must have one sample time, but got {', '.join(f'{dt:g} s' for dt in times)}")
+    check_times([one for one in given if isinstance(one, Log)])
     inputs: list[np.ndarray] = []
     measurements: list[np.ndarray] = []
     for one in given:

@@ -9,6 +9,7 @@ from typing import Any
 
 from thruster_env.numerics.checks import shown
 from thruster_env.numerics.modules import object_named
+from thruster_env.plants.continuous import in_discrete_time
 from thruster_env.plants.logs.findings import has_outliers, remarks_on
 from thruster_env.plants.logs.log import Log, cut_at_gaps
 from tuning.identification.family import ModelFamily
@@ -99,7 +100,7 @@ def family_of(
     if not free:
         raise ValueError("free (--free) must name at least one parameter of the model, but got none")
     found = object_named(model, "model") if isinstance(model, str) else model
-    return LoggedFamily(logs, found, list(free), noise=noise, dt=logs[0].dt)
+    return LoggedFamily(logs, in_discrete_time(found), list(free), noise=noise, dt=logs[0].dt)
 
 
 class LoggedFamily(ModelFamily):

@@ -8,6 +8,7 @@ from typing import Any
 
 from thruster_env.numerics.checks import finite, shown
 from thruster_env.numerics.modules import object_named
+from thruster_env.plants.continuous import in_discrete_time
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.replay import ANY_DT, read_for
 from tuning.problems.rooms import room_of_logs
@@ -24,6 +25,7 @@ def read_named(
     clock_offset: Named = None,
     dt: float | None = None,
     name: str | None = None,
+    grid: bool = True,
 ) -> tuple[Log, Any]:
     """A log, and the source of its model at its sample time.
 
@@ -37,6 +39,7 @@ def read_named(
         clock_offset: seconds by quantity, a mapping or texts NAME=SECONDS.
         dt: sample time [s].
         name: name of a log that is not a file.
+        grid: whether samples are put on a grid; else the log is on its own stamps.
 
     Raises:
         ValueError: states the rule and the value.
@@ -50,6 +53,7 @@ def read_named(
         "columns": pairs("columns (--column)", columns),
         "clock_offset": {key: _seconds(key, value) for key, value in offsets.items()},
         "dt": dt,
+        "grid": None if grid else False,
     }
     if isinstance(path, Log):
         given = next((key for key, value in options.items() if value not in (None, {})), None)
@@ -63,7 +67,7 @@ def read_named(
             from tuning.identification.values import with_values  # which imports Optuna
 
             log = read_for(path, offer, **options)[0]
-            offer = with_values(offer, preset)
+            offer = with_values(in_discrete_time(offer), preset)
             offer(log.dt)  # or the values are of another sample time
             return log, offer
         return read_for(path, offer, **options)[0], offer

@@ -7,6 +7,7 @@ from typing import Any
 
 from thruster_env.numerics.checks import shown
 from thruster_env.numerics.modules import is_code
+from thruster_env.plants.continuous import ContinuousModel
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.logs.recorders.registry import ENDINGS
 from thruster_env.plants.logs.table import SUFFIXES
@@ -45,7 +46,9 @@ def _is_model(one: Any) -> bool:
         if Path(one).suffix in (*SUFFIXES, *ENDINGS):  # a log in a folder of Windows has a colon, too
             return False
         return is_code(str(one)) or room_of_logs().is_preset(one)
-    return isinstance(one, StateSpaceModel) or hasattr(one, "state_space_model") or _makes_one(one)
+    return (
+        isinstance(one, StateSpaceModel | ContinuousModel) or hasattr(one, "state_space_model") or _makes_one(one)
+    )
 
 
 def _makes_one(one: Any) -> bool:

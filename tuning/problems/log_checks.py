@@ -24,7 +24,10 @@ def checked_logs(given: Any) -> tuple[Log, ...]:
 
 
 def check_times(logs: Sequence[Log]) -> None:
-    """Raise ValueError unless all logs have the same sample time."""
+    """Raise ValueError unless all logs lie on grids of the same sample time."""
+    for log in logs:
+        if log.stamps is not None:
+            raise ValueError(f"logs to learn from must lie on a grid, but {log.name} has its own stamps")
     for log in logs[1:]:
         if not same_dt(log.dt, logs[0].dt):
             first, dt = logs[0].name, f"{logs[0].dt:g}"

@@ -104,6 +104,42 @@ def test_a_file_that_is_cut_off_or_damaged_is_read_in_part_or_refused(tmp_path, 
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only Linux limits what a process takes")
+@pytest.mark.parametrize("kind", ["ros1", "message"])
+def test_what_unpacks_to_too_much_is_refused(tmp_path, kind, monkeypatch):
+    """A bag of 80 MB of zeros, compressed."""
+    import resource
+
+    path = write_bomb(tmp_path / ("a.bag" if kind == "ros1" else "a"), kind, 80_000_000)
+    size = sum(one.stat().st_size for one in path.rglob("*")) if path.is_dir() else path.stat().st_size
+    assert size < 400_000
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    monkeypatch.setattr(topics, "MOST_MEMORY", 40_000_000)
+    refused(path, "a bag must take at most 4e.07 bytes of memory, but .* takes more")
+    assert resource.getrlimit(resource.RLIMIT_AS) == limits
+    monkeypatch.undo()
+    assert fields(path)
+
+
+def write_bomb(path, kind, size):
+    """A bag with one message that holds a number and so many zeros, compressed."""
+    from rosbags import rosbag1, rosbag2
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg("float64 x\nuint8[] picture", "a/msg/Bomb"))
+    message = store.types["a/msg/Bomb"](1.0, np.zeros(size, np.uint8))
+    if kind == "ros1":
+        writer, data = rosbag1.Writer(path), store.serialize_ros1(message, "a/msg/Bomb")
+        writer.set_compression(writer.CompressionFormat.LZ4)
+    else:
+        writer, data = rosbag2.Writer(path, version=9), store.serialize_cdr(message, "a/msg/Bomb")
+        writer.set_compression(rosbag2.CompressionMode.MESSAGE, rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        writer.write(writer.add_connection("/bomb", "a/msg/Bomb", typestore=store), 1, data)
+    return path
+
+
 def test_a_field_that_is_not_there_is_answered_with_those_near_it(tmp_path):
     ticks = np.arange(9)
     rows = {"timestamp": ticks, **{f"output[{k}]": ticks for k in range(40)}}

@@ -9,10 +9,10 @@ from functools import cache
 import numpy as np
 
 from thruster_env.numerics import matrices
-from thruster_env.numerics.algebra.graphs import called
+from thruster_env.numerics.algebra.graphs import Graph, called
 from thruster_env.numerics.algebra.matrices import Operation, operation, same
 from thruster_env.numerics.algebra.operations import factor, mirrored, quotient
-from thruster_env.numerics.algebra.programs import CALLED
+from thruster_env.numerics.algebra.programs import CALLED, CALLED_IN_ROUNDS, Place, Program, program_of
 from thruster_env.numerics.compiled import inlined
 from thruster_env.numerics.sources import Source, entrywise, is_array
 from thruster_env.numerics.tuples import matrix_reader, matrix_writer
@@ -38,18 +38,29 @@ def geometric_mean(a, b):
         return mirrored.compute(np.array(found, dtype=object).reshape(size, size))
     if size == 1:
         return np.array([[(a[0, 0] * b[0, 0]) ** 0.5]])
+    a, b, unit = _scaled(a, b)
+    for _ in range(rounds(size)):
+        a, b = _closer(a, b)
+    return a * unit
+
+
+def _scaled(a, b):
+    """Both with determinant 1, and the factor of their mean."""
     unit_a, unit_b = _unit(factor(a)), _unit(factor(b))
-    a, b = a * (1.0 / unit_a), b * (1.0 / unit_b)
-    for _ in range(_rounds(size)):
-        both = a + b
-        of = factor(both)
-        parallel = mirrored(quotient(a, of) @ b)  # (a^-1 + b^-1)^-1
-        unit = _unit(of)
-        a, b = both * (1.0 / unit), parallel * unit
-    return a * (unit_a * unit_b) ** 0.5
+    return a * (1.0 / unit_a), b * (1.0 / unit_b), (unit_a * unit_b) ** 0.5
 
 
-def _rounds(size: int) -> int:
+def _closer(a, b):
+    """A round: arithmetic and harmonic mean, with determinant 1."""
+    both = a + b
+    of = factor(both)
+    parallel = mirrored(quotient(a, of) @ b)  # (a^-1 + b^-1)^-1
+    unit = _unit(of)
+    return both * (1.0 / unit), parallel * unit
+
+
+def rounds(size: int) -> int:
+    """How many rounds it takes."""
     return 1 if size == 2 else ROUNDS
 
 
@@ -63,7 +74,7 @@ def geometric_mean_of(size: int) -> Callable:
     """Return `mean(a, b)`, the same for `calls`; large ones end as soon as both are close."""
     if size == 1:
         return entrywise("mean", "a, b", (1, 1), lambda i, j: "(a[0][0] * b[0][0]) ** 0.5", a=(1, 1), b=(1, 1))
-    rounds, close = _rounds(size), 1.0 + CLOSE if is_array(size, size) else 0.0  # small ones take no time
+    count, close = rounds(size), 1.0 + CLOSE if is_array(size, size) else 0.0  # small ones take no time
     cholesky, solve = matrices.cholesky_factor(size), matrices.row_solver(size, size)
     times, add = matrices.multiplier(size, size, size), matrices.symmetric_sum(size)
     source = Source("unit", "l", l=(size, size))  # l l' over this has determinant 1
@@ -74,7 +85,7 @@ def geometric_mean_of(size: int) -> Callable:
     def mean(a, b):
         unit_a, unit_b = unit(cholesky(a)), unit(cholesky(b))
         a, b = scaled(a, 1.0 / unit_a), scaled(b, 1.0 / unit_b)
-        rounds_left = rounds
+        rounds_left = count
         while rounds_left > 0:
             rounds_left -= 1
             both = add(a, b)
@@ -99,8 +110,26 @@ def _taught(size: int) -> str:
     def work(given, found):
         write(found, mean(first(given), second(given)))
 
-    CALLED[name] = work
+    CALLED[name], CALLED_IN_ROUNDS[name] = work, lambda: _as_programs(size)
     return name
+
+
+def _as_programs(size: int) -> tuple[Program, Program, Program, int, int]:
+    """The mean as programs, for `CALLED_IN_ROUNDS`: both matrices are kept, and the factor."""
+    square = size * size
+
+    def program(array: str, work: Callable, to: str) -> Program:
+        graph = Graph()
+        given = np.array(
+            [graph.given(Place(array, k)) for k in range(2 * square + (array == "kept"))], dtype=object
+        )
+        a, b = (given[k * square : (k + 1) * square].reshape(size, size) for k in range(2))
+        found = np.concatenate([np.ravel(one) for one in work(a, b, *given[2 * square :])])
+        return program_of([(Place(to, k), graph.number(one)) for k, one in enumerate(found)], {})
+
+    first, again = program("given", _scaled, "kept"), program("kept", lambda a, b, unit: _closer(a, b), "kept")
+    last = program("kept", lambda a, b, unit: (a * unit,), "found")
+    return first, again, last, rounds(size), 2 * square + 1
 
 
 FUNCTIONS: dict[Operation, Callable] = {geometric_mean: lambda result, a, b: geometric_mean_of(a[0])}

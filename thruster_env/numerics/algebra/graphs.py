@@ -50,9 +50,10 @@ def uncollected() -> Iterator[None]:
 class Graph:
     """The operations on some numbers that are given, in the order in which they were first asked for."""
 
-    def __init__(self, most: int = 1_000_000):
-        """Begin without numbers; more operations than `most` raise TooLarge."""
+    def __init__(self, most: int = 1_000_000, size: int | None = None):
+        """Begin without numbers; more operations than `most` raise TooLarge. `size` members may be known now."""
         self.numbers: list[Number] = []
+        self.size = size
         self.whole: set[int] = set()  # places of numbers that are not taken apart, as along them slopes are taken
         self._made: dict[tuple, Number] = {}
         self._most = most
@@ -240,7 +241,8 @@ def over_members(a: Number) -> Number:
 
 def size_of(a: Number) -> Number:
     """The number of members, beside a number."""
-    return a.graph.make("size")
+    graph = a.graph
+    return graph.make("size") if graph.size is None else graph.constant(graph.size)
 
 
 def called(name: str, count: int, *numbers: Number) -> list[Number]:

@@ -47,6 +47,9 @@ SPECIAL = {
 
 CALLED: dict[str, Callable] = {}
 """Functions work(given, found) of two arrays that programs call: what would be too long if it were written out."""
+CALLED_IN_ROUNDS: dict[str, Callable[[], tuple[Program, Program, Program, int, int]]] = {}
+"""Makers of the same as programs: what is done at first, in each round and at last; how many rounds there are, and
+how many numbers are in the array `kept` from which and to which rounds lead."""
 
 
 class Place(NamedTuple):
@@ -76,11 +79,6 @@ class Program(NamedTuple):
             values = [names[a.place] if isinstance(a, Number) else a for a in one.arguments]
             lines.append(f"{names[one.place]} = {_expression(one.operation, values)}")
         return lines + [f"{place} = {names[one.place]}" for place, one in self.stores]
-
-    @property
-    def operations(self) -> int:
-        """How many operations it has."""
-        return len(self.works)
 
 
 def _expression(operation: str, values: list[str]) -> str:
@@ -164,10 +162,15 @@ def _run(digest: str, width: int, *arrays) -> None:
 
 
 def _in_python(text: list[str], arrays: Sequence[str] = ARRAYS) -> Callable:
-    names: dict = {**vars(np), "where": _chosen, "over_members": _total, "called": _called}
+    names = work_names()
     lines = "".join(f"    {line}\n" for line in text or ["pass"])
     exec(f"def work({', '.join(arrays)}):\n{lines}", names)
     return names["work"]
+
+
+def work_names() -> dict:
+    """What names in a program's text mean."""
+    return {**vars(np), "where": _chosen, "over_members": _total, "called": _called}
 
 
 def _chosen(condition, a, b):

@@ -248,9 +248,10 @@ def _spikes(rows: np.ndarray, values: np.ndarray, angle: bool) -> np.ndarray:
 
 
 def _where(log: Log, first: int, last: int) -> str:
+    since, until = (log.start + (row * log.dt if log.stamps is None else log.stamps[row]) for row in (first, last))
     if first == last:
-        return f" in row {first}, at {log.start + first * log.dt:.6g} s"
-    return f" in rows {first} to {last}, {log.start + first * log.dt:.6g} to {log.start + last * log.dt:.6g} s"
+        return f" in row {first}, at {since:.6g} s"
+    return f" in rows {first} to {last}, {since:.6g} to {until:.6g} s"
 
 
 def _name(channel: str) -> str:

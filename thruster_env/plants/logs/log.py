@@ -23,6 +23,8 @@ FEWEST_STEPS = 2
 class Log:
     """One recorded run. Row k holds what was measured at time k dt, and the input that acts from then on.
 
+    A log on its own stamps has row k at `stamps[k]`, and only what goes by the clock can filter it.
+
     `thruster simulate --out` writes rows like this, and so does a recorder that reads its sensors right after it
     has sent a command. Channels are named as in `input:V_s`, `measurement:thrust`, `state:omega_m` and `output:T`.
 
@@ -43,6 +45,7 @@ class Log:
         irregular: whether the time stamps of the file lay on no grid.
         recording: what became of the file's rows on the grid; empty where the log is not from a file.
         whole: the log that this one is a piece of, between gaps; None for one that is no piece.
+        stamps: times of the rows [s], (K + 1,), 0 at row 0 and increasing; None for a log on a grid.
     """
 
     name: str
@@ -59,6 +62,7 @@ class Log:
     irregular: bool = False
     recording: Recording = Recording()
     whole: Log | None = None
+    stamps: np.ndarray | None = None
 
     def __post_init__(self):
         """Check shapes and numbers, and make the arrays read-only."""
@@ -80,6 +84,8 @@ class Log:
             held_parts[name] = array
         if steps < FEWEST_STEPS:
             raise ValueError(f"a log must have at least {FEWEST_STEPS + 1} rows, but {self.name} has {steps + 1}")
+        if self.stamps is not None:
+            object.__setattr__(self, "stamps", _checked_stamps(self.stamps, steps, self.name))
         object.__setattr__(self, "inputs", held_parts.pop("inputs"))
         object.__setattr__(self, "measurements", held_parts.pop("measurements"))
         object.__setattr__(self, "references", held_parts)
@@ -92,7 +98,7 @@ class Log:
     @property
     def times(self) -> np.ndarray:
         """Times of the rows [s], (K + 1,), 0 at row 0."""
-        return self.dt * np.arange(self.steps + 1)
+        return self.dt * np.arange(self.steps + 1) if self.stamps is None else self.stamps
 
     @property
     def pieces(self) -> tuple[tuple[int, int], ...]:
@@ -115,6 +121,8 @@ class Log:
         found.update("\0".join(f"{one.symbol} {one.unit}" for one in ones).encode())
         for part in (self.inputs, self.measurements, *(self.references[key] for key in sorted(self.references))):
             found.update(np.ascontiguousarray(part + 0.0).tobytes())
+        if self.stamps is not None:
+            found.update(self.stamps.tobytes())
         return found.hexdigest()[:12]
 
     @property
@@ -174,6 +182,8 @@ def at_offset(log: Log, channel: str, seconds: float) -> Log:
     Raises:
         ValueError: for an unknown channel, or an offset that is no number.
     """
+    if log.stamps is not None:
+        raise ValueError(f"a clock offset must move samples on a grid, but log {log.name} has its own stamps")
     seconds, series = finite(f"the clock offset of {channel}", seconds), log.series(channel)
     changes: dict = {"offsets": {**log.offsets, channel: seconds}, "source": {**log.source, channel: series}}
     kind, _, symbol = channel.partition(":")
@@ -218,6 +228,15 @@ def _piece(log: Log, first: int, rows: int) -> Log:
         recording=Recording(),
         whole=log,
     )
+
+
+def _checked_stamps(given: np.ndarray, steps: int, name: str) -> np.ndarray:
+    stamps = np.array(as_floats(given))
+    if stamps.shape != (steps + 1,) or stamps[0] != 0.0 or not (np.diff(stamps) > 0.0).all():
+        rule = f"{steps + 1} increasing times from 0 on"
+        raise ValueError(f"stamps of log {name} must be {rule}, but got {shown(stamps)}")
+    stamps.setflags(write=False)
+    return stamps
 
 
 def _with_column(rows: np.ndarray, place: int, values: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ from thruster_env.plants.logs.columns import (
 from thruster_env.plants.logs.findings import Recording
 from thruster_env.plants.logs.grid import MOST_HELD, TOLERANCE, Grid, Series, grid_of, held, sampled
 from thruster_env.plants.logs.log import FEWEST_STEPS, Log
+from thruster_env.plants.logs.own_stamps import at_own_stamps
 from thruster_env.plants.logs.recorders.merged import Recorded
 from thruster_env.plants.logs.recorders.registry import format_of
 from thruster_env.plants.logs.table import Table, read_table, table_of
@@ -60,6 +61,7 @@ def read_log(
     *,
     clock_offset: Mapping[str, float] | None = None,
     dt: float | None = None,
+    grid: bool = True,
     name: str = "a table",
 ) -> Log:
     """Read a log of a model's inputs and measurements from a file; columns of states and outputs are references.
@@ -86,6 +88,8 @@ def read_log(
         columns: headers by the symbol or name of a quantity, or "kind:symbol"; "HEADER[UNIT]" with another unit.
         clock_offset: how far a channel's clock is ahead [s].
         dt: sample time [s], for files without a time column, or whose time stamps lie on no grid.
+        grid: whether samples are put on a grid; else rows are the times of samples
+            (`thruster_env.plants.logs.own_stamps`), and `dt` is the sample time to which covariances belong.
         name: of a log that is not a file.
 
     Raises:
@@ -107,24 +111,33 @@ def read_log(
         table = read_table(path) if is_file else table_of(path, name)
         found = find_columns(wanted, table.names, said.columns, said.units, table.file, said.dt is None)
     file = table.file
-    grid, start = _grid(table, found.get(TIME), said.dt, file)
-    offsets = _offsets(said.clock_offset, wanted, found, grid, file)
-    source, parts, last = {}, {}, grid.rows - 1
-    rows, dropped = np.zeros(len(grid.times), bool), []
+    of_file, start = _grid(table, found.get(TIME), said.dt, file, grid)
+    dt = of_file.dt
+    offsets = _offsets(said.clock_offset, wanted, found, of_file, file)
+    samples, source, parts = {}, {}, {}
+    rows, dropped = np.zeros(len(of_file.times), bool), []
     for one in wanted:
         if one.key not in found:
             continue
-        series, there = _series(table, found[one.key], one, grid)
+        series, there = _series(table, found[one.key], one, of_file)
+        samples[one.key] = series
         rows |= there
-        if len(series.values) < len(grid.times) or grid.irregular or one.key in offsets:
+        if len(series.values) < len(of_file.times) or of_file.irregular or one.key in offsets:
             source[one.key] = series  # elsewhere the rows tell the same
         offset = offsets.get(one.key, 0.0)
+        if not grid:
+            continue
         if one.kind == INPUT:
-            parts[one.key] = held(series, grid.dt, last, offset, one.quantity.angle)
+            parts[one.key] = held(series, dt, of_file.rows - 1, offset, one.quantity.angle)
         else:
-            parts[one.key] = sampled(series, grid.dt, grid.rows, offset, one.quantity.angle)
-            lost = len(series.values) - int((~np.isnan(sampled(series, grid.dt, grid.rows))).sum())
+            parts[one.key] = sampled(series, dt, of_file.rows, offset, one.quantity.angle)
+            lost = len(series.values) - int((~np.isnan(sampled(series, dt, of_file.rows))).sum())
             dropped += [(one.key, lost)] if lost else []
+    stamps, last = None, of_file.rows - 1
+    if not grid:
+        driving = [one.key for one in wanted if one.kind == INPUT]
+        stamps, parts = at_own_stamps(samples, driving, offsets, dt, float(of_file.times[-1]))
+        last = len(stamps) - 1
 
     def those(kind: str, rows: int) -> np.ndarray:
         some = [parts[one.key] for one in wanted if one.kind == kind]
@@ -133,13 +146,13 @@ def read_log(
     referred = {
         one.key: one.quantity for one in wanted if one.kind not in (INPUT, MEASUREMENT) and one.key in parts
     }
-    if grid.rows <= FEWEST_STEPS:
-        raise ValueError(f"a log must have at least {FEWEST_STEPS + 1} rows, but {file} has {grid.rows}")
+    if last < FEWEST_STEPS:
+        raise ValueError(f"a log must have at least {FEWEST_STEPS + 1} rows, but {file} has {last + 1}")
     return Log(
         name=file,
-        dt=grid.dt,
+        dt=dt,
         inputs=those(INPUT, last),
-        measurements=those(MEASUREMENT, grid.rows),
+        measurements=those(MEASUREMENT, last + 1),
         input_quantities=model.input_quantities,
         measured=model.measurements,
         references={key: parts[key] for key in referred},
@@ -147,9 +160,15 @@ def read_log(
         start=start,
         source=source,
         offsets=offsets,
-        irregular=grid.irregular,
-        recording=_recording(grid, rows, tuple(dropped)),
+        irregular=of_file.irregular,
+        recording=_recording(of_file, rows, tuple(dropped)) if grid else _as_recorded(of_file),
+        stamps=stamps,
     )
+
+
+def _as_recorded(of_file: Grid) -> Recording:
+    """What became of a file's rows without a grid: at most of two with one stamp the last one counts."""
+    return Recording(doubled=int((np.diff(of_file.times) == 0).sum()))
 
 
 def _recording(grid: Grid, rows: np.ndarray, dropped: tuple[tuple[str, int], ...]) -> Recording:
@@ -185,8 +204,8 @@ def _described(path: Path) -> Description:
     return Description(**content)
 
 
-def _grid(table: Table, column: Column | None, dt: float | None, file: str) -> tuple[Grid, float]:
-    """The grid of a file's rows, and the stamp of its first one [s]."""
+def _grid(table: Table, column: Column | None, dt: float | None, file: str, grid: bool) -> tuple[Grid, float]:
+    """The grid of a file's rows, or its sample time with their own times, and the stamp of the first one [s]."""
     count = len(table.lines)
     if dt is not None:
         dt = positive("dt", dt)
@@ -222,7 +241,10 @@ def _grid(table: Table, column: Column | None, dt: float | None, file: str) -> t
         raise ValueError(
             f"a log must be at most {MOST_STEPS} steps long, but {file} has {count:.3g} from first to last time"
         )
-    return grid_of(stamps, dt, table.clock), float(stamps[0])
+    found = grid_of(stamps, dt, table.clock)
+    if not grid:
+        found = Grid(found.dt, found.rows, stamps - stamps[0], True)
+    return found, float(stamps[0])
 
 
 def _offsets(

@@ -17,6 +17,7 @@ from thruster_env.plants.logs.recorders.topics import (
     MOST_FIELDS,
     Topic,
     Wanted,
+    bounded,
     check_bytes,
     package,
     reading,
@@ -59,7 +60,7 @@ def topics(path: Path, wanted: Wanted = None) -> Iterator[Topic]:
     room = package("rosbags.rosbag1" if path.suffix.lower() == ".bag" else "rosbags.rosbag2", KIND, path)
     types = package("rosbags.typesys", KIND, path)
     found: dict[str, Samples] = {}
-    with reading(KIND, path), room.Reader(path) as reader:
+    with reading(KIND, path), bounded("a bag", path), room.Reader(path) as reader:
         for file in sorted(path.glob(f"*{DATABASE}")) if path.is_dir() else [path]:
             _check_whole(file)
         some = [one for one in reader.connections if wants(wanted, one.topic)]

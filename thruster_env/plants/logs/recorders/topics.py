@@ -14,6 +14,7 @@ import numpy as np
 from thruster_env.numerics.extras import to_install
 
 MOST_BYTES = 2**31  # of all arrays that are read at once, and of a file that a package reads whole
+MOST_MEMORY = 3 * MOST_BYTES  # by which a process may grow while a package unpacks a file
 MOST_COLUMNS = 64  # of a field that is an array: pictures and point clouds are no channels
 MOST_FIELDS = 20_000  # of a message
 
@@ -76,6 +77,32 @@ def reading(kind: str, path: Path) -> Iterator[None]:
         raise
     except Exception as error:
         raise unreadable(kind, path, error) from None
+
+
+@contextmanager
+def bounded(what: str, path: Path) -> Iterator[None]:
+    """Let the process grow by MOST_MEMORY at most, so that what unpacks to more is refused, in one line.
+
+    The limit is the operating system's, on Linux; elsewhere there is none. Nothing may be yielded within.
+    """
+    most = MOST_MEMORY
+    try:
+        import resource
+
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    except (ImportError, OSError):
+        yield
+        return
+    before = soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    limit = pages * resource.getpagesize() + most
+    if soft == resource.RLIM_INFINITY or limit < soft:
+        resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
+    try:
+        yield
+    except MemoryError:
+        raise Refused(f"{what} must take at most {most:.3g} bytes of memory, but {path} takes more") from None
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 @contextmanager

@@ -1,0 +1,263 @@
+"""NAME.h and NAME.c of a filter of mean and covariance."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterable, Mapping
+from inspect import cleandoc
+from math import prod
+
+import numpy as np
+
+from filters.c.monitor import TestsWriter
+from filters.c.programs import FilterPrograms
+from filters.engine.restart import LARGEST
+from thruster_env.numerics.algebra.c_source import functions_called_by, literal, statements_of
+from thruster_env.numerics.algebra.programs import Program
+from thruster_env.numerics.angles import wrapped_where
+from thruster_env.plants.quantities import Quantity
+
+LARGEST_FLOAT = 1e30  # what is LARGEST in single precision
+TEST_ANEW = "    {name}_test_anew(filter);\n"
+TEST_UPDATE = "    test_update(filter, z);\n"
+
+
+class Writer:
+    """Writes the files of one filter.
+
+    Attributes:
+        name, programs, single: of the filter.
+        model: that it assumes.
+        real: "double" or "float".
+        tests: of innovations, or None.
+        of_key, by_key: parameters and arguments of what begins with random numbers.
+    """
+
+    includes = ""  # of NAME.h
+    of_key = by_key = ""
+
+    def __init__(self, name: str, programs: FilterPrograms, single: bool, tests: TestsWriter | None):
+        """Take a filter."""
+        self.name, self.programs, self.single, self.tests = name, programs, single, tests
+        self.model, self.real = programs.model, "float" if single else "double"
+        self.of_u = f", const {self.real} *u" if self.model.inputs else ""
+        self.by_u = ", u" * (self.model.inputs > 0)
+
+    def header(self, filter_name: str) -> str:
+        """NAME.h."""
+        name, model, real = self.name, self.model, self.real
+        page = sys.modules[self.programs.page].__doc__ or ""
+        guard, n, m = name.upper(), model.n, model.m
+        u, z = self._given()
+        types, members, declared = (
+            ("", "", "") if self.tests is None else (self.tests.types, self.tests.members, self.tests.declared)
+        )
+        return f"""\
+/* The filter {filter_name}, {"single" if self.single else "double"} precision.
+
+{_indented(cleandoc(page))}
+
+   Compile without -ffast-math, which takes NaN for a number. */
+#ifndef {guard}_H
+#define {guard}_H
+{self.includes}
+#ifdef __cplusplus
+extern "C" {{
+#endif
+
+enum {{ {guard}_STATES = {n}, {guard}_INPUTS = {model.inputs}, {guard}_MEASUREMENTS = {m} }};
+
+{types}typedef struct {{
+    {real} x[{n}];            /* estimate: {_listed(model.states)} */
+    {real} P[{n * n}];            /* covariance of its error, by rows */
+    {real} innovation[{m}];   /* measurement minus its prediction: {_listed(model.measurements)}; 0 if missing */
+    {real} S[{m * m}];            /* covariance of the innovation, by rows */
+    {real} nis;             /* v' S^-1 v of the innovation v: chi-square of `channels` degrees of freedom */
+    {real} log_likelihood;  /* log N(v; 0, S) */
+{self.kept()}    int channels;           /* that were measured */
+    unsigned long restarts; /* from the prior, after an estimate that was not finite or had a negative variance */
+{members}}} {name};
+
+/* Begin with the prior{" and a key: the same one gives the same random numbers" * bool(self.of_key)}. */
+void {name}_init({name} *filter{self.of_key});
+
+/* Predict a step{f", under u: {_listed(model.input_quantities)}" if model.inputs else ""}. */
+void {name}_predict({name} *filter{u});
+
+/* Correct by a measurement; a channel that is NaN is missing. */
+void {name}_update({name} *filter{z});
+{declared}
+#ifdef __cplusplus
+}}
+#endif
+
+#endif
+"""
+
+    def source(self) -> str:
+        """NAME.c."""
+        name, model, real = self.name, self.model, self.real
+        n, m, zero = model.n, model.m, literal(0.0, self.single)
+        magnitude = "fabsf" if self.single else "fabs"
+        u, z = self._given()
+        constants = "\n".join(self._array(key, np.ravel(value)) for key, value in self.constants().items())
+        begin, test = ("", "") if self.tests is None else (TEST_ANEW.format(name=name), TEST_UPDATE)
+        functions = "\n".join(functions_called_by(self.programs.all, self.single) + self.functions())
+        return f"""\
+#include "{name}.h"
+
+#include <math.h>
+
+{constants}
+
+{functions}
+static void become_prior({name} *filter)
+{{
+    for (int i = 0; i < {m}; i++) {{
+        filter->innovation[i] = {zero};
+    }}
+    for (int i = 0; i < {m * m}; i++) {{
+        filter->S[i] = R[i];
+    }}
+    filter->nis = {zero};
+    filter->log_likelihood = {zero};
+{self.prior()}}}
+
+/* Whether a number is not finite, or a variance negative. */
+static int is_lost(const {name} *filter)
+{{
+    {real} sum = {magnitude}(filter->log_likelihood);
+
+    for (int i = 0; i < {n}; i++) {{
+        sum += {magnitude}(filter->x[i]);
+        if (!(filter->P[i * {n + 1}] >= {zero})) {{
+            return 1;
+        }}
+    }}
+    for (int i = 0; i < {n * n}; i++) {{
+        sum += {magnitude}(filter->P[i]);
+    }}
+    for (int i = 0; i < {m}; i++) {{
+        sum += {magnitude}(filter->innovation[i]);
+    }}
+    for (int i = 0; i < {m * m}; i++) {{
+        sum += {magnitude}(filter->S[i]);
+    }}
+    return !(sum < {literal(LARGEST_FLOAT if self.single else LARGEST, self.single)});
+}}
+
+{"" if self.tests is None else self.tests.functions}void {name}_init({name} *filter{self.of_key})
+{{
+{self.by_key}    become_prior(filter);
+    filter->channels = 0;
+    filter->restarts = 0;
+{begin}}}
+
+void {name}_predict({name} *filter{u})
+{{
+{self.predict()}}}
+
+void {name}_update({name} *filter{z})
+{{
+{self.before_update()}    correct(filter, z);
+    filter->channels = 0;
+    for (int i = 0; i < {m}; i++) {{
+        filter->channels += !isnan(z[i]);
+    }}
+    if (is_lost(filter)) {{
+        become_prior(filter);
+        filter->restarts++;
+    }}
+{test}}}
+"""
+
+    def kept(self) -> str:
+        """The members of the struct for what the filter keeps besides."""
+        members = ""
+        for name, shape in self.programs.kept.items():
+            size = f"[{prod(shape)}]" * bool(shape)
+            how = ", by rows" * (len(shape) == 2)
+            members += f"    {self.real} {name}{size}; /* kept besides x and P{how} */\n"
+        return members
+
+    def constants(self) -> Mapping[str, np.ndarray]:
+        """Arrays by their names."""
+        model = self.model
+        mean = wrapped_where(model.prior_mean, model.shape.state_angles)
+        return {"prior_mean": mean, "prior_cov": model.prior_cov, "R": model.measurement_noise_cov}
+
+    def functions(self) -> list[str]:
+        """Functions of the programs."""
+        programs, belief, real = self.programs, f"{self.name} *filter", self.real
+        predicted = f", {real} *X" * bool(programs.flying)
+        advanced = f"{real} *x" if programs.points else belief + predicted
+        return [
+            *[self.function("start", belief, programs.start)] * bool(programs.kept),
+            *[self.function("begin", belief + predicted, programs.begin)] * bool(programs.flying),
+            self.function("advance", advanced + self.of_u, programs.advance),
+            self.function("settle", belief + predicted, programs.settle),
+            self.function("correct", f"{belief}, const {real} *z", programs.update),
+        ]
+
+    def prior(self) -> str:
+        """Statements that set the belief."""
+        n, start = self.model.n, "    start(filter);\n" * bool(self.programs.kept)
+        return f"""\
+    for (int i = 0; i < {n}; i++) {{
+        filter->x[i] = prior_mean[i];
+    }}
+    for (int i = 0; i < {n * n}; i++) {{
+        filter->P[i] = prior_cov[i];
+    }}
+{start}"""
+
+    def predict(self) -> str:
+        """Statements of a step."""
+        programs, n = self.programs, self.model.n
+        flying = ", X" * bool(programs.flying)
+        begin, step = "", f"        advance(filter{flying}{self.by_u});\n"
+        if programs.flying:
+            begin = f"    {self.real} X[{programs.flying}];\n\n    begin(filter, X);\n"
+        if programs.points:
+            move = f"            advance(X + {n} * i{self.by_u});\n"
+            step = f"        for (int i = 0; i < {programs.points}; i++) {{\n{move}        }}\n"
+        loop = f"    for (int k = 0; k < {self.model.substeps}; k++) {{\n{step}    }}\n"
+        return f"{begin}{loop}    settle(filter{flying});\n"
+
+    def before_update(self) -> str:
+        """Statements before a correction."""
+        return ""
+
+    def statements(self, program: Program) -> list[str]:
+        """A program in C."""
+        return statements_of(program, self.single)
+
+    def function(self, name: str, arguments: str, program: Program) -> str:
+        """A function that runs a program."""
+        lines = self.statements(program)
+        used = set(re.findall(r"\w+", " ".join(lines)))
+        unused = [one for one in re.findall(r"\*(\w+)", arguments) if one not in used]
+        body = "\n".join(f"    {line}" for line in [*(f"(void){one};" for one in unused), *lines])
+        return f"static void {name}({arguments})\n{{\n{body}\n}}\n"
+
+    def _given(self) -> list[str]:
+        sizes = self.model.inputs, self.model.m
+        return [f", const {self.real} {key}[{size}]" * (size > 0) for key, size in zip("uz", sizes, strict=True)]
+
+    def _array(self, name: str, values: np.ndarray) -> str:
+        numbers = ", ".join(literal(float(value), self.single) for value in values)
+        return f"static const {self.real} {name}[{len(values)}] = {{{numbers}}};"
+
+
+def _listed(quantities: Iterable[Quantity]) -> str:
+    return _plain(", ".join(one.short_label for one in quantities))
+
+
+def _indented(text: str) -> str:
+    return "\n".join(f"   {line}".rstrip() for line in _plain(text).splitlines())
+
+
+def _plain(text: str) -> str:
+    """Text for a comment."""
+    return text.encode("ascii", "replace").decode().replace("*/", "* /")

@@ -1,0 +1,144 @@
+"""Logs on their own stamps: the numbers of the grid where stamps lie on it, and those of `live` elsewhere."""
+
+import dataclasses
+import inspect
+import pickle
+
+import numpy as np
+import pytest
+
+from filters import make_filter
+from filters.logs.alarms import alarms_of
+from filters.logs.estimate import estimate
+from filters.monitoring import Monitor
+from tests.filters.test_live import oscillator
+from thruster_env.logged import logged_model
+from thruster_env.model import thruster_model
+from thruster_env.plants.continuous import in_discrete_time
+from thruster_env.plants.logs.read import read_log
+from thruster_env.plants.replay import ReplayEnv
+from tuning.identification.family import ModelFamily
+from tuning.identification.runs import runs_of
+from tuning.problems.log_problem import LogProblem
+
+
+def table(stamps, seed=0, missing=()):
+    rng = np.random.default_rng(seed)
+    thrust = 5.0 * np.sin(stamps) + rng.normal(size=len(stamps))
+    thrust[list(missing)] = np.nan
+    return {"time_s": stamps, "V_s": 8.0 * np.sign(np.sin(3.0 * stamps)) + 0.1, "thrust": thrust}
+
+
+@pytest.mark.parametrize("name", ["ekf", "ukf", "enkf", "sage-husa", "pf"])
+def test_where_stamps_lie_on_the_grid_the_numbers_are_those_of_the_grid(name):
+    stamps = 100.0 + 0.01 * np.delete(np.arange(200), [50, 51, 120])  # rows that are missing
+    data = table(stamps, missing=[20, 21, 22])
+    on_grid = estimate(data, name, thruster_model)
+    own = estimate(data, name, thruster_model, grid=False)
+    rows = np.round((stamps - 100.0) / 0.01).astype(int)
+    assert own.log.steps + 1 == len(stamps) < on_grid.log.steps + 1 == 200
+    np.testing.assert_allclose(own.log.times, stamps - 100.0, atol=1e-12)
+    for one in ("means", "covs", "innovations", "innovation_covs", "log_likelihoods"):
+        np.testing.assert_allclose(getattr(own, one), getattr(on_grid, one)[rows], rtol=1e-10, atol=1e-10)
+
+
+def test_sensors_at_rates_of_their_own_are_rows_at_their_own_times():
+    rng = np.random.default_rng(3)
+    stamps = np.cumsum(rng.uniform(0.01, 0.09, size=80))
+    first = rng.random(80) < 0.5
+    data = {"time_s": stamps, "u_1": rng.normal(size=80), "position": np.where(first, rng.normal(size=80), np.nan)}
+    data["rate"] = np.where(first, np.nan, rng.normal(size=80))
+    plant = oscillator()
+    found = estimate(data, "ekf", plant, grid=False, dt=0.05)
+    live = make_filter("ekf", plant.at(0.05)).live(noise=plant.noise)
+    z = np.column_stack([data["position"], data["rate"]])
+    live.start(stamps[0], z[0])
+    for k in range(1, 80):
+        live.predict_to(stamps[k], data["u_1"][k - 1])
+        live.update(stamps[k], "position" if first[k] else "rate", z[k][~np.isnan(z[k])])
+        np.testing.assert_allclose(found.means[k], live.mean, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(found.covs[k], live.cov, rtol=1e-10, atol=1e-12)
+
+
+def test_another_q_than_that_of_the_rates_goes_with_the_length_of_a_step():
+    stamps = np.array([0.0, 0.02, 0.05, 0.06, 0.1])
+    data = {"time_s": stamps, "u_1": np.ones(5), "position": stamps + 1.0, "rate": stamps**2}
+    q = [1e-3, 2e-3]
+    found = estimate(data, "ekf", oscillator(), grid=False, dt=0.05, model_arguments={"process_noise_cov": q})
+    live = make_filter("ekf", oscillator().at(0.05).replace(process_noise_cov=q)).live()
+    live.start(0.0, [1.0, 0.0])
+    for k in range(1, 5):
+        live.predict_to(stamps[k], [1.0])
+        live.update(stamps[k], None, [stamps[k] + 1.0, stamps[k] ** 2])
+    np.testing.assert_allclose(found.means[-1], live.mean, rtol=1e-12)
+
+
+def test_a_clock_offset_moves_stamps_and_inputs_are_held_from_their_own():
+    stamps = 0.1 * np.arange(8.0)
+    data = {"time_s": stamps, "u_1": np.arange(8.0), "position": stamps, "rate": stamps**2}
+    log = read_log(data, oscillator().at(0.1), clock_offset={"rate": 0.03}, grid=False)
+    np.testing.assert_allclose(log.times, np.sort([*stamps, *(stamps[1:] - 0.03)]), atol=1e-12)
+    np.testing.assert_array_equal(log.inputs[:6, 0], [0, 0, 1, 1, 2, 2])
+    rate = log.measurements[~np.isnan(log.measurements[:, 1])]
+    np.testing.assert_allclose(rate[:, 1], stamps[1:] ** 2)  # its first sample was before the log's
+    assert np.isnan(rate[:, 0]).all()
+
+
+def damped(damping=0.6):
+    """A function that makes a model in continuous time, as users offer one."""
+    plant = oscillator()
+    return dataclasses.replace(plant, constants=plant.constants._replace(damping=damping))
+
+
+def test_a_function_may_make_a_model_in_continuous_time():
+    rng = np.random.default_rng(7)
+    stamps = 0.05 * np.arange(40.0)
+    data = {"time_s": stamps, "u_1": rng.normal(size=40), "position": rng.normal(size=40), "rate": stamps}
+    of_model, of_function = (estimate(data, "ekf", one, grid=False) for one in (oscillator(), damped))
+    np.testing.assert_array_equal(of_function.means, of_model.means)
+    assert of_function.noise is not None
+    on_grid = estimate(data, "ekf", damped, model_arguments={"damping": 0.6})
+    np.testing.assert_allclose(on_grid.means, of_model.means, rtol=1e-9, atol=1e-12)
+    made = pickle.loads(pickle.dumps(in_discrete_time(damped)))
+    assert list(inspect.signature(made).parameters) == ["damping", "dt"]
+    family = ModelFamily(made, ["damping"], dt=0.05)
+    assert family.model(damping=0.7).constants.damping == 0.7 and {"damping", "Q11"} <= set(family.known)
+    assert in_discrete_time(thruster_model) is thruster_model
+
+
+def test_alarms_and_isolation_work_on_own_stamps():
+    rng = np.random.default_rng(5)
+    stamps = np.cumsum(rng.uniform(0.01, 0.09, size=300))
+    data = {"time_s": stamps, "u_1": np.zeros(300), "position": 0.1 * rng.normal(size=300)}
+    data["rate"] = np.where(np.arange(300) < 200, 0.3 * rng.normal(size=300), 0.25)
+    found = estimate(data, "ekf", oscillator(), grid=False, dt=0.05)
+    told = alarms_of(found, Monitor(stuck=10), isolate=True)
+    assert any(one.test == "stuck" and one.step in (208, 209) for one in told.alarms)
+
+
+@pytest.mark.parametrize(
+    "call, rule",
+    [
+        (
+            lambda data: estimate(data, "ekf", thruster_model, grid=False, smoother=True),
+            "a smoother must run on",
+        ),
+        (lambda data: estimate(data, "kf", thruster_model, grid=False), "on a model with a constant dt"),
+        (
+            lambda data: estimate(data, "ekf", logged_model(lag={"thrust": 0.02}), grid=False),
+            "a model whose other constants do not follow from dt",
+        ),
+        (lambda data: ReplayEnv(data, thruster_model, grid=False).reset(), "must lie on a grid to be replayed"),
+        (
+            lambda data: LogProblem(read_log(data, thruster_model(), grid=False), thruster_model()),
+            "logs to learn from must lie on a grid, but a table has its own stamps",
+        ),
+        (
+            lambda data: runs_of([read_log(data, thruster_model(), grid=False)]),
+            "logs to learn from must lie on a grid",
+        ),
+    ],
+)
+def test_what_needs_a_grid_says_so(call, rule):
+    with pytest.raises(ValueError, match=rule):
+        call(table(0.01 * np.arange(30)))
