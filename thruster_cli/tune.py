@@ -187,9 +187,10 @@ def command(
 
     With --way a published method finds the numbers instead; samplers among them end after so many trials, the
     others of themselves. With a model that is right and true states: noise-estimation. With true states, if the
-    covariance counts, too: log-score; if the estimate alone counts: mse. Without true states: likelihood. Of an
-    ensemble: this study, or desroziers without true states. With true states and a wrong model, or a dead
-    band, add --full-q (and --full-r) to mse or log-score. `thruster ways` lists all of them.
+    covariance counts, too: log-score; if the estimate alone counts: mse. Without true states: likelihood, or of a
+    linear model on long runs als, which takes --full-q and --full-r. Of an ensemble: this study, or desroziers
+    without true states. With true states and a wrong model, or a dead band, add --full-q (and --full-r) to mse or
+    log-score. `thruster ways` lists all of them.
 
     With --log it uses recorded runs instead, cut into blocks of which every third is held out. It minimises the
     negative log-likelihood of the innovations, unless the logs contain the true states.

@@ -11,7 +11,7 @@ from tests.thruster_cli.test_cli import as_json, thruster  # noqa: F401 - fixtur
 from thruster_env.studies.ways import runs as study_runs
 from thruster_env.studies.ways.entries import Result, Scored, data_set, reference, run_way, start_of
 from thruster_env.studies.ways.predictions import PREDICTIONS
-from thruster_env.studies.ways.problems import CASES, GROUPS, QUICK
+from thruster_env.studies.ways.problems import CASES, GROUPS, QUICK, ring
 from thruster_env.studies.ways.protocol import ENTRIES, FAST, REFERENCE, Protocol
 from thruster_env.studies.ways.runs import file_of, jobs_of, run_protocol
 from thruster_env.studies.ways.statistics import chance, regrets, student
@@ -91,6 +91,32 @@ def test_the_protocol_names_all_groups_and_was_predicted():
     assert {case.group for case in CASES} == set(GROUPS)
     assert len({case.name for case in CASES}) == len(CASES) and Protocol().ways == ENTRIES
     assert {"we", "Rawlings et al."} <= {one.who for one in PREDICTIONS}
+
+
+def test_two_targets_have_full_blocks_of_q_which_noise_estimation_finds():
+    case = next(case for case in CASES if case.name == "targets")._replace(runs=4)
+    q = case.make().true["process_noise_cov"]
+    blocks = np.array(q).reshape(2, 4, 2, 4)
+    assert np.count_nonzero(blocks[0, :, 0]) == np.count_nonzero(blocks[1, :, 1]) == 16
+    assert not blocks[0, :, 1].any() and np.linalg.eigvalsh(np.array(q))[0] > 0.0
+    # Van Loan's integral of a velocity that wanders, by small steps.
+    steps = np.linspace(0.0, 1.0, 2001)
+    moved = np.array(
+        [[np.trapezoid(a * b, steps) for b in (steps, 1.0 + 0.0 * steps)] for a in (steps, 1.0 + 0.0 * steps)]
+    )
+    np.testing.assert_allclose(blocks[0, :, 0], np.kron(moved, blocks[0, 2:, 0, 2:]), rtol=1e-6)
+    found, start, oracle = (run_way(case, way, 0, FAST).last for way in ("noise-estimation", "start", "oracle"))
+    assert found.score < 1.01 * oracle.score < 0.9 * start.score
+
+
+def test_a_ring_is_tuned_by_its_inflation_alone():
+    case = next(case for case in CASES if case.make is ring)._replace(make=lambda: ring(100), runs=2)
+    starts = [start_of(case, place) for place in range(3)]
+    assert starts[0] == starts[1] == starts[2] and starts[0].numbers["ensemble_size"] == 20
+    assert set(starts[0].model["measurement_noise_cov"]) == {1.0}
+    found = run_way(case, "anderson", 0, FAST)
+    assert found.error == "" and 1.005 < found.choice["numbers"]["inflation"] < 1.05
+    assert run_way(case, "likelihood", 0, FAST).last is None
 
 
 def test_the_command_writes_its_page(as_json, thruster, tmp_path):  # noqa: F811

@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-OF_ONE_PACKAGE = {"parquet": "pyarrow", "units": "pint", "frames": "pandas", "samplers": "cmaes", "torch": "torch"}
+OF_ONE_PACKAGE = {
+    "parquet": "pyarrow",
+    "units": "pint",
+    "frames": "pandas",
+    "samplers": "cmaes",
+    "nuts": "nutpie",
+    "torch": "torch",
+}
 
 
 def to_install(extra: str) -> str:

@@ -101,6 +101,14 @@ class Data(NamedTuple):
             return values[:, self.late].mean(axis=(0, 1))
         return self.scored_rows(values).mean(axis=0)
 
+    def every(self, count: int) -> Data:
+        """The same runs measured at every so many steps alone, from the first scored one on: a slower sample time.
+
+        What was measured between is missing, so that a filter predicts over all of it with its own model.
+        """
+        kept = np.arange(self.steps + 1) % count == self.first_scored % count
+        return self._replace(measurements=np.where(kept[:, None], self.measurements, np.nan))
+
     def slice(self, first: int, last: int) -> Data:
         """The runs from `first` up to, but without, `last`."""
         part = slice(first, last)

@@ -2,31 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 import numpy as np
 
-from thruster_env.plants.affine import linearize
-from tuning.likelihood.family import Family
-from tuning.problems.data import Data
+from filters.tuned_file import NOISE
+from tuning.evaluation.baselines import with_covariances
+from tuning.ways.lagged import ITERATIONS, Noise, Stationary, by_lags, lagged, observed, stationary
 from tuning.ways.task import Task
 
-LAGS = 15
-DROPPED = 100  # rows at the beginning, at most a fifth of a run
-ITERATIONS = 3  # the gain of each is that of the Q and R found before
-ALIKE = 1e-9  # relative difference, up to which two linearisations are the same
-LINEAR = 1e-6  # part of Q or R that numbers may not stand for: slopes of a model's own numbers are differences
-
-
-class Stationary(NamedTuple):
-    """A linear model x' = A x + B u + a, z = C x + d."""
-
-    a: np.ndarray
-    b: np.ndarray
-    offset: np.ndarray
-    c: np.ndarray
-    zero: np.ndarray
+LEAST = 1e-10  # part of the start's variances below which none falls, so that a gain exists
+PRECISE, MOST = 1e-12, 400  # relative change of squares and roots that ends Gauss and Newton's steps; and how many
 
 
 def als(task: Task) -> None:
@@ -36,8 +20,9 @@ def als(task: Task) -> None:
         b = (C x O)(I - Ab x Ab)^-1 [vec Q + (A L x A L) vec R] + (I x Gam) vec R,   b = vec(C_0; C_1; ...)
         O = (C; C Ab; ...),   Gam = (I; -C A L; -C Ab A L; ...),   x the product of Kronecker
 
-    Q and R have to be linear in the numbers that are tuned. The first gain is that of the start. It needs one pass
-    of a filter an iteration. With more unknowns in Q than n m the answer is not unique.
+    Q and R have to be linear in the numbers that are tuned, or are full matrices that stay positive semidefinite.
+    The first gain is that of the start. It needs one pass of a filter an iteration. With more unknowns in Q than
+    n m the answer is not unique.
 
     Source: Odelson, Rajamani, Rawlings (2006), "A new autocovariance least-squares method for estimating noise
     covariances", Automatica 42(2); Rajamani, Rawlings (2009), Automatica 45(1).
@@ -48,127 +33,90 @@ def als(task: Task) -> None:
         design = [lagged(linear, gain, q, r, lags).ravel() for q, r in zip(noise.q, noise.r, strict=True)]
         return np.column_stack(design), (seen - lagged(linear, gain, *noise.rest, lags)).ravel()
 
-    by_lags(task, "als", equations)
+    wanted = [bool(task.options.get(one)) for one in ("full_q", "full_r")]
+    if any(wanted) and set(NOISE) <= set(task.start.model):
+        _matrices(task, *wanted)
+    else:
+        by_lags(task, "als", equations)
 
 
-class Noise(NamedTuple):
-    """Q and R as sums of numbers times units, and of what no number moves."""
+def _matrices(task: Task, full_q: bool, full_r: bool) -> None:
+    """The same of Q, R or both in full; of what is not full the diagonal is found."""
+    model, held = task.model(task.start), bool(task.options.get("hold_r"))
+    linear = stationary(model, task.problems[0].name, "als")
+    first = q, r = model.process_noise_cov, model.measurement_noise_cov
+    free = _free(q, full_q), _free(r, full_r) & (not held)
+    for _ in range(ITERATIONS):
+        gain, seen = observed(task, linear, q, r)
+        q, r = semidefinite(linear, gain, seen, first, free)
+        task.keep(with_covariances(task.start, q, None if held else r))
 
-    q: np.ndarray  # units, (p, n, n)
-    r: np.ndarray  # (p, m, m)
-    rest: tuple[np.ndarray, np.ndarray]
 
+def semidefinite(
+    linear: Stationary,
+    gain: np.ndarray,
+    seen: np.ndarray,
+    first: tuple[np.ndarray, np.ndarray],
+    free: tuple[np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Q = S S' and R = T T' with the least squares of lagged covariances, over their triangular roots S and T.
 
-def by_lags(task: Task, name: str, equations: Callable[..., tuple[np.ndarray, np.ndarray]]) -> None:
-    """Numbers not below zero that solve linear equations in the lagged covariances of innovations, three times.
+        d b / d S_ik = 2 sum_j B_ij S_jk,   B_ij the lagged covariances of Q = (e_i e_j' + e_j e_i') / 2
+
+    The squares are convex in Q and R, and roots with as many columns as rows have no minimum but theirs.
 
     Args:
-        task: what is tuned.
-        name: of the way, for errors.
-        equations: (linear, gain, covariances (lags, m, m), noise) returns the matrix (rows, p) and the right side.
+        linear: the model.
+        gain: L (n, m).
+        seen: lagged covariances of its innovations, (lags, m, m).
+        first: Q (n, n) and R (m, m), at whose diagonals the search begins; what has no free entry stays.
+        free: which entries of their roots are free, (n, n) and (m, m) bool.
 
-    Raises:
-        ValueError: of a model that is not linear, or whose Q and R are not linear in the numbers.
+    Source: Burer, Monteiro (2005), "Local minima and convergence in low-rank semidefinite programming",
+    Mathematical Programming 103(3).
     """
-    from scipy.optimize import nnls
+    from scipy.optimize import least_squares
 
-    family = Family(task.start, task.problems[0], task.free)
-    coordinates = family.coordinates
-    if not coordinates.log.all():
-        raise ValueError(
-            f"way {name!r} needs Q and R linear in positive numbers, but a number is on a linear scale"
-        )
-    model = task.model(task.start)
-    linear = stationary(model, task.problems[0].name, name)
-    point = np.clip(coordinates.of(task.values_of(task.start, task.free)), coordinates.low, coordinates.high)
-    for _ in range(ITERATIONS):
-        model, slopes = family.at(point)
-        each = np.exp(point)
-        units = [one / each[:, None, None] for one in (slopes.process_noise_cov, slopes.measurement_noise_cov)]
-        of_model = model.process_noise_cov, model.measurement_noise_cov
-        q, r = (of - np.tensordot(each, one, 1) for of, one in zip(of_model, units, strict=True))
-        if any(abs(one).max() > LINEAR * abs(of).max() for one, of in zip((q, r), of_model, strict=True)):
-            if not task.options.get("hold_r"):
-                raise ValueError(
-                    f"way {name!r} needs Q and R linear in the numbers that are tuned, but they are not"
-                )
-        gain = steady_gain(linear, *of_model)
-        lags = min(LAGS, *(max(2, int(one.rows.min()) // 4) for one in task.data))
-        seen = autocovariances([_innovations(linear, gain, one, model.prior_mean) for one in task.data], lags)
-        task.charge(task.passes)
-        design, wanted = equations(linear, gain, seen, Noise(units[0], units[1], (q, r)))
-        scale = np.maximum(abs(design).max(axis=0), 1e-300)
-        found, _ = nnls(design / scale, wanted)
-        values = np.maximum(found / scale, np.exp(coordinates.low))
-        point = np.clip(coordinates.of(values), coordinates.low, coordinates.high)
-        task.keep(family.choice_at(point))
+    pairs = list(zip(first, free, strict=True))
+    roots = [np.sqrt(np.diag(np.diag(one))) if mask.any() else np.linalg.cholesky(one) for one, mask in pairs]
+    parts = [one[mask] for one, mask in zip(roots, free, strict=True)]
+    by = [_responses(linear, gain, len(seen), side, len(one)) for side, one in enumerate(first)]
+    wanted, end = seen.ravel(), len(parts[0])
+
+    def filled(point: np.ndarray) -> list[np.ndarray]:
+        for root, mask, some in zip(roots, free, (point[:end], point[end:]), strict=True):
+            root[mask] = some
+        return roots
+
+    def left(point: np.ndarray) -> np.ndarray:
+        expected = [np.tensordot(one, root @ root.T) for one, root in zip(by, filled(point), strict=True)]
+        return expected[0] + expected[1] - wanted
+
+    def slopes(point: np.ndarray) -> np.ndarray:
+        pairs = zip(by, filled(point), free, strict=True)
+        return np.concatenate([2.0 * (one @ root)[:, mask] for one, root, mask in pairs], axis=1)
+
+    ends = {"ftol": PRECISE, "xtol": PRECISE, "gtol": None, "max_nfev": MOST}
+    found = least_squares(left, np.concatenate(parts), slopes, x_scale="jac", **ends)
+    floors = (LEAST * np.diag(np.diag(one)) for one in first)
+    q, r = (root @ root.T + floor for root, floor in zip(filled(found.x), floors, strict=True))
+    return q, r
 
 
-def stationary(model, name: str, way: str) -> Stationary:
-    """The matrices of a linear model; ValueError for another one."""
-    about = np.zeros(model.n), np.zeros(model.inputs)
-    away = np.ones(model.n) * model.scales, np.ones(model.inputs)
-    found, other = (linearize(model, *one).matrices() for one in (about, away))
-    pairs = zip(found, other, strict=True)
-    if not all(
-        np.allclose(one, two, rtol=ALIKE, atol=ALIKE * max(abs(one).max(initial=0), 1.0)) for one, two in pairs
-    ):
-        raise ValueError(
-            f"way {way!r} needs a linear model, such as that of the filter kf, but {name} has another one"
-        )
-    return Stationary(*found)
+def _free(cov: np.ndarray, full: bool) -> np.ndarray:
+    """Which entries of a root are free, (n, n) bool: none of a state without noise."""
+    there = np.diag(cov) > 0.0
+    return np.tril(np.outer(there, there)) if full else np.diag(there)
 
 
-def steady_gain(linear: Stationary, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """The gain L (n, m) of the stationary Kalman filter."""
-    from scipy.linalg import solve_discrete_are
-
-    try:
-        p = solve_discrete_are(linear.a.T, linear.c.T, q, r)
-    except np.linalg.LinAlgError as error:
-        raise ValueError(
-            f"ways by lagged covariances need a model with a stationary filter, but {error}"
-        ) from None
-    s = linear.c @ p @ linear.c.T + r
-    return np.linalg.solve(s, linear.c @ p).T
-
-
-def lagged(linear: Stationary, gain: np.ndarray, q: np.ndarray, r: np.ndarray, lags: int) -> np.ndarray:
-    """C_0, C_1, ..., C_{N-1} of a gain's innovations, under a Q and R, (lags, m, m)."""
-    from scipy.linalg import solve_discrete_lyapunov
-
-    a, c = linear.a, linear.c
-    through = a @ gain
-    closed = a - through @ c
-    p = solve_discrete_lyapunov(closed, q + through @ r @ through.T)
-    blocks, power = [c @ p @ c.T + r], np.eye(len(a))
-    for _ in range(1, lags):
-        blocks.append(c @ (closed @ power @ p @ c.T - power @ through @ r))
-        power = closed @ power
-    return np.array(blocks)
-
-
-def _innovations(linear: Stationary, gain: np.ndarray, data: Data, prior_mean: np.ndarray) -> list[np.ndarray]:
-    """The innovations of each run, (rows, m), without those of the beginning."""
-    seen, measurements = data.seen, data.measurements
-    times = measurements.shape[1]
-    means, found = np.tile(prior_mean, (len(measurements), 1)), np.empty(measurements.shape)
-    for k in range(times):
-        found[:, k] = measurements[:, k] - means @ linear.c.T - linear.zero
-        if k < times - 1:
-            after = means + np.nan_to_num(found[:, k]) @ gain.T
-            means = after @ linear.a.T + seen.inputs[:, k] @ linear.b.T + linear.offset
-    return [run[min(DROPPED, rows // 5) : rows] for run, rows in zip(found, data.rows.tolist(), strict=True)]
-
-
-def autocovariances(parts: list[list[np.ndarray]], lags: int) -> np.ndarray:
-    """Means of e_{k+j} e_k' over all times at which both were measured, (lags, m, m)."""
-    runs = [run for part in parts for run in part]
-    found = []
-    for j in range(lags):
-        pairs = [(run[j:], run[: len(run) - j]) for run in runs if len(run) > j]
-        ahead, behind = (np.concatenate(side) for side in zip(*pairs, strict=True))
-        there = np.isfinite(ahead)[:, :, None] & np.isfinite(behind)[:, None, :]
-        products = np.nan_to_num(ahead)[:, :, None] * np.nan_to_num(behind)[:, None, :]
-        found.append(products.sum(axis=0) / np.maximum(there.sum(axis=0), 1))
-    return np.array(found)
+def _responses(linear: Stationary, gain: np.ndarray, lags: int, side: int, size: int) -> np.ndarray:
+    """Lagged covariances by each entry of Q, side 0, or of R, (lags m m, size, size), symmetric in the entries."""
+    n, m = gain.shape
+    found = np.empty((lags * m * m, size, size))
+    for i in range(size):
+        for j in range(i + 1):
+            noise = np.zeros((n, n)), np.zeros((m, m))
+            noise[side][i, j] += 0.5
+            noise[side][j, i] += 0.5
+            found[:, i, j] = found[:, j, i] = lagged(linear, gain, *noise, lags).ravel()
+    return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tuning.ways.als import Noise, Stationary, by_lags
+from tuning.ways.lagged import Noise, Stationary, by_lags
 from tuning.ways.task import Task
 
 

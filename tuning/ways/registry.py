@@ -15,11 +15,12 @@ from tuning.ways.map import maximum_a_posteriori
 from tuning.ways.masked import masked
 from tuning.ways.mehra import mehra
 from tuning.ways.noise import noise_estimation
+from tuning.ways.nuts import nuts
 from tuning.ways.okf import okf
 from tuning.ways.posterior import posterior
-from tuning.ways.samplers import sample
+from tuning.ways.samplers import SLOWER, sample
 from tuning.ways.scoring import scoring
-from tuning.ways.way import COVARIANCE, GRADIENT, INFLATION, LINEAR, NOISE, TRUTH, Way
+from tuning.ways.way import COVARIANCE, GRADIENT, INFLATION, LINEAR, NOISE, NUTPIE, TRUTH, Way
 
 ABBEEL = "Abbeel, Coates, Montemerlo, Ng, Thrun (2005)"
 CHEN = "Chen, Heckman, Julier, Ahmed (2018), arXiv 1807.08855"
@@ -102,12 +103,12 @@ WAYS = {
         MATRICES,
     ),
     "als": Way(
-        "least squares of lagged covariances of the innovations of a fixed gain",
+        "least squares of lagged covariances of a fixed gain's innovations, full Q and R semidefinite",
         "without true states, of a linear model on long stationary runs: a few passes",
         als,
         "Odelson, Rajamani, Rawlings (2006)",
         (GRADIENT, LINEAR),
-        DIAGONAL,
+        ("hold_r", "full_q", "full_r"),
     ),
     "mehra": Way(
         "P H', R and Q in turn from lagged covariances of the innovations of a fixed gain",
@@ -115,7 +116,7 @@ WAYS = {
         mehra,
         "Mehra (1970)",
         (GRADIENT, LINEAR),
-        DIAGONAL,
+        ("hold_r",),
     ),
     "desroziers": Way(
         "R and one factor on Q from innovations before and after updates, repeated",
@@ -131,7 +132,7 @@ WAYS = {
         anderson,
         "Anderson (2007)",
         (COVARIANCE, INFLATION),
-        (),
+        ("hold_r",),
     ),
     "sage-husa": Way(
         "Sage and Husa's adaptive filter over all runs, then its mean Q and R",
@@ -155,6 +156,13 @@ WAYS = {
         posterior,
         "Haario, Saksman, Tamminen (2001)",
         (COVARIANCE,),
+    ),
+    "nuts": Way(
+        "the same mean by the no-U-turn sampler with exact gradients, of the package nutpie",
+        "like `posterior`, from six numbers on",
+        nuts,
+        "Hoffman, Gelman (2014)",
+        (GRADIENT, NUTPIE),
     ),
     "masked": Way(
         "the downhill simplex on the error of measurements that the filter is not shown",
@@ -215,6 +223,14 @@ WAYS = {
         "the same of mean and variance of the NIS",
         "to compare",
         sample("tpe", "c-nis"),
+        "Chen, Biggie, Ahmed, Julier, Heckman, arXiv 2306.07225",
+        (COVARIANCE,),
+        by_trials=True,
+    ),
+    "c-nis-two-rates": Way(
+        "the larger one of c-nis at the sample time and at one ten times as long",
+        "to compare: two sample times tell Q from R where one leaves a curve of zeros",
+        sample("tpe", "c-nis", SLOWER),
         "Chen, Biggie, Ahmed, Julier, Heckman, arXiv 2306.07225",
         (COVARIANCE,),
         by_trials=True,

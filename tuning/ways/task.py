@@ -176,14 +176,20 @@ class Task:
         finally:
             self._excluded = before + time.process_time() - begin  # what was within this is part of it
 
-    def value(self, choice: Choice, objective: str | None = None) -> float:
-        """An objective of a choice on all training runs, the mean over problems, as a study has it."""
+    def value(self, choice: Choice, objective: str | None = None, data: Sequence[Data] | None = None) -> float:
+        """An objective of a choice on all training runs, the mean over problems, as a study has it.
+
+        Args:
+            choice: of which.
+            objective: the task's if None.
+            data: the same runs as a filter shall see them; the task's if None.
+        """
         name = self.objective if objective is None else objective
         if ("value", name) not in self._seen:
             self._seen.add(("value", name))
             with self.uncounted():
                 self._value(self.start, name, [one.slice(0, 1) for one in self.data])
-        found = self._value(choice, name, self.data)
+        found = self._value(choice, name, self.data if data is None else data)
         self.charge(self.passes)
         return found
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
 from typing import NamedTuple
 
 from filters.registry import filter_class, tunable_numbers
+from thruster_env.numerics.extras import to_install
 from tuning.likelihood.family import check_gradient
 from tuning.search.parameters import Q, R
 from tuning.search.space import has_search_space
-from tuning.ways.als import stationary
+from tuning.ways.lagged import stationary
 from tuning.ways.task import Spent, Task
 
 TRUTH = "truth"  # true states
@@ -17,6 +19,7 @@ GRADIENT = "gradient"  # a Kalman filter with derivatives
 COVARIANCE = "covariance"  # a filter with a covariance
 LINEAR = "linear"  # a linear model with a stationary filter
 INFLATION = "inflation"  # an ensemble
+NUTPIE = "nutpie"  # the package
 NOISE = "noise"  # that Q and R are tuned, and not a model's own parameters
 
 
@@ -27,7 +30,7 @@ class Way(NamedTuple):
     when: str  # when to use it
     follow: Callable[[Task], None]  # keeps choices of a task until it is done, or the task raises Spent
     source: str
-    needs: tuple[str, ...] = ()  # of TRUTH, GRADIENT, COVARIANCE, LINEAR, NOISE
+    needs: tuple[str, ...] = ()  # of the above
     # Options of the model's numbers with which it can work.
     options: tuple[str, ...] = ("hold_r", "full_q", "full_r", "prior", "where")
     by_trials: bool = False  # whether it goes on for as many trials as it is given; others end of themselves
@@ -50,6 +53,8 @@ class Way(NamedTuple):
             raise ValueError(f"way {name!r} tunes Q and R, but {task.problems[0].name} has parameters of its own")
         if LINEAR in self.needs:
             stationary(task.model(task.start), task.problems[0].name, name)
+        if NUTPIE in self.needs and importlib.util.find_spec(NUTPIE) is None:
+            raise ValueError(f"way {name!r} needs {NUTPIE}, which is not installed: {to_install('nuts')}")
         unable = [option for option, wanted in task.options.items() if wanted and option not in self.options]
         if unable:
             raise ValueError(f"way {name!r} must come without {', '.join(unable)}")

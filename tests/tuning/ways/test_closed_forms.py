@@ -7,12 +7,14 @@ from filters import affine_model
 from tests.tuning.ways.problems import A, Q, R, at, linear, task_of
 from thruster_env.plants.simulate import simulate
 from tuning.evaluation.residuals import estimated_from
+from tuning.likelihood.family import symmetric_units
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.parameter import Parameter
 from tuning.problems.runs_problem import RunsProblem
 from tuning.search.objectives import LIKELIHOOD
-from tuning.ways.als import Noise, autocovariances, lagged, stationary, steady_gain
+from tuning.ways.als import semidefinite
 from tuning.ways.anderson import updated
+from tuning.ways.lagged import Noise, autocovariances, lagged, stationary, steady_gain
 from tuning.ways.mehra import mehra_equations
 from tuning.ways.registry import find_way
 from tuning.ways.task import Budget, Task
@@ -99,7 +101,10 @@ def test_map_of_a_full_q_that_is_seen_is_the_mode_of_an_inverse_wishart_distribu
     np.testing.assert_allclose(task.best.model["process_noise_cov"], expected, rtol=1e-4)
 
 
-def test_the_posterior_mean_is_that_of_an_integral_on_a_grid():
+@pytest.mark.parametrize("way", ["posterior", "nuts"])
+def test_the_posterior_mean_is_that_of_an_integral_on_a_grid(way):
+    if way == "nuts":
+        pytest.importorskip("nutpie")
     still = {"prior_mean": [0.0], "prior_cov": [1e-14], "process_noise_cov": [0.0]}
     one = np.eye(1)
     model = affine_model(a=one, b=np.zeros((1, 0)), c=one, measurement_noise_cov=2.0, **still)
@@ -107,14 +112,35 @@ def test_the_posterior_mean_is_that_of_an_integral_on_a_grid():
     problem = RunsProblem([{"measurements": run} for run in z], model, held_out=[2, 3], name="noise")
     task = Task("kf", problem, problem.data([0]), start=None)
     assert [parameter.name for parameter in task.free] == ["R"]
-    find_way("posterior").run("posterior", task)
+    find_way(way).run(way, task)
     grid = np.linspace(-8.0, 8.0, 4001)
     log = -0.5 * (z[0].size * grid + (z[0] ** 2).sum() * np.exp(-grid))
     log -= 0.5 * ((grid - np.log(2.0)) / np.log(10.0)) ** 2
     weights = np.exp(log - log.max())
     mean, second = ((weights * power).sum() / weights.sum() for power in (grid, grid**2))
-    error = 4 * np.sqrt((second - mean**2) / 300)  # of 2000 draws that go together over some steps
+    error = 4 * np.sqrt((second - mean**2) / 300)  # of 2000 draws, or 500, that go together over some steps
     assert np.log(task.best.model["measurement_noise_cov"]) == pytest.approx(mean, abs=error)
+
+
+def test_draws_by_gradients_have_the_mean_of_a_random_walk_and_end_with_the_budget():
+    pytest.importorskip("nutpie")
+    problem, found = linear(runs=4), {}
+    for way in ("posterior", "nuts", "nuts"):
+        task = task_of(problem, 4)
+        find_way(way).run(way, task)
+        found.setdefault(way, []).append(np.log(task.values_of(task.best, task.free)))
+    np.testing.assert_allclose(found["nuts"][0], found["posterior"][0], atol=0.12)
+    np.testing.assert_array_equal(*found["nuts"])
+    for runs in (1, 300):
+        task = task_of(problem, 4, budget=Budget(runs=runs))
+        find_way("nuts").run("nuts", task)
+        assert task.runs <= runs + 4 * task._prices[LIKELIHOOD] and (len(task.kept) > 1) == (runs > 1)
+
+
+def test_without_nutpie_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match="way 'nuts' needs nutpie, which is not installed: pip install nutpie"):
+        find_way("nuts").run("nuts", task_of(linear()))
 
 
 MOTIVATING = {  # of the ALS toolbox: Odelson, Rajamani, Rawlings
@@ -197,6 +223,49 @@ def test_mehra_scatters_more_than_als():
     assert ratios.max() > 1.3 and ratios.min() > 0.9, ratios
 
 
+FULL_Q, FULL_R = np.array([[0.05, 0.06], [0.06, 0.2]]), np.array([[0.4, -0.1], [-0.1, 0.1]])
+WHOLE = np.tril(np.ones((2, 2), dtype=bool)), np.tril(np.ones((2, 2), dtype=bool))
+OTHER = np.diag([0.5, 0.01]), np.diag([0.1, 2.0])  # where searches begin
+
+
+def test_als_finds_full_matrices_from_the_covariances_of_a_gain_that_is_not_the_best():
+    model = stationary(linear(a=A).model(), "a chain", "als")
+    gain = steady_gain(model, *OTHER)
+    q, r = semidefinite(model, gain, lagged(model, gain, FULL_Q, FULL_R, 8), OTHER, WHOLE)
+    np.testing.assert_allclose(q, FULL_Q, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(r, FULL_R, rtol=1e-6, atol=1e-8)
+    with_r = WHOLE[0], np.zeros((2, 2), dtype=bool)
+    q, r = semidefinite(model, gain, lagged(model, gain, FULL_Q, FULL_R, 8), (OTHER[0], FULL_R), with_r)
+    np.testing.assert_allclose(q, FULL_Q, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(r, FULL_R, rtol=1e-9)
+
+
+def test_semidefinite_least_squares_have_the_optimality_of_convex_programs():
+    model = stationary(linear(a=A).model(), "a chain", "als")
+    gain, units = steady_gain(model, *OTHER), symmetric_units(2)
+    outside = lagged(model, gain, np.array([[0.05, 0.15], [0.15, 0.2]]), FULL_R, 8)  # of a Q that is none
+    outside += 0.02 * np.random.default_rng(0).standard_normal(outside.shape)
+    q, r = semidefinite(model, gain, outside, OTHER, WHOLE)
+    left = lagged(model, gain, q, r, 8) - outside
+    none, floor = np.zeros((2, 2)), 1e-6 * (left**2).sum()
+    for cov, side in ((q, 0), (r, 1)):
+        by = [(left * lagged(model, gain, *((one, none) if side == 0 else (none, one)), 8)).sum() for one in units]
+        slope = 0.5 * (np.tensordot(by, units, 1) + np.diag(np.diag(np.tensordot(by, units, 1))))
+        assert np.linalg.eigvalsh(cov)[0] > 0.0
+        assert np.linalg.eigvalsh(slope)[0] > -floor and abs(np.trace(slope @ cov)) < floor
+    assert np.linalg.eigvalsh(q)[0] < 1e-8  # at the end of what may be
+
+
+def test_als_finds_full_matrices_of_long_runs():
+    problem = linear(q=FULL_Q, r=FULL_R, steps=4000, runs=8)
+    task = task_of(problem, 8, options={"full_q": True, "full_r": True})
+    task.start = at(task, np.diag(OTHER[0]), np.diag(OTHER[1]))
+    find_way("als").run("als", task)
+    np.testing.assert_allclose(task.best.model["process_noise_cov"], FULL_Q, rtol=0.1)
+    np.testing.assert_allclose(task.best.model["measurement_noise_cov"], FULL_R, rtol=0.1)
+    assert task.runs == 3 * 8
+
+
 def test_fisher_scoring_ends_where_l_bfgs_ends():
     problem = linear(runs=4, steps=80)
     tasks = {way: task_of(problem, 4, options={"full_q": True}) for way in ("scoring", "likelihood")}
@@ -214,9 +283,9 @@ def test_als_refuses_what_it_cannot_do():
     task = Task("ekf", problem, problem.data(range(2)))
     with pytest.raises(ValueError, match="way 'als' needs a linear model"):
         find_way("als").run("als", task)
-    task = task_of(linear(), options={"full_q": True})
-    with pytest.raises(ValueError, match="way 'als' must come without full_q"):
-        find_way("als").run("als", task)
+    for way, option in (("als", "prior"), ("mehra", "full_q")):
+        with pytest.raises(ValueError, match=f"way '{way}' must come without {option}"):
+            find_way(way).run(way, task_of(linear(), options={option: True}))
 
 
 def test_what_ways_need_is_said_in_a_line():

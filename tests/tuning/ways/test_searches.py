@@ -150,6 +150,42 @@ def test_masked_measurements_find_the_ratio_of_q_and_r():
     assert model["process_noise_cov"][0] / model["measurement_noise_cov"] == pytest.approx(0.25, rel=0.3)
 
 
+def test_two_sample_times_find_the_q_and_r_of_a_level_where_one_leaves_a_curve_of_zeros():
+    problem = linear(a=np.eye(1), c=np.eye(1), q=[[1.0]], r=[[4.0]], p0=np.eye(1), steps=400, runs=32)
+    box, ratios = {"where": ("Q11 = 0.05..20", "R = 0.2..80")}, {"c-nis": [], "c-nis-two-rates": []}
+    for seed in range(3):
+        for name, found in ratios.items():
+            task = task_of(problem, 32, options=box, seed=seed, budget=Budget(runs=5000))
+            task.start = at(task, [5.0], [0.5])
+            find_way(name).run(name, task)
+            found.append(
+                np.log([task.best.model["process_noise_cov"][0], task.best.model["measurement_noise_cov"] / 4])
+            )
+    away = {name: np.median(abs(np.array(found)), axis=0) for name, found in ratios.items()}
+    assert (away["c-nis-two-rates"] < 0.15).all() and away["c-nis"][0] > 0.4, away
+    on_the_curve = at(task, [0.1], [8.784])  # where a naive filter's mean NIS is 1, too
+    single, slower = (task._value(on_the_curve, "nis", data) for data in (task.data, [task.data[0].every(10)]))
+    assert single < 0.01 and slower > 0.5
+
+
+def test_a_slower_sample_time_has_the_likelihood_of_a_model_of_ten_steps():
+    problem = linear(steps=50)
+    task = task_of(problem)
+    data = task.data[0].every(10)
+    expected = 0.0
+    z, mean, cov = task.data[0].measurements[0, ::10], np.zeros(2), P0
+    for k in range(6):
+        for _ in range(10 if k else 0):
+            mean, cov = A @ mean, A @ cov @ A.T + Q
+        s, d = C @ cov @ C.T + R, z[k] - C @ mean
+        expected -= 0.5 * (d @ np.linalg.solve(s, d) + np.linalg.slogdet(2 * np.pi * s)[1])
+        gain = cov @ C.T @ np.linalg.inv(s)
+        mean, cov = mean + gain @ d, cov - gain @ C @ cov
+    filter_ = at(task, np.diag(Q), np.diag(R)).filter(problem)
+    assert values_of(filter_, data.slice(0, 1), problem.scale).log_likelihood == pytest.approx(expected)
+    assert np.isfinite(data.measurements).all(axis=2).sum() == 4 * 6
+
+
 @pytest.mark.parametrize(("name", "within"), [("vb", 0.1), ("sage-husa", 0.3)])  # the latter moves Q, too
 def test_adaptive_filters_converge_to_the_r_of_a_level(name, within):
     problem = linear(a=np.eye(1), c=np.eye(1), q=[[1.0]], r=[[4.0]], p0=np.eye(1), steps=600, runs=8)

@@ -104,9 +104,9 @@ def start_of(case: Case, place: int) -> Choice:
     """Where a data set's ways begin."""
     problem, (on_q, on_r) = case.make(), STARTS[place % len(STARTS)]
     found = untuned_choice(case.filter, problem)
-    if case.group == "E":
-        found = found.with_size(10)
-    for one in model_parameters(problem):
+    if case.members is not None:
+        found = found.with_size(case.members)
+    for one in model_parameters(problem, hold_r=case.options.get("hold_r", False)):
         factor = {ProcessVariance: on_q, MeasurementVariance: on_r}.get(type(one.place), 1.0)
         found = one.set(found, min(max(factor * (one.get(found) or 1.0), one.low), one.high))
     return found
@@ -136,6 +136,7 @@ def run_way(case: Case, way: str, place: int, protocol: Protocol) -> Result:
         _follow(case, way, place, task)
     except ValueError as problem:
         error = str(problem) or type(problem).__name__
+    taken = task.runs, task.seconds  # without that of scoring
     known: dict[int, Scored] = {}
 
     def at(choice: Choice) -> Scored:
@@ -152,7 +153,6 @@ def run_way(case: Case, way: str, place: int, protocol: Protocol) -> Result:
         for one in SECONDS
         if one <= protocol.seconds
     }
-    taken = task.runs, task.seconds
     return Result(case.name, label, place, by_runs, by_seconds, at(last), *taken, _plain(last), error)
 
 
@@ -185,7 +185,7 @@ def _follow(case: Case, way: str, place: int, task: Task) -> None:
         return _study(case, way, place, task)
     if found is None:
         raise ValueError(f"there is no {way}")
-    return task.keep(found if case.group != "E" else found.with_size(10))
+    return task.keep(found if case.members is None else found.with_size(case.members))
 
 
 def _study(case: Case, way: str, place: int, task: Task) -> None:
@@ -226,8 +226,11 @@ def reference(case: Case, protocol: Protocol) -> Result:
         least, choice = math.inf, start
         some = data.slice(0, min(protocol.many, 200))
         budget = Budget(SIMPLEX * len(some.seeds))
-        for turn in range(min(protocol.starts, len(STARTS))):
-            one = Task(case.filter, problem, some, options=case.options, start=start_of(case, turn), budget=budget)
+        starts = [start_of(case, turn) for turn in range(min(protocol.starts, len(STARTS)))]
+        for turn, begun in enumerate(starts):
+            if begun in starts[:turn]:
+                continue
+            one = Task(case.filter, problem, some, options=case.options, start=begun, budget=budget)
             find_way("nelder-mead").run("nelder-mead", one)
             value = one.value(one.best)
             if value < least:

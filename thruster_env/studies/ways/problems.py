@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from filters import affine_model
+from thruster_env.studies import lorenz96
+from thruster_env.studies.benchmark import noise_free_problem
 from thruster_env.studies.lidar import drawn, lidar_problem
 from thruster_env.studies.pendulum import model as pendulum
 from tuning.problems.excitation import Steps
@@ -18,6 +20,8 @@ from tuning.problems.problem import Problem
 
 NOTHING: Mapping[str, bool] = {}
 FULL: Mapping[str, bool] = {"full_q": True, "full_r": True}
+FULL_Q: Mapping[str, bool] = {"full_q": True}
+HELD_R: Mapping[str, bool] = {"hold_r": True}
 LIDAR_RUNS, LIDAR_SETS = 700, 20  # that are held out, and sets of runs to learn from
 MASSES, STIFFNESS, DAMPING, DT = 5, 200.0, 0.4, 0.02  # of a chain, each mass 1 kg
 
@@ -31,6 +35,7 @@ class Case(NamedTuple):
     filter: str
     options: Mapping[str, bool] = NOTHING
     runs: int = 32  # to learn from, in a data set
+    members: int | None = None  # of an ensemble
     truth: bool = True  # whether they have true states
     about: str = ""
 
@@ -118,6 +123,41 @@ def chain() -> Problem:
 
 
 @cache
+def targets() -> Problem:
+    """A target in a plane and another one beside it, whose noise goes together: Q has two full blocks.
+
+    A velocity that wanders for a time T = 1 with the intensity S moves the position, too:
+    Q = (T^3/3 S, T^2/2 S; T^2/2 S, T S), van Loan's integral.
+    """
+    motion, eye = np.eye(4) + np.eye(4, k=2), np.eye(2, 4)
+    times = np.array([[1.0 / 3.0, 0.5], [0.5, 1.0]])
+    intensities = np.array([[0.10, 0.06], [0.06, 0.05]]), np.array([[0.02, -0.01], [-0.01, 0.04]])
+    q = np.zeros((8, 8))
+    q[:4, :4], q[4:, 4:] = (np.kron(times, one) for one in intensities)
+    model = affine_model(
+        a=np.kron(np.eye(2), motion),
+        b=np.zeros((8, 0)),
+        c=np.block([[eye, np.zeros((2, 4))], [-eye, eye]]),
+        process_noise_cov=q,
+        measurement_noise_cov=[4.0, 1.0, 0.25, 0.25],
+        prior_mean=np.zeros(8),
+        prior_cov=[10.0, 10.0, 1.0, 1.0] * 2,
+    )
+    given = {"process_noise_cov": (0.1,) * 8, "measurement_noise_cov": (1.0,) * 4}
+    about = "a target and another one seen from it, eight states; Q has two full blocks: forty numbers"
+    return ModelProblem(model, steps=300, untuned=given, name="targets", about=about)
+
+
+@cache
+def ring(steps: int = 300) -> Problem:
+    """Lorenz-96, where twenty members need some inflation; in the first half of a run it reaches its attractor."""
+    given: dict[str, Any] = {"scale": np.ones(lorenz96.STATES), "dt": lorenz96.SUBSTEP}
+    return noise_free_problem(
+        lorenz96.model(), steps=steps, first_scored_step=steps // 2, about="Lorenz-96", **given
+    )
+
+
+@cache
 def lidar() -> Problem:
     """OKF's lidar: twenty sets of 32 runs to learn from, and others that are held out."""
     return lidar_problem(drawn(LIDAR_SETS * 32 + LIDAR_RUNS), LIDAR_RUNS)
@@ -139,8 +179,10 @@ CASES = (
     Case("lidar", "C", lidar, "kf", FULL),
     Case("outliers", "D", found("outliers"), "ekf"),
     Case("deadband", "D", found("deadband"), "ekf"),
-    Case("nominal, N = 10", "E", found("nominal"), "enkf"),
+    Case("nominal, N = 10", "E", found("nominal"), "enkf", members=10),
+    Case("lorenz96, N = 20", "E", ring, "etkf", HELD_R, 4, 20),
     Case("chain", "F", chain, "kf"),
+    Case("targets", "F", targets, "kf", FULL_Q),
     Case("auv:motion", "F", found("auv:motion"), "ekf"),
     Case("nominal, blind", "G", found("nominal"), "ekf", truth=False),
     Case("mismatch, blind", "G", found("mismatch"), "ekf", truth=False),

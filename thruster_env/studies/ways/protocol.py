@@ -16,7 +16,7 @@ TRIALS = 50
 WITH_FULL = ", full"  # behind a way: it tunes full Q and R, where the others of a case tune diagonals
 FROM_NOISE = ", full, from noise estimation"  # the same, and begins there: added after the first results
 FULL_WAYS = (
-    *(f"{way}{WITH_FULL}" for way in ("mse", "log-score", "likelihood")),
+    *(f"{way}{WITH_FULL}" for way in ("mse", "log-score", "likelihood", "als")),
     *(f"{way}{FROM_NOISE}" for way in ("mse", "log-score")),
 )
 ENTRIES = (*WAYS, *FULL_WAYS, START, SCALED, ORACLE, STUDY, STUDY_LOG_SCORE)

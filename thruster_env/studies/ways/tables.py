@@ -29,7 +29,11 @@ from tuning.ways.registry import WAYS
 from tuning.ways.way import GRADIENT, TRUTH
 
 # Ways that look at no true state; but searches minimise an error where there are true states.
-BLIND = (*(name for name, way in WAYS.items() if TRUTH not in way.needs), f"{LIKELIHOOD}{WITH_FULL}")
+BLIND = (
+    *(name for name, way in WAYS.items() if TRUTH not in way.needs),
+    f"{LIKELIHOOD}{WITH_FULL}",
+    f"als{WITH_FULL}",
+)
 SEARCHES = ("nelder-mead", "coordinate-steps", "tpe", "gp", "cma-es", "random")
 ENOUGH, ENOUGH_NATS = 0.005, 0.02  # of log ratios and log scores, up to which the cheaper way is taken
 NO_WAYS = (START, ORACLE)  # nobody has these
