@@ -14,10 +14,14 @@ from filters.ensembles.stochastic import EnsembleKalmanFilter
 from filters.ensembles.transform import EnsembleTransformFilter
 from filters.gaussian.cubature import CubatureKalmanFilter
 from filters.gaussian.extended import ExtendedKalmanFilter
+from filters.gaussian.fading import FadingMemoryFilter
 from filters.gaussian.fuzzy import FuzzyKalmanFilter
 from filters.gaussian.gaussian_sum import GaussianSumFilter
+from filters.gaussian.h_infinity import HInfinityFilter
 from filters.gaussian.iterated import IteratedExtendedKalmanFilter
 from filters.gaussian.kalman import KalmanFilter
+from filters.gaussian.multiple_models import InteractingMultipleModelFilter, MultipleModelAdaptiveEstimator
+from filters.gaussian.schmidt import SchmidtKalmanFilter
 from filters.gaussian.steady_state import SteadyStateKalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
 from filters.particles.auxiliary import AuxiliaryParticleFilter
@@ -44,18 +48,23 @@ __all__ = [
     "EstimateStates",
     "Estimates",
     "ExtendedKalmanFilter",
+    "FadingMemoryFilter",
     "FuzzyKalmanFilter",
     "GaussianSumFilter",
     "Innovation",
+    "HInfinityFilter",
+    "InteractingMultipleModelFilter",
     "Inversion",
     "IteratedEnsembleKalmanFilter",
     "IteratedExtendedKalmanFilter",
     "KalmanFilter",
     "LowPass",
+    "MultipleModelAdaptiveEstimator",
     "OpenLoop",
     "ParticleFilter",
     "RobustExtendedKalmanFilter",
     "SageHusaFilter",
+    "SchmidtKalmanFilter",
     "SerialSquareRootFilter",
     "Smoothed",
     "StateSpaceModel",

@@ -18,10 +18,14 @@ from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
 from filters.gaussian.cubature import CubatureKalmanFilter
 from filters.gaussian.extended import ExtendedKalmanFilter
+from filters.gaussian.fading import FadingMemoryFilter
 from filters.gaussian.fuzzy import FuzzyKalmanFilter
 from filters.gaussian.gaussian_sum import GaussianSumFilter
+from filters.gaussian.h_infinity import HInfinityFilter
 from filters.gaussian.iterated import IteratedExtendedKalmanFilter
 from filters.gaussian.kalman import KalmanFilter
+from filters.gaussian.multiple_models import InteractingMultipleModelFilter, MultipleModelAdaptiveEstimator
+from filters.gaussian.schmidt import SchmidtKalmanFilter
 from filters.gaussian.steady_state import SteadyStateKalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
 from filters.particles.auxiliary import AuxiliaryParticleFilter
@@ -39,6 +43,9 @@ FILTERS: dict[str, type[Filter]] = {
         IteratedExtendedKalmanFilter,
         UnscentedKalmanFilter,
         CubatureKalmanFilter,
+        FadingMemoryFilter,
+        HInfinityFilter,
+        SchmidtKalmanFilter,
         EnsembleKalmanFilter,
         EnsembleTransformFilter,
         SerialSquareRootFilter,
@@ -47,6 +54,8 @@ FILTERS: dict[str, type[Filter]] = {
         ParticleFilter,
         AuxiliaryParticleFilter,
         GaussianSumFilter,
+        InteractingMultipleModelFilter,
+        MultipleModelAdaptiveEstimator,
         FuzzyKalmanFilter,
         SageHusaFilter,
         VariationalBayesFilter,

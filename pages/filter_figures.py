@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pages import filter_fuzzy, filter_gaussian, filter_noise, filter_sampled, filter_tables
+from pages import filter_fuzzy, filter_gaussian, filter_models, filter_noise, filter_sampled, filter_tables
 from pages.page import make_page
 
 FIGURES = {
@@ -19,6 +19,8 @@ FIGURES = {
     "filters_points.png": filter_gaussian.sigma_points,
     "filters_ensembles.png": filter_sampled.ensembles,
     "filters_modes.png": filter_sampled.modes,
+    "filters_weighted.png": filter_models.weighted,
+    "filters_several.png": filter_models.several,
     "filters_fuzzy.png": filter_fuzzy.picture,
     "filters_adaptive.png": filter_noise.adaptive,
     "filters_baselines.png": filter_noise.baselines,

@@ -37,6 +37,11 @@ WORDS = {
         "belief nearly Gaussian", "mean, P", "2", "strong nonlinearity: the gain is that of a wide average"
     ),
     "ckf": Words("belief nearly Gaussian", "mean, P", "1", "as `ukf`"),
+    "fading": Words(
+        "f and h nearly linear; the model drifts", "mean, P", "1", "a model that is right: it forgets too soon"
+    ),
+    "h-infinity": Words("bounded noise of any kind", "mean, P", "1", "random noise: larger errors than `ekf`"),
+    "schmidt": Words("some states are better not corrected", "mean, P", "1", "as `ekf`"),
     "enkf": Words("belief nearly Gaussian", "N members", "30", "small N: overconfident; sampling noise"),
     "etkf": Words("belief nearly Gaussian", "N members", "30", "small N: overconfident"),
     "ensrf": Words("belief nearly Gaussian", "N members", "20", "small N: overconfident"),
@@ -47,6 +52,8 @@ WORDS = {
     "gsf": Words(
         "h nonlinear in one component of the state", "mean, P between updates", "20", "nonlinearity in others"
     ),
+    "imm": Words("one of K models at a time", "K means and P, probabilities", "3", "a mode that no model has"),
+    "mmae": Words("one of K models, always", "K means and P, probabilities", "4", "a plant that switches"),
     "fuzzy": Words("the state stays within a narrow range", "mean, P of 2^n rules", "3", "a wide range"),
     "sage-husa": Words(
         "R (and Q) unknown, steady", "mean, P, R, Q", "3", "where `ekf` fails: takes nonlinearity for noise"
@@ -163,7 +170,7 @@ def situations() -> list[Situation]:
         Situation(
             "one measurement in ten is off by 10 N",
             partial(held_runs, **outliers(0.1)),
-            named(quiet, "ekf", "vb", "sage-husa", "ekf-robust"),
+            named(quiet, "ekf", "vb", "sage-husa", "ekf-robust", "imm"),
         ),
         Situation(
             "R is 16 times the assumed one",

@@ -25,7 +25,7 @@ from tuning.thruster.scenarios import SCENARIOS
 
 SEEDS = 200
 REFERENCE_SEEDS, REFERENCE_SIZE = 20, 100_000
-EKF, ROBUST, IEKF, UKF, GSF = (contender(name) for name in ("ekf", "ekf-robust", "iekf", "ukf", "gsf"))
+EKF, ROBUST, IMM, IEKF, UKF, GSF = map(contender, ("ekf", "ekf-robust", "imm", "iekf", "ukf", "gsf"))
 PF, MANY = contender("pf"), contender("pf", ensemble_size=5000)
 ENKF, IENKF = (contender(name, ensemble_size=100) for name in ("enkf", "ienkf"))
 SMALL = contender("enkf", ensemble_size=30)
@@ -50,7 +50,7 @@ def fast() -> str:
 
 def outliers() -> str:
     """Outliers in the thrust."""
-    return table_of(leaderboard(find_scenario("outliers"), [EKF, ROBUST, ENKF, PF]))
+    return table_of(leaderboard(find_scenario("outliers"), [EKF, ROBUST, IMM, ENKF, PF]))
 
 
 def ambient() -> str:
@@ -83,7 +83,7 @@ def startup() -> str:
 
 def scores() -> str:
     """Scores over that of the EKF, a row per scenario."""
-    filters = [EKF, ROBUST, IEKF, UKF, ENKF, GSF, PF]
+    filters = [EKF, ROBUST, IMM, IEKF, UKF, ENKF, GSF, PF]
     boards = [leaderboard(scenario, filters) for scenario in SCENARIOS.values()]
     labels = [one.label for one in filters[1:]]
     lines = [f"| scenario | ekf: score | {' | '.join(labels)} |", "|---" * (len(labels) + 2) + "|"]

@@ -11,8 +11,11 @@ from filters.adaptive.variational import VariationalBayesFilter
 from filters.filter import Filter
 from filters.gaussian.cubature import CubatureKalmanFilter
 from filters.gaussian.extended import ExtendedKalmanFilter
+from filters.gaussian.fading import FadingMemoryFilter
+from filters.gaussian.h_infinity import HInfinityFilter
 from filters.gaussian.iterated import IteratedExtendedKalmanFilter
 from filters.gaussian.kalman import KalmanFilter
+from filters.gaussian.schmidt import SchmidtKalmanFilter
 from filters.gaussian.unscented import UnscentedKalmanFilter
 from filters.pages.page_filter import Page, PageFilter
 from thruster_env.plants.state_space import StateSpaceModel
@@ -23,6 +26,9 @@ KINDS: tuple[type[PageFilter], ...] = (
     IteratedExtendedKalmanFilter,
     UnscentedKalmanFilter,
     CubatureKalmanFilter,
+    FadingMemoryFilter,
+    HInfinityFilter,
+    SchmidtKalmanFilter,
     RobustExtendedKalmanFilter,
     SageHusaFilter,
     VariationalBayesFilter,

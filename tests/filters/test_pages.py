@@ -87,6 +87,9 @@ MADE = {
     "kf-steady": {},
     "ekf": {},
     **CHANGED,
+    "fading": {"fading": 1.1},
+    "h-infinity": {"theta": 0.002},
+    "schmidt": {"considered": [0]},
     "ekf-robust": {"degrees_of_freedom": 3.0, "iterations": 3},
     "sage-husa": {"forgetting_factor": 0.9, "process_forgetting_factor": 0.8},
     "vb": {"forgetting_factor": 0.9, "prior_weight": 6.0, "iterations": 2},
@@ -277,7 +280,8 @@ def test_kalmans_filter_of_a_nonlinear_model_is_that_of_its_affine_one():
 def test_filters_without_a_page_are_refused():
     model = two_channels()
     given = (model, np.zeros((1, 2, 1)), np.zeros((1, 3, 2)), np.zeros((1, 2, 2)), np.zeros((1, 2, 2)))
-    rule = "a filter with derivatives must be one of kf, ekf, iekf, ukf, ckf, ekf-robust, sage-husa, vb, but got "
+    names = "kf, ekf, iekf, ukf, ckf, fading, h-infinity, schmidt, ekf-robust, sage-husa, vb"
+    rule = f"a filter with derivatives must be one of {names}, but got "
     assert ", ".join(kind.name for kind in KINDS) in rule
     with pytest.raises(ValueError, match=f"{rule}'enkf'"):
         likelihood(*given, filter=make_filter("enkf", model))

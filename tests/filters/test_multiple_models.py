@@ -1,0 +1,229 @@
+"""Filters for several models: FilterPy's, a textbook's written naively, closed forms, a thruster that switches."""
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from filters import make_filter, run
+from tests.models import pendulum
+from tests.numerics.test_angles import turning
+from thruster_env.model import thruster_model
+from thruster_env.plants.affine import affine_model, linearize
+
+
+def moving(q, r=1.0, **changes):
+    """A point whose position is measured; its acceleration has variance q."""
+    f, g = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[0.5], [1.0]])
+    noise = {"process_noise_cov": q * g @ g.T + 1e-9 * np.eye(2), "measurement_noise_cov": [[r]]}
+    prior = {"prior_mean": [0.0, 0.0], "prior_cov": np.diag([4.0, 1.0])}
+    return affine_model(a=f, b=np.zeros((2, 1)), c=np.array([[1.0, 0.0]]), **(noise | prior | changes))
+
+
+def measured(count, seed=0):
+    """Positions of a point that begins to manoeuvre half-way."""
+    rng, x, found = np.random.default_rng(seed), np.zeros(2), []
+    for k in range(count):
+        push = rng.normal(0.0, 0.1 if 2 * k < count else 2.0)
+        x = np.array([x[0] + x[1] + 0.5 * push, x[1] + push])
+        found.append([x[0] + rng.normal()])
+    return np.array(found)
+
+
+def test_equals_the_filter_of_filterpy():
+    filterpy = pytest.importorskip("filterpy.kalman")
+    models = [moving(0.01), moving(0.3), moving(4.0)]
+    transition = np.array([[0.9, 0.08, 0.02], [0.1, 0.8, 0.1], [0.05, 0.05, 0.9]])
+    p = [0.6, 0.3, 0.1]
+    ours = make_filter("imm", models[0], modes=models, mode_filter="kf", transition=transition, probabilities=p)
+
+    def theirs(model):
+        one = filterpy.KalmanFilter(2, 1)
+        one.x, one.P = np.zeros((2, 1)), np.diag([4.0, 1.0])
+        one.F, one.H = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]])
+        one.Q, one.R = np.array(model.process_noise_cov), np.array([[1.0]])
+        return one
+
+    other, belief = filterpy.IMMEstimator([theirs(one) for one in models], p, transition), ours.init()
+    for z in measured(80):
+        belief, _ = ours.update(ours.predict(belief, [0.0]), z)
+        other.predict()
+        other.update(z[:, None])
+        np.testing.assert_allclose(belief.mean, other.x[:, 0], rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(belief.cov, other.P, rtol=1e-10)
+        np.testing.assert_allclose(ours.mode_probabilities(belief), other.mu, rtol=1e-9, atol=1e-14)
+        means, covs, _ = ours.mode_estimates(belief)
+        np.testing.assert_allclose(means, [one.x[:, 0] for one in other.filters], rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(covs, [one.P for one in other.filters], rtol=1e-10)
+
+
+def merged(weights, means, covs):
+    mean = weights @ means
+    return mean, np.einsum("i,iab->ab", weights, covs + np.einsum("ia,ib->iab", means - mean, means - mean))
+
+
+def naive(filter_, inputs, measurements):
+    """The recursion of the docstring with the modes' own filters; means, covariances, log-likelihoods."""
+    filters, pi, mu, found = filter_.mode_filters, filter_.transition_matrix, filter_.p, []
+    beliefs = [one.init() for one in filters]
+    for k, z in enumerate(measurements):
+        if k:
+            means, covs = np.array([b.mean for b in beliefs]), np.array([b.cov for b in beliefs])
+            c = mu @ pi
+            mixed = [merged(pi[:, j] * mu / c[j], means, covs) for j in range(len(mu))]
+            beliefs = [
+                one.predict(b._replace(mean=x, cov=p), inputs[k - 1])
+                for one, b, (x, p) in zip(filters, beliefs, mixed, strict=True)
+            ]
+            mu = c
+        both = [one.update(b, z) for one, b in zip(filters, beliefs, strict=True)]
+        beliefs, levels = [b for b, _ in both], np.array([v.log_likelihood for _, v in both])
+        top = levels.max()
+        levels = np.exp(levels - top)
+        expected = merged(mu, np.array([v.value for _, v in both]), np.array([v.cov for _, v in both]))
+        total, mu = mu @ levels, mu * levels / (mu @ levels)
+        mean, cov = merged(mu, np.array([b.mean for b in beliefs]), np.array([b.cov for b in beliefs]))
+        found.append((mean, cov, np.log(total) + top, *expected))
+    return [np.array(one) for one in zip(*found, strict=True)]
+
+
+@pytest.mark.parametrize(("name", "kinds"), [("ekf", "functions"), ("ekf-robust", "numbers"), ("ukf", "numbers")])
+def test_equals_the_recursion_of_the_textbook(name, kinds):
+    whole = thruster_model()
+    lost = whole.replace(constants=whole.constants._replace(thrust_30=5e-6), process_noise_cov=[4.0, 1e-3])
+    modes = [whole, lost]
+    if kinds == "functions":  # the filter of the third mode is another program
+        modes.append(linearize(whole, [100.0, 1.0], [10.0]))
+    filter_ = make_filter("imm", whole, modes=modes, mode_filter=name, stay=0.8)
+    rng = np.random.default_rng(1)
+    inputs, measurements = rng.uniform(-20, 20, (1, 30, 1)), rng.normal(5.0, 20.0, (1, 31, 1))
+    measurements[0, 7] = np.nan
+    found = run(filter_, np.array([[0, 0]]), inputs, measurements)
+    means, covs, levels, innovations, innovation_covs = naive(filter_, inputs[0], measurements[0])
+    np.testing.assert_allclose(found.means[0], means, rtol=1e-9)
+    np.testing.assert_allclose(found.covs[0], covs, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(found.log_likelihoods[0], levels, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.innovations[0], innovations, rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(found.innovation_covs[0], innovation_covs, rtol=1e-8)
+
+
+def test_equal_modes_are_one_filter():
+    model = thruster_model()
+    rng = np.random.default_rng(2)
+    data = np.zeros((3, 2), dtype=int), rng.uniform(-20, 20, (3, 40, 1)), rng.normal(0.0, 10.0, (3, 41, 1))
+    one, several = run(make_filter("ekf", model), *data), run(make_filter("imm", model, modes=[model] * 3), *data)
+    for name in ("means", "covs", "innovations", "innovation_covs", "log_likelihoods"):
+        np.testing.assert_allclose(getattr(several, name), getattr(one, name), rtol=1e-10, atol=1e-10)
+
+
+def test_the_static_estimator_has_the_posterior_of_the_models():
+    models, p, z = [moving(0.01), moving(0.3), moving(4.0)], np.array([0.5, 0.3, 0.2]), measured(25)
+    filter_ = make_filter("mmae", models[0], modes=models, mode_filter="kf", probabilities=p)
+    belief, total = filter_.init(), 0.0
+    for k, one in enumerate(z):
+        belief, innovation = filter_.update(belief if k == 0 else filter_.predict(belief, [0.0]), one)
+        total += innovation.log_likelihood
+    levels = []
+    for model in models:  # the density of all measurements together
+        a, h = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([1.0, 0.0])
+        means, covs, powers = [], np.zeros((25, 25)), [np.linalg.matrix_power(a, k) for k in range(25)]
+        cov = np.diag([4.0, 1.0])
+        for k in range(25):
+            for later in range(k, 25):
+                covs[k, later] = covs[later, k] = h @ powers[later - k] @ cov @ h
+            cov = a @ cov @ a.T + model.process_noise_cov
+            means.append(0.0)
+        levels.append(multivariate_normal.logpdf(z[:, 0], means, covs + np.eye(25)))
+    weights = p * np.exp(np.array(levels) - max(levels))
+    np.testing.assert_allclose(filter_.mode_probabilities(belief), weights / weights.sum(), rtol=1e-8)
+    assert total == pytest.approx(np.log(weights.sum()) + max(levels), rel=1e-10)
+
+
+def switching(models, stay, steps, rng):
+    """A run of a plant that switches among models: modes, states, inputs, measurements."""
+    x, mode = rng.multivariate_normal(models[0].prior_mean, models[0].prior_cov), 0
+    modes, states, seen = [], [], []
+    inputs = np.repeat(rng.uniform(-20.0, 20.0, steps // 25 + 1), 25)[:steps, None]
+    for k in range(steps + 1):
+        if k:
+            mode = mode if rng.uniform() < stay else int(rng.integers(len(models)))
+            model = models[mode]
+            for _ in range(model.substeps):
+                x = np.array(model.transition(tuple(x), tuple(inputs[k - 1]), model.constants))
+            x = x + rng.multivariate_normal(np.zeros(len(x)), model.process_noise_cov)
+        model = models[mode]
+        z = np.array(model.observe(tuple(x), model.constants))
+        seen.append(rng.multivariate_normal(z, model.measurement_noise_cov))
+        modes.append(mode)
+        states.append(x)
+    return np.array(modes), np.array(states), inputs, np.array(seen)
+
+
+def test_a_thruster_that_loses_thrust_is_followed_almost_as_if_the_mode_were_known():
+    whole = thruster_model()
+    weak = {name: 0.5 * getattr(whole.constants, name) for name in whole.constants._fields if name[:6] == "thrust"}
+    models = [whole, whole.replace(constants=whole.constants._replace(**weak))]
+    filters = [make_filter("ekf", one) for one in models]
+    imm = make_filter("imm", whole, modes=models, stay=0.96)
+    errors, brier = {"told": [], "imm": [], "ekf": []}, []
+    for seed in range(12):
+        modes, states, inputs, seen = switching(models, 0.96, 300, np.random.default_rng(seed))
+        told = filters[0].init()
+        several, single = imm.init(), filters[0].init()
+        for k, (mode, x, z) in enumerate(zip(modes, states, seen, strict=True)):
+            if k:
+                told, u = filters[mode].predict(told, inputs[k - 1]), inputs[k - 1]
+                several, single = imm.predict(several, u), filters[0].predict(single, u)
+            told, _ = filters[mode].update(told, z)
+            several, _ = imm.update(several, z)
+            single, _ = filters[0].update(single, z)
+            for name, belief in (("told", told), ("imm", several), ("ekf", single)):
+                errors[name].append(belief.mean - x)
+            brier.append((imm.mode_probabilities(several)[1], mode == 1))
+    rmse = {name: np.sqrt(np.mean(np.square(one), axis=0)) for name, one in errors.items()}
+    assert (rmse["imm"] < 1.1 * rmse["told"]).all() and (rmse["ekf"] > 1.5 * rmse["imm"]).all(), rmse
+    said, true = np.array(brier).T
+    assert np.mean((said - true) ** 2) == pytest.approx(np.mean(said * (1.0 - said)), rel=0.25)  # calibrated
+    assert np.mean((said - true) ** 2) < 0.1
+
+
+def test_an_angle_is_mixed_the_short_way_round():
+    """Estimates near the cut are those far from it, turned: modes, mixtures and innovations alike."""
+    rng = np.random.default_rng(4)
+    inputs, noise = rng.normal(size=(1, 60, 1)), rng.normal(0.0, 0.3, (1, 61, 2))
+    found = []
+    for heading in (0.0, np.pi):
+        model = turning(heading)
+        filter_ = make_filter("imm", model, modes=[{}, {"process_noise_cov": 30.0 * model.process_noise_cov}])
+        seen = noise + [heading, 0.0]
+        seen[..., 0] = np.angle(np.exp(1j * seen[..., 0]))
+        found.append(run(filter_, np.array([[0, 0]]), inputs, seen))
+    here, there = found
+    turned = np.exp(1j * (there.means[..., 1] - here.means[..., 1]))
+    np.testing.assert_allclose(turned, -1.0, atol=1e-9)
+    np.testing.assert_allclose(there.means[..., 0], here.means[..., 0], rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(there.covs, here.covs, rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(there.log_likelihoods, here.log_likelihoods, rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "rule"),
+    [
+        ({"modes": [thruster_model()]}, "modes must be a list of 2 to 32 models, but got"),
+        ({"modes": [thruster_model(), pendulum()]}, "states, measurements, inputs and angles of a mode must be"),
+        ({"modes": [thruster_model(), 3]}, "a mode must be a model, or changes of one, but got 3"),
+        ({"stay": 1.5}, "stay must be"),
+        (
+            {"mode_filter": "enkf"},
+            "mode_filter must be a filter of one mean and covariance, such as 'ekf', but got",
+        ),
+        ({"mode_filter": ["ekf"]}, "mode_filter must be one name, or one for each of 2 modes, but got"),
+        ({"probabilities": [0.5, 0.6]}, "probabilities must be 2 numbers of at least 0 that sum to 1, but got"),
+        (
+            {"transition": [[1.0, 0.0], [0.5, 0.4]]},
+            "transition must be 2 x 2 numbers of at least 0 that sum to 1 in",
+        ),
+    ],
+)
+def test_what_is_refused(changes, rule):
+    with pytest.raises(ValueError, match=rule):
+        make_filter("imm", thruster_model(), **changes)
