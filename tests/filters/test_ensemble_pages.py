@@ -99,12 +99,16 @@ def test_a_page_of_arrays_is_the_filter(name, chosen, make):
     assert_page_is_the_filter(make_filter(name, make(), ensemble_size=SIZE, **CHOICES[name] if chosen else {}))
 
 
-@pytest.mark.parametrize("name", CHOICES)
+@pytest.mark.parametrize(
+    "name",
+    [one if one in ("etkf", "ienkf") else pytest.param(one, marks=pytest.mark.slow) for one in CHOICES],
+)
 def test_a_page_of_arrays_is_the_compiled_filter(name):
     model = random_affine(7, 3, 2, seed=4)  # sums of more loops than one, and a geometric mean that is called
     assert_page_is_the_filter(make_filter(name, model, ensemble_size=21, **CHOICES[name]))
 
 
+@pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("name", CHOICES)
 def test_a_page_of_arrays_is_the_filter_by_calls(name):
     """Of a model that decides, and of one that is large."""
@@ -133,6 +137,7 @@ class PartlyFilter(EnsembleFilter):
     part: float = 0.5
 
 
+@pytest.mark.usefixtures("as_python")
 def test_a_filter_of_ones_own_is_its_page_and_by_name_too():
     model = wide_model()
     filter_ = make_filter(f"{__name__}:PartlyFilter", model, ensemble_size=SIZE, part=0.7, inflation=1.1)

@@ -36,6 +36,10 @@ def in_session(filter_, key, inputs, measurements):
     return [np.array(part) for part in zip(*rows, strict=True)]
 
 
+# One of each kind of page and kernel: what one of the others has in common with it is compiled alike.
+OF_EACH_KIND = ("kf-steady", "ekf-robust", "ukf", "vb", "enkf", "ensrf", "pf", "gsf", "fuzzy", "inversion")
+
+
 @pytest.fixture(params=list(FILTERS))
 def name(request):
     return request.param
@@ -100,7 +104,14 @@ def assert_compiled_as_python(filter_, *data, **noise):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["thruster", "wide affine"])
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [(name, "thruster") for name in FILTERS]
+    + [
+        pytest.param(name, "wide affine", marks=[] if name in OF_EACH_KIND else pytest.mark.slow)
+        for name in FILTERS
+    ],
+)
 def test_compiled_and_interpreted_agree(name, kind):
     model = MODELS[kind]()
     filter_ = small(name, model)

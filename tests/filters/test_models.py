@@ -327,7 +327,7 @@ def swinging(**changes):
     return StateSpaceModel(**arguments | changes)
 
 
-@pytest.mark.parametrize("plainly", [False, True])
+@pytest.mark.parametrize("plainly", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_complex_steps_give_an_analytic_model_exact_jacobians(plainly):
     keys, inputs = episode_keys(range(3)), np.random.default_rng(0).normal(size=(3, 30, 1))
     measurements = simulate.simulate(swinging(), keys, inputs).measurements

@@ -53,12 +53,13 @@ def textbook(model, filter_, data, score):
     return sums
 
 
+@pytest.mark.usefixtures("as_python")
 @pytest.mark.parametrize("score", ["log-score", "squares"])
 @pytest.mark.parametrize("case", CASES)
 def test_a_score_is_that_of_the_estimates_and_its_gradient_that_of_central_differences(case, score):
     make, filter_ = CASES[case]
     model = make()
-    data = data_of(model)
+    data = data_of(model, steps=15)
     q_slopes, r_slopes = directions(model)
     found = state_score(model, *data[1:], q_slopes, r_slopes, score, WEIGHTS)
     np.testing.assert_allclose(found.values, textbook(model, filter_, data, score), rtol=1e-10)

@@ -24,6 +24,7 @@ PARTS = (
 )
 
 
+@pytest.mark.slow
 def test_each_part_of_the_benchmark_can_be_measured_quickly():
     """Some rows of one part; that all parts run is for the slow test."""
     pytest.importorskip("filterpy")

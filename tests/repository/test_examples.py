@@ -43,7 +43,7 @@ SHOWN = {  # what a page's code makes
     "unknown_constant": {"problem"},
 }
 HOW_TO = [
-    pytest.param(page.stem, "\n".join(blocks), id=page.stem)
+    pytest.param(page.stem, "\n".join(blocks), id=page.stem, marks=SLOW if page.stem == "torch" else ())
     for page in sorted((EXAMPLES.parent / "docs" / "howto").glob("*.md"))
     if (blocks := re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.DOTALL))
 ]

@@ -23,6 +23,7 @@ def ranked(name, contenders, seeds=24):
     return {row.label: row for row in board.rows}
 
 
+@pytest.mark.slow
 def test_with_a_tachometer_without_a_sign_the_particle_filter_beats_the_ekf():
     rows = ranked("speed_magnitude", [contender("ekf"), contender("pf", ensemble_size=2000)], 12)
     assert rows["pf 2000"].ratios[0].high < 0.9  # omega_m, whose sign is in question

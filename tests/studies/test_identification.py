@@ -14,6 +14,7 @@ from tuning.problems.coordinates import Coordinates
 from tuning.thruster.identification import ThrusterFamily
 
 
+@pytest.mark.slow
 def test_estimates_lie_within_their_standard_errors_of_the_truth():
     found = study(3, starts=1, runs=3, steps=250)
     rows = coverage(found)

@@ -60,6 +60,7 @@ def test_the_package_begins_at_noise_estimation_and_leaves_it():
         assert (np.linalg.eigvalsh(one) > 0).all()
 
 
+@pytest.mark.slow
 def test_the_table_in_its_quick_form():
     rows = compared(24, 12, 2, ways={name: one for name, one in WAYS.items() if name != "EM"})
     names = [row.name for row in rows]

@@ -89,7 +89,13 @@ QUICK = {
 }
 
 
-@pytest.mark.parametrize(("study", "published", "deviation"), QUICK.values(), ids=QUICK)
+@pytest.mark.parametrize(
+    ("study", "published", "deviation"),
+    [
+        pytest.param(*one, id=name, marks=[] if name == "lorenz63" else pytest.mark.slow)
+        for name, one in QUICK.items()
+    ],
+)
 def test_a_published_score_comes_out(study, published, deviation):
     (row,) = against_published(study.problem, study.model, [published])(range(4), lambda row: None)
     assert abs(row.ours.value - published.value) < 3 * deviation / 2 and row.divergences == 0
@@ -167,6 +173,7 @@ def test_a_study_finds_the_acceleration_of_a_target():
     assert 0.1 < range_bearing.tuned_sigma(trials=8) < 0.4  # 0.2 is true, and 2 the guess that it starts from
 
 
+@pytest.mark.slow
 def test_a_study_tunes_inflation_and_nothing_else():
     short = noise_free_problem(lorenz63.model(), steps=40, first_scored_step=10, scale=[1.0] * 3)
     choice, score = tune_inflation("etkf", short, trials=3, runs=4)

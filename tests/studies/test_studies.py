@@ -216,7 +216,7 @@ def test_json_on_standard_output_is_whole(monkeypatch, capsys, tmp_path):
         assert all(row["why"] and len(row["published"]) == 2 for row in study["rows"])
 
 
-@pytest.mark.parametrize("width", [100, 160])
+@pytest.mark.parametrize("width", [100, pytest.param(160, marks=pytest.mark.slow)])
 def test_tables_fit_the_terminal(tmp_path, width):
     target = tmp_path / "table.json"
     arguments = ["reproduce", "nurhadi2022", "--runs", "4", "--members", "5", "--json", str(target)]

@@ -162,10 +162,10 @@ def test_inspect_draws(thruster, as_json, tmp_path):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("width", [80, 115])
-def test_inspect_fits_the_terminal(thruster, preset, width, monkeypatch):
+@pytest.mark.parametrize(("width", "voltages"), [(80, (-12, 0)), (115, (13,))])
+def test_inspect_fits_the_terminal(thruster, preset, width, voltages, monkeypatch):
     monkeypatch.setattr(console, "width", width)
-    for voltage in (-12, 0, 13):
+    for voltage in voltages:
         done = thruster("inspect", "--preset", preset, "--voltage", voltage)
         assert done.returncode == 0 and "…" not in done.stdout
         lines = done.stdout.splitlines()

@@ -67,6 +67,7 @@ def test_identified_numbers_go_into_a_preset_that_everything_takes(thruster, as_
     assert env.state_space_model().constants.dead_band_high == kept.dead_band[1]
 
 
+@pytest.mark.slow
 def test_a_load_cell_that_will_not_be_there_is_predicted(as_json, logs):  # noqa: F811
     free = "--free", "motor_damping,voltage_gain,lift_coefficient", "--hold-noise", "--starts", 1
     found = as_json("identify", *logs, *OF_LOGS, *free, "--predicted", "thrust", "--degrees", 20)

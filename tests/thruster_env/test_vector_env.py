@@ -148,11 +148,13 @@ def test_a_copy_is_the_single_env_with_its_seed_over_many_episodes(name, mode, c
     assert ends.sum() >= 4 * len(watched) and (ends.all() or count < 130)
 
 
+# With all effects this is a kernel of fifteen seconds; the test above has them, in two blocks on one thread.
 @every_mode
-def test_copies_of_many_blocks_on_two_threads_are_single_envs(mode):
-    name, watched = IDS[1], [0, 127, 128, 600, 1023, 1024, 1099]
-    ends = assert_copies_are_single_envs(name, 1100, mode, 25, 11, watched, **wild(name))
-    assert ends.all()
+@pytest.mark.parametrize("given", [{}, pytest.param(wild(IDS[1]), marks=pytest.mark.slow)], ids=["plain", "wild"])
+def test_copies_of_many_blocks_on_two_threads_are_single_envs(mode, given):
+    name, watched = IDS[1] if given else IDS[0], [0, 127, 128, 600, 1023, 1024, 1099]
+    ends = assert_copies_are_single_envs(name, 1100, mode, 25, 11, watched, **given)
+    assert ends.all() if given else ends[1] > 0
 
 
 @every_id

@@ -92,6 +92,7 @@ def lines_of(page):
     return "from filters import EstimateState" + html.unescape(found)
 
 
+@pytest.mark.slow
 def test_lines_to_copy_name_the_file_that_was_saved_and_run(study, tmp_path):
     fresh, page, file = (
         type(study)(study.tuning._replace(file=None)),
@@ -175,6 +176,7 @@ def test_copies_and_pickles_are_the_same(study, tmp_path):
         study.tuning = None
 
 
+@pytest.mark.slow
 def test_a_report_of_a_value_is_that_of_its_file_and_storage(study, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = study.report("mine.html")
@@ -187,6 +189,7 @@ def test_a_report_of_a_value_is_that_of_its_file_and_storage(study, tmp_path, mo
     assert page.with_suffix(".md").read_text() == (folder / "ekf-mismatch-seed0.md").read_text()
 
 
+@pytest.mark.slow
 def test_a_report_of_two_is_that_of_the_command(study, thruster, monkeypatch, tmp_path):  # noqa: F811
     drawn = "<svg></svg>", ""  # pictures take most of a page's time
     monkeypatch.setattr("tuning.reporting.sketchbook.figure_svg", lambda figure, name: drawn)

@@ -192,6 +192,7 @@ def test_cost_is_of_one_core_and_grows_with_the_ensemble():
     assert over_budget(2.0, 1.0) == pytest.approx(np.log(2)) and over_budget(1.0, 1.0) == 0.0
 
 
+@pytest.mark.slow
 def test_the_command_says_which_filters_it_tried_and_reports_on_the_winner(priced, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("tuning.evaluation.held_out.HELD_OUT_SEEDS", 8)

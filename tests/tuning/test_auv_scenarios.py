@@ -65,7 +65,7 @@ def test_scales_are_those_of_the_code():
         np.testing.assert_allclose(found, find_scenario(name).scale, rtol=0.08)
 
 
-@pytest.mark.parametrize("name", ["auv:motion", "auv:navigation"])
+@pytest.mark.parametrize("name", ["auv:motion", pytest.param("auv:navigation", marks=pytest.mark.slow)])
 def test_an_extended_filter_is_consistent_and_on_its_scale(name):
     scenario = find_scenario(name)
     found = evaluate(make_filter("ekf", scenario.model(**scenario.true)), scenario.data(range(24)), scenario.scale)

@@ -63,6 +63,7 @@ def test_what_a_way_lacks_is_said_in_one_line(problem, options, words):
     assert "\n" not in str(said.value)
 
 
+@pytest.mark.slow
 def test_the_command_follows_a_way(as_json, thruster):  # noqa: F811
     told = as_json("tune", "--filter", "enkf", "--problem", "nominal", "--way", "desroziers", "--trials", 4)
     assert told["way"]["name"] == "desroziers" and told["way"]["runs"] % 32 == 0 and told["way"]["runs"] > 4 * 32
@@ -72,6 +73,7 @@ def test_the_command_follows_a_way(as_json, thruster):  # noqa: F811
     assert "Shumway" in shown and "dlog L/dq" in shown
 
 
+@pytest.mark.slow
 def test_gradients_of_full_matrices_begin_at_noise_estimation():
     study = tuning.tune("deadband", "ekf", way="log-score", full_q=True, trials=6, progress=False)
     ratios = study.held_out.ratios

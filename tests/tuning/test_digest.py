@@ -170,7 +170,15 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("form", [(), WRAPPED, REGISTERED, MADE], ids=["class", "wrapped", "id", "object"])
+@pytest.mark.parametrize(
+    "form",
+    [
+        pytest.param((), id="class"),
+        pytest.param(WRAPPED, id="wrapped"),
+        pytest.param(REGISTERED, id="id", marks=pytest.mark.slow),
+        pytest.param(MADE, id="object", marks=pytest.mark.slow),
+    ],
+)
 def test_another_class_of_an_env_is_another_problem(form, tmp_path):
     found = [of_template(tmp_path, "spring", *form)]
     found += [

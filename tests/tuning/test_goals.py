@@ -84,8 +84,26 @@ def level(goal, choice, problems, data):
     return np.mean([OBJECTIVES[goal.objective].value(one, np.nan) for one in found])
 
 
-@pytest.mark.parametrize("objective", ["likelihood", "score", "mse", "log-score"])
-@pytest.mark.parametrize("case", CASES)
+OBJECTIVE = ["likelihood", "score", "mse", "log-score"]
+LIGHT = {  # each of the others is compiled for a second or two
+    *(("own numbers", objective) for objective in OBJECTIVE),
+    ("affine", "likelihood"),
+    ("affine", "score"),
+    ("correlation and prior", "likelihood"),
+    ("R held", "log-score"),
+    ("one more state", "log-score"),
+    ("several problems", "likelihood"),
+}
+
+
+@pytest.mark.parametrize(
+    ("case", "objective"),
+    [
+        pytest.param(case, objective, marks=[] if (case, objective) in LIGHT else pytest.mark.slow)
+        for case in CASES
+        for objective in OBJECTIVE
+    ],
+)
 def test_a_goal_is_the_objective_of_the_filter_that_runs_and_its_gradient_that_of_differences(case, objective):
     name, problems, options = CASES[case]
     data = [problem.data(range(3)) for problem in problems]
@@ -167,12 +185,17 @@ def of_two_sensors(**assumed):
     return ModelProblem(truth, truth.replace(measurement_noise_cov=[1.0, 4.0]), steps=200, **assumed)
 
 
-def test_correlated_sensors_are_found_and_a_full_r_is_read_back_wherever_a_tuned_file_is(tmp_path):
+def test_correlated_sensors_are_found():
     plan = Plan("ekf", (of_two_sensors(),), full_q=True, full_r=True).checked()
     found = tune_by_gradient("ekf", plan.scenarios, plan.training_data(), [1.0], options=plan.options)
     assert found.names == ("Q11", "Q22", "correlation_12", "R11", "R22", "R_correlation_12")
     at, error = found.best.parameters[-1], found.standard_errors[-1]
     assert abs(at - 0.6) < 3.5 * error < 0.2 and found.identified[-1]
+
+
+@pytest.mark.slow
+def test_a_full_r_is_read_back_wherever_a_tuned_file_is(tmp_path):
+    plan = Plan("ekf", (of_two_sensors(),), full_q=True, full_r=True).checked()
     file = tmp_path / "full.json"
     result = tune(plan, 8, out=file, by_gradient="likelihood")
     choice, *_ = read_tuned(file, plan.scenarios)

@@ -61,6 +61,7 @@ def test_objectives_on_true_states_need_them():
         tune_by_gradient("ekf", MISMATCH, data, objective="nees")
 
 
+@pytest.mark.slow
 def test_a_study_of_the_score_follows_its_gradient_only_where_there_are_many_numbers():
     plan = Plan("kf", (LinearProblem(n=3),), full_q=True, full_r=True)
     result = run_study(open_study("many", plan), plan, 8)

@@ -77,6 +77,7 @@ def test_an_end_at_zero_is_not_to_be_widened(found):
     assert found._end_sentences() == []
 
 
+@pytest.mark.slow
 def test_standard_errors_are_the_scatter_of_estimates(found, data):
     some = [identify(recorded(8, first=100 * i), pendulum, FREE, starts=1) for i in range(1, 9)]
     for name in TRUTH:

@@ -51,6 +51,7 @@ def test_what_other_packages_made_or_what_is_bent_is_computed_anew(tmp_path):
         assert kept_comparison(content, choice, NOMINAL) is None
 
 
+@pytest.mark.slow
 def test_a_report_takes_what_the_file_keeps_unless_the_problem_has_changed(tmp_path, monkeypatch):
     path = write_untuned(tmp_path / "ekf.json")
     asked = []

@@ -75,6 +75,7 @@ def test_what_is_reported_to_the_pruner_is_an_equal_share_of_each_problem(proble
     assert sum(np.diff(ends)) == len(many.seeds) and np.ptp(np.diff(ends)) <= 1
 
 
+@pytest.mark.slow
 def test_a_study_of_a_list_is_tuned_saved_verified_and_reported(problems, tmp_path):
     found = tuning.tune(list(problems), "ekf", trials=14, consistent=False, progress=False)
     best = min((trial for trial in found.trials if trial.values), key=lambda trial: trial.values[0])

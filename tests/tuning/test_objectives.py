@@ -21,7 +21,8 @@ DATA = PROBLEM.data(range(8))
 CHOICE = untuned_choice("kf", PROBLEM)
 
 
-def naive():
+@pytest.fixture(scope="module")
+def expected():
     """The objectives of the untuned filter, step by step."""
     estimates = run(CHOICE.filter(PROBLEM), DATA.filter_keys, DATA.inputs, DATA.measurements)
     errors, nees, nis, log_scores, channels = [], [], [], [], []
@@ -52,12 +53,12 @@ def naive():
     }
 
 
-@pytest.mark.parametrize(("name", "expected"), naive().items())
+@pytest.mark.parametrize("name", ["score", "mse", "log-score", "nees", "nis", "c-nees", "c-nis", "consistency"])
 def test_an_objective_is_what_its_definition_says_in_a_trial_and_held_out(name, expected):
     objective = find_objective(name)
     (found,) = measure(CHOICE, Plan("kf", (PROBLEM,), objectives=(name,)), [DATA])
     for one in (found, evaluate(CHOICE.filter(PROBLEM), DATA, PROBLEM.scale)):
-        assert objective.value(one, 0.0) == pytest.approx(expected, rel=1e-9)
+        assert objective.value(one, 0.0) == pytest.approx(expected[name], rel=1e-9)
 
 
 def test_chi_squares_have_the_variance_that_is_expected_of_a_consistent_filter():

@@ -9,6 +9,7 @@ from tuning.search.plan import TRAINING_SEEDS
 from tuning.search.study import quiet_optuna
 
 
+@pytest.mark.slow
 def test_with_pruning_a_study_ends_at_the_score_that_it_has_without():
     quiet_optuna()
     found = pair(

@@ -90,6 +90,7 @@ def test_a_way_that_finds_whole_matrices_knows_none():
         find_way("em").run("em", task)
 
 
+@pytest.mark.slow
 def test_a_study_and_its_workers_keep_them_and_resume(tmp_path):
     plan = Plan("ekf", (find_scenario("mismatch"),), where=("Q22 = 1e-3 Q11", "R = 0.5..50"))
     path = str(tmp_path / "j")

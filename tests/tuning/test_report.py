@@ -75,6 +75,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_the_page_of_a_tuned_ensemble_has_all_parts_and_needs_no_network(folder):
     result = tuned(Plan("enkf", (MISMATCH,)), 14)
     report = write_report("s.json", STORAGE)
@@ -121,6 +122,7 @@ def test_the_page_of_a_tuned_ensemble_has_all_parts_and_needs_no_network(folder)
     assert write_report("s.json", STORAGE, "again").page.read_text() == text
 
 
+@pytest.mark.slow
 def test_without_its_study_a_tuned_file_still_has_a_page():
     plan = Plan("ekf", (MISMATCH,))
     tuned(plan, 2)
@@ -176,6 +178,7 @@ def test_importances_count_pruned_trials_where_few_are_complete(caplog, monkeypa
     assert caplog.text == "", "a copy of a study is nobody's study"
 
 
+@pytest.mark.slow
 def test_two_studies_stand_beside_each_other(folder, monkeypatch, capsys):
     tuned(Plan("ekf", (MISMATCH,)), 2)
     tuned(Plan("kf", (MISMATCH,)), 2, "t")

@@ -85,6 +85,7 @@ def test_by_the_command_line_a_module_of_one_s_own_is_tuned_evaluated_verified_a
     assert abs(np.angle(np.exp(1j * wrong[0]))) < 0.1 and abs(wrong[1]) < 0.5
 
 
+@pytest.mark.slow
 def test_by_python_a_study_of_one_number_comes_near_its_most_likely_value(tuned):
     path, result, problem = tuned
     assert (

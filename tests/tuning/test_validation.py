@@ -50,6 +50,7 @@ def test_four_numbers_of_an_altitude_model_are_no_worse_than_any_baseline_and_tw
     assert any(MAXIMUM_LIKELIHOOD in trial.user_attrs for trial in study.trials) and ORACLE not in found
 
 
+@pytest.mark.slow
 def test_a_tuned_file_keeps_the_choice_as_data_and_a_noise_that_own_numbers_do_not_give(altitude):
     problem, study, file = altitude
     met, content = study.tuning.result.validation, read_tuned_file(file)

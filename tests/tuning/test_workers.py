@@ -105,6 +105,7 @@ def postgres():
         running.cleanup()
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_all_workers_and_keeps_what_is_finished(tmp_path):
     journal, tuned = tmp_path / "j", tmp_path / "tuned.json"
     command = "from thruster_cli.main import run; run()"

@@ -43,7 +43,20 @@ PAGES = (
 )
 SEEDS = range(2000, 2008)
 FEW = 20  # runs that decide a statistic
-every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.__name__.rpartition(".")[2])
+QUICK = (altitude, pendulum, range_bearing)  # an affine one, one of an env, and one with an angle
+
+
+def named(page):
+    return page.__name__.rpartition(".")[2]
+
+
+def of_filters(pages):
+    """Pages as parameters: of most, filters are compiled in the slow tests only."""
+    marks = {page: [] if page in QUICK else pytest.mark.slow for page in pages}
+    return pytest.mark.parametrize("page", [pytest.param(one, id=named(one), marks=marks[one]) for one in pages])
+
+
+every_page = pytest.mark.parametrize("page", PAGES, ids=named)
 
 
 def of_models(pages):
@@ -57,12 +70,16 @@ def known(page):
 
 def test_every_page_is_in_the_panel():
     files = {path.stem for path in Path(__file__).parent.glob("*.py")} - {"__init__", "test_users"}
-    assert files == {page.__name__.rpartition(".")[2] for page in PAGES}
-    assert [name_of(problem) for problem in found_problems(PANEL)] == sorted(files)  # each is checked on the way
-    assert len(files) >= 12
+    assert files == {named(page) for page in PAGES} and len(files) >= 12
+    assert PANEL == tuple(f"tests.users.{one}:problem" for one in sorted(files))
 
 
-@every_page
+@pytest.mark.slow
+def test_every_problem_of_the_panel_passes_the_checks_of_a_problem():
+    assert [name_of(problem) for problem in found_problems(PANEL)] == sorted(map(named, PAGES))
+
+
+@of_filters(PAGES)
 def test_a_filter_runs_with_what_its_user_had(page):
     problem = page.problem
     data = problem.data(SEEDS)
@@ -75,7 +92,7 @@ def test_a_filter_runs_with_what_its_user_had(page):
         assert one.value < width
 
 
-@pytest.mark.parametrize("page", of_models(PAGES), ids=lambda page: page.__name__.rpartition(".")[2])
+@of_filters(of_models(PAGES))
 def test_who_knows_the_plant_is_consistent_and_better_than_its_user(page):
     problem = page.problem
     data = problem.data(range(3000, 3000 + FEW))

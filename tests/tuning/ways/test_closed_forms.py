@@ -207,6 +207,7 @@ def test_mehra_finds_q_and_r_from_the_covariances_of_a_gain_that_is_not_the_best
     assert np.linalg.matrix_rank(matrix) == 3
 
 
+@pytest.mark.slow
 def test_mehra_scatters_more_than_als():
     problem, found = linear(a=A, steps=400, runs=40), {"mehra": [], "als": []}
     truth = np.array([Q[0, 0], Q[1, 1], R[0, 0], R[1, 1]])

@@ -78,6 +78,7 @@ def test_slopes_of_cholesky_factors_are_differences():
     np.testing.assert_allclose(factors.matrices(factors.first)[0], q + 1e-6 * np.eye(3), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_okf_goes_below_noise_estimation_where_the_model_is_wrong_and_not_below_the_gradient_of_the_same_error():
     problem = find_scenario("mismatch")
     values = {}
