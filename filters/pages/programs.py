@@ -36,7 +36,8 @@ def programs_of(
     """
     try:
         memory, model = _seen(page, functions, shape, trace=True)
-        programs = [as_programs(one, 0, MOST).values for one in stages(memory, model)]
+        # The update, the largest stage, comes first: one that is too large shows at once.
+        programs = [as_programs(one, 0, MOST).values for one in stages(memory, model)[::-1]][::-1]
         works = [callable_of(program, 1, OF_STEPS) for program in programs]
         return Programs(memory, works, tuple(callable_of(program, LANES, OF_STEPS) for program in programs))
     except Exception:  # whatever a user's function raises of numbers that it does not know: it is called, then
