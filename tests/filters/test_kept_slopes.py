@@ -161,6 +161,12 @@ def test_on_a_vehicle_the_gradient_is_that_of_differences(name):
     assert_gradient_on(find_vehicle("auv:motion"), name, 15, mixed=2)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_on_a_vehicle_the_compiled_gradient_is_that_of_differences(name):
+    assert_gradient_on(find_vehicle("auv:motion"), name, 100)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_gradients_tune_such_a_filter(name):
     scenario = find_scenario("outliers")
