@@ -141,5 +141,7 @@ def test_a_variance_that_the_data_do_not_determine_is_said_to_be_so():
 
 def test_only_filters_with_sensitivities_have_a_gradient():
     scenario = find_scenario("nominal")
-    with pytest.raises(ValueError, match="one of kf, ekf, iekf, ukf, ckf, ekf-robust, sage-husa, vb, but"):
+    with pytest.raises(
+        ValueError, match="one of kf, ekf, iekf, ukf, ckf, fading, h-infinity, schmidt, ekf-robust"
+    ):
         tune_by_gradient("enkf", scenario, scenario.data(training_seeds(0, 2)))

@@ -1,16 +1,14 @@
-"""The list of parameters that a study may choose: each one's name, range, unit and place in a choice."""
+"""The parameters of a model that a study may choose: each one's name, range, unit and place in a choice."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from filters.estimators.find import is_foreign, own_filter, parameters_of
-from filters.filter import Filter
-from filters.registry import filter_class, tunable_numbers
+from filters.registry import filter_class
 from filters.tuned_file import NOISE
 from filters.tuned_file import PRIOR as PRIOR_FACTOR
 from thruster_env.numerics.checks import covariance
@@ -86,81 +84,12 @@ class MeasurementVariance:
         return _with_variance(choice, R, self.index, value)
 
 
-@dataclass(frozen=True)
-class FilterParameter:
-    """One of the filter's parameters."""
-
-    name: str
-    is_variance: ClassVar[bool] = False
-
-    def get(self, choice) -> float | int | None:
-        """The parameter in a choice."""
-        return choice.numbers.get(self.name)
-
-    def set(self, choice, value):
-        """The choice with another value of the parameter."""
-        return choice._replace(numbers={**choice.numbers, self.name: value})
-
-
 PRIOR = Argument(PRIOR_FACTOR, is_variance=True)
-
-
-def _own(name: str, low: float, high: float, **options) -> Parameter:
-    return Parameter(name, low, high, **{"log": False, **options}, place=FilterParameter(name))
-
-
-# Ranges of the parameters that filters have beside Q, R and N; the defaults of all filters lie within them.
-FILTER_PARAMETERS = {
-    one.name: one
-    for one in (
-        _own("inflation", 1.0, 1.3),
-        _own("relaxation", 0.0, 0.9),
-        _own("iterations", 1, 8, integer=True),
-        _own("alpha", 0.05, 2.0, log=True),
-        _own("resampling_threshold", 0.1, 1.0),
-        _own("forgetting_factor", 0.9, 0.9999),
-        _own("prior_weight", 1.0, 100.0, log=True),
-        _own("degrees_of_freedom", 2.5, 50.0, log=True),
-        _own("time_constant", 0.2, 50.0, log=True, unit="steps"),
-        _own("fading", 1.0, 1.3),
-        _own("theta", 1e-3, 0.9, log=True),
-        _own("stay", 0.0, 0.999),
-        _own("outlier_scale", 3.0, 1e4, log=True),
-        _own("outlier_rate", 0.001, 0.5, log=True),
-    )
-}
-
-
-# Without process noise only this separates the copies of a particle; with process noise Q does.
-WITHOUT_NOISE = {one.name: one for one in (_own("regularisation", 0.0, 3.0),)}
 
 
 def has_process_noise(problem: Problem) -> bool:
     """Whether a problem has process noise in the untuned filter, or parameters from which it follows."""
     return problem.parameters is not None or bool(np.any(problem.untuned.get(Q, True)))
-
-
-def filter_parameters(name: str, sizes: tuple[int, int] | None, process_noise: bool) -> list[Parameter]:
-    """Parameters of a filter that a study may choose: N from `sizes`, if it has an ensemble, and the others.
-
-    An estimator declares its own parameters. Some parameters are chosen only without process noise.
-    """
-    own = own_filter(name) if is_foreign(name) else None
-    if own is not None:
-        return [_own_of_user(own, number, *ends) for number, ends in getattr(own, "ranges", {}).items()]
-    if is_foreign(name):
-        return [replace(one, place=FilterParameter(one.name)) for one in parameters_of(name)]
-    size = [] if sizes is None else [Parameter("N", *sizes, integer=True, place=FilterParameter("ensemble_size"))]
-    known = tunable_numbers(name)
-    numbers = FILTER_PARAMETERS if process_noise else FILTER_PARAMETERS | WITHOUT_NOISE
-    return size + [one for number, one in numbers.items() if number in known]
-
-
-def _own_of_user(kind: type[Filter], number: str, low: float, high: float) -> Parameter:
-    """A field of a user's filter: a whole number where its default is one, logarithmic over a factor of ten."""
-    default = getattr(kind, number)
-    options = {"integer": True} if isinstance(default, int) else {"log": 0 < 10 * low <= high}
-    return _own(number, low, high, default=default, **options)
 
 
 def model_parameters(

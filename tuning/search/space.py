@@ -14,9 +14,8 @@ from filters.particles.weighted import WeightedFilter
 from filters.registry import FILTERS, filter_class, make_filter, tunable_numbers
 from tuning.problems.parameter import Parameter
 from tuning.problems.problem import Problem
+from tuning.search.filter_parameters import FilterParameter, filter_parameters
 from tuning.search.parameters import (
-    FilterParameter,
-    filter_parameters,
     has_process_noise,
     model_parameters,
     places_in,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from filters.engine.session import Session
-from tuning.search.parameters import FILTER_PARAMETERS
+from tuning.search.filter_parameters import FILTER_PARAMETERS
 from tuning.ways.task import Task
 from tuning.ways.way import INFLATION
 
