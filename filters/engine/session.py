@@ -133,7 +133,7 @@ class Session:
 
         Q does not change: covariances are per step and do not scale with dt; `set_noise` sets another.
 
-        Raises ValueError for a model without such a constant, or if it is not a positive number.
+        Raises ValueError for a model without such a constant, a filter of several models, or another number.
         """
         place, parts = self._dt_place
         self._numbers[place] = positive("dt", dt) / parts
@@ -147,6 +147,7 @@ class Session:
     @cached_property
     def _dt_place(self) -> tuple[int, int]:
         """Where the constant lies, and how many of it are a step."""
+        self._check_one_model("set_dt")
         model = self._filter.kernel_model
         names = getattr(model.constants, "_fields", ())
         if "of_one_dt" in names:
@@ -173,12 +174,17 @@ class Session:
         raise ValueError(f"a number of {self._name!r} must be one of {', '.join(names)}, but got {name!r}")
 
     def scale_process_noise(self, factor: float) -> None:
-        """Use Q of the model times a factor above zero from here on."""
+        """Use Q of the model times a factor above zero from here on; ValueError for a filter of several models."""
+        self._check_one_model("scale_process_noise")
         n, at = len(self.mean), self._noise_places.q
         self._remember_noise()
         scales = self._q_scales
         scales[: n * n], scales[n * n :] = factor, factor**0.5
         np.multiply(self._given_q, scales, out=self._numbers[at : at + 2 * n * n])
+
+    def _check_one_model(self, name: str) -> None:
+        if not self._filter.one_model:
+            raise ValueError(f"{name} must be called on a filter of one model, but got {self._name!r}")
 
     def _remember_noise(self) -> None:
         """Keep the first numbers, with which `clear` begins again."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +14,7 @@ from filters.engine.belief import Belief, Kernels
 from filters.engine.layout import memory_places
 from filters.filter import Filter
 from filters.gaussian.modes import Mode, mode_kernels
-from thruster_env.numerics.checks import between, positive, shown
+from thruster_env.numerics.checks import between, one_of, positive, shown
 from thruster_env.plants.state_space import StateSpaceModel
 
 MOST_MODES = 32
@@ -32,6 +33,7 @@ class MultipleModelFilter(Filter):
         probabilities: p (K,), of the modes at first; `usual_probabilities` if None.
     """
 
+    one_model: ClassVar[bool] = False
     gaussian_likelihood: ClassVar[bool] = False
     varying_noise: ClassVar[bool] = False  # each mode has Q and R of its own
     modes: Any = None
@@ -84,7 +86,7 @@ class MultipleModelFilter(Filter):
         model, modes = self.model, self.usual_modes if self.modes is None else self.modes
         if not isinstance(modes, Sequence) or not 2 <= len(modes) <= MOST_MODES:
             raise ValueError(f"modes must be a list of 2 to {MOST_MODES} models, but got {shown(modes)}")
-        models = [model.replace(**one) if isinstance(one, Mapping) else one for one in modes]
+        models = [self._changed(one) if isinstance(one, Mapping) else one for one in modes]
         for one in models:
             if not isinstance(one, StateSpaceModel):
                 raise ValueError(f"a mode must be a model, or changes of one, but got {shown(one)}")
@@ -92,6 +94,12 @@ class MultipleModelFilter(Filter):
                 rule = "states, measurements, inputs and angles of a mode must be those of the model"
                 raise ValueError(f"{rule}, {_sizes(model)}, but got {_sizes(one)}")
         return models
+
+    def _changed(self, changes: Mapping[str, Any]) -> StateSpaceModel:
+        names = [one.name for one in dataclasses.fields(self.model) if one.init]
+        return self.model.replace(
+            **{one_of("a change of a mode", name, names): it for name, it in changes.items()}
+        )
 
     @cached_property
     def own_numbers(self) -> tuple[float, ...]:

@@ -211,6 +211,7 @@ def test_an_angle_is_mixed_the_short_way_round():
         ({"modes": [thruster_model()]}, "modes must be a list of 2 to 32 models, but got"),
         ({"modes": [thruster_model(), pendulum()]}, "states, measurements, inputs and angles of a mode must be"),
         ({"modes": [thruster_model(), 3]}, "a mode must be a model, or changes of one, but got 3"),
+        ({"modes": [{}, {"gain": 3.0}]}, "a change of a mode must be one of .*, but got 'gain'"),
         ({"stay": 1.5}, "stay must be"),
         (
             {"mode_filter": "enkf"},
@@ -227,3 +228,15 @@ def test_an_angle_is_mixed_the_short_way_round():
 def test_what_is_refused(changes, rule):
     with pytest.raises(ValueError, match=rule):
         make_filter("imm", thruster_model(), **changes)
+
+
+@pytest.mark.parametrize("name", ["imm", "mmae", "fuzzy"])
+def test_the_sample_times_of_several_models_do_not_change(name):
+    filter_ = make_filter(name, thruster_model())
+    for use in (
+        filter_.live,
+        lambda: filter_.session().set_dt(0.02),
+        lambda: filter_.session().scale_process_noise(2.0),
+    ):
+        with pytest.raises(ValueError, match=f"must be called on a filter of one model, but got '{name}'"):
+            use()
