@@ -35,9 +35,7 @@ class Filter:
     name: ClassVar[str]
     varying_noise: ClassVar[bool] = True  # whether Q and R may differ from step to step
     has_covariance: ClassVar[bool] = True  # if not, covariances and log-likelihoods are zero and say nothing
-    one_model: ClassVar[bool] = (
-        True  # if not, it has others beside `model`, whose sample times and Q are their own
-    )
+    one_model: ClassVar[bool] = True  # if not, it has others beside `model`, with their own sample times and Q
     gaussian_likelihood: ClassVar[bool] = True  # whether the log-likelihood is that of N(innovation; 0, S)
     model: StateSpaceModel
 

@@ -47,8 +47,8 @@ def likelihood(
         measurements: (B, K + 1, m); NaN where missing.
         q_slopes: dQ/dparameter, (parameters, n, n), symmetric.
         r_slopes: dR/dparameter, (parameters, m, m), symmetric.
-        filter: a Kalman filter but "kf-steady", "gsf" and "fuzzy", of which the type and its own parameters count:
-            it is used with `model` in place of its own.
+        filter: one of `differentiated.differentiable.KINDS`, or your own, of which the type and its own parameters
+            count: it is used with `model` in place of its own.
         own_slopes: how the filter's own numbers (`own_numbers`, count of them) change, (parameters, count); not at
             all if None.
 

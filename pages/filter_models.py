@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,28 +25,36 @@ def half_lost(model: StateSpaceModel) -> StateSpaceModel:
 
 
 def run_that_switches(whole: StateSpaceModel, seed: int = 2) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """States (K + 1, 2), voltages (K, 1), thrusts (K + 1, 1) of a run that loses half of its thrust."""
-    generator, lost = np.random.default_rng(seed), half_lost(whole)
+    """States (K + 1, 2), thrusts (K + 1, 1), voltages (K, 1) of a run that loses half of its thrust."""
+    generator, steps = np.random.default_rng(seed), np.arange(STEPS + 1)
     inputs = np.repeat(generator.uniform(-LEVEL, LEVEL, STEPS // 25), 25)[:, None]
-    x = np.array(whole.prior_mean)
-    states, seen = [], []
-    for k in range(STEPS + 1):
-        model = lost if LOST_FROM <= k < LOST_TO else whole
+    is_lost = (steps >= LOST_FROM) & (steps < LOST_TO)
+    return *followed([whole, half_lost(whole)], is_lost.astype(int), inputs, generator), inputs
+
+
+def followed(
+    models: Sequence[StateSpaceModel], modes: np.ndarray, inputs: np.ndarray, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """States (K + 1, n) and measurements (K + 1, m) of a plant that is models[modes[k]] at step k."""
+    first, states, seen = models[modes[0]], [], []
+    x = generator.multivariate_normal(first.prior_mean, first.prior_cov)
+    for k, mode in enumerate(modes):
+        model = models[mode]
         if k:
             for _ in range(model.substeps):
                 x = np.array(model.transition(tuple(x), tuple(inputs[k - 1]), model.constants))
-            x = x + generator.multivariate_normal(np.zeros(2), model.process_noise_cov)
+            x = x + generator.multivariate_normal(np.zeros(len(x)), model.process_noise_cov)
         seen.append(
             generator.multivariate_normal(model.observe(tuple(x), model.constants), model.measurement_noise_cov)
         )
         states.append(x)
-    return np.array(states), inputs, np.array(seen)
+    return np.array(states), np.array(seen)
 
 
 def several(path: Path) -> Path:
     """The probability of a mode, and errors with and without it."""
     whole = thruster_model()
-    states, inputs, seen = run_that_switches(whole)
+    states, seen, inputs = run_that_switches(whole)
     imm = InteractingMultipleModelFilter(model=whole, modes=[whole, half_lost(whole)], stay=0.98)
     figure = new_figure((9.6, 3.6))
     left, right = figure.subplots(1, 2)

@@ -43,8 +43,9 @@ def command(
 ) -> None:
     """Write a tuned Kalman or ensemble filter as C99: model, Q and R in it, and a program that filters a log.
 
-    Any one but gsf and fuzzy. The code has fixed sizes and needs math.h alone; a class of C++ lies beside it. With
-    --single the largest change of an estimate on a training run is printed. docs/howto/export.md says more.
+    Any one but gsf, imm, mmae and fuzzy. The code has fixed sizes and needs math.h alone; a class of C++ lies
+    beside it. With --single the largest change of an estimate on a training run is printed.
+    docs/howto/export.md says more.
 
     Example: thruster export out/ekf-mismatch-seed0.json --out boat
     """

@@ -121,8 +121,9 @@ def command(
     method: Annotated[
         str,
         typer.Option(
-            help="optuna; or gradient, for Kalman filters but kf-steady, gsf and fuzzy: maximum likelihood, or "
-            "the best score, mse or log-score where that is the --objective; optuna runs for comparison.",
+            help="optuna; or gradient, for Kalman filters but kf-steady, gsf, imm, mmae and fuzzy: maximum "
+            "likelihood, or the best score, mse or log-score where that is the --objective; optuna runs "
+            "for comparison.",
             rich_help_panel=SEARCH,
         ),
     ] = "optuna",

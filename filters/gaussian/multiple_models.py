@@ -181,7 +181,9 @@ class InteractingMultipleModelFilter(MultipleModelFilter):
     @property
     def usual_probabilities(self) -> Sequence[float] | np.ndarray:
         """As outliers come, where no modes are given; else all equal."""
-        return super().usual_probabilities if self.modes else (1.0 - self.outlier_rate, self.outlier_rate)
+        return (
+            super().usual_probabilities if self.modes is not None else (1.0 - self.outlier_rate, self.outlier_rate)
+        )
 
     @property
     def transition_matrix(self) -> np.ndarray:

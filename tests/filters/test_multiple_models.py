@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from filters import make_filter, run
+from pages.filter_models import followed, half_lost
 from tests.models import pendulum
 from tests.numerics.test_angles import turning
 from thruster_env.model import thruster_model
@@ -140,28 +141,17 @@ def test_the_static_estimator_has_the_posterior_of_the_models():
 
 def switching(models, stay, steps, rng):
     """A run of a plant that switches among models: modes, states, inputs, measurements."""
-    x, mode = rng.multivariate_normal(models[0].prior_mean, models[0].prior_cov), 0
-    modes, states, seen = [], [], []
+    modes = np.zeros(steps + 1, dtype=int)
+    for k in range(steps):
+        modes[k + 1] = modes[k] if rng.uniform() < stay else rng.integers(len(models))
     inputs = np.repeat(rng.uniform(-20.0, 20.0, steps // 25 + 1), 25)[:steps, None]
-    for k in range(steps + 1):
-        if k:
-            mode = mode if rng.uniform() < stay else int(rng.integers(len(models)))
-            model = models[mode]
-            for _ in range(model.substeps):
-                x = np.array(model.transition(tuple(x), tuple(inputs[k - 1]), model.constants))
-            x = x + rng.multivariate_normal(np.zeros(len(x)), model.process_noise_cov)
-        model = models[mode]
-        z = np.array(model.observe(tuple(x), model.constants))
-        seen.append(rng.multivariate_normal(z, model.measurement_noise_cov))
-        modes.append(mode)
-        states.append(x)
-    return np.array(modes), np.array(states), inputs, np.array(seen)
+    states, seen = followed(models, modes, inputs, rng)
+    return modes, states, inputs, seen
 
 
 def test_a_thruster_that_loses_thrust_is_followed_almost_as_if_the_mode_were_known():
     whole = thruster_model()
-    weak = {name: 0.5 * getattr(whole.constants, name) for name in whole.constants._fields if name[:6] == "thrust"}
-    models = [whole, whole.replace(constants=whole.constants._replace(**weak))]
+    models = [whole, half_lost(whole)]
     filters = [make_filter("ekf", one) for one in models]
     imm = make_filter("imm", whole, modes=models, stay=0.96)
     errors, brier = {"told": [], "imm": [], "ekf": []}, []

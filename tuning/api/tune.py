@@ -83,8 +83,8 @@ def tune(
         budget: time limit of a step of the filter [microseconds of one core].
         sampler: of Optuna: "tpe", "random", "cma-es", ...
         prune: end a trial that is significantly worse than the best on the same seeds.
-        method: "optuna"; or "gradient", for Kalman filters but kf-steady, gsf and fuzzy: maximum likelihood, or
-            the best "score", "mse" or "log-score" where that is the objective.
+        method: "optuna"; or "gradient", for Kalman filters but kf-steady, gsf, imm, mmae, fuzzy: maximum
+            likelihood, or the best "score", "mse" or "log-score" where that is the objective.
         way: another way of tuning in place of the study, such as "em", as `thruster ways` lists them: it ends of
             itself, or if it is a sampler after so many trials.
         workers: processes on this host that share the study; several need a storage.

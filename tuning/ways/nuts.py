@@ -47,9 +47,7 @@ def nuts(task: Task) -> None:
         try:
             task.check()
             found, away = goal(point), (point - centre) / DEVIATION**2
-        except (
-            Spent
-        ):  # an exception would end the process: the rest of the draws is of something cheap, and not kept
+        except Spent:  # an exception would end the process: the other draws are of something cheap, and not kept
             return -0.5 * float(y @ y), -y
         except ValueError:  # the filter diverges
             return -DIVERGED, np.zeros(p)
