@@ -20,7 +20,7 @@ from tuning.ways.okf import okf
 from tuning.ways.posterior import posterior
 from tuning.ways.samplers import SLOWER, sample
 from tuning.ways.scoring import scoring
-from tuning.ways.way import COVARIANCE, GRADIENT, INFLATION, LINEAR, NOISE, NUTPIE, TRUTH, Way
+from tuning.ways.way import COVARIANCE, GRADIENT, INFLATION, LINEAR, MODEL, NOISE, NUTPIE, TRUTH, Way
 
 ABBEEL = "Abbeel, Coates, Montemerlo, Ng, Thrun (2005)"
 CHEN = "Chen, Heckman, Julier, Ahmed (2018), arXiv 1807.08855"
@@ -155,7 +155,7 @@ WAYS = {
         "without true states and with few runs, if time does not count",
         posterior,
         "Haario, Saksman, Tamminen (2001)",
-        (COVARIANCE,),
+        (COVARIANCE, MODEL),
     ),
     "nuts": Way(
         "the same mean by the no-U-turn sampler with exact gradients, of the package nutpie",

@@ -21,6 +21,7 @@ LINEAR = "linear"  # a linear model with a stationary filter
 INFLATION = "inflation"  # an ensemble
 NUTPIE = "nutpie"  # the package
 NOISE = "noise"  # that Q and R are tuned, and not a model's own parameters
+MODEL = "model"  # that some number of the model is tuned
 
 
 class Way(NamedTuple):
@@ -51,6 +52,8 @@ class Way(NamedTuple):
             raise ValueError(f"way {name!r} needs true states, but {lacking} has none")
         if NOISE in self.needs and not {Q, R} <= set(task.start.model):
             raise ValueError(f"way {name!r} tunes Q and R, but {task.problems[0].name} has parameters of its own")
+        if MODEL in self.needs and not task.free:
+            raise ValueError(f"way {name!r} tunes the model, but {task.problems[0].name} has none of it free")
         if LINEAR in self.needs:
             stationary(task.model(task.start), task.problems[0].name, name)
         if NUTPIE in self.needs and importlib.util.find_spec(NUTPIE) is None:

@@ -6,6 +6,7 @@ import pytest
 from filters import affine_model
 from tests.tuning.ways.problems import A, Q, R, at, linear, task_of
 from thruster_env.plants.simulate import simulate
+from thruster_env.studies.ways.problems import ring
 from tuning.evaluation.residuals import estimated_from
 from tuning.likelihood.family import symmetric_units
 from tuning.problems.model_problem import ModelProblem
@@ -296,6 +297,9 @@ def test_what_ways_need_is_said_in_a_line():
         find_way("mse").run("mse", blind)
     with pytest.raises(ValueError, match="way must be one of .*, but got 'magic'"):
         find_way("magic")
+    certain = Task("enkf", ring(steps=4), ring(steps=4).data(range(2)), options={"hold_r": True})
+    with pytest.raises(ValueError, match="way 'posterior' tunes the model, but .* has none of it free"):
+        find_way("posterior").run("posterior", certain)
     ensemble = task_of(linear(), filter_name="enkf")
     with pytest.raises(ValueError, match="a filter for way 'em' must be one of kf"):
         find_way("em").run("em", ensemble)

@@ -180,7 +180,7 @@ CASES = (
     Case("outliers", "D", found("outliers"), "ekf"),
     Case("deadband", "D", found("deadband"), "ekf"),
     Case("nominal, N = 10", "E", found("nominal"), "enkf", members=10),
-    Case("lorenz96, N = 20", "E", ring, "etkf", HELD_R, 4, 20),
+    Case("lorenz96, N = 20", "E", ring, "etkf", HELD_R, 16, 20),
     Case("chain", "F", chain, "kf"),
     Case("targets", "F", targets, "kf", FULL_Q),
     Case("auv:motion", "F", found("auv:motion"), "ekf"),
