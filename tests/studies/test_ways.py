@@ -2,6 +2,7 @@
 
 import json
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -90,6 +91,7 @@ def test_what_is_done_is_not_done_again(tmp_path, monkeypatch):
 def test_the_protocol_names_all_groups_and_was_predicted():
     assert {case.group for case in CASES} == set(GROUPS)
     assert len({case.name for case in CASES}) == len(CASES) and Protocol().ways == ENTRIES
+    assert pickle.loads(pickle.dumps(CASES)) is not None  # --jobs sends them to processes
     assert {"we", "Rawlings et al."} <= {one.who for one in PREDICTIONS}
 
 

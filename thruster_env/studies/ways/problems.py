@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -165,7 +165,7 @@ def lidar() -> Problem:
 
 def found(name: str) -> Callable[[], Problem]:
     """A problem by its name."""
-    return lambda: find_problem(name)
+    return partial(find_problem, name)  # which another process can be sent
 
 
 CASES = (
