@@ -1,4 +1,4 @@
-"""`thruster demo`: its own result first, in thirty lines, with the pictures and the page that it speaks of."""
+"""`thruster demo`: its own result first, in 36 lines, with the pictures and the page that it speaks of."""
 
 import json
 import sys
@@ -13,6 +13,7 @@ from thruster_cli import demo
 from thruster_cli.main import main
 from thruster_cli.output import console
 from tuning.reporting.report import Report
+from tuning.search.space import AUTO_FILTER_TYPES
 
 
 @pytest.fixture
@@ -30,9 +31,9 @@ def run_demo(tmp_path, monkeypatch, capsys):
     return run
 
 
-def test_demo_tells_its_result_in_thirty_lines_and_draws_what_it_tuned(run_demo, tmp_path):
+def test_demo_tells_its_result_in_36_lines_and_draws_what_it_tuned(run_demo, tmp_path):
     code, lines = run_demo()
-    assert code == 0 and len(lines) <= 30 and max(map(len, lines)) <= 80
+    assert code == 0 and len(lines) <= 36 and max(map(len, lines)) <= 80
     data = json.loads((tmp_path / "demo.json").read_text())
     held_out = data["tuning"]["held_out"]["outliers"]
     assert any("motor" in line and "flow" in line for line in lines)
@@ -43,8 +44,13 @@ def test_demo_tells_its_result_in_thirty_lines_and_draws_what_it_tuned(run_demo,
     found = [rmse[0] for rmse in held_out["tuned"]["rmse"]]
     assert [float(row[2]), float(row[5])] == pytest.approx(found, rel=0.006)
     told = [tmp_path / line.split()[0] for line in lines if line.startswith("out/")]
-    assert told == [tmp_path / name for name in (*data["pictures"], data["report"], data["tuning"]["file"])]
-    assert [path.read_bytes()[:4] == b"\x89PNG" for path in told] == [True, True, True, False, False]
+    written = (*data["pictures"], data["report"], data["tuning"]["file"], data["best_type"]["file"])
+    assert told == [tmp_path / name for name in written]
+    assert [path.read_bytes()[:4] == b"\x89PNG" for path in told] == [True, True, True, False, False, False]
+    best = data["best_type"]["held_out"]["outliers"]["tuned"]["rmse"]
+    (row,) = [line.split() for line in lines if line.startswith("auto: ")]
+    assert [float(row[3]), float(row[6])] == pytest.approx([rmse[0] for rmse in best], rel=0.006)
+    assert f"also chose the filter type, among {len(AUTO_FILTER_TYPES)}: {row[1]}." in words
     assert "<html" in told[3].read_text()
     sensors = {"thrust": [{"name": "outliers", "std": 10.0, "probability": 0.05}]}
     assert EstimateState(gym.make("BowThruster-v0", sensors=sensors), tuned=str(told[4]))

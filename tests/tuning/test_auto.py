@@ -12,12 +12,16 @@ from rich.progress import Progress
 
 from filters.registry import FILTERS
 from thruster_cli.main import main
+from tuning.evaluation.baselines import noise_estimated
 from tuning.evaluation.held_out import evaluate_held_out
 from tuning.evaluation.tuned import write_tuned
+from tuning.problems.runs_problem import RunsProblem
 from tuning.search import trials as tuning_trials
+from tuning.search.among_types import ESTIMATED, ESTIMATED_Q, SMALLER, TRANSFERRED, UNTUNED, ends_a_round
 from tuning.search.cost import BUDGET, COST, microseconds_a_step, over_budget
-from tuning.search.enqueued import RESCALED, SMALLER, TRANSFERRED, UNTUNED, _ends_a_round
+from tuning.search.enqueued import RESCALED
 from tuning.search.filter_types import filter_types_tried, trials_of_type
+from tuning.search.gradient_noise import noise_by_gradient
 from tuning.search.outcome import best_trial, is_over_budget, violation
 from tuning.search.plan import Plan
 from tuning.search.space import (
@@ -78,22 +82,42 @@ def test_numbers_of_a_kind_are_chosen_for_that_kind_alone_and_noise_for_all(pric
         assert (f"{kind} N" in own) == (kind in ("enkf", "pf"))
 
 
-def test_each_kind_is_tried_untuned_and_then_rescaled_before_the_next_one_is_begun(priced):
-    trials = studied(PLAN, 12).trials
-    untuned = [trial for trial in trials if UNTUNED in trial.user_attrs]
-    found = [choice_of("auto", trial.params, MISMATCH) for trial in untuned]
-    assert found == [untuned_choice(kind, MISMATCH) for kind in FEW]
-    kinds = [trial.params[FILTER_TYPE] for trial in trials[: untuned[-1].number]]
-    assert kinds == sorted(kinds, key=FEW.index) and kinds.count("ekf") == 2  # the rescaled one is the other
-    assert trials[1].user_attrs[RESCALED] == 1
+def test_each_kind_is_tried_with_the_noise_that_true_states_show(priced):
+    trials = studied(PLAN._replace(prune=False), 16).trials
+    assert [trial.user_attrs.get(UNTUNED) for trial in trials[:2]] == ["ekf", None]
+    assert choice_of("auto", trials[0].params, MISMATCH) == untuned_choice("ekf", MISMATCH)
+    for key, kinds in ((ESTIMATED_Q, list(FEW)), (ESTIMATED, ["ekf", "kf", "enkf"])):  # pf is over the budget
+        found = [trial for trial in trials if key in trial.user_attrs]
+        assert (
+            [trial.user_attrs[key] for trial in found] == [trial.params[FILTER_TYPE] for trial in found] == kinds
+        )
+        for trial in found:
+            choice = choice_of("auto", trial.params, MISMATCH)
+            estimated = noise_estimated(choice.name, MISMATCH).model
+            np.testing.assert_allclose(choice.model["process_noise_cov"], np.diag(estimated["process_noise_cov"]))
+            r = np.squeeze(estimated["measurement_noise_cov"]) if key == ESTIMATED else 0.25
+            assert choice.model["measurement_noise_cov"] == pytest.approx(r)
+    assert trials[1].user_attrs[RESCALED] == 1  # before the next kind is begun
 
 
 def test_kinds_that_were_not_begun_are_begun_by_whoever_goes_on(priced):
     storage = optuna.storages.InMemoryStorage()
-    for count in range(1, 9):
+    for count in range(1, 11):
         trials = run_study(open_study("s", PLAN, storage), PLAN, count).trials
-    assert [trial.user_attrs[UNTUNED] for trial in trials if UNTUNED in trial.user_attrs] == list(FEW)
+    assert [one.user_attrs[ESTIMATED_Q] for one in trials if ESTIMATED_Q in one.user_attrs] == list(FEW)
     assert RESCALED in trials[1].user_attrs
+
+
+def test_on_recorded_runs_each_kind_begins_with_the_likeliest_noise(priced):
+    model = MISMATCH.model()
+    data = MISMATCH.data(range(5))
+    runs = [{"measurements": z, "inputs": u} for z, u in zip(data.measurements, data.inputs, strict=True)]
+    problem = RunsProblem(runs, model, held_out=[3, 4], dt=MISMATCH.dt)
+    plan = PLAN._replace(scenarios=(problem,), objectives=("likelihood",))
+    trials = studied(plan, 9).trials
+    likeliest = noise_by_gradient(open_study("t", plan, optuna.storages.InMemoryStorage()), plan)
+    for trial in (one for one in trials if ESTIMATED_Q in one.user_attrs):
+        assert {key: trial.params[key] for key in likeliest} == pytest.approx(likeliest)
 
 
 def test_what_is_over_the_budget_ends_at_once_and_never_wins(priced):
@@ -124,7 +148,7 @@ def test_a_filter_over_the_budget_is_tried_with_fewer_members(priced):
 
 
 def test_other_kinds_inherit_the_noise_of_the_best_one(priced):
-    assert [n for n in range(1, 65) if _ends_a_round(n, 4)] == [12, 24, 48]
+    assert [n for n in range(1, 65) if ends_a_round(n, 4)] == [12, 24, 48]
     result = studied(PLAN._replace(prune=False), 17)
     heirs = [trial for trial in result.trials if TRANSFERRED in trial.user_attrs]
     (best,) = {trial.user_attrs[TRANSFERRED] for trial in heirs}

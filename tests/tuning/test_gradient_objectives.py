@@ -6,7 +6,8 @@ import pytest
 from tests.linear_problem import LinearProblem
 from tuning.evaluation.evaluate import evaluate
 from tuning.likelihood.gradient import tune_by_gradient
-from tuning.search.enqueued import BY_GRADIENT, MAXIMUM_LIKELIHOOD_AFTER
+from tuning.search.enqueued import MAXIMUM_LIKELIHOOD_AFTER
+from tuning.search.gradient_noise import BY_GRADIENT
 from tuning.search.objectives import OBJECTIVES
 from tuning.search.plan import Plan
 from tuning.search.space import choice_of

@@ -13,7 +13,9 @@ from tuning.evaluation.held_out import evaluate_held_out
 from tuning.likelihood.gradient import BAD_START, tune_by_gradient
 from tuning.search import trials
 from tuning.search.box import box
-from tuning.search.enqueued import MAXIMUM_LIKELIHOOD, MAXIMUM_LIKELIHOOD_AFTER, RESCALED, enqueue_new
+from tuning.search.enqueued import MAXIMUM_LIKELIHOOD_AFTER, RESCALED
+from tuning.search.gradient_noise import MAXIMUM_LIKELIHOOD
+from tuning.search.new_trials import enqueue_new
 from tuning.search.objectives import LARGEST, NIS_BAND, nis_violation
 from tuning.search.outcome import best_trial, violation
 from tuning.search.plan import Plan

@@ -19,7 +19,8 @@ from tuning.evaluation.baselines import GIVEN, NOISE, ORACLE, RULE, SCALED
 from tuning.evaluation.tuned import read_tuned
 from tuning.reporting.choice_words import choice_sentences
 from tuning.reporting.units import apart
-from tuning.search.enqueued import BASELINE, MAXIMUM_LIKELIHOOD
+from tuning.search.enqueued import BASELINE
+from tuning.search.gradient_noise import MAXIMUM_LIKELIHOOD
 from tuning.search.local import is_local, near
 from tuning.search.measures import Measured, measured, over
 from tuning.search.parameters import FACTORS, model_parameters

@@ -17,7 +17,7 @@ from tuning.search.interruption import stop_on_interrupt
 from tuning.search.measures import measured
 from tuning.search.parameters import R
 from tuning.search.plan import Plan
-from tuning.search.space import AUTO, Choice, trial_parameters, untuned_choice
+from tuning.search.space import AUTO, Choice, trial_parameters, untuned_choice, within_ranges
 from tuning.search.study import FINISHED, OnTrial, StudyResult
 from tuning.search.trials import run_trial
 from tuning.ways.registry import WAYS, find_way
@@ -72,7 +72,7 @@ def follow(
         stopped = interrupted()
     space = plan.space()
     for choice in _some([one.choice for one in task.kept[1:]], trials - 1):
-        study.enqueue_trial(_within(trial_parameters(choice, space), space))
+        study.enqueue_trial(within_ranges(trial_parameters(choice, space), space))
     waiting = len(study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.WAITING,)))
 
     def after(study: optuna.Study, trial: FrozenTrial) -> None:
@@ -125,11 +125,6 @@ def _some(choices: Sequence[Choice], count: int) -> list[Choice]:
         return list(choices) if count >= 1 else []
     places = sorted({round((i + 1) * len(choices) / count) - 1 for i in range(count)})
     return [choices[place] for place in places]
-
-
-def _within(parameters: dict[str, Any], space: dict[str, Any]) -> dict[str, Any]:
-    """The parameters of a trial, those that are numbers within their ranges."""
-    return {key: min(max(value, space[key].low), space[key].high) for key, value in parameters.items()}
 
 
 def _tuples(content: Any) -> Any:

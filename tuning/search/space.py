@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from numbers import Real
 from typing import Any, NamedTuple
 
 import optuna
@@ -178,6 +179,17 @@ def ends_of(distribution: BaseDistribution) -> tuple[float, float]:
     if not isinstance(distribution, FloatDistribution | IntDistribution):
         raise TypeError(f"only a range of numbers has ends, but got {distribution}")
     return distribution.low, distribution.high
+
+
+def within_ranges(parameters: Mapping, space: Mapping[str, BaseDistribution]) -> dict:
+    """The parameters of a trial, those that are numbers moved into their ranges."""
+    found = {}
+    for name, value in parameters.items():
+        if isinstance(value, Real):
+            low, high = ends_of(space[name])
+            value = min(max(value, low), high)
+        found[name] = value
+    return found
 
 
 def choice_of(
