@@ -186,6 +186,13 @@ def test_the_table_of_all_filters_is_that_of_the_code():
     assert all(f"`{kind.__name__}`" in table for kind in FILTERS.values())
 
 
+def test_the_chart_of_filters_names_filters_that_there_are():
+    from pages.ranking_chart import FILE, OTHERWISE, STEPS
+
+    assert {name for step in (*STEPS, OTHERWISE) for name in step.filters} <= set(FILTERS)
+    assert FILE in (ROOT / "docs" / "ranking.md").read_text()
+
+
 def test_the_thrust_of_the_tunnel_falls_with_the_flow_velocity_as_the_page_says():
     model = thruster_model()
     states = [(speed, flow) for speed in (-190.0, -5.0, 5.0, 190.0) for flow in np.linspace(-40.0, 40.0, 801)]
