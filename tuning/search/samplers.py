@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from functools import partial
 from types import MappingProxyType
 
@@ -61,24 +60,13 @@ def make_sampler(
         return optuna.samplers.GridSampler(values, seed=seed)
     seed = int(np.random.SeedSequence([seed, present, worker]).generate_state(1)[0])
     makers: dict[str, Callable[..., optuna.samplers.BaseSampler]] = {
-        "tpe": partial(_tpe, first),
+        "tpe": partial(TpeInBox, first),
         "gp": partial(GpInBox, first),
         "cma-es": CmaEsSampler,
         "nsga-ii": optuna.samplers.NSGAIISampler,
         "random": partial(RandomInBox, first),
     }
     return makers[name](seed=seed)
-
-
-def _tpe(first: Mapping, seed: int) -> optuna.samplers.TPESampler:
-    """Optuna's sampler, which evaluates its densities as arrays where its version is known."""
-    sampler = TpeInBox(first, seed=seed)
-    with suppress(ImportError):  # of another version
-        from tuning.search.parzen import ParzenEstimator, is_optunas
-
-        if is_optunas():
-            sampler._parzen_estimator_cls = ParzenEstimator
-    return sampler
 
 
 def give_sampler(study: optuna.Study, make: Callable[[int], optuna.samplers.BaseSampler], present: int) -> None:
