@@ -64,7 +64,7 @@ def many() -> str:
             ratio = score_ratio(proof.evaluations[NOISE], proof.evaluations[GIVEN])
             rows.append(["noise estimation", f"{ratio.value:.2f}"])
         rows.append([name, f"{proof.ratios[GIVEN].value:.2f}"])
-    return table(["", "score over what was given"], rows)
+    return table(["", "score over the given one"], rows)
 
 
 TABLES: dict[str, Callable[[], str]] = {"many": many}

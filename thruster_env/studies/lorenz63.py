@@ -131,15 +131,15 @@ BENCHMARK = Benchmark(
     remarks=(
         "Our inflation acts on the forecast, the published one on the analysis: without process noise the two "
         "differ by one forecast.",
-        "The EKF's inflation is a factor on its covariance in one unit of time, here within the Jacobian.",
-        "The published EnKF has centred perturbations of the measurements. The mean of independent ones, of "
-        "variance R/N, moves the estimate: with N = 10 the mean of 64 runs is 0.81, their median 0.75.",
-        "Small ensembles lose the truth for some time in few runs, which move the mean of all: what is published "
-        "rests on a single run, which is more like the median. Of 64 runs of the EnKF with N = 10 the mean is "
-        "0.72, the median 0.64, the largest 1.8; of DAPPER's own EnKF 16 runs give 0.65 +- 0.02 and 0.64.",
-        "Without process noise particles die out. The published filter spreads those that it has drawn more than "
-        "once by a Gaussian kernel of the width 2.4, 0.9 and 0.7 times N^(-1/7), ours spreads all that it has "
-        "drawn by the same: regularisation 1 is the width (4/5)^(1/7) N^(-1/7).",
+        "The EKF's inflation is a factor on its covariance per unit of time, here within the Jacobian.",
+        "The published EnKF has centred perturbations of the measurements. Independent ones have a mean of "
+        "variance R/N, which shifts the estimate: with N = 10 the mean of 64 runs is 0.81, their median 0.75.",
+        "In few runs a small ensemble loses the truth for a time, which affects the mean; published values rest "
+        "on a single run, which is more like the median. Over 64 runs of the EnKF with N = 10 the mean is "
+        "0.72, the median 0.64, the maximum 1.8; 16 runs of DAPPER's own EnKF give 0.65 +- 0.02 and 0.64.",
+        "Without process noise particles die out. The published filter spreads particles drawn more than "
+        "once by a Gaussian kernel of width 2.4, 0.9 and 0.7 times N^(-1/7); ours spreads all particles drawn by "
+        "the same kernel: regularisation 1 is the width (4/5)^(1/7) N^(-1/7).",
     ),
     rows=against_published(problem, model, PUBLISHED),
 )

@@ -122,7 +122,7 @@ PUBLISHED = (
     Published("etkf", {"ensemble_size": 24, "inflation": 1.013, "rotations": 1}, 0.18),
     Published("etkf", {"ensemble_size": 20, "inflation": 1.04, "rotations": 1}, 0.20),
     Published("ensrf", {"ensemble_size": 28, "inflation": 1.02, "rotations": 1}, 0.18),
-    Published("ekf", {}, 0.24, {"inflation": 10.0}, "it linearises where a step ends, ours where it begins"),
+    Published("ekf", {}, 0.24, {"inflation": 10.0}, "it linearises at the end of a step, ours at the start"),
 )
 BENCHMARK = Benchmark(
     name="lorenz96",
@@ -133,11 +133,11 @@ BENCHMARK = Benchmark(
     remarks=(
         "Our inflation acts on the forecast, the published one on the analysis: without process noise the two "
         "differ by one forecast.",
-        "The EKF's inflation is a factor on its covariance in one unit of time, here within the Jacobian. With "
-        "exp(0.05 dx'/dx) at the forecast for the step's own Jacobian, as DAPPER has it, ours gives 0.235.",
-        "The published EnKF has centred perturbations of the measurements. Its N = 28 is few for forty states: "
-        "two of 64 of our runs lose the truth, one with independent perturbations; the median of all is 0.237 and "
-        "0.241. None of 16 runs of DAPPER's own is lost: 0.242 +- 0.002.",
+        "The EKF's inflation is a factor on its covariance per unit of time, here within the Jacobian. With "
+        "DAPPER's Jacobian, exp(0.05 dx'/dx) at the forecast, ours gives 0.235.",
+        "The published EnKF has centred perturbations of the measurements. N = 28 is small for forty states: "
+        "two of our 64 runs lose the truth, with independent perturbations one; the medians are 0.237 and "
+        "0.241. None of 16 runs of DAPPER's own does: 0.242 +- 0.002.",
     ),
     rows=against_published(problem, model, PUBLISHED),
 )

@@ -119,10 +119,10 @@ BENCHMARK = Benchmark(
     about="a target at nearly constant velocity, seen in range and bearing across the cut at pi",
     theirs="Stone Soup",
     score="the RMSE of position [m]",
-    source="Stone Soup 1 on the same measurements, with the same numbers",
+    source="Stone Soup 1 on the same measurements, with the same parameters",
     remarks=(
-        f"The truth has sigma_a = {TRUE_SIGMA} m/s^1.5. A study of {TRIALS} trials tunes this one number.",
-        "Stone Soup finds the sensor's Jacobian by one-sided differences, ours are central.",
+        f"The truth has sigma_a = {TRUE_SIGMA} m/s^1.5. A study of {TRIALS} trials tunes only this parameter.",
+        "Stone Soup computes the sensor's Jacobian by one-sided differences, ours are central.",
     ),
     rows=rows,
 )

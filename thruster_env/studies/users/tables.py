@@ -88,11 +88,11 @@ def sentences(cases: Sequence[Case]) -> list[str]:
     """What the table says, in words."""
     found, failed = verdict_of(cases), [case for case in cases if case.error]
     said = [
-        f"Tuned is significantly worse than a baseline in {len(found.losses)} of {found.comparisons} comparisons "
-        f"(Holm's procedure, {100 * LEVEL:g} % for all together; the oracle does not count). Better it is in "
+        f"The tuned filter is significantly worse than a baseline in {len(found.losses)} of {found.comparisons} "
+        f"comparisons (Holm's procedure, {100 * LEVEL:g} % for all together, without the oracle), and better in "
         f"{found.wins}, by the 95 % interval of each.",
-        f"95 % intervals that lie above 1: {found.above}; were tuned filters and baselines equally good, chance "
-        f"would put {found.by_chance:.1f} there.",
+        f"95 % intervals that lie above 1: {found.above}; with equally good filters and baselines one would "
+        f"expect {found.by_chance:.1f} by chance.",
     ]
     for loss in found.losses:
         ratio = loss.beside.ratio
