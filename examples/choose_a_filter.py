@@ -2,7 +2,7 @@
 Choose a filter
 ===============
 
-Which of two dozen filters, for which plant? All of them see the same runs, and only paired differences on the same
+Which of two dozen filters, for which plant? All see the same runs, and only paired differences on the same
 seeds count.
 """
 
@@ -30,14 +30,14 @@ tuning.compare(["ekf", "kf", "ukf", "enkf", "pf", "open-loop"], "nominal", seeds
 # :term:`paired`, against the first filter.
 #
 # The Kalman filter is linearised at one operating point, and diverges as soon as the voltage leaves it. The
-# extended Kalman filter is at the bound. Nothing can be better, and particles reach the same at several hundred
-# times the cost.
+# extended Kalman filter is at the bound, which no filter can beat. Particle filters reach it, too, at several
+# hundred times the cost.
 #
 # Where it matters
 # ----------------
 #
-# With outliers in the sensor the ranking changes. No filter knows them; ``ekf-robust`` allows for some, and gives
-# an unlikely measurement less weight.
+# With outliers in the sensor the ranking changes. No filter's model includes them; ``ekf-robust`` gives unlikely
+# measurements less weight.
 
 comparison = tuning.compare(
     ["ekf", "ekf-robust", "enkf", "pf"], "outliers", seeds=SEEDS
@@ -52,8 +52,8 @@ figure = comparison.plot_scores()
 # Further parameters
 # ------------------
 #
-# Besides the model every filter has its own parameters. ``thruster filters enkf`` prints them with the filter's
-# equations, and so does ``help``.
+# Besides the model every filter has its own parameters. ``thruster filters enkf`` and ``help`` print them with the
+# filter's equations.
 
 enkf = make_filter("enkf", thruster_model(), ensemble_size=50, inflation=1.02)
 print(enkf.ensemble_size, enkf.init().members.shape)

@@ -55,7 +55,7 @@ truth, estimate, deviation = np.array(truth), np.array(estimate), np.sqrt(varian
 # ------------------------
 #
 # A filter's covariance is a claim about its errors: about 95 % of them should lie within 1.96 standard
-# deviations. Motor speed is hardly visible in the thrust, yet the band is right.
+# deviations. The thrust contains little information on motor speed, yet the band is right.
 
 time = 0.01 * np.arange(1, STEPS + 1)
 figure, axes = plt.subplots(2, 2, figsize=(9, 4.6), layout="constrained", sharex=True)
@@ -84,8 +84,8 @@ inside = np.mean(np.abs(estimate - truth) < 1.96 * deviation, axis=0)
 print(f"inside the band: motor speed {inside[0]:.0%}, flow velocity {inside[1]:.0%}")
 
 # %%
-# Without a true state the innovations show it. The NIS (normalised innovation squared) is the innovation over its
-# standard deviation, squared; its mean is 1 for a filter that is :term:`consistent`.
+# Without a true state the innovations show this. The NIS (normalised innovation squared) is the innovation over
+# its standard deviation, squared; its mean is 1 for a filter that is :term:`consistent`.
 
 nis = np.square(innovation) / innovation_variance
 print(f"mean NIS: {nis.mean():.2f}")

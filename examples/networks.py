@@ -2,8 +2,8 @@
 Tutorial: a network in a model
 ==============================
 
-A thruster's log shows friction that its model does not have. Nobody has an equation for it, so a small network
-takes its place in the model's transition, and torch learns it from the innovations of a filter.
+A thruster's log shows friction that its model lacks. There is no equation for it, so a small network
+represents it in the model's transition, and torch learns it from the innovations of a filter.
 """
 
 # %%
@@ -62,9 +62,9 @@ u.shape, z.shape
 # More process noise
 # ------------------
 #
-# Without a network one tells the filter that the motor is uncertain. ``filters.torch`` makes a filter of
-# tensors, and its ``log_likelihood`` is the compiled recursion with the exact gradient along Q and R. Any
-# optimiser of torch can follow it, here along the logarithms of the variances in Q.
+# Without a network, more process noise tells the filter that the motor is uncertain. ``filters.torch`` makes a
+# filter on tensors, and its ``log_likelihood`` is the compiled recursion with the exact gradient along Q and R.
+# Any optimiser of torch can use it, here along the logarithms of the variances in Q.
 
 ekf = filters.torch(make_filter("ekf", model))
 log_q = torch.tensor(np.log(np.diag(model.process_noise_cov)), requires_grad=True)
@@ -85,10 +85,10 @@ print(
 # A network
 # ---------
 #
-# ``transition`` takes and returns one tensor for each state, with a number for each run. The thruster's
-# equations consist of ``+ - * /`` and ``abs``, which work on tensors, so the network is added to them. Points of
-# a ``ukf`` are further numbers of these tensors, and no Jacobian is needed; for an ``ekf`` torch would find the
-# network's. Q is learned with the network: what the network explains is no noise any more.
+# ``transition`` takes and returns one tensor for each state, with an entry for each run. The thruster's
+# equations consist of ``+ - * /`` and ``abs``, which work on tensors, so the network is added to them. The sigma
+# points of a ``ukf`` are further entries, and no Jacobian is needed; for an ``ekf`` torch would compute the
+# network's. Q is learned with the network: what the network explains is no longer noise.
 
 torch.manual_seed(0)
 net = torch.nn.Sequential(
@@ -124,8 +124,7 @@ print(
 # On other runs
 # -------------
 #
-# Log-likelihood of a step and RMSE on runs that no optimiser has seen, beside a filter that has the equation of
-# the friction.
+# Log-likelihood per step and RMSE on held-out runs, compared with a filter that has the equation of the friction.
 
 u, recorded = record(1000)
 z = recorded.measurements
@@ -144,7 +143,7 @@ for name, one in found.items():
     print(f"{name:18} {level:7.2f}   {speed:5.2f} rad/s   {flow:.4f} m/s")
 
 # %%
-# More noise makes the filter trust its sensors and nothing else. The network makes its model right, up to the
+# With more noise the filter trusts only its sensors. The network makes its model right, up to the
 # speeds in the log.
 
 speeds = np.linspace(-160.0, 160.0, 161)

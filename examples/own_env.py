@@ -2,8 +2,8 @@
 An env of your own
 ==================
 
-Any Gymnasium env can be a problem: it generates the data, and you define what filters assume of it. Here
-Gymnasium's pendulum, of which noisy sensors measure cosine, sine and rate.
+Any Gymnasium env can be a problem: it generates the data, and you define the model that filters assume. Here
+it is Gymnasium's pendulum, with noisy sensors for cosine, sine and rate.
 """
 
 # %%

@@ -2,8 +2,8 @@
 A filter of your own
 ====================
 
-A filter is a page of a textbook: pure functions of small matrices. Written so, it is compiled, runs over thousands
-of runs side by side, stands around an env, is differentiated, and studies tune it. Here: the maximum correntropy
+Write a filter as a page of a textbook: pure functions of small matrices. It is then compiled and differentiated,
+processes thousands of runs side by side, wraps an env, and can be tuned. Here: the maximum correntropy
 Kalman filter of Chen, Liu, Zhao and Principe (2017), which gives outliers little weight.
 """
 
@@ -21,7 +21,7 @@ Kalman filter of Chen, Liu, Zhao and Principe (2017), which gives outliers littl
 #    \tilde R = M \, \mathrm{diag}\left(1/G(M^{-1} (v - H K v))\right) M', \quad
 #    K = \tilde P H' (H \tilde P H' + \tilde R)^{-1}
 #
-# Nothing in a page may decide by values that are not known yet (``if``): it is traced once for the sizes of a
+# A page must not branch on values (``if``), because it is traced once for the sizes of a
 # model. Its parameters are the fields of a class.
 
 from dataclasses import dataclass
@@ -91,8 +91,8 @@ class MaximumCorrentropyFilter(PageFilter):
 
 
 # %%
-# It is a filter like any other. Here it predicts a second at 12 V, and then a measurement is 8 N too large: that
-# moves the extended filter's motor speed and flow velocity, and hardly its own.
+# It is a filter like any other. Here it predicts 20 steps at 12 V, and then a measurement is 8 N too large: this
+# moves the extended filter's motor speed and flow velocity, but barely those of the new filter.
 
 model = thruster_model()
 for kind in (ExtendedKalmanFilter, MaximumCorrentropyFilter):
@@ -105,11 +105,11 @@ for kind in (ExtendedKalmanFilter, MaximumCorrentropyFilter):
     print(filter_.name, updated.mean - belief.mean)
 
 # %%
-# Its place
-# ---------
+# Compared with others
+# --------------------
 #
-# On the same held-out runs as filters that come with the package. Each knows the plant's own Q and R, and nothing
-# of the outliers.
+# On the same held-out runs as the package's filters. Each uses the plant's own Q and R, and no model of the
+# outliers.
 
 comparison = tuning.compare(
     ["ekf", "ukf", "enkf", "pf", "ekf-robust", MaximumCorrentropyFilter],
@@ -123,8 +123,8 @@ comparison
 figure = comparison.plot_scores()
 
 # %%
-# Where one measurement in twenty is an outlier it is as good as ``ekf-robust``, within five per cent of the bound,
-# and both have half the error of filters that trust each measurement alike.
+# With one outlier in twenty measurements it is as good as ``ekf-robust``, within five per cent of the bound,
+# and both have half the error of filters that trust all measurements equally.
 #
 # ``thruster new filter my_filter`` writes this filter into a file of your own, with comments. Every command then
 # takes ``--filter my_filter:MyFilter``, and ``EstimateState(env, filter="my_filter:MyFilter")`` puts it around an

@@ -10,9 +10,10 @@ the innovations, and estimate the hidden state.
 # The log
 # -------
 #
-# A CSV or Parquet file, a pandas table or a mapping from headers to arrays. Row k has what was measured at time k
-# dt and the input that acts from then on; headers name quantities and units. Here they are four runs of a thruster
-# whose voltage gain is a tenth below its data sheet's. Motor speed and flow velocity are not in the table.
+# A CSV or Parquet file, a pandas table or a mapping from headers to arrays. Row k contains the measurements at
+# time k dt and the input that acts from then on; headers name quantities and units. Here there are four runs of a
+# thruster whose voltage gain is a tenth below its data sheet's. Motor speed and flow velocity are not in the
+# table.
 
 import tempfile
 from pathlib import Path
@@ -31,7 +32,7 @@ WORN = PRESETS["tunnel_physical"]._replace(voltage_gain=TRUE_GAIN)
 
 
 def record(seed):
-    """A run as a data logger has it."""
+    """A run, as a data logger records it."""
     env = gym.make("BowThruster-v0", preset=WORN, max_episode_steps=ROWS).unwrapped
     levels = np.random.default_rng(seed).uniform(-20.0, 20.0, ROWS // 50 + 1)
     voltages = np.repeat(levels, 50)[:ROWS]
@@ -52,11 +53,11 @@ for header, column in runs[0].items():
     print(header, column[:3])
 
 # %%
-# What the data sheet gets wrong
-# ------------------------------
+# Errors of the data sheet
+# ------------------------
 #
-# A first estimate, with the data sheet's model: the innovations are larger than the filter assumes, as the mean
-# NIS (normalised innovation squared) above its band shows.
+# A first estimate, with the data sheet's model: the mean NIS (normalised innovation squared) is above its band, so
+# the innovations are larger than the filter assumes.
 
 before = tuning.estimate(runs[3], preset="tunnel_physical")
 before
@@ -74,11 +75,10 @@ found
 # -------
 #
 # For an EKF, use the Q and R of ``identify``; ``mine`` below contains them. A study is for other filters, other
-# criteria, or logs with true states. It is shown with the EKF, because that is the fastest filter.
+# criteria, or logs with true states. This one uses the EKF, because it is the fastest filter.
 #
 # Without a true state the study maximises the likelihood of the innovations over Q and R, with their NIS
-# (normalised innovation squared) kept in its band, and evaluates the choice on other runs. Of three runs every
-# third is :term:`held-out`.
+# kept in its band, and evaluates the result on other runs: every third run is :term:`held-out`.
 
 mine = found.save(Path(tempfile.mkdtemp()) / "mine.toml")
 study = tuning.tune((mine, runs[:3]), filter="ekf", trials=TRIALS)

@@ -111,8 +111,8 @@ figure = study.plot_run()
 # The study attributes the model's error to the right state, the unmeasured upper level. Errors are a third smaller
 # than with the :term:`scaled default`, on the same held-out seeds.
 #
-# The best answer to a wrong constant is not noise, though. ``augmented_model`` makes it a state, and the filter
-# finds it.
+# The best remedy for a wrong constant is not noise, though. ``augmented_model`` makes it a state, and the filter
+# estimates it.
 
 from filters import Unknown, augmented_model
 

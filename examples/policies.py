@@ -2,7 +2,7 @@
 Policies on an estimate
 =======================
 
-Reinforcement learning from the raw sensor, or from a filter's estimate? Both are trained in a script of your own,
+Reinforcement learning from the raw sensor, or from a filter's estimate? This script trains both
 with Stable-Baselines3 (``pip install '.[rl]'``), for some seconds each.
 """
 
@@ -10,7 +10,7 @@ with Stable-Baselines3 (``pip install '.[rl]'``), for some seconds each.
 # The env
 # -------
 #
-# ``BowThrusterTracking-v0`` asks for a thrust that changes. ``gym.make_vec`` steps all copies in one compiled
+# ``BowThrusterTracking-v0`` has a thrust reference that changes. ``gym.make_vec`` steps all copies in one compiled
 # call; ``filters:BowThrusterTracking-EKF-v0`` is the same env with an extended Kalman filter beside each copy.
 # ``NativeVecEnv`` passes either to Stable-Baselines3, with actions in [-1, 1] for voltages in [-24, 24].
 
@@ -99,5 +99,5 @@ print(f"better on {np.mean(difference > 0):.0%} of {EPISODES} held-out episodes"
 
 # %%
 # One training seed says little about an algorithm. :doc:`/policies` has five for each case, all observations from
-# raw to true state, and MPC for comparison; ``thruster train``, ``thruster score`` and ``thruster study policies``
-# compute them.
+# raw to true state, and MPC for comparison, computed by ``thruster train``, ``thruster score`` and ``thruster
+# study policies``.

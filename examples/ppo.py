@@ -2,13 +2,13 @@
 PPO in a script of one's own
 ============================
 
-A policy that makes the thruster's thrust follow a reference, from the estimate of a Kalman filter, learnt with
-Stable-Baselines3 (``pip install '.[rl]'``) and hyperparameters that suit this plant. In a third of the
-steps that ``thruster train`` takes; with all of them::
+This script trains a policy by which the thrust follows a reference, from a Kalman filter's estimate, with
+Stable-Baselines3 (``pip install '.[rl]'``) and hyperparameters for this plant. It takes a third of the
+steps of ``thruster train``; for all of them::
 
     python examples/ppo.py --steps 401408 --out ppo_thruster
 
-This page is not run while the site is built, because training takes about a minute. Its recorded output is at the
+This page is not run when the site is built, because training takes about a minute. Its recorded output is at the
 end.
 """
 
@@ -75,11 +75,11 @@ def make_single():
 
 def learn(steps, copies=COPIES, seed=0):
     """The policy after so many steps, and the normalisation that belongs to it."""
-    torch.set_num_threads(1)  # quickest for networks as small as these
+    torch.set_num_threads(1)  # fastest for such small networks
     venv = make_training(copies, seed)
     rate = 1e-3
 
-    def falling(remaining):  # to zero, as the share of the steps that is left does
+    def falling(remaining):  # linearly to zero with the remaining share of the steps
         return rate * max(remaining, 0.0)
 
     model = PPO(
@@ -108,17 +108,17 @@ def episode_return(model, venv, seed):
 
 
 def main(arguments=None):
-    """Learn, say what it is worth on held-out episodes, and save it."""
+    """Train a policy, evaluate it on held-out episodes, and save it."""
     parser = argparse.ArgumentParser(description="PPO on the estimate of a filter.")
     parser.add_argument(
         "--steps",
         type=int,
         default=131_072,
-        help="steps to learn from; 401408 is what is best",
+        help="training steps; 401408 is best",
     )
-    parser.add_argument("--copies", type=int, default=COPIES, help="of the env")
+    parser.add_argument("--copies", type=int, default=COPIES, help="copies of the env")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--episodes", type=int, default=5, help="held-out ones")
+    parser.add_argument("--episodes", type=int, default=5, help="held-out episodes")
     parser.add_argument(
         "--out", help="where to save: OUT.zip, and OUT.pkl with the normalisation"
     )
@@ -138,7 +138,7 @@ if __name__ == "__main__":
     main()
 
 # %%
-# What it printed on two cores, within a minute, of 131072 steps::
+# Its output on two cores, within a minute, after 131072 steps::
 #
 #    mean return of 5 held-out episodes: -0.917
 #

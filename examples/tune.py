@@ -2,8 +2,7 @@
 Tune a filter, and measure the gain
 ===================================
 
-Q and R are what a Kalman-type filter has to be told. Here a study finds them, and seeds that the study never saw
-show whether that was worth it.
+A Kalman-type filter needs Q and R. Here a study finds them, and held-out seeds show the gain.
 """
 
 # %%
@@ -28,11 +27,10 @@ study = tuning.tune("outliers", filter="ekf", trials=TRIALS, seed=0)
 study
 
 # %%
-# The baseline to look at first is the :term:`scaled default`: R from the sensor's data sheet, and one factor on Q
-# by which the mean NIS (normalised innovation squared) is right. A careful engineer has that after five minutes.
-# The :term:`oracle` knows the plant's own Q and R. Neither helps here: the outliers are in the sensor, where no
-# factor on Q helps, and the plant's own R does not include them. The study makes R some twenty times the data
-# sheet's.
+# The first baseline is the :term:`scaled default`: R from the sensor's data sheet, and one factor on Q
+# for which the mean NIS (normalised innovation squared) is right. A careful engineer has it after five minutes.
+# The :term:`oracle` has the plant's own Q and R. Neither helps here: no factor on Q helps with outliers in the
+# sensor, and the plant's own R does not include them. The study makes R some twenty times the data sheet's.
 
 figure = study.plot_errors()
 
@@ -55,7 +53,7 @@ study.to_frame().tail(4).round(4)
 # Use it
 # ------
 #
-# ``study.filter`` is the tuned filter. Saved as JSON it can be used in an env, on a log, or by ``thruster
+# ``study.filter`` is the tuned filter. The saved JSON works in an env, on a log, and with ``thruster
 # verify``, which recomputes all held-out metrics.
 
 print(study.filter.model.process_noise_cov, study.filter.model.measurement_noise_cov)
@@ -69,7 +67,7 @@ with tempfile.TemporaryDirectory() as folder:
 print(observation)
 
 # %%
-# **Covariances are per step and do not scale with dt**: the file contains its sample time, and any other one is
+# **Covariances are per step and do not scale with dt**: the file contains its sample time, and any other is
 # refused.
 #
 # ``tuning.report(study, "report.html")`` writes a page with all of this, for any browser. The study in detail, and

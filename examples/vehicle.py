@@ -10,7 +10,7 @@ Doppler log, gyros, a depth sensor and a compass.
 # A filter of twelve states
 # -------------------------
 #
-# Only the name of the env has changed. The filter's model comes from the env, with names and units.
+# Only the name of the env changes. The filter's model comes from the env, with names and units.
 
 import gymnasium as gym
 import matplotlib.pyplot as plt
@@ -55,7 +55,7 @@ print(
 # What is not observable
 # ----------------------
 #
-# Depth is measured, the horizontal position is not: its error is a random walk, and the band grows as it should.
+# Depth is measured, horizontal position is not: its error is a random walk, and the band grows accordingly.
 
 time = 0.05 * np.arange(1, len(truth) + 1)
 figure, axes = plt.subplots(1, 3, figsize=(10, 3), layout="constrained")
