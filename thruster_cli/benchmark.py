@@ -38,7 +38,7 @@ def _table(benchmark: Benchmark, rows: list[Row], runs: int) -> Table:
     for row in cells:
         row[2] = row[2].replace(" [", "\n[")
     compared = f"The table compares {benchmark.score}, ours with its 95 % interval."
-    caption = f"{compared} Median run: of the scores of single runs. Pooled: the RMSE of our tables."
+    caption = f"{compared} Median run: median score of single runs. Pooled: the RMSE of our tables."
     out = fitted(table(benchmark.about, columns, cells, caption=caption), cells, flexible=WHY)
     out.columns[0].width = None
     return out

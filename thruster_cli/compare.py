@@ -64,7 +64,7 @@ def command(
         list[str] | None,
         typer.Option(
             metavar="[FILTER=]N",
-            help="Ensemble size, of all filters or of one; 30, of particles 1000, by default. May be repeated.",
+            help="Ensemble size of all filters or of one; 30 by default, 1000 for particles. May be repeated.",
             rich_help_panel=FILTER,
         ),
     ] = None,

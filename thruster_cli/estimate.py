@@ -61,9 +61,7 @@ def command(
     no_grid: NoGridOption = False,
     ensemble_size: Annotated[
         int | None,
-        typer.Option(
-            help="For a filter with an ensemble; 100 by default, particles 1000.", rich_help_panel=FILTER
-        ),
+        typer.Option(help="Ensemble size; 100 by default, 1000 for particles.", rich_help_panel=FILTER),
     ] = None,
     smoother: Annotated[
         bool, typer.Option("--smoother", help="Also use later measurements.", rich_help_panel=FILTER)
@@ -74,7 +72,7 @@ def command(
     skip: Annotated[
         int | None,
         typer.Option(
-            help="Number of first rows that are not scored; 50, or a quarter of a short log, by default.",
+            help="Number of initial rows that are not scored; 50, or a quarter of a short log, by default.",
             rich_help_panel=RUNS,
         ),
     ] = None,
@@ -83,7 +81,7 @@ def command(
         bool,
         typer.Option(
             "--isolate",
-            help="Run the filter without each channel, too, and name the faulty one.",
+            help="Also run the filter without each channel, and name the faulty one.",
             rich_help_panel=RUNS,
         ),
     ] = False,
@@ -102,9 +100,9 @@ def command(
 ) -> None:
     """Estimate the state of a recorded run, and report what the innovations say about filter and model.
 
-    The log has the model's inputs and measurements, found by the headers of its columns or given by --column. If
-    it also has states or outputs of the model, such as the thrust of a load cell where the filter sees the
-    tachometer, they are compared with the estimate. docs/logs.md has the rules.
+    The log has the model's inputs and measurements, found by the headers of its columns or given by --column.
+    States or outputs of the model in the log, such as the thrust of a load cell that the filter does not see, are
+    compared with the estimate. docs/logs.md has the rules.
 
     Example: thruster estimate run.csv --tuned out/ekf-run-seed0.json --out est.csv --plot est.png
 
@@ -186,7 +184,7 @@ def _alarms(found: LogEstimate, told: LogAlarms | None) -> list[RenderableType]:
         counts = ", ".join(f"{one.symbol} {count}" for one, count in zip(log.measured, told.without, strict=True))
         place = told.at_fault
         fault = "no single channel is at fault" if place is None else f"{log.measured[place].symbol} is at fault"
-        shown.append(f"Alarms left without a channel: {counts}: {fault}.")
+        shown.append(f"Remaining alarms without each channel: {counts}: {fault}.")
     return shown
 
 

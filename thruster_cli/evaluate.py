@@ -82,10 +82,10 @@ def command(
     is the same with one factor on Q that brings the mean NIS (normalised innovation squared) to 1. The oracle has
     the plant's own Q and R.
 
-    With --given it is the filter with the model's own Q and R, an ekf unless --filter names another.
+    --given evaluates the model's own Q and R, in an ekf unless --filter names another filter.
 
-    With --consistency a filter's errors and innovations are compared with its own covariances: NEES, NIS,
-    whiteness, coverage, CRPS and, for ensembles, rank histograms; with a sentence on each and one picture.
+    --consistency compares a filter's errors and innovations with its covariances: NEES, NIS,
+    whiteness, coverage, CRPS and, for ensembles, rank histograms, with a sentence on each and one picture.
 
     Example: thruster evaluate out/enkf-mismatch-seed0.json
 

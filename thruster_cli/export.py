@@ -25,27 +25,26 @@ def command(
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the files.", rich_help_panel=OUTPUT)],
     language: Annotated[str, typer.Option(help="Only c.", rich_help_panel=OUTPUT)] = "c",
     name: Annotated[
-        str | None, typer.Option(help="Of the C type and files; the filter's by default.", rich_help_panel=OUTPUT)
+        str | None,
+        typer.Option(help="Name of the C type and files; the filter's by default.", rich_help_panel=OUTPUT),
     ] = None,
-    single: Annotated[
-        bool, typer.Option("--single", help="Floats in place of doubles.", rich_help_panel=OUTPUT)
-    ] = False,
+    single: Annotated[bool, typer.Option("--single", help="Single precision.", rich_help_panel=OUTPUT)] = False,
     monitor: MonitorOption = None,
     board: Annotated[
         bool,
         typer.Option(
-            "--board", help="Also board.c and board.ld, for an emulated Cortex-M4.", rich_help_panel=OUTPUT
+            "--board", help="Also write board.c and board.ld, for an emulated Cortex-M4.", rich_help_panel=OUTPUT
         ),
     ] = False,
     problem: CodeOption = None,
     model: LogModelOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Write a tuned Kalman or ensemble filter as C99: model, Q and R in it, and a program that filters a log.
+    """Write a tuned Kalman or ensemble filter as C99, with its model, Q and R, and a program that filters a log.
 
-    Any one but gsf, imm, mmae and fuzzy. The code has fixed sizes and needs math.h alone; a class of C++ lies
-    beside it. With --single the largest change of an estimate on a training run is printed.
-    docs/howto/export.md says more.
+    All but gsf, imm, mmae and fuzzy can be exported. The code has fixed sizes and needs only math.h; it comes with
+    a C++ class. --single also prints the largest change of an estimate on a training run.
+    See docs/howto/export.md.
 
     Example: thruster export out/ekf-mismatch-seed0.json --out boat
     """
@@ -61,6 +60,6 @@ def command(
         data = found.data(found.training_seeds(seed, 2)[:1])
         error = single_error(filter_, programs_of(filter_), data.inputs[0], data.measurements[0])
         lines.append(
-            f"Floats move an estimate by at most {error:.1g} of its standard deviation on a training run."
+            f"Single precision changes estimates by at most {error:.1g} standard deviations on a training run."
         )
     emit(lines, {"files": files, "single_error": error}, json)

@@ -101,9 +101,9 @@ def overview(entries: list[Entry]) -> list[RenderableType]:
         table("Filters", ["filter", "what it is", "cov.", "ens."], filters, words=True),
         table("Parameters of the filters themselves", ["of; number", "default", "meaning"], numbers, words=True),
         "cov.: it has a covariance, the uncertainty of the estimate. ens.: it has an ensemble.",
-        f"ensemble_size: {MADE} members if you make a filter or estimate from a log; {KALMAN_SIZES.untuned} "
-        "in the rule of thumb, from which tune, evaluate and compare start (particles: "
-        f"{PARTICLE_SIZES.untuned} in both); a tuned file has its own.",
+        f"ensemble_size: {MADE} members in make_filter and estimate, {KALMAN_SIZES.untuned} in the rule of thumb, "
+        f"from which tune, evaluate and compare start (particles: {PARTICLE_SIZES.untuned} in both); a tuned file "
+        "has its own.",
         "thruster filters NAME shows one in full, with its equations and sources.",
     ]
 

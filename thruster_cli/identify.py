@@ -138,7 +138,7 @@ def command(
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Find the parameters under which recorded runs are most likely, and say which of them the runs determine.
+    """Find the maximum-likelihood parameters for recorded runs, and say which of them the runs determine.
 
     The free parameters of a thruster may be its constants (motor_damping, voltage_gain, ...), dead_band or
     dead_band_low and dead_band_high, thrust_asymmetry, ambient_velocity, bias_CHANNEL, lag_CHANNEL,
@@ -146,9 +146,9 @@ def command(
     named constants.
 
     With --predicted the result predicts that channel best for a filter that does not see it: --sensor speed
-    --sensor thrust --predicted thrust identifies on a test stand a model that will estimate thrust on the ship.
+    --sensor thrust --predicted thrust identifies, on a test stand, a model that estimates thrust on the ship.
 
-    The file written is a --preset for other commands, for a thruster also for gym.make(preset=...); with --model
+    The output is a --preset for other commands, for a thruster also for gym.make(preset=...); with --model
     it contains the values of that model. Ctrl-C keeps the best so far.
 
     Example: thruster identify run*.csv --preset tunnel --free motor_damping,voltage_gain,dead_band

@@ -58,8 +58,8 @@ def command(
 
     Other commands that read logs print the same before their results. docs/logs.md has the rules.
 
-    A recorder's file (PX4's .ulg, ArduPilot's .bin, bags of ROS, MATLAB, HDF5) has its topics and fields listed if
-    no other option says how to read it. docs/recorders.md has the formats.
+    For a recorder's file (PX4's .ulg, ArduPilot's .bin, ROS bags, MATLAB, HDF5) it lists topics and fields, unless
+    options say how to read it. docs/recorders.md has the formats.
 
     Example: thruster log run.csv --plot run.png
 

@@ -70,7 +70,7 @@ CodeOption = Annotated[
     typer.Option(
         "--problem",
         metavar="MODULE:OBJECT",
-        help="The problem it was tuned on, if that is code: nothing that a file or a study names is imported.",
+        help="The problem it was tuned on, if that is code: names in files and studies are never imported.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -95,8 +95,8 @@ ModelOption = Annotated[
     typer.Option(
         "--model",
         metavar="MODULE:OBJECT",
-        help="In place of a thruster: a StateSpaceModel, or a function that returns one (called with dt, if "
-        "it takes it).",
+        help="Instead of a thruster: a StateSpaceModel, or a function that returns one (called with dt if it has "
+        "that argument).",
         rich_help_panel=INPUT,
     ),
 ]
@@ -122,7 +122,7 @@ ClockOption = Annotated[
     typer.Option(
         "--clock-offset",
         metavar="NAME=SECONDS",
-        help="How far the clock of a channel is ahead.",
+        help="Offset of a channel's clock, positive if it is ahead.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -139,7 +139,7 @@ NoGridOption = Annotated[
     bool,
     typer.Option(
         "--no-grid",
-        help="Go by the log's own stamps, for a model in continuous time; variances are per step of --dt.",
+        help="Use the log's own time stamps, for a model in continuous time; variances are per step of --dt.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -149,8 +149,8 @@ MonitorOption = Annotated[
     typer.Option(
         "--monitor",
         metavar="STEPS",
-        help="Test for outliers, biases, changed noise, stuck and missing readings, with one false alarm in so "
-        "many steps, or 'tuned', as the tuned file says (docs/monitoring.md).",
+        help="Test for outliers, biases, changed noise, stuck and missing readings, with one false alarm in this "
+        "number of steps, or 'tuned' for the tuned file's monitor (docs/monitoring.md).",
         rich_help_panel=RUNS,
     ),
 ]
@@ -158,7 +158,7 @@ LogOption = Annotated[
     list[Path] | None,
     typer.Option(
         "--log",
-        help=f"In place of a problem: a recorded run; may be repeated. {A_LOG}",
+        help=f"Instead of a problem: a recorded run; may be repeated. {A_LOG}",
         rich_help_panel=INPUT,
     ),
 ]
@@ -190,7 +190,7 @@ HoldGapsOption = Annotated[
     bool,
     typer.Option(
         "--hold-gaps",
-        help="Hold the last input over gaps of a log; by default runs are cut there.",
+        help="Hold the last input over gaps of a log; by default runs are split there.",
         rich_help_panel=INPUT,
     ),
 ]
@@ -222,5 +222,5 @@ def asked_monitor(given: str | None, tuned: Path | None) -> Monitor | None:
         except ValueError as error:
             raise ValueError(f"--monitor must be steps, or {TUNED!r}, but got {given}: {error}") from None
     if tuned is None:
-        raise ValueError(f"--monitor {TUNED} must come with a tuned file, but there is none")
+        raise ValueError(f"--monitor {TUNED} must come with a tuned file, but got none")
     return tuned_monitor(tuned)

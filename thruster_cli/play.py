@@ -89,9 +89,9 @@ def command(
 ) -> None:
     """Show an episode: the motion of the thruster, and a filter's estimate of its hidden state.
 
-    Without MODEL there is no policy to load, and torch is not needed: a PI controller follows a reference, a
-    constant voltage or a sequence drives the thruster, or a log is shown as it was recorded, with the estimate in
-    place of the truth if the log has none.
+    Without MODEL no policy is loaded, and torch is not needed: a PI controller follows a reference, a
+    constant voltage or a sequence drives the thruster, or a recorded log is shown, with the estimate instead of
+    the truth if the log has none.
 
     A policy gets the observations of its training: the same measurements, filter and scaling. The strip charts
     show the thrust, its reference and its measurement, and the filter's estimate with a band of two standard

@@ -43,11 +43,10 @@ def command(
 ) -> None:
     """Write a report page on a tuned filter, for any browser without a network, and its tables as Markdown.
 
-    It has errors and consistency before and after on held-out seeds, the convergence of the study, the importance
-    of parameters, the error against ensemble size, one run over time with 95 % bands, and a sentence of advice.
+    It shows errors and consistency before and after on held-out seeds, the convergence of the study, the
+    importance of parameters, the error against ensemble size, one run over time with 95 % bands, and advice.
 
-    With two files it shows both side by side and, if they are of the same problem, the paired ratio of their
-    scores.
+    With two files it shows both side by side and, for the same problem, the paired ratio of their scores.
 
     Example: thruster report out/enkf-mismatch-seed0.json
 

@@ -72,15 +72,15 @@ def command(
     seed: SeedOption = 0,
     json: JsonOption = None,
 ) -> None:
-    """Run a published experiment many times and say why its table differs from ours.
+    """Repeat a published experiment many times and say why its table differs from ours.
 
     The papers compare a Kalman filter (KF) with an ensemble Kalman filter
     (EnKF) on two linear bow thrusters, tunnel and open-bladed, at Q = R = q I
-    for four values of q, by the RMSE of one run, it seems.
+    for four values of q, apparently by the RMSE of one run.
 
     Here both filters see the same runs. Three more columns show what to expect: the Riccati optimum, which no
     filter can beat; the start from P_0 = I; and a wrong filter, whose ensemble is never updated, which gives the
-    published open-bladed EnKF. Every published value comes with its distances in standard deviations of a single
+    published open-bladed EnKF. Every published value comes with its distance in standard deviations of a single
     run, and the reason for the difference.
 
     The papers on the underwater vehicle compare ensemble and fuzzy Kalman

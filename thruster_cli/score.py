@@ -70,13 +70,13 @@ def command(
     within 0.15 s of its steps, elsewhere, and within 0.15 s of changes of its sign. Several policies are compared
     with the first one episode by episode.
 
-    With --scenario the plant changes, including its noise and sensors, but filters and controllers do not know: a
-    filter still assumes the plant of training, a classical controller keeps its gains. Settings of a scenario for
+    With --scenario the plant changes, including its noise and sensors, but filters and controllers do not: a
+    filter still assumes the plant of training, a classical controller keeps its gains. A scenario's settings for
     filters are ignored.
 
     Needs the extra rl: pip install '.[rl]' in the project's folder
 
-    mpc plans a few steps ahead by the thruster's equations, one-step a single one; lqr is linear.
+    mpc plans a few steps ahead with the thruster's equations, one-step plans one step; lqr is linear.
 
     Example: thruster score out/policies/* --classical mpc --scenario ambient
     """

@@ -21,7 +21,7 @@ from thruster_cli.output import announce_compilation, emit, progress_console, ta
 
 RESULTS = Path("out") / "comparison"
 
-app = typer.Typer(help="Comparisons that take their time.", no_args_is_help=True)
+app = typer.Typer(help="Long comparisons.", no_args_is_help=True)
 
 
 @app.callback()
@@ -47,7 +47,7 @@ def policies(
     seeds: Annotated[
         int | None,
         typer.Option(
-            min=1, max=1000, help="Number of training seeds of each learned policy; 5.", rich_help_panel=RUNS
+            min=1, max=1000, help="Training seeds of each learned policy; 5 by default.", rich_help_panel=RUNS
         ),
     ] = None,
     steps: Annotated[
@@ -84,9 +84,9 @@ def policies(
 ) -> None:
     """Train policies on raw, filtered and true state, and compare them with model-predictive control, PI and LQG.
 
-    PPO at three noises of the thrust sensor, SAC and policies that correct the controller; the same held-out
-    episodes for all. Writes a page with tables and two pictures. Ctrl-C keeps finished work, and the same command
-    continues. On two cores it takes an hour or more.
+    It trains PPO at three noise levels of the thrust sensor, SAC, and policies that correct the controller, scores
+    all on the same held-out episodes, and writes a page with tables and two pictures. Ctrl-C keeps finished work,
+    and the same command continues. On two cores it takes an hour or more.
 
     Example: thruster study policies --quick
     """

@@ -58,7 +58,9 @@ def kinds_table(kinds: Sequence[FilterType], plan: Plan) -> Table:
         for kind in kinds
     ]
     columns = ["filter", "trials", "pruned", "over\nbudget", f"best\n{plan.objectives[0]}", "us/step"]
-    caption = "us/step: of the best trial, or of the cheapest if none is complete. *: mean NIS outside its band."
+    caption = (
+        "us/step: time of the best trial, or of the fastest if none is complete. *: mean NIS outside its band."
+    )
     best = [0] if len(rows) > 1 else []
     title = f"Filters that were tried, on the training {plan.scenarios[0].seed_word}"
     return table(title, columns, rows, caption=caption, best=best)

@@ -122,8 +122,8 @@ def command(
 ) -> None:
     """Train a policy on raw, filtered or true state, with Stable-Baselines3.
 
-    The reward depends on the true thrust, whatever the policy sees. A filter knows the plant's Q and R, unless
-    --tuned or --untuned is given. The return shown is that of 32 validation episodes, the same each time; for
+    The reward depends on the true thrust, whatever the policy sees. A filter uses the plant's Q and R, unless
+    --tuned or --untuned is given. The return shown is that of 32 fixed validation episodes; for
     held-out ones use `thruster score`.
 
     Training uses whole rollouts, so it may end some steps later. In FOLDER, final/ is the policy for score and
@@ -132,7 +132,7 @@ def command(
     With --controller the policy sees the action of a controller and adds up to a fifth of the maximum voltage to
     it. The controller needs an estimate, or the true state.
 
-    Ctrl-C saves a checkpoint, and the same command continues from it; also after a crash, or with more steps.
+    Ctrl-C saves a checkpoint. The same command continues from it, also after a crash or with more steps.
 
     Needs the extra rl: pip install '.[rl]' in the project's folder. To watch it learn:
     tensorboard --logdir out/policies

@@ -69,7 +69,7 @@ def command(
     worst: Annotated[
         bool,
         typer.Option(
-            "--worst", help="Of several problems minimise the worst one's, not the mean.", rich_help_panel=SEARCH
+            "--worst", help="Minimise the worst of several problems instead of their mean.", rich_help_panel=SEARCH
         ),
     ] = False,
     any_nis: Annotated[
@@ -82,7 +82,7 @@ def command(
     ] = False,
     hold_r: Annotated[
         bool,
-        typer.Option("--hold-r", help="Keep R of the sensor's data sheet, tune only Q.", rich_help_panel=SEARCH),
+        typer.Option("--hold-r", help="Keep R from the sensor's data sheet, tune only Q.", rich_help_panel=SEARCH),
     ] = False,
     full_q: Annotated[
         bool, typer.Option("--full-q", help="Tune the correlations of Q, too.", rich_help_panel=SEARCH)
@@ -94,8 +94,8 @@ def command(
         list[str] | None,
         typer.Option(
             metavar="RELATION",
-            help="A relation that numbers of the model keep: 'Q22 = 4 Q11', 'Q33 = Q11', 'R = 0.01' (not tuned), "
-            "'Q11 = 1e-6..1e-2' (its range). Give it again for more.",
+            help="A relation that parameters must obey: 'Q22 = 4 Q11', 'Q33 = Q11', 'R = 0.01' (not tuned), "
+            "'Q11 = 1e-6..1e-2' (its range). May be repeated.",
             rich_help_panel=SEARCH,
         ),
     ] = None,
@@ -114,15 +114,15 @@ def command(
         bool,
         typer.Option(
             "--no-pruning",
-            help="Do not end a trial that is significantly worse than the best on the same seeds.",
+            help="Also finish trials that are significantly worse than the best on the same seeds.",
             rich_help_panel=SEARCH,
         ),
     ] = False,
     method: Annotated[
         str,
         typer.Option(
-            help="optuna; or gradient, for Kalman filters but kf-steady, gsf, imm, mmae and fuzzy: maximum "
-            "likelihood, or the best score, mse or log-score where that is the --objective; optuna runs "
+            help="optuna, or gradient for Kalman filters except kf-steady, gsf, imm, mmae and fuzzy: maximum "
+            "likelihood, or the best score, mse or log-score if that is the --objective; optuna runs "
             "for comparison.",
             rich_help_panel=SEARCH,
         ),
@@ -130,7 +130,7 @@ def command(
     way: Annotated[
         str | None,
         typer.Option(
-            help="Another way of tuning in place of the study; `thruster ways` lists them, and when to use which.",
+            help="Another way of tuning instead of a study; `thruster ways` lists them and when to use which.",
             callback=spelt(WAYS),
             rich_help_panel=SEARCH,
         ),
@@ -171,29 +171,29 @@ def command(
 
     The score is the mean over states of RMSE over its scale, on 32 training seeds that every trial shares. The
     first trial is the rule of thumb: R from the sensor's data sheet, Q from 1 % of each state's range. Ctrl-C
-    keeps all finished trials: the same command continues the study. The report compares the filter with its
-    baselines on 200 seeds that no trial saw, first with the Q and R given with your model.
+    keeps all finished trials, and the same command continues the study. The report compares the filter with its
+    baselines, first with your model's own Q and R, on 200 seeds that no trial saw.
 
     Q's variances and R are searched from 1e-10 to 1e4 times the rule of thumb, on logarithmic scales, beginning
     from 1e-5 to 1e2 (R: 1e-2 to 1e3) and ten times beyond the best trial; given values lie inside, and the report
     flags a parameter at an end of its range. Besides sampled trials the study tries the baselines (given, rule of
-    thumb, scaled default, noise estimation) and the maximum-likelihood values. At the end the best trials meet the
-    baselines on 100 validation seeds, and a trial that is not significantly better there gives way to the best
-    baseline.
+    thumb, scaled default, noise estimation) and the maximum-likelihood values. At the end the best trials are
+    compared with the baselines on 100 validation seeds. If none is significantly better, the best baseline is
+    chosen.
 
-    RMSE alone hardly determines Q and R: only their ratio matters to the estimate. The mean NIS is therefore kept
-    in a band, unless --no-consistency is given, as long as that costs at most 5 % of the score; if it costs more,
-    the trial with the best log score among the best ones is taken. If no trial is in the band, the one with the
-    least error is taken, the report and the file say so, and the exit code is 3.
+    RMSE alone barely determines Q and R: only their ratio affects the estimate. The study therefore keeps the mean
+    NIS in a band, unless --no-consistency is given, as long as that costs at most 5 % of the score; if it costs
+    more, it chooses the trial with the best log score among the best ones. If no trial is in the band, it chooses
+    the one with the least error, the report and the file say so, and the exit code is 3.
 
-    With --way a published method finds the numbers instead; samplers among them end after so many trials, the
-    others of themselves. With a model that is right and true states: noise-estimation. With true states, if the
-    covariance counts, too: log-score; if the estimate alone counts: mse. Without true states: likelihood, or of a
-    linear model on long runs als, which takes --full-q and --full-r. Of an ensemble: this study, or desroziers
-    without true states. With true states and a wrong model, or a dead band, add --full-q (and --full-r) to mse or
-    log-score. `thruster ways` lists all of them.
+    --way selects a published method instead; its samplers end after --trials trials, the other methods by their
+    own criterion. With a right model and true states use noise-estimation. With true states use log-score if the
+    covariance matters, mse if only the estimate does. Without true states use likelihood, or als for a linear
+    model on long runs, which accepts --full-q and --full-r. For an ensemble use this study, or desroziers without
+    true states. With true states and a wrong model, or a dead band, add --full-q (and --full-r) to mse or
+    log-score. `thruster ways` lists all methods.
 
-    With --log it uses recorded runs instead, cut into blocks of which every third is held out. It minimises the
+    With --log the study uses recorded runs, cut into blocks of which every third is held out. It minimises the
     negative log-likelihood of the innovations, unless the logs contain the true states.
 
     Example: thruster tune --filter ekf --scenario mismatch --scenario outliers --trials 100

@@ -125,7 +125,7 @@ def _search_sentences(tuning: Tuning) -> list[RenderableType]:
             f"{r.size}: {r.ratio.value:.3f} [{r.ratio.high:.3f}]" for r in result.sizes if r.size in ladder
         )
         shown.append(
-            f"Score relative to the best, by ensemble size, on {word} that chose neither Q nor R, with the "
+            f"Score relative to the best, by ensemble size, on separate {word}, with the "
             f"upper end of its 95 % interval: {ratios}. "
             f"{_size_sentence(kept, result)}{_seeds_sentence(result, word)}"
         )
@@ -153,7 +153,7 @@ def _search_sentences(tuning: Tuning) -> list[RenderableType]:
 
 def _none_consistent(result: StudyResult, plan: Plan) -> str:
     word, channels = plan.scenarios[0].seed_word, len(plan.scenarios[0].quantities.measurements)
-    found = [f"{channels * ratio:.3g}" if isfinite(ratio) else "beyond all numbers" for ratio in result.nis]
+    found = [f"{channels * ratio:.3g}" if isfinite(ratio) else "infinite" for ratio in result.nis]
     low, high = (channels * end for end in NIS_BAND)
     which = "the baseline above" if gave_way(result) else f"the trial with the least {plan.objectives[0]}"
     return (
@@ -179,9 +179,9 @@ def _gradient_sentences(tuning: Tuning, gradient: GradientResult, rival: Compari
             f"a range that is not logarithmic), or the {optimum} lies at the end of the range."
         )
     agree = (
-        f"All starts lead to the same {optimum}."
+        f"All starts reach the same {optimum}."
         if gradient.agree
-        else f"Starts lead to different {optima}: the best is kept."
+        else f"Starts reach different {optima}: the best is kept."
     )
     over = (
         f"Score over Optuna's on the held-out {tuning.scenario.seed_word}: {span(score_ratio(ours, theirs), 3)}."
@@ -292,4 +292,4 @@ def _consistency_sentence(evaluation: Evaluation) -> str:
     if not evaluation.has_truth:
         return mean_sentence("NIS", evaluation.nis, evaluation.expected_nis)
     said = mean_sentence("NEES", evaluation.nees, len(evaluation.rmse))
-    return said if said.startswith("Consistent") else f"{said} RMSE and NIS do not show all of the covariance."
+    return said if said.startswith("Consistent") else f"{said} RMSE and NIS do not fully test the covariance."

@@ -20,14 +20,16 @@ def command(
         typer.Option(
             "--problem",
             metavar="MODULE:OBJECT",
-            help="A problem, may be repeated; the twelve of tests/users in a checkout of the project.",
+            help="A problem, may be repeated; by default the twelve of tests/users in a checkout of the project.",
             rich_help_panel=INPUT,
         ),
     ] = None,
     filters: Annotated[
         list[str] | None,
         typer.Option(
-            "--filter", help="A filter, may be repeated; ekf, ukf, enkf, ekf-robust.", rich_help_panel=RUNS
+            "--filter",
+            help="A filter, may be repeated; by default ekf, ukf, enkf, ekf-robust.",
+            rich_help_panel=RUNS,
         ),
     ] = None,
     trials: Annotated[
@@ -47,17 +49,17 @@ def command(
     out: Annotated[
         Path,
         typer.Option(
-            help="Folder of results; existing ones are not recomputed. After a change of the code use another.",
+            help="Folder of results; existing ones are not recomputed. Use another one after changes in the code.",
             rich_help_panel=OUTPUT,
         ),
     ] = RESULTS,
     json: JsonOption = None,
 ) -> None:
-    """Tune filters on problems of users, and compare each with everything that its user had before.
+    """Tune filters on users' problems, and compare each with its user's baselines.
 
     The table has the held-out score of the tuned filter over that of each baseline, with 95 % intervals paired by
-    run; "!" marks where it is significantly worse, by Holm's procedure at 5 % over the whole table. Ctrl-C keeps
-    finished cases, and the same command continues. All of them take about an hour on one core.
+    run; "!" marks significantly worse ones, by Holm's procedure at 5 % over the whole table. Ctrl-C keeps
+    finished cases, and the same command continues. All cases take about an hour on one core.
 
     Example: thruster study users --quick
     """

@@ -24,15 +24,15 @@ def command(
     model: LogModelOption = None,
     json: JsonOption = None,
 ) -> None:
-    """Compute the held-out metrics of a tuned file once more, on its seeds, and say whether they hold.
+    """Recompute the held-out metrics of a tuned file on its seeds, and say whether they hold.
 
-    They hold where every number is the same within rounding; the exit code is 0 then, and 1 otherwise. Packages
-    whose versions are not those that the file was made with are named.
+    They hold if every number is the same within rounding; the exit code is then 0, otherwise 1. Packages
+    whose versions have changed since the file was made are named.
 
     Example: thruster verify out/enkf-mismatch-seed0.json
     """
     announce_compilation()
-    with working(f"computing the metrics of {file} once more"):
+    with working(f"recomputing the metrics of {file}"):
         found = verify(file, [*map(find_problem, problem or []), *problems_in(file, model)])
     emit(_shown(file, found), _as_json(file, found), json)
     if not found.holds:
@@ -49,7 +49,7 @@ def _shown(file: Path, found: Verification) -> list[RenderableType]:
         shown.append(table("The largest differences", ["number", "stored", "found", "relative"], rows))
     if found.packages:
         changes = ", ".join(f"{name} {then} then, {now} now" for name, (then, now) in found.packages.items())
-        shown.append(f"Packages of other versions than those that the file was made with: {changes}.")
+        shown.append(f"Packages whose versions have changed since the file was made: {changes}.")
     return shown
 
 

@@ -19,10 +19,10 @@ def command(
     name: Annotated[str | None, typer.Argument(help="A way to show in full.", callback=spelt(WAYS))] = None,
     json: JsonOption = None,
 ) -> None:
-    """List the ways of tuning that `thruster tune --way` follows; or show one with its equations and source.
+    """List the ways of tuning of `thruster tune --way`, or show one with its equations and source.
 
-    Those that need a gradient take kf, ekf, iekf, ukf, ckf, ekf-robust, sage-husa and vb; the others
-    take any filter with a covariance, and searches any filter at all.
+    Those that need a gradient accept kf, ekf, iekf, ukf, ckf, ekf-robust, sage-husa and vb; searches accept any
+    filter, the others any filter with a covariance.
 
     Example: thruster ways em
     """

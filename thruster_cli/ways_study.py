@@ -17,7 +17,8 @@ RESULTS = Path("out") / "ways"
 def command(
     groups: Annotated[str, typer.Option(help="Groups of problems.", rich_help_panel=RUNS)] = "ABCDEFGH",
     way: Annotated[
-        list[str] | None, typer.Option("--way", help="A way, may be repeated; all.", rich_help_panel=RUNS)
+        list[str] | None,
+        typer.Option("--way", help="A way, may be repeated; by default all.", rich_help_panel=RUNS),
     ] = None,
     sets: Annotated[int | None, typer.Option(min=2, max=20, help="Data sets; 20.", rich_help_panel=RUNS)] = None,
     runs: Annotated[
@@ -48,17 +49,17 @@ def command(
         Path | None,
         typer.Option(
             metavar="FILE.md",
-            help="Page whose tables are written anew, with the picture beside it.",
+            help="Page whose tables are rewritten, with the picture beside it.",
             rich_help_panel=OUTPUT,
         ),
     ] = None,
     json: JsonOption = None,
 ) -> None:
-    """Follow every way of tuning on the same data within the same budget, and score it on held-out truth.
+    """Run every way of tuning on the same data within the same budget, and score it on held-out truth.
 
-    The regret of a way is its score over that of the best constant numbers, which gradients from many starts find
-    on many runs. Ctrl-C keeps finished results, and the same command continues. In full it takes days; the options
-    reduce it, and results of different budgets lie beside each other.
+    The regret of a way is its score over that of the best constant parameters, found by gradients from many starts
+    on many runs. Ctrl-C keeps finished results, and the same command continues. The whole study takes days; the
+    options reduce it, and results of different budgets are stored separately.
 
     Example: thruster study ways --quick
     """

@@ -22,9 +22,9 @@ from thruster_env.numerics.algebra.scalars import at_most, diagonal, entries_pro
 def update(model, x, P, z):
     """The measurement z (m,) of a state of mean x (n,) and covariance P (n, n).
 
-    A page computes with small matrices: + - @ *, .T and what `thruster_env.numerics.algebra` offers. It cannot
-    decide (`if`) by their values, only choose (`scalars.choose`). The model has f(x, u), F, h(x), H, Q and R;
-    `model.own` has the fields below. Channels of z that are NaN are missing: `only` makes their rows zero.
+    A page computes with small matrices: + - @ *, .T and the functions of `thruster_env.numerics.algebra`. It
+    cannot branch (`if`) on their values, only choose (`scalars.choose`). The model has f(x, u), F, h(x), H, Q and
+    R; `model.own` has the fields below. Channels of z that are NaN are missing: `only` makes their rows zero.
     """
     seen = present(z)
     H, R = only(seen, model.H(x)), uncorrelated(seen, model.R)
