@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from thruster_env.numerics.derivatives import RELATIVE_STEP
 from thruster_env.numerics.pickling import makes_functions
 from thruster_env.numerics.sources import Source, entrywise, tuple_of, written_out
 from thruster_env.numerics.tuples import assembled, joiner, vector_part
-from thruster_env.plants.quantities import Quantity
+from thruster_env.plants.quantities import Output, Quantity
 from thruster_env.plants.shape import constants_are_array
 from thruster_env.plants.state_space import StateSpaceModel
 
@@ -56,7 +56,7 @@ def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unkno
             the new states have this order.
 
     Returns:
-        A model of n + len(parameters) states with the same inputs and measurements.
+        A model of n + len(parameters) states with the same inputs, measurements and outputs.
 
     Raises:
         ValueError: if a name is not one of the model's constants, or a standard deviation is not positive.
@@ -104,8 +104,21 @@ def augmented_model(model: StateSpaceModel, parameters: Mapping[str | int, Unkno
         states=(*model.states, *further_states),
         input_quantities=model.input_quantities,
         measurements=model.measurements,
+        outputs={
+            symbol: Output(one.quantity, partial(_output, one.function, model.shape, tuple(places)))
+            for symbol, one in model.outputs.items()
+        },
         **helpful,
     )
+
+
+def _output(function: Callable, shape, places: tuple[int, ...], x, c):
+    """An output of the model, function(x, c), at the model's states and with the constants that are states."""
+    values = list(c[: shape.constants])
+    for q, place in enumerate(places):
+        values[place] = x[shape.n + q]
+    tuples = isinstance(shape.form, int) or constants_are_array(shape.form)
+    return function(x[: shape.n], tuple(values) if tuples else shape.form(*values))
 
 
 def _block_diagonal(cov: np.ndarray, variances: list[float]) -> np.ndarray:

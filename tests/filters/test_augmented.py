@@ -1,6 +1,7 @@
 """Joint estimation of state and parameters: the augmented model, and that it recovers what is not known."""
 
 import math
+import pickle
 
 import gymnasium as gym
 import numpy as np
@@ -44,6 +45,19 @@ def test_the_new_states_stand_in_for_the_constants():
     np.testing.assert_allclose(found, [*model.transition(x, u, constants), -0.2, 16e3], rtol=1e-14)
     seen = augmented.observe((*x, -0.2, 16e3), augmented.constants)
     np.testing.assert_allclose(seen, model.observe(x, constants), rtol=1e-14)
+
+
+def test_it_has_the_models_outputs():
+    """Thrust of states and a constant that differ from row to row, as the model with that constant has it."""
+    model = thruster_model(preset="tunnel_physical")
+    augmented = pickle.loads(pickle.dumps(augmented_model(model, {"thrust_30": Unknown(1e-6)})))
+    assert augmented.outputs.keys() == model.outputs.keys() == {"T"}
+    factors = model.constants.thrust_30 * np.array([1.0, 1.2, 0.8])
+    states = np.column_stack([[80.0, 80.0, -60.0], [1.0, 1.0, -0.5], factors])
+    there = [model.replace(constants=model.constants._replace(thrust_30=factor)) for factor in factors]
+    expected = [one.output("T", x) for one, x in zip(there, states[:, :2], strict=True)]
+    np.testing.assert_allclose(augmented.output("T", states), expected, rtol=1e-14)
+    assert expected[0] != pytest.approx(expected[1], rel=0.01)  # the constant counts
 
 
 def test_its_jacobians_are_those_of_its_functions():
