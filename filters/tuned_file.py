@@ -26,7 +26,8 @@ NOISE = ("process_noise_cov", "measurement_noise_cov")
 PRIOR = "prior_cov_factor"  # on P_0
 FACTORS = "parameter_factors"  # a mapping of names to factors
 STATES = "states"  # which of its states a model has, by a name that the plant knows
-MODEL_KEYS = (*NOISE, PRIOR, FACTORS, STATES)  # what every plant with data of its own knows
+AUGMENTED = "augmented_constants"  # a mapping of constants that are states to [std, walk, mean]
+MODEL_KEYS = (*NOISE, PRIOR, FACTORS, STATES, AUGMENTED)  # what every plant with data of its own knows
 
 
 def sealed(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -123,13 +124,17 @@ def _check_filter(entry, known: tuple[str, ...] | None) -> None:
     for key, value in model.items():
         if key == STATES and isinstance(value, str):
             continue
-        if key != FACTORS:
+        if key not in (FACTORS, AUGMENTED):
             _check_finite(key, value)
     if PRIOR in model:
         positive(PRIOR, model[PRIOR])
     for key, value in _mapping(FACTORS, model.get(FACTORS, {})).items():
         _check_finite(f"{FACTORS}, {key}", value)
         positive(f"{FACTORS}, {key}", value)
+    for key, value in _mapping(AUGMENTED, model.get(AUGMENTED, {})).items():
+        _check_finite(f"{AUGMENTED}, {key}", value)
+        if not isinstance(value, list) or len(value) != 3:
+            raise ValueError(f"{AUGMENTED}, {key} must be std, walk and mean, but got {shown(value)}")
 
 
 def _check_finite(name: str, value) -> None:

@@ -9,7 +9,6 @@ from typing import Annotated
 
 import typer
 
-from filters.augmented import Unknown
 from filters.registry import FILTERS
 from thruster_cli.options import FILTER, INPUT, RUNS, JsonOption, OfPresetOption, SeedOption, filter_option
 from thruster_cli.output import announce_compilation, emit, progress_console
@@ -18,6 +17,7 @@ from thruster_env.numerics.checks import at_least
 from tuning.api.compare import DEFAULT_FILTERS, compared, contenders_of, knowledge_on, without_unfit
 from tuning.api.comparison import INTERRUPTED, left_out_lines
 from tuning.evaluation.tuned import read_choice, read_tuned
+from tuning.problems.augmented import unknown_in
 from tuning.problems.find import find_problem
 from tuning.problems.problem import Problem
 from tuning.reporting.leaderboard import as_json, report
@@ -86,7 +86,7 @@ def command(
     for file, problem in product(files or [], chosen):
         read_choice(file, problem)  # a clear error for a file that is for another plant
     names = filters or ([] if files else list(DEFAULT_FILTERS))
-    sizes, unknown = dict(map(_size, ensemble_size or [])), dict(map(_unknown, augment or []))
+    sizes, unknown = dict(map(_size, ensemble_size or [])), dict(map(unknown_in, augment or []))
     knows = knowledge_on(chosen) if knows is None else knows
     some, left_out = without_unfit([*(files or []), *names], chosen)
     contenders = contenders_of(some, knows, unknown, sizes, seed)
@@ -117,11 +117,3 @@ def _size(text: str) -> tuple[str | None, int]:
             raise ValueError(f"--ensemble-size must be for a filter with an ensemble, but got {text!r}")
         return name, at_least("--ensemble-size", number, 2)
     return None, at_least("--ensemble-size", number, 2)
-
-
-def _unknown(text: str) -> tuple[str, Unknown | None]:
-    name, *numbers = text.split(":")
-    try:
-        return name, Unknown.of_numbers(*map(float, numbers)) if numbers else None
-    except (TypeError, ValueError):
-        raise ValueError(f"--augment must be NAME, NAME:STD or NAME:STD:WALK, but got {text!r}") from None

@@ -38,6 +38,7 @@ from thruster_cli.problems import PROBLEMS
 from thruster_cli.tuning_report import Tuning, as_json, report
 from tuning.api.run import aim_of, name_of, run_tuning
 from tuning.evaluation.tuned import check_keepable
+from tuning.problems.augmented import augmented, unknowns_of
 from tuning.search.objectives import OBJECTIVES
 from tuning.search.plan import Plan
 from tuning.search.samplers import SAMPLERS
@@ -97,6 +98,15 @@ def command(
             help="A relation that parameters must obey: 'Q22 = 4 Q11', 'Q33 = Q11', 'R = 0.01' (not tuned), "
             "'Q11 = 1e-6..1e-2' (its range). May be repeated.",
             rich_help_panel=SEARCH,
+        ),
+    ] = None,
+    augment: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME[:STD[:WALK]]",
+            help="Let the filter also estimate this constant of its model, such as voltage_gain, with prior "
+            "deviation STD; its random walk, at first WALK per step, is tuned with Q. Give it again for more.",
+            rich_help_panel=FILTER,
         ),
     ] = None,
     budget: Annotated[
@@ -203,13 +213,16 @@ def command(
     Example: thruster tune --filter ekf --way log-score --scenario mismatch
 
     Example: thruster tune --filter auto --budget 2 --scenario published_noise --trials 100
+
+    Example: thruster tune --filter ekf --augment voltage_gain --scenario mismatch
     """
     aim = aim_of(method, objective)
     check_keepable(filter_name)
     of_logs: dict[str, Any] = {"preset": preset, "model": model, "sensors": sensor, "columns": column}
     of_logs |= {"clock_offset": clock_offset, "dt": dt, "held_out": held_out, "blocks": blocks, "lead": lead}
     of_logs |= {"hold_gaps": hold_gaps or None, "start": start}
-    scenarios = problems_of(scenario, log, of_logs, "mismatch")
+    unknown = unknowns_of(augment or ())
+    scenarios = tuple(augmented(one, unknown) for one in problems_of(scenario, log, of_logs, "mismatch"))
     check_targets((out,), json, read=(*(log or []), *(held_out or []), *(scenario or []), preset))
     objectives = tuple(objective or ["score" if scenarios[0].scale is not None else "likelihood"])
     plan = Plan(

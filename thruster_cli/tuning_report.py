@@ -22,6 +22,7 @@ from tuning.likelihood.family import has_gradient
 from tuning.likelihood.gradient import GradientResult
 from tuning.likelihood.identifiability import as_data, sentences, too_many
 from tuning.logs.problem import model_named_in
+from tuning.problems.augmented import within
 from tuning.problems.rooms import built_in
 from tuning.reporting.error_tables import comparison_table
 from tuning.reporting.gains import gains
@@ -96,8 +97,9 @@ def next_steps(tuning: Tuning) -> list[str]:
     """The path of the tuned filter, and the next command; for an interrupted study how to continue it."""
     shown = [f"Tuned filter: {tuning.file}"]
     problems = tuning.plan.scenarios
-    given = [f"--problem {one.name}" for one in problems if is_code(one.name) and one.name not in built_in()]
-    given += [f"--model {name}" for name in dict.fromkeys(map(model_named_in, problems)) if name is not None]
+    plain = [*map(within, problems)]
+    given = [f"--problem {one.name}" for one in plain if is_code(one.name) and one.name not in built_in()]
+    given += [f"--model {name}" for name in dict.fromkeys(map(model_named_in, plain)) if name is not None]
     shown.append(" ".join([f"Next: thruster report {quote(str(tuning.file))}", *given]))
     if tuning.result.interrupted:
         shown.append("Interrupted: this is the result of the finished trials; the same command continues.")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections.abc import Callable, Mapping
 
+from filters.augmented import Unknown, augmented_model
 from filters.filter import Filter
 from filters.registry import make_filter
-from filters.tuned_file import NOISE, PRIOR, read_tuned_file
+from filters.tuned_file import AUGMENTED, FACTORS, NOISE, PRIOR, read_tuned_file
 from filters.tuned_model import check_same_model, check_same_quantities
 from filters.wrappers.models import made, maker_of
 from thruster_env.plants.state_space import StateSpaceModel
@@ -35,6 +37,10 @@ def tuned_filter(env, model: str | StateSpaceModel | None, file: str) -> Filter:
         check(plant, file)
     entry, tuned_for = content["filter"], content.get("model")
     dt = None if plant is not None else sample_time(env)
+    factors = [f"{name} {value:g}" for name, value in entry["model"].get(FACTORS, {}).items() if value != 1.0]
+    if factors:
+        said = f"{file} was tuned on a model that is wrong on purpose: here, too, its filter assumes"
+        warnings.warn(f"{said} {', '.join(factors)} times the plant's own", stacklevel=4)
 
     def fits(found: StateSpaceModel) -> None:
         if tuned_for is not None:
@@ -62,17 +68,24 @@ def _with_numbers(
 ) -> StateSpaceModel:
     """A model with the numbers of a tuned file: Q and R, the factor on P_0, and what else the maker takes by name.
 
-    Other parameters are left out only where the model's digest then shows whether that makes another model.
+    Constants that the file has as states become states. Other parameters are left out only where the model's
+    digest then shows whether that makes another model.
     """
+    unknown = {name: Unknown.of_numbers(*one) for name, one in numbers.get(AUGMENTED, {}).items()}
+
+    def augmented(found: StateSpaceModel) -> StateSpaceModel:
+        return augmented_model(found, unknown) if unknown else found
+
     if isinstance(make, StateSpaceModel):
-        fits(make)
-        return _with_noise(make, numbers)
-    own = {name: value for name, value in numbers.items() if name not in (*NOISE, PRIOR)}
+        found = augmented(make)
+        fits(found)
+        return _with_noise(found, numbers)
+    own = {name: value for name, value in numbers.items() if name not in (*NOISE, PRIOR, AUGMENTED)}
     if by_digest:
         own = {name: value for name, value in own.items() if name in _arguments_of(make)}
-    plain = made(what, make, own)
+    plain = augmented(made(what, make, own))
     fits(plain)  # before Q and R of other sizes are
-    return _with_noise(plain, numbers) if by_digest else made(what, make, numbers)
+    return _with_noise(plain, numbers) if by_digest or unknown else made(what, make, numbers)
 
 
 def _with_noise(model: StateSpaceModel, numbers: Mapping) -> StateSpaceModel:

@@ -129,11 +129,11 @@ def test_errors_state_the_rule_and_the_value(call, said):
 
 
 def test_beliefs_have_several_forms():
-    from tuning.api.compare import beliefs_of
+    from tuning.problems.augmented import unknowns_of
 
     mine = Unknown(0.2)
-    assert beliefs_of(["a", "b"]) == {"a": None, "b": None} == beliefs_of({"a": None, "b": None})
-    assert beliefs_of({"a": mine, "b": 0.2, "c": (0.2, 0.1)}) == {"a": mine, "b": mine, "c": Unknown(0.2, 0.1)}
+    assert unknowns_of(["a", "b"]) == {"a": None, "b": None} == unknowns_of({"a": None, "b": None})
+    assert unknowns_of({"a": mine, "b": 0.2, "c": (0.2, 0.1)}) == {"a": mine, "b": mine, "c": Unknown(0.2, 0.1)}
 
 
 def test_a_filter_that_refuses_the_model_is_left_out_and_the_others_are_compared():

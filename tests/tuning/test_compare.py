@@ -14,8 +14,9 @@ from thruster_env.plants.affine import affine_model
 from tuning.evaluation.compare import Leaderboard, Row, compare, contender, sized, winners
 from tuning.evaluation.evaluate import Evaluation, evaluate, score_ratio
 from tuning.evaluation.held_out import Comparison
-from tuning.evaluation.knowledge import belief_sentences, beliefs_of, default_belief
+from tuning.evaluation.knowledge import belief_sentences
 from tuning.evaluation.tuned import write_tuned
+from tuning.problems.augmented import beliefs_of, default_belief
 from tuning.problems.model_problem import ModelProblem
 from tuning.problems.seeds import held_out_seeds
 from tuning.search.plan import Plan
@@ -240,7 +241,7 @@ def test_where_nobody_knows_the_plants_noise_filters_have_the_scaled_default(thr
         (("--seeds", "1"), "held-out seeds must be a whole number of at least 2, but got 1"),
         (("--ensemble-size", "many"), "--ensemble-size must be a finite number, but got 'many'"),
         (("--ensemble-size", "ekf=5"), "--ensemble-size must be for a filter with an ensemble, but got 'ekf=5'"),
-        (("--augment", "ambient_velocity:x"), "--augment must be NAME, NAME:STD or NAME:STD:WALK, but got"),
+        (("--augment", "ambient_velocity:x"), "--augment\) must be NAME, NAME:STD, NAME:STD:WALK or"),
         (("--filter", "ekf", "--augment", "colour"), "a constant to estimate must be one of motor_damping"),
         (("--filter", "ekf", "--augment", "load_gain:-1"), "std of load_gain must be positive, but got -1.0"),
         (("missing.json",), "a tuned file must be readable"),

@@ -64,6 +64,15 @@ def test_a_file_on_another_plant_is_refused_and_each_difference_named(arguments,
         wrapped(nominal, count, **arguments)
 
 
+@pytest.mark.parametrize("count", [None, 2])
+def test_a_model_that_is_wrong_on_purpose_is_warned_of(count, tmp_path):
+    file = write_untuned(tmp_path / "ekf.json", "mismatch")
+    said = "ekf.json was tuned on a model that is wrong on purpose: .* lift_coefficient 1.15, voltage_gain 0.95 times"
+    with pytest.warns(UserWarning, match=said) as caught:
+        wrapped(file, count)
+    assert [one.filename for one in caught] == [__file__]
+
+
 def test_other_noise_is_warned_of_and_what_does_not_matter_is_not_compared(nominal):
     with pytest.warns(UserWarning, match=r"tuned for max_voltage 24.0 \(here 12.0\), measurement_noise_cov .*4.0"):
         wrapped(nominal, max_voltage=12.0, measurement_noise_cov=[4.0])

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 
-from filters.tuned_file import read_tuned_file
+from filters.tuned_file import AUGMENTED, read_tuned_file
 from thruster_env.numerics.checks import at_least, one_of, shown
 from thruster_env.training.algorithms import find_algorithm
 from thruster_env.training.checks import check_configuration
@@ -115,6 +115,10 @@ def make_configuration(
     if tuned is not None:
         content = read_tuned_file(tuned)
         found = content["filter"]
+        if AUGMENTED in found["model"]:
+            raise ValueError(
+                f"a policy's filter must have the plant's states, but {tuned} has constants as states"
+            )
         one_of("filter of the tuned file", found["name"], () if observed.filter is None else (observed.filter,))
         scenario.check_tuned_for(content.get("plant"), tuned)
         given |= {**found["numbers"], **found["model"]}

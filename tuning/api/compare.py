@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from filters.augmented import Unknown
 from filters.estimators.find import is_foreign, label_of
 from filters.filter import Filter
 from filters.registry import filter_class
@@ -26,13 +25,13 @@ from tuning.evaluation.compare import Contender, contender, sized
 from tuning.evaluation.compare import compare as compare_all
 from tuning.evaluation.fitting import fitting
 from tuning.evaluation.knowledge import OF_FILE
-from tuning.evaluation.tuned import read_choice, read_tuned
+from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
+from tuning.problems.augmented import Unknowns, constants_in, suited, unknowns_of
 from tuning.problems.problem import Problem
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice, has_ensemble
 
 DEFAULT_FILTERS = ("ekf", "enkf", "pf")
-Beliefs = Mapping[str, Unknown | None]
 
 
 def compare(
@@ -97,8 +96,7 @@ def compare(
             for one in some
         ]
     knows = knowledge_on(problems) if knows is None else knows
-    beliefs = beliefs_of(augment or {})
-    contenders = contenders_of(some, knows, beliefs, sizes, seed)
+    contenders = contenders_of(some, knows, unknowns_of(augment or {}), sizes, seed)
     return replace(compared(contenders, problems, seed, seeds, console_for(progress)), left_out=left_out)
 
 
@@ -127,7 +125,7 @@ def compared(
 
 
 def contenders_of(
-    filters: Sequence[Any], knows: str, unknown: Beliefs, sizes: Mapping[Any, int], seed: int
+    filters: Sequence[Any], knows: str, unknown: Unknowns, sizes: Mapping[Any, int], seed: int
 ) -> list[Contender]:
     """The filters that take part: tuned files and studies first as they are, then those that are named.
 
@@ -150,34 +148,21 @@ def contenders_of(
     for one in filters:
         if isinstance(one, Study):
             choice = sized(one.choice, size_of(one.choice.name))
-            out.append(
-                Contender(_new(f"{label_of(choice.name)} tuned", out), partial(_same, choice), knows=OF_FILE)
-            )
+            label, suit = f"{label_of(choice.name)} tuned", partial(suited, kept=constants_in(one.problem))
+            out.append(Contender(_new(label, out), partial(_same, choice), knows=OF_FILE, suit=suit))
         elif is_own(one):
             label = f"{one.name if isinstance(one, Filter) else DEFAULT_FILTER} {OWN}"
             out.append(Contender(_new(label, out), partial(own_choice, one)))
         elif not is_filter(one):
             size = size_of(read_tuned_file(one)["filter"]["name"])
-            out.append(Contender(_new(Path(one).stem, out), partial(_from_file, Path(one), size), knows=OF_FILE))
+            chosen, suit = partial(_from_file, Path(one), size), partial(suited_to, Path(one))
+            out.append(Contender(_new(Path(one).stem, out), chosen, knows=OF_FILE, suit=suit))
         else:
             size = size_of(one) if not is_foreign(one) and has_ensemble(one) else None
             out.append(contender(one, knows, seed=seed, ensemble_size=size))
             if unknown and filter_class(one).has_covariance:
                 out.append(contender(one, knows, unknown, seed, ensemble_size=size))
     return out
-
-
-def beliefs_of(augment: Sequence[str] | Mapping[str, Any]) -> dict[str, Unknown | None]:
-    """The priors of the constants; None for the defaults."""
-    if not isinstance(augment, Mapping):
-        return dict.fromkeys([augment] if isinstance(augment, str) else augment)
-    found: dict[str, Unknown | None] = {}
-    for name, given in augment.items():
-        if given is None or isinstance(given, Unknown):
-            found[name] = given
-        else:
-            found[name] = Unknown.of_numbers(*map(float, given if isinstance(given, list | tuple) else (given,)))
-    return found
 
 
 def _is_named(given: Any) -> bool:

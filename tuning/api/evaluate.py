@@ -11,7 +11,8 @@ from tuning.api.problems import given_for, is_filter, problem_of
 from tuning.api.progress import console_for
 from tuning.api.study import Study
 from tuning.evaluation.baselines import OWN, TUNED, rule_of_thumb
-from tuning.evaluation.tuned import read_choice, read_tuned
+from tuning.evaluation.tuned import read_choice, read_tuned, suited_to
+from tuning.problems.augmented import constants_in, suited
 from tuning.problems.problem import Problem
 from tuning.search.plan import HELD_OUT_SEEDS
 from tuning.search.space import Choice
@@ -70,7 +71,8 @@ def subject_of(
 ) -> tuple[Choice, Problem, bool]:
     """The choice, the problem, and whether it was tuned; the arguments are those of `evaluate`."""
     if isinstance(tuned, Study):
-        return tuned.choice, problem_of(tuned.problem if problem is None else problem, preset), True
+        found = problem_of(tuned.problem if problem is None else problem, preset)
+        return tuned.choice, suited(found, constants_in(tuned.problem)), True
     if is_own(tuned):
         if problem is None:
             raise ValueError(f"a filter or model must come with a problem, but got {type(tuned).__name__} alone")
@@ -87,5 +89,5 @@ def subject_of(
             )
         choice, found, _ = read_tuned(tuned, given_for(tuned, model=model))
         return choice, found, True
-    found = problem_of(problem, preset)
+    found = suited_to(tuned, problem_of(problem, preset))
     return read_choice(tuned, found), found, True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from tuning.api.problems import problems_of
 from tuning.api.progress import console_for
 from tuning.api.run import aim_of, run_tuning
 from tuning.api.study import Study
+from tuning.problems.augmented import augmented, unknowns_of
 from tuning.search.plan import Plan
 
 
@@ -27,6 +28,7 @@ def tune(
     full_q: bool = False,
     full_r: bool = False,
     where: Sequence[str] = (),
+    augment: Sequence[str] | Mapping[str, Any] = (),
     budget: float | None = None,
     sampler: str = "tpe",
     prune: bool = True,
@@ -80,6 +82,8 @@ def tune(
         full_r: tune the correlations of R, too.
         where: relations among the numbers of the model that hold, such as "Q22 = 4 Q11", "Q33 = Q11", "R = 0.01"
             (not tuned), "Q11 = 1e-6..1e-2" (its range).
+        augment: constants of the model, such as "voltage_gain", that the filter also estimates, as further states
+            whose random walks are tuned with Q; by name with an `Unknown`, or (std, walk).
         budget: time limit of a step of the filter [microseconds of one core].
         sampler: of Optuna: "tpe", "random", "cma-es", ...
         prune: end a trial that is significantly worse than the best on the same seeds.
@@ -118,7 +122,8 @@ def tune(
         )
     of_logs: dict[str, Any] = {"sensors": sensors, "columns": columns, "clock_offset": clock_offset, "dt": dt}
     of_logs |= {"held_out": held_out, "blocks": blocks, "lead": lead, "hold_gaps": hold_gaps, "start": start}
-    problems = problems_of(problem, preset, **of_logs)
+    unknown = unknowns_of(augment)
+    problems = tuple(augmented(one, unknown) for one in problems_of(problem, preset, **of_logs))
     if objective is None:
         objective = "score" if problems[0].scale is not None else "likelihood"
     plan = Plan(

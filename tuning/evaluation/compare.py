@@ -27,8 +27,9 @@ from tuning.evaluation.evaluate import (
     median_score_ratio,
     score_ratio,
 )
-from tuning.evaluation.knowledge import KNOWLEDGE, beliefs_of
+from tuning.evaluation.knowledge import KNOWLEDGE
 from tuning.evaluation.runs import RunMetrics, joined, metrics_by_run
+from tuning.problems.augmented import beliefs_of
 from tuning.problems.check import data_of
 from tuning.problems.data import Data
 from tuning.problems.in_parts import estimates_in_parts
@@ -48,11 +49,12 @@ class Contender(NamedTuple):
     choose: Callable[[Problem], Choice]
     unknown: Mapping[str, Unknown | None] = {}  # constants that it estimates, too; None for a default
     knows: str = ""  # of the plant's Q and R: one of `KNOWLEDGE`, or "tuned"
+    suit: Callable[[Problem], Problem] = lambda problem: problem  # as the filter assumes it
 
     def filter(self, scenario: Problem) -> Filter:
         """The filter, with what the scenario lets it assume of the plant."""
         choice = self.choose(scenario)
-        filter_ = choice.filter(scenario)
+        filter_ = choice.filter(self.suit(scenario))
         if not self.unknown:
             return filter_
         beliefs = beliefs_of(filter_.model.constants, self.unknown)

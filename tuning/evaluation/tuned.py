@@ -15,7 +15,7 @@ import numpy as np
 
 from filters.estimators.find import is_foreign, label_of
 from filters.monitoring.stored import monitor_data, monitor_for
-from filters.tuned_file import FACTORS, FILE_FORMAT, FILE_VERSION, NOISE, PRIOR, read_tuned_file, sealed
+from filters.tuned_file import AUGMENTED, FACTORS, FILE_FORMAT, FILE_VERSION, NOISE, PRIOR, read_tuned_file, sealed
 from filters.tuned_model import check_same_quantities, model_data
 from thruster_env.numerics.checks import at_least, covariance, positive, shown
 from thruster_env.numerics.files import write_whole
@@ -25,6 +25,7 @@ from tuning.evaluation.held_out import Comparison
 from tuning.evaluation.kept import ROLES, comparison_as_data, sizes_as_data
 from tuning.evaluation.summary import summary
 from tuning.evaluation.versions import versions
+from tuning.problems.augmented import augmented, name_and_unknown, suited
 from tuning.problems.files import scenario_of
 from tuning.problems.find import find_given, find_problem
 from tuning.problems.problem import Problem
@@ -148,7 +149,10 @@ def problem_in(content: Mapping, name, path: str | Path, given: Sequence[Problem
                 f"the problem of a tuned file must be the one it was tuned on, {name} of digest {digest}, but "
                 f"here it has the digest {one.digest} ({path})"
             )
+    plain, unknown = name_and_unknown(name) if digest is not None else (name, {})
     mapping = kept.get("content") if isinstance(kept, Mapping) else kept
+    if unknown and isinstance(mapping, Mapping) and "of" in mapping:
+        return augmented(problem_in({"problems": {plain: mapping.get("of")}}, plain, path, given), unknown)
     if isinstance(mapping, Mapping) and "logs" in mapping:
         raise ValueError(
             f"a problem of logs must be given, but {path} only names the logs of {name}: the commands evaluate, "
@@ -212,16 +216,21 @@ def read_tuned(path: str | Path, problems: Sequence[Problem] = ()) -> tuple[Choi
 
 
 def read_choice(path: str | Path, problem: Problem) -> Choice:
-    """The choice of a tuned file for a problem with the same plant, or with the same states, inputs and sensors.
+    """The choice of a tuned file for a problem of the same plant, or states, inputs and sensors, `suited_to` it.
 
     Raises:
         ValueError: if the file is damaged, or for another plant: another thruster, dt or sensor.
     """
-    content = read_tuned_file(path)
+    content, problem = read_tuned_file(path), suited_to(path, problem)
     problem.check_tuned_for(content.get("plant"), path)
     if "model" in content:
         check_same_quantities(content["model"], problem.model(), problem.dt, path)
     return _choice(content, problem)
+
+
+def suited_to(path: str | Path, problem: Problem) -> Problem:
+    """The problem as the filter of a tuned file assumes it: with the constants as states that the file has."""
+    return suited(problem, read_tuned_file(path)["filter"]["model"].get(AUGMENTED, {}))
 
 
 def _choice(content: Mapping, problem: Problem) -> Choice:

@@ -13,6 +13,7 @@ from thruster_env.numerics.checks import shown
 from thruster_env.plants.logs.log import Log
 from thruster_env.plants.replay import read_for
 from tuning.logs.read import read_named, texts
+from tuning.problems.augmented import name_and_unknown
 from tuning.problems.find import named
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Problem
@@ -151,6 +152,8 @@ def problems_in(file: Path, model: str | None = None) -> list[Problem]:
     found: list[Problem] = []
     for name, entry in read_tuned_file(file)["problems"].items():
         content = entry.get("content") if isinstance(entry, dict) else None
+        if isinstance(content, dict) and isinstance(content.get("of"), dict):  # that of an augmented problem
+            name, content = name_and_unknown(name)[0], content["of"].get("content")
         if not isinstance(content, dict) or "logs" not in content:
             continue
         try:

@@ -9,6 +9,7 @@ from typing import Any
 
 from thruster_env.numerics.checks import FEW, any_case, meant, shown
 from thruster_env.numerics.modules import is_code, object_named, said
+from tuning.problems.augmented import augmented, name_and_unknown
 from tuning.problems.check import checked_problem
 from tuning.problems.files import read_scenario
 from tuning.problems.problem import Problem
@@ -18,11 +19,15 @@ from tuning.problems.rooms import built_in
 def find_problem(name: str) -> Problem:
     """A problem by its name, from a FILE.toml, or by "module:object": the object, or a function's result.
 
-    Modules are looked for on Python's path, then in the working folder.
+    After "+" stands a constant of the model that filters also estimate, as in "mismatch+voltage_gain". Modules are
+    looked for on Python's path, then in the working folder.
 
     Raises:
         ValueError: states the rule and the value, where there is no such problem, or the object is not a problem.
     """
+    name, unknown = name_and_unknown(name) if isinstance(name, str) else (name, {})
+    if unknown:
+        return augmented(find_problem(name), unknown)
     known = built_in()  # whose names may have a colon, too
     own = any_case(name, known)
     if isinstance(own, str) and own in known:
@@ -69,6 +74,9 @@ def find_given(name, given: Sequence[Problem], where: str | Path) -> Problem:
     for one in given:
         if one.name == name:
             return one
+    plain, unknown = name_and_unknown(name) if isinstance(name, str) else (name, {})
+    if unknown:
+        return augmented(find_given(plain, given, where), unknown)
     known = built_in()
     if isinstance(name, str) and (any_case(name, known) in known or name.endswith(".toml")):
         return find_problem(name)

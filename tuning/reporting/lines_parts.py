@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from tuning.problems.augmented import within
 from tuning.problems.log_problem import LogProblem
 from tuning.problems.problem import Problem
 from tuning.problems.rooms import built_in
@@ -42,7 +43,7 @@ def lines_section(choice: Choice, problem: Problem, file: str | None) -> Section
     """
     name = Path(file).name if file else UNSAVED
     model = problem.model(**choice.model)
-    lines = ON_LOG if isinstance(problem, LogProblem) else ON_ENV
+    lines = ON_LOG if isinstance(within(problem), LogProblem) else ON_ENV
     python = lines.format(file=name, problem=_found_by(problem)) + BY_HAND
     noise = {"process_noise_cov": model.process_noise_cov, "measurement_noise_cov": model.measurement_noise_cov}
     entry = {"name": choice.name, "numbers": dict(choice.numbers)}

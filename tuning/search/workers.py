@@ -25,9 +25,11 @@ import optuna
 
 from thruster_env.numerics.modules import as_module, working_folder_last
 from thruster_env.numerics.threads import cores
+from tuning.problems.augmented import within
 from tuning.problems.data import Data
 from tuning.problems.find import find_same
 from tuning.problems.log_problem import LogProblem
+from tuning.problems.problem import Problem
 from tuning.search.interruption import stop_on_interrupt, without_interrupts
 from tuning.search.plan import Plan
 from tuning.search.storage import open_storage, retry_orphans, this_process
@@ -69,7 +71,7 @@ def run_in_workers(
     }
     orders["plan"] = {**plan._asdict(), "scenarios": names}
     orders["digests"] = [scenario.digest for scenario in plan.scenarios]
-    orders["logs"] = {one.name: _packed(one) for one in plan.scenarios if isinstance(one, LogProblem)}
+    orders["logs"] = {one.name: _packed(one) for one in plan.scenarios if isinstance(within(one), LogProblem)}
     # Indices that no other host has, so that no two workers propose the same trials.
     first = zlib.crc32(this_process().encode())
     processes: dict[int, subprocess.Popen] = {}
@@ -89,7 +91,7 @@ def run_in_workers(
         retry_orphans(study)
 
 
-def _packed(problem: LogProblem) -> str:
+def _packed(problem: Problem) -> str:
     """A problem of logs as text, since it cannot be found by a name. Only the parent of a worker sends it."""
     try:
         return base64.b64encode(pickle.dumps(problem)).decode()
@@ -99,7 +101,7 @@ def _packed(problem: LogProblem) -> str:
         ) from None
 
 
-def _unpacked(text: str) -> LogProblem:
+def _unpacked(text: str) -> Problem:
     with working_folder_last():  # where the model's module may lie
         return pickle.loads(base64.b64decode(text))
 
