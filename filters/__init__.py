@@ -8,6 +8,7 @@ from filters.baselines.baselines import Inversion, LowPass, OpenLoop
 from filters.engine.batch import Estimates, run
 from filters.engine.belief import Belief, Innovation
 from filters.ensembles.deterministic import DeterministicEnsembleKalmanFilter
+from filters.ensembles.finite_size import FiniteSizeEnsembleFilter
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
 from filters.ensembles.serial import SerialSquareRootFilter
 from filters.ensembles.stochastic import EnsembleKalmanFilter
@@ -49,6 +50,7 @@ __all__ = [
     "Estimates",
     "ExtendedKalmanFilter",
     "FadingMemoryFilter",
+    "FiniteSizeEnsembleFilter",
     "FuzzyKalmanFilter",
     "GaussianSumFilter",
     "Innovation",

@@ -13,11 +13,11 @@ from typing import Any
 
 from thruster_env.numerics.plots import BLUE, GREEN, MUSTARD, PALE, PLUM, RUST, SKY, TRUE, WINE
 
-SOLID, DASHED, DOTTED, BOTH = "-", "--", ":", "-."
+SOLID, DASHED, DOTTED, BOTH, TWO_DOTS = "-", "--", ":", "-.", (0, (4, 1.5, 1, 1.5, 1, 1.5))
 TRUTH: dict[str, Any] = {"color": TRUE, "linewidth": 3.0, "zorder": 1.8}  # wide, below the estimates
 MEASURED: dict[str, Any] = {"color": PALE, "linewidth": 0.8}
 OTHER = (GREEN, DOTTED)  # an estimator of one's own
-LOOKS: dict[str, tuple[str, str]] = {
+LOOKS: dict[str, tuple[str, Any]] = {
     "kf": (PLUM, SOLID),
     "kf-steady": (PLUM, DOTTED),
     "ekf": (BLUE, SOLID),
@@ -29,6 +29,7 @@ LOOKS: dict[str, tuple[str, str]] = {
     "ensrf": (WINE, BOTH),
     "denkf": (MUSTARD, BOTH),
     "ienkf": (PLUM, BOTH),
+    "enkf-n": (GREEN, TWO_DOTS),
     "pf": (GREEN, SOLID),
     "apf": (GREEN, DASHED),
     "gsf": (PLUM, DASHED),

@@ -9,6 +9,7 @@ from filters.adaptive.sage_husa import SageHusaFilter
 from filters.adaptive.variational import VariationalBayesFilter
 from filters.baselines.baselines import Inversion, LowPass, OpenLoop
 from filters.ensembles.deterministic import DeterministicEnsembleKalmanFilter
+from filters.ensembles.finite_size import FiniteSizeEnsembleFilter
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
 from filters.ensembles.serial import SerialSquareRootFilter
 from filters.ensembles.stochastic import EnsembleKalmanFilter
@@ -51,6 +52,7 @@ FILTERS: dict[str, type[Filter]] = {
         SerialSquareRootFilter,
         DeterministicEnsembleKalmanFilter,
         IteratedEnsembleKalmanFilter,
+        FiniteSizeEnsembleFilter,
         ParticleFilter,
         AuxiliaryParticleFilter,
         GaussianSumFilter,

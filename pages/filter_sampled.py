@@ -29,7 +29,7 @@ def ensembles(path: Path) -> Path:
     figure = new_figure((9.6, 3.6))
     axes = figure.subplots(1, 3)
     tidy(axes)
-    for name in ("enkf", "etkf", "denkf"):
+    for name in ("enkf", "etkf", "denkf", "enkf-n"):
         results = [judged(make_filter(name, model, ensemble_size=size), runs) for size in sizes]
         for axis, values in zip(axes, list(zip(*results, strict=True))[1:], strict=False):
             axis.plot(sizes, values, label=name, **LOOKS[name])

@@ -47,6 +47,7 @@ WORDS = {
     "ensrf": Words("belief nearly Gaussian", "N members", "20", "small N: overconfident"),
     "denkf": Words("good models, poor measurements", "N members", "30", "accurate sensors: P too wide"),
     "ienkf": Words("one mode", "N members", "30", "two modes; large N at strong nonlinearity"),
+    "enkf-n": Words("as `etkf`; N is small", "N members", "30", "a wrong model, taken for sampling error"),
     "pf": Words("none on shape", "N weighted particles", "400", "few particles: one takes all the weight"),
     "apf": Words("none on shape", "N weighted particles", "600", "as `pf`, later"),
     "gsf": Words(

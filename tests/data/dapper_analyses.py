@@ -4,12 +4,14 @@ In an environment of its own: `pip install dapper==1.7.1`, then `python dapper_a
 others, https://github.com/nansencenter/DAPPER.
 """
 
+import functools
 import json
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-from dapper.da_methods.ensemble import EnKF_analysis
+from dapper.da_methods import ensemble
+from dapper.da_methods.ensemble import EnKF_analysis, EnKF_N
 from dapper.da_methods.variational import iEnKS_update
 from dapper.tools.matrices import CovMat
 from dapper.tools.randvars import GaussRV
@@ -25,7 +27,7 @@ class Ignored:
     """Takes whatever statistics DAPPER reports, and keeps none."""
 
     def __init__(self):
-        self.trHK, self.iters = {}, {}
+        self.trHK, self.iters, self.infl = {}, {}, {}
 
     def assess(self, *arguments, **named):
         pass
@@ -50,6 +52,8 @@ def cases():
             found[f"ienkf {iterations}"] = iEnKS_update(
                 "Sqrt", members.copy(), [], model, Ignored(), 1.0, z, at, whiten, None, False, threshold
             )
+        for certainty in (1, 2):
+            found[f"enkf-n {certainty}"] = finite_size(members, z, noise, certainty)
         analyses = {kind: posterior.T.tolist() for kind, posterior in found.items()}
         yield {"name": name, "r": cov, "z": z.tolist(), "prior": members.T.tolist(), "posterior": analyses}
 
@@ -60,6 +64,35 @@ class _Observation:
 
     def __call__(self, members):
         return observe(members)
+
+
+def finite_size(members, z, noise, certainty):
+    """The analysis of the EnKF-N in its dual form, whose Newton's method ends where rounding does."""
+    ensemble.Newton_m = functools.partial(ensemble.Newton_m, xtol=1e-15, ytol=1e-15)
+    model = SimpleNamespace(
+        X0=SimpleNamespace(sample=lambda size: members.copy()),
+        Dyn=_Still(),
+        tseq=SimpleNamespace(ticker=[(1, 0, 1.0, 1.0)]),
+        Obs=lambda ko: _Observation(noise),
+    )
+    method = EnKF_N(N=len(members), dual=True, xN=certainty)
+    method.stats = _Last()
+    EnKF_N.assimilate.__wrapped__(method, model, None, [z])
+    return method.stats.members
+
+
+class _Still:
+    noise = SimpleNamespace(C=0)
+
+    def __call__(self, members, *time):
+        return members
+
+
+class _Last(Ignored):
+    """Keeps the last ensemble."""
+
+    def assess(self, *arguments, E, **named):
+        self.members = E.copy()
 
 
 if __name__ == "__main__":

@@ -53,6 +53,7 @@ ENSEMBLES = {
     "ensrf": {"inflation": 1.02},
     "denkf": {},
     "ienkf": {"iterations": 2},
+    "enkf-n": {"certainty": 1.5, "inflation": 1.02},
 }
 KEPT = {"kf square-root": ["L"], "ekf-robust": ["weight"], "sage-husa": ["R", "Q", "predicted"], "vb": ["V", "nu"]}
 MODELS = {

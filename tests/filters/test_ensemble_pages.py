@@ -32,6 +32,7 @@ CHOICES = {
     "ensrf": {"relaxation": 0.4},
     "denkf": {"inflation": 0.9, "relaxation": 1.0},
     "ienkf": {"iterations": 2},
+    "enkf-n": {"certainty": 1.5, "inflation": 1.02},
 }
 
 

@@ -20,6 +20,7 @@ def curved(x, c):
     return (x[0] + 0.2 * x[1] * x[1], x[0] * x[1] - 0.5 * x[2])
 
 
+NUMBERS = {"ienkf": "iterations", "enkf-n": "certainty"}
 DAPPER = json.loads((Path(__file__).parents[1] / "data" / "dapper_analyses.json").read_text())
 
 
@@ -34,8 +35,8 @@ def test_the_same_ensemble_gives_the_same_ensemble_as_in_dapper(case):
         prior_cov=np.ones(3),
     )
     for name, posterior in case["posterior"].items():
-        kind, _, iterations = name.partition(" ")
-        numbers = {"iterations": int(iterations)} if iterations else {}
+        kind, _, number = name.partition(" ")
+        numbers = {NUMBERS[kind]: int(number)} if number else {}
         filter_ = make_filter(kind, model, ensemble_size=10, **numbers)
         with interpreted():
             analysis, _ = filter_.update(filter_.init()._replace(members=np.array(case["prior"])), case["z"])

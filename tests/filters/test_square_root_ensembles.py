@@ -166,7 +166,7 @@ def test_the_geometric_mean_is_the_middle_of_two_covariances(size, decades):
     np.testing.assert_array_equal(mean, mean.T)
 
 
-@pytest.mark.parametrize("name", ["etkf", "ensrf", "denkf", "ienkf"])
+@pytest.mark.parametrize("name", ["etkf", "ensrf", "denkf", "ienkf", "enkf-n"])
 @pytest.mark.parametrize("noise", [1e-9, 1e9])
 def test_two_members_and_any_ratio_of_noise_to_spread_are_enough_to_run(name, noise):
     model = linear_model(3)

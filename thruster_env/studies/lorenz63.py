@@ -117,6 +117,8 @@ PUBLISHED = (
     Published("enkf", {"ensemble_size": 100, "inflation": 1.01, "centred_perturbations": 1}, 0.56),
     Published("etkf", {"ensemble_size": 10, "inflation": 1.02, "rotations": 1}, 0.60),
     Published("etkf", {"ensemble_size": 3, "inflation": 1.30}, 0.80),
+    Published("enkf-n", {"ensemble_size": 10, "rotations": 1}, 0.54),
+    Published("enkf-n", {"ensemble_size": 3}, 0.60),
     Published("ekf", {}, 0.92, {"inflation": 180.0}),
     Published("pf", particles(100, 2.4, 0.3), 0.38),
     Published("pf", particles(800, 0.9, 0.2), 0.28),

@@ -122,6 +122,10 @@ PUBLISHED = (
     Published("etkf", {"ensemble_size": 24, "inflation": 1.013, "rotations": 1}, 0.18),
     Published("etkf", {"ensemble_size": 20, "inflation": 1.04, "rotations": 1}, 0.20),
     Published("ensrf", {"ensemble_size": 28, "inflation": 1.02, "rotations": 1}, 0.18),
+    Published("enkf-n", {"ensemble_size": 24, "rotations": 1}, 0.21),
+    Published("enkf-n", {"ensemble_size": 24, "rotations": 1, "certainty": 2.0}, 0.18),
+    Published("enkf-n", {"ensemble_size": 20}, 0.24),
+    Published("enkf-n", {"ensemble_size": 20, "certainty": 2.0}, 0.19),
     Published("ekf", {}, 0.24, {"inflation": 10.0}, "it linearises at the end of a step, ours at the start"),
 )
 BENCHMARK = Benchmark(

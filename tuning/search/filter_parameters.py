@@ -44,6 +44,7 @@ FILTER_PARAMETERS = {
         _own("prior_weight", 1.0, 100.0, log=True),
         _own("degrees_of_freedom", 2.5, 50.0, log=True),
         _own("time_constant", 0.2, 50.0, log=True, unit="steps"),
+        _own("certainty", 0.3, 5.0, log=True),
         _own("fading", 1.0, 1.3),
         _own("theta", 1e-3, 0.9, log=True),
         _own("stay", 0.0, 0.999),

@@ -54,6 +54,7 @@ def _diagonal(result: tuple, v: tuple) -> Callable:
 
 FUNCTIONS: dict[Operation, Callable] = {
     scalars.reciprocal: lambda result, a: _number("1.0 / a", "a"),
+    scalars.power: lambda result, exponent, a: _number(f"a ** {exponent!r}", "a"),
     scalars.exceeds: lambda result, value, a: _number(f"a > {value!r}", "a"),
     scalars.is_number: lambda result, a: _number("a == a", "a"),
     scalars.choose: _chosen,

@@ -131,12 +131,12 @@ def forward(c, lower):
 
 @operation(same)
 def quotient(c, of):
-    """The same, of the factor of S."""
+    """The same, of the factor of S. A vector may be a column, as it is beside an ensemble of NumPy's arrays."""
     lower, d = of
-    x = forward(c, lower)
+    x = forward(c.ravel() if c.shape == (len(d), 1) else c, lower)
     for i in reversed(range(len(d))):
         x[..., i] = x[..., i] / d[i] - sum(x[..., k] * lower[k, i] for k in range(i + 1, len(d)))
-    return x
+    return x.reshape(c.shape)
 
 
 @operation(same, lambda of, seen: True)

@@ -34,6 +34,12 @@ def is_number(a):
     return a == a
 
 
+@operation(lambda a, exponent: ())
+def power(a, exponent):
+    """A number to a power that is known now."""
+    return a**exponent
+
+
 @operation(lambda *shapes: shapes[1], lambda condition, a, b: a.symmetric and b.symmetric)
 def choose(condition, a, b):
     """`a` if the condition holds, else `b`: two numbers, or two matrices of the same shape."""
@@ -101,6 +107,12 @@ def shifted(a, value):
 @reciprocal.derivative
 def _of_reciprocal(result, arguments, slopes):
     return through(lambda slope: slope * result * result * -1.0, slopes[0])
+
+
+@power.derivative
+def _of_power(result, arguments, slopes):
+    a, exponent = arguments
+    return through(lambda slope: slope * power(a, exponent - 1.0) * exponent, slopes[0])
 
 
 @exponential.derivative
