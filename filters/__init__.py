@@ -12,7 +12,7 @@ from filters.ensembles.finite_size import FiniteSizeEnsembleFilter
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
 from filters.ensembles.serial import SerialSquareRootFilter
 from filters.ensembles.stochastic import EnsembleKalmanFilter
-from filters.ensembles.transform import EnsembleTransformFilter
+from filters.ensembles.transform import EnsembleTransformFilter, LocalEnsembleTransformFilter
 from filters.gaussian.cubature import CubatureKalmanFilter
 from filters.gaussian.extended import ExtendedKalmanFilter
 from filters.gaussian.fading import FadingMemoryFilter
@@ -60,6 +60,7 @@ __all__ = [
     "IteratedEnsembleKalmanFilter",
     "IteratedExtendedKalmanFilter",
     "KalmanFilter",
+    "LocalEnsembleTransformFilter",
     "LowPass",
     "MultipleModelAdaptiveEstimator",
     "OpenLoop",

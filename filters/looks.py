@@ -26,6 +26,7 @@ LOOKS: dict[str, tuple[str, Any]] = {
     "ckf": (WINE, DOTTED),
     "enkf": (RUST, SOLID),
     "etkf": (SKY, DASHED),
+    "letkf": (SKY, TWO_DOTS),
     "ensrf": (WINE, BOTH),
     "denkf": (MUSTARD, BOTH),
     "ienkf": (PLUM, BOTH),

@@ -13,7 +13,7 @@ from filters.ensembles.finite_size import FiniteSizeEnsembleFilter
 from filters.ensembles.iterated import IteratedEnsembleKalmanFilter
 from filters.ensembles.serial import SerialSquareRootFilter
 from filters.ensembles.stochastic import EnsembleKalmanFilter
-from filters.ensembles.transform import EnsembleTransformFilter
+from filters.ensembles.transform import EnsembleTransformFilter, LocalEnsembleTransformFilter
 from filters.estimators.find import foreign_filter, is_foreign, own_filter, parameters_of
 from filters.estimators.foreign import ForeignFilter
 from filters.filter import Filter
@@ -49,6 +49,7 @@ FILTERS: dict[str, type[Filter]] = {
         SchmidtKalmanFilter,
         EnsembleKalmanFilter,
         EnsembleTransformFilter,
+        LocalEnsembleTransformFilter,
         SerialSquareRootFilter,
         DeterministicEnsembleKalmanFilter,
         IteratedEnsembleKalmanFilter,

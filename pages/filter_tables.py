@@ -44,6 +44,9 @@ WORDS = {
     "schmidt": Words("some states are better not corrected", "mean, P", "1", "as `ekf`"),
     "enkf": Words("belief nearly Gaussian", "N members", "30", "small N: overconfident; sampling noise"),
     "etkf": Words("belief nearly Gaussian", "N members", "30", "small N: overconfident"),
+    "letkf": Words(
+        "as `etkf`; what is far is not correlated", "N members", "30", "a radius too small or too large"
+    ),
     "ensrf": Words("belief nearly Gaussian", "N members", "20", "small N: overconfident"),
     "denkf": Words("good models, poor measurements", "N members", "30", "accurate sensors: P too wide"),
     "ienkf": Words("one mode", "N members", "30", "two modes; large N at strong nonlinearity"),

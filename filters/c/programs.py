@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from filters.engine.layout import memory_places
-from filters.ensembles.ensemble import EnsembleFilter
+from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
 from filters.filter import Filter
 from filters.pages.equations import Equations
 from filters.pages.kernels import stages_of
@@ -142,8 +142,7 @@ def _of_rows(paged: FilterWithPage) -> FilterPrograms:
 
 def _of_members(paged: EnsembleFilter) -> FilterPrograms:
     """The programs of an ensemble filter."""
-    if getattr(paged, "rotations", 0):
-        raise ValueError("an ensemble in C must have no random rotations, but got rotations=1")
+    check_page_is_all(paged, "in C")
     model, page, numbers, size = paged.kernel_model, paged.written_page, paged.numbers, paged.size
     shape, memory = model.shape, MembersMemory(model.shape, page)
     stages = stages_of_members(page, memory, Equations(model.functions, memory, constants_move=False, trace=True))

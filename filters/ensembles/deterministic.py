@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from filters.engine.belief import Kernels
 from filters.ensembles.ensemble import EnsembleFilter, advance, compare, settle
+from filters.ensembles.localised import LocalisedFilter
 from filters.ensembles.rotation import with_rotation
 from filters.pages.page_filter import Page
 from thruster_env.numerics.algebra.operations import divide
@@ -42,7 +43,7 @@ class DeterministicUpdateFilter(EnsembleFilter):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class DeterministicEnsembleKalmanFilter(DeterministicUpdateFilter):
+class DeterministicEnsembleKalmanFilter(LocalisedFilter, DeterministicUpdateFilter):
     """Deterministic ensemble Kalman filter: the mean moves by the gain, the members' distances by half of it.
 
         predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
@@ -51,8 +52,17 @@ class DeterministicEnsembleKalmanFilter(DeterministicUpdateFilter):
 
     With a linear h the update leaves P - K H P + K H P H'K'/4, more than the Kalman filter's P - K H P, by little
     where measurements are poor. The update draws nothing: only the process noise of the members is random, and the
-    error of its sample mean and covariance enters the estimate. Attributes are those of
-    `DeterministicUpdateFilter`.
+    error of its sample mean and covariance enters the estimate.
+
+    Attributes:
+        radius: of Gaspari and Cohn's taper, in the unit of the model's `Positions`; 0 for no localisation. With
+            one, entries of cov(x, y) and cov(y, y) are multiplied by the taper of the distance of both
+            (P-localisation).
+
+    The other attributes are those of `DeterministicUpdateFilter`.
+
+    Raises:
+        ValueError: if a parameter is out of its range, or there is a radius for a model without positions.
 
     Source: Sakov, Oke (2008), "A deterministic formulation of the ensemble Kalman filter".
     """

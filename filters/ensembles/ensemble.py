@@ -7,16 +7,18 @@ from dataclasses import dataclass
 
 from filters.engine.belief import Kernels
 from filters.ensembles.inflation import inflated, relaxed
+from filters.filter import Filter
 from filters.pages.members import analysis_of, members_kernels
 from filters.pages.page_filter import FilterWithPage, Page
 from thruster_env.numerics.algebra.densities import log_density
 from thruster_env.numerics.algebra.members import covariance, mean, on_branch
-from thruster_env.numerics.algebra.operations import only, present, uncorrelated, wrap
+from thruster_env.numerics.algebra.operations import only, present, sym, uncorrelated, wrap
+from thruster_env.numerics.algebra.scalars import entries_product
 from thruster_env.numerics.checks import at_least, positive, shown
 from thruster_env.plants.shape import Functions, Shape
 
 LARGEST_ENSEMBLE = 1_000_000
-OF_THE_ENGINE = "ensemble_size", "rotations"  # parameters that no page reads
+OF_THE_ENGINE = "ensemble_size", "rotations", "radius"  # parameters that no page reads
 
 
 def advance(model, x, u):
@@ -35,12 +37,26 @@ def expect(model, x, z):
 
 
 def compare(model, x, z):
-    """A member's y less their mean, cov(x, y), innovation v, S, R, log N(v; 0, S)."""
+    """A member's y less their mean, cov(x, y), innovation v, S, R, log N(v; 0, S).
+
+    Covariances are tapered where a filter has tapers between channels.
+    """
     seen, y = present(z), expect(model, x, z)
     R = uncorrelated(seen, model.R)
     v = only(seen, wrap(z - mean(y), model.measurement_angles))
-    S = covariance(y, y) + R
-    return y - mean(y), covariance(x, y), v, S, R, log_density(v, S, seen)
+    C, A = covariance(x, y), covariance(y, y)
+    if hasattr(model.own, "between"):
+        C, A = entries_product(C, model.own.taper), sym(entries_product(A, model.own.between))
+    S = A + R
+    return y - mean(y), C, v, S, R, log_density(v, S, seen)
+
+
+def check_page_is_all(filter_: Filter, where: str) -> None:
+    """Raise ValueError for an ensemble whose update is more than its page, which is all that there is `where`."""
+    if getattr(filter_, "rotations", 0):
+        raise ValueError(f"an ensemble {where} must have no random rotations, but got rotations=1")
+    if getattr(filter_, "by_parts", False):
+        raise ValueError(f"an ensemble {where} must have no radius, but got {filter_.radius:g}")  # type: ignore
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

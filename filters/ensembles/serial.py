@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from filters.ensembles.deterministic import DeterministicUpdateFilter
 from filters.ensembles.ensemble import advance, compare, settle
+from filters.ensembles.localised import LocalisedByParts
 from filters.pages.page_filter import Page
 from thruster_env.numerics.algebra.blocks import triangle_quotient
 from thruster_env.numerics.algebra.operations import divide
@@ -21,7 +22,7 @@ def update(model, x, z, e):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SerialSquareRootFilter(DeterministicUpdateFilter):
+class SerialSquareRootFilter(LocalisedByParts, DeterministicUpdateFilter):
     """Serial ensemble square root filter (EnSRF), without perturbed measurements.
 
         predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
@@ -37,11 +38,24 @@ class SerialSquareRootFilter(DeterministicUpdateFilter):
     process noise of the members is random, and the error of its sample mean and covariance enters the estimate.
 
     With one channel it is the `EnsembleTransformFilter`. Close relatives go by the name of EnKF-SR in the
-    literature on ships. Attributes are those of `DeterministicUpdateFilter`.
+    literature on ships.
+
+    With a radius the gain k of a state is tapered by its distance from the channel (P-localisation), and each
+    channel is predicted anew from the members that those before have moved.
+
+    Attributes:
+        radius: of Gaspari and Cohn's taper, in the unit of the model's `Positions`; 0 for no localisation. The
+            others are those of `DeterministicUpdateFilter`.
+
+    Raises:
+        ValueError: if a parameter is out of its range; for a radius also if the model has no positions, or R is
+            not diagonal.
 
     Source: Whitaker, Hamill (2002), "Ensemble data assimilation without perturbed observations", equations (10) to
-    (13); Andrews (1968), "A square root formulation of the Kalman covariance equations".
+    (13); Andrews (1968), "A square root formulation of the Kalman covariance equations"; with tapers: Karspeck,
+    Anderson (2007), "Experimental implementation of an ensemble adjustment filter for an intermediate ENSO model".
     """
 
     name: ClassVar[str] = "ensrf"
     page: ClassVar[Page] = Page(advance, settle, update)
+    serial: ClassVar[bool] = True

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from filters.ensembles.ensemble import EnsembleFilter, advance, compare, settle
+from filters.ensembles.ensemble import advance, compare, settle
+from filters.ensembles.localised import LocalisedFilter
 from filters.pages.page_filter import Page
 from thruster_env.numerics.algebra.members import centred
 from thruster_env.numerics.algebra.operations import divide
@@ -20,7 +21,7 @@ def update(model, x, z, e):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class EnsembleKalmanFilter(EnsembleFilter):
+class EnsembleKalmanFilter(LocalisedFilter):
     """Stochastic ensemble Kalman filter, on the full nonlinear model, with perturbed measurements.
 
         predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
@@ -36,13 +37,18 @@ class EnsembleKalmanFilter(EnsembleFilter):
             in the Kalman filter; the mean of independent ones, of covariance R/N, enters the estimate. Use it for
             small N.
 
+        radius: of Gaspari and Cohn's taper, in the unit of the model's `Positions`; 0 for no localisation. With
+            one, entries of cov(x, y) and cov(y, y) are multiplied by the taper of the distance of both
+            (P-localisation).
+
     The other attributes are those of `EnsembleFilter`.
 
     Raises:
-        ValueError: if a parameter is out of its range.
+        ValueError: if a parameter is out of its range, or there is a radius for a model without positions.
 
     Source: Evensen (1994); Burgers, van Leeuwen, Evensen (1998), "Analysis scheme in the EnKF"; centred: Evensen
-    (2004), "Sampling strategies and square root analysis schemes for the EnKF".
+    (2004), "Sampling strategies and square root analysis schemes for the EnKF"; with tapers: Houtekamer, Mitchell
+    (2001), "A sequential ensemble Kalman filter for atmospheric data assimilation".
     """
 
     name: ClassVar[str] = "enkf"

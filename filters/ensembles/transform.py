@@ -7,6 +7,7 @@ from typing import ClassVar
 
 from filters.ensembles.deterministic import DeterministicUpdateFilter
 from filters.ensembles.ensemble import advance, compare, settle
+from filters.ensembles.localised import LocalisedByParts
 from filters.pages.page_filter import Page
 from thruster_env.numerics.algebra.geometric import geometric_mean
 from thruster_env.numerics.algebra.operations import divide
@@ -37,8 +38,37 @@ class EnsembleTransformFilter(DeterministicUpdateFilter):
 
     Source: Bishop, Etherton, Majumdar (2001), "Adaptive sampling with the ensemble transform Kalman filter", part
     I; the symmetric root: Hunt, Kostelich, Szunyogh (2007), "Efficient data assimilation for spatiotemporal chaos:
-    a local ensemble transform Kalman filter", section 2.3, here without localisation.
+    a local ensemble transform Kalman filter", section 2.3, here without localisation, which the
+    `LocalEnsembleTransformFilter` has.
     """
 
     name: ClassVar[str] = "etkf"
     page: ClassVar[Page] = Page(advance, settle, update)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LocalEnsembleTransformFilter(LocalisedByParts, EnsembleTransformFilter):
+    """Local ensemble transform Kalman filter (LETKF): each state has an analysis of its own, with what lies near.
+
+        predict: x_j = f(x_j, u) + w_j,  w_j ~ N(0, Q)
+        update:  state i is moved as by the `EnsembleTransformFilter` with R_kk/taper(distance of i and k) in
+                 place of each R_kk (R-localisation), by Gaspari and Cohn's taper; tapers below 0.001 are zero
+
+    N members span N - 1 directions, which are enough for a field of any length if what lies far apart is not
+    correlated. The model says where its states and measurements lie (`Positions`); without a radius it is the
+    `EnsembleTransformFilter`. Innovation, its covariance and log-likelihood are those without tapers.
+
+    Attributes:
+        radius: at which a channel counts about 0.6 times, in the unit of the positions; 0 for no localisation. The
+            others are those of `DeterministicUpdateFilter`.
+
+    Raises:
+        ValueError: if a parameter is out of its range; for a radius also if the model has no positions, or R is
+            not diagonal.
+
+    Source: Hunt, Kostelich, Szunyogh (2007), "Efficient data assimilation for spatiotemporal chaos: a local
+    ensemble transform Kalman filter".
+    """
+
+    name: ClassVar[str] = "letkf"
+    serial: ClassVar[bool] = False

@@ -31,11 +31,15 @@ def smooth_ensembles(
     - v_j - y_j). Relaxation is for the members of now only, and steps before a restart from the prior are left as
     they are.
 
-    Raises ValueError for a filter with rotations, which would part the members of different steps.
+    Raises ValueError for a filter with rotations, which would part the members of different steps, or with a
+    radius, as localisation moves each state by other weights.
     """
     rotations = getattr(filter_, "rotations", 0)
     if rotations:
         raise ValueError(f"a smoothed filter must have rotations 0, but got {rotations}")
+    radius = getattr(filter_, "radius", 0.0)
+    if radius:
+        raise ValueError(f"a smoothed filter must have a radius of 0, but got {radius:g}")
     paired = dataclasses.replace(filter_, model=_paired_model(filter_.kernel_model))
     kernels, pair_kernels, size = filter_.kernels(), paired.kernels(), filter_.size
     analyse_pair = filter_.analysis(paired.model.functions, paired.model.shape)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from filters.ensembles.ensemble import EnsembleFilter
+from filters.ensembles.ensemble import EnsembleFilter, check_page_is_all
 from filters.filter import Filter
 from filters.pages.page_filter import with_page
 from filters.tensors.algebra import root, where, wrapped_where
@@ -105,8 +105,7 @@ class TensorFilter:
         motion = equation_of("transition", (f, by_f), (transition, by_transition), 2, shape)
         sight = equation_of("observe", (h, by_h), (observe, by_observe), 1, shape)
         if isinstance(paged, EnsembleFilter):
-            if getattr(paged, "rotations", 0):
-                raise ValueError("an ensemble on tensors must have no random rotations, but got rotations=1")
+            check_page_is_all(paged, "on tensors")
             self._stages: Stages = EnsembleStages(motion, sight, shape, paged.page_with())
         else:
             self._stages = Stages(motion, sight, shape, paged.written_page)

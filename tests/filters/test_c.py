@@ -50,6 +50,7 @@ ENSEMBLES = {
     "enkf": {},
     "enkf centred": {"centred_perturbations": 1, "inflation": 1.02},
     "etkf": {"relaxation": 0.3},
+    "letkf": {},
     "ensrf": {"inflation": 1.02},
     "denkf": {},
     "ienkf": {"iterations": 2},

@@ -29,6 +29,7 @@ SIZE = 11
 CHOICES = {
     "enkf": {"centred_perturbations": 1},
     "etkf": {"inflation": 1.05},
+    "letkf": {},
     "ensrf": {"relaxation": 0.4},
     "denkf": {"inflation": 0.9, "relaxation": 1.0},
     "ienkf": {"iterations": 2},

@@ -18,6 +18,7 @@ from thruster_env.numerics.results import array_valued
 from thruster_env.numerics.sources import is_array
 from thruster_env.plants.model_check import check_functions, checked_constants
 from thruster_env.plants.model_digest import digest_of
+from thruster_env.plants.positions import Positions
 from thruster_env.plants.quantities import Quantities, count_of, outputs, quantities
 from thruster_env.plants.shape import Functions, Shape, constants_are_array, constants_form
 
@@ -69,6 +70,7 @@ class StateSpaceModel:
         input_quantities: the same for the inputs; u_1, ... if None.
         measurements: the same for the measurements; z_1, ... if None.
         outputs: outputs of the model by symbol: an `Output` each, a quantity and a function of (x, c).
+        positions: `Positions` of states and measurements, for ensembles with localisation; None if unknown.
 
     Raises:
         ValueError: if shapes do not fit, a covariance or constant is not valid, or a function does not work at the
@@ -96,6 +98,7 @@ class StateSpaceModel:
     input_quantities: Any = None
     measurements: Any = None
     outputs: Mapping[str, Any] = field(default_factory=dict)
+    positions: Positions | None = None
 
     def __post_init__(self):
         """Check shapes and signs, and try the functions; raise ValueError that states the rule and the value."""
@@ -125,6 +128,8 @@ class StateSpaceModel:
         checked["input_quantities"] = inputs
         checked["measurements"] = quantities("measurements", self.measurements, m, "z", "measurement_noise_cov")
         checked["outputs"] = outputs(self.outputs)
+        if self.positions is not None:
+            checked["positions"] = Positions(*self.positions).checked(n, m)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         check_functions(self)

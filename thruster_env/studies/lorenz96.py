@@ -22,6 +22,7 @@ import numpy as np
 
 from filters import StateSpaceModel
 from thruster_env.numerics.compiled import inlined
+from thruster_env.plants.positions import Positions
 from thruster_env.studies.benchmark import Benchmark, Published, against_published, noise_free_problem
 
 STATES, FORCING, SUBSTEP = 40, 8.0, 0.05
@@ -108,6 +109,7 @@ def model(inflation: float = 1.0) -> StateSpaceModel:
         prior_cov=np.full(STATES, START_VARIANCE),
         inputs=0,
         constants=Constants(FORCING, SUBSTEP, float(np.sqrt(inflation**SUBSTEP))),
+        positions=Positions(range(STATES), range(STATES), STATES),
     )
 
 
@@ -122,6 +124,8 @@ PUBLISHED = (
     Published("etkf", {"ensemble_size": 24, "inflation": 1.013, "rotations": 1}, 0.18),
     Published("etkf", {"ensemble_size": 20, "inflation": 1.04, "rotations": 1}, 0.20),
     Published("ensrf", {"ensemble_size": 28, "inflation": 1.02, "rotations": 1}, 0.18),
+    Published("letkf", {"ensemble_size": 7, "radius": 4, "inflation": 1.04, "rotations": 1}, 0.22),
+    Published("ensrf", {"ensemble_size": 7, "radius": 6, "inflation": 1.07, "rotations": 1}, 0.23),
     Published("enkf-n", {"ensemble_size": 24, "rotations": 1}, 0.21),
     Published("enkf-n", {"ensemble_size": 24, "rotations": 1, "certainty": 2.0}, 0.18),
     Published("enkf-n", {"ensemble_size": 20}, 0.24),

@@ -61,7 +61,7 @@ FUNCTIONS: dict[Operation, Callable] = {
     scalars.trace: _trace,
     scalars.exponential: _exponential,
     scalars.entries_product: lambda result, a, b: entrywise(
-        "product", "a, b", a, lambda i: f"a[{i}] * b[{i}]", a=a, b=b
+        "product", "a, b", a, lambda *at: "a[{0}] * b[{0}]".format("][".join(map(str, at))), a=a, b=b
     ),
     scalars.at_most: lambda result, value, v: entrywise("most", "v", v, lambda i: f"min(v[{i}], {value!r})", v=v),
     scalars.below: lambda result, value, v: entrywise(

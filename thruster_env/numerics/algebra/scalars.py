@@ -83,7 +83,7 @@ def below(v, value):
 
 @operation(lambda a, b: a)
 def entries_product(a, b):
-    """The products of the entries of two vectors."""
+    """The products of the entries of two vectors, or of two matrices."""
     return a * b
 
 
